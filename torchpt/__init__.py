@@ -1,7 +1,7 @@
 """torchpt: a wavefront path tracer that is a PyTorch program.
 
-``torchpt.load`` a scene, ``torchpt.render`` it, ``torchpt.write_image`` the picture. Names are resolved on first use,
-so ``import torchpt`` itself is quick.
+``torchpt.load`` a scene, ``torchpt.render`` it, ``torchpt.write_image`` the picture. Names are imported on first use,
+so ``import torchpt`` is quick.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ __all__ = [
     "write_image",
 ]
 
-# public name -> the module that has it
+# public name -> module that defines it
 _LAZY = {
     "Bsdf": "torchpt.physics.bsdfs",
     "Rendering": "torchpt.rendering",

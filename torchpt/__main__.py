@@ -1,4 +1,4 @@
-"""``python -m torchpt`` is ``torchpt``."""
+"""Run the command line: ``python -m torchpt`` is ``torchpt``."""
 
 from torchpt.cli.main import run
 

@@ -1,4 +1,4 @@
-"""Cameras of other libraries, in and out, and NeRF's ``transforms.json``."""
+"""Convert cameras to and from other libraries, and read and write NeRF's ``transforms.json``."""
 
 from torchpt.physics.cameras.opencv import PinholeMatrices
 from torchpt.scene.conventions import (

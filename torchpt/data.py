@@ -1,9 +1,8 @@
-"""Rendered pictures as data sets of ``torch.utils.data``: ``RenderDataset`` by index, ``RenderStream`` without end.
+"""Data sets of rendered pictures for ``torch.utils.data``: ``RenderDataset`` by index, the endless ``RenderStream``.
 
-An item is a function of its index alone: the same bits in any number of workers, forked or spawned, on any rank. For it,
-what is handed over as ``make`` must be such a function too: draw its random numbers from
-``torch.Generator().manual_seed(index)``. Spawned workers pickle the data set, so that ``make`` must be a function of a
-module, no ``lambda``.
+An item is a function of its index: it has the same bits in any number of workers, forked or spawned, and on any rank. So must
+be the scene that ``make`` returns: draw its random numbers from ``torch.Generator().manual_seed(index)``. Spawned workers
+pickle the data set, so for them ``make`` must be a function of a module, not a ``lambda``.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ from torchpt.spec.arguments import check_names
 
 __all__ = ["Made", "RenderDataset", "RenderStream"]
 
-#: A scene or a mapping of the scene format; with arguments of ``torchpt.render`` for it, where there are some.
+#: A scene or a mapping of the scene format, optionally with arguments of ``torchpt.render``.
 Made = Scene | Mapping[str, Any] | tuple[Scene | Mapping[str, Any], Mapping[str, Any]]
 
 
 class _ItemRenderer:
-    """How an index becomes an item."""
+    """Renders the items of a data set."""
 
     def __init__(
         self,
@@ -73,7 +72,7 @@ class _ItemRenderer:
         own_types = {name: value.dtype for name, value in scene.params.items()}
         params = {n: _tensor(f"params.{n}", value, own_types.get(n, torch.float32)) for n, value in params.items()}
         if get_worker_info() is not None:
-            options.setdefault("threads", 1)  # workers share the cores
+            options.setdefault("threads", 1)  # the workers share the cores
         options = {"spp": self.spp, "seed": self.seed + index, **options, "film": film}
         with torch.no_grad():
             found = render(scene, params=params, full=True, **options)
@@ -87,7 +86,7 @@ class _ItemRenderer:
         return {**{name: value.detach() for name, value in item.items()}, "index": torch.tensor(index)}
 
     def _scene(self, number: int) -> tuple[Scene, dict[str, Any]]:
-        """A scene and its own wishes; the latest one is kept, for its next camera."""
+        """Return a scene and its arguments of ``render``; the latest is cached for its next camera."""
         if self.latest is None or self.latest[0] != number:
             made = self.make(number)
             source, own = made if isinstance(made, tuple) and len(made) == 2 else (made, {})
@@ -103,36 +102,36 @@ class _ItemRenderer:
         return self.latest[1], dict(self.latest[2])
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "latest": None}  # workers make their own
+        return {**self.__dict__, "latest": None}  # each worker makes its own scene
 
 
 class RenderDataset(Dataset):
-    """A data set of rendered pictures, by index.
+    """A map-style data set of rendered pictures.
 
     Item ``i`` is a dict of tensors: ``image (H, W, 3)`` linear RGB; each of ``layers`` by name, ``(H, W, C)``; the camera as
     ``to_world (4, 4)`` and, of a perspective or thin lens one, as OpenCV's ``K (3, 3)`` in pixels, ``R (3, 3)`` and ``t (3,)``
-    (docs/reference/cameras.md); ``index ()`` int64. ``torch.utils.data.DataLoader`` puts them into batches as they are, where
-    all are of one size.
+    (docs/reference/cameras.md); ``index ()`` int64. ``torch.utils.data.DataLoader`` collates them into batches if all have one
+    size.
 
-    Its seed is ``seed + i``. In workers a render takes one thread, else as many as the scene wishes, unless ``threads``
-    says otherwise.
+    The seed of item ``i`` is ``seed + i``. Renders use one thread in workers, and otherwise the scene's number, unless
+    ``threads`` is given.
 
     Args:
-        make: from a scene's index to the scene: a :class:`torchpt.Scene`, a mapping of the scene format, or a pair of one of
-            these and arguments of ``torchpt.render`` (``params`` among them), which win over those of the data set.
-        scenes: how many there are.
+        make: returns the scene of an index: a :class:`torchpt.Scene`, a mapping of the scene format, or a pair of one of these
+            and arguments of ``torchpt.render`` (also ``params``), which take precedence over those of the data set.
+        scenes: number of scenes.
         cameras: poses ``(4, 4)`` from camera to world, or mappings of ``camera.*`` parameters, for each scene: item
-            ``i`` is scene ``i // len(cameras)`` seen by camera ``i % len(cameras)``. Without any, each scene has its own.
-        spp: samples a pixel; None: the scene's own wish.
-        layers: names of layers (``film.aovs``).
-        seed: of item 0; any integer from 0.
-        device: where mappings are loaded.
+            ``i`` is scene ``i // len(cameras)`` by camera ``i % len(cameras)``. Without cameras, each scene has its own.
+        spp: samples a pixel; None: the scene's own.
+        layers: names of AOVs (``film.aovs``).
+        seed: seed of item 0; any integer from 0.
+        device: device on which mappings are loaded.
         options: further arguments of ``torchpt.render``.
 
     Raises:
-        SceneError: arguments that are not accepted; on access, what ``load`` and ``render`` raise.
-        TypeError: an argument that ``render`` does not know; on access, an index that is no whole number.
-        IndexError: on access, an index that there is not.
+        SceneError: an argument is not accepted; on access, as ``load`` and ``render``.
+        TypeError: an unknown argument; on access, an index that is no integer.
+        IndexError: on access, an index out of range.
     """
 
     def __init__(
@@ -169,18 +168,18 @@ class RenderDataset(Dataset):
 
 
 class RenderStream(IterableDataset):
-    """The items of a :class:`RenderDataset` one after the other, without end by default.
+    """An iterable data set of the items of a :class:`RenderDataset`, endless by default.
 
-    Ranks and workers share them: rank ``r`` of ``R`` has the indices ``i`` with ``i % R == r``, and its worker ``w`` of ``W``
-    every ``W``-th of these. So no picture is rendered twice, and one that is rendered on another rank has the same bits.
+    Ranks and workers share the items: rank ``r`` of ``R`` has the indices ``i`` with ``i % R == r``, and its worker ``w`` of
+    ``W`` every ``W``-th of these. So no picture is rendered twice, and each has the same bits on any rank.
 
     Args:
         make: see :class:`RenderDataset`.
-        scenes: how many there are; None: no end.
-        start: the first index, to go on where a run ended.
-        shard: ``(rank, world)``; by default those of ``torch.distributed``, where it is set up in the process that makes the
-            workers, else ``(0, 1)``.
-        cameras: see :class:`RenderDataset`; so are all others.
+        scenes: number of scenes; None: endless.
+        start: the first index, to resume a run.
+        shard: ``(rank, world)``; by default those of ``torch.distributed``, if it is initialized in the process that starts
+            the workers, else ``(0, 1)``.
+        cameras: see :class:`RenderDataset`, as for all others.
         spp: see there.
         layers: see there.
         seed: see there.
@@ -211,10 +210,10 @@ class RenderStream(IterableDataset):
         self._items = _ItemRenderer("RenderStream", make, cameras, spp, layers, seed, device, options)
         self.scenes = scenes
         self.start, self.shard = start, shard
-        self.seen: tuple[int, int] | None = None  # of the process that made this worker
+        self.seen: tuple[int, int] | None = None  # rank and world of the process that started this worker
 
     def indices(self) -> Iterator[int]:
-        """Those that this process renders, in order."""
+        """Yield the indices of the items of this process, in order."""
         rank, world = self.shard or self.seen or _ranks()
         worker = get_worker_info()
         mine, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
@@ -228,11 +227,11 @@ class RenderStream(IterableDataset):
         return (self._items.item(index) for index in self.indices())
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "seen": self.seen or _ranks()}  # spawned workers know nothing of ranks
+        return {**self.__dict__, "seen": self.seen or _ranks()}  # spawned workers have no process group
 
 
 def _check_options(options: Mapping[str, Any], where: str = "") -> None:
-    """Refuse arguments of ``render`` that would change nothing here; ``where``: what their keys begin with."""
+    """Raise SceneError for arguments of ``render`` that have no effect here; ``where`` begins their keys."""
     film, params = options.get("film"), options.get("params")
     if "full" in options:
         raise SceneError(f"{where}full", options["full"], "none: an item holds the picture and its layers")
@@ -249,7 +248,7 @@ def _check_options(options: Mapping[str, Any], where: str = "") -> None:
 
 
 def _cameras(cameras: Any) -> list[Mapping[str, Any]]:
-    """Each camera as parameters of a scene."""
+    """Return each camera as parameters of a scene."""
     if isinstance(cameras, str | Mapping) or not isinstance(cameras, Iterable):
         raise SceneError("cameras", cameras, "a sequence of poses (4, 4) or of mappings of camera.* parameters")
     found: list[Mapping[str, Any]] = []
@@ -267,7 +266,7 @@ def _cameras(cameras: Any) -> list[Mapping[str, Any]]:
 
 
 def _tensor(key: str, value: Any, dtype: torch.dtype) -> Tensor:
-    """A floating tensor as it is, and other numbers as one of ``dtype``."""
+    """Return a floating tensor unchanged, other numbers as a tensor of ``dtype``."""
     if isinstance(value, Tensor) and value.is_floating_point():
         return value
     try:
@@ -277,7 +276,7 @@ def _tensor(key: str, value: Any, dtype: torch.dtype) -> Tensor:
 
 
 def _ranks() -> tuple[int, int]:
-    """Rank and number of ranks; ``(0, 1)`` where there are none."""
+    """Return rank and number of ranks; ``(0, 1)`` without a process group."""
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
     return 0, 1

@@ -1,6 +1,6 @@
-"""All that a kind of your own needs, from one place: base classes, records, parameters, random numbers, vectors.
+"""Everything for a kind of your own: base classes, records, parameters, random numbers, vectors.
 
-What is here keeps its name and meaning from release to release as the functions of ``torchpt`` do; other modules may move.
+Names and meanings here are as stable as the functions of ``torchpt``; other modules may change.
 
 ====================  =====================================================================================
 a material            :class:`Bsdf` with :class:`BsdfSample`
@@ -11,7 +11,7 @@ a sampler             :class:`Points`
 a filter              :class:`Filter`, :class:`Tabulated`
 a texture             :class:`Computed`
 an integrator         :class:`Path`, :class:`FirstSurfaceIntegrator`, :class:`Limits`, and the records of stages
-a layer (AOV)         :class:`SurfaceLayer`, :class:`FilmLayer`
+an AOV                :class:`SurfaceLayer`, :class:`FilmLayer`
 parameters            :class:`Scalar`, :class:`Color`, ... with :class:`Moves` and :class:`Refused`
 ====================  =====================================================================================
 """

@@ -1,6 +1,6 @@
-"""Image-based lighting by split sum: maps of a sky as tensors, differentiable in the sky, and shading with them.
+"""Image-based lighting by the split-sum approximation: prefiltered environment maps as tensors, differentiable in the sky.
 
-``torchpt.ibl.maps(sky)`` makes them, ``torchpt.ibl.shade(maps, n, v, base_color, roughness, metallic)`` looks them up.
+``torchpt.ibl.maps(sky)`` prefilters a sky; ``torchpt.ibl.shade(maps, n, v, base_color, roughness, metallic)`` shades with it.
 """
 
 from torchpt.physics.ibl.convolve import irradiance_map, prefiltered, roughnesses

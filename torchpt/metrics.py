@@ -1,4 +1,4 @@
-"""Metrics of two pictures ``(H, W, 3)``, by name in :data:`METRICS`; ``error_map`` says where errors lie."""
+"""Metrics of two pictures ``(H, W, 3)``, by name in :data:`METRICS`; ``error_map`` returns errors by pixel."""
 
 from torchpt.images.metrics import (
     MAPS,

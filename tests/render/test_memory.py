@@ -306,7 +306,7 @@ def measured(wish: str, more: str = "{}") -> tuple[str, int]:
     """Return what a render of a process of its own says, and bytes that it held above import at most."""
     text = f"""
 import torchpt
-from torchpt.core.memory import Meter
+from torchpt.core.memory import MemoryMeter
 scene = torchpt.load("cornell_box", "cpu")
 try:
     found = torchpt.render(scene, spp=1, full=True, max_memory={wish!r}, **{more})

@@ -46,7 +46,7 @@ def steps(stop: StopRules, pace: float, error: Any = None) -> list[int]:
     while size := stop.step(taken):
         out.append(size)
         taken += size
-        stop.told(taken, pace * taken, None if error is None else error(taken))
+        stop.update(taken, pace * taken, None if error is None else error(taken))
     return out
 
 
@@ -71,7 +71,7 @@ def test_a_time_limit_holds_on_a_machine_that_others_slow(pace, seed):
     while size := stop.step(taken):
         slow = float(torch.rand((), generator=g)) < (0.3 if seconds < 8.0 else 0.7)
         taken, seconds = taken + size, seconds + pace * size * (2.0 if slow else 1.0)
-        stop.told(taken, seconds, None)
+        stop.update(taken, seconds, None)
     one = 2.0 * pace - 1.25 * pace  # a single sample that takes longer than its rule foresaw
     assert stop.reason == "time_limit" and 9.6 - 2.5 * pace <= seconds <= 10.3 + one
 

@@ -1,13 +1,13 @@
-"""What every room may use, and nothing of rendering.
+"""Utilities that every other package of torchpt may use; nothing here is about rendering.
 
 ==================  =====================================================================================
-``errors.py``       errors that users read, in one line: start here
-``files.py``        files that a scene may name, those that ship, writes that are whole or not at all
-``tree.py``         one walker over nested records: their tensors, copies with other tensors, a fingerprint
-``dispatch.py``     functions of tensors that physics declares and an engine may take over
-``memory.py``       the one policy for memory: how much a job may use, and what is tried when it runs out
-``threads.py``      the one pool of threads, and dealers that give results in the order of tasks
-``autograd.py``     functions whose backward pass is given, as autograd and ``torch.func`` take them
+``errors.py``       exceptions and warnings, each a line for the user: start here
+``files.py``        paths of scene files, safe reading, and the configs that ship
+``tree.py``         nested records of tensors: leaves, copies with other tensors, a fingerprint
+``dispatch.py``     tensor functions for which engines register implementations
+``memory.py``       the memory limit, and what is done when memory runs out
+``threads.py``      the thread pool, and results that do not depend on the number of threads
+``autograd.py``     custom VJPs for autograd and ``torch.func``
 ``version.py``      the version of the package
 ==================  =====================================================================================
 

@@ -1,4 +1,4 @@
-"""A function of tensors whose backward pass is given, as autograd and ``torch.func`` take it."""
+"""Functions of tensors with a custom backward pass (VJP), for autograd and ``torch.func``."""
 
 from __future__ import annotations
 
@@ -35,45 +35,46 @@ _BATCHES = (
 def custom_vjp(
     forward: Forward, backward: Backward, tensors: tuple[Tensor, ...], captured: tuple[Tensor, ...] = ()
 ) -> tuple[Tensor, ...]:
-    """What ``forward`` gives, as a function of ``tensors`` that autograd can go back through.
+    """Return ``forward(*tensors)``, differentiable in ``tensors`` and ``captured`` by ``backward``.
 
-    The functions see plain tensors, whatever transforms of ``torch.func`` are at work. Under ``vmap``, and where
-    cotangents come in batches (``jacrev``), they are called once for each element.
+    Both functions get plain tensors, unwrapped from transforms of ``torch.func``. Under ``vmap``, and for batches of
+    cotangents (``jacrev``), they are called once for each element.
 
     Args:
-        forward: from ``tensors`` to its results.
-        backward: from the derivatives by these (a tuple) and ``tensors`` to those by ``tensors`` and ``captured``.
-        tensors: what is handed to both.
-        captured: what both use by themselves, such as weights of modules; they may change before the backward pass.
+        forward: returns a tuple of tensors, given ``tensors``.
+        backward: the VJP: returns cotangents of ``tensors`` and ``captured``, given those of the results (a tuple) and
+            ``tensors``.
+        tensors: arguments of both.
+        captured: tensors that both functions capture, such as weights of modules; they may change before the backward pass.
 
     Raises:
-        TorchptError: forward mode is asked for; in the backward pass, second derivatives.
+        TorchptError: forward-mode derivatives; in the backward pass, second derivatives.
     """
     return _CustomVjp.apply(forward, backward, len(captured), *tensors, *captured)  # pyright: ignore[reportReturnType]
 
 
 def wants_gradients(value: Tensor) -> bool:
-    """Whether a tensor requires gradients, at any level of nested transforms of ``torch.func``."""
+    """Return True if a tensor requires gradients, at any level of nested transforms of ``torch.func``."""
     return any(level.requires_grad for level in _levels(value))
 
 
 def is_batched(value: Tensor) -> bool:
-    """Whether a tensor stands for a batch of them, at any level of nested transforms of ``torch.func``."""
+    """Return True if a tensor is batched by ``vmap``, at any level of nested transforms of ``torch.func``."""
     return any(is_batchedtensor(level) for level in _levels(value))
 
 
 def is_transformed(value: Tensor) -> bool:
-    """Whether a transform of ``torch.func`` is at work on a tensor, whose numbers cannot be read there."""
+    """Return True if a transform of ``torch.func`` wraps a tensor, so that its values cannot be read."""
     return is_functorch_wrapped_tensor(value)
 
 
 def outside_transforms() -> AbstractContextManager[Any]:
-    """Where tensors are made that no transform of ``torch.func`` at work is to know."""
+    """Return a context in which tensors are made outside of all transforms of ``torch.func``."""
     return _DisableFuncTorch()
 
 
 def _levels(value: Tensor) -> Iterator[Tensor]:
-    """A tensor, and those that transforms have wrapped up in it."""
+    """Yield a tensor, and the tensors that transforms wrapped in it."""
     yield value
     while is_functorch_wrapped_tensor(value):
         value = get_unwrapped(value)
@@ -106,7 +107,7 @@ class _CustomVjp(torch.autograd.Function):
 
 
 class _CustomVjpBackward(torch.autograd.Function):
-    """The backward pass, which ``torch.func`` differentiates once more without looking at it."""
+    """The backward pass as a function of its own, on which ``torch.func`` may call ``vmap`` or differentiate again."""
 
     @staticmethod
     def forward(work: Backward, count: int, *tensors: Tensor) -> tuple[Tensor | None, ...]:
@@ -137,7 +138,7 @@ class _CustomVjpBackward(torch.autograd.Function):
 def _each(
     call: Callable[..., Any], count: int, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...]
 ) -> tuple[tuple[Tensor | None, ...], tuple[int | None, ...]]:
-    """One call for each element of a batch, and their results in a batch."""
+    """Return the stacked results of one call for each element of a batch, and their batch dimensions."""
     rows = [
         call(*(a if dim is None else a.select(dim, k) for a, dim in zip(arguments, in_dims, strict=True)))
         for k in range(count)

@@ -1,4 +1,4 @@
-"""Functions of whole tensors that engines may take over: physics declares them, engines register."""
+"""Tensor functions that physics defines and engines may replace by faster implementations."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ T = TypeVar("T")
 
 
 class Dispatched(Generic[P, T]):
-    """A function with the implementations that were registered for it.
+    """A function with registered implementations, the latest of which that accepts the arguments is called.
 
     Args:
-        function: what is called where no implementation takes the arguments.
+        function: is called where no implementation accepts the arguments.
 
     Attributes:
-        function: the same.
-        implementations: those that are asked, in this order.
+        function: the function itself.
+        implementations: registered implementations, in the order in which they are tried.
     """
 
     def __init__(self, function: Callable[P, T]) -> None:
@@ -29,12 +29,12 @@ class Dispatched(Generic[P, T]):
         update_wrapper(self, function)
 
     def register(self, implementation: Callable[..., Any]) -> None:
-        """Ask ``implementation`` first from now on; it returns NotImplemented for arguments that it leaves to others."""
+        """Try ``implementation`` first from now on; it returns NotImplemented for arguments that it does not accept."""
         if implementation not in self.implementations:
             self.implementations.insert(0, implementation)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call the function, or the first implementation that takes the arguments."""
+        """Call the first implementation that accepts the arguments, else the function."""
         for implementation in self.implementations:
             result = implementation(*args, **kwargs)
             if result is not NotImplemented:
@@ -43,5 +43,5 @@ class Dispatched(Generic[P, T]):
 
 
 def dispatched(function: Callable[P, T]) -> Dispatched[P, T]:
-    """Let engines take a function over: they call ``register`` of what is returned."""
+    """Make a function one for which engines can ``register`` implementations (a decorator)."""
     return Dispatched(function)

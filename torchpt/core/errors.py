@@ -1,4 +1,4 @@
-"""The exceptions users meet. Each is one readable line: where, what was found, what is accepted."""
+"""Exceptions and warnings for users. Each message is one line: where, what was found, what is accepted."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ def _shown(value: object, limit: int = 80) -> str:
     try:
         shape = getattr(value, "shape", ())
         text = repr(value)
-        if len(shape) > 1:  # cut off, rows of numbers would not even say how many there are
+        if len(shape) > 1:  # the shape, as the rows of numbers are cut off
             text = f"an array of shape {tuple(shape)}: {text}"
-    except Exception:  # whole numbers of more than 4300 digits, and objects that cannot be shown
+    except Exception:  # integers of more than 4300 digits, and objects whose repr fails
         text = f"a value of type {type(value).__name__} that cannot be shown"
     return _one_line(text, limit)
 
 
 def _one_line(text: str, limit: int = 500) -> str:
-    """Text of a damaged file in one readable line."""
+    """Return text as one printable line of at most ``limit`` characters."""
     text = "".join(letter if letter.isprintable() else " " for letter in text[: limit + 1])
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
 def _where(key: str, file: str | None) -> str:
-    """Of a scene: its file, however it is called, and the key."""
+    """Return the scene file, if any, and the dotted key."""
     return f"{_one_line(file, len(file))}: {_one_line(key)}" if file else _one_line(key)
 
 
 class TorchptError(Exception):
-    """Base of every error that is the input's fault. ``str()`` is always a single line."""
+    """Base of all errors caused by input. ``str()`` is always a single line."""
 
 
 class SceneError(TorchptError):
@@ -90,7 +90,7 @@ class AssetError(TorchptError):
 
 
 class OutputError(TorchptError):
-    """A picture that cannot be written where it was asked for."""
+    """A file that cannot be written."""
 
     def __init__(self, file: object, problem: str) -> None:
         self.file, self.problem = str(file), problem.replace("\n", " ")
@@ -101,15 +101,15 @@ class OutputError(TorchptError):
 
 
 class RenderError(TorchptError):
-    """A render that could not be carried out as asked (device, compiler, strict mode)."""
+    """A render that cannot be carried out as requested (device, compiler, strict mode)."""
 
 
 class LostRankError(RenderError):
-    """A process of those that render together has ended, or cannot be reached."""
+    """A rank of the render has ended, or cannot be reached."""
 
 
 class OtherRankError(RenderError):
-    """A process of those that render together failed; its own error says why. ``code`` is its exit code."""
+    """A rank of the render failed; its own error says why. ``code`` is its exit code."""
 
     def __init__(self, text: str, code: int = 2) -> None:
         self.code = code
@@ -120,25 +120,25 @@ class OtherRankError(RenderError):
 
 
 class EdgeWarning(UserWarning):
-    """A gradient with respect to geometry leaves out visibility edges: all of them, or some that the scene has."""
+    """A gradient with respect to geometry leaves out visibility edges: all, or some of the scene's."""
 
 
 class EnergyWarning(UserWarning):
-    """Energy may not be kept: a material that may reflect more than it receives, refracting shapes that touch."""
+    """Energy may not be conserved: a material reflects more than it receives, or refracting shapes touch."""
 
 
 class NoLightWarning(UserWarning):
-    """A picture, or part of it, lacks light that no sample met, so that its error is not known."""
+    """No sample met the light of a picture or a part of it, so that its error is not known."""
 
 
 @cache
 def warn_once(text: str) -> None:
-    """Write a line on stderr, the first time only."""
+    """Write a line to stderr, once a process."""
     print(text, file=sys.stderr, flush=True)
 
 
 def warn_caller(message: str, category: type[Warning]) -> None:
-    """Warn at the line that called this package, be it through torch (``nn.Module``, a data loader)."""
+    """Warn at the line that called this package, directly or through torch (``nn.Module``, a data loader)."""
     frame, level = sys._getframe(), 1
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("torchpt", "torch"):
         frame, level = frame.f_back, level + 1

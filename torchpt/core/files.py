@@ -1,6 +1,6 @@
-"""Files: those that others name, regular ones only and no larger than is said, and those that ship with torchpt.
+"""Files: paths from users, safe reading of files that a scene names, and configs that ship with torchpt.
 
-A scene may name anything: ``/dev/zero`` has no end, and a pipe is opened only once somebody writes to it.
+A scene may name anything: ``/dev/zero`` is endless, and opening a pipe blocks. So only regular files are read.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from torchpt.core.errors import SceneError
 
 __all__ = ["MAX_BYTES", "UnreadableFile", "as_path", "check_regular", "configs", "is_regular", "read_regular"]
 
-#: Bytes of the largest mesh or picture file that is read.
+#: Size limit of mesh and picture files in bytes.
 MAX_BYTES = 4 * 2**30
 
 _PACKAGE = Path(__file__).resolve().parent.parent
-_PIECE = 2**20  # bytes read at a time of a file that is longer than it said
+_PIECE = 2**20  # bytes of a read once a file turns out longer than its size
 
 
 class UnreadableFile(OSError):
-    """Something that is there and is not read; ``strerror`` says why, as what "it" is or has."""
+    """A path that is not read although it exists; ``strerror`` says why, with "it" as subject."""
 
 
 def as_path(path: Any) -> Path:
-    """A path as users give it.
+    """Return a user's path as a ``Path``.
 
     Raises:
-        SceneError: something else.
+        SceneError: neither a string nor a path of strings.
     """
     found = os.fspath(path) if isinstance(path, str | os.PathLike) else None
     if not isinstance(found, str):  # bytes neither
@@ -39,7 +39,7 @@ def as_path(path: Any) -> Path:
 
 
 def is_regular(path: str | os.PathLike[str]) -> bool:
-    """Whether it is there and a regular file (or a link to one): no folder, device, pipe or socket."""
+    """Return True for an existing regular file (or a link to one): not a folder, device, pipe or socket."""
     try:
         return stat.S_ISREG(os.stat(path).st_mode)
     except (OSError, ValueError):  # a name too long, or one with a NUL
@@ -47,11 +47,11 @@ def is_regular(path: str | os.PathLike[str]) -> bool:
 
 
 def check_regular(path: str | os.PathLike[str], most: int | None = None) -> int:
-    """The size in bytes of a regular file.
+    """Return the size of a regular file in bytes.
 
     Args:
-        path: of the file.
-        most: bytes that it may have; None: any number.
+        path: path of the file.
+        most: size limit in bytes; None: no limit.
 
     Raises:
         UnreadableFile: a folder, device, pipe or socket, or a file of more than ``most`` bytes.
@@ -71,7 +71,7 @@ def check_regular(path: str | os.PathLike[str], most: int | None = None) -> int:
 
 
 def read_regular(path: str | os.PathLike[str], most: int = MAX_BYTES) -> bytes:
-    """The bytes of a regular file.
+    """Return the content of a regular file.
 
     Raises:
         OSError: as :func:`check_regular`, or it cannot be read.
@@ -80,15 +80,15 @@ def read_regular(path: str | os.PathLike[str], most: int = MAX_BYTES) -> bytes:
     with Path(path).open("rb", buffering=0) as file:
         parts = [file.read(size + 1)]
         total = len(parts[0])
-        while parts[-1]:  # it has grown, or is one of those that do not know their size
+        while parts[-1]:  # the file has grown, or its size was unknown (as under /proc)
             if total > most:
                 raise UnreadableFile(errno.EFBIG, f"has more than {most} bytes; at most so many are read")
             parts.append(file.read(min(_PIECE, most + 1 - total)))
             total += len(parts[-1])
-    return parts[0] if total == len(parts[0]) else b"".join(parts)  # not twice in memory
+    return parts[0] if total == len(parts[0]) else b"".join(parts)  # avoids a copy
 
 
 def configs() -> Path:
-    """Return the folder of the config groups that ship (``scene/``, ...), in an installed wheel or in a checkout."""
+    """Return the folder of the configs that ship (``scene/``, ...), in an installed wheel or in a checkout."""
     installed = _PACKAGE / "share" / "configs"
     return installed if installed.is_dir() else _PACKAGE.parent / "configs"

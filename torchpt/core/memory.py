@@ -1,12 +1,12 @@
-"""Memory: what is held and what is free, how much a job may use, and what is tried when it runs out. The only policy.
+"""Memory: used and free memory, the limit of a job, and what is done when memory runs out.
 
-A job has some threads, and lanes that each of them takes at once. Under a limit (``render.max_memory``) a :class:`Budget` fits
-both to what is left: by what a lane is known to cost (``fit``), or by what lanes before were measured to cost (``through``).
-Where an allocation fails all the same, what nobody needs is given back (:func:`release_memory`). Then one thread goes on alone,
-then with half as many lanes, and so on (``shrink``). Where not even the fewest fit it is an error of one line.
+A job has threads, each of which traces some lanes at once. Under a limit (``render.max_memory``) a :class:`Budget` chooses both
+numbers: by the known size of a lane (``fit``), or by the measured size of earlier ones (``through``). If an allocation fails
+all the same, caches are freed (:func:`release_memory`), then one thread goes on alone, then with half as many lanes, and so on
+(``shrink``). If the fewest lanes do not fit, a one-line error is raised.
 
-The limit is about the memory of the process above what it held after import. What is there already (scene, search structure,
-world) is measured. What is still to come (films, the picture at the end, code that is loaded) each job foresees.
+The limit is on the memory of the process above that after import. Memory in use (scene, search structure, world) is measured;
+memory to come (films, the final picture, code to load) is estimated by each job.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ __all__ = [
     "retry_out_of_memory",
 ]
 
-#: Lanes of the first wave under a limit, after which all code is there: what it adds for good is no lane's.
+#: Lanes of the first wave under a limit. After it all code is loaded, whose memory must not count as that of lanes.
 FEWEST = 4096
-#: Of what is free, what waves are let to use: what one piece of the picture costs is measured on another.
+#: Share of the free memory for waves: the next one may need more than the measured one.
 SHARE = 0.88
-#: Waves grow by no more than this from one to the next.
+#: Largest growth of a wave over the one before.
 GROWTH = 2
-#: Bytes of addresses that libraries may ask for while they make code: some of them end the process where there are none.
+#: Bytes of address space that libraries may need to make code; some of them abort the process without it.
 MARGIN = 96 << 20
 
-#: Where Linux tells what is free, and what control groups may take.
+#: Files of Linux with the free memory, and with the limits of control groups.
 _MEMINFO = Path("/proc/meminfo")
 _GROUP = Path("/sys/fs/cgroup")
 
-#: What errors of exhausted memory say where their type does not.
+#: Messages of out-of-memory errors that have no type of their own.
 _SAID = (
     "can't allocate memory",
     "not enough memory",
@@ -75,48 +75,48 @@ T = TypeVar("T")
 Span = tuple[int, int, int, int]
 
 
-# -- what is held, and what is free
+# -- used and free memory
 
 
 class MemoryMeter:
-    """What is held of a device's memory, in bytes: of the process on a CPU (pages that are really there), of tensors on CUDA.
+    """Memory in use on a device, in bytes: resident pages of the process on a CPU, tensors on CUDA.
 
     Args:
-        device: which.
+        device: the device.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
 
     def now(self) -> int:
-        """Return what is held at the moment."""
+        """Return the memory in use now."""
         if self.device.type == "cuda":
             return torch.cuda.memory_allocated(self.device)
         return _status("VmRSS:")
 
     def peak(self) -> int:
-        """Return the most that was ever held."""
+        """Return the largest memory that was ever in use."""
         if self.device.type == "cuda":
             return torch.cuda.max_memory_allocated(self.device)
         return _status("VmHWM:")
 
     def base(self) -> int:
-        """Return what is no part of any render."""
+        """Return the memory that belongs to no render: that after import, 0 on CUDA."""
         return 0 if self.device.type == "cuda" else after_import()
 
     def above(self) -> int:
-        """Return what is held above import."""
+        """Return the memory in use now above :meth:`base`."""
         return max(self.now() - self.base(), 0)
 
 
 @cache
 def after_import() -> int:
-    """Return the bytes that the process held when modules were there; the first call is that moment."""
+    """Return the memory of the process after import, in bytes: it is measured by the first call."""
     return _status("VmRSS:")
 
 
 def _status(key: str) -> int:
-    """Return a line of what Linux tells of the process; elsewhere the peak, which is all that is known; 0 where nothing is."""
+    """Return a value of ``/proc/self/status`` in bytes; elsewhere the peak memory, or 0 if that is unknown."""
     try:
         with open("/proc/self/status", "rb") as file:
             for line in file:
@@ -133,12 +133,12 @@ def _status(key: str) -> int:
 
 
 def mb(size: float) -> str:
-    """Write a number of bytes as a user would, rounded up: ``37MB``."""
+    """Return a number of bytes in megabytes, rounded up: ``37MB``."""
     return f"{-int(-size // 1_000_000)}MB"
 
 
 def free_memory(device: torch.device) -> int | None:
-    """Return the bytes that are free on a device, on a CPU of the machine and its container; None where nobody tells."""
+    """Return the free memory in bytes, on a CPU that of machine and container; None if unknown."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     found = [size for size in (_of_machine(), _of_group()) if size is not None]
@@ -154,7 +154,7 @@ def _of_machine() -> int | None:
 
 
 def _of_group() -> int | None:
-    """Return what the limit of a control group (version 2) leaves; what it keeps of files is not counted as taken."""
+    """Return the memory that the limit of a control group (version 2) leaves; its file cache counts as free."""
     try:
         limit = int((_GROUP / "memory.max").read_text())
         taken = int((_GROUP / "memory.current").read_text())
@@ -165,12 +165,12 @@ def _of_group() -> int | None:
 
 
 def check_address_space(size: int = MARGIN) -> None:
-    """Refuse to go on where the system would not let the process have so many bytes of addresses more.
+    """Raise if the process cannot get ``size`` more bytes of address space.
 
-    Libraries that end the process where they find none (LLVM, OpenMP, BLAS) are called behind this.
+    Called before libraries that would abort the process then (LLVM, OpenMP, BLAS).
 
     Raises:
-        MemoryError: there is no room.
+        MemoryError: the system refuses.
     """
     try:
         mmap.mmap(-1, size).close()
@@ -178,18 +178,18 @@ def check_address_space(size: int = MARGIN) -> None:
         raise MemoryError(f"no room for {mb(size)}") from None
 
 
-# -- what is given back
+# -- releasing memory
 
 _spare: list[Callable[[], object]] = []
 
 
 def on_low_memory(release: Callable[[], object]) -> None:
-    """Register what gives back memory that is kept for later jobs: :func:`release_memory` calls it."""
+    """Register a function that drops cached memory; :func:`release_memory` calls it."""
     _spare.append(release)
 
 
 def release_memory() -> None:
-    """Give back what nobody holds any more: what is kept for later jobs, cycles, what allocators keep."""
+    """Free caches, reference cycles, and the memory that allocators keep."""
     for release in _spare:
         release()
     gc.collect()
@@ -202,7 +202,7 @@ def release_memory() -> None:
 
 @cache
 def _trim() -> ctypes._NamedFuncPointer | None:
-    """Glibc's ``malloc_trim``; None elsewhere."""
+    """Return glibc's ``malloc_trim``; None elsewhere."""
     if not sys.platform.startswith("linux"):
         return None
     try:
@@ -211,12 +211,12 @@ def _trim() -> ctypes._NamedFuncPointer | None:
         return None
 
 
-# -- that it ran out
+# -- running out of memory
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return True where an error, or what it came of, says that there is no more memory, on whatever device."""
-    if isinstance(error, TorchptError):  # somebody said so already
+    """Return True if an error or one of its causes says that memory ran out, on any device."""
+    if isinstance(error, TorchptError):  # already reported
         return False
     seen: set[int] = set()
     cause: BaseException | None = error
@@ -233,7 +233,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def fits_in_memory(work: Callable[[], object]) -> bool:
-    """Do work; return False where memory ran out. What the work held is free only once its error is, so none is handed on."""
+    """Call ``work``; return False if memory ran out. The error is dropped, as its traceback holds the memory of the work."""
     try:
         work()
     except Exception as error:
@@ -245,10 +245,10 @@ def fits_in_memory(work: Callable[[], object]) -> bool:
 
 @contextmanager
 def explain_out_of_memory(what: str | Callable[[], str]) -> Iterator[None]:
-    """Context that says in a line what it was for that there is not enough memory: a text, or what makes one.
+    """Turn out-of-memory errors within into a line that names ``what``: a text, or a function that returns it.
 
     Raises:
-        RenderError: there is not.
+        RenderError: memory ran out.
     """
     try:
         yield
@@ -264,10 +264,10 @@ def explain_out_of_memory(what: str | Callable[[], str]) -> Iterator[None]:
 
 
 def retry_out_of_memory(what: str | Callable[[], str], work: Callable[[], T]) -> T:
-    """Return what work comes to; where memory runs out it is tried again, once what nobody needs is given back.
+    """Return ``work()``; if memory runs out, release memory and try once more.
 
     Raises:
-        RenderError: as :func:`explain_out_of_memory`.
+        RenderError: memory ran out again.
     """
     found: list[T] = []
     if not fits_in_memory(lambda: found.append(work())):
@@ -277,11 +277,11 @@ def retry_out_of_memory(what: str | Callable[[], str], work: Callable[[], T]) ->
     return found[0]
 
 
-# -- how much a job may use
+# -- limits
 
 
 def check_limit(limit: int, least: int, expected: str) -> None:
-    """Refuse a ``render.max_memory`` of fewer bytes than the least; one below a megabyte was hardly meant in bytes.
+    """Raise if ``render.max_memory`` is below ``least`` bytes; a number below a megabyte was probably not meant in bytes.
 
     Raises:
         SceneError: it is too small.
@@ -294,16 +294,16 @@ def check_limit(limit: int, least: int, expected: str) -> None:
 
 
 def check_memory(limit: int, device: torch.device, least: Callable[[int], int], loading: int) -> None:
-    """Refuse a limit under which nothing can be rendered.
+    """Raise if nothing can be rendered within a limit.
 
     Args:
         limit: ``render.max_memory``.
-        device: where lanes live.
-        least: from what is held above import to the least limit.
-        loading: the most that was held above import while the scene was made; 0 where it is not known.
+        device: the device of the lanes.
+        least: returns the least limit, given the memory in use above import.
+        loading: peak memory above import while the scene was loaded; 0 if unknown.
 
     Raises:
-        SceneError: it is too small; says the least that is not.
+        SceneError: the limit is too small; the message gives the least.
     """
     release_memory()
     enough = max(least(MemoryMeter(device).above()), loading)
@@ -311,22 +311,22 @@ def check_memory(limit: int, device: torch.device, least: Callable[[int], int], 
 
 
 class Budget:
-    """What one job may use: threads, and lanes that each takes at once.
+    """Threads of one job, and lanes of each, that fit in memory.
 
     Args:
-        device: where lanes live.
-        lanes: most.
-        threads: most.
-        what: for which there is too little memory where not even the fewest lanes of one thread fit.
-        instead: how the job goes on where memory ran out, as users are told.
-        limit: ``render.max_memory``, where lanes are to be measured; None: they need not be.
-        per_lane: bytes that a lane is expected to cost until it is measured.
-        fewest: lanes without which nothing goes.
+        device: the device of the lanes.
+        lanes: largest number of lanes of a thread.
+        threads: largest number of threads.
+        what: names, in the error, what does not fit even with the fewest lanes of one thread.
+        instead: tells the user how the job goes on after memory ran out.
+        limit: ``render.max_memory`` if the memory of lanes is to be measured; else None.
+        per_lane: expected bytes of a lane, until it is measured.
+        fewest: least number of lanes.
 
     Attributes:
-        threads: of the job at the moment.
-        lanes: of each at the moment.
-        short: whether memory ran out.
+        threads: current number of threads.
+        lanes: current number of lanes of a thread.
+        short: True once memory ran out.
     """
 
     def __init__(
@@ -346,16 +346,16 @@ class Budget:
         self.limit = None if limit is None else self.meter.base() + limit
         self._most = max(lanes, 1)
         self.lanes = self._most if limit is None else min(FEWEST, self._most)
-        self._start: int | None = None  # what was held after the first wave
+        self._start: int | None = None  # memory in use after the first wave
         self._before = 0
 
     def fit(self, left: int, per_lane: int, least: int) -> None:
-        """Take as many threads, and lanes of each, as fit into so many bytes; one thread with the least lanes always does.
+        """Set threads and lanes to the most that fit into ``left`` bytes, but at least one thread with ``least`` lanes.
 
         Args:
-            left: the bytes.
-            per_lane: what one costs.
-            least: lanes that repay a thread.
+            left: bytes that are available.
+            per_lane: bytes of a lane.
+            least: fewest lanes for which a thread is worth its cost.
         """
         for threads in range(self.threads, 0, -1):
             lanes = left // (per_lane * threads)
@@ -364,20 +364,20 @@ class Budget:
                 return
 
     def drop_unneeded_limit(self) -> None:
-        """Forget the limit where all lanes are expected to fit: then pieces are of the same size with it and without."""
+        """Drop the limit if all lanes are expected to fit: chunks then have the same size as without one."""
         if self.limit is None or self._most * self.per_lane <= SHARE * (self.limit - self.meter.now()):
             self.limit, self.lanes = None, self._most
 
     def through(self, work: Callable[[Span], object], pixels: int, first: int, count: int) -> Iterator[Span]:
-        """Take samples ``first .. first + count`` of all pixels, piece by piece; yield each once it is done.
+        """Call ``work`` for chunks of samples ``first .. first + count`` of all pixels; yield each finished chunk.
 
-        Pieces split pixels, and samples of one pixel stay in their order, so that sums do not depend on the pieces.
+        A chunk has some pixels; samples of a pixel are taken in order, so that sums do not depend on the chunks.
 
         Args:
-            work: takes a piece: all of it, or, where it raises, nothing.
-            pixels: how many.
-            first: sample.
-            count: samples of each.
+            work: takes all samples of a chunk, or raises and takes none.
+            pixels: number of pixels.
+            first: first sample.
+            count: samples of each pixel.
 
         Raises:
             RenderError: not even the fewest lanes fit in memory.
@@ -393,7 +393,7 @@ class Budget:
             sample += samples
 
     def _whole(self, work: Callable[[Span], object], span: Span) -> Iterator[Span]:
-        """Take a piece at once, or in halves of halves."""
+        """Take a chunk at once; if memory runs out, in halves."""
         todo = [span]
         while todo:
             pixel, n, sample, samples = span = todo.pop()
@@ -411,10 +411,10 @@ class Budget:
                 todo += (pixel, n, sample + half, samples - half), (pixel, n, sample, half)
 
     def shrink(self, tried: int | None = None) -> None:
-        """Memory ran out: go on with one thread, or with half as many lanes as were tried (None: as there are).
+        """After memory ran out, go on with one thread, or with half of the ``tried`` lanes (None: of the current number).
 
         Raises:
-            RenderError: there were but one thread and the fewest lanes.
+            RenderError: one thread had the fewest lanes already.
         """
         release_memory()
         tried = self.lanes if tried is None else tried
@@ -424,18 +424,18 @@ class Budget:
             raise RenderError(f"not enough memory for {self.what}")
         else:
             self.lanes = max(tried // 2, self.fewest)
-        self.limit, self.short = None, True  # waves do not grow any more
+        self.limit, self.short = None, True  # waves no longer grow
         warn_once(f"torchpt: memory ran out: {self.instead} from now on, for the same picture")
 
-    # -- what lanes cost, measured
+    # -- measured memory of lanes
 
     def _begins(self) -> None:
-        """Note that a wave begins."""
+        """Record the peak memory before a wave."""
         if self.limit is not None:
             self._before = self.meter.peak()
 
     def _ended(self, taken: int) -> None:
-        """Note that a wave of ``taken`` lanes ended, and decide how many the next may have."""
+        """Measure a wave of ``taken`` lanes, and decide the size of the next."""
         if self.limit is None:
             return
         if self._start is None:
@@ -445,11 +445,11 @@ class Budget:
             return
         peak = self.meter.peak()
         rose = peak > self._before
-        if rose or (peak <= self.limit and 2 * taken >= self.lanes):  # else nothing is known of this wave
+        if rose or (peak <= self.limit and 2 * taken >= self.lanes):  # otherwise the wave tells nothing
             self._grow(self.limit, self._start, max(peak - self._start, 1) / taken, rose)
 
     def _grow(self, limit: int, start: int, cost: float, rose: bool) -> None:
-        """Take as many lanes as fit at a cost that was measured where memory ``rose``, and else is guessed from above."""
+        """Set lanes to as many as fit at ``cost`` bytes each: measured if the peak ``rose``, else an upper bound."""
         fit = int(SHARE * max(limit - start, 0) / cost)
         if rose and self._before > 0 and self.meter.peak() > limit:
             self.lanes = max(min(fit, self.lanes), 1)

@@ -1,14 +1,14 @@
-"""Threads: the one pool of the process, who is dealt which task, and what torch is set to while they work.
+"""Threads: the thread pool of the process, and torch's number of threads and modes while it works.
 
-A thread of the pool waits until somebody has work for it. Whoever needs threads takes as many as wait and starts the others, so
-renders that overlap never wait for each other's threads. Three ways to use them: :func:`map_in_order` runs a task for each item and
-hands over what they come to in the order of items; a :class:`TaskQueue` takes tasks from a list that grows; :func:`parallel_for` cuts a
-range into a part for each thread. No idle thread lives while the process forks, and a child has a pool of its own.
+A caller takes idle threads of the pool and starts the missing ones, so overlapping renders never wait for each other's threads.
+There are three ways to use them: :func:`map_in_order` runs a task for each item and passes results on in the order of items; a
+:class:`TaskQueue` runs tasks of a queue that may grow; :func:`parallel_for` splits a range into a part for each thread. Idle
+threads end before the process forks; a child has a pool of its own.
 
-On a CPU torch cuts a tensor of more than 32,768 elements into a part for each of its own threads. The last elements of a part
-fill no vector, and where another function computes those than computes vectors (``atan2``, ``pow``) they round differently. A
-sum over all elements becomes a sum of the threads' own. :func:`map_in_pieces`, :func:`sum_all` and :func:`mean_all` give on any
-number of threads what one thread alone computes.
+On a CPU torch splits a tensor of more than 32,768 elements among its threads. The last elements of a part do not fill a vector,
+and functions whose scalar code differs from their vector code (``atan2``, ``pow``) round them differently. A sum over all
+elements becomes a sum of the threads' sums. :func:`map_in_pieces`, :func:`sum_all` and :func:`mean_all` have on any number of
+threads the bits of one thread.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ __all__ = [
 T = TypeVar("T")
 R = TypeVar("R")
 
-#: Seconds after which a thread that waits for others looks whether it is to end.
+#: Seconds between two checks of a waiting thread whether it is to stop.
 PATIENCE = 0.05
-#: Elements that one thread computes alone: fewer than torch divides, and a whole number of the vectors of any CPU.
+#: Elements of a piece that one thread computes: fewer than torch splits, and a multiple of the vectors of any CPU.
 PIECE = 1 << 14
-#: Numbers of a tensor that torch leaves to one thread.
+#: Elements up to which torch uses one thread.
 _GRAIN = 32_768
-#: Bytes of addresses that a thread may ask for: its stack, and some to spare.
+#: Bytes of address space that a thread needs: its stack, and a margin.
 _STACK = 12 << 20
-#: What torch hands over to MKL's vector mathematics.
+#: Functions that torch computes by MKL's vector math.
 _FUNCTIONS = "acos asin atan cos erf erfc erfinv exp log log10 log2 sin sqrt tan tanh trunc".split()
 
 
@@ -65,9 +65,9 @@ _FUNCTIONS = "acos asin atan cos erf erfc erfinv exp log log10 log2 sin sqrt tan
 
 
 class _Thread:
-    """A thread of the pool, in which torch uses no other; RuntimeError or MemoryError where there is no memory for it.
+    """A thread of the pool, in which torch is single-threaded; RuntimeError or MemoryError if it cannot be started.
 
-    A team of OpenMP in each would stay for as long as the thread does, and make every other team wait instead of spin.
+    A team of OpenMP threads in each would live as long as the thread, and make every other team sleep instead of spin.
     """
 
     def __init__(self) -> None:
@@ -78,31 +78,31 @@ class _Thread:
             count = torch.get_num_threads()
             self.thread.start()
             self._ready.get()
-            torch.set_num_threads(count)  # what threads that are yet to come begin with is the process's
+            torch.set_num_threads(count)  # new threads inherit the process's number
 
     def _run(self) -> None:
         try:
-            torch.get_num_threads()  # a thread takes the process's number when it first asks for it
+            torch.get_num_threads()  # the first call makes the thread inherit the process's number
             torch.set_num_threads(1)
         finally:
             self._ready.put(None)
         while (given := self.given.get()) is not None:
             work, ended = given
             work()
-            del given, work  # what it held is free
+            del given, work  # frees what it references
             _idle.append(self)
             ended.put(None)
 
 
 _numbers = itertools.count()
-#: Threads are started one by one: each changes the process's number for a moment.
+#: Serializes starts: each changes the process's number of threads for a moment.
 _starting = threading.Lock()
-#: Threads that wait for work.
+#: Idle threads.
 _idle: list[_Thread] = []
 
 
 def _run_in_pool(work: Callable[[], object], ended: SimpleQueue[None]) -> bool:
-    """Give work, which raises nothing, to a thread of the pool; return False where there is no memory for one."""
+    """Run ``work``, which must not raise, on a thread of the pool; return False if no thread can be started."""
     try:
         thread = _idle.pop()
     except IndexError:
@@ -115,7 +115,7 @@ def _run_in_pool(work: Callable[[], object], ended: SimpleQueue[None]) -> bool:
 
 
 def _before_fork() -> None:
-    """End idle threads: a child would not have them."""
+    """End idle threads before a fork: the child would not have them."""
     ending = []
     while _idle:
         ending.append(_idle.pop())
@@ -126,7 +126,7 @@ def _before_fork() -> None:
 
 
 def _after_fork() -> None:
-    """Forget threads: a child has none of its parent's, torch's included, and waiting for those would never end."""
+    """Forget all threads after a fork: the child has neither its parent's nor torch's, and would wait forever."""
     global _torch_threads, _starting
     _idle.clear()
     _starting = threading.Lock()
@@ -138,14 +138,14 @@ if hasattr(os, "register_at_fork"):
 
 
 class TaskQueue(Generic[T, R]):
-    """Threads of the pool that take tasks from one list, which may grow.
+    """Threads of the pool that run the tasks of one queue.
 
     Args:
-        threads: most; fewer where there is no memory for them.
+        threads: largest number of threads; fewer run if memory is short.
 
     Attributes:
-        threads: likewise.
-        pending: tasks in the list or being done, and those that nobody asked for with ``next``.
+        threads: the number of threads.
+        pending: tasks that are queued or running, or whose results ``next`` has not returned.
     """
 
     def __init__(self, threads: int) -> None:
@@ -156,7 +156,7 @@ class TaskQueue(Generic[T, R]):
         self._size = 0
 
     def add(self, tag: T, task: Callable[[], R]) -> None:
-        """Put a task at the end of the list; ``tag`` comes back with what it comes to.
+        """Queue a task; ``next`` returns ``tag`` with its result.
 
         Raises:
             RenderError: there is no memory for a single thread.
@@ -173,7 +173,7 @@ class TaskQueue(Generic[T, R]):
             raise RenderError("not enough memory for a thread that renders")
 
     def next(self, wait: bool) -> tuple[T, R | BaseException] | None:
-        """Return what a task came to, or raised; None where nothing came, after a while where it waits."""
+        """Return tag and result (or exception) of a finished task; None if there is none, with ``wait`` after a while."""
         try:
             found = self._done.get(timeout=PATIENCE) if wait else self._done.get_nowait()
         except Empty:
@@ -182,7 +182,7 @@ class TaskQueue(Generic[T, R]):
         return found
 
     def close(self) -> None:
-        """Let go of the threads once their tasks are done; those that were not begun are dropped."""
+        """Drop queued tasks, and return the threads to the pool once the running ones are finished."""
         try:
             while True:
                 self._todo.get_nowait()
@@ -212,21 +212,21 @@ def map_in_order(
     halt: threading.Event | None = None,
     ahead: int | None = None,
 ) -> None:
-    """Do a task for each item on threads of the pool; what they come to is handed over in the order of items.
+    """Run a task for each item on threads of the pool, and pass the results on in the order of items.
 
     Args:
-        items: taken one by one.
-        task: called in a thread of the pool; the calling thread does none, and looks after signals.
-        threads: most.
-        each: called in this thread with what every task came to, and now and then with None while tasks are done; returning
-            True ends it.
-        halt: set by whoever wants it to end, and here where ``each`` says so or something raises. No task is begun then, and
-            ``task`` may look at it to end early.
-        ahead: tasks that are begun before the oldest of them was handed over, at most; None: any number.
+        items: items, taken one by one.
+        task: is called in a thread of the pool; the calling thread only handles results and signals.
+        threads: largest number of threads.
+        each: is called in this thread with every result, and now and then with None while tasks run; True ends the
+            work.
+        halt: set from outside to end the work, and here after ``each`` returned True or something raised. Then no task
+            starts, and a running ``task`` may check it to end early.
+        ahead: largest number of tasks that start before the oldest one's result was passed on; None: any number.
 
     Raises:
         RenderError: there is no memory for a single thread.
-        Exception: what a task or ``each`` raised; of several tasks the first one in order.
+        Exception: the exception of a task or of ``each``; of several tasks that of the first in order.
     """
     halt = halt or threading.Event()
     queue, left = TaskQueue[int, R](threads), enumerate(items)
@@ -234,7 +234,7 @@ def map_in_order(
     begun = delivered = 0
 
     def tell() -> None:
-        """Hand over what is next, as far as it is there."""
+        """Pass on the results that are next in order."""
         nonlocal delivered
         while delivered in found:
             result = found.pop(delivered)
@@ -242,7 +242,7 @@ def map_in_order(
             if isinstance(result, BaseException):
                 try:
                     raise result
-                finally:  # or the error would hold this frame, which holds the error with all that the task had
+                finally:  # the error's traceback would keep this frame, and this frame the error
                     del result
             if each(result):
                 halt.set()
@@ -268,7 +268,7 @@ def map_in_order(
         raise
     finally:
         queue.close()
-    while (came := queue.next(wait=False)) is not None:  # of tasks that were on their way
+    while (came := queue.next(wait=False)) is not None:  # tasks that were running
         found[came[0]] = came[1]
     late = [found[number] for number in sorted(found)]
     for result in late:
@@ -280,11 +280,11 @@ def map_in_order(
 
 
 def parallel_for(work: Callable[[int, int], object], items: int, threads: int) -> None:
-    """Call ``work(first, last)`` for parts of ``range(items)``, one for each thread; the first in the calling one.
+    """Call ``work(first, last)`` for parts of ``range(items)``, one part for each thread, the first in this one.
 
     Args:
         work: machine code that releases the GIL.
-        items: how many there are.
+        items: length of the range.
         threads: 1 runs strictly in the calling thread.
     """
     if threads == 1:
@@ -309,7 +309,7 @@ def parallel_for(work: Callable[[int, int], object], items: int, threads: int) -
     helpers = sum(_run_in_pool(take, ended) for _ in range(threads - 1))
     try:
         work(*first)
-        take()  # what nobody has begun
+        take()  # parts that no thread has begun
     finally:
         for _ in range(helpers):
             ended.get()
@@ -317,16 +317,16 @@ def parallel_for(work: Callable[[int, int], object], items: int, threads: int) -
         raise errors[0]
 
 
-# -- torch's own threads, and its modes
+# -- torch's threads and modes
 
 
 def thread_count(threads: int | None) -> int:
-    """Return the threads to use: the caller's wish, else torch's own number."""
+    """Return the number of threads to use: ``threads``, or torch's number."""
     return max(1, int(threads)) if threads else max(1, torch.get_num_threads())
 
 
 class _TorchThreads:
-    """The thread count that renders found, and how many of them run."""
+    """Torch's number of threads before the first of overlapping renders, and the number of those."""
 
     def __init__(self, forked: bool) -> None:
         self.forked, self.lock = forked, threading.Lock()
@@ -337,7 +337,7 @@ class _TorchThreads:
             if self.renders == 0:
                 self.before = torch.get_num_threads()
             self.renders += 1
-            # The thread pool of the parent does not survive a fork: waiting for it would never end.
+            # Torch's thread pool does not survive a fork: the child would wait for it forever.
             now = 1 if self.forked else self.before if threads == "auto" else int(threads)
             if now != torch.get_num_threads():
                 torch.set_num_threads(now)
@@ -346,30 +346,30 @@ class _TorchThreads:
     def leave(self) -> None:
         with self.lock:
             self.renders -= 1
-            # Of renders that overlap, the last one puts back what the first one found.
+            # The last of overlapping renders restores the number that the first one found.
             if self.renders == 0 and torch.get_num_threads() != self.before and not self.forked:
                 torch.set_num_threads(self.before)
 
 
-#: Of the process, as the thread count is.
+#: One for the process, as torch's number of threads is.
 _torch_threads = _TorchThreads(forked=False)
 
 
 @contextmanager
 def limited_threads(threads: int | str) -> Iterator[None]:
-    """Let torch use ``threads`` threads for a while, in renders that may overlap."""
+    """Let torch use ``threads`` threads within, also in overlapping renders."""
     here = _torch_threads
     here.enter(threads)
     try:
         yield
     finally:
-        if here is _torch_threads:  # else this is the child of a fork, where another thread may have held the lock
+        if here is _torch_threads:  # otherwise this is the child of a fork, where another thread may hold the lock
             here.leave()
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use a single thread for a while, where what it sums cannot be reached."""
+    """Let torch use one thread within, for sums that :func:`sum_all` cannot replace."""
     before = torch.get_num_threads()
     if before > 1:
         torch.set_num_threads(1)
@@ -382,10 +382,10 @@ def one_thread() -> Iterator[None]:
 
 @functools.cache
 def warm_up() -> None:
-    """Call the vector functions once, before several threads do.
+    """Call MKL's vector functions once, before several threads do.
 
-    MKL finds out at its first call which code suits the processor. Two threads that find it out together may compute half a
-    tensor by less exact code: then the same render gave other bits now and then.
+    MKL selects code for the processor at its first call. If two threads do so at once, half a tensor may be computed by less
+    exact code, and the same render has other bits now and then.
     """
     for dtype in (torch.float32, torch.float64):
         half = torch.full((1,), 0.5, dtype=dtype)
@@ -393,14 +393,14 @@ def warm_up() -> None:
             getattr(torch, name)(half)
 
 
-#: Numbers of threads that were started, by the thread that renders.
+#: Numbers of threads for which torch's team was started.
 _started: set[int] = set()
 
 
 def start_torch_threads() -> None:
-    """Start torch's threads for the calling one while there is memory for them; where there is not, it renders alone.
+    """Start torch's threads for the calling thread; without memory for them set torch to one thread.
 
-    OpenMP ends the process where it cannot start a thread, which it does at the first large tensor, however late that is.
+    OpenMP aborts the process if it cannot start a thread, which happens at the first large tensor.
     """
     count = torch.get_num_threads()
     if count > 1 and count not in _started:
@@ -413,9 +413,9 @@ def start_torch_threads() -> None:
 
 @contextmanager
 def outside_inference_mode() -> Iterator[None]:
-    """What is made here can be used outside of ``torch.inference_mode`` too: tensors made in that mode could not."""
+    """Leave ``torch.inference_mode`` within: tensors made in that mode cannot be used outside of it."""
     if torch.is_inference_mode_enabled():
-        with torch.inference_mode(False), torch.no_grad():  # the former alone would turn gradients on
+        with torch.inference_mode(False), torch.no_grad():  # inference_mode(False) alone enables gradients
             yield
     else:
         yield
@@ -423,16 +423,16 @@ def outside_inference_mode() -> Iterator[None]:
 
 @contextmanager
 def without_autocast(device: torch.device) -> Iterator[None]:
-    """No gradients, no ``torch.autocast`` (which would round products to half precision), and what is made lasts."""
+    """Disable gradients, ``torch.autocast`` (which would round products to half precision) and inference mode."""
     with outside_inference_mode(), torch.no_grad(), torch.autocast(device.type, enabled=False):
         yield
 
 
-# -- what does not depend on the number of threads
+# -- results that do not depend on the number of threads
 
 
 def map_in_pieces(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
-    """Return ``function`` of each element of tensors of one shape."""
+    """Return an elementwise ``function`` of tensors of one shape, computed in pieces of one thread each."""
     first = given[0]
     if first.device.type != "cpu" or first.numel() <= PIECE:
         return function(*given)
@@ -442,7 +442,7 @@ def map_in_pieces(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
 
 def sum_all(x: Tensor) -> Tensor:
     """Return the sum ``()`` of all elements."""
-    # Of two sums at once each is one thread's.
+    # Of two sums in one call, torch computes each in one thread.
     return x.expand(2, *x.shape).sum(tuple(range(1, x.dim() + 1)))[0]
 
 

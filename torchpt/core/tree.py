@@ -1,7 +1,7 @@
-"""Nested records: dataclasses, tuples, lists and mappings that hold tensors, and whatever stands beside these.
+"""Nested records: dataclasses, tuples, lists and mappings that hold tensors and other values.
 
-A record's *leaves* are its tensors, in the order of its fields. Modules and other objects of a user's own are one thing
-whole: no tensor of theirs is a leaf. :func:`fingerprint` alone looks into them, as it leaves nothing out.
+A record's *leaves* are its tensors, in the order of its fields. Modules and other objects of a user are opaque: their tensors
+are no leaves. Only :func:`fingerprint` looks into them.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ __all__ = ["NOT_FINGERPRINTED", "fingerprint", "leaves", "map_leaves", "named_le
 
 T = TypeVar("T")
 
-#: ``field(metadata=NOT_FINGERPRINTED)``: of a dataclass's field that no picture depends on, such as the file that it was read from.
+#: ``field(metadata=NOT_FINGERPRINTED)`` for a dataclass field on which no picture depends, such as the path of a file.
 NOT_FINGERPRINTED = {"fingerprint": False}
 
 _TENSOR, _MAPPING, _SEQUENCE, _STATIC = range(4)
-#: By class how its instances are walked: one of the above, or the names of a dataclass's fields.
+#: For each class, how its instances are walked: one of the above, or the names of dataclass fields.
 _known: dict[type, Any] = {}
 
 
@@ -50,7 +50,7 @@ def _form(kind: type) -> Any:
 
 
 def leaves(record: Any) -> list[Tensor]:
-    """Return the tensors of a record, in order; one that stands in two places twice."""
+    """Return the tensors of a record, in order; one that occurs twice is returned twice."""
     found: list[Tensor] = []
     _gather(record, found)
     return found
@@ -77,7 +77,7 @@ def _gather(record: Any, found: list[Tensor]) -> None:
 
 
 def named_leaves(record: Any, path: str) -> Iterator[tuple[str, Tensor]]:
-    """Yield the tensors of a record with their dotted paths, which begin with ``path``; in the order of :func:`leaves`."""
+    """Yield dotted path and tensor of each leaf, in the order of :func:`leaves`; paths begin with ``path``."""
     kind = type(record)
     form = _known.get(kind)
     if form is None:
@@ -96,9 +96,9 @@ def named_leaves(record: Any, path: str) -> Iterator[tuple[str, Tensor]]:
 
 
 def map_leaves(function: Callable[..., Any], record: T, *others: T) -> T:
-    """Return a record with other tensors: ``function`` of each one, and of those in the same places of ``others``.
+    """Return a record whose leaves are ``function`` of the leaves of ``record`` and of the corresponding ones of ``others``.
 
-    What holds none that changed stays itself.
+    Parts without a changed leaf are not copied.
     """
     made, rest = cast("Any", record), cast("Sequence[Any]", others)
     kind: Any = type(made)
@@ -122,7 +122,7 @@ def map_leaves(function: Callable[..., Any], record: T, *others: T) -> T:
         value = new = getattr(made, name)
         if rest:
             new = map_leaves(function, value, *[getattr(each, name) for each in rest])
-        elif type(value) is Tensor:  # what most fields of a small record are
+        elif type(value) is Tensor:  # the most frequent case, without a call
             new = function(value)
         elif value is not None:
             new = map_leaves(function, value)
@@ -132,10 +132,10 @@ def map_leaves(function: Callable[..., Any], record: T, *others: T) -> T:
 
 
 def rebuild(record: T, tensors: Sequence[Tensor]) -> T:
-    """Return a record with ``tensors`` in the places of its :func:`leaves`.
+    """Return a record whose :func:`leaves` are replaced by ``tensors``.
 
     Raises:
-        ValueError: there are more or fewer of them.
+        ValueError: their number differs.
     """
     count = len(leaves(record))
     if count != len(tensors):
@@ -145,10 +145,10 @@ def rebuild(record: T, tensors: Sequence[Tensor]) -> T:
 
 
 def signature(record: Any) -> Any:
-    """Return what code that is specialized for a record may ask of it beside the numbers in its leaves: hashable.
+    """Return a hashable key of everything in a record but the values of its leaves: for code specialized to it.
 
-    Objects of a user's own count by identity, by the plain numbers that they hold, and by which tensors: what is in those is
-    memory, and those that a program reads live as long as it does.
+    A user's objects count by identity, by the plain values that they hold, and by the identity of their tensors: compiled code
+    reads those from memory, and keeps them alive.
     """
     kind = type(record)
     form = _known.get(kind)
@@ -170,7 +170,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def _contents(value: Any, seen: set[int]) -> Any:
-    """Return what an object of a user's own holds, see :func:`signature`."""
+    """Return the contents of a user's object for :func:`signature`."""
     if _is_plain(value):
         return value
     if id(value) in seen:
@@ -187,19 +187,19 @@ def _contents(value: Any, seen: set[int]) -> Any:
 
 # -- fingerprints
 
-#: Whose code is known by its name: versions of these are told beside a fingerprint, or change no number.
+#: Libraries whose code is identified by name: their versions are stored with a fingerprint, or do not matter.
 _LIBRARIES = {"torchpt", "torch", "numpy", "builtins", *sys.stdlib_module_names}
 
 
 def fingerprint(record: Any) -> bytes:
-    """Return 16 bytes that two records share where all that they hold is equal, in any process and on any device.
+    """Return a hash of 16 bytes, the same for equal records in any process and on any device.
 
-    It goes by types, values, and the bytes of tensors and arrays; fields that say :data:`NOT_FINGERPRINTED` are left out. Of classes
-    and functions of a user's own it takes the code, comments apart, with the functions and plain values of their modules that
-    the code names.
+    It covers types, values, and the bytes of tensors and arrays, but no field marked :data:`NOT_FINGERPRINTED`. Classes and
+    functions of a user count by their code without comments, with the functions and plain values of their module that the
+    code names.
 
     Raises:
-        TypeError: something whose contents cannot be known, such as a lock or an open file.
+        TypeError: an object whose contents cannot be read, such as a lock or an open file.
     """
     return _Fingerprinter().digest(record)
 
@@ -208,15 +208,15 @@ class _Fingerprinter:
     """One call of :func:`fingerprint`."""
 
     def __init__(self) -> None:
-        self._printed: dict[int, tuple[Any, bytes]] = {}  # objects live as long as their ids are of use
-        self._open: dict[int, int] = {}  # depth of the objects that hold the present one
+        self._printed: dict[int, tuple[Any, bytes]] = {}  # keeps objects alive, so that ids stay unique
+        self._open: dict[int, int] = {}  # depth of each object around the current one, for cycles
 
     def digest(self, value: Any) -> bytes:
-        """Return that of anything."""
+        """Return the fingerprint of a value."""
         return _hash(self._encoded(value))
 
     def _encoded(self, value: Any) -> bytes:
-        """Return bytes that no other value has; of what is large its hash."""
+        """Return bytes that identify a value; of large values their hash."""
         if value is None:
             return b"0"
         kind = type(value)
@@ -242,7 +242,7 @@ class _Fingerprinter:
         return found
 
     def _large(self, value: Any) -> bytes:
-        """Return what stands for a value that holds others, or many numbers."""
+        """Return bytes that identify a container, a tensor or an object."""
         if isinstance(value, Tensor):
             value = value.detach().cpu().resolve_conj().resolve_neg().contiguous()
             numbers = value.reshape(-1).view(torch.uint8).numpy()
@@ -254,7 +254,7 @@ class _Fingerprinter:
             return _named("objects", value.shape) + self._each(value.reshape(-1).tolist())
         if isinstance(value, enum.Enum):
             return self._class(type(value)) + self._encoded(value.name)
-        if isinstance(value, int | float | str | bytes):  # of classes derived from these
+        if isinstance(value, int | float | str | bytes):  # subclasses
             plain = next(base for base in (int, float, str, bytes) if isinstance(value, base))
             return self._class(type(value)) + self._encoded(cast("Any", plain)(value))
         if isinstance(value, PurePath):
@@ -293,14 +293,14 @@ class _Fingerprinter:
         else:
             reduced = value.__reduce_ex__(4)
             state = {"": reduced if isinstance(reduced, str) else reduced[1:3]}
-        if isinstance(value, tuple | list):  # such as a named tuple
+        if isinstance(value, tuple | list):  # for example a named tuple
             state[""] = [*value]
         return (
             b"object" + self._class(type(value)) + self._each(part for item in sorted(state.items()) for part in item)
         )
 
     def _class(self, kind: type) -> bytes:
-        """Return what stands for a class: its name, and where it is a user's own the code of its methods."""
+        """Return bytes that identify a class: its name, and the code of its methods if it is a user's."""
         name = _named("class", kind.__module__, kind.__qualname__)
         if not _is_own(kind):
             return name
@@ -320,7 +320,7 @@ class _Fingerprinter:
         return held + self._code(function.__code__, function.__globals__)
 
     def _code(self, code: types.CodeType, around: Mapping[str, Any]) -> bytes:
-        """Return what stands for code: instructions, constants, names, and what those mean around it."""
+        """Return bytes that identify code: instructions, constants, names, and the values of names in ``around``."""
         inner = [self._code(part, around) if isinstance(part, types.CodeType) else part for part in code.co_consts]
         named = [around.get(name) for name in code.co_names]
         read = [
@@ -353,12 +353,12 @@ def _is_own(code: Any) -> bool:
 
 @functools.cache
 def _unprinted(kind: Any) -> frozenset[str]:
-    """Return the fields of a dataclass that are left out."""
+    """Return the fields of a dataclass that fingerprints leave out."""
     return frozenset(field.name for field in fields(kind) if not field.metadata.get("fingerprint", True))
 
 
 def _state(value: Any) -> dict[str, Any]:
-    """Return the attributes of an object, what it only keeps of its own results apart."""
+    """Return the attributes of an object, without cached properties."""
     kinds = type(value).__mro__
     slots = [name for kind in kinds for name in _names(kind) if hasattr(value, name)]
     state = {name: getattr(value, name) for name in slots} | getattr(value, "__dict__", {})

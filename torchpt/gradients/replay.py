@@ -216,7 +216,7 @@ def _budget_of_tensors(device: torch.device, settings: Settings) -> Budget:
     each = 2 * BYTES_PER_LANE + BYTES_PER_VERTEX * (min(depth, KEPT) if depth >= 0 else KEPT)
     lanes, limit = LANES.get(device.type, LANES["cpu"]), settings.render.max_memory
     budget = Budget(device, lanes, what="the vertices of a single lane", limit=limit, per_lane=each)
-    budget.steady()
+    budget.drop_unneeded_limit()
     return budget
 
 

@@ -1,9 +1,9 @@
-"""Modules of ``torch.nn`` that render: ``torchpt.nn.Renderer``.
+"""``torch.nn`` modules that render: ``torchpt.nn.Renderer``.
 
-=================  ==================================================
+=================  ===========================================================
 ``renderer.py``    a scene with chosen parameters as ``nn.Parameter``
-``ranges.py``      numbers without bounds for parameters that have some
-=================  ==================================================
+``ranges.py``      maps unconstrained numbers to the ranges of parameters
+=================  ===========================================================
 """
 
 from __future__ import annotations

@@ -1,19 +1,19 @@
-"""Numbers without bounds for parameters that have some, so that an optimizer may take any step.
+"""Map unconstrained numbers to the ranges of parameters, so that an optimizer may take any step.
 
 =============  ======================================  =============================================================
-kind           of                                      parameter
+kind           range                                   parameter
 =============  ======================================  =============================================================
-``Bounded``    two ends: albedos, roughnesses, angles  ``low + (high - low) ((1 + 2 e) sigmoid(x) - e)``, held at the ends
-``LowerBounded``      one end: radiances, radii, indices      ``low + s (softplus(x) - e)``, held at the end; ``s`` as below
+``Bounded``    two ends: albedos, roughnesses, angles  ``low + (high - low) ((1 + 2 e) sigmoid(x) - e)``, clamped
+``LowerBounded``      one end: radiances, radii, indices      ``low + s (softplus(x) - e)``, clamped; ``s`` as below
 ``Unbounded``       none: points, directions, vertices      ``x``
-``RigidMotion``      poses                                   ``exp(w)`` times the pose at first, at ``l t``; ``x = (w, t)``
+``RigidMotion``      poses                                   ``exp(w)`` times the initial pose, at ``l t``; ``x = (w, t)``
 =============  ======================================  =============================================================
 
-A plain sigmoid reaches neither 0 nor 1, and has no slope near them: an albedo of 0 would be minus infinity, and stay there.
-So it is stretched by ``e = 0.05`` at each end that belongs to the range, which is then met at a finite ``x`` with a sixth of
-the slope in the middle. Beyond an end the parameter is held there, and only derivatives that lead back pass (a projected
-gradient). An end that does not belong to the range (a radius above 0) is not stretched to. ``s`` is the mean magnitude of the
-parameter at first (1 where that is 0), so that a step of ``x`` is one of its own scale, for a lamp of 0.01 as for one of 1,000.
+A plain sigmoid never reaches 0 or 1, and is flat near them: an albedo of 0 would be ``x`` of minus infinity, and stay there.
+So it is stretched by ``e = 0.05`` at each closed end, which is then reached at a finite ``x`` with a sixth of the slope in
+the middle. Beyond an end the parameter is clamped, and only gradients that lead back pass (a projected gradient). Open ends
+(a radius above 0) are not stretched. ``s`` is the mean magnitude of the initial value (1 if that is 0), so that a step of
+``x`` is relative to the parameter's scale, for a lamp of 0.01 as for one of 1,000.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from torchpt.spec import Pose, Spec
 
 __all__ = ["Bounded", "LowerBounded", "Parametrization", "RigidMotion", "Unbounded", "parametrization_of"]
 
-#: By how much an end that belongs to the range is overshot, as a share.
+#: Overshoot of a closed end, as a share of the range.
 STRETCH = 0.05
-#: How near an end that does not belong to it is come to, as a share.
+#: Closest distance to an open end, as a share of the range.
 CLOSEST = 1e-6
-#: A range this many times wider than the parameter is one with a single end.
+#: A range that is wider than the parameter by more than this factor counts as open-ended.
 WIDE = 100.0
 
 
 class _ProjectedClamp(torch.autograd.Function):
-    """``clamp`` whose derivative passes beyond an end too, where a step against it leads back."""
+    """``clamp`` that passes gradients beyond an end if they lead back into the range."""
 
     generate_vmap_rule = True
 
@@ -58,18 +58,18 @@ class _ProjectedClamp(torch.autograd.Function):
 
 
 class Parametrization(nn.Module):
-    """One parameter: ``forward`` makes it of the numbers ``x`` that are optimized, ``inverse`` finds these.
+    """Map of one parameter: ``forward`` computes it from the optimized numbers ``x``, ``inverse`` computes ``x``.
 
-    Both keep the device and the type of what they are given. Buffers hold what depends on the parameter at first.
+    Both keep the device and dtype of their argument. Buffers hold what depends on the initial value.
     """
 
     def inverse(self, value: Tensor) -> Tensor:
-        """The numbers that stand for ``value``."""
+        """Return ``x`` of a value of the parameter."""
         raise NotImplementedError
 
 
 class Unbounded(Parametrization):
-    """The numbers themselves."""
+    """The identity, for parameters without bounds."""
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
@@ -81,7 +81,7 @@ class Unbounded(Parametrization):
 
 
 class Bounded(Parametrization):
-    """Between two ends; ``open_low`` and ``open_high``: whether they do not belong to the range."""
+    """A range between two ends; ``open_low`` and ``open_high``: True for an end that is excluded."""
 
     def __init__(self, low: float, high: float, open_low: bool, open_high: bool) -> None:
         super().__init__()
@@ -103,7 +103,7 @@ class Bounded(Parametrization):
 
 
 class LowerBounded(Parametrization):
-    """Above an end, and up to another one that lies far away; ``start``: the parameter at first."""
+    """A range above an end, and up to a distant one; ``start``: initial value of the parameter."""
 
     scale: Tensor
 
@@ -127,10 +127,10 @@ class LowerBounded(Parametrization):
 
 
 class RigidMotion(Parametrization):
-    """A pose: turned about the axes of the world around its own origin, and moved; its scales and shears stay.
+    """A rigid motion of a pose: rotation about the origin of the pose, and translation; scale and shear are kept.
 
-    ``x`` is ``(6,)``: the rotation from the pose at first as axis times angle in radians, and the place of its origin in
-    ``length``, so that a step of either is as large as the other's to what is seen.
+    ``x`` is ``(6,)``: the rotation from the initial pose as axis times angle in radians, and the position of the origin in
+    units of ``length``, so that steps of both change the picture alike.
     """
 
     frame: Tensor
@@ -142,9 +142,9 @@ class RigidMotion(Parametrization):
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
-        a, b, c = x[:3].double().unbind()  # angles of many turns have no digits left in float32
+        a, b, c = x[:3].double().unbind()  # large angles lose their digits in float32
         zero = torch.zeros_like(a)
-        across = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).reshape(3, 3)  # of the cross product
+        across = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).reshape(3, 3)  # cross-product matrix
         turned = (torch.linalg.matrix_exp(across) @ self.frame.double()).to(x.dtype)
         last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=x.dtype, device=x.device)
         return torch.cat((torch.cat((turned, self.length * x[3:, None]), 1), last))
@@ -153,7 +153,7 @@ class RigidMotion(Parametrization):
         """See :class:`Parametrization`.
 
         Raises:
-            ValueError: the pose is not one of this one's, turned and moved.
+            ValueError: the pose is no rigid motion of the initial one.
         """
         from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
@@ -164,15 +164,15 @@ class RigidMotion(Parametrization):
 
 
 def parametrization_of(spec: Spec, start: Tensor, rigid: bool = True, length: float = 1.0) -> Parametrization:
-    """The range of a parameter that is ``start`` at first.
+    """Return the range of a parameter with initial value ``start``.
 
-    ``rigid``: whether poses are turned and moved alone; ``length``: how large the scene is.
+    ``rigid``: poses move rigidly; ``length``: size of the scene.
     """
     if isinstance(spec, Pose):
         return RigidMotion(start, length) if rigid or spec.angles or spec.rigid else Unbounded()
     low, high = getattr(spec, "low", None), getattr(spec, "high", None)
     above, below = getattr(spec, "above", None), getattr(spec, "below", None)
-    # Of an end that belongs to the range and one that does not, the tighter one counts.
+    # Of a closed and an open end, the tighter one counts.
     open_low = above is not None and (low is None or above >= low)
     open_high = below is not None and (high is None or below <= high)
     low, high = above if open_low else low, below if open_high else high

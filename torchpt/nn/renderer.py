@@ -1,4 +1,4 @@
-"""A scene with chosen parameters as ``nn.Parameter``: ``forward`` renders it."""
+"""A module that renders a scene, with some of its parameters as ``nn.Parameter``."""
 
 from __future__ import annotations
 
@@ -23,33 +23,34 @@ __all__ = ["Renderer"]
 
 
 class Renderer(nn.Module):
-    """A scene that is rendered, and optimized, as any other module.
+    """A module that renders a scene and optimizes its parameters.
 
-    The chosen parameters are ``nn.Parameter`` objects without bounds, which :mod:`torchpt.nn.parametrizations` keeps in range: as long as
-    they are finite, the scene can be rendered, but for places too far away and for what must go together: a spot whose
-    ``beam_width`` is larger than its ``cutoff_angle``, or whose ``position`` is its ``target``, is refused by the render.
-    ``values()`` gives what they stand for.
+    The parameters are unconstrained ``nn.Parameter`` tensors, which :mod:`torchpt.nn.parametrizations` maps to their ranges;
+    ``values()`` returns the mapped ones. As long as they are finite the scene can be rendered, with two exceptions: positions
+    too far away, and parameters that do not fit together, such as a ``beam_width`` above the ``cutoff_angle``: the render
+    refuses them.
 
-    Each ``forward`` in training mode draws other samples: with the same ones in every step an optimizer fits their noise. The
-    seed is ``seed + steps``, where the buffer ``steps`` counts calls in training mode; with ``torch.distributed`` set up,
-    ``seed + steps * world + rank``, so that ranks render different samples of one picture (but with ``ranks=``, where they
-    share it). In ``eval()`` mode it is ``seed``, always. A seed that is handed to ``forward`` wins, and counts nothing.
+    Each ``forward`` in training mode draws new samples: with the same ones in every step an optimizer would fit their noise.
+    The seed is ``seed + steps``, where the buffer ``steps`` counts calls in training mode; with ``torch.distributed``
+    initialized it is ``seed + steps * world + rank``, so that ranks render different samples of one picture (with ``ranks=``
+    they share it). In ``eval()`` mode it is always ``seed``. A seed passed to ``forward`` takes precedence, and does not
+    count as a step.
 
-    Scenes are shared, not copied, and never changed: ``scene.params`` keeps what it had (:meth:`write` changes it). Weights of
-    BSDF models of your own are theirs: hand them to the optimizer beside ``parameters()``.
+    The scene is shared, not copied, and not changed: only :meth:`write` changes ``scene.params``. Weights of your own BSDF
+    models are not among ``parameters()``: pass them to the optimizer too.
 
     Args:
-        scene: from ``torchpt.load``.
-        names: dotted names of ``scene.params``, and patterns of them such as ``materials.*.reflectance``; None: no parameters.
+        scene: a scene from ``torchpt.load``.
+        names: dotted names of ``scene.params``, or patterns such as ``materials.*.reflectance``; None: no parameters.
         seed: any integer from 0.
-        rigid: whether poses are turned and moved alone (six numbers each); False: their 16 numbers are parameters, as they are,
-            where poses need not keep angles, as those of balls and cameras must.
-        full: whether calls return a :class:`torchpt.Rendering`.
-        options: further arguments of ``torchpt.render`` for each call.
+        rigid: True: poses move rigidly (six numbers each); False: their 16 numbers are optimized, except for poses that must
+            keep angles, as those of spheres and cameras.
+        full: True makes calls return a :class:`torchpt.Rendering`.
+        options: further arguments of ``torchpt.render`` for all calls.
 
     Raises:
-        SceneError: no scene, a name or pattern without a parameter, a render's argument that has a place of its own here.
-        TypeError: an argument that ``render`` does not know.
+        SceneError: no scene, a name or pattern that matches no parameter, or an argument that ``forward`` or this class has.
+        TypeError: an unknown argument.
     """
 
     steps: Tensor
@@ -97,14 +98,13 @@ class Renderer(nn.Module):
         full: bool | None = None,
         **options: Unpack[Common],
     ) -> Any:
-        """Render.
+        """Render the scene with the current parameters.
 
         Args:
-            params: further parameters in place of the scene's, by dotted name, such as those of the camera; of a name that is a
-                parameter of this module, in place of that.
-            seed: in place of the counted one.
-            full: in place of what was said at first.
-            options: arguments of ``torchpt.render``, in place of those given at first.
+            params: tensors in place of parameters of the scene or of this module, by dotted name, such as those of the camera.
+            seed: seed in place of the counted one.
+            full: in place of the constructor's ``full``.
+            options: arguments of ``torchpt.render``, in place of the constructor's.
 
         Returns:
             The picture ``(H, W, 3)``; with ``full=True`` a :class:`torchpt.Rendering`.
@@ -116,16 +116,16 @@ class Renderer(nn.Module):
         return render(self.scene, params={**self.values(), **(params or {})}, seed=seed, full=full, **given)
 
     def values(self) -> dict[str, Tensor]:
-        """What the parameters stand for, by dotted name, as ``torchpt.render(params=...)`` takes them; gradients flow."""
-        with torch.autocast(self.steps.device.type, enabled=False):  # a pose of half precision is another one
+        """Return the parameters in their ranges by dotted name, for ``torchpt.render(params=...)``; gradients flow."""
+        with torch.autocast(self.steps.device.type, enabled=False):  # half precision would move poses
             return {name: found(self.free[_key(name)]) for name, found in zip(self.names, self.ranges, strict=True)}
 
     @torch.no_grad()
     def assign(self, values: Mapping[str, Tensor]) -> None:
-        """Let parameters stand for other values, by dotted name: all of them, or none where one is refused.
+        """Set parameters to values by dotted name: all of them, or none if one is refused.
 
         Raises:
-            SceneError: a name that is not chosen, or values that the scene does not accept, with those that stay.
+            SceneError: a name is no parameter of this module, or the scene does not accept the values.
         """
         for name in values:
             if name not in self.names:
@@ -143,7 +143,7 @@ class Renderer(nn.Module):
 
     @torch.no_grad()
     def write(self) -> None:
-        """Put the values into ``scene.params``."""
+        """Write the current values to ``scene.params``."""
         for name, value in self.values().items():
             self.scene.params[name] = value.detach().clone()
 
@@ -158,23 +158,23 @@ class Renderer(nn.Module):
         return seed
 
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Renderer:
-        device_of(fn(self.steps).device)  # one that is not there is refused before anything has moved
+        device_of(fn(self.steps).device)  # raises for a missing device before anything moves
         super()._apply(fn, recurse)
         self.scene = self.scene.to(self.steps.device)
         return self
 
     def extra_repr(self) -> str:
-        """The scene and the names, for ``print``."""
+        """Return the scene's name, the parameters and the seed, for ``print``."""
         return f"{self.scene.name or 'scene'}: {', '.join(self.names) or 'no parameters'}; seed {self.seed}"
 
 
 def _key(name: str) -> str:
-    """How ``torch`` may call a parameter: without dots."""
+    """Return a parameter's name for ``torch``, which allows no dots."""
     return name.replace(".", "/")
 
 
 def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
-    """The parameters that names and patterns stand for, in the scene's order."""
+    """Return the parameters that match names and patterns, in the scene's order."""
     if not isinstance(names, Iterable) or isinstance(names, Mapping):
         raise SceneError("names", names, "a name of scene.params, or a sequence of names and patterns")
     names = tuple(names)

@@ -1,12 +1,12 @@
-"""Several processes, on one machine or on many, that render one picture together: *ranks*, as torch.distributed calls them.
+"""Ranks (several processes, as torch.distributed calls them) that render one picture together.
 
 ==============  ==========================================================
-``group.py``    the ranks of one process group, and what they say
-``dealing.py``  who takes which pixels, or which items of a list
-``launch.py``   the ranks that torchrun started, for the command line
+``group.py``    the ranks of a process group, and their communication
+``dealing.py``  partition of pixels and items among ranks
+``launch.py``   ranks that torchrun started, for the command line
 ==============  ==========================================================
 
-One process never comes here, and imports nothing of torch.distributed.
+A render by one process imports nothing of torch.distributed.
 """
 
 from torchpt.ranks.group import Group, together

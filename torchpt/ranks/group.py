@@ -1,8 +1,8 @@
-"""The ranks of a process group. All they say goes over gloo, from the host's memory: films are small beside what they cost.
+"""The ranks of a process group and their communication, by gloo in host memory: films are small beside their cost.
 
-Ranks do the same things in the same order. Before each thing they tell each other by a few numbers what it is, so that one that
-failed is no riddle to the others, and what would be read wrongly is never sent. Where a decision may differ (by the clock, or
-by the rounding of another kind of processor) the first rank takes it for all.
+Ranks take the same steps in the same order. Before each step they exchange its name, so that an error of one rank is reported
+by all, and a tensor is never read as another. Decisions that may differ (by the clock, or by the rounding of another processor)
+are made by the first rank.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ from torchpt.core.errors import LostRankError, OtherRankError, RenderError, Scen
 
 __all__ = ["TIMEOUT", "Group", "together"]
 
-#: Seconds after which a rank that says nothing is given up. Ranks wait for the slowest one, which may have much to load.
+#: Seconds until a silent rank is given up. Ranks wait for the slowest one, which may have much to load.
 TIMEOUT = 1800.0
-#: The most of them that torch counts in milliseconds.
+#: Largest timeout in seconds that torch can count in milliseconds.
 LONGEST = 1e6
-#: Numbers that a rank says at once.
+#: Numbers in a message.
 WORDS = 8
-#: Seconds between two looks whether the others have answered, at first and at most: signals are heard in between.
+#: Seconds between two checks for answers, at first and at most: signals are handled in between.
 SOON, LATE = 5e-5, 5e-3
-#: What ranks say last, and what they say where they fail.
+#: Names of the last message of a rank, and of the message after an error.
 END, FAILED = "end", "failed"
-#: Name of the mark on an error that the others know of.
+#: Attribute of an error that the other ranks know of.
 _TOLD = "_torchpt_other_ranks_know"
 
 
 class Group:
-    """The ranks that share a render. To make one is a collective call: every rank of the process group must make it.
+    """The ranks that share a render. Creating one is a collective call of all ranks of the process group.
 
     Args:
-        process_group: of torch.distributed, which must be initialized, by whatever backend; None: all processes.
-        timeout: seconds after which a rank that does not answer is given up, above 0 and at most a million.
+        process_group: an initialized group of torch.distributed, of any backend; None: all processes.
+        timeout: seconds until a rank that does not answer is given up, above 0 and at most a million.
 
     Attributes:
-        rank: of this process, from 0.
-        size: how many there are.
-        timeout: as given.
-        over: whether ranks have parted: one is gone.
+        rank: rank of this process, from 0.
+        size: number of ranks.
+        timeout: the timeout in seconds.
+        over: True once communication has ended, or a rank is lost.
 
     Raises:
-        SceneError: something else than a process group, or than such a number.
-        RenderError: there is no process group, or this process is not in it.
+        SceneError: not a process group, or not such a number.
+        RenderError: torch.distributed is not initialized, or this process is not in the group.
     """
 
     def __init__(self, process_group: Any = None, timeout: float = TIMEOUT) -> None:
@@ -64,7 +64,7 @@ class Group:
         members = _members(dist, process_group)
         if dist.get_rank() not in members:
             raise RenderError("ranks: this process is not in the process group")
-        # One of its own: what others send over theirs is never mixed up with it.
+        # A new group: its messages never mix with those of the caller's group.
         try:
             own = dist.new_group(
                 members,
@@ -82,21 +82,21 @@ class Group:
     # -- a few numbers
 
     def all_gather_numbers(self, what: str, *numbers: float) -> list[tuple[float, ...]]:
-        """What all ranks say: the numbers (whole ones up to 2^53) of each, in the order of ranks.
+        """Return the numbers (integers up to 2^53, or floats) of all ranks, in the order of ranks.
 
         Args:
-            what: comes next.
-            numbers: of this rank, at most six, as many on each.
+            what: name of the next step, the same on all ranks.
+            numbers: numbers of this rank, at most six, as many on each.
 
         Raises:
-            LostRankError: one is gone, or did not answer in time.
-            OtherRankError: one failed.
-            RenderError: ranks do different things.
+            LostRankError: a rank is gone, or did not answer in time.
+            OtherRankError: a rank failed.
+            RenderError: ranks are at different steps.
         """
         return self._exchange_step(what, 0, numbers)
 
     def end(self, code: int) -> int:
-        """Say that this rank is done, with an exit code; returns the highest one of all that are."""
+        """Send the exit code of this finished rank; return the highest code of all ranks."""
         every = self._exchange(END, code, ())
         self.over = True
         return max(status for status, _, _ in every)
@@ -116,7 +116,7 @@ class Group:
         return [said for _, _, said in every]
 
     def _exchange(self, what: str, status: int, numbers: tuple[float, ...]) -> list[tuple[int, int, tuple[float, ...]]]:
-        """Status, what comes next, and numbers of every rank."""
+        """Return status, step and numbers of every rank."""
         own = torch.zeros(WORDS, dtype=torch.float64)
         own[: 2 + len(numbers)] = torch.tensor([status, zlib.crc32(what.encode()), *numbers], dtype=torch.float64)
         every = [torch.empty_like(own) for _ in range(self.size)]
@@ -124,21 +124,21 @@ class Group:
         return [(int(said[0]), int(said[1]), tuple(said[2 : 2 + len(numbers)].tolist())) for said in every]
 
     def broadcast_numbers(self, what: str, *numbers: float) -> tuple[float, ...]:
-        """Numbers as the first rank has them; NaN goes through."""
+        """Return the numbers of the first rank; NaN is allowed."""
         return self.all_gather_numbers(what, *numbers)[0]
 
     def check_same(self, what: str, content: bytes) -> None:
-        """Make sure that all ranks have the same.
+        """Raise unless ``content`` is the same on all ranks.
 
         Raises:
-            RenderError: they do not; on every rank.
+            RenderError: it differs; raised on every rank.
         """
         if len({check for (check,) in self.all_gather_numbers(what, zlib.crc32(content))}) > 1:
             raise _mark_known(RenderError(f"ranks: {what} must be the same on every rank"))
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Context in which an error of this rank is told to the others, which are at the same work."""
+        """Tell the other ranks, which do the same work, of an error raised within."""
         try:
             yield
         except (LostRankError, OtherRankError):
@@ -153,7 +153,7 @@ class Group:
     # -- many numbers
 
     def gather(self, own: Tensor) -> list[Tensor]:
-        """The tensors ``(n,)`` of all ranks, in their order; n may differ, the dtype may not.
+        """Return the tensors ``(n,)`` of all ranks, in order; n may differ, the dtype may not.
 
         Raises:
             LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
@@ -166,7 +166,7 @@ class Group:
         return [values[:size].to(own.device) for values, size in zip(every, sizes, strict=True)]
 
     def first(self, own: Tensor) -> Tensor:
-        """The tensor ``(n,)`` of the first rank; n may differ, the dtype may not.
+        """Return the tensor ``(n,)`` of the first rank; n may differ, the dtype may not.
 
         Raises:
             LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
@@ -175,7 +175,7 @@ class Group:
         return self._broadcast(own if self.rank == 0 else own.new_empty(int(size)), 0)
 
     def sum(self, own: Tensor) -> Tensor:
-        """The sum of a tensor of the same shape over ranks, added in their order: the same bits on every rank.
+        """Return the sum of tensors of one shape, added in the order of ranks: the same bits on every rank.
 
         Raises:
             LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
@@ -195,16 +195,16 @@ class Group:
         self.all_gather_numbers("barrier")
 
     def _broadcast(self, values: Tensor, rank: int) -> Tensor:
-        """The values that a rank has."""
+        """Return the values of a rank."""
         sent = values.cpu().contiguous()
         self._wait(lambda: self._dist.broadcast(sent, group=self._process_group, group_src=rank, async_op=True))
         return sent.to(values.device)
 
     def _wait(self, begin: Any) -> None:
-        """Wait for what is sent, but not for ever, and with an ear for signals."""
+        """Wait for a transfer until the timeout, and let signals in."""
         end, pause = time.monotonic() + self.timeout, SOON
         try:
-            # Kept until the next: what gloo's thread lets go last it needs Python for, which may be about to end.
+            # Kept until the next transfer: gloo's thread needs Python to free it, which may be about to end.
             self._work = work = begin()
             while not work.is_completed():
                 if time.monotonic() > end:
@@ -218,7 +218,7 @@ class Group:
             if not isinstance(error, RuntimeError):
                 raise
             self.over = True
-            if time.monotonic() > end:  # gloo noticed first
+            if time.monotonic() > end:  # gloo's own timeout came first
                 raise self._silent() from None
             raise LostRankError("ranks: another rank has ended, or cannot be reached any more") from None
 
@@ -228,15 +228,15 @@ class Group:
 
 @contextmanager
 def together(group: Group | None, what: str, content: Callable[[], bytes]) -> Iterator[None]:
-    """Context in which ranks do one thing; nothing where ``group`` is None.
+    """Raise on all ranks if ``content`` differs, and tell them of errors raised within; nothing if ``group`` is None.
 
     Args:
         group: the ranks.
-        what: must be the same on each.
-        content: gives its bytes.
+        what: name of the content, for errors.
+        content: returns the bytes that must be the same on each rank.
 
     Raises:
-        RenderError: it is not the same.
+        RenderError: the content differs.
     """
     if group is None:
         yield
@@ -247,7 +247,7 @@ def together(group: Group | None, what: str, content: Callable[[], bytes]) -> It
 
 
 def _members(dist: Any, group: Any) -> list[int]:
-    """The ranks of a process group of torch.distributed; none of one that this process is not in."""
+    """Return the ranks of a process group; none if this process is not in it."""
     if group is dist.GroupMember.NON_GROUP_MEMBER:
         return []
     try:
@@ -259,12 +259,12 @@ def _members(dist: Any, group: Any) -> list[int]:
 
 
 def _leak(work: Any) -> None:
-    """Keep what is still under way beyond the end of Python: gloo's thread would free its tensors then, and abort."""
+    """Never free a pending transfer: gloo's thread would free its tensors after Python has ended, and abort."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(work))
 
 
 def _mark_known(error: Exception) -> Exception:
-    """Mark an error of which all ranks know."""
+    """Mark an error that all ranks know of."""
     setattr(error, _TOLD, True)
     return error
 

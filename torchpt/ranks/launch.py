@@ -1,4 +1,4 @@
-"""The ranks that torchrun (or whoever sets RANK, WORLD_SIZE, MASTER_ADDR and MASTER_PORT) started, for the command line."""
+"""Ranks that torchrun (or anything that sets RANK, WORLD_SIZE, MASTER_ADDR and MASTER_PORT) started, for the command line."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from torchpt.ranks.group import TIMEOUT, Group
 
 __all__ = ["LaunchedProcess"]
 
-#: Seconds between two looks whether a signal has come.
+#: Seconds between two checks for signals.
 PAUSE = 0.02
-#: What must be set.
+#: Environment variables that must be set.
 NAMES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 
 class LaunchedProcess:
-    """A process that was started as one of several.
+    """A process that was started as one of several ranks.
 
     Args:
-        timeout: seconds for all to come, and for every answer later.
+        timeout: seconds until a missing or silent rank is given up.
 
     Attributes:
-        group: the ranks, once they have met.
+        group: the ranks, after :meth:`connect`.
 
     Raises:
-        RenderError: the environment lacks something, or this build of PyTorch does.
+        RenderError: a variable of the environment is missing, or PyTorch was built without gloo.
     """
 
     group: Group
 
     def __init__(self, timeout: float = TIMEOUT) -> None:
-        os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # else it warns of every connection that ends
+        os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # torch warns of every connection that ends
         import torch.distributed as dist
 
         missing = [name for name in NAMES if not os.environ.get(name)]
@@ -50,13 +50,13 @@ class LaunchedProcess:
         self._store: Any = None
 
     def connect(self, check: Callable[[], None]) -> None:
-        """Wait for the other ranks.
+        """Connect to the other ranks.
 
         Args:
-            check: called while they are waited for; what it raises ends the wait.
+            check: is called while ranks are missing; an exception of it ends the wait.
 
         Raises:
-            LostRankError: not all came.
+            LostRankError: ranks are missing.
         """
         failed: list[Exception] = []
 
@@ -69,7 +69,7 @@ class LaunchedProcess:
                 said = str(error).strip().split("\n", 1)[0]
                 failed.append(LostRankError(f"ranks: not all of them came ({said})"))
 
-        # In a thread: what waits inside of torch hears no signals.
+        # In a thread: a call that waits inside torch handles no signals.
         thread = threading.Thread(target=work, name="torchpt_ranks", daemon=True)
         thread.start()
         while thread.is_alive():
@@ -86,24 +86,24 @@ class LaunchedProcess:
 
         timeout = timedelta(seconds=self._timeout)
         store, rank, size = next(iter(rendezvous("env://", timeout=timeout)))
-        # torchrun keeps its store where it starts all ranks again, with the addresses of those that are gone.
+        # torchrun keeps its store when it restarts all ranks, with the addresses of the old ones.
         own: Any = PrefixStore(f"torchpt/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
-        self._store = own.clone()  # a connection of its own: who waits by one keeps it for himself
+        self._store = own.clone()  # a second connection: a waiting call blocks its own
         with _output_to_errors():
             dist.init_process_group("gloo", store=own, rank=rank, world_size=size, timeout=timeout)
             self.group = Group(timeout=self._timeout)
         local = os.environ.get("LOCAL_RANK", "")
-        if torch.cuda.is_available() and local.isdigit():  # `auto` and `cuda` are one GPU for each rank of a machine
+        if torch.cuda.is_available() and local.isdigit():  # `auto` and `cuda` mean one GPU for each rank of a machine
             torch.cuda.set_device(int(local) % torch.cuda.device_count())
 
     def first_to_say(self, line: str) -> bool:
-        """Whether no other rank said this line before; true where nobody can be asked."""
+        """Return True if no other rank said this line before, or none can be asked."""
         with suppress(RuntimeError):
             return self._store is None or self._store.add(f"said/{zlib.crc32(line.encode())}", 1) == 1
         return True
 
     def disconnect(self) -> None:
-        """Close connections, where all ranks are there to do so."""
+        """Close the connections; all ranks must call it."""
         import torch.distributed as dist
 
         dist.destroy_process_group()
@@ -111,10 +111,10 @@ class LaunchedProcess:
 
 @contextmanager
 def _output_to_errors() -> Iterator[None]:
-    """While gloo connects: that of older torch (2.8 to 2.10) tells stdout of it, where others read what a render came to."""
+    """Redirect stdout to stderr within: gloo of older torch (2.8 to 2.10) prints there while it connects."""
     try:
         kept = os.dup(1)
-    except OSError:  # it is closed
+    except OSError:  # stdout is closed
         yield
         return
     try:

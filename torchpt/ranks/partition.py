@@ -1,4 +1,4 @@
-"""Who takes what: a function of how much there is and how many ranks there are, so that nobody has to ask."""
+"""Partition pixels and items among ranks: a function of their numbers alone, without communication."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from torchpt.ranks.group import Group
 
 __all__ = ["blocks", "dealt", "share"]
 
-#: Consecutive pixels that stay together: neighbours meet the same things.
+#: Consecutive pixels that stay together: neighbours tend to hit the same surfaces.
 TOGETHER = 64
-#: Lanes of a block, and blocks a rank takes at least where there are fewer.
+#: Lanes of a block, and the least number of blocks of a rank.
 LANES, FEWEST = 1 << 16, 4
 
 T = TypeVar("T")
 
 
 def _mine(count: int, rank: int, size: int) -> range | list[int]:
-    """Numbers below ``count`` that a rank takes.
+    """Return the indices below ``count`` of a rank.
 
-    Round by round each takes one; who begins moves on by one a round, so that nobody has a column of the picture for himself.
+    Each round gives an index to every rank; rounds begin with different ranks, so that no rank gets a column of pixels.
     """
     if size == 1:
         return range(count)
@@ -33,11 +33,11 @@ def _mine(count: int, rank: int, size: int) -> range | list[int]:
 
 
 def dealt(pixels: int, rank: int, size: int) -> Tensor:
-    """The pixels of a rank ``(n,)`` int64, ascending, of ``pixels`` that lie row by row.
+    """Return the pixels of a rank ``(n,)`` int64, ascending, of a picture in row-major order.
 
     Args:
-        pixels: how many there are.
-        rank: whose.
+        pixels: number of pixels.
+        rank: the rank.
         size: number of ranks.
     """
     starts = torch.tensor(list(_mine(-(-pixels // TOGETHER), rank, size)), dtype=torch.int64) * TOGETHER
@@ -46,12 +46,12 @@ def dealt(pixels: int, rank: int, size: int) -> Tensor:
 
 
 def blocks(count: int, samples: int, group: Group | None) -> list[tuple[int, int]]:
-    """Blocks of consecutive pixels (first, how many) that this process takes: all in one where ``group`` is None.
+    """Return the blocks of consecutive pixels (first, count) of this rank; one block if ``group`` is None.
 
     Args:
-        count: of the pixels.
-        samples: of each.
-        group: the ranks that share them.
+        count: number of pixels.
+        samples: samples of each pixel.
+        group: the ranks that share the pixels.
     """
     if group is None or group.size == 1:
         return [(0, count)]
@@ -61,12 +61,12 @@ def blocks(count: int, samples: int, group: Group | None) -> list[tuple[int, int
 
 
 def share(items: Sequence[T], group: Group | None) -> list[tuple[int, T]]:
-    """The items of a list that this rank takes, each with its number in the list; all where ``group`` is None.
+    """Return the items of this rank, each with its index; all items if ``group`` is None.
 
-    Every item is one rank's. The numbers of items that two ranks take differ by one at most.
+    Every item belongs to one rank. The numbers of items of two ranks differ by at most one.
 
     Raises:
-        SceneError: ``group`` is none.
+        SceneError: ``group`` is no group of ranks.
     """
     if group is None:
         return list(enumerate(items))

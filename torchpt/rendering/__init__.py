@@ -1,17 +1,17 @@
-"""One render: chunks of pixels, each a wave, accumulate in films.
+"""One render, from the arguments of a call to a finished picture.
 
 ===================  ===================================================================================
 ``api.py``           ``render`` and ``trace``, the one entry of the command line and of Python: start here
-``orders.py``        one call of ``render``: checked, completed to settings, on a tape where gradients are wanted
-``run.py``           one forward render: takes chunks, adds them up in films
-``stopping.py``      how many samples are next, and what ends a render
-``piece.py``         a piece of a pass by tensor operations, whole or not at all
-``error.py``         pilots, and the rounds of adaptive sampling that they decide
-``picture.py``       what a render comes to; ``result.py`` the picture with all that is known of it
-``checkpoint.py``    what a render goes on from; ``split.py`` passes that several processes share
-``many.py``          several renders at once; ``batches/`` many small pictures by one call
-``one_path.py``      one path, vertex by vertex; ``causes.py`` what is said of samples that are not finite
-``graphs.py``        ``render`` as operators in graphs of ``torch.compile``
+``requests.py``      one call of ``render``: arguments checked and completed to settings, autograd where gradients are needed
+``run.py``           one forward render: samples chunks and accumulates them in films
+``stopping.py``      stop rules, and the number of samples of the next pass
+``error.py``         error probes, and adaptive sampling that is guided by them
+``picture.py``       makes a ``Rendering`` of the films; ``result.py`` that class: picture, AOVs, error, counts, seconds
+``missing_light.py`` light that no sample found, for which there is no error estimate
+``checkpoint.py``    saves and resumes a render; ``split.py`` shares a pass among ranks
+``many.py``          several renders on one thread pool; ``batches/`` scenes by cameras in one call
+``one_path.py``      prints one path vertex by vertex; ``nonfinite.py`` counts non-finite samples by cause
+``graphs.py``        ``render`` as a custom operator for ``torch.compile``
 ===================  ===================================================================================
 
 May import: ``gradients`` and what lies below. (It is not called ``render``: that name is the function's.)

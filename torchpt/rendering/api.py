@@ -1,4 +1,4 @@
-"""The one entry: a scene and settings in, a picture out. The CLI and ``torchpt.render`` both come through here."""
+"""Render a scene: the entry points ``render`` and ``trace``, which the CLI and Python both call."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def render(scene: Scene, *, full: bool = False, **options: Unpack[CommonOptions]
 
     Args:
         scene: from :func:`torchpt.load`.
-        full: True returns a :class:`torchpt.Rendering`: picture, layers, error, counts and seconds as one object.
-        options: settings, which win over the scene file's (None keeps the scene's own wish), and what is said of this call
-            probe_estimate, as :class:`torchpt.scene.settings.CommonOptions` declares them: ``spp``, ``seed``, ``params`` (tensors in
-            place of those of ``scene.params``: where one requires gradients, so does the picture), ``film``, ``integrator``...
-            ``help`` lists them, and docs/guides/ml.md has them as a table.
+        full: True returns a :class:`torchpt.Rendering`: picture, AOVs, error, counts and seconds in one object.
+        options: settings, which win over the scene file's (None keeps the file's value), and options of this call: ``spp``,
+            ``seed``, ``params`` (tensors in place of those of ``scene.params``; if one requires gradients, so does the
+            picture), ``film``, ``integrator``... :class:`torchpt.scene.settings.CommonOptions` declares them, ``help`` lists
+            them, and docs/guides/ml.md has them as a table.
 
     Raises:
-        SceneError: a setting or parameter that is not accepted.
-        RenderError: a device, compiler or denoiser that is not there; a rank that is lost, or at something else.
-        TypeError: an argument that there is not.
+        SceneError: a setting or parameter is not accepted.
+        RenderError: a device, compiler or denoiser is missing; a rank is lost, or renders something else.
+        TypeError: an unknown argument.
     """
     check_names("render", options, CommonOptions, ("full",))
     rendering = execute_request(prepare_request(scene, full, **options))
@@ -63,26 +63,25 @@ def trace(
 ) -> Tensor:
     """Return the radiance that arrives at ``o`` from ``d``, linear RGB ``(..., 3)``; differentiable in both and in ``params``.
 
-    Random numbers are a function of the seed, of a ray's number in row-major order, and of the sample. Rays that stand as
-    pixels do, ``(H, W, 3)``, have those of the pixels: along a camera's own rays this is ``render``, to the bit. A ray has no
-    width, so textures are looked up at points. Gradients leave out visibility edges, and say so by an
-    :class:`torchpt.EdgeWarning` where rays, surfaces or places of lights are differentiated.
+    Random numbers are a function of the seed, the index of the ray in row-major order, and the sample. Rays in the shape of a
+    picture, ``(H, W, 3)``, draw the numbers of its pixels: along a camera's own rays the result is ``render``'s, to the bit. A
+    ray has no footprint, so textures are not filtered. Gradients leave out visibility edges; an :class:`torchpt.EdgeWarning`
+    says so where rays, surfaces or positions of lights are differentiated.
 
     Args:
         scene: from :func:`torchpt.load`.
         o: origins ``(..., 3)``, float32 or float64, in the scene's world, on its device.
-        d: directions from there ``(..., 3)``, of any length; ``o`` and ``d`` are broadcast. The derivative is that of
-            ``d / |d|``.
+        d: directions ``(..., 3)``, of any length; ``o`` and ``d`` are broadcast. Gradients are those of ``d / |d|``.
         spp: samples a ray, which are averaged.
         seed: any integer from 0; the same seed gives the same numbers.
-        params: tensors in place of ``scene.params`` by dotted name, but for those of the camera.
-        options: others, as of :func:`render`: those that :class:`torchpt.scene.settings.TraceOptions` declares. What a scene
-            file says of its film, and of when a picture is done, does not count here.
+        params: tensors in place of ``scene.params`` by dotted name; parameters of the camera are refused.
+        options: further options of :func:`render`, as :class:`torchpt.scene.settings.TraceOptions` declares them. The scene
+            file's film and stop rules are not used.
 
     Raises:
-        SceneError: a setting, parameter or ray that is not accepted: a direction that is zero, numbers that are not finite.
-        RenderError: a device or compiler that is not there.
-        TypeError: an argument that there is not.
+        SceneError: a setting, parameter or ray is not accepted, such as a zero direction or a number that is not finite.
+        RenderError: a device or compiler is missing.
+        TypeError: an unknown argument.
     """
     check_names("trace", options, TraceOptions, ("spp", "seed", "params"))
     request = prepare_trace_request(scene, o, d, spp=spp, seed=seed, params=params, **options)
@@ -92,7 +91,7 @@ def trace(
 
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:
-    """Layers ``(H, W, C)`` of the first surface at one sample a pixel: a preview that is there at once."""
+    """Return AOVs ``(H, W, C)`` of the first surface at one sample a pixel, by name: a quick preview."""
     film = settings.film.but(
         aovs=names, denoise=False, filter=ParsedParams(FILTERS["box"], {})
     )  # one sample fills no wider filter

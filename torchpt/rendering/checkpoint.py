@@ -1,4 +1,4 @@
-"""Checkpoints: films and counts in one file, what may go on from which, and checks of what was read."""
+"""Checkpoints: write films and counts to a file, read and validate them, and decide which renders may resume from it."""
 
 from __future__ import annotations
 
@@ -47,20 +47,20 @@ __all__ = [
 ]
 
 
-# ---- Arrays out of an ``.npz`` archive that may be anybody's: numbers only, none larger than the bytes that are there
+# ---- Read an ``.npz`` archive from an untrusted source: arrays of numbers only, none larger than the file
 
 
 _MAGIC = b"\x93NUMPY"
 
 
 def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
-    """The arrays by name, as ``numpy.savez`` wrote them.
+    """Return the arrays of an archive by name, as ``numpy.savez`` wrote them.
 
     NumPy's own reader trusts a header that declares any size, and runs a tokenizer over one that is malformed.
 
     Raises:
-        ValueError: no such archive, a member that is compressed (it could unfold to anything) or no array of numbers.
-        zipfile.BadZipFile: a damaged one.
+        ValueError: a member is compressed, encrypted, overlaps others, or is no array of numbers.
+        zipfile.BadZipFile: the archive is damaged.
     """
     found: dict[str, np.ndarray] = {}
     whole = file.seek(0, 2)
@@ -84,7 +84,7 @@ def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
 
 
 def _array(data: bytes) -> np.ndarray:
-    """An array from the bytes of a ``.npy`` file (NumPy enhancement proposal 1)."""
+    """Return the array in the bytes of a ``.npy`` file (NumPy enhancement proposal 1)."""
     if not data.startswith(_MAGIC):
         raise ValueError("no array")
     size, start = (
@@ -102,16 +102,16 @@ def _array(data: bytes) -> np.ndarray:
     return np.array(values, kind.newbyteorder("="), order="C")
 
 
-# ---- The state of a render on disk, so that one that was killed goes on where it was
+# ---- Save the state of a render between passes, and resume from it
 #
-# A checkpoint holds the films between two passes and what decides what comes next. Samples are functions of their numbers, so
-# the finished picture has the bits of one that nobody killed. The file is an ``.npz`` archive of numbers and one JSON text, of
-# which nothing is executed; it is written beside its place and moved there, so there is always a whole one.
+# A checkpoint holds the films and the counts on which the next pass depends. Random numbers are functions of pixel and sample,
+# so a resumed render ends with the bits of an uninterrupted one. The file is an ``.npz`` archive of arrays and one JSON text;
+# nothing in it is executed. It is written to a temporary file and renamed, so there is always a whole checkpoint.
 
 
-#: Seconds between two checkpoints, at least; and at least so many times as long as it takes to write one.
+#: Seconds between two checkpoints are at least ``EVERY``, and ``PATIENCE`` times as long as writing the last one took.
 EVERY, PATIENCE = 5.0, 20.0
-#: Settings that may differ between a checkpoint and the render that goes on from it: no sample depends on them.
+#: Settings that may differ between a checkpoint and the render that resumes from it: samples do not depend on them.
 FREE = having(Role.FREE)
 #: Name of the JSON text among the arrays.
 _FACTS = "facts"
@@ -120,11 +120,11 @@ _FORMAT = 3
 
 @dataclass
 class RenderState:
-    """Of a render between two passes.
+    """The state of a render between two passes.
 
     Attributes:
-        facts: plain values.
-        arrays: numbers by name.
+        facts: numbers, text and nested dicts, as JSON holds them.
+        arrays: tensors by name, such as ``picture.sums``.
     """
 
     facts: dict[str, Any]
@@ -134,7 +134,7 @@ class RenderState:
 def identity(
     scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
 ) -> dict[str, Any]:
-    """Return what a render is of: where two have the same, one goes on from the other's checkpoint."""
+    """Return all that samples depend on, ready for JSON: renders of equal identity may resume each other's checkpoints."""
     return {
         "torchpt": __version__,
         "scene": fingerprints(scene),
@@ -147,14 +147,14 @@ def identity(
 
 
 class CheckpointFile:
-    """Writes and reads the checkpoints of one render.
+    """The checkpoint file of one render.
 
     Args:
         path: of the file.
-        of: the render's :func:`identity`; None where its place is only checked.
+        of: the render's :func:`identity`; None where only the path is checked.
 
     Attributes:
-        seconds: spent on writing.
+        seconds: spent on writing so far.
     """
 
     def __init__(self, path: str, of: Mapping[str, Any] | None = None) -> None:
@@ -163,24 +163,24 @@ class CheckpointFile:
         self._last, self._took = time.perf_counter(), 0.0
 
     def check(self, resume: bool) -> None:
-        """Find out before a long render whether there is a place for its checkpoints.
+        """Check before a long render that its checkpoints can be written.
 
         Raises:
-            OutputError: there is none, or a file is there that nobody wishes to go on from.
+            OutputError: the path cannot be written, or a file is there and ``resume`` is False.
         """
         check_writable(self.path, (self.path.suffix.lower(),))
         if not resume and self.path.exists():
             raise OutputError(self.path, "is there already; render.resume=true goes on from it, or remove it first")
 
     def due(self) -> bool:
-        """Return True where it is time for another."""
+        """Return True if it is time for another checkpoint."""
         return time.perf_counter() - self._last >= max(EVERY, PATIENCE * self._took)
 
     def write(self, state: RenderState) -> None:
         """Replace the checkpoint.
 
         Raises:
-            OutputError: it cannot be written; the one that was there is still whole.
+            OutputError: the file cannot be written; the previous checkpoint is still whole.
         """
         begun = time.perf_counter()
         try:
@@ -208,14 +208,14 @@ class CheckpointFile:
                 temporary.unlink()
 
     def read(self, like: RenderState, check: Callable[[RenderState], None] | None = None) -> RenderState | None:
-        """Return the checkpoint, with ``render.spp`` as it was among its facts; None where there is none.
+        """Return the checkpoint, its ``render.spp`` among the facts; None if there is no file.
 
         Args:
-            like: a state of this render: facts and arrays of the same names, kinds and sizes are there, or it is refused.
-            check: looks at the facts before the arrays, and may refuse them.
+            like: a state of this render, whose names, types and shapes the checkpoint must have.
+            check: is called with the facts before arrays are compared, and may raise.
 
         Raises:
-            AssetError: a file that is no whole checkpoint, or one of another render.
+            AssetError: the file is damaged, or is the checkpoint of another render.
         """
         if not self.path.exists():
             return None
@@ -254,7 +254,7 @@ class CheckpointFile:
 
 
 def _check_facts(state: RenderState, like: RenderState, path: Path) -> None:
-    """Refuse facts of other kinds."""
+    """Raise AssetError where a fact is missing or has another type than in ``like``."""
     for name, value in like.facts.items():
         there: Any = state.facts.get(name)
         if name == "lost":
@@ -269,7 +269,7 @@ def _check_facts(state: RenderState, like: RenderState, path: Path) -> None:
 
 
 def _check_arrays(state: RenderState, like: RenderState, path: Path) -> None:
-    """Refuse arrays that the render could not hold."""
+    """Raise AssetError where an array is missing or has another shape or dtype than in ``like``."""
     for name, value in like.arrays.items():
         found = state.arrays.get(name)
         if found is None or found.shape != value.shape or found.dtype != value.dtype:
@@ -281,7 +281,7 @@ def _said(problem: Exception) -> str:
 
 
 def _differences(a: Any, b: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
-    """Return where two nests of plain values differ: dotted key, and both values in JSON."""
+    """Yield the differences of two nested dicts: dotted key, and both values in JSON."""
     if isinstance(a, dict) and isinstance(b, dict):
         for name in dict.fromkeys((*a, *b)):
             yield from _differences(a.get(name), b.get(name), f"{key}.{name}" if key else name)
@@ -289,14 +289,14 @@ def _differences(a: Any, b: Any, key: str = "") -> Iterator[tuple[str, str, str]
         yield key, json.dumps(a), json.dumps(b)
 
 
-# ---- What a checkpoint has to hold for a render to go on from it, and when that render may take more samples than it was of
+# ---- Decide whether a render may resume from a checkpoint
 
 
 def check_samples(run: Run, state: RenderState, path: Path) -> None:
-    """Refuse a checkpoint of another ``render.spp`` where the picture would not have the bits of one that is taken at once.
+    """Refuse a checkpoint of another ``render.spp`` from which the picture would not get the bits of an uninterrupted render.
 
     Raises:
-        AssetError: says why.
+        AssetError: gives the reason.
     """
     settings, there, taken = run.settings, state.facts["spp"], state.facts["taken"]
     here, reason = settings.render.spp, ""
@@ -320,21 +320,21 @@ def check_samples(run: Run, state: RenderState, path: Path) -> None:
 
 
 def ends_a_pass(run: Run, taken: int) -> bool:
-    """Return True if a render that ends by its error, and is not short of time, asks for that at so many samples."""
+    """Return True if ``target_error`` is checked after ``taken`` samples a pixel in a render without a time limit."""
     stop = StopRules(run.settings.render.but(spp=taken + BLOCK, time_limit=None), run.picture.streams.count)
-    end = taken - taken % (4 * BLOCK)  # from there on passes are whole blocks
+    end = taken - taken % (4 * BLOCK)  # passes from here on are whole blocks
     while end < taken:
         end += stop.step(end)
     return end == taken
 
 
 def check_plausible(run: Run, state: RenderState, path: Path) -> None:
-    """Refuse numbers that no render of these settings comes to.
+    """Refuse a checkpoint whose numbers no render of these settings can have.
 
-    Sums may be negative: those of signed filters are. Layers may hold what is not finite, as models of a user's own may.
+    Sums may be negative (signed filters); AOVs of a user's models may be non-finite.
 
     Raises:
-        AssetError: names the first one.
+        AssetError: names the first such number.
     """
     facts, arrays = state.facts, state.arrays
     taken, done, lost = facts["taken"], facts["done"], NonFinite.read(facts["lost"])
@@ -375,7 +375,7 @@ def _finite(values: Iterable[Tensor]) -> bool:
 
 
 def _is_taken(run: Run, place: Place, samples: int) -> bool:
-    """Return True for a sample that a plate of the render takes."""
+    """Return True if the render takes this sample, in the picture or in its error probes."""
     x, y, width, height = run.wave.crop
     pixel_sets = [run.picture] if run.probes is None else [run.picture, run.probes.pixel_set]
     inside = x <= place.x < x + width and y <= place.y < y + height and place.sample < samples

@@ -1,4 +1,4 @@
-"""The second values of a render's pilots, and the rounds of adaptive sampling that they decide."""
+"""Error probes, and adaptive sampling that is guided by them."""
 
 from __future__ import annotations
 
@@ -28,22 +28,23 @@ from torchpt.scene.settings import Settings
 __all__ = ["FIRST_ROUND", "ErrorProbes", "SampleAllocation", "error_probes"]
 
 
-# ---- The second values of a render's pilots: pixels that are sampled again by other random numbers
+# ---- Error probes: pixels that are sampled a second time with independent random numbers
 
 
 @dataclass
 class ErrorProbes:
-    """Pilots and their second values.
+    """The error probes of a render and their second values.
 
-    Adaptive sampling decides by them where samples go. For no pixel to depend on it they are left out of the picture then, and
-    are made of two streams, whose difference tells their own variance.
+    Without adaptive sampling the second values are averaged into the picture. Adaptive sampling allocates samples by them; so
+    that this does not bias the pixels, it leaves them out of the picture and takes them in two streams, whose difference gives
+    their own variance.
 
     Attributes:
-        pilots: where they are.
-        pixel_set: sums of their second values.
-        counted: whether these are part of the picture.
-        resampled: what was looked at again, and how many of those pixels are suspects.
-        resampled_at: samples a pixel that the picture had then; None: nothing was looked at yet.
+        pilots: the pixels.
+        pixel_set: films of the second values.
+        counted: True if the picture includes the second values.
+        resampled: third values of outliers and of uncertain pixels, and the number of outliers; None: not sampled yet.
+        resampled_at: samples a pixel of the picture when third values were taken; None: not yet.
     """
 
     pilots: Pilots
@@ -53,7 +54,7 @@ class ErrorProbes:
     resampled_at: float | None = None
 
     def picture(self, film: Film) -> Tensor:
-        """The picture ``(H, W, 3)`` in float64."""
+        """Return the picture ``(H, W, 3)`` in float64, with the second values where they count."""
         if not self.counted or not len(self.pilots):
             return film.mean()
         places, second = self.pixel_set.places, self.pixel_set.film
@@ -64,14 +65,14 @@ class ErrorProbes:
         return values.reshape(film.height, film.width, -1)
 
     def counts(self, film: Film) -> Tensor:
-        """Samples that each pixel of the picture holds ``(pixels,)`` int64."""
+        """Return the number of samples of each pixel ``(pixels,)`` int64."""
         counts = film.counts
         if self.counted and len(self.pilots):
             counts[self.pixel_set.places] += self.pixel_set.film.counts
         return counts
 
     def estimate(self, film: Film, picture: Tensor) -> ErrorEstimate | None:
-        """What the picture, :meth:`picture` of the film, knows of its error."""
+        """Return the error estimate of ``picture``, which is :meth:`picture` of the film; None without probes."""
         if not len(self.pilots) or int(self.pixel_set.film.counts.min()) == 0:
             return None
         again = None
@@ -86,15 +87,15 @@ class ErrorProbes:
         )
 
     def resampling_share(self, pixels: int) -> float:
-        """Return what looking again takes, as a share of the samples of a picture of so many pixels."""
+        """Return the samples that third values take, as a share of the samples of a picture of ``pixels`` pixels."""
         return STREAMS * sum(again_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
 
     def resample_outliers(
         self, film: Film, from_first_rank: Callable[[Tensor], Tensor] | None = None
     ) -> list[tuple[PixelSet, int, int]]:
-        """What is to be sampled for the picture to know its error better, once it is finished or may be.
+        """Choose the pixels to resample for a better error estimate, and return their spans: pixels, first sample, count.
 
-        ``from_first_rank`` makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
+        ``from_first_rank`` replaces integers ``(n,)`` by those of the first rank; None: one process renders.
         """
         if not len(self.pilots):
             return []
@@ -111,7 +112,7 @@ class ErrorProbes:
         return [(pixel_set, 0, STREAMS * samples)]
 
     def probe_estimate(self, film: Film) -> ErrorEstimate | None:
-        """RelMSE as the pilots alone tell it."""
+        """Return the error estimate that the probes give without third values; None without probes."""
         if not len(self.pilots):
             return None
         return pilots_alone(self.pilots, self._first(film), self._second(), self._second_variance(), self.counted)
@@ -124,7 +125,7 @@ class ErrorProbes:
         return self.pixel_set.film.values().cpu()
 
     def _second_variance(self) -> Tensor | None:
-        """The variance of second values where it is not that of the first ones."""
+        """Return the variance of the second values where it differs from that of the first ones; else None."""
         if self.counted:
             return None
         one, other = self.pixel_set.film.streams()
@@ -132,7 +133,7 @@ class ErrorProbes:
 
 
 def error_probes(wave: Wave, settings: Settings, device: torch.device) -> ErrorProbes:
-    """Pilots of a render, nothing sampled yet."""
+    """Return the error probes of a render, before any sample."""
     film = settings.film
     pilots = pilots_of(settings.render.seed, (film.width, film.height), wave.crop)
     streams = Streams(wave.sampler.randomizations, 2 if settings.adaptive else 1)
@@ -140,35 +141,36 @@ def error_probes(wave: Wave, settings: Settings, device: torch.device) -> ErrorP
     return ErrorProbes(pilots, PixelSet(sums, {}, streams, pilots.places.to(device)), not settings.adaptive)
 
 
-# ---- Adaptive sampling: rounds of samples where pilots say that the error is
+# ---- Adaptive sampling: error probes decide where samples go
 
 
-#: Samples that every pixel takes before any is asked.
+#: Samples of every pixel before adaptive sampling begins.
 FIRST_ROUND = 16
 
 
 class SampleAllocation:
-    """Samples of the blocks of a picture.
+    """Allocates the samples of adaptive rounds to the 4 x 4 blocks of a picture.
 
     Args:
-        pilots: of the picture.
-        film: of the picture.
-        from_first_rank: makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
+        pilots: the error probes of the picture.
+        film: the film of the picture.
+        from_first_rank: replaces integers ``(n,)`` by those of the first rank; None: one process renders.
     """
 
     def __init__(self, pilots: Pilots, film: Film, from_first_rank: Callable[[Tensor], Tensor] | None = None) -> None:
         self.pilots, self._from_first_rank = pilots, from_first_rank
         x, y = torch.arange(film.width) + pilots.corner[0], torch.arange(film.height) + pilots.corner[1]
         rows, columns = pilots.blocks
-        #: Block of each pixel.
+        #: Block index of each pixel ``(pixels,)``.
         self.block = ((y // BLOCK)[:, None] * columns + (x // BLOCK)[None]).reshape(-1)
         self.pixels = torch.bincount(self.block, minlength=rows * columns)
         self._parts: list[tuple[Film, Tensor, Film]] = []
 
     def spans(self, picture: PixelSet, probes: ErrorProbes, mean: float, last: bool) -> list[tuple[PixelSet, int, int]]:
-        """What is to be sampled for the picture to have ``mean`` samples a pixel: plates of pixels with as many samples.
+        """Return the next round's spans (pixels, first sample, count), after which the picture has ``mean`` samples a pixel.
 
-        ``last``: whether no round follows, see :func:`torchpt.physics.film.error.shared_out`.
+        Pixels of one span have the same number of samples. ``last``: no round follows, see
+        :func:`torchpt.physics.film.error.shared_out`.
         """
         device = picture.film.sums.device
         counts = self._of_blocks(picture.film.counts.cpu())
@@ -190,13 +192,13 @@ class SampleAllocation:
         return spans
 
     def merge(self) -> None:
-        """Add what was sampled to the films that it is of."""
+        """Add the samples of the round to the films that its pixels were taken from."""
         for whole, places, part in self._parts:
             whole.put(places, part)
         self._parts.clear()
 
     def _part(self, pixel_set: PixelSet, places: Tensor, pixels: Tensor) -> PixelSet:
-        """Some pixels of a plate as a plate of their own."""
+        """Return pixels ``places`` of a pixel set as a set with films of their own."""
         films = {}
         for name, film in (("", pixel_set.film), *pixel_set.layers.items()):
             films[name] = film.taken(places)
@@ -204,15 +206,15 @@ class SampleAllocation:
         return PixelSet(films.pop(""), films, pixel_set.streams, pixels)
 
     def _of_blocks(self, counts: Tensor) -> Tensor:
-        """Samples of the pixels of each block, which are the same."""
+        """Return the samples a pixel of each block; the pixels of a block have the same number."""
         found = torch.zeros(len(self.pixels), dtype=torch.int64)
         found[self.block] = counts
         return found
 
     def _errors(self, probes: ErrorProbes) -> Tensor:
-        """Relative variance of the pixels of each block, up to a factor: second values alone are asked."""
+        """Return the relative variance of each block's pixels, up to a factor, from the second values alone."""
         a, b = (x.cpu() for x in probes.pixel_set.film.streams())
-        errors, estimate = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
+        errors, probed = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
         at = tuple(self.pilots.block)
-        errors[at], estimate[at] = error_by_pilots(self.pilots, a, b), True
-        return foreseen(errors, estimate).reshape(-1)
+        errors[at], probed[at] = error_by_pilots(self.pilots, a, b), True
+        return foreseen(errors, probed).reshape(-1)

@@ -1,9 +1,9 @@
-"""``render`` in graphs of ``torch.compile``: one opaque operator forward and one backward, with fake kernels.
+"""``render`` in graphs of ``torch.compile``: custom operators for the forward and the backward pass, with fake kernels.
 
-A graph holds tensors, numbers and text. So a scene is named by its number, wishes are written as text, and parameters are the
-operators' tensors; the seed is a number of its own, so that another one needs no other graph. What a graph cannot hold is
-rendered outside of it, which breaks it: ``full=True`` (a :class:`torchpt.Rendering`), scenes with models of the caller's own,
-arguments that are no plain values.
+A graph holds tensors, numbers and text. So the scene is passed by its number, options as text, and parameters as the operators'
+tensors; the seed is a separate number, so that another seed does not recompile. Everything else breaks the graph and is
+rendered outside of it: ``full=True`` (a :class:`torchpt.Rendering`), scenes with models of the user's own, arguments that are
+not plain values.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ __all__ = ["as_custom_op", "reuse_rendering", "with_graph_break"]
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: What arguments that are written down in a graph may be. (Older torch traces no unions of types, but tuples of them.)
+#: Types of arguments that can be written as text. (Older torch traces no unions of types, but tuples of them.)
 _LISTS, _PLAIN = (list, tuple), (bool, int, str)
-#: While an operator is at work: what its forward pass made, which its backward pass is not to make again.
+#: While an operator runs: the rendering of its forward pass, which its backward pass reuses.
 _known: ContextVar[list[Rendering] | None] = ContextVar("reuse_rendering", default=None)
 
 
 def reuse_rendering(make: Callable[[], Rendering]) -> Rendering:
-    """What the forward pass of an operator made, where this is its backward pass; else what is made now."""
+    """Return the rendering of the forward pass inside an operator's backward pass; else call ``make``."""
     made = _known.get()
     if made:
         return made[0]
@@ -50,7 +50,7 @@ def reuse_rendering(make: Callable[[], Rendering]) -> Rendering:
 
 
 def as_custom_op(render: Callable[P, R]) -> Callable[P, R]:
-    """``render`` for eager code and for graphs, whose operators are registered here."""
+    """Return a function that calls ``render`` in eager code and its custom operator while a graph is traced."""
     _register(render)
 
     @wraps(render)
@@ -62,7 +62,7 @@ def as_custom_op(render: Callable[P, R]) -> Callable[P, R]:
 
 
 def with_graph_break(call: Callable[P, R]) -> Callable[P, R]:
-    """``call`` for eager code and for graphs, which break there."""
+    """Return a function that calls ``call`` in eager code and breaks the graph while one is traced."""
 
     @wraps(call)
     def either(*args: P.args, **options: P.kwargs) -> R:
@@ -81,7 +81,7 @@ def _in_graph(
     dtype: torch.dtype = torch.float32,
     **options: Any,
 ) -> Any:
-    """The render as an operator of the graph that is being traced, or outside of it. It is torch that reads this function."""
+    """Call the operator, or ``render`` outside of the graph; ``torch.compile`` traces this function."""
     if full or len(scene.own_models) > 0 or not _fits_graph(params, seed, dtype, options):
         with_graph_break: Any = torch.compiler.disable(render)
         return with_graph_break(scene, params=params, full=full, seed=seed, dtype=dtype, **options)
@@ -96,18 +96,18 @@ def _in_graph(
 
 
 def _fits_graph(params: Any, seed: Any, dtype: Any, options: Mapping[str, Any]) -> bool:
-    """Whether arguments can be written down in a graph; others, what is not accepted among them, are seen to outside of it."""
-    reuse_rendering = dtype is torch.float32 or dtype is torch.float64
+    """Return True if the arguments can be part of a graph; others, also invalid ones, are rendered outside of it."""
+    is_float = dtype is torch.float32 or dtype is torch.float64
     number = isinstance(seed, int) and not isinstance(seed, bool)
     if params is not None and not (
         isinstance(params, Mapping) and all([isinstance(value, Tensor) for value in params.values()])
     ):
         return False
-    return reuse_rendering and (seed is None or (number and 0 <= seed < 1 << 63)) and _plain(options)
+    return is_float and (seed is None or (number and 0 <= seed < 1 << 63)) and _plain(options)
 
 
 def _plain(value: Any) -> bool:
-    """Whether a nest of values is one of numbers, words and None."""
+    """Return True for nested mappings and lists of finite numbers, strings and None."""
     if isinstance(value, Mapping):
         return all([isinstance(key, str) and _plain(value[key]) for key in value])
     if isinstance(value, _LISTS):
@@ -118,7 +118,7 @@ def _plain(value: Any) -> bool:
 
 
 def _text(value: Any) -> str:
-    """A nest of plain values as Python writes it."""
+    """Return the source text of nested plain values, for ``ast.literal_eval``."""
     if isinstance(value, Mapping):
         return "{" + ", ".join([repr(key) + ": " + _text(value[key]) for key in value]) + "}"
     if isinstance(value, _LISTS):
@@ -127,13 +127,13 @@ def _text(value: Any) -> str:
 
 
 class _OperatorCall(NamedTuple):
-    """A render as an operator is asked for it.
+    """The arguments of a call of the operator.
 
     Attributes:
-        scene: what.
+        scene: the scene.
         options: arguments of ``render``.
-        names: of the parameters that are handed over.
-        wanted: which of them are differentiated.
+        names: dotted names of the operator's tensors.
+        wanted: the names that are differentiated.
     """
 
     scene: Scene
@@ -143,7 +143,7 @@ class _OperatorCall(NamedTuple):
 
     @classmethod
     def read(cls, number: int, text: str, seed: int) -> _OperatorCall:
-        """Raises RenderError where the scene is gone."""
+        """Return the arguments that :func:`_in_graph` wrote; RenderError if the scene was garbage-collected."""
         scene = numbered(int(number))
         if scene is None:
             raise RenderError("the scene that this compiled graph renders is gone: keep a reference to it")
@@ -152,11 +152,11 @@ class _OperatorCall(NamedTuple):
         return cls(scene, options, names, wanted)
 
     def versions(self) -> dict[str, int]:
-        """Of the scene's own parameters, but for those that are handed over."""
+        """Return the versions of the scene's own parameters, without those that are passed as tensors."""
         return {name: edition for name, edition in self.scene.versions().items() if name not in self.names}
 
     def like(self) -> Tensor:
-        """A picture of the right size, unfilled."""
+        """Return an uninitialized picture of the right size, dtype and device."""
         blocks = {name: self.options.get(name) for name in BLOCKS if name != "render"}
         film = settings(self.scene.description, blocks).film
         _, _, width, height = film.crop or (0, 0, film.width, film.height)
@@ -164,7 +164,7 @@ class _OperatorCall(NamedTuple):
 
 
 def _in_thread(work: Callable[[], R], made: list[Rendering], device: torch.device) -> R:
-    """Work of an operator, in a thread of its own: in that of the operator torch would not note what depends on what."""
+    """Return ``work()``, run in another thread: in the operator's own thread autograd would not record it."""
     stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
     found: list[R] = []
     failed: list[BaseException] = []

@@ -1,4 +1,4 @@
-"""Several renders at once: their samples are one work list, and what is next is made ready while threads trace."""
+"""Render several pictures on one thread pool; the next ones are prepared while its threads trace."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from torchpt.rendering.run import Run
 
 __all__ = ["QueuedRender", "render_many"]
 
-#: Renders a thread that are made ready in advance.
+#: Renders for each thread that are prepared in advance.
 PREFETCH = 2
 
 
 @dataclass
 class QueuedRender:
-    """A render of several.
+    """One render of a batch.
 
     Attributes:
-        device: where it is rendered.
-        make: makes it ready for a number of threads; called when it is soon to begin.
-        done: told of the rendering.
-        failed: told of an error instead, which it may raise as another one.
-        run: once it is ready.
-        left: tasks of it that are not done.
-        rest: blocks that memory did not suffice for.
+        device: of the scene.
+        make: prepares the render for a number of threads; called shortly before it begins.
+        done: is called with the rendering.
+        failed: is called with an error instead, and may raise another one.
+        run: the prepared render.
+        left: number of its tasks that are not finished.
+        rest: blocks put back when memory ran out.
     """
 
     device: torch.device
@@ -45,17 +45,17 @@ class QueuedRender:
 
 
 def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
-    """Render them, each to the very bits that it has alone.
+    """Render all entries; each picture has the bits that it has alone.
 
-    Renders that the compiled loop takes, and that nothing but their number of samples ends, share threads and a work list.
-    Others are rendered one after another: by tensor operations (as on CUDA), to a time or an error, in bounded memory.
+    Compiled renders that only ``spp`` ends share the threads and one queue of tasks. Others are rendered one after another:
+    those by tensor operations (as on CUDA), with a time limit or target error, or in bounded memory.
 
     Args:
-        entries: what is to be rendered; taken one by one.
-        tasks: into how many parts the work of a render is cut, as far as that repays.
+        entries: the renders, taken one by one.
+        tasks: the number of tasks that a render is cut into, at most.
 
     Raises:
-        Exception: what an entry's ``failed`` raises; the others are given up then.
+        Exception: the error that an entry's ``failed`` raises; all other renders are cancelled.
     """
     queue = TaskQueue[QueuedRender, Share](torch.get_num_threads())
     waiting, begun = iter(entries), dict[int, QueuedRender]()
@@ -85,7 +85,7 @@ def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
             _collect(queue, begun, PREFETCH * queue.threads * tasks)
         _collect(queue, begun, 0)
     finally:
-        for entry in begun.values():  # those that are not done stop at their next kernel
+        for entry in begun.values():  # unfinished renders stop at their next kernel
             if entry.run.tasks is not None:
                 entry.run.tasks.halt()
         queue.close()
@@ -93,14 +93,14 @@ def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
 
 @contextmanager
 def _single_threaded(queue: TaskQueue[QueuedRender, Share]) -> Iterator[None]:
-    """While all cores trace, tensor operations of this thread are its own: a team would wait for a core, and spin meanwhile."""
+    """Let tensor operations use one thread while the pool traces: torch's team would wait for busy cores, and spin."""
     with one_thread() if queue.pending else nullcontext():
         yield
 
 
 @contextmanager
 def _errors_to(entry: QueuedRender) -> Iterator[None]:
-    """Tell an entry of the errors within."""
+    """Pass errors raised within to the entry's ``failed``."""
     try:
         yield
     except Exception as error:
@@ -109,7 +109,7 @@ def _errors_to(entry: QueuedRender) -> Iterator[None]:
 
 
 def _collect(queue: TaskQueue[QueuedRender, Share], begun: dict[int, QueuedRender], most: int) -> None:
-    """Take in what threads have done, until no more than ``most`` blocks are pending."""
+    """Collect results of the pool until at most ``most`` tasks are pending."""
     while True:
         found = queue.next(wait=queue.pending > most)
         if found is None:

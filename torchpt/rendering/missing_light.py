@@ -1,7 +1,7 @@
-"""Light that a picture lacks: what no sample met has no known error.
+"""Find light that no sample met, which the error estimate cannot know of.
 
-A pixel without any light may be off by all that it should hold. Its squared error over ``r² + 0.01`` is below 1, whatever the
-true radiance r is, so that dark pixels add at most their share of the picture to relMSE.
+A black pixel may miss all of its true radiance r. Its squared error over ``r² + 0.01`` is below 1 for any r, so dark pixels add
+at most their share of the picture to relMSE.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from torchpt.search.bounds import primitive_bounds
 
 __all__ = ["MissingLight", "find_missing_light"]
 
-#: Share of the picture that may be dark for the rest to tell the error.
+#: Largest share of dark pixels at which the rest still gives an error estimate.
 DARK = 0.05
-#: Dark pixels of which one camera ray each is asked whether it meets anything that reflects.
+#: Number of dark pixels for which one camera ray tests whether it meets a surface that reflects.
 DARK_PIXELS = 256
-#: Rays from a light that are asked what they meet first; and from each dark pixel's surface, what is in sight.
+#: Rays traced from a light; directions traced from the surface of each dark pixel.
 RAYS, DIRECTIONS = 512, 8
 
 
@@ -42,8 +42,8 @@ class MissingLight:
     """Light that a picture lacks.
 
     Attributes:
-        reason: why its error is not known; "" where it is.
-        dark: share of its pixels that hold no light, although what they show reflects some.
+        reason: why the error is not known; "" where it is.
+        dark: share of pixels that are black although their surface reflects light.
     """
 
     reason: str
@@ -54,14 +54,14 @@ class MissingLight:
 def find_missing_light(
     scene: Scene, wave: Wave, geometry: Callable[[], Geometry], picture: Tensor, relmse: float
 ) -> MissingLight:
-    """Look for light that a picture lacks.
+    """Look for light that no sample of a picture met.
 
     Args:
         scene: what was rendered.
-        wave: of the render.
-        geometry: the primitives as the search sees them.
+        wave: the wave of the render.
+        geometry: returns the primitives that the search structure was built from.
         picture: ``(H, W, C)`` float64.
-        relmse: what the samples tell of its error.
+        relmse: the error estimate of the samples.
     """
     lights, names = wave.context.world.lights, Names(scene.built, wave.context.world)
     if wave.integrator.lit and (lights is None or (lights.environment is None and not bool(lights.radiance.any()))):
@@ -82,7 +82,7 @@ def find_missing_light(
 
 
 class _Search:
-    """A few rays of a render; a structure whose kernels the render does not need itself is not compiled for them."""
+    """The render's search structure for a few rays; an LBVH where its kernels would have to be compiled for them."""
 
     def __init__(self, wave: Wave, geometry: Callable[[], Geometry]) -> None:
         self._wave, self.geometry = wave, geometry
@@ -91,7 +91,7 @@ class _Search:
 
     @property
     def wave(self) -> Wave:
-        """The wave, whose ``accel`` may be asked."""
+        """The wave, with an ``accel`` that needs no compilation."""
         if self._own is None:
             self._own = self._wave.accel
             if self._own.name == "brute":
@@ -102,9 +102,9 @@ class _Search:
 
 
 def _dark_share(search: _Search, black: Tensor) -> float:
-    """Share of all pixels that are ``black (pixels,)`` although their first camera ray meets what reflects.
+    """Return the share of pixels that are ``black (pixels,)`` although their first camera ray meets a surface that reflects.
 
-    Shadows of direct light are black, and known to be: each sample asked a light for what it would bring.
+    With direct light only, shadows are black and their error is known: each sample evaluated a light.
     """
     places, integrator = black.nonzero()[:, 0], search.integrator
     count = len(places)
@@ -126,7 +126,7 @@ def _dark_share(search: _Search, black: Tensor) -> float:
 
 
 def _camera_rays(wave: Wave, places: Tensor) -> PathState:
-    """Rays from the middle of the lens through the middles of pixels ``places (n,)`` of the picture."""
+    """Return camera rays from the centre of the lens through the centres of pixels ``places (n,)``."""
     x0, y0, width, _ = wave.crop
     x, y = places % width + x0, places // width + y0
     dtype, camera = wave.context.plan.dtype, wave.camera
@@ -137,9 +137,9 @@ def _camera_rays(wave: Wave, places: Tensor) -> PathState:
 
 
 def _any_surface_visible(wave: Wave, state: PathState, hit: Hit) -> bool:
-    """Return True where anything can be seen from the surfaces that camera rays meet, or light passes them.
+    """Return True if any surface is visible from the surfaces that camera rays hit, or if one of them transmits light.
 
-    Else, as behind a single ball in the sun, no path goes on, and what the lights were asked for is all there is.
+    Otherwise, as with a single ball in the sun, all paths have one vertex, and light sampling has found all there is.
     """
     world = wave.context.world
     for model, _ in partition(world, hit)[1]:
@@ -159,14 +159,14 @@ def _any_surface_visible(wave: Wave, state: PathState, hit: Hit) -> bool:
 
 
 def _sphere(k: Tensor, count: int) -> Tensor:
-    """Directions ``(3, n)`` number ``k (n,)`` of ``count`` on a Fibonacci lattice, float64."""
+    """Return directions ``(3, n)`` with indices ``k (n,)`` of ``count`` on a Fibonacci lattice, float64."""
     turn, height = math.pi * (3.0 - math.sqrt(5.0)) * k.double(), 1.0 - (2.0 * k.double() + 1.0) / count
     radius = (1.0 - height.square()).sqrt()
     return torch.stack((radius * turn.cos(), radius * turn.sin(), height))
 
 
 def _delta_lights(lights: Lights) -> list[tuple[int, str]]:
-    """Rows of the lights that no ray meets by chance, and their kinds; those without power are none."""
+    """Return row and kind of each delta light with power."""
     kinds = [lights.kinds[0]] if lights.kind is None else [lights.kinds[k] for k in lights.kind.tolist()]
     bright = lights.radiance.abs().amax(0).tolist()
     return [
@@ -175,10 +175,9 @@ def _delta_lights(lights: Lights) -> list[tuple[int, str]]:
 
 
 def _why_unreachable(search: _Search, names: Names, lights: Lights, row: int, kind: str) -> str:
-    """Return why no path finds a light that no ray meets by chance; "" where one may.
+    """Return why no path finds delta light ``row``; "" where one may.
 
-    A path takes its light at a surface that the light shines on directly, and only where that scatters: polished ones have
-    no direction to spare for it.
+    A path finds a delta light by light sampling at a surface that the light reaches directly and whose BSDF is not all deltas.
     """
     integrator, world = search.integrator, search.world
     cannot = f"cannot be found by integrator {integrator.name}"
@@ -205,7 +204,7 @@ def _why_unreachable(search: _Search, names: Names, lights: Lights, row: int, ki
 
 
 def _rays(search: _Search, lights: Lights, row: int, kind: str) -> tuple[Tensor, Tensor]:
-    """Rays ``o, d (3, RAYS)`` along which a light shines, evenly: on a Fibonacci lattice."""
+    """Return rays ``o, d (3, RAYS)`` from a light, evenly distributed on a Fibonacci lattice."""
     k = torch.arange(RAYS, dtype=torch.float64, device=lights.p0.device)
     turn, share = math.pi * (3.0 - math.sqrt(5.0)) * k, (k + 0.5) / RAYS
     axis = lights.normal[:, row : row + 1].double()

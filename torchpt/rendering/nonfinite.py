@@ -1,4 +1,4 @@
-"""What a render says of its samples that are not finite: how many by cause, and where the first one is."""
+"""Report non-finite samples: count them by cause and describe the first."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from torchpt.scene.scene import Scene
 if TYPE_CHECKING:  # what traces samples again is imported once there are such
     from torchpt.paths.explain import NonFiniteCause
 
-__all__ = ["causes_of", "told"]
+__all__ = ["causes_of", "describe_sample"]
 
 
 def causes_of(scene: Scene, wave: Wave, lost: NonFinite) -> tuple[dict[str, int], str]:
-    """Samples by cause, most first, and a sentence about the first one; nothing where none was lost.
+    """Return the number of non-finite samples by cause, largest first, and a sentence about the first; ``{}, ""`` if none.
 
-    Only the first :data:`~torchpt.paths.nonfinite.KEPT` are traced again. The others are counted as ``nan, not traced`` and
-    ``infinite, not traced``, so that all add up to ``lost.count``.
+    Only the first :data:`~torchpt.paths.nonfinite.KEPT` are traced again. Others count as ``nan, not traced`` and
+    ``infinite, not traced``; all add up to ``lost.count``.
 
     Args:
         scene: what was rendered.
-        wave: of the render.
-        lost: its samples that were not finite.
+        wave: the wave of the render.
+        lost: the non-finite samples.
     """
     if not lost.count:
         return {}, ""
@@ -44,8 +44,8 @@ def causes_of(scene: Scene, wave: Wave, lost: NonFinite) -> tuple[dict[str, int]
     return {name: count for name, count in causes.most_common() if count}, first
 
 
-def told(scene: Scene, wave: Wave, place: Place) -> str:
-    """Return a sentence about one sample that is not finite."""
+def describe_sample(scene: Scene, wave: Wave, place: Place) -> str:
+    """Return a sentence about one non-finite sample and its cause."""
     from torchpt.paths.explain import causes_of_samples
 
     return f"{_named(wave, place)} is not finite: {_said(scene, wave, causes_of_samples(_trace, wave, [place])[0])}"
@@ -56,7 +56,7 @@ def _trace(wave: Wave, state: PathState, observer: Any) -> Tensor:
 
 
 def _named(wave: Wave, place: Place) -> str:
-    """A sample by number and pixel, or ray; pilots take some of their own."""
+    """Return the name of a sample: its index and pixel or ray, and whether it is a second value of an error probe."""
     if wave.given is not None:
         return f"sample {place.sample} of ray {place.y * wave.crop[2] + place.x}"
     return str(place) + (" (its second value)" if place.first else "")

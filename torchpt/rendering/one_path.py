@@ -1,4 +1,4 @@
-"""One path of a render, vertex by vertex: the very path that the picture's sample is made of."""
+"""Trace one path of a render and describe it vertex by vertex; it is the path of the picture's sample, to the bit."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ Triple = tuple[float, ...]
 
 @dataclass(frozen=True)
 class EmissionRecord:
-    """Light that the path met by chance.
+    """Emission of a light that a camera ray or a BSDF sample hit.
 
     Attributes:
-        light: its name.
-        radiance: of it.
-        pdf: density in solid angle with which it would have been sampled.
-        mis_weight: of having met it.
-        contribution: to the sample.
+        light: name of the light.
+        radiance: emitted radiance.
+        pdf: density per solid angle with which light sampling would have drawn this direction.
+        mis_weight: MIS weight of the BSDF sample.
+        contribution: radiance added to the sample.
     """
 
     light: str
@@ -49,17 +49,17 @@ class EmissionRecord:
 
 @dataclass(frozen=True)
 class LightSampleRecord:
-    """Light that was sampled.
+    """Light sample at a vertex, and its contribution.
 
     Attributes:
-        light: its name.
-        wi: direction to it.
-        pdf: in solid angle, with the choice of the light; infinite of a light without extent.
-        arriving: its radiance over that density.
-        bsdf: what the material reflects of it, with the cosine and the shadowing of bent normals.
-        mis_weight: of having sampled it.
-        visible: how much of it gets here: 0, 1, or between behind what is not opaque; None where it would bring nothing anyway.
-        contribution: to the sample.
+        light: name of the light.
+        wi: direction to the light.
+        pdf: density per solid angle, times the probability of the light; infinite for a delta light.
+        arriving: radiance over pdf, before occlusion.
+        bsdf: BSDF times cosine, with the shadowing of perturbed normals.
+        mis_weight: MIS weight of the light sample.
+        visible: transmittance of the shadow ray, from 0 to 1; None where the contribution is 0 and no ray is traced.
+        contribution: radiance added to the sample.
     """
 
     light: str
@@ -74,15 +74,15 @@ class LightSampleRecord:
 
 @dataclass(frozen=True)
 class BsdfSampleRecord:
-    """The direction in which the path goes on, as the material drew it.
+    """BSDF sample at a vertex.
 
     Attributes:
-        wi: the direction.
-        pdf: in solid angle; infinite of a mirror's.
-        weight: BSDF and cosine over the density, with the shadowing of bent normals.
-        eta: index of refraction of the side of ``wi`` over that of ``wo``; None where nothing refracts.
-        survival: chance to survive roulette; None where it does not play.
-        throughput: what the path carries on; before roulette where that ends it.
+        wi: direction of the next ray.
+        pdf: density per solid angle; infinite for a delta.
+        weight: BSDF times cosine over pdf, with the shadowing of perturbed normals.
+        eta: index of refraction on the side of ``wi`` over that of ``wo``; None for BSDFs that do not refract.
+        survival: survival probability of Russian roulette; None before it begins.
+        throughput: path throughput after the vertex; before roulette where that ends the path.
     """
 
     wi: Triple
@@ -95,23 +95,23 @@ class BsdfSampleRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class Vertex:
-    """A place where a ray of the path ended; places are the scene's, directions unit, all of the world.
+    """One vertex of a path: the hit or the escape of a ray. Positions and directions are in scene coordinates.
 
     Attributes:
-        depth: from 1.
-        position: None where the ray escaped, as the rest then.
-        shape: name.
-        kind: of the primitive.
-        primitive: its number within its part of the shape.
-        material: name.
+        depth: number of the vertex, from 1.
+        position: point of the hit; None, as the fields up to ``geometric_normal``, where the ray escaped.
+        shape: name of the shape.
+        kind: kind of the primitive.
+        primitive: index of the primitive within its part of the shape.
+        material: name of the material.
         model: the material's ``type``.
-        normal: for shading, on the side of ``wo`` where the material is opaque.
-        geometric_normal: on the shape's outside.
-        wo: direction to the vertex before.
-        emission: None where nothing shines here.
-        light: None where none was sampled.
-        scattered: None where the path is as long as it may be.
-        radiance: of the sample up to here.
+        normal: shading normal, on the side of ``wo`` where the material is opaque.
+        geometric_normal: geometric normal, which points out of the shape.
+        wo: direction to the previous vertex.
+        emission: emission of the hit or of the environment; None if there is none.
+        light: light sample; None if none was taken.
+        scattered: BSDF sample; None at the limit of depth.
+        radiance: radiance that the path has gathered so far.
     """
 
     depth: int
@@ -132,19 +132,19 @@ class Vertex:
 
 @dataclass(frozen=True)
 class Path:
-    """One path.
+    """One path and the value of its sample.
 
     Attributes:
-        scene: its name.
+        scene: name of the scene.
         pixel: ``(x, y)`` on the whole film.
-        sample: its number in the pixel.
-        seed: of the render.
-        origin: of the camera ray.
-        direction: of it.
-        vertices: in order.
-        ended: how it did: escaped, max_depth, absorbed, roulette or not finite.
-        radiance: of the whole path.
-        value: what enters the picture: weighted by the filter, black where it is not finite, clamped.
+        sample: index of the sample in its pixel.
+        seed: seed of the render.
+        origin: origin of the camera ray.
+        direction: direction of the camera ray.
+        vertices: vertices from the camera on.
+        ended: why the path ended: escaped, max_depth, absorbed, roulette or not finite.
+        radiance: radiance of the whole path.
+        value: value added to the film: weighted by the filter, 0 where it is not finite, clamped.
     """
 
     scene: str
@@ -160,16 +160,16 @@ class Path:
 
 
 def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: int) -> Path:
-    """Trace one sample by tensor operations, and tell what happened.
+    """Trace one sample by tensor operations, and describe its path.
 
     Args:
-        scene: what.
-        settings: of the render whose sample it is.
+        scene: the scene.
+        settings: settings of the render.
         pixel: ``(x, y)`` on the whole film.
-        sample: its number in the pixel.
+        sample: index of the sample in its pixel.
 
     Raises:
-        SceneError: a pixel or sample that the render has not, or an integrator that follows no paths.
+        SceneError: the pixel or sample does not exist, or the integrator traces no paths.
     """
     film, spp = settings.film, settings.render.spp
     if not (0 <= pixel[0] < film.width and 0 <= pixel[1] < film.height):
@@ -192,7 +192,7 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
 
 
 class _PathBuilder:
-    """Turns what happened in one lane into a :class:`Path`."""
+    """Builds a :class:`Path` from the events that an observer recorded."""
 
     def __init__(self, scene: Scene, explainer: Explainer) -> None:
         self.scene, self.events, self.world = scene, explainer.events, explainer.world
@@ -221,15 +221,13 @@ class _PathBuilder:
         )
 
     def _scene_point(self, p: Tensor) -> Triple:
-        """A point in the scene's own coordinates."""
+        """Return a point in scene coordinates."""
         return tuple((p[:, 0].double() * self.unit + self.centre).tolist())
 
     def _vertices(self) -> Iterator[Vertex]:
-        """One for each time that a ray of the path met something, or nothing."""
+        """Yield a vertex for each ray that was traced, whether it hit a surface or escaped."""
         for k, met in enumerate(self.events):
-            if (
-                not isinstance(met, Intersection) or float(met.state.t_max) == 0.0
-            ):  # a path that ended has rays without length
+            if not isinstance(met, Intersection) or float(met.state.t_max) == 0.0:  # ended paths have rays of length 0
                 continue
             here = [event for event in self.events[k:] if not isinstance(event, CameraRay) and event.depth == met.depth]
             shone = next((event for event in here if isinstance(event, EmitterHit)), None)
@@ -297,7 +295,7 @@ class _PathBuilder:
         )
 
     def _why_ended(self) -> str:
-        """Return how the path did."""
+        """Return why the path ended."""
         last = next(event for event in reversed(self.events) if not isinstance(event, EmitterHit))
         if isinstance(last, Intersection) and float(last.state.t_max) > 0.0:
             return "escaped" if int(last.hit.prim) < 0 else "max_depth"
@@ -327,5 +325,5 @@ def _bsdf_sample(output: VertexOutput) -> BsdfSampleRecord:
 
 
 def _first_lane(value: Tensor) -> Triple:
-    """The numbers of one lane."""
+    """Return the vector of the first lane."""
     return tuple(value.detach().reshape(3, -1)[:, 0].tolist())

@@ -1,4 +1,4 @@
-"""What a render comes to: the picture so far, its layers, and what is known of both."""
+"""Make a :class:`Rendering` of a render's films: picture, AOVs and error estimate."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["error_estimate_of", "finished_rendering", "rendering_of"]
 
 
 def finished_rendering(run: Run) -> Rendering:
-    """The picture at the end, and why samples of it are not finite."""
+    """Return the finished rendering, with the causes of its non-finite samples."""
     size = mb(run.need.picture)
     return retry_out_of_memory(
         lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}", lambda: _told(run)
@@ -36,7 +36,7 @@ def _told(run: Run) -> Rendering:
 
 
 def rendering_of(run: Run) -> Rendering:
-    """The picture so far; where ranks share a render, what their films hold was joined before."""
+    """Return the rendering of the films as they are; of several ranks they must have been joined."""
     radiant, film = run.integrator.light, run.picture.film
     layers = _layers(run)
     estimate, unknown = None, ""
@@ -85,7 +85,7 @@ def rendering_of(run: Run) -> Rendering:
 
 
 def error_estimate_of(run: Run, picture: Tensor) -> tuple[ErrorEstimate | None, str]:
-    """Return what the samples tell of the picture's own error, None where nobody asked, and why that is not known, or ""."""
+    """Return the error estimate of the picture (None: not estimated), and why it cannot be trusted ("": it can)."""
     film = run.picture.film
     if run.probes is not None:
         estimate = run.probes.estimate(film, picture)
@@ -106,7 +106,7 @@ def error_estimate_of(run: Run, picture: Tensor) -> tuple[ErrorEstimate | None, 
 
 
 def _layers(run: Run) -> dict[str, Tensor]:
-    """The layers so far: those of first surfaces, and those that the film makes."""
+    """Return the AOVs by name: those of first surfaces, and those computed from the film."""
     layers = {}
     film = run.picture.film
     for name, layer in run.seen.items():

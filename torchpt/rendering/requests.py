@@ -1,4 +1,4 @@
-"""From the arguments of ``render`` to a rendering: what is asked for is checked, completed and made, on a tape or without."""
+"""From the arguments of ``render`` to a rendering: validate and complete them, then render, with autograd where needed."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ _FLOATS = (torch.float32, torch.float64)
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """A picture that was asked for: checked, complete, and not begun.
+    """A validated request for one picture.
 
     Attributes:
-        given: the scene as the caller has it.
-        scene: what is rendered: the same, or one that reads texels where that has numbers.
-        settings: how.
-        call: what the arguments say beside settings.
-        params: tensors in place of the scene's, those of its own that want gradients among them.
-        versions: of the scene's own parameters, but for those that ``params`` stand for, as they were.
-        rays: origins and directions ``(..., 3)`` in place of the camera's, pixels of a film of one row; None: the camera's.
+        given: the scene that the caller passed.
+        scene: the scene to render: the same, or a copy that reads texels where ``params`` replace numbers by images.
+        settings: the complete settings.
+        call: options of this call that are no settings.
+        params: tensors in place of the scene's, and those of the scene's own that require gradients.
+        versions: versions of the scene's other parameters when the request was made.
+        rays: origins and directions ``(..., 3)``, the pixels of a film of one row; None: the camera's rays.
     """
 
     given: Scene
@@ -61,35 +61,35 @@ class RenderRequest:
 
     @property
     def differentiates_rays(self) -> bool:
-        """Return True where rays are differentiated."""
+        """Return True if gradients with respect to rays are needed."""
         return any(wants_gradients(vectors) for vectors in self.rays or ())
 
     @property
     def needs_gradients(self) -> bool:
-        """Return True where the picture is to carry gradients."""
+        """Return True if the picture requires gradients."""
         return torch.is_grad_enabled() and bool(self.wanted or self.differentiates_rays or self.scene.weights())
 
     def with_versions(self) -> RenderRequest:
-        """The same, with what :meth:`check_unchanged` compares."""
+        """Return a copy that records versions of parameters for :meth:`check_unchanged`."""
         now = self.given.versions()
         return replace(self, versions={name: edition for name, edition in now.items() if name not in self.params})
 
     def check_unchanged(self, since: str) -> None:
-        """Refuse to go on with another scene than it was when it was noted; ``since`` is for the error.
+        """Raise if the scene changed since its versions were recorded; ``since`` is a phrase for the error.
 
         Raises:
-            RenderError: one of the scene's own parameters was replaced, or changed in place.
+            RenderError: a parameter of the scene was replaced, or changed in place.
         """
         check_unchanged(self.versions, self.given.versions(), since)
         renew(self.scene, self.given, self.params)
 
 
 def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) -> RenderRequest:
-    """Return what the arguments of ``render`` ask for.
+    """Return the request that arguments of ``render`` make.
 
     Raises:
-        SceneError: one that is not accepted.
-        RenderError: a denoiser that is not there.
+        SceneError: an argument is not accepted.
+        RenderError: the denoiser is missing.
     """
     scene = as_scene(scene)
     call = Call.of({**options, "full": full})
@@ -107,10 +107,10 @@ def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) 
 
 
 def prepare_trace_request(scene: Scene, o: Tensor, d: Tensor, **options: Unpack[CommonOptions]) -> RenderRequest:
-    """Return what the arguments of ``trace`` ask for: a picture whose pixels are the rays.
+    """Return the request that arguments of ``trace`` make: a picture whose pixels are the rays.
 
     Raises:
-        SceneError: one that is not accepted.
+        SceneError: an argument is not accepted.
     """
     as_scene(scene)
     o, d = _broadcast(scene, o, d)
@@ -132,7 +132,7 @@ def prepare_trace_request(scene: Scene, o: Tensor, d: Tensor, **options: Unpack[
         raise SceneError("sampler.adaptive", True, "false: rays have the same number of samples")
     if seen := [name for name in options.get("params") or {} if name.startswith("camera.")]:
         raise SceneError("params", seen[0], "none of the camera's, which rays do not come from")
-    # What a scene file says of its picture, and of when that is done, is not meant for rays.
+    # The scene file's film and stop rules are for pictures, not for rays.
     settings = replace(
         settings,
         film=settings.film.but(width=d.numel() // 3, height=1, crop=None, aovs=(), denoise=False),
@@ -145,10 +145,10 @@ def prepare_trace_request(scene: Scene, o: Tensor, d: Tensor, **options: Unpack[
 
 
 def _broadcast(scene: Scene, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-    """Return origins and directions of rays in one shape ``(..., 3)``.
+    """Return origins and directions of rays, broadcast to one shape ``(..., 3)``.
 
     Raises:
-        SceneError: no such tensors, or on another device than the scene.
+        SceneError: not two tensors of floats on the scene's device that broadcast.
     """
     for key, vectors in (("o", o), ("d", d)):
         form = (vectors.dtype, tuple(vectors.shape)) if isinstance(vectors, Tensor) else vectors
@@ -165,11 +165,11 @@ def _broadcast(scene: Scene, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _parameters(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
-    """Return parameters in place of the scene's, those of its own that want gradients among them.
+    """Return tensors in place of the scene's parameters, and those of its own that require gradients.
 
     Raises:
-        SceneError: an unknown name, or no tensor that holds numbers. All else is checked where they are plain tensors
-            (:mod:`torchpt.core.autograd`).
+        SceneError: an unknown name, or a value that is no tensor with data. Values are checked later, outside of transforms
+            of ``torch.func`` (:mod:`torchpt.core.autograd`).
     """
     given = dict(params or {})
     if any(name not in scene.params or not isinstance(value, Tensor) or value.is_meta for name, value in given.items()):
@@ -182,12 +182,12 @@ def _parameters(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -
 
 
 def execute_request(request: RenderRequest, made: list[Rendering] | None = None) -> Rendering:
-    """The rendering that was asked for, on a tape where one is wanted, and denoised where that is.
+    """Render a request: with autograd where it requires gradients, denoised where its film asks for that.
 
-    ``made``: a list of the rendering alone, without gradients, where it is there already; it is taken out.
+    ``made``: a list with the rendering that was already made without gradients; it is popped.
 
     Raises:
-        SceneError: a parameter that is not accepted.
+        SceneError: a parameter is not accepted.
     """
     scene, settings, call = request.scene, request.settings, request.call
 
@@ -215,10 +215,10 @@ def execute_request(request: RenderRequest, made: list[Rendering] | None = None)
 
 
 def _without_aovs(settings: Settings, film: Mapping[str, Any] | None) -> Settings:
-    """Settings of a render that returns a tensor; a scene file's wishes for layers and to denoise are for files.
+    """Return settings without AOVs and denoising, which a tensor cannot hold; a scene file may ask for them.
 
     Raises:
-        SceneError: such a wish of the caller's own.
+        SceneError: the caller asks for them.
     """
     if (film or {}).get("aovs") and settings.integrator.light:  # else the picture is a layer
         raise SceneError("film.aovs", settings.film.aovs, "none, or full=True: a tensor is one picture, without layers")
@@ -232,7 +232,7 @@ def _without_aovs(settings: Settings, film: Mapping[str, Any] | None) -> Setting
 
 
 def _check(scene: Scene, call: Call, device: str | torch.device | None) -> None:
-    """Refuse arguments of :func:`render` that do not fit the scene."""
+    """Raise SceneError for arguments of :func:`render` that do not fit the scene."""
     for name in call.params or {}:
         if not isinstance(name, str):
             raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.params))}")
@@ -241,7 +241,7 @@ def _check(scene: Scene, call: Call, device: str | torch.device | None) -> None:
 
 
 def _same_device(requested: str | torch.device, own: torch.device) -> bool:
-    """Return True where a wish for a device names the one that a scene is on."""
+    """Return True if ``requested`` names device ``own``."""
     try:
         device = torch.device(requested)
     except RuntimeError:
@@ -250,16 +250,16 @@ def _same_device(requested: str | torch.device, own: torch.device) -> bool:
 
 
 def _pair(rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor] | None:
-    """Return origins and directions of rays; None where there are none."""
+    """Return origins and directions of rays; None for none."""
     return (rays[0], rays[1]) if rays else None
 
 
-#: Makes a rendering of parameters and rays, without a tape.
+#: Renders given parameters and rays, without gradients.
 _Make = Callable[[Mapping[str, Tensor], tuple[Tensor, ...]], Rendering]
 
 
 def _differentiable(request: RenderRequest, render: _Make) -> Rendering:
-    """Return a rendering whose picture is on a tape from the parameters and rays wanted; ``render`` makes it without."""
+    """Return a rendering whose picture has gradients with respect to parameters and rays; ``render`` makes it without."""
     from torchpt import gradients as adjoint
     from torchpt.gradients import edges
 
@@ -297,7 +297,7 @@ def _differentiable(request: RenderRequest, render: _Make) -> Rendering:
 
     def gradients(cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:
         given, of_edges = given_by(*tensors), edges_taken()
-        # One pass that is a derivative of the very estimator takes its own samples again.
+        # A backward pass with the seed and samples of the forward pass is the exact derivative of its estimator.
         own = again().render
         exact = own.seed == settings.render.seed and own.spp == taken[0]
         held = not exact and adjoint.film_space_applies(scene, settings, wanted)
@@ -339,7 +339,7 @@ def _differentiable(request: RenderRequest, render: _Make) -> Rendering:
     tensors = (*(params[name] for name in names), *(request.rays or ()))
     (image,) = custom_vjp(forward, backward_pass, tensors, scene.weights())
     rendering = made[-1]
-    made.clear()  # the tape keeps the closures, which are not to keep pictures
+    made.clear()  # autograd keeps the closures alive: they must not hold pictures
     taken.append(max(rendering.spp, 1))
     layers = edges.followed(settings)
     if layers:
@@ -349,7 +349,7 @@ def _differentiable(request: RenderRequest, render: _Make) -> Rendering:
 
 
 def _constant(request: RenderRequest, render: _Make) -> Rendering:
-    """Return a rendering without gradients, of parameters and rays that may still be those of a transform of ``torch.func``."""
+    """Return a rendering without gradients; parameters and rays may be wrapped by transforms of ``torch.func``."""
     params, made = request.params, list[Rendering]()
 
     def forward(*tensors: Tensor) -> tuple[Tensor]:
@@ -361,7 +361,7 @@ def _constant(request: RenderRequest, render: _Make) -> Rendering:
 
 
 def _warn_of_edges(missing: Sequence[str], every: bool) -> None:
-    """Say which visibility edges (``every`` one, or those that are ``missing``) a gradient leaves out."""
+    """Warn of the visibility edges that a gradient leaves out: all (``every``), or those in ``missing``."""
     edges = "all visibility edges (silhouettes and shadow edges that move)"
     if not every:
         if not missing:

@@ -1,4 +1,4 @@
-"""The picture with all that is known of it: as an object, as files, in notebooks, denoised."""
+"""The :class:`Rendering`: picture, AOVs, error and counts as an object, in files and in notebooks; denoising."""
 
 from __future__ import annotations
 
@@ -39,48 +39,48 @@ __all__ = [
 ]
 
 
-# ---- A picture and how it came about
+# ---- The result of a render, and its progress
 
 
 @dataclass(repr=False, eq=False)
 class Rendering:
-    """A picture and how it came about; ``torchpt.render(scene, full=True)`` gives one, and notebooks show it.
+    """A picture with its AOVs, error, counts and seconds; ``torchpt.render(scene, full=True)`` returns one.
 
-    ``rendering["rgb"]`` is the picture, and ``rendering["depth"]`` the layer of that name; ``dict(rendering)`` has all of them.
+    ``rendering["rgb"]`` is the picture, ``rendering["depth"]`` the AOV of that name, ``dict(rendering)`` has all of them.
 
     Attributes:
-        image: ``(H, W, 3)`` linear RGB; it carries gradients, where they are wanted.
-        layers: what ``film.aovs`` asked for, each ``(H, W, C)``; those of first surfaces that are averaged carry gradients too.
-        guides: what the denoiser looks at beside the picture, by the names of its arguments, each ``(H, W, 3)``; empty
+        image: ``(H, W, 3)`` linear RGB; it requires gradients if parameters or rays do.
+        layers: the AOVs of ``film.aovs``, each ``(H, W, C)``; averages over first surfaces carry gradients too.
+        guides: AOVs for the denoiser, by the names of its arguments, each ``(H, W, 3)``; empty
             without ``film.denoise``.
-        denoised: the picture without its noise ``(H, W, 3)``; None where nobody denoised it. No number here is about it.
-        spp: samples a pixel that the picture holds.
-        load_seconds: for reading the scene and its files; 0 where nobody took the time.
-        build_seconds: for the world and its search structure.
-        compile_seconds: for kernels: compiled, or loaded from disk.
-        render_seconds: for sampling, and for what the picture knows of its error; with those before a checkpoint.
-        denoise_seconds: for the denoised picture.
-        write_seconds: for files: checkpoints, and the pictures of ``torchpt render``.
-        paths: camera samples traced.
-        rays: rays traced, shadow rays included.
-        nonfinite_samples: samples that were NaN or infinite, and counted as black.
-        nonfinite_causes: how many of them by cause, such as ``{"infinite light": 3}``; they add up to ``nonfinite_samples``.
-            See :data:`torchpt.paths.explain.CAUSES`. Not known yet of a picture that is still being rendered.
-        nonfinite_first: which sample was the first of them, and what of it stopped being finite; "" where there is none.
-        truncated_paths: paths ended by the cap on endless depth.
-        clamped: fraction of the light that ``integrator.clamp`` took away; None where it is off.
-        relmse: the picture's estimate of its own relMSE; None where it has no pilots, or where light is missing.
-        relmse_interval: of 95 % for it; None where there are too few pilots.
-        relmse_unknown: which light is missing, so that no error is known; "" where none is, or where there are no pilots.
-        heavy_tailed: whether few pixels carry the error, so that the interval is not to be trusted.
-        stopped_by: the rule that ended it: spp, time_limit or target_error; "" where it was ended from outside.
-        complete: whether a rule ended it.
-        peak_memory: bytes, the most that the process ever held above what it held after import; on CUDA, of tensors.
-        lanes: of a wave at the end, where failed allocations made them fewer; None where memory sufficed.
-        eager: stages that ran as tensor operations although kernels were wanted, and why.
-        scene: name of the scene; "" where it came as a mapping.
-        overrides: of the scene's keys, as words of the command line.
-        settings: what it was rendered with, complete.
+        denoised: the denoised picture ``(H, W, 3)``; None without ``film.denoise``. All numbers below are of ``image``.
+        spp: samples a pixel of the picture.
+        load_seconds: reading the scene and its files; 0 if not measured.
+        build_seconds: building the world and its search structure.
+        compile_seconds: compiling kernels, or loading them from disk.
+        render_seconds: sampling, and estimating the error; includes the time before a checkpoint.
+        denoise_seconds: denoising.
+        write_seconds: writing files: checkpoints, and the pictures of ``torchpt render``.
+        paths: number of paths.
+        rays: number of rays, with shadow rays.
+        nonfinite_samples: number of samples that were NaN or infinite, and counted as black.
+        nonfinite_causes: their number by cause, such as ``{"infinite light": 3}``; the sum is ``nonfinite_samples``.
+            See :data:`torchpt.paths.explain.CAUSES`. Empty until the render ends.
+        nonfinite_first: the first such sample, and the quantity that stopped being finite; "" where there is none.
+        truncated_paths: number of paths that ended at the hard limit of depth.
+        clamped: fraction of the light that ``integrator.clamp`` removed; None without it.
+        relmse: estimate of the picture's relMSE; None without error probes, or where light is missing.
+        relmse_interval: its 95 % confidence interval; None where there are too few error probes.
+        relmse_unknown: the light that no sample found, so that the error is not known; "" if none is missing.
+        heavy_tailed: True if so few pixels carry the error that the interval is not to be trusted.
+        stopped_by: the rule that ended the render: spp, time_limit or target_error; "" if ``on_progress`` did.
+        complete: True if a rule ended the render.
+        peak_memory: largest memory of the process above that after import, in bytes; on CUDA, of tensors.
+        lanes: lanes of the last wave, where failed allocations made them fewer; None if memory sufficed.
+        eager: stages that ran by tensor operations although kernels were requested, with the reasons.
+        scene: name of the scene; "" for a scene from a mapping.
+        overrides: overrides of the scene's keys, as words of the command line.
+        settings: the complete settings.
     """
 
     image: Tensor
@@ -116,27 +116,27 @@ class Rendering:
 
     @property
     def seconds(self) -> float:
-        """Return what it took, from reading the scene to writing the picture: the sum of the six above."""
+        """Return the seconds from reading the scene to writing the picture: the sum of the six above."""
         prepared = self.load_seconds + self.build_seconds + self.compile_seconds
         return prepared + self.render_seconds + self.denoise_seconds + self.write_seconds
 
     @property
     def variance(self) -> Tensor | None:
-        """The variance of each pixel ``(H, W, 3)``; None where ``film.aovs`` does not ask for it."""
+        """Variance of each pixel ``(H, W, 3)``; None if ``film.aovs`` does not have it."""
         return self.layers.get("variance")
 
     @property
     def _open(self) -> bool:
-        """Return True where anything but ``render.spp`` has a say in how many samples a pixel gets."""
+        """Return True if anything else than ``render.spp`` decides the number of samples a pixel."""
         if self.settings is None:
             return False
         return self.settings.adaptive or bool(self.settings.render.stops)
 
     def __getitem__(self, name: str) -> Tensor:
-        """The picture (``rgb``) or a layer, by name.
+        """Return the picture (``rgb``) or an AOV, by name.
 
         Raises:
-            KeyError: a layer that ``film.aovs`` did not ask for.
+            KeyError: an AOV that ``film.aovs`` does not have.
         """
         if name == "rgb":
             return self.image
@@ -145,7 +145,7 @@ class Rendering:
         return self.layers[name]
 
     def __iter__(self) -> Iterator[str]:
-        """Names of the picture and its layers."""
+        """Iterate over the names of the picture and its AOVs."""
         return iter(("rgb", *self.layers))
 
     def __contains__(self, name: object) -> bool:
@@ -155,21 +155,21 @@ class Rendering:
         return 1 + len(self.layers)
 
     def keys(self) -> tuple[str, ...]:
-        """Names of the picture and its layers."""
+        """Return the names of the picture and its AOVs."""
         return tuple(self)
 
     def write(self, path: str | PathLike[str]) -> None:
-        """Write it as ``torchpt render`` does: whole or not at all, shown as ``film`` says.
+        """Write the picture as ``torchpt render`` does: atomically, tone-mapped as ``film`` says.
 
-        An ``.exr`` keeps the layers, and the facts of :meth:`header`. Where there is a denoised picture it lies beside it, as
+        An ``.exr`` has the AOVs, and the :meth:`header`. A denoised picture is written beside it, as
         ``NAME.denoised.exr``.
 
         Args:
-            path: where to, ending in ``.exr .hdr .png .jpg .jpeg .ppm``.
+            path: file name that ends in ``.exr .hdr .png .jpg .jpeg .ppm``.
 
         Raises:
-            SceneError: ``path`` is none.
-            OutputError: an ending that is not written, or a place that cannot be written.
+            SceneError: ``path`` is no path.
+            OutputError: the ending is unknown, or the file cannot be written.
         """
         from torchpt.scene.settings import Film
 
@@ -179,7 +179,7 @@ class Rendering:
             write_denoised(beside(path), self, film)
 
     def header(self) -> dict[str, str | int | float]:
-        """Return what the header of an EXR file says of it, by name; :func:`torchpt.read_header` reads it back."""
+        """Return the facts for the header of an EXR file, by name; :func:`torchpt.read_header` reads them back."""
         from torchpt.core.version import __version__
 
         low, high = self.relmse_interval or (None, None)
@@ -217,21 +217,20 @@ class Rendering:
         }
 
     def __repr__(self) -> str:
-
         facts = table_of(self)
         size = facts.pop("size")
         return f"Rendering({size}; {'; '.join(f'{name}: {value}' for name, value in facts.items())})"
 
     def _repr_png_(self) -> bytes:
-        """The picture in a notebook."""
+        """Return the picture for a notebook, as PNG."""
         return png_of(self.image, None if self.settings is None else self.settings.film)
 
     def _repr_html_(self) -> str:
-        """The picture and what is known of it, in a notebook."""
+        """Return the picture and a table of its facts for a notebook, as HTML."""
         return html_of(self)
 
     def summary(self) -> dict[str, Any]:
-        """The facts as plain values, ready for JSON."""
+        """Return the facts as plain values, ready for JSON."""
         facts: dict[str, Any] = {
             "spp": self.spp,
             "load_seconds": round(self.load_seconds, 4),
@@ -283,12 +282,12 @@ class Progress:
     """The state of a render between two chunks.
 
     Attributes:
-        done: camera samples taken.
-        total: camera samples that there will be; a guess where time or error end the render.
-        rays: rays traced.
-        seconds: since the start.
-        pass_finished: whether a pass over all pixels ends here.
-        snapshot: makes the picture so far.
+        done: paths traced so far.
+        total: number of paths in the end; an estimate where a time limit or target error ends the render.
+        rays: rays traced so far.
+        seconds: seconds since the start.
+        pass_finished: True if a pass over all pixels ends here.
+        snapshot: returns the rendering so far.
     """
 
     done: int
@@ -299,19 +298,19 @@ class Progress:
     snapshot: Callable[[], Rendering]
 
 
-# ---- A rendering as notebooks show it: the picture, no larger than it need be, and a table of what is known
+# ---- A rendering in notebooks: the picture, scaled down, and a table of its facts
 
 
-#: Pixels of the longer side from which on a picture is shown scaled down.
+#: Longest side of a picture in a notebook, in pixels; larger ones are scaled down.
 LONGEST = 768
 
 
 def png_of(image: Tensor, film: Any) -> bytes:
-    """A picture ``(H, W, 3)`` as a screen shows it, in PNG, scaled down to ``LONGEST``.
+    """Return a picture ``(H, W, 3)`` as PNG, tone-mapped and scaled down to ``LONGEST``.
 
     Args:
         image: linear radiance.
-        film: says ``exposure``, ``tonemap`` and ``gamma``; None: the defaults.
+        film: has ``exposure``, ``tonemap`` and ``gamma``; None: the defaults.
     """
     from PIL import Image
 
@@ -325,7 +324,7 @@ def png_of(image: Tensor, film: Any) -> bytes:
 
 
 def table_of(rendering: Rendering) -> dict[str, str]:
-    """What is worth a look, by name."""
+    """Return the facts for a notebook's table, by name."""
     height, width = rendering.image.shape[:2]
     facts = {"size": f"{width} x {height}", "samples a pixel": str(rendering.spp)}
     if rendering.relmse is not None:
@@ -353,7 +352,7 @@ def table_of(rendering: Rendering) -> dict[str, str]:
 
 
 def html_of(rendering: Rendering) -> str:
-    """The picture, the denoised one beside it, and the table; one piece of HTML without anything outside it."""
+    """Return picture, denoised picture and table as one self-contained piece of HTML."""
     film = None if rendering.settings is None else rendering.settings.film
     shown = {"rendered": rendering.image}
     if rendering.denoised is not None:
@@ -373,30 +372,30 @@ def _figure(name: str, image: Tensor, film: Any, titled: bool) -> str:
     return f'<figure style="display:inline-block;margin:0 8px 0 0">{picture}{title}</figure>'
 
 
-# ---- A rendering as files: the picture with its layers and what is known of it, and the denoised one beside it
+# ---- A rendering as files: the picture with AOVs and header, and the denoised picture
 
 
 def beside(path: str | PathLike[str]) -> str:
-    """Where a denoised picture goes: ``a.exr`` as ``a.denoised.exr``."""
+    """Return the path of a denoised picture: ``a.denoised.exr`` for ``a.exr``."""
     file = as_path(path)
     return str(file.with_name(f"{file.stem}.denoised{file.suffix}"))
 
 
 def write_rendered(path: str | PathLike[str], rendering: Rendering, film: Film) -> None:
-    """Write the picture, shown as the film says; an ``.exr`` keeps layers, and facts in its header.
+    """Write the picture, tone-mapped as the film says; an ``.exr`` has AOVs, and facts in its header.
 
     Raises:
-        OutputError: an ending that is not written, or a place that cannot be written.
+        OutputError: the ending is unknown, or the file cannot be written.
     """
     layers = rendering.layers if as_path(path).suffix.lower() == ".exr" else None
     _write(path, rendering, film, rendering.image, layers=layers, header=rendering.header())
 
 
 def write_denoised(path: str | PathLike[str], rendering: Rendering, film: Film) -> None:
-    """Write the denoised picture; its header says that it is one, and nothing of an error, which nobody knows.
+    """Write the denoised picture; its header says that it is denoised, and has no error estimate.
 
     Raises:
-        OutputError: an ending that is not written, or a place that cannot be written.
+        OutputError: the ending is unknown, or the file cannot be written.
     """
     assert rendering.denoised is not None
     facts = {name: value for name, value in rendering.header().items() if not name.startswith(("relmse", "heavy"))}
@@ -404,17 +403,17 @@ def write_denoised(path: str | PathLike[str], rendering: Rendering, film: Film) 
 
 
 def _write(path: str | PathLike[str], rendering: Rendering, film: Film, image: Tensor, **more: Any) -> None:
-    """Write a picture of a rendering, and count the seconds that it took."""
+    """Write a picture of a rendering, and add the time to ``write_seconds``."""
     start = time.perf_counter()
     write_image(path, image, exposure=film.exposure, tonemap=film.tonemap, gamma=film.gamma, **more)
     rendering.write_seconds += time.perf_counter() - start
 
 
-# ---- The second picture of `film.denoise`, made of the first one and its layers
+# ---- Denoising
 
 
 def denoise_rendering(rendering: Rendering, settings: Settings) -> float:
-    """Give a rendering of ``film.denoise`` its denoised picture, on as many threads as it had; returns the seconds it took.
+    """Set ``denoised`` of a rendering, on as many threads as it was rendered with; return the seconds.
 
     Raises:
         RenderError: the denoiser failed.

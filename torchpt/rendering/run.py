@@ -1,4 +1,4 @@
-"""One forward render: takes chunks, adds them up in films, and says what they come to."""
+"""One forward render: passes of samples, stop rules, checkpoints and the error estimate."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from torchpt.physics.shapes.geometry import Geometry
 from torchpt.ranks import Group, together
 from torchpt.rendering.checkpoint import EVERY, CheckpointFile, RenderState, check_plausible, check_samples, identity
 from torchpt.rendering.error import FIRST_ROUND, SampleAllocation, error_probes
-from torchpt.rendering.nonfinite import told
+from torchpt.rendering.nonfinite import describe_sample
 from torchpt.rendering.picture import error_estimate_of, finished_rendering, rendering_of
 from torchpt.rendering.result import Progress, Rendering
 from torchpt.rendering.split import DistributedRender, render_fingerprint
@@ -37,22 +37,37 @@ from torchpt.scene.settings import Settings
 __all__ = ["Run", "render_scene"]
 
 
-# ---- One forward render: takes chunks and adds them up in films
+# ---- One forward render
 
 
-#: A last round of adaptive sampling of less than this part of the samples is not kept: the checkpoint before serves any spp.
+#: A last adaptive round of less than 1 / SMALL_ROUND of the samples is not kept: the checkpoint before it serves any spp.
 SMALL_ROUND = 8
 
 
 def _upper_bound(estimate: ErrorEstimate | None) -> float:
-    """The upper end of an interval; infinite where there is none that is to be trusted."""
+    """Return the upper end of the estimate's interval; infinite if there is none, or it is not to be trusted."""
     return math.inf if estimate is None or estimate.interval is None or estimate.heavy_tailed else estimate.interval[1]
 
 
 class Run:
-    """One forward render: accumulates chunks into films; by several ranks where there is a ``group`` of them.
+    """One forward render, by one process or by the ranks of ``group``.
 
-    ``like``, ``rays``: see :func:`torchpt.scene.prepare.make_wave`. ``threads``: that will take samples; None: torch's number.
+    ``like``, ``rays``: see :func:`torchpt.scene.prepare.make_wave`. ``threads``: number of worker threads; None: torch's.
+
+    Attributes:
+        picture: films of the picture and its AOVs.
+        probes: the error probes; None without an error estimate.
+        engine: traces the paths; ``tasks`` is the same engine if it is compiled, else None.
+        taken: samples a pixel of the finished passes.
+        done: number of paths traced, by all ranks.
+        left: number of paths of this pass that are not traced yet.
+        lost: the non-finite samples.
+        light: sum of all samples before and after the firefly clamp ``(2,)`` float64.
+        stop: the stop rules.
+        ended: True once ``on_progress`` stopped the render.
+        keeps: True if the render has a checkpoint, which the first rank writes.
+        split: this rank's share; None for a single process.
+        eager: why stages run by tensor operations although kernels were requested.
     """
 
     def __init__(
@@ -68,9 +83,9 @@ class Run:
     ) -> None:
         self.start = time.perf_counter()
         self._compiled_before = compile_time.seconds()
-        self._kernels = 0.0  # seconds of kernels that were given up
+        self._kernels = 0.0  # seconds of compiling for an engine that was given up
         self.split = None if group is None or group.size == 1 else DistributedRender(group)
-        self.shared: tuple[int, int] = 0, 1  # samples before this pass, and how many ranks take it
+        self.shared: tuple[int, int] = 0, 1  # samples before this pass, and the number of ranks that share it
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
         meter, limit = MemoryMeter(self.device), settings.render.max_memory
@@ -89,7 +104,7 @@ class Run:
         self.eager: list[str] = []
         self.unsupported: Unsupported | None = None
         self.checkpoint_file: CheckpointFile | None = None
-        self.warned = False  # that it cannot write
+        self.warned = False  # of a checkpoint that cannot be written
         self.keeps = settings.render.checkpoint is not None
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
             self.checkpoint_file = CheckpointFile(settings.render.checkpoint, identity(scene, settings, params, dtype))
@@ -115,7 +130,7 @@ class Run:
         return forward_tensors(self.wave, Budget(self.device, lanes, what=what, limit=limit, per_lane=BYTES_PER_LANE))
 
     def _begin(self) -> None:
-        """Nothing is sampled yet."""
+        """Set films and counts to zero."""
         device, streams = self.device, self.wave.sampler.streams
         splats, channels = self.integrator.splats, [len(x.channels) for x in self.seen.values()]
         check_film(self.width, self.height, streams.count, channels, device, splats)
@@ -126,10 +141,10 @@ class Run:
         self.picture = PixelSet(film, layers, streams)
         self.probes = error_probes(self.wave, self.settings, device) if self.settings.pilots else None
         self.tally, self.done, self.left, self.taken, self.ended = RayCounts(), 0, 0, 0, False
-        self._final_checkpoint_written = False  # what follows is done again by whoever goes on
-        self.cut = False  # whether a round of adaptive sampling was shortened
-        self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
-        bounded = self.keeps or self.split is not None  # a rank that is gone is noticed after a pass
+        self._final_checkpoint_written = False  # later samples are taken again after a resume
+        self.cut = False  # True once spp or the time limit shortened an adaptive round
+        self.before = 0.0  # seconds of sampling before the checkpoint that was resumed
+        bounded = self.keeps or self.split is not None  # a lost rank is noticed between passes
         self.stop = StopRules(self.settings.render, streams.count, EVERY if bounded else None)
         if self.probes is not None:
             self.stop.after = self.probes.resampling_share(self.width * self.height)
@@ -139,12 +154,12 @@ class Run:
         self._before_resampling: tuple[dict[str, Any], Tensor] = (
             {},
             torch.empty(0),
-        )  # counted before pixels were looked at again
+        )  # counts before outliers were resampled
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
         self.begun: float | None = None
 
     def sample_all(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
-        """Take all samples, or as many as the rules or ``on_progress`` let."""
+        """Take all samples, until a stop rule or ``on_progress`` ends the render, and return the rendering."""
         self.on_progress = on_progress
         self.stop.watched = on_progress is not None or self.settings.adaptive or self.keeps or self.split is not None
         try:
@@ -158,9 +173,9 @@ class Run:
         return self._final()
 
     def all_spans(self) -> list[tuple[PixelSet, int, int]] | None:
-        """All samples, to be handed to :meth:`task_finished` as they come, and then :meth:`finish`.
+        """Return the spans of the whole render; their results go to :meth:`task_finished`, and then :meth:`finish` ends it.
 
-        None where that cannot be: there are no kernels, something but their number may end them, or memory is bounded.
+        None if it must run by :meth:`sample_all`: without kernels, with stop rules besides ``spp``, or in bounded memory.
         """
         ends = self.keeps or self.stop.open or self.probes is not None or self.split is not None
         if self.tasks is None or ends or self.settings.render.max_memory is not None:
@@ -169,7 +184,7 @@ class Run:
         return [(self.picture, 0, self.settings.render.spp)]
 
     def finish(self, rest: list[Block]) -> Rendering:
-        """The picture of samples that were taken at once, but for the blocks for which there was no memory."""
+        """Return the rendering of :meth:`all_spans`, after taking the blocks in ``rest``, put back when memory ran out."""
         with explain_out_of_memory("a render"):
             if self.unsupported is not None:
                 self._restart_by_tensors(self.unsupported)
@@ -178,7 +193,7 @@ class Run:
                     assert self.tasks is not None
                     self.tasks.take_rest(rest, self.task_finished)
                 self.taken = self.settings.render.spp
-                self.stop.told(self.taken, self.seconds_of_sampling(), None)
+                self.stop.update(self.taken, self.seconds_of_sampling(), None)
         return self._final()
 
     def _final(self) -> Rendering:
@@ -187,7 +202,7 @@ class Run:
         return finished_rendering(self)
 
     def _all(self) -> None:
-        """All samples, by tensor operations where there can be no kernels."""
+        """Take all samples; by tensor operations if kernels cannot be made."""
         try:
             self._complete()
         except Unsupported as error:
@@ -196,10 +211,10 @@ class Run:
             self._restart_by_tensors(error)
 
     def _restart_by_tensors(self, error: Unsupported) -> None:
-        """All samples, once more, by tensor operations.
+        """Take all samples again from the start, by tensor operations.
 
         Raises:
-            SceneError: kernels alone were asked for.
+            SceneError: ``render.compile`` is ``on``.
         """
         if self.settings.render.compile == "on":
             raise SceneError("render.compile", "on", f"auto or off (no kernel can be made of {error})")
@@ -210,10 +225,10 @@ class Run:
         self._begin()
         self._complete()
 
-    # -- which samples
+    # -- passes
 
     def _complete(self) -> None:
-        """The picture, and then what it takes to know its error."""
+        """Take the samples of the picture, and then those of outliers for the error estimate."""
         self._resume()
         self._sample()
         self._join()
@@ -221,7 +236,7 @@ class Run:
             self._resample_outliers()
 
     def _resample_outliers(self) -> None:
-        """Sample what it takes to know the picture's error better, unless that was done with as many samples."""
+        """Resample outliers for the error estimate, unless that was done at this number of samples."""
         if self.probes is None or self.probes.resampled_at == self._mean():
             return
         self._before_resampling = self._counted()
@@ -231,7 +246,7 @@ class Run:
         self._join()
 
     def _sample(self) -> None:
-        """Pass by pass, until a rule says that it is enough."""
+        """Take passes until a rule ends the render."""
         self.begun = time.perf_counter()
         while not self._adapts() and (size := self.stop.step(self.taken)):
             if self.settings.adaptive:  # the first round is the same whatever spp and the seconds of a pass
@@ -250,11 +265,11 @@ class Run:
             self._keep(last=True)
 
     def _adapts(self) -> bool:
-        """Return True where pilots say from now on where samples go."""
+        """Return True once error probes decide where samples go."""
         return self.probes is not None and self.settings.adaptive and self.taken >= FIRST_ROUND
 
     def _adapt(self) -> None:
-        """Rounds that double the samples there are, each where pilots say."""
+        """Take adaptive rounds, each of which doubles the samples."""
         assert self.probes is not None
         self._join()
         allocation = SampleAllocation(
@@ -266,10 +281,10 @@ class Run:
             more = self.stop.affordable(requested)
             last = more == requested and more < mean and mean + more >= self.settings.render.spp
             spans = allocation.spans(self.picture, self.probes, mean + more, last)
-            if not spans:  # a sample of one block's pixels is more than what is left
+            if not spans:  # not enough samples are left for one block
                 self.stop.reason = "spp" if more == requested else "time_limit"
                 break
-            if last and SMALL_ROUND * more < mean and not self.cut:  # quickly done again, and then for any spp
+            if last and SMALL_ROUND * more < mean and not self.cut:  # cheap to repeat, with any spp
                 self._keep(last=True)
                 self._final_checkpoint_written = True
             self.cut |= more < mean
@@ -282,16 +297,16 @@ class Run:
             self._reached(mean, self.seconds_of_sampling())
             self._keep()
 
-    # -- what a killed render goes on from
+    # -- checkpoints
 
     def films(self) -> dict[str, Film]:
-        """Return all that samples are added to, by name."""
+        """Return all films by name."""
         films = {"picture": self.picture.film}
         films |= {f"layers.{name}": film for name, film in self.picture.layers.items()}
         return films if self.probes is None else films | {"pilots": self.probes.pixel_set.film}
 
     def _keep(self, last: bool = False) -> None:
-        """Write a checkpoint where it is time for one."""
+        """Write a checkpoint if one is due."""
         if not self.keeps or self._final_checkpoint_written:
             return
         due = self.checkpoint_file is not None and (last or self.checkpoint_file.due())
@@ -301,7 +316,7 @@ class Run:
                 self._write(self.checkpoint_file)
 
     def _write(self, checkpoint_file: CheckpointFile) -> None:
-        """Write a checkpoint; where that fails the render goes on, as its picture may have a better place."""
+        """Write a checkpoint; if that fails, warn and go on: the picture may still be written elsewhere."""
         try:
             checkpoint_file.write(self._state())
         except OutputError as problem:
@@ -310,26 +325,26 @@ class Run:
             self.warned = True
 
     def _state(self) -> RenderState:
-        """Return where the render is."""
+        """Return the state for a checkpoint."""
         resampled_at = (
             self.probes is not None and self.probes.resampled_at == self._mean()
-        )  # whoever goes on looks once more
+        )  # outliers are resampled after a resume
         counted, light = self._before_resampling if resampled_at else self._counted()
         facts = {"taken": self.taken, "seconds": self.seconds_of_sampling(), "cut": int(self.cut), **counted}
         arrays = {f"{name}.{key}": value for name, film in self.films().items() for key, value in film.state().items()}
         return RenderState(facts, arrays | {"light": light})
 
     def _counted(self) -> tuple[dict[str, Any], Tensor]:
-        """Return what is counted beside the films, by name, and the light before and after the clamp."""
+        """Return the counts by name, and the light before and after the clamp."""
         counts = {"done": self.done, "rays": self.tally.rays, "truncated": self.tally.truncated}
         return {**counts, "lost": self.lost.plain()}, self.light.clone()
 
     def _mean(self) -> float:
-        """Samples a pixel that the picture holds."""
+        """Return the mean samples a pixel of the picture."""
         return float(self.picture.film.counts.double().mean())
 
     def _resume(self) -> None:
-        """Go on from the checkpoint, where that is wished and there is one."""
+        """Restore the checkpoint if ``render.resume`` is set and there is one."""
         if not self.keeps or not self.settings.render.resume:
             return
         state = None if self.checkpoint_file is None else self._kept(self.checkpoint_file)
@@ -349,14 +364,14 @@ class Run:
         self._reached(mean, self.before)
 
     def _kept(self, checkpoint_file: CheckpointFile) -> RenderState | None:
-        """Return the checkpoint, once it is known to be one that this render can go on from; None where there is none."""
+        """Return the validated checkpoint; None if there is none."""
         state = checkpoint_file.read(self._state(), lambda state: check_samples(self, state, checkpoint_file.path))
         if state is not None:
             check_plausible(self, state, checkpoint_file.path)
         return state
 
     def _reached(self, mean: float, seconds: float) -> None:
-        """Tell the rules what was reached; where ranks share a render, as the first one sees it."""
+        """Update the stop rules with the samples, seconds and error so far, as the first rank has them."""
         if self.settings.render.target_error is not None:
             self._join()
         error = self._probe_error_bound() if self.stop.checks_error(mean, self._adapts()) else None
@@ -369,27 +384,27 @@ class Run:
                 _, error = self.split.broadcast_numbers(seconds, error)
             if (error is None or error > target) and not self.ended:
                 self._undo_resampling()
-        self.stop.told(mean, seconds, error)
+        self.stop.update(mean, seconds, error)
 
     def _join(self) -> None:
-        """Let the films hold what all ranks took."""
+        """Make the films whole on every rank."""
         if self.split is not None:
             self.split.join()
 
     def _probe_error_bound(self) -> float:
-        """The relMSE that pilots alone hold possible: the upper end of its interval."""
+        """Return the upper end of the interval of relMSE that the error probes give."""
         assert self.probes is not None
         return _upper_bound(self.probes.probe_estimate(self.picture.film))
 
     def _error_bound(self) -> float:
-        """The relMSE that the picture itself holds possible, once suspects were looked at again; it takes some samples."""
+        """Return the upper end of the interval of relMSE after resampling outliers, which takes samples."""
         assert self.probes is not None
         self._resample_outliers()
         estimate, unknown = error_estimate_of(self, self.probes.picture(self.picture.film))
         return math.inf if self.ended or unknown else _upper_bound(estimate)
 
     def _undo_resampling(self) -> None:
-        """Count as if no pixel had been looked at again: the picture gets more samples, and will be then."""
+        """Restore the counts before outliers were resampled: the picture gets more samples, and they will be again."""
         assert self.probes is not None
         counts, self.light = self._before_resampling
         self.done, self.tally = counts["done"], RayCounts(counts["rays"], counts["truncated"])
@@ -397,29 +412,29 @@ class Run:
         self.probes.resampled, self.probes.resampled_at = None, None
 
     def geometry(self) -> Geometry:
-        """The primitives as the search sees them."""
+        """Return the primitives that the search structure was built from."""
         moved = {name: value for name, value in (self.params or {}).items() if not name.startswith("camera.")}
         return self.scene.world(torch.float32, moved)[1]
 
     def seconds_of_sampling(self) -> float:
-        """Since the first sample, without what was spent on kernels and checkpoints."""
+        """Return the seconds of sampling, without compiling kernels and writing checkpoints."""
         if self.begun is None:
             return 0.0
         made = self.compile_seconds() - self._compiled
         return self.before + max(time.perf_counter() - self.begun - made - self.write_seconds(), 0.0)
 
     def compile_seconds(self) -> float:
-        """Since the start, for kernels: those of stages, and others that a first call makes, such as those of searches."""
+        """Return the seconds of compiling kernels since the start: of stages and of the search."""
         return self._kernels + self.engine.seconds + compile_time.seconds() - self._compiled_before
 
     def write_seconds(self) -> float:
-        """For checkpoints."""
+        """Return the seconds of writing checkpoints."""
         return 0.0 if self.checkpoint_file is None else self.checkpoint_file.seconds
 
-    # -- how they are taken
+    # -- samples of a pass
 
     def _take(self, spans: list[tuple[PixelSet, int, int]]) -> bool:
-        """Samples of plates, with the first one and how many; returns whether all were taken."""
+        """Take the samples of spans (pixels, first sample, count); return True if all were taken."""
         if not spans:
             return True
         if self.split is None:
@@ -431,12 +446,12 @@ class Run:
         return whole
 
     def take_alone(self, spans: list[tuple[PixelSet, int, int]]) -> bool:
-        """The same by this process alone."""
+        """Take the samples of spans in this process; return True if all were taken."""
         self.left = sum(pixel_set.film.width * pixel_set.film.height * samples for pixel_set, _, samples in spans)
         return self.engine.run(spans, self.task_finished)
 
     def task_finished(self, share: Share | None) -> bool:
-        """Count what a task brought; returns whether the render is to stop."""
+        """Add the counts of a finished task; return True if the render is to stop."""
         if share is None:
             return self._advanced(0, False)
         self.tally.rays += share.tally.rays
@@ -448,43 +463,43 @@ class Run:
         return self._advanced(share.samples, self.left == 0 and self.split is None)
 
     def _advanced(self, samples: int, ends: bool) -> bool:
-        """Tell of progress; returns whether to stop."""
+        """Count samples and call ``on_progress``; return True if the render is to stop."""
         self.done += samples
-        if self.on_progress is None or self.ended:  # tasks of other threads still come in after the wish to stop
+        if self.on_progress is None or self.ended:  # other threads' tasks still finish after a stop
             return self.ended
         seconds = time.perf_counter() - self.start
-        before, ranks = self.shared  # the others are about as far
+        before, ranks = self.shared  # other ranks have taken about as many
         done = before + ranks * (self.done - before)
         state = Progress(done, max(self._total(), done), self.tally.rays, seconds, ends, self.result)
         requested = bool(self.on_progress(state))
-        if samples or ranks > 1 or self.split is None:  # between passes ranks do not part
+        if samples or ranks > 1 or self.split is None:  # ranks stop together, after a pass
             self.ended = requested and self.done < self.asked()
         return self.ended
 
     def _total(self) -> int:
-        """Camera samples that there will be, as far as one can tell: fewer where time or error end the render."""
+        """Return the expected number of paths: fewer than ``spp`` gives where time or error end the render."""
         asked = self.asked()
         if not self.stop.open or self.stop.share <= 0.0:
             return max(asked, self.done)
         return max(min(asked, round(self.done / self.stop.share)), self.done)
 
     def asked(self) -> int:
-        """Camera samples that ``render.spp`` comes to."""
+        """Return the number of paths of ``render.spp`` samples, error probes included."""
         pixels = self.width * self.height + (0 if self.probes is None else len(self.probes.pilots))
         return pixels * self.settings.render.spp
 
     def _count(self, lost: NonFinite) -> None:
-        """Count samples that are not finite; with ``integrator.strict`` the first one ends the render."""
+        """Count non-finite samples; with ``integrator.strict`` raise RenderError at the first one."""
         if lost.count and self.integrator.strict:
-            raise RenderError(f"integrator.strict: {told(self.scene, self.wave, lost.places[0])}")
+            raise RenderError(f"integrator.strict: {describe_sample(self.scene, self.wave, lost.places[0])}")
         self.lost.add(lost)
 
     def result(self) -> Rendering:
-        """The picture so far."""
+        """Return the rendering so far."""
         return rendering_of(self)
 
 
-# ---- One render with complete settings: what every way to a picture comes down to
+# ---- One render with complete settings, for all callers
 
 
 def render_scene(
@@ -496,22 +511,22 @@ def render_scene(
     ranks: Group | None = None,
     rays: tuple[Tensor, Tensor] | None = None,
 ) -> Rendering:
-    """Render with complete settings.
+    """Render a scene with complete settings.
 
     Args:
-        scene: what.
-        settings: how.
-        on_progress: called after every chunk; returning True stops early with the picture so far.
+        scene: the scene.
+        settings: the complete settings.
+        on_progress: called after every chunk; a return value of True ends the render with the picture so far.
         params: tensors in place of the scene's, without gradients.
-        dtype: of the lanes.
-        ranks: those that share the work; each gets all of the picture.
-        rays: in place of the camera's, see :func:`torchpt.scene.prepare.make_wave`; by one process.
+        dtype: dtype of the picture and of all lanes.
+        ranks: processes that share the work; each returns the whole picture.
+        rays: rays in place of the camera's, see :func:`torchpt.scene.prepare.make_wave`; by one process only.
 
     Raises:
-        SceneError: settings that this scene cannot be rendered with.
+        SceneError: this scene cannot be rendered with these settings.
         RenderError: with ``integrator.strict``, the first sample that is not finite.
-        AssetError: a checkpoint that is damaged, or of another render.
-        OutputError: a checkpoint that cannot be written, or that is there although nobody wishes to go on from it.
+        AssetError: the checkpoint is damaged, or is of another render.
+        OutputError: the checkpoint cannot be written, or exists without ``render.resume``.
     """
     with without_autocast(scene.device), limited_threads(settings.render.threads):
         with together(ranks, "what is rendered", lambda: render_fingerprint(scene, settings, params, dtype)):

@@ -1,7 +1,7 @@
-"""A render's passes by several ranks: each samples some pixels of every plate, and the films are put together again.
+"""Share a render's passes among ranks: each samples some pixels of every pixel set, then films are joined.
 
-A rank's pixels are a plate of their own, as those are that adaptive sampling asks for. Their sums go on from what the film
-holds, sample by sample, so a film has the bits that it has in one process, whoever took which pixel.
+The pixels of a rank are a pixel set with films of their own. Their sums continue those of the whole film, sample by sample, so
+a joined film has the bits of a render by one process.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ if TYPE_CHECKING:
 
 __all__ = ["DistributedRender", "Span", "render_fingerprint"]
 
-#: A plate, its first sample and how many.
+#: Pixels, first sample, number of samples.
 Span = tuple[PixelSet, int, int]
 
 
 class DistributedRender:
-    """This rank's part in a render.
+    """The share of this rank in a render.
 
     Args:
-        group: the ranks.
+        group: the ranks that share the render.
     """
 
     def __init__(self, group: Group) -> None:
@@ -47,14 +47,14 @@ class DistributedRender:
         self._parts: list[tuple[PixelSet, PixelSet]] = []
 
     def begin(self) -> None:
-        """Nothing is sampled yet."""
+        """Forget the pixels of an earlier start."""
         self._parts.clear()
 
     def take(self, run: Run, spans: list[Span]) -> bool:
-        """Take the samples of this rank, and count those of all; returns whether all were taken.
+        """Take the samples of this rank, and add the counts of all; return True if all samples were taken.
 
         Raises:
-            Unsupported: of any rank.
+            Unsupported: a rank cannot make a kernel.
         """
         done, rays, truncated = run.done, run.tally.rays, run.tally.truncated
         lost, light = run.lost, run.light
@@ -89,20 +89,20 @@ class DistributedRender:
         self._parts.clear()
 
     def broadcast_numbers(self, seconds: float, error: float | None) -> tuple[float, float | None]:
-        """Seconds and an error as the first rank has them."""
+        """Return seconds and error of the first rank."""
         seconds, known, error_there = self.group.broadcast_numbers("seconds", seconds, error is not None, error or 0.0)
         return seconds, error_there if known else None
 
     def due(self, due: bool) -> bool:
-        """Return True where the first rank is to write a checkpoint."""
+        """Return True if a checkpoint is due on the first rank."""
         return bool(self.group.broadcast_numbers("a checkpoint", due)[0])
 
     def places(self, own: Tensor) -> Tensor:
-        """Whole numbers that the first rank computed; those of another kind of processor may round otherwise."""
+        """Return the integers of the first rank; other processors may have rounded differently."""
         return self.group.first(own)
 
     def state(self, own: RenderState | None, like: RenderState) -> RenderState | None:
-        """Return what the first rank read from a checkpoint, which is ``like`` a state of this render; None: nothing."""
+        """Return the state that the first rank read from a checkpoint, of the form of ``like``; None if it read none."""
         text = "" if own is None else json.dumps(own.facts)
         sent = bytes(self.group.first(torch.tensor(list(text.encode()), dtype=torch.uint8)).tolist())
         if not sent:
@@ -114,7 +114,7 @@ class DistributedRender:
         return RenderState(json.loads(sent), arrays)
 
     def _part(self, pixel_set: PixelSet) -> PixelSet:
-        """The pixels of a plate that are this rank's."""
+        """Return the pixels of a pixel set that this rank samples."""
         for whole, part in self._parts:
             if whole is pixel_set:
                 return part
@@ -127,7 +127,7 @@ class DistributedRender:
         return part
 
     def _join(self, whole: Film, own: Film) -> None:
-        """The pixels of all ranks into a film."""
+        """Gather the pixels of all ranks into a film."""
         sent = torch.cat([value.reshape(-1).view(torch.int64) for value in own.state().values()])
         for rank, values in enumerate(self.group.gather(sent)):
             places = dealt(whole.width * whole.height, rank, self.group.size).to(sent.device)
@@ -140,7 +140,7 @@ class DistributedRender:
             whole.put(places, part)
 
     def _of_all(self, own: NonFinite) -> NonFinite:
-        """Samples that are not finite, of all ranks."""
+        """Return the non-finite samples of all ranks."""
         text = json.dumps(own.plain()).encode()
         every = NonFinite()
         for values in self.group.gather(torch.tensor(list(text), dtype=torch.uint8)):
@@ -155,8 +155,8 @@ def _films(pixel_set: PixelSet) -> list[Film]:
 def render_fingerprint(
     scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
 ) -> bytes:
-    """Return a hash of what ranks must have in common to render one picture."""
-    free = having(Role.FREE, but=Role.FILES)  # upon files ranks must agree all the same
+    """Return a hash of everything that ranks must have in common to share a render."""
+    free = having(Role.FREE, but=Role.FILES)  # ranks must have the same file settings
     free["render"] = (*free["render"], "device")
     own = settings.integrator if settings.integrator.foreign else None
     return tree.fingerprint((__version__, settings.plain(free), own, fingerprints(scene, params), dtype))

@@ -1,11 +1,11 @@
-"""When a render ends, and how many samples it takes until it asks again.
+"""Stop rules of a render, and the number of samples of its next pass.
 
-Where only ``render.spp`` ends it, passes double if somebody looks at the picture in between. Else they are blocks of 16
-samples, after a start that doubles, and shorter where a block would take more time than is left, or is more than a quarter of
-the samples there are: every pass begins at a multiple of its own length, so that sequences stay balanced.
+Where only ``render.spp`` ends the render, the length of passes doubles if something looks at the picture in between. Otherwise
+it doubles up to 16 samples a pixel, and is shorter where a pass would take more time than is left, or (with a target error)
+more than a quarter of the samples so far. Every pass begins at a multiple of its length, so that sequences stay balanced.
 
-An error is asked for at four numbers of samples an octave, from 16 on: each time it may lie below the target by chance.
-A pass before a time limit is let to take twice as long as the last ones foretell, as other work on the machine may slow it.
+The error is checked at four numbers of samples an octave, from 16 on: each check may pass by chance. A pass may take twice
+as long as predicted before it breaks a time limit, as other work on the machine may slow it.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from torchpt.scene.settings import Render
 
 __all__ = ["BLOCK", "StopRules"]
 
-#: A pass never holds more samples a pixel than this.
+#: Largest number of samples a pixel of a pass.
 LARGEST_PASS = 64
-#: Where something else than the number of samples may end a render, passes hold no more than this.
+#: Largest number of samples a pixel of a pass where anything besides ``spp`` may end the render.
 BLOCK = 16
-#: What of ``render.time_limit`` may be left over or exceeded.
+#: Tolerance of ``render.time_limit``, as a share of it.
 SLACK = 0.03
-#: Samples from which on an error may end a render: of fewer it is little more than a guess.
+#: Fewest samples a pixel at which a target error may end a render; the estimate of fewer is a guess.
 FEWEST = 16
-#: How many times longer than foretold a pass may take for the time limit to hold; of a single sample, which cannot be cut.
+#: Factors on the predicted time of a pass, so that the time limit holds; the second for a pass of one sample.
 SLOWER, SLOWER_ONE = 2.0, 1.25
-#: What is left of the difference to a quicker pass, from one pass to the next.
+#: Weight of the earlier pace against that of a quicker last pass.
 FADING = 0.75
 
 
 @dataclass
 class StopRules:
-    """The rules of one render.
+    """The stop rules of one render, and its progress toward them.
 
     Attributes:
-        render: the settings.
-        streams: that share the samples of a pixel.
-        longest: seconds that a pass may take where only ``render.spp`` ends it; None: it does not matter.
-        watched: whether something looks at the picture between passes; else they are as long as they may be.
-        after: what comes after the last sample, as a share of the samples there are: pixels that are looked at again.
-        reason: the rule that ended it; "" as long as it goes on.
-        share: of the work that is done, 0..1, by the rule that is nearest to its end.
+        render: settings of the render.
+        streams: number of randomizations that share the samples of a pixel.
+        longest: longest pass in seconds where only ``render.spp`` ends the render; None: unbounded.
+        watched: False if nothing looks at the picture between passes, which are as long as possible then.
+        after: samples of resampled outliers at the end, as a share of all samples.
+        reason: the rule that ended the render; "" while it goes on.
+        share: fraction of the work that is done, 0..1, by the rule closest to its end.
     """
 
     render: Render
@@ -51,25 +51,25 @@ class StopRules:
     after: float = 0.0
     reason: str = ""
     share: float = 0.0
-    _pace: float | None = field(default=None, repr=False)  # seconds a sample of every pixel, in the last passes
+    _pace: float | None = field(default=None, repr=False)  # seconds for one sample of every pixel, by the last passes
     _last: tuple[float, float] = field(default=(0.0, 0.0), repr=False)
 
     @property
     def open(self) -> bool:
-        """Whether something else than the number of samples may end it."""
+        """True if anything besides ``spp`` may end the render."""
         return bool(self.render.stops)
 
     def checks_error(self, taken: float, adaptive: bool = False) -> bool:
-        """Whether an error may end the render at so many samples a pixel; adaptive rounds are few, so each may."""
+        """Return True if the target error is checked at ``taken`` samples a pixel; adaptive rounds are few: always."""
         if self.render.target_error is None or taken < FEWEST:
             return False
         whole = int(taken)
         return adaptive or (whole == taken and whole % (1 << max(whole.bit_length() - 3, 0)) == 0)
 
-    def told(self, taken: float, seconds: float, error: float | None) -> None:
-        """What was reached after a pass: samples a pixel, seconds of sampling, and relMSE where it is asked for.
+    def update(self, taken: float, seconds: float, error: float | None) -> None:
+        """Update the rules after a pass with samples a pixel, seconds of sampling, and relMSE (None: not checked).
 
-        An ``error`` at or below the target ends the render: who tells it must be certain of it.
+        An ``error`` at or below the target ends the render, so it should be an upper bound.
         """
         before, since = self._last
         if taken > before and seconds > since:
@@ -88,7 +88,7 @@ class StopRules:
                 self.reason = rule
 
     def step(self, taken: int) -> int:
-        """Samples of the next pass; 0 where it is to end."""
+        """Return the samples a pixel of the next pass; 0 if the render is to end."""
         left = self.render.spp - taken
         if self.reason or left <= 0:
             self.reason = self.reason or "spp"
@@ -100,7 +100,7 @@ class StopRules:
             return min(size, LARGEST_PASS, left)
         if taken == 0:
             return min(self.streams, left)
-        # The lowest bit that is set: what a pass of that length begins at a multiple of.
+        # A pass begins at a multiple of its length: that is at most the lowest bit set in `taken`.
         size = min(BLOCK, taken & -taken)
         if self.render.target_error is not None and taken >= BLOCK:
             while size > max(taken // 4, 1):
@@ -115,7 +115,7 @@ class StopRules:
         return min(size, left)
 
     def should_continue(self, mean: float) -> bool:
-        """Whether adaptive sampling goes on, at so many samples a pixel."""
+        """Return True if adaptive sampling goes on at a mean of ``mean`` samples a pixel."""
         if not self.reason and mean >= self.render.spp:
             self.reason = "spp"
         if not self.reason and self.affordable(1.0) < 1.0:
@@ -123,14 +123,14 @@ class StopRules:
         return not self.reason
 
     def time_left(self) -> float:
-        """Seconds that ``render.time_limit`` leaves, but for what comes after the last sample."""
+        """Return the seconds that ``render.time_limit`` leaves for sampling, without resampling outliers."""
         if self.render.time_limit is None:
             return float("inf")
         taken, seconds = self._last
         return self.render.time_limit - seconds - self.after * taken * (self._pace or 0.0)
 
     def affordable(self, more: float) -> float:
-        """Of ``more`` samples a pixel those for which there is time."""
+        """Return the number of samples a pixel, at most ``more``, for which there is time."""
         if self._pace is None or self._pace <= 0.0:
             return more
         return min(more, max(self.time_left(), 0.0) / (SLOWER * self._pace))

@@ -1,4 +1,4 @@
-"""What runs come to: errors against a reference, tests for bias, rates, tables."""
+"""Analyse the runs of a study: errors against a reference, bias tests, slopes, times to an error."""
 
 from __future__ import annotations
 
@@ -37,39 +37,39 @@ __all__ = [
 ]
 
 
-# ---- Whether pictures converge to their reference: is the error of their mean more than chance explains?
+# ---- Bias test: does the mean of the pictures differ from the reference by more than chance explains?
 #
-# The picture is cut into tiles, since a mean over many pixels is nearly normal where a pixel is not, and independent runs give
-# a variance of each tile's mean. Without bias
+# Pictures are averaged over tiles, as a mean over many pixels is nearly normal; independent runs give the variance of
+# each tile's mean. Without bias
 #
 #     F = Σ w (mean of runs - reference)² / Σ w (variance of that mean + variance of the reference)
 #
 # has expectation 1 and nearly the distribution of Fisher's F, whose degrees of freedom follow from the variances (Box 1954,
-# *Some theorems on quadratic forms*, theorem 3.1; Satterthwaite 1946). It finds what is moved from place to place; light that
-# is lost everywhere shows sooner in the mean over the picture. A firefly does not alarm either: it raises both sums.
+# *Some theorems on quadratic forms*, theorem 3.1; Satterthwaite 1946). F finds light that is moved within the picture; light
+# lost everywhere shows sooner in the mean over the picture. A firefly raises both sums, and so is no false alarm.
 #
-# All channels and sizes of tiles are tested; the least chance among them, times their number (Bonferroni), is the verdict's.
+# All channels and tile sizes are tested; the verdict is the smallest probability times their number (Bonferroni).
 
 
-#: A right renderer is flagged with at most this chance.
+#: Largest probability of flagging an unbiased renderer.
 SIGNIFICANCE = 1e-3
 #: Tiles along each side.
 _GRIDS = (1, 4, 16)
-#: Share of a value by which equal pictures may differ in rounding.
+#: Relative difference of equal pictures by rounding.
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
 class BiasTest:
-    """What the test found.
+    """Result of the bias test.
 
     Attributes:
-        biased: whether chance is ruled out.
-        chance: of a difference at least as large without bias.
-        squared: the mean picture's relative squared error beyond what variance explains: where the error curve ends.
-        share: of the picture's light that is too much (negative: missing), with its 95 % interval.
-        low: see ``share``.
-        high: see ``share``.
+        biased: True if chance is ruled out.
+        chance: probability of a difference at least as large without bias (p-value).
+        squared: relative squared error of the mean picture beyond its variance: the error at which the curve ends.
+        share: relative excess of light in the whole picture (negative: missing light), with its 95 % interval.
+        low: lower bound of ``share``.
+        high: upper bound of ``share``.
     """
 
     biased: bool
@@ -80,12 +80,12 @@ class BiasTest:
     high: float
 
     def plain(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the fields, ready for JSON."""
         return asdict(self)
 
 
 def tiles(image: Tensor, count: int) -> Tensor:
-    """Means over ``count x count`` parts of a picture ``(H, W, C)``, no pixel in two of them: ``(C, count²)``."""
+    """Return means ``(C, count²)`` over ``count x count`` disjoint tiles of a picture ``(H, W, C)``."""
     high, wide, channels = image.shape
     rows, columns = torch.arange(high) * count // high, torch.arange(wide) * count // wide
     cells = (rows[:, None] * count + columns).flatten()
@@ -94,14 +94,13 @@ def tiles(image: Tensor, count: int) -> Tensor:
 
 
 def bias_test(runs: Sequence[Tensor], reference: ReferencePicture, more: float = 0.0) -> BiasTest:
-    """Test independent pictures ``(H, W, 3)`` of one setting against their reference.
+    """Test independent pictures ``(H, W, 3)`` of one setting for bias against their reference.
 
     Args:
-        runs: two or more.
-        reference: the reference; a file without variances is taken to be exact.
-        more: how many times the samples of all runs together the reference has, where that is known: it has seen rare bright
-            paths of which the runs may have had none, so the runs' variance is not believed to be less than its own at as
-            many samples.
+        runs: two or more pictures.
+        reference: the reference; a file without variance counts as exact.
+        more: samples of the reference over those of all runs, if known (else 0). The reference has seen rare bright paths that
+            the runs may have missed, so the variance of the runs is taken to be at least the reference's at as many samples.
     """
     high, wide = reference.image.shape[:2]
     grids = [count for count in _GRIDS if count == 1 or min(high, wide) >= 2 * count]
@@ -123,7 +122,7 @@ def bias_test(runs: Sequence[Tensor], reference: ReferencePicture, more: float =
 
 
 def _reference_tiles(reference: ReferencePicture, count: int) -> tuple[Tensor, Tensor, float]:
-    """Tiles of the reference, the variance of each, and its degrees of freedom."""
+    """Return tiles of the reference, their variances, and the degrees of freedom of those."""
     if len(reference.runs) > 1:
         own = torch.stack([tiles(run, count) for run in reference.runs])
         return own.mean(0), own.var(0) / len(own), len(own) - 1.0
@@ -133,7 +132,7 @@ def _reference_tiles(reference: ReferencePicture, count: int) -> tuple[Tensor, T
 
 @dataclass(frozen=True)
 class _Side:
-    """Tiles ``(C, tiles)`` of both: their difference, its variance with the degrees of freedom, and their weight."""
+    """Tiles ``(C, tiles)``: difference of runs and reference, its variance with degrees of freedom, and weights."""
 
     away: Tensor
     variance: Tensor
@@ -142,7 +141,7 @@ class _Side:
 
 
 def _difference(own: Tensor, reference: Tensor, known: Tensor, freedom: float, more: float) -> _Side:
-    """``own`` is ``(runs, C, tiles)``; with ``more`` the variance is all the reference's."""
+    """Compare tiles ``own (runs, C, tiles)`` with the reference's; with ``more`` > 0 the variance is the reference's alone."""
     count, rounding = len(own), (_ROUNDING * reference.abs()).square()
     if more > 0:
         total = (1.0 + more) * known + rounding
@@ -150,19 +149,19 @@ def _difference(own: Tensor, reference: Tensor, known: Tensor, freedom: float, m
     spread = own.var(0) / count + rounding
     total = spread + known
     freedoms = total.square() / (spread.square() / (count - 1.0) + known.square() / freedom).clamp_min(1e-300)
-    freedoms = freedoms.clamp_min(min(count - 1.0, freedom))  # never less; black in all, it would be 0 of 0
+    freedoms = freedoms.clamp_min(min(count - 1.0, freedom))  # the true lower bound; 0 / 0 for black tiles
     return _Side(own.mean(0) - reference, total, freedoms, relative(1.0, reference))
 
 
 def _p_values_of_f(side: _Side) -> list[float]:
-    """The chance of each channel's F."""
+    """Return the p-value of each channel's F."""
     found = []
     for x, u, d, w in zip(side.away, side.variance, side.freedom, side.weight, strict=True):
         explained = w * u
-        if not float(explained.sum()) > 0:  # black in every run and in the reference
+        if not float(explained.sum()) > 0:  # black in all runs and the reference
             found.append(0.0 if float(x.abs().max()) > 0 else 1.0)
             continue
-        squares = (explained.square() * d / (d + 2.0)).sum()  # u² alone is too large by what u itself varies
+        squares = (explained.square() * d / (d + 2.0)).sum()  # unbiased: E u² exceeds (E u)² by the variance of u
         upper = (explained.sum().square() / squares).clamp(1.0, float(len(x)))
         ratio = (w * x.square()).sum() / explained.sum()
         found.append(f_tail(float(ratio), float(upper), _freedom(explained, d)))
@@ -170,10 +169,10 @@ def _p_values_of_f(side: _Side) -> list[float]:
 
 
 def _p_values_of_means(whole: _Side, fine: _Side) -> list[float]:
-    """The chance of each channel's mean over the picture.
+    """Return the p-value of each channel's mean over the picture.
 
-    Its variance is known twice: from how the runs' means spread, by few degrees of freedom, and from tiles, by many, where
-    those are independent. The larger one counts.
+    The variance is estimated twice: from the means of runs, with few degrees of freedom, and from tiles, with many, if those
+    are independent. The larger estimate is used.
     """
     found = []
     for x, u, parts, d in zip(whole.away, whole.variance, fine.variance, fine.freedom, strict=True):
@@ -187,12 +186,12 @@ def _p_values_of_means(whole: _Side, fine: _Side) -> list[float]:
 
 
 def _freedom(parts: Tensor, freedom: Tensor) -> float:
-    """Of a sum of variances (Satterthwaite)."""
+    """Return the degrees of freedom of a sum of variances (Satterthwaite)."""
     return min(float(parts.sum().square() / (parts.square() / freedom).sum().clamp_min(1e-300)), 1e5)
 
 
 def _share(runs: Sequence[Tensor], reference: ReferencePicture) -> tuple[float, float, float]:
-    """How much too bright the whole is, relative, with its interval (Welch)."""
+    """Return the relative excess of light of the whole picture, with its interval (Welch)."""
     own = torch.stack([run.mean() for run in runs])
     light = float(reference.image.mean())
     if not light > 0:
@@ -214,24 +213,24 @@ def _share(runs: Sequence[Tensor], reference: ReferencePicture) -> tuple[float, 
     return share, share - reach, share + reach
 
 
-# ---- The measures of one picture against a reference that is noisy itself
+# ---- Error measures against a noisy reference
 #
-# Of a picture x and a reference r that are independent, ``E (x - r)² = var x + var r + bias²``. The second is known by pixel
-# and taken off, so that what is left is the picture's own error (and may, by chance, be negative where that is small).
+# For independent picture x and reference r, ``E (x - r)² = var x + var r + bias²``. The variance of r is known by pixel and
+# subtracted: the rest estimates the picture's own error (and may be negative by chance).
 
 
 def error_map(image: Tensor, reference: ReferencePicture) -> Tensor:
-    """``(x - r)² / (r² + 0.01)``, the mean of the channels: ``(H, W)``."""
+    """Return ``(x - r)² / (r² + 0.01)``, averaged over channels: ``(H, W)``."""
     return metrics.error_map("relmse", image, reference.image)
 
 
 def relmse(image: Tensor, reference: ReferencePicture) -> float:
-    """Relative mean squared error without the reference's part."""
+    """Return relMSE without the variance of the reference."""
     return float((((image - reference.image).square() - reference.variance) * reference.weight).mean())
 
 
 def relmse_trimmed(image: Tensor, reference: ReferencePicture) -> float:
-    """The same without the 0.1 % of pixels that are furthest off (rounded down)."""
+    """Return relMSE without the 0.1 % of pixels with the largest errors (rounded down)."""
     found, own = error_map(image, reference).flatten(), (reference.variance * reference.weight).mean(-1).flatten()
     if not torch.isfinite(found).all():
         return math.nan
@@ -239,7 +238,7 @@ def relmse_trimmed(image: Tensor, reference: ReferencePicture) -> float:
 
 
 def mse(image: Tensor, reference: ReferencePicture) -> float:
-    """Mean squared error without the reference's part."""
+    """Return MSE without the variance of the reference."""
     return float(((image - reference.image).square() - reference.variance).mean())
 
 
@@ -252,13 +251,13 @@ _SHOWN = ("psnr", "ssim")
 
 
 def measures(image: Tensor, reference: ReferencePicture, names: tuple[str, ...], film: Any) -> Mapping[str, float]:
-    """The measures by name; NaN where one has no value, as SSIM of a picture smaller than its window.
+    """Return measures by name; NaN for one that is undefined, as SSIM of a picture smaller than its window.
 
     Args:
         image: ``(H, W, 3)`` float64, linear.
         reference: the reference.
-        names: which.
-        film: how a screen shows it (exposure, tonemap, gamma): what PSNR and SSIM look at.
+        names: the measures.
+        film: exposure, tonemap and gamma, for PSNR and SSIM of displayed pictures.
     """
     found: dict[str, float] = {}
     plain = shown = image, reference.image
@@ -273,17 +272,17 @@ def measures(image: Tensor, reference: ReferencePicture, names: tuple[str, ...],
     return found
 
 
-# ---- What the runs of a study come to: errors, slopes, times to an error, efficiency, bias. All that the report says
+# ---- The analysis of a study
 
 
-#: Of the least error of a scene: a reference that is noisier than this share of it is worth a word.
+#: A reference with a larger share of the least error of a scene is reported as noisy.
 _NOISY = 0.5
-#: Measures that take longer than many a run, and hardly differ from one to the next: of the first run of a step only, but
+#: Expensive measures that hardly differ between runs: evaluated for the first run of a step, unless curves show them.
 #: where curves show them.
 _EXPENSIVE = ("flip",)
-#: Runs of fewer seconds are mostly beginning and end.
+#: Runs of fewer seconds are mostly fixed cost.
 _SHORT = 0.05
-#: How far a line is followed: the logarithm of a ratio of times to the first step's.
+#: Largest extrapolation: logarithm of a ratio of times to the first step's.
 _FARTHEST = math.log(1e6)
 
 
@@ -292,14 +291,14 @@ class Step:
     """The runs of one number of samples.
 
     Attributes:
-        spp: samples a pixel; None where an extra does not say.
-        seconds: the median of its runs.
-        errors: measure to the value of each run; of some measures only the first run's.
-        nonfinite: samples that were NaN or infinite.
-        variance: of a pixel, relative to ``ref² + 0.01``; each run's part, whose mean it is.
-        pictures: makes the picture of each run.
-        times: of each run, in seconds.
-        seeds: of each run.
+        spp: samples a pixel; None if an extra picture does not have it.
+        seconds: median time of the runs.
+        errors: values of the runs by measure; of expensive measures that of the first run.
+        nonfinite: number of samples that were NaN or infinite.
+        variance: contribution of each run to the variance of a pixel relative to ``ref² + 0.01``, which is their mean.
+        pictures: functions that return the picture of each run.
+        times: seconds of each run.
+        seeds: seed of each run.
     """
 
     spp: int | None
@@ -312,11 +311,11 @@ class Step:
     seeds: list[int] = field(default_factory=list)
 
     def estimate(self, name: str) -> Estimate:
-        """The mean over runs of a measure."""
+        """Return the mean of a measure over runs."""
         return estimate(self.errors[name], positive=name in ERRORS)
 
     def efficiency(self) -> Estimate | None:
-        """``1 / (variance x seconds)``."""
+        """Return ``1 / (variance x seconds)``; None with fewer than two runs."""
         if len(self.variance) < 2:
             return None
         spread = estimate(self.variance)
@@ -330,17 +329,17 @@ class ErrorCurve:
     """A curve of the report.
 
     Attributes:
-        label: what it is called.
-        steps: in the order of time.
-        reference: what it is compared with.
-        measured: whether these are runs of a study; else pictures that others made.
-        settings: complete, of a study's runs.
-        of: the curve whose runs' pictures these are, denoised; else None. They are guesses: no slope, no efficiency.
-        look: number of its colour and mark; that of ``of`` where there is one.
-        by_spp: the line through its errors over samples.
-        by_seconds: the same over seconds.
-        bias: the verdict of the bias test.
-        times: error to where the curve reaches it.
+        label: name of the curve.
+        steps: the steps in the order of time.
+        reference: the reference.
+        measured: True for runs of the study; False for other renderers' pictures.
+        settings: complete settings of the study's runs.
+        of: the curve that this one is denoised from; else None. A denoised curve has no slope and no efficiency.
+        look: index of colour and marker; that of ``of`` for a denoised curve.
+        by_spp: fit of error over samples.
+        by_seconds: fit of error over seconds.
+        bias: result of the bias test.
+        times: for each target error, when the curve reaches it.
     """
 
     label: str
@@ -357,16 +356,16 @@ class ErrorCurve:
 
     @property
     def estimates(self) -> bool:
-        """Whether these are what a renderer of a study gave: neither others' pictures nor denoised ones."""
+        """True for pictures that a renderer of the study made: neither other renderers' nor denoised ones."""
         return self.measured and self.of is None
 
     @property
     def floor(self) -> float:
-        """The error at which the curve ends; 0 where no bias was found. That of a denoised one still falls with samples."""
+        """Error at which the curve ends; 0 if no bias was found. Denoised curves go on falling."""
         return self.bias["squared"] if self.estimates and self.bias and self.bias["biased"] else 0.0
 
     def plain(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the curve, ready for JSON."""
         return {
             "label": self.label,
             "measured": self.measured,
@@ -401,11 +400,11 @@ class SceneReport:
     """A scene of the report.
 
     Attributes:
-        name: as it was asked for.
+        name: name or path of the scene.
         lines: the curves.
-        film: how a screen shows its pictures.
-        targets: errors whose times are told.
-        notes: what a reader should know.
+        film: film settings, with which pictures are displayed.
+        targets: errors for which times are reported.
+        notes: remarks for the reader.
     """
 
     name: str
@@ -416,10 +415,10 @@ class SceneReport:
 
 
 def check_files(study: Study, prepared: Sequence[Measured]) -> None:
-    """Read the files of references and extras once, before anything is rendered.
+    """Read the files of references and extra pictures once, before anything is rendered.
 
     Raises:
-        AssetError: one that cannot be used.
+        AssetError: a file cannot be used.
     """
     for measured in prepared:
         for size in {film_size(curve.job.settings) for curve in measured.curves}:
@@ -431,7 +430,7 @@ def check_files(study: Study, prepared: Sequence[Measured]) -> None:
 
 
 def analyse(study: Study, measured: Measured) -> SceneReport:
-    """All figures of one scene."""
+    """Analyse the runs of one scene."""
     names, first = study.options["metrics"], measured.curves[0]
     truths: dict[str, ReferencePicture] = {}
 
@@ -476,7 +475,7 @@ def _line(
         images = [run.image() for run in runs]
         steps.append(_step(spp, runs, images, reference, names, film))
         if of is not None:
-            steps[-1].variance = []  # a guess that varies little is not better for it
+            steps[-1].variance = []  # low variance does not make a denoised picture better
     last, origin = steps[-1], reference.origin
     more = origin["spp"] * origin["seeds"] / ((last.spp or 1) * len(images)) if origin["made"] else 0.0
     verdict = bias_test(images, reference, more)
@@ -510,7 +509,7 @@ def _step(
 def _extra_lines(
     study: Study, measured: Measured, reference: ReferencePicture, names: tuple[str, ...]
 ) -> list[ErrorCurve]:
-    """Other renderers' pictures: those of one name are one curve, of one time one step."""
+    """Return curves of other renderers' pictures, grouped by name, and into steps by time."""
     film, lines = measured.curves[0].job.settings, {}
     for extra in sorted(study.extras, key=lambda extra: extra.seconds):
         if extra.scene != measured.name:
@@ -543,7 +542,7 @@ def _picture(extra: Extra, size: tuple[int, int]) -> Tensor:
 
 
 def common_targets(lines: Sequence[ErrorCurve], main: str) -> tuple[float, ...]:
-    """An error that all measured curves without bias come down to: the least of the worst of them."""
+    """Return an error that all unbiased curves reach: the largest of their least errors."""
     measured = [line for line in lines if line.estimates]
     lines = [line for line in measured if not (line.bias and line.bias["biased"])] or measured
     least = [min((e.mean for s in line.steps if (e := s.estimate(main)).mean > 0), default=0.0) for line in lines]
@@ -551,25 +550,25 @@ def common_targets(lines: Sequence[ErrorCurve], main: str) -> tuple[float, ...]:
 
 
 def _fits(line: ErrorCurve, main: str, targets: Sequence[float]) -> None:
-    """Slopes over samples and seconds, and when the curve reaches each target: of denoised ones only within their runs."""
+    """Fit slopes over samples and seconds, and find when the curve reaches each target; without extrapolation if denoised."""
     values = [step.errors[main] for step in line.steps]
     if all(step.spp for step in line.steps):
         line.by_spp = fit([float(step.spp or 0) for step in line.steps], values)
     line.by_seconds = fit([step.seconds for step in line.steps], values)
     for target in targets:
         found = line.by_seconds.reach(math.log(target)) if line.by_seconds else None
-        origin: dict[str, Any] = {"error": target, "seconds": None}
+        reached: dict[str, Any] = {"error": target, "seconds": None}
         if found is not None:
             place, beyond = found
             inside = abs(place.mean - math.log(line.steps[0].seconds)) < _FARTHEST
-            if beyond and line.of is not None:  # no line tells how a guess goes on
+            if beyond and line.of is not None:  # denoised curves are not extrapolated
                 pass
-            elif beyond and line.floor >= target:  # it never gets there
-                origin["never"] = True
+            elif beyond and line.floor >= target:  # bias keeps the error above the target
+                reached["never"] = True
             elif inside or not beyond:
                 bounds = [None if x is None else _exp(x) for x in (place.mean, place.low, place.high)]
-                origin |= dict(zip(("seconds", "low", "high"), bounds, strict=True)) | {"extrapolated": beyond}
-        line.times.append(origin)
+                reached |= dict(zip(("seconds", "low", "high"), bounds, strict=True)) | {"extrapolated": beyond}
+        line.times.append(reached)
     if line.of is not None:
         line.by_spp = line.by_seconds = None
 
@@ -592,22 +591,20 @@ def _notes(scene_report: SceneReport, main: str) -> list[str]:
     shortest = min(step.seconds for line in scene_report.lines if line.measured for step in line.steps)
     if shortest < _SHORT:
         notes.append(
-            f"The shortest runs take {1e3 * shortest:.2g} ms, of which a part is the same for any number of samples: "
-            "slopes over seconds come out too steep. A larger film, or steps of more samples, tell more."
+            f"The shortest runs take {1e3 * shortest:.2g} ms, part of which does not depend on the number of samples: slopes "
+            "over seconds are too steep. Use a larger film, or steps of more samples."
         )
     origin = scene_report.lines[0].reference.origin
     if not origin["made"] and not origin["variance"]:
-        notes.append(
-            "The reference file says nothing of its variance, so it is taken to be exact; its noise counts as error."
-        )
+        notes.append("The reference file has no variance, so it is taken to be exact; its noise counts as error.")
     drowned = [line.label for line in scene_report.lines if any(s.estimate(main).mean <= 0 for s in line.steps)]
     if any(line.of is not None for line in scene_report.lines):
         notes.append(
-            "Denoised pictures are guesses: they are biased by an amount that falls with samples by no known law. So their "
-            "curves have no slope and no efficiency, and no time to an error beyond their runs."
+            "Denoised pictures are guesses: their bias falls with samples by no known law. So their curves have no slope, no "
+            "efficiency, and no time to an error beyond their runs."
         )
     if drowned:
         notes.append(
-            f"Some steps lie below what the reference can tell and are left out of curves: {', '.join(drowned)}."
+            f"Some steps have errors below the noise of the reference and are left out of curves: {', '.join(drowned)}."
         )
     return notes

@@ -1,4 +1,4 @@
-"""Numbers as a reader wants them."""
+"""Format numbers, durations and intervals for the report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["count", "interval", "number", "seconds", "span", "times"]
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """With so many digits that count; small and large ones by powers of ten."""
+    """Return a number with ``digits`` significant digits; very small and large ones with a power of ten."""
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -29,7 +29,7 @@ def _raised(exponent: int) -> str:
 
 
 def seconds(value: float | None) -> str:
-    """A duration."""
+    """Return a duration in seconds with a suitable unit."""
     if value is None:
         return "–"
     if value < 1:
@@ -42,22 +42,22 @@ def seconds(value: float | None) -> str:
 
 
 def times(value: float) -> str:
-    """A ratio."""
+    """Return a ratio such as ``2.5 ×``."""
     return f"{number(value)} ×"
 
 
 def count(value: int) -> str:
-    """A whole number in groups of three."""
+    """Return an integer with its digits in groups of three."""
     return f"{value:,}".replace(",", " ")
 
 
 def interval(found: Estimate) -> str:
-    """The bounds of an estimate; empty where there are none."""
+    """Return the bounds of an estimate; empty if there are none."""
     return "" if found.low is None or found.high is None else f"{number(found.low)} … {number(found.high)}"
 
 
 def span(low: float | None, high: float | None) -> str:
-    """Two durations in one unit; empty where they are not known."""
+    """Return two durations in one unit; empty if unknown."""
     if low is None or high is None:
         return ""
     unit, name = (1e-3, "ms") if high < 1 else (1.0, "s")

@@ -1,4 +1,4 @@
-"""The page of a study: its pictures and tables as one HTML file."""
+"""Render the page of a study: its pictures and tables in one HTML file."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ from torchpt.reports.study import Study
 __all__ = ["Figure", "ImageStrip", "Panel", "closest_step", "largest_errors", "page", "sheet_of"]
 
 
-# ---- Pictures of the report: at equal time, where errors are largest, and maps of the errors
+# ---- Pictures of the report: crops at equal time, where errors are largest, and maps of the errors
 
 
-#: Widest map, in pixels; larger ones are means over squares.
+#: Largest side of a map in pixels; larger maps are averaged over squares.
 _WIDE = 400
-#: A crop is so much of the smaller side, within these bounds in pixels.
-_PART, _LEAST, _MOST = 5, 16, 64  # 64 pixels are shown at three times their size or more
+#: A crop has 1 / _PART of the smaller side, within these bounds in pixels.
+_PART, _LEAST, _MOST = 5, 16, 64  # crops are enlarged three times or more
 
 
 @dataclass
 class Panel:
-    """One setting at the common time.
+    """One curve at the common time.
 
     Attributes:
-        line: its curve.
-        step: the step nearest in time.
-        crop: PNG of the crop.
-        errors: PNG of the map.
+        line: the curve.
+        step: the step whose time is closest.
+        crop: PNG of the cropped picture.
+        errors: PNG of the error map.
     """
 
     line: ErrorCurve
@@ -53,16 +53,16 @@ class Panel:
 
 @dataclass
 class ImageStrip:
-    """A scene's pictures.
+    """The pictures of a scene.
 
     Attributes:
         seconds: the common time.
-        place: x, y, width, height of the crop in pixels.
+        place: x, y, width and height of the crop in pixels.
         whole: PNG of the reference.
-        crop: PNG of its crop.
-        size: width and height of the picture.
-        panels: one a curve.
-        scale: least and greatest error of the maps' colours.
+        crop: PNG of the cropped reference.
+        size: width and height of the picture in pixels.
+        panels: one for each curve.
+        scale: smallest and largest error of the colour map.
     """
 
     seconds: float
@@ -75,14 +75,14 @@ class ImageStrip:
 
 
 def closest_step(line: ErrorCurve, seconds: float) -> Step:
-    """The step of a curve whose time is nearest, as a ratio."""
+    """Return the step of a curve whose time is closest to ``seconds``, by ratio."""
     return min(line.steps, key=lambda step: abs(math.log(step.seconds / seconds)))
 
 
 def largest_errors(errors: Tensor, side: int) -> tuple[int, int]:
-    """Where a square of ``side`` pixels holds most error: x and y of its corner in a map ``(H, W)``.
+    """Return x and y of the corner of the ``side``-pixel square with the largest errors in a map ``(H, W)``.
 
-    Errors count by their root, so that a single firefly does not choose.
+    Square roots of errors are summed, so that a single firefly does not decide.
     """
     sums = torch.nn.functional.avg_pool2d(errors.sqrt()[None, None], side, stride=1)[0, 0]
     place = int(sums.argmax())
@@ -90,9 +90,9 @@ def largest_errors(errors: Tensor, side: int) -> tuple[int, int]:
 
 
 def sheet_of(scene_report: SceneReport) -> ImageStrip | None:
-    """The pictures of all curves that have the first one's film, at the longest time that each of them has.
+    """Return pictures of all curves with the first one's film, at the longest time that all of them have.
 
-    Denoised ones have no say in where the crop lies.
+    The position of the crop does not depend on denoised curves.
     """
     reference, film = scene_report.lines[0].reference, scene_report.film
     lines = [line for line in scene_report.lines if line.reference.image.shape == reference.image.shape]
@@ -125,7 +125,7 @@ def _reduced(errors: Tensor) -> Tensor:
 
 
 def _scale(maps: Sequence[Tensor]) -> tuple[float, float]:
-    """Whole powers of ten about most values."""
+    """Return powers of ten that enclose most values."""
     values = torch.cat([found.flatten() for found in maps])
     values = values[values > 0].log10()
     if not len(values):
@@ -137,7 +137,7 @@ def _scale(maps: Sequence[Tensor]) -> tuple[float, float]:
 
 
 def _coloured(errors: Tensor, scale: tuple[float, float]) -> np.ndarray:
-    """A map in colours, by the logarithm."""
+    """Return an error map in false colours, on a logarithmic scale."""
     low, top = (math.log10(x) for x in scale)
     level = (errors.clamp_min(1e-30).log10() - low) / (top - low)
     return (false_colour(level, 1.0).numpy() * 255 + 0.5).astype(np.uint8)
@@ -151,13 +151,13 @@ def _png(levels: np.ndarray) -> bytes:
     return encoded.getvalue()
 
 
-# ---- The report as one file: every picture inside, no script, nothing asked of any server
+# ---- The page: self-contained HTML, without scripts
 
 
-#: As the curves' marks are drawn.
+#: Characters for the markers of curves.
 _MARKS = "●■▲◆▼✚✖★"
 _HOLLOW = "○□△◇▽✛✕☆"
-#: Name -> PNG and SVG.
+#: PNG and SVG.
 Figure = tuple[bytes, bytes]
 
 
@@ -168,14 +168,14 @@ def page(
     plots: Sequence[dict[str, Figure]],
     made: str,
 ) -> str:
-    """The text of ``report.html``.
+    """Return the text of ``report.html``.
 
     Args:
-        study: what was asked.
-        scene_reports: a scene each.
-        sheets: their pictures.
-        plots: their figures: ``seconds``, ``spp`` (where there is one) and ``measures``.
-        made: when and on what.
+        study: the study.
+        scene_reports: the analysed scenes.
+        sheets: pictures of each scene.
+        plots: figures of each scene: ``seconds``, ``spp`` (if it has one) and ``measures``.
+        made: version, date and machine.
     """
     template = (Path(__file__).parent / "report.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
@@ -212,7 +212,7 @@ def _scene(
 
 
 def _headline(scene_report: SceneReport, main: str) -> str:
-    """Who is first, and by how much, among settings without bias; or that the runs do not tell."""
+    """Return a sentence on the fastest unbiased setting and its lead, or that it is not significant; "" for a single one."""
     able = [line for line in scene_report.lines if line.estimates and not (line.bias and line.bias["biased"])]
     lines = sorted(
         (line for line in able if line.times and line.times[-1]["seconds"]), key=lambda line: line.times[-1]["seconds"]
@@ -226,8 +226,8 @@ def _headline(scene_report: SceneReport, main: str) -> str:
         (lines[0].times[-1]["high"], lines[1].times[-1]["low"]),
     )
     if high is None or low is None or high >= low:
-        return f"Which comes to {main} {aim} first, {first} or {second}, these runs do not tell: more would."
-    text = f"{first} comes to {main} {aim} first, in {formatting.seconds(least)}: "
+        return f"These runs do not show whether {first} or {second} reaches {main} {aim} first: more runs would."
+    text = f"{first} reaches {main} {aim} first, in {formatting.seconds(least)}: "
     text += f"{formatting.times(timed[1][0] / least)} as fast as {second}"
     return f"{text}." if len(timed) == 2 else f"{text}, {formatting.times(most / least)} as fast as {last}."
 
@@ -241,7 +241,8 @@ def _about(scene_report: SceneReport) -> str:
     origin, spp = reference.origin, formatting.count(reference.origin["spp"])
     return (
         f"{size} Reference: the mean of {origin['seeds']} independent runs of {spp} samples a pixel "
-        f"({formatting.seconds(origin['seconds'])} in all); its own relMSE, {formatting.number(reference.noise, 2)}, is taken off."
+        f"({formatting.seconds(origin['seconds'])} in all); its own relMSE, {formatting.number(reference.noise, 2)}, "
+        "is taken off."
     )
 
 
@@ -265,16 +266,16 @@ def _row(scene_report: SceneReport, line: ErrorCurve, main: str) -> dict[str, An
 
 
 def _time_cell(scene_report: SceneReport, line: ErrorCurve, number: int) -> dict[str, Any]:
-    origin, first = line.times[number], scene_report.lines[0].times[number]
-    if origin.get("never"):
+    reached, first = line.times[number], scene_report.lines[0].times[number]
+    if reached.get("never"):
         return _cell("never", "its bias is larger", tone="bad")
-    if origin["seconds"] is None:
+    if reached["seconds"] is None:
         return _cell("–", "too far to tell" if line.by_seconds else "beyond its runs" if line.of else "")
-    parts = [formatting.span(origin["low"], origin["high"]), "extrapolated" if origin["extrapolated"] else ""]
+    parts = [formatting.span(reached["low"], reached["high"]), "extrapolated" if reached["extrapolated"] else ""]
     if line is not scene_report.lines[0] and first["seconds"]:
-        ratio = first["seconds"] / origin["seconds"]
+        ratio = first["seconds"] / reached["seconds"]
         parts.insert(0, f"{formatting.times(max(ratio, 1 / ratio))} {'faster' if ratio >= 1 else 'slower'}")
-    return _cell(formatting.seconds(origin["seconds"]), *parts)
+    return _cell(formatting.seconds(reached["seconds"]), *parts)
 
 
 def _efficiency_cell(scene_report: SceneReport, line: ErrorCurve) -> dict[str, Any]:
@@ -347,8 +348,8 @@ def _sheet(sheet: ImageStrip, main: str) -> dict[str, Any]:
             }
         )
     return {
-        "about": f"Of every setting the run nearest to {formatting.seconds(sheet.seconds)}, where errors are largest: "
-        f"{wide} × {high} pixels, enlarged. Times are told, since steps of samples do not meet exactly.",
+        "about": f"The run of each setting that is closest to {formatting.seconds(sheet.seconds)}, cropped to the "
+        f"{wide} × {high} pixels with the largest errors, enlarged. Times differ, as steps of samples do not match exactly.",
         "whole": _data(sheet.whole, "png"),
         "crop": _data(sheet.crop, "png"),
         "side": 3 * wide,
@@ -360,7 +361,7 @@ def _sheet(sheet: ImageStrip, main: str) -> dict[str, Any]:
 
 
 def _plot(figure: Figure, alt: str) -> dict[str, Any]:
-    """The vector form, with the size in pixels that keeps its place while it loads."""
+    """Return an SVG and its size in pixels, which reserves its space while it loads."""
     text = figure[1].decode()
     wide, high = (float(text.partition(f'{name}="')[2].partition("pt")[0]) for name in ("width", "height"))
     return {"data": _data(figure[1], "svg+xml"), "alt": alt, "width": round(wide), "height": round(high)}
@@ -378,30 +379,30 @@ def _ramp() -> str:
 
 
 def _method(study: Study) -> list[str]:
-    """What a reader must know to trust the figures."""
+    """Return paragraphs on the method of measurement."""
     seeds, steps = study.options["seeds"], ", ".join(map(formatting.count, study.options["spp"]))
     denoised = (
-        "Denoised curves, of loose dashes and hollow marks, show the pictures of the same runs, denoised by what first "
-        "surfaces are like (albedo and normals). Their times are those of the runs with these layers, and of denoising."
+        "Denoised curves (loose dashes, hollow markers) show the pictures of the same runs, denoised with albedo and normals "
+        "of first surfaces. Their times are those of the runs with these layers, and of denoising."
     )
     return [
-        f"Each step ({steps} samples a pixel) was run {seeds} times with independent seeds. Times are those of sampling, "
-        "without loading, building and compiling; a run that is thrown away goes before. Settings took turns.",
-        "Errors are means over the runs, times medians. Bands and intervals are 95 %, Student's t of the logarithm. From "
-        "relMSE, its trimmed form (without the 0.1 % of pixels that are furthest off) and MSE the reference's own variance is "
-        "taken off; the other measures include it. PSNR and SSIM look at what a screen shows. HDR-FLIP "
-        "is that of a step's first run.",
-        "A slope is that of the straight line through the logarithms of error and samples; −1 is what independent samples "
-        "give. The time to an error is read from the line over seconds, marked where that lies beyond the runs. Efficiency is "
-        "1 / (variance × seconds) at the largest step, the variance relative to the reference's square + 0.01.",
-        "Bias: the mean of the runs of the largest step differs from the reference by more than the spread of both explains, "
-        "with a chance of less than 0.1 % otherwise. A dotted line is the error at which such a curve ends.",
+        f"Each step ({steps} samples a pixel) was run {seeds} times with independent seeds. Times are of sampling alone, "
+        "without loading, building and compiling, after a warm-up run. Runs of different settings are interleaved.",
+        "Errors are means over the runs, times are medians. Bands and intervals are 95 % (Student's t of the logarithm). The "
+        "variance of the reference is subtracted from relMSE, its trimmed form (without the 0.1 % of pixels with the largest "
+        "errors) and MSE; other measures include it. PSNR and SSIM compare displayed pictures. HDR-FLIP is of each step's "
+        "first run.",
+        "A slope is of the straight line through the logarithms of error and samples; independent samples give −1. The time to "
+        "an error is read from the line over seconds, and marked if it lies outside of the runs. Efficiency is 1 / (variance × "
+        "seconds) at the largest step, with the variance relative to the reference's square + 0.01.",
+        "Biased: the mean over the runs of the largest step differs from the reference by more than their variances explain "
+        "(p < 0.1 %). A dotted line is the error at which such a curve ends.",
         *((denoised,) if study.options["denoise"] else ()),
     ]
 
 
 def _settings(scene_reports: Sequence[SceneReport]) -> str:
-    """What ran, as a scene file would state it."""
+    """Return the complete settings as YAML."""
     import yaml
 
     shown: dict[str, Any] = {}

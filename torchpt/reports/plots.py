@@ -1,7 +1,7 @@
-"""The curves: error over seconds and over samples, with 95 % bands; PNG and SVG.
+"""Plot error over seconds and over samples, with 95 % bands, as PNG and SVG.
 
-Colours are those of Okabe and Ito (2008), which all kinds of sight tell apart; marks and dashes differ too, so that a print
-without colours can be read.
+Colours are those of Okabe and Ito (2008), which colour-blind readers can distinguish; markers and dashes differ too, for
+prints in grey.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ __all__ = ["COLOURS", "NAMES", "curves", "encoded", "overview"]
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D1F")
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 _DASHES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)))
-#: Of denoised pictures, whose marks are hollow and whose colour is that of the curve that they are made of.
+#: Dashes of denoised curves, which have hollow markers and the colour of the curve that was denoised.
 _DENOISED = (0, (4, 4))
-#: How measures are written.
+#: Names of measures in the report.
 NAMES = {
     "relmse": "relMSE",
     "relmse_trimmed": "relMSE, 0.1 % trimmed",
@@ -46,7 +46,7 @@ _STYLE: dict[str, Any] = {
 
 
 def _matplotlib() -> Any:
-    """Matplotlib without a window and without its global state."""
+    """Import matplotlib without a window."""
     os.environ.setdefault("MPLBACKEND", "agg")
     import matplotlib
 
@@ -54,7 +54,7 @@ def _matplotlib() -> Any:
 
 
 def curves(scene_report: SceneReport, measure: str, over: str) -> Any:
-    """One figure: a measure over ``seconds`` or ``spp``, of every curve that has it."""
+    """Return the figure of a measure over ``seconds`` or ``spp``, with all curves that have it."""
     matplotlib = _matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -82,7 +82,7 @@ def curves(scene_report: SceneReport, measure: str, over: str) -> Any:
 
 
 def overview(scene_report: SceneReport, measures: Sequence[str]) -> Any:
-    """All measures over seconds, small, in one figure."""
+    """Return a figure of all measures over seconds, in small plots."""
     matplotlib = _matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -103,18 +103,18 @@ def overview(scene_report: SceneReport, measures: Sequence[str]) -> Any:
 
 
 def encoded(figure: Any) -> tuple[bytes, bytes]:
-    """The figure as PNG and as SVG."""
+    """Return a figure as PNG and as SVG."""
     matplotlib = _matplotlib()
     png, svg = BytesIO(), BytesIO()
     with matplotlib.rc_context(_STYLE):
         figure.savefig(png, format="png", dpi=200)
-        figure.set_layout_engine("none")  # it is laid out: once is enough
+        figure.set_layout_engine("none")  # keep the layout of the PNG
         figure.savefig(svg, format="svg", metadata={"Date": None})
     return png.getvalue(), svg.getvalue()
 
 
 def _points(line: ErrorCurve, measure: str, over: str) -> list[tuple[float, float, float, float]]:
-    """x, mean, lower and upper bound of the steps that can be shown."""
+    """Return x, mean, lower and upper bound of each step that can be drawn."""
     points = []
     for step in line.steps:
         found, x = step.estimate(measure), step.seconds if over == "seconds" else step.spp
@@ -130,7 +130,7 @@ def _points(line: ErrorCurve, measure: str, over: str) -> list[tuple[float, floa
 
 
 def _draw(axes: Any, line: ErrorCurve, measure: str, over: str, slopes: bool | None = True) -> None:
-    """One curve; named in the legend with its slope, without it, or (None) not at all."""
+    """Draw one curve; ``slopes``: with a legend and slope, without slope (False), or without a legend (None)."""
     look, inside = line.look, "auto" if line.of is None else "white"
     colour, mark = COLOURS[look % len(COLOURS)], _MARKS[look % len(_MARKS)]
     dash: Any = _DASHES[(look // len(COLOURS) + look) % len(_DASHES)] if line.measured else ":"
@@ -144,12 +144,12 @@ def _draw(axes: Any, line: ErrorCurve, measure: str, over: str, slopes: bool | N
     axes.plot(x, mean, marker=mark, markersize=5, markerfacecolor=inside, label=label, **style)
     if x == sorted(x):
         axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
-    else:  # times so short that more samples took less
+    else:  # runs so short that more samples took less time
         axes.vlines(x, low, high, color=colour, alpha=0.5)
     floor = line.floor if measure == "relmse" else 0.0
     if floor > 0:
         axes.axhline(floor, color=colour, linewidth=1.0, linestyle=(0, (1, 2)))
-        if not axes.texts:  # said once
+        if not axes.texts:  # label it once
             place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
             axes.annotate("bias", (1.0, floor), fontsize=9, color=colour, **place)
 
@@ -160,7 +160,7 @@ def _slope(line: ErrorCurve, over: str) -> str:
 
 
 def _guide(axes: Any, lines: Sequence[ErrorCurve], measure: str) -> None:
-    """How an unbiased estimate of independent samples falls."""
+    """Draw the guide ``1 / samples`` of an unbiased estimator."""
     points = [point for line in lines if line.of is None for point in _points(line, measure, "spp")]
     if measure not in ("relmse", "mse", "relmse_trimmed") or not points:
         return

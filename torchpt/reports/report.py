@@ -1,4 +1,4 @@
-"""From runs to files: ``report.html``, ``report.json``, and the plots as PNG and SVG."""
+"""Write a study's report: ``report.html``, ``report.json``, and the plots as PNG and SVG."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ __all__ = ["facts_of", "write_report"]
 
 
 def write_report(study: Study, measured: Sequence[Measured], folder: Path) -> list[SceneReport]:
-    """Work everything out and write the files.
+    """Analyse the runs of a study and write its report.
 
     Args:
-        study: what was asked.
-        measured: its scenes, whose runs are there.
-        folder: where to; it exists.
+        study: the study.
+        measured: its scenes, with all runs.
+        folder: an existing folder.
 
     Returns:
-        What the files say.
+        The analysed scenes.
 
     Raises:
-        OutputError: a file that cannot be written.
+        OutputError: a file cannot be written.
     """
     scene_reports = [analyse(study, scene) for scene in measured]
     sheets = [sheet_of(scene_report) for scene_report in scene_reports]
@@ -70,7 +70,7 @@ def _figures(scene_report: SceneReport, measures: tuple[str, ...]) -> dict[str, 
 
 
 def facts_of(study: Study, scene_reports: Sequence[SceneReport], made: str) -> dict[str, Any]:
-    """All that the report says, in plain values."""
+    """Return the content of the report as plain values."""
     options = {key: value for key, value in study.options.items() if key not in ("extra", "target")}
     return {
         "torchpt": __version__,
@@ -90,7 +90,7 @@ def facts_of(study: Study, scene_reports: Sequence[SceneReport], made: str) -> d
 
 
 def plain(value: Any) -> Any:
-    """As JSON knows it: what is not finite becomes null."""
+    """Return a value ready for JSON; non-finite numbers become null."""
     if isinstance(value, ParsedParams):
         return plain({"type": value.name, **value.values})
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Timed runs of a study that resume: where they are kept, the reference pictures, the measuring."""
+"""Render and time the runs of a study, keep them on disk, and resume; make references."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from torchpt.reports.study import Study, Variant
 from torchpt.scene.devices import device_of
 from torchpt.scene.fingerprint import fingerprint as fingerprint_of
 from torchpt.scene.formats.description import Description, overridden, read_description
-from torchpt.scene.formats.overrides import origin
+from torchpt.scene.formats.overrides import told
 from torchpt.scene.prepare import SceneCache, scene_cache
 from torchpt.scene.scene import Scene
 from torchpt.scene.settings import Settings, having
@@ -55,14 +55,14 @@ __all__ = [
 ]
 
 
-# ---- Finished runs on disk: a picture and its facts each, so that a study which was stopped resumes
+# ---- Finished runs on disk: a picture and a JSON file each, from which a stopped study resumes
 #
-# A run's name is a hash of all that it depends on: the scene and its files, every setting, seed and samples, the renderer's
-# own source and the machine. So a study that changed takes up what still holds of it and never a wrong run. The facts are
-# written after the picture and say that the run is whole.
+# A run's name is a hash of everything it depends on: the scene and its files, all settings, seed, spp, the renderer's source
+# and the machine. So a changed study reuses the runs that are still valid, and no others. The JSON file is written after the
+# picture: it marks a complete run.
 
 
-#: Rooms that no picture depends on.
+#: Packages and files on which no picture depends.
 _WITHOUT_EFFECT = ("reports", "commands", "cli/main.py", "__main__.py", "share")
 
 
@@ -71,8 +71,8 @@ class Run:
     """A finished run.
 
     Attributes:
-        file: its picture, ``.exr``.
-        facts: ``spp seed seconds set_up nonfinite_samples rays``, and what it was a run of.
+        file: the picture, ``.exr``.
+        facts: ``spp seed seconds set_up nonfinite_samples rays``, and what the run depends on.
     """
 
     file: Path
@@ -80,11 +80,11 @@ class Run:
 
     @property
     def seconds(self) -> float:
-        """Of sampling alone."""
+        """Seconds of sampling."""
         return self.facts["seconds"]
 
     def image(self) -> Tensor:
-        """The picture ``(H, W, 3)`` float64."""
+        """Return the picture ``(H, W, 3)`` float64."""
         return read_image(self.file)[..., :3].double()
 
 
@@ -92,10 +92,10 @@ class Store:
     """The folder of a study's runs.
 
     Args:
-        folder: made where it is not there; others may share it.
+        folder: the folder, which is created if missing; studies may share it.
 
     Raises:
-        OutputError: it cannot be made or written.
+        OutputError: the folder cannot be created or written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -109,7 +109,7 @@ class Store:
             raise OutputError(folder, f"cannot be used for runs ({error.strerror or error})") from None
 
     def get(self, name: str) -> Run | None:
-        """The run of this name, where it is there and whole."""
+        """Return the run of this name; None if it is missing or incomplete."""
         try:
             facts = json.loads((self.folder / f"{name}.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -119,7 +119,7 @@ class Store:
         return Run(picture, facts) if whole and picture.is_file() else None
 
     def put(self, name: str, image: Tensor, facts: Mapping[str, Any]) -> Run:
-        """Keep a run."""
+        """Write a run, and return it."""
         picture = self.folder / f"{name}.exr"
         write_image(picture, image)
         write_whole(self.folder / f"{name}.json", json.dumps(facts, indent=1).encode())
@@ -127,10 +127,10 @@ class Store:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file beside its place and move it there.
+    """Write a file atomically: to a temporary file, which is renamed.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     temporary = temporary_beside(path)
     try:
@@ -144,14 +144,14 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def name_of(facts: Mapping[str, Any]) -> str:
-    """The name of a run that depends on these facts, on this renderer and on this machine."""
+    """Return the name of a run: a hash of these facts, the renderer and the machine."""
     whole = {"facts": facts, "torchpt": __version__, "source": _source(), "torch": torch.__version__, **machine()}
     return fingerprint(json.dumps(whole, sort_keys=True)).hex()
 
 
 @lru_cache(maxsize=1)
 def machine() -> dict[str, Any]:
-    """What times depend on: processor, cores, threads, GPU."""
+    """Return what times depend on: processor, cores, threads, GPU."""
     processor = platform.processor() or platform.machine()
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -164,7 +164,7 @@ def machine() -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def _source() -> str:
-    """A hash of the package, but for what stands above rendering."""
+    """Return a hash of the package's source, without the packages above rendering."""
     root = Path(__file__).parents[1]
     hashed = hashlib.blake2b(digest_size=12)
     for path in sorted(root.rglob("*.py")):
@@ -174,18 +174,18 @@ def _source() -> str:
     return hashed.hexdigest()
 
 
-# ---- The reference: a file, or the mean of independent runs, whose variance is known and taken off squared errors
+# ---- References: a file, or the mean of independent runs, whose variance is subtracted from squared errors
 
 
 @dataclass(frozen=True)
 class ReferencePicture:
-    """What pictures are compared with.
+    """The reference of a scene.
 
     Attributes:
         image: ``(H, W, 3)`` float64.
-        variance: of ``image`` by value, the same shape; 0 where nobody knows it.
-        runs: the independent pictures ``(H, W, 3)`` that it is the mean of; empty for a file.
-        origin: where it comes from, for the report.
+        variance: variance of ``image``, of the same shape; 0 if unknown.
+        runs: independent pictures ``(H, W, 3)`` of which ``image`` is the mean; empty for a file.
+        origin: its origin, for the report.
     """
 
     image: Tensor
@@ -195,11 +195,11 @@ class ReferencePicture:
 
     @cached_property
     def weight(self) -> Tensor:
-        """Of a squared error that becomes relative: ``1 / (ref² + 0.01)``."""
+        """Weight that makes squared errors relative: ``1 / (ref² + 0.01)``."""
         return relative(1.0, self.image)
 
     def shown(self, film: Any) -> Tensor:
-        """As a screen shows it; the latest is kept."""
+        """Return the displayed reference; the latest is cached."""
         key = (film.exposure, film.tonemap, film.gamma)
         if key not in self._shown:
             self._shown.clear()
@@ -212,12 +212,12 @@ class ReferencePicture:
 
     @property
     def noise(self) -> float:
-        """Its own relMSE, as far as it is known."""
+        """The reference's own relMSE, as far as known."""
         return float((self.variance * self.weight).mean())
 
 
 def from_runs(runs: Sequence[Run]) -> ReferencePicture:
-    """The mean of independent runs; the variance of that mean is their spread over their number."""
+    """Return the mean of independent runs, with the variance of that mean."""
     images = tuple(run.image() for run in runs)
     stack = torch.stack(images)
     origin = {
@@ -231,14 +231,14 @@ def from_runs(runs: Sequence[Run]) -> ReferencePicture:
 
 
 def from_file(path: str, size: tuple[int, int]) -> ReferencePicture:
-    """A picture from a file; its layer ``variance`` (of the mean, as ``film.aovs=[variance]`` writes it) counts.
+    """Return a reference from a file; its layer ``variance`` (as ``film.aovs=[variance]`` writes it) is that of the mean.
 
     Args:
-        path: linear, such as ``.exr``.
+        path: a linear picture, such as ``.exr``.
         size: width and height that it must have.
 
     Raises:
-        AssetError: a file that cannot be read, of another size, or with values that are not finite.
+        AssetError: the file cannot be read, has another size, or has values that are not finite.
     """
     layers = read_layers(path)
     image = layers["image"] if "image" in layers else next(iter(layers.values()))
@@ -258,17 +258,16 @@ def from_file(path: str, size: tuple[int, int]) -> ReferencePicture:
     return ReferencePicture(image.double(), spread, (), {"made": False, "file": path, "variance": usable})
 
 
-# ---- The runs of a study: which there are, and how each is timed
+# ---- The runs of a study: which there are, and how they are timed
 #
-# Every step of a curve has independent runs with seeds of their own. Settings take turns, one seed after the other, so that a
-# machine that slows down slows all of them. Whenever they change, a run that is thrown away comes first: what it compiles and
-# builds is no run's time.
+# Each step of a curve has independent runs with their own seeds. Settings are interleaved, seed by seed, so that a machine that
+# slows down affects all of them. After each change of settings a warm-up run is discarded, which compiles and builds.
 #
-# For the denoised pictures of a curve its runs are rendered once more, by the same seeds and with the layers that the denoiser
-# looks at: the picture under the noise is the same to the bit, and the curve's own times are without those layers.
+# Denoised curves render the runs again, with the same seeds and the AOVs that the denoiser needs: the noisy pictures are the
+# same to the bit, and the times of the other curve do not include the AOVs.
 
 
-#: Settings that no run depends on, or that each has its own of.
+#: Settings on which runs do not depend, or that differ from run to run.
 _FREE = {
     "film": (*having(Role.FREE)["film"], "aovs"),
     "render": (*having(Role.FILES)["render"], "seed", "spp"),
@@ -276,11 +275,11 @@ _FREE = {
 
 
 class Stopped(Exception):
-    """A wish to stop was met.
+    """Raised when ``on_progress`` stops a study.
 
     Attributes:
-        done: runs that are kept.
-        total: runs of the study.
+        done: number of runs on disk.
+        total: number of runs of the study.
     """
 
     def __init__(self, done: int, total: int) -> None:
@@ -290,14 +289,14 @@ class Stopped(Exception):
 
 @dataclass
 class Job:
-    """Settings of which runs are wanted.
+    """Complete settings of a group of runs, which differ in spp and seed.
 
     Attributes:
-        scene: loaded.
-        settings: complete; spp and seed are set for each run.
-        facts: what runs depend on, beside spp and seed.
-        purpose: ``run`` or ``reference``: their seeds never meet.
-        left: what its runs left for the next one: its kernels, while those of another setting are in the scene's hands.
+        scene: the loaded scene.
+        settings: complete settings; spp and seed are replaced for each run.
+        facts: everything that runs depend on besides spp and seed.
+        purpose: ``run`` or ``reference``, whose seeds differ.
+        left: the scene's cache after the latest of these runs, while other settings use the scene.
     """
 
     scene: Scene
@@ -308,7 +307,7 @@ class Job:
 
     @property
     def pixels(self) -> int:
-        """Of the picture."""
+        """Number of pixels of the picture."""
         wide, high = film_size(self.settings)
         return wide * high
 
@@ -318,13 +317,13 @@ class Curve:
     """A variant on a scene.
 
     Attributes:
-        variant: its settings.
-        job: how it is run.
-        steps: spp to its runs.
-        denoised: how the runs are rendered that are denoised; None where none are wanted.
-        denoised_steps: spp to those runs, whose pictures are the denoised ones.
-        reference: how its reference is made; None where that is a file.
-        truths: the runs of the reference.
+        variant: the settings.
+        job: the settings as a job.
+        steps: runs by spp.
+        denoised: job of the runs that are denoised; None without ``denoise``.
+        denoised_steps: runs with denoised pictures, by spp.
+        reference: job of the reference; None if it is a file.
+        truths: runs of the reference.
     """
 
     variant: Variant
@@ -341,8 +340,8 @@ class Measured:
     """A scene of a study with its curves.
 
     Attributes:
-        name: as it was asked for.
-        curves: in the order of the grid.
+        name: name or path of the scene.
+        curves: the curves in the order of the grid.
     """
 
     name: str
@@ -350,22 +349,22 @@ class Measured:
 
 
 def film_size(settings: Settings) -> tuple[int, int]:
-    """Width and height of the picture."""
+    """Return width and height of the picture."""
     film = settings.film
     return (film.width, film.height) if film.crop is None else film.crop[2:]
 
 
 def seed_of(study_seed: int, purpose: str, spp: int, number: int) -> int:
-    """The seed of a run: another one for each purpose, step and number."""
+    """Return the seed of a run, a hash of the arguments."""
     words = f"{study_seed}/{purpose}/{spp}/{number}"
     return int.from_bytes(hashlib.blake2b(words.encode(), digest_size=6).digest(), "big")
 
 
 def prepare(study: Study) -> list[Measured]:
-    """Load the scenes and check every setting, before anything is rendered.
+    """Load the scenes and check all settings, before anything is rendered.
 
     Raises:
-        TorchptError: a scene or setting that cannot be used; a denoiser that is wanted and not there.
+        TorchptError: a scene or setting cannot be used, or the denoiser is missing.
     """
     if study.options["denoise"]:
         check_denoiser()
@@ -374,7 +373,7 @@ def prepare(study: Study) -> list[Measured]:
         known: dict[tuple[str, ...], tuple[Description, dict[str, tuple[Scene, str]]]] = {}
         curves = []
         for variant in study.variants:
-            words = origin(variant.changes)
+            words = told(variant.changes)
             if words not in known:
                 known[words] = read_description(name, overrides=variant.changes), {}
             description, loaded = known[words]
@@ -395,7 +394,7 @@ def _job(
     purpose: str,
 ) -> Job:
     description, settings = overridden(description, overrides)
-    # Such wishes of a scene are about files.
+    # These settings of a scene concern files.
     film, render = settings.film.but(denoise=False, aovs=()), settings.render.without(Role.FILES)
     settings = replace(settings, film=film, render=render)
     if not settings.integrator.light:
@@ -409,7 +408,7 @@ def _job(
 
 
 def _denoised(job: Job) -> Job:
-    """The same runs with the layers that the denoiser looks at."""
+    """Return the job of the same runs with the AOVs that the denoiser needs."""
     settings = replace(job.settings, film=job.settings.film.but(denoise=True))
     facts = {**job.facts, "settings": settings.plain(_FREE), "denoiser": denoiser_version()}
     return Job(job.scene, settings, facts, job.purpose)
@@ -421,16 +420,16 @@ def measure(
     store: Store,
     on_progress: Callable[[int, int, int, float], bool | None] | None = None,
 ) -> None:
-    """Render what is missing and fill in the runs.
+    """Render missing runs, and add all runs to the curves.
 
     Args:
-        study: what is asked.
-        prepared: from `prepare`.
-        store: where runs are kept.
-        on_progress: called with samples done and to do, rays and seconds; returning True stops.
+        study: the study.
+        prepared: the scenes, from :func:`prepare`.
+        store: the folder of runs.
+        on_progress: called with samples done, samples in total, rays and seconds; returning True stops.
 
     Raises:
-        Stopped: ``on_progress`` said so; finished runs are kept.
+        Stopped: ``on_progress`` returned True; finished runs are kept.
     """
     wanted = _all_runs(study, prepared)
     names = [_name(job, spp, seed) for job, spp, seed, _ in wanted]
@@ -441,11 +440,11 @@ def measure(
     for name, (job, spp, seed, place) in zip(names, wanted, strict=True):
         run = store.get(name)
         if run is None:
-            if job is not latest:  # what it leaves is there for the runs that follow
+            if job is not latest:  # other settings: warm up, so that caches are filled
                 _swap_kernels(latest, job)
                 thrown = _render(job, min(study.options["spp"][0], spp), seed, clock, counts=False)
                 if not clock.stop:
-                    _denoise(job, thrown)  # its first time takes longer too
+                    _denoise(job, thrown)  # the first call takes longer
                 latest = job
             rendering = None if clock.stop else _render(job, spp, seed, clock)
             if rendering is None or not rendering.complete:
@@ -457,7 +456,7 @@ def measure(
 
 
 def _swap_kernels(latest: Job | None, job: Job) -> None:
-    """Another setting's turn: a scene keeps the kernels of its latest render only, and making them anew takes seconds."""
+    """Swap cached kernels when settings change: a scene has those of its latest render only, and making them takes seconds."""
     if latest is not None:
         latest.left = replace(scene_cache(latest.scene))
     if job.left is not None:
@@ -469,7 +468,7 @@ Wanted = tuple[Job, int, int, list[Run]]
 
 
 def _all_runs(study: Study, prepared: list[Measured]) -> list[Wanted]:
-    """All runs in order, each with the list that it goes to."""
+    """Return all runs in order, each with the list that it is added to."""
     found: list[Wanted] = []
     for measured in prepared:
         for number in range(study.options["seeds"]):
@@ -505,7 +504,7 @@ def _render(job: Job, spp: int, seed: int, clock: _Clock, counts: bool = True) -
 
 
 def _denoise(job: Job, rendering: Rendering) -> float | None:
-    """Denoise where that is wanted; returns the seconds that it took."""
+    """Denoise if the job asks for it; return the seconds, or None."""
     return denoise_rendering(rendering, job.settings) if job.settings.film.denoise else None
 
 
@@ -528,21 +527,21 @@ def _told(job: Job, spp: int, seed: int, rendering: Rendering, denoising: float 
 
 
 class _Clock:
-    """How far all of the study is."""
+    """Progress of the whole study."""
 
     def __init__(self, total: int, tell: Callable[[int, int, int, float], bool | None] | None) -> None:
         self.total, self.tell = total, tell
         self.done, self.rays, self.seconds, self.stop = 0, 0, 0.0, False
 
     def watch(self, state: Progress) -> bool:
-        """Tell of a run on its way."""
+        """Report the progress of a run; return True to stop."""
         if self.tell is not None:
             done = self.done + state.done
             self.stop |= bool(self.tell(done, self.total, self.rays + state.rays, self.seconds + state.seconds))
         return self.stop
 
     def glance(self, state: Progress) -> bool:
-        """Ask only whether to stop."""
+        """Return True to stop, during a run that is not counted."""
         if self.tell is not None:
             self.stop |= bool(self.tell(self.done, self.total, self.rays, self.seconds))
         return self.stop

@@ -1,7 +1,7 @@
-"""Means over seeds with their 95 % intervals, slopes, times to an error.
+"""Means over seeds with 95 % intervals, slopes of error curves, and times to a given error.
 
 Intervals are Student's, of logarithms: a mean ``m`` of K runs with spread s has ``log m ± t s / (m √K)``, so no bound is
-negative. What is made of several steps has the variance that theirs come to, with Satterthwaite's degrees of freedom.
+negative. Variances of several steps are combined with Satterthwaite's degrees of freedom.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _LEVEL = 0.95
 
 
 def f_tail(f: float, d1: float, d2: float) -> float:
-    """The chance that Fisher's F of ``d1`` and ``d2`` degrees of freedom is larger than ``f``."""
+    """Return the probability that Fisher's F of ``d1`` and ``d2`` degrees of freedom is larger than ``f``."""
     if not f > 0:
         return 1.0
     if math.isinf(f):
@@ -29,7 +29,7 @@ def f_tail(f: float, d1: float, d2: float) -> float:
 
 @lru_cache(maxsize=4096)
 def t_quantile(freedom: float, level: float = _LEVEL) -> float:
-    """How many standard errors an interval of this level reaches to either side, by Student's t."""
+    """Return the half-width of a two-sided interval in standard errors, by Student's t."""
     low, high = 0.0, 1.0
     while f_tail(high * high, 1.0, freedom) > 1 - level:
         low, high = high, 2 * high
@@ -41,7 +41,7 @@ def t_quantile(freedom: float, level: float = _LEVEL) -> float:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its interval; the bounds are None where nothing is known of it."""
+    """A number with its interval; the bounds are None if unknown."""
 
     mean: float
     low: float | None = None
@@ -50,13 +50,13 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Level:
-    """The logarithm of a step's error.
+    """The mean error of a step, in logarithms.
 
     Attributes:
-        x: logarithm of what it is over: samples or seconds.
-        y: logarithm of the mean.
-        variance: of ``y``.
-        freedom: its degrees.
+        x: logarithm of samples or seconds.
+        y: logarithm of the mean error.
+        variance: variance of ``y``.
+        freedom: degrees of freedom of ``variance``.
     """
 
     x: float
@@ -66,7 +66,7 @@ class Level:
 
 
 def _moments(values: Sequence[float]) -> tuple[float, float]:
-    """Mean, and the variance of that mean."""
+    """Return the mean, and the variance of the mean."""
     count, mean = len(values), math.fsum(values) / len(values)
     if count < 2:
         return mean, math.nan
@@ -74,7 +74,7 @@ def _moments(values: Sequence[float]) -> tuple[float, float]:
 
 
 def estimate(values: Sequence[float], positive: bool = True) -> Estimate:
-    """The mean of independent values with its interval, of the logarithm where they are ``positive`` quantities."""
+    """Return the mean of independent values with its interval; of the logarithm for ``positive`` quantities."""
     mean, variance = _moments(values)
     if len(values) < 2 or not math.isfinite(variance):
         return Estimate(mean)
@@ -92,9 +92,9 @@ class Fit:
     """A straight line through levels: ``y = middle_y + slope (x - middle_x)``.
 
     Attributes:
-        slope: with its interval.
+        slope: the slope with its interval.
         middle: mean x and mean y of the levels.
-        levels: what it was drawn through, in the order of x.
+        levels: the fitted levels, in the order of x.
     """
 
     slope: Estimate
@@ -102,9 +102,9 @@ class Fit:
     levels: tuple[Level, ...]
 
     def reach(self, y: float) -> tuple[Estimate, bool] | None:
-        """Where the line comes down to ``y``, with its interval; whether that lies beyond the levels.
+        """Return the x with its interval at which the line falls to ``y``, and True if that lies outside of the levels.
 
-        None where the line does not fall. Without an interval where chance alone may have made it fall.
+        None if the line does not fall. Without an interval if its fall is not significant.
         """
         slope = self.slope.mean
         if not slope < 0:
@@ -112,8 +112,10 @@ class Fit:
         away = (y - self.middle[1]) / slope
         x = self.middle[0] + away
         share = 1.0 / len(self.levels)
-        parts = [-(share + away * c) / slope for c in _slope_derivatives(self.levels)]  # derivative by each y
-        falls = self.slope.high is not None and self.slope.high < 0  # else the line may never come down there
+        parts = [
+            -(share + away * c) / slope for c in _slope_derivatives(self.levels)
+        ]  # derivatives of x by each level's y
+        falls = self.slope.high is not None and self.slope.high < 0  # otherwise the line may never reach y
         spread = _combined(self.levels, parts) if falls else None
         beyond = not self.levels[0].x <= x <= self.levels[-1].x
         if spread is None:
@@ -122,15 +124,15 @@ class Fit:
 
 
 def fit(xs: Sequence[float], values: Sequence[Sequence[float]]) -> Fit | None:
-    """The line by least squares through the logarithms of means over seeds.
+    """Fit a line by least squares to the logarithms of means over seeds.
 
     Args:
         xs: samples or seconds of each step.
-        values: errors of the step's runs. A step whose mean is not positive is left out: there the error drowned in the
-            reference's own.
+        values: errors of each step's runs. A step whose mean is not positive is left out: its error is below the noise of
+            the reference.
 
     Returns:
-        None where fewer than two steps are left, or they have all the same x.
+        None if fewer than two steps are left, or all have the same x.
     """
     levels = []
     for x, step in zip(xs, values, strict=True):
@@ -149,14 +151,14 @@ def fit(xs: Sequence[float], values: Sequence[Sequence[float]]) -> Fit | None:
 
 
 def _slope_derivatives(levels: Sequence[Level]) -> list[float]:
-    """The derivative of the slope by each level's y."""
+    """Return the derivative of the slope by each level's y."""
     middle = math.fsum(v.x for v in levels) / len(levels)
     square = math.fsum((v.x - middle) ** 2 for v in levels)
     return [(v.x - middle) / square for v in levels]
 
 
 def _combined(levels: Sequence[Level], parts: Sequence[float]) -> float | None:
-    """Half the interval of ``Σ part y``; None where a level has no spread."""
+    """Return the half-width of the interval of ``Σ part y``; None if a level's variance is unknown."""
     shares = [part * part * level.variance for part, level in zip(parts, levels, strict=True)]
     total = math.fsum(shares)
     if not math.isfinite(total):

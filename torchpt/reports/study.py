@@ -1,4 +1,4 @@
-"""Studies: a grid of settings, and the settings of a study itself."""
+"""Read a study: its own settings and the grid of render settings."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ class Variant:
     """One combination of settings.
 
     Attributes:
-        label: what differs from the other variants.
-        settings: by dotted key or name of a group, as written.
-        axes: of them, those that the grid gave a list of.
+        label: the settings that differ from other variants, in words.
+        settings: values by dotted key or name of a group, as written.
+        axes: keys for which the grid has a list.
         changes: overrides of the scene's keys, as :func:`torchpt.load` takes them.
     """
 
@@ -75,12 +75,12 @@ class Variant:
 
 
 def denoised_label(label: str) -> str:
-    """What the curve of a variant's denoised pictures is called."""
+    """Return the label of a variant's denoised curve."""
     return f"{label}, denoised"
 
 
 def flat(raw: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested blocks as dotted keys; lists stay, with all that is in them."""
+    """Return nested blocks as a flat mapping by dotted key; lists are kept whole."""
     found: dict[str, Any] = {}
     for key, value in raw.items():
         if isinstance(value, Mapping):
@@ -93,15 +93,15 @@ def flat(raw: Mapping[str, Any]) -> dict[str, Any]:
 def variants_of(
     settings: Mapping[str, Any], file: str | None, changes: Mapping[str, list[Any]] = MappingProxyType({})
 ) -> list[Variant]:
-    """Every combination of what the lists hold, the last list turning fastest.
+    """Return all combinations of the listed values; the last list varies fastest.
 
     Args:
-        settings: by dotted key (``integrator.max_depth``) or name of a group; a value or a list of values.
+        settings: values or lists of values by dotted key (``integrator.max_depth``) or name of a group.
         file: the study file, for errors.
         changes: values of the scene's keys, a list each.
 
     Raises:
-        SceneError: an unknown key, an empty list, a value given twice, a setting that a study decides itself.
+        SceneError: an unknown key, an empty list, a repeated value, or a setting that a study refuses.
     """
     for key in settings:
         check_keys({key.partition(".")[0]: 0}, BLOCKS, "", "a study", file)
@@ -135,7 +135,7 @@ def _values(key: str, values: list[Any], file: str | None) -> list[Any]:
 
 
 def _labels(chosen: list[dict[str, Any]]) -> list[str]:
-    """What a reader must be told of each to know it from the others."""
+    """Return a label for each combination that tells it from the others."""
     keys = list(dict.fromkeys(key for item in chosen for key in item))
     told = [key for key in keys if len({repr(item.get(key)) for item in chosen}) > 1]
     return [", ".join(_words(key, item[key]) for key in told if key in item) or "as the scene says" for item in chosen]
@@ -153,10 +153,10 @@ def _words(key: str, value: Any) -> str:
 
 
 def blocks_of(settings: Mapping[str, Any], file: str | None) -> dict[str, dict[str, Any]]:
-    """The overrides of one variant by block, as `torchpt.scene.formats.description.settings` takes them; nulls are kept.
+    """Return overrides by block, as :func:`torchpt.scene.formats.description.settings` takes them; nulls are kept.
 
     Raises:
-        SceneError: a group without such a file, a key below something that is no block.
+        SceneError: a group has no such file, or a key lies below a value that is no block.
     """
     blocks: dict[str, dict[str, Any]] = {}
     for key, value in sorted(settings.items(), key=lambda item: item[0] not in BLOCKS):  # a group first
@@ -176,7 +176,7 @@ def blocks_of(settings: Mapping[str, Any], file: str | None) -> dict[str, dict[s
 
 
 def _group(group: str, name: Any, file: str | None) -> dict[str, Any]:
-    """What a group's file sets: ``integrator=path`` is ``configs/integrator/path.yaml``."""
+    """Return the settings of a group's file: ``integrator=path`` is ``configs/integrator/path.yaml``."""
     folder = configs() / group
     names = sorted(path.stem for path in folder.glob("*.yaml"))
     if name not in names:
@@ -236,14 +236,14 @@ def _targets(value: Any) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class Extra:
-    """Somebody else's picture.
+    """A picture by another renderer.
 
     Attributes:
-        name: of the curve that it belongs to.
-        seconds: that it took.
-        file: where it is.
-        scene: what it shows.
-        spp: samples a pixel, where that is known.
+        name: name of its curve.
+        seconds: render time.
+        file: path of the picture.
+        scene: name of the scene.
+        spp: samples a pixel; None if unknown.
     """
 
     name: str
@@ -271,7 +271,7 @@ def _extras(value: Any) -> tuple[dict[str, Any], ...]:
 
 
 class StudyOptions(Valued):
-    """The keys that are the study's own, beside ``scene`` and ``reference``."""
+    """Settings of a study besides ``scene`` and ``reference``."""
 
     parameters: ClassVar = {
         "spp": Other((4, 16, 64, 256), reader=_steps, words="growing numbers", doc="samples a pixel of each step"),
@@ -295,7 +295,7 @@ class StudyOptions(Valued):
 
 
 class Reference(Valued):
-    """How the reference is made, where it is no file."""
+    """Settings of a reference that is rendered."""
 
     parameters: ClassVar = {
         "spp": Whole(None, low=1, doc="samples a pixel of each of its runs; 4 times the largest step"),
@@ -310,13 +310,13 @@ RECORDS = {"study": StudyOptions, "reference": Reference}
 
 @dataclass(frozen=True)
 class ReferencePlan:
-    """How a reference comes about: of files, or by runs.
+    """The reference of a study: files, or runs to be made.
 
     Attributes:
-        files: scene to file; empty where it is made.
-        spp: of each run.
-        seeds: how many runs.
-        settings: by dotted key, over those that all variants share.
+        files: path by scene; empty if the reference is rendered.
+        spp: samples a pixel of each run.
+        seeds: number of runs.
+        settings: overrides by dotted key of the settings that all variants share.
     """
 
     files: dict[str, str]
@@ -327,14 +327,14 @@ class ReferencePlan:
 
 @dataclass(frozen=True)
 class Study:
-    """A study, checked as far as it can be without its scenes.
+    """A study, validated as far as possible without loading its scenes.
 
     Attributes:
-        scenes: names or paths.
-        variants: the grid.
-        options: spp, seeds, seed, metrics, target, denoise, title.
+        scenes: names or paths of the scenes.
+        variants: the combinations of the grid.
+        options: settings of the study: spp, seeds, seed, metrics, target, denoise, title.
         extras: other renderers' pictures.
-        reference: how it comes about.
+        reference: the reference.
         file: the study file.
     """
 
@@ -346,23 +346,23 @@ class Study:
     file: str | None = None
 
     def overrides(self, variant: Variant) -> dict[str, dict[str, Any]]:
-        """The variant's settings by block."""
+        """Return the overrides of a variant by block."""
         return blocks_of(variant.settings, self.file)
 
     def reference_overrides(self, variant: Variant) -> dict[str, dict[str, Any]]:
-        """The settings of a variant's reference by block: what all share, its own film, no clamp; then what was asked."""
+        """Return the overrides of a variant's reference: shared settings, its film, no clamp; then those of ``reference``."""
         own = {k: v for k, v in variant.settings.items() if k not in variant.axes or k.partition(".")[0] == "film"}
         return blocks_of({**own, "integrator.clamp": None, **self.reference.settings}, self.file)
 
 
 def read_study(name: str) -> tuple[dict[str, Any], str]:
-    """The keys of a study file, and its path; files that it names start at its own folder.
+    """Return the keys of a study file, and its path; relative paths in it start at its folder.
 
     Args:
-        name: of a study in ``configs/study/``, or a path ending in ``.yaml``.
+        name: name of a study in ``configs/study/``, or a path that ends in ``.yaml``.
 
     Raises:
-        SceneError: no such file, no valid YAML, no mapping.
+        SceneError: the file is missing, is no valid YAML, or no mapping.
     """
     shipped = {path.stem: str(path) for path in sorted((configs() / "study").glob("*.yaml"))}
     if not name.endswith((".yaml", ".yml")) and name not in shipped:
@@ -404,10 +404,10 @@ def _extra_placed(item: Any, placed: Callable[[Any], Any], named: Callable[[Any]
 
 
 def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
-    """A study of its keys, as a file and the command line give them.
+    """Return the study with the given keys, as a file and the command line have them.
 
     Raises:
-        SceneError: a key or value that is not accepted.
+        SceneError: a key or value is not accepted.
     """
     scenes = tuple(_list(raw.get("scene") or []))
     if not scenes or not all(isinstance(name, str) for name in scenes) or len(set(scenes)) < len(scenes):
@@ -445,7 +445,7 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
 
 
 def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> ReferencePlan:
-    """The reference: a file's name, or a mapping with ``file``, or one with ``spp``, ``seeds`` and settings."""
+    """Return the reference of a path, of a mapping with ``file``, or of one with ``spp``, ``seeds`` and settings."""
     if raw is None or isinstance(raw, str):
         raw = {} if raw is None else {"file": raw}
     if not isinstance(raw, Mapping):

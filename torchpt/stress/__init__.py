@@ -1,7 +1,7 @@
-"""Stiff and extreme cases as a command: what float32 tracers break at, against closed forms and float64.
+"""Stress tests as a command: extreme scenes that break float32 path tracers, against closed forms and float64.
 
-``case.py`` says what a case is, ``cases/`` holds them by topic, ``harness.py`` renders for them, ``own_scene.py`` makes cases
-of any scene, ``outcome.py`` runs them, ``table.py`` and ``plots.py`` show what came of it.
+``case.py`` defines a case, ``cases/`` has the cases by topic, ``harness.py`` renders their scenes, ``own_scene.py`` makes cases
+of any scene, ``outcome.py`` runs cases, ``table.py`` and ``plots.py`` show the results.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a case is, and what comes of it."""
+"""A stress test, and its result."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ __all__ = ["Case", "Measurement", "Outcome", "powers"]
 
 @dataclass(frozen=True)
 class Case:
-    """Something that breaks path tracers, and what is to come of it.
+    """A stress test: a figure that must be small at all points of a sweep.
 
     Attributes:
-        name: a few words.
-        measures: what the figure is, in a line; nothing is lost and nothing is wrong where it is 0.
+        name: the name in tables.
+        measures: what the figure is, in a line; 0 is perfect.
         bound: the largest figure that passes.
-        figure: of one place in the sweep. It may raise: that is a failure, and is told.
-        axis: what is swept.
-        sweep: values of it.
-        quick: those that stand for all in a quick run; by default the first, the middle and the last.
-        backend: whether the figure depends on how rays are searched and stages are run; else one run tells for all.
+        figure: returns the figure at a point of the sweep. An exception is a failure, and is reported.
+        axis: name of the swept quantity.
+        sweep: the points of the sweep.
+        quick: points of a quick run; by default the first, the middle and the last.
+        backend: True if the figure depends on search and engine; else one run is enough.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Case:
     backend: bool = True
 
     def points(self, quick: bool) -> tuple[float, ...]:
-        """Places of a run."""
+        """Return the points of a run."""
         if not quick:
             return self.sweep
         return self.quick or tuple(dict.fromkeys((self.sweep[0], self.sweep[len(self.sweep) // 2], self.sweep[-1])))
@@ -46,13 +46,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Measurement:
-    """One figure.
+    """The figure at one point of a sweep.
 
     Attributes:
-        at: the place in the sweep.
-        figure: NaN where there is none.
-        problem: why there is none.
-        refused: whether the search that was asked for says itself that it is not for this scene.
+        at: the point of the sweep.
+        figure: the figure; NaN if there is none.
+        problem: why there is no figure.
+        refused: True if the search structure refused the scene.
     """
 
     at: float
@@ -63,12 +63,12 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of a case.
+    """The result of a case.
 
     Attributes:
-        case: which.
-        readings: in the order of the sweep.
-        seconds: that it took.
+        case: the case.
+        readings: the figures in the order of the sweep.
+        seconds: run time.
     """
 
     case: Case
@@ -77,21 +77,21 @@ class Outcome:
 
     @property
     def worst(self) -> Measurement:
-        """The one that decides: a failure to measure, else the largest figure; a refusal where there is nothing else."""
+        """Reading that decides: a failure, else the largest figure; a refusal if there is nothing else."""
         measured = [one for one in self.readings if not one.refused] or self.readings
         return max(measured, key=lambda one: math.inf if math.isnan(one.figure) else one.figure)
 
     @property
     def passed(self) -> bool:
-        """Whether all figures that there are lie within the bound."""
+        """True if all figures are within the bound; refusals are ignored."""
         return all(one.refused or one.figure <= self.case.bound for one in self.readings)
 
     @property
     def refused(self) -> int:
-        """At how many places the search refused the scene."""
+        """Number of points at which the search refused the scene."""
         return sum(one.refused for one in self.readings)
 
 
 def powers(low: int, high: int, step: int = 1) -> tuple[float, ...]:
-    """``10^low .. 10^high``."""
+    """Return ``10^low .. 10^high``."""
     return tuple(10.0**k for k in range(low, high + 1, step))

@@ -1,4 +1,4 @@
-"""Renders small scenes for cases, by the backend that is asked for, and lets no sample be lost on the way."""
+"""Render the small scenes of cases by the chosen device, search and engine; non-finite samples are errors."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ __all__ = ["Harness", "relative", "relative_difference"]
 
 @dataclass(frozen=True)
 class Harness:
-    """How cases are rendered.
+    """The device, search structure, engine and dtype by which cases are rendered.
 
     Attributes:
-        device: where.
-        accel: the search structure.
-        compile: ``on`` or ``off``.
-        dtype: of the lanes.
+        device: name of the device.
+        accel: name of the search structure.
+        compile: ``on``, ``off`` or ``auto``.
+        dtype: dtype of the lanes.
     """
 
     device: str = "cpu"
@@ -35,14 +35,14 @@ class Harness:
     def render(
         self, described: Mapping[str, Any], spp: int = 64, size: int = 8, seed: int = 1, **integrator: Any
     ) -> Tensor:
-        """A picture ``(size, size, 3)`` in float64, box filter.
+        """Return a picture ``(size, size, 3)`` in float64, with the box filter.
 
         Args:
-            described: a scene.
+            described: the scene as a mapping.
             spp: samples a pixel.
-            size: of the film.
-            seed: of the samples.
-            integrator: keys of ``path``.
+            size: width and height of the film.
+            seed: seed of the samples.
+            integrator: settings of integrator ``path``.
 
         Raises:
             RenderError: a sample was not finite.
@@ -63,16 +63,16 @@ class Harness:
         return found.image.double().cpu()
 
     def exact(self) -> Harness:
-        """The same in float64."""
+        """Return a copy that renders in float64."""
         return replace(self, dtype=torch.float64)
 
 
 def relative(found: Tensor | float, expected: Tensor | float) -> float:
-    """How far the mean of a picture is from what it is to be, relative to that."""
+    """Return the relative difference of the mean of a picture from that expected; the absolute one if that is 0."""
     found, expected = (x.mean().item() if isinstance(x, Tensor) else x for x in (found, expected))
     return abs(found - expected) / abs(expected) if expected else abs(found)
 
 
 def relative_difference(a: Tensor, b: Tensor) -> float:
-    """How far two pictures of the same numbers are apart: mean difference over mean value."""
+    """Return the difference of two pictures: mean absolute difference over mean absolute value of ``b``."""
     return float((a - b).abs().mean() / b.abs().mean())

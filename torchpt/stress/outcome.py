@@ -1,4 +1,4 @@
-"""Runs cases."""
+"""Run cases."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["outcome_of"]
 
 
 def outcome_of(case: Case, harness: Harness, quick: bool = False) -> Outcome:
-    """What a case comes to; a figure that cannot be had is told, not raised.
+    """Run a case at all points of its sweep; exceptions are recorded, not raised.
 
-    A search that is asked for by name may refuse a scene (``brute``, where float32 is too coarse for it): that is told too, and
-    is no failure, as ``auto`` takes another one there.
+    A search structure may refuse a scene (``brute``, where float32 is too coarse for it). That is recorded, and is no failure:
+    ``auto`` takes another one there.
     """
     begun, readings = time.perf_counter(), []
     for at in case.points(quick):

@@ -1,4 +1,4 @@
-"""The error over each sweep of a topic, with its bound."""
+"""Plot the figures of each sweep with their bound."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from torchpt.stress.case import Outcome
 __all__ = ["draw"]
 
 COLUMNS = 3
-#: What a figure of 0 is drawn as.
+#: Value at which a figure of 0 is drawn.
 NOTHING = 1e-9
 
 
 def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
-    """One picture, ``.svg`` or ``.png``, of all cases that are swept; returns whether there were any.
+    """Plot all cases with a sweep to ``.svg`` or ``.png``; return False if there are none.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     swept = [outcome for outcome in outcomes if len(outcome.readings) > 2]
     if not swept:
@@ -62,7 +62,7 @@ def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
 
 
 def _places(at: list[float]) -> tuple[list[float], bool]:
-    """Where readings stand, and whether on a logarithmic axis: there a place at 0 is half the least of the others."""
+    """Return positions of readings, and True for a logarithmic axis, on which 0 lies at half of the least other point."""
     positive = [place for place in at if place > 0]
     if not positive or min(at) < 0 or max(positive) <= 50 * min(positive):
         return at, False

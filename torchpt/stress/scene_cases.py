@@ -1,4 +1,4 @@
-"""Cases made of any scene: elsewhere, larger, turned, by every search and in float64 it is the same picture."""
+"""Make cases of any scene: moved, scaled, turned, by every search and in float64 its picture must not change."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from torchpt.stress.harness import Harness, relative_difference
 
 __all__ = ["cases_of", "moved"]
 
-#: Pixels on the longer side, and samples of each.
+#: Pixels of the longer side, and samples a pixel.
 SIZE, SPP = 48, 4
-#: Difference of two pictures, in that of two seeds: of the same random numbers, and of others (frames turn with a scene).
+#: Largest difference of two pictures, in that of two seeds: with the same random numbers, and with others (as after a turn).
 NEAR, ANOTHER = 0.2, 1.2
 _NOISE = "difference over that of another seed"
-#: Primitives up to which a scene is searched one by one, too.
+#: Primitives up to which brute force is tested too.
 FEW = 2_000
 
 Array = NDArray[np.float64]
@@ -39,15 +39,15 @@ Array = NDArray[np.float64]
 def cases_of(
     source: str, overrides: Mapping[str, Mapping[str, Any]], changes: Mapping[str, Any] | None = None
 ) -> tuple[Case, ...]:
-    """The cases of a scene, rendered small.
+    """Return the cases of a scene, which render it small.
 
     Args:
-        source: its name or file.
-        overrides: settings by block.
-        changes: overrides of its keys, as :func:`torchpt.load` takes them.
+        source: name or file of the scene.
+        overrides: overrides of settings by block.
+        changes: overrides of the scene's keys, as :func:`torchpt.load` takes them.
 
     Raises:
-        TorchptError: a scene or setting that cannot be used.
+        TorchptError: the scene or a setting cannot be used.
     """
     description, settings = overridden(read_description(source, overrides=changes), overrides)
     wishes = _small(settings)
@@ -95,7 +95,7 @@ def cases_of(
 
 
 def _small(settings: Settings) -> Settings:
-    """The same, quickly rendered and nothing written."""
+    """Return settings of a quick render that writes no files."""
     film, most = settings.film, max(settings.film.width, settings.film.height)
     width, height = (max(round(side * SIZE / most), 1) for side in (film.width, film.height))
     render = settings.render.without(Role.FILES | Role.ENDS).but(spp=SPP, pilots=False)
@@ -113,12 +113,12 @@ def _step(distance: float) -> Array:
 
 
 def moved(raw: dict[str, Any], by: Array, camera: Array) -> dict[str, Any]:
-    """A scene, as it is written, under a similarity.
+    """Return a scene description transformed by a similarity.
 
     Args:
-        raw: what was written.
+        raw: the scene as read from its file.
         by: ``(4, 4)``: rotation, uniform scale and translation.
-        camera: its pose ``(4, 4)``.
+        camera: pose of its camera ``(4, 4)``.
     """
     scale = float(np.cbrt(np.linalg.det(by[:3, :3])))
     turn = np.eye(4)

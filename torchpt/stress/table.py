@@ -1,4 +1,4 @@
-"""Outcomes as lines of text, as Markdown and as JSON."""
+"""Show outcomes as lines of text, as Markdown and as JSON."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _COLUMNS = "{:38s} {:>10s} {:>10s} {:>14s}  {}"
 
 
 def heading() -> str:
-    """Of :func:`line`."""
+    """Return the heading of the columns of :func:`line`."""
     return _COLUMNS.format("case", "worst", "bound", "at", "verdict")
 
 
 def line(outcome: Outcome) -> str:
-    """A case in a line; a failure says why."""
+    """Return the result of a case in a line, with the reason of a failure."""
     worst, case = outcome.worst, outcome.case
     at = f"{case.axis} {worst.at:g}" if case.axis else ""
     verdict = _verdict(outcome)
@@ -29,7 +29,7 @@ def line(outcome: Outcome) -> str:
 
 
 def _verdict(outcome: Outcome) -> str:
-    """In words."""
+    """Return the verdict in words."""
     said = "passed" if outcome.passed else "FAILED"
     if outcome.refused == len(outcome.readings):
         return "refused"
@@ -37,7 +37,7 @@ def _verdict(outcome: Outcome) -> str:
 
 
 def facts(outcomes: Mapping[str, Sequence[Outcome]]) -> list[dict[str, Any]]:
-    """All figures, by topic."""
+    """Return all figures as plain values, by topic."""
     return [
         {
             "topic": topic,
@@ -63,7 +63,7 @@ def facts(outcomes: Mapping[str, Sequence[Outcome]]) -> list[dict[str, Any]]:
 
 
 def markdown(outcomes: Mapping[str, Sequence[Outcome]]) -> str:
-    """A table for a page."""
+    """Return a Markdown table."""
     rows = ["| case | sweep | what is measured | worst | at | bound |", "|---|---|---|---|---|---|"]
     for row in outcomes.values():
         for outcome in row:

@@ -1,4 +1,4 @@
-"""Many pictures by one call: ``inputs`` reads what is given, ``batch`` orders the pictures and puts them together."""
+"""Render scenes by cameras in one call: ``inputs`` reads and checks arguments, ``batch`` renders and stacks the pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many pictures by one call: scenes by cameras, on one work list. Each is to the bit the one that ``render`` makes alone."""
+"""Render scenes by cameras in one call; each picture is that of ``render``, to the bit."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ __all__ = ["Renderings", "render_batch"]
 
 @dataclass(repr=False, eq=False)
 class Renderings:
-    """The pictures of a batch of S scenes and C cameras; ``renderings[s, c]`` is one of them with all its facts.
+    """The pictures of S scenes by C cameras; ``renderings[s, c]`` is a :class:`torchpt.Rendering`.
 
     Attributes:
-        image: ``(S, C, H, W, 3)`` linear RGB; it carries gradients, where they are wanted.
-        layers: what ``film.aovs`` asked for, by name, each ``(S, C, H, W, channels)``.
-        denoised: the pictures without their noise ``(S, C, H, W, 3)``; None without ``film.denoise``.
-        rows: the pictures one by one, those of a scene together. Times in them overlap.
+        image: ``(S, C, H, W, 3)`` linear RGB; it requires gradients if parameters or poses do.
+        layers: the AOVs of ``film.aovs`` by name, each ``(S, C, H, W, channels)``.
+        denoised: the denoised pictures ``(S, C, H, W, 3)``; None without ``film.denoise``.
+        rows: the renderings, a tuple for each scene. Their times overlap.
     """
 
     image: Tensor
@@ -47,7 +47,7 @@ class Renderings:
     rows: tuple[tuple[Rendering, ...], ...]
 
     def __getitem__(self, which: tuple[int, int]) -> Rendering:
-        """The picture of scene ``s`` by camera ``c``."""
+        """Return the rendering of scene ``s`` by camera ``c``."""
         if not isinstance(which, tuple) or len(which) != 2:
             raise TypeError(f"expected renderings[s, c], a scene's number and a camera's, got renderings[{which!r}]")
         s, c = which
@@ -59,7 +59,7 @@ class Renderings:
 
 @dataclass(frozen=True)
 class _Picture:
-    """One picture of a batch: where it belongs, its name in errors, what is asked for."""
+    """One picture of a batch: its indices, its name in errors, and the request."""
 
     scene: int
     camera: int
@@ -94,28 +94,28 @@ def render_batch(
     """Render S scenes by C cameras to linear RGB ``(S, C, H, W, 3)``; differentiable in ``params`` and poses.
 
     Picture ``[s, c]`` is to the bit ``torchpt.render(scenes[s].seen_by(cameras[c]), params=..., seed=...)``. Threads share one
-    list of work over all pictures, and what is next is made ready while they trace. Worlds, search structures and kernels are
-    made once for all cameras of a scene. Pictures by tensor operations (as on CUDA) are rendered one after another; so are all
-    that a time or an error ends, in bounded memory, or by several ``ranks`` (which share each picture's pixels).
+    queue of tasks of all pictures, and the next pictures are prepared while they trace. World, search structure and kernels
+    are made once for all cameras of a scene. Pictures are rendered one after another by tensor operations (as on CUDA), with
+    a time limit or target error, in bounded memory, or by several ``ranks`` (which share each picture's pixels).
 
     Args:
-        scenes: from :func:`torchpt.load`: a sequence, or an iterator that loads them (while others are rendered), of any kinds,
-            all with films of one size; or one scene, of which ``params`` make S.
+        scenes: scenes of :func:`torchpt.load` with films of one size: a sequence, or an iterator, which may load each while
+            others are rendered; or one scene, of which ``params`` make S.
         cameras: shared by all scenes: a sequence of blocks ``camera`` as in scene files (with ``K``, ``R``, ``t`` too), of
-            poses ``camera.to_world (4, 4)`` for the scenes' own cameras, or a tensor of such ``(C, 4, 4)``; None: C is 1, each
-            scene's own.
+            poses ``camera.to_world (4, 4)`` for the scenes' own cameras, or a tensor of poses ``(C, 4, 4)``; None: each
+            scene's own camera, C = 1.
         params: tensors in place of the scenes', by dotted name: a mapping to tensors with a leading dimension S, or a sequence
             of S mappings.
-        seed: one for all pictures (by default the scenes' own), or a sequence of S of them or of S sequences of C.
-        on_progress: called after each picture with how many are done, and of how many (None: scenes came from an iterator).
-        full: True returns a :class:`Renderings`: pictures, layers, and each picture's own facts.
-        options: all other arguments of :func:`torchpt.render`, the same for all pictures. ``checkpoint`` is not taken;
-            ``max_memory`` holds for the batch, the pictures included.
+        seed: one seed for all pictures (by default the scenes' own), a sequence of S, or S sequences of C.
+        on_progress: called after each picture with the number of finished and of all pictures (None: an iterator of scenes).
+        full: True returns :class:`Renderings`: pictures, AOVs, and the facts of each picture.
+        options: other arguments of :func:`torchpt.render`, the same for all pictures. ``checkpoint`` is refused;
+            ``max_memory`` bounds the whole batch with its pictures.
 
     Raises:
-        SceneError: what is not accepted, by a key that begins with the scene's or camera's place, such as ``scenes[3].``.
+        SceneError: an argument is not accepted; its key names the scene or camera, such as ``scenes[3].``.
         RenderError: as :func:`torchpt.render`.
-        TypeError: an argument that ``render`` does not know.
+        TypeError: an unknown argument.
     """
     check_names("render_batch", options, RenderOptions, ("cameras", "on_progress"))
     if on_progress is not None and not callable(on_progress):
@@ -143,7 +143,7 @@ def render_batch(
     for key, given in (("params", sets), ("seed", seed)):
         if isinstance(given, Sequence | Tensor | np.ndarray) and len(given) != count:
             raise SceneError(key, len(given), f"as many as there are scenes, {count}")
-    # Gradients last: what is on a tape is made of pictures that are there.
+    # Gradients last: autograd wraps pictures that are rendered already.
     rows = tuple(tuple(_taped(found.pop((s, c))) for c in range(len(views))) for s in range(count))
     image = _stacked([[r.image for r in row] for row in rows])
     if not full:
@@ -159,7 +159,7 @@ def _stacked(rows: list[list[Tensor]]) -> Tensor:
 
 
 def _taped(found: tuple[RenderRequest | None, Rendering]) -> Rendering:
-    """A rendering on the tape that its parameters are on; without an order there is none."""
+    """Return a rendering with autograd; without a request it needs none."""
     request, rendering = found
     return rendering if request is None else execute_request(request, [rendering])
 
@@ -173,12 +173,12 @@ def _pictures(
     full: bool,
     options: Common,
 ) -> Iterator[_Picture]:
-    """Return the orders, picture by picture, those of a scene together; ``several``: scenes are one under other parameters."""
+    """Yield the pictures, those of a scene together; ``several``: they share one scene with different parameters."""
     like: dict[str, Any] = {}
     versions: WeakKeyDictionary[Scene, dict[str, int]] = WeakKeyDictionary()
     for s, each in enumerate(scenes):
         scene = as_scene(each, f"scenes[{s}]")
-        if not several:  # whether its pictures are rendered by now, nobody can tell
+        if not several:  # earlier pictures of the scene may still be in work
             with named(f"scenes[{s}]", None):
                 now = scene.versions()
                 check_unchanged(versions.setdefault(scene, now), now, "while the batch has it")
@@ -206,7 +206,7 @@ def _ordered(
     full: bool,
     options: Common,
 ) -> RenderRequest:
-    """Return the order of one picture."""
+    """Return the request for one picture."""
     if isinstance(camera, Tensor):
         if "camera.to_world" in params:
             raise SceneError("params.camera.to_world", "a pose", "none where cameras are poses")
@@ -228,12 +228,12 @@ def _entries(
     on_progress: Callable[[int, int | None], None] | None,
     total: int | None,
 ) -> Iterator[QueuedRender]:
-    """Renders of pictures; what they come to is put into ``found``."""
-    latest: list[tuple[int, Wave]] = []  # of the scene that is being rendered
+    """Return the renders of pictures; they put requests that need gradients, and renderings, into ``found``."""
+    latest: list[tuple[int, Wave]] = []  # index and wave of the latest scene
 
     def entry(picture: _Picture) -> QueuedRender:
         request, place = picture.request, (picture.scene, picture.camera)
-        needs_gradients = request.needs_gradients  # before gradients are off
+        needs_gradients = request.needs_gradients  # read before gradients are disabled
 
         def make(threads: int) -> Run:
             like = next((wave for scene, wave in latest if scene == picture.scene), None)
@@ -244,7 +244,7 @@ def _entries(
 
         def done(rendering: Rendering) -> None:
             request.check_unchanged("while the batch has it")
-            # An order holds its scene, of which there may be many.
+            # A request keeps its scene alive, and there may be many.
             found[place] = (request, rendering) if needs_gradients else (None, execute_request(request, [rendering]))
             if on_progress is not None:
                 on_progress(len(found), total)
@@ -259,10 +259,10 @@ def _entries(
 
 
 def _check_memory(request: RenderRequest, total: int | None) -> None:
-    """Refuse a bound that the pictures of a batch alone would break."""
+    """Raise if the pictures of a batch alone need more than ``render.max_memory``."""
     limit, film = request.settings.render.max_memory, request.settings.film
     _, _, width, height = film.crop or (0, 0, film.width, film.height)
     bytes_each = torch.finfo(request.call.dtype).bits // 8
-    held = 2 * 3 * width * height * bytes_each * (total or 1)  # one by one, and then together
+    held = 2 * 3 * width * height * bytes_each * (total or 1)  # single pictures, and the stacked ones
     if limit is not None:
         check_limit(limit, held, f"more than the {mb(held)} that the pictures alone take")

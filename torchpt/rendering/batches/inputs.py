@@ -1,4 +1,4 @@
-"""What a batch is given, read and checked: cameras, parameters, seeds; and how errors name the scene that they are about."""
+"""Read and check the arguments of a batch (scenes, cameras, parameters, seeds), and name the scene in errors."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from torchpt.scene.entry import as_scene
 
 __all__ = ["Cameras", "Seeds", "cameras_of", "named", "params_of", "scenes_of", "seeds_of"]
 
-#: Blocks of scene files, poses ``(4, 4)`` (lists of numbers too), or a tensor of poses ``(C, 4, 4)``.
+#: Camera blocks as in scene files, poses ``(4, 4)`` (also as lists), or a tensor of poses ``(C, 4, 4)``.
 Cameras = Tensor | Sequence[Mapping[str, Any] | Tensor] | None
-#: One for all, one for each scene, or one for each scene and camera.
+#: One seed for all pictures, one for each scene, or one for each scene and camera.
 Seeds = int | Sequence[int] | Sequence[Sequence[int]] | None
 
-#: Keys of a camera's block, one of which at least says where it stands.
+#: Keys of a camera block that position it: at least one must be given.
 _PLACES = frozenset({"origin", "target", "to_world", "R", "t"})
 
 
 def scenes_of(scenes: Any) -> Scene | Iterable[Scene]:
-    """The scenes of a batch, as they are given; what an iterator gives is not looked at yet.
+    """Return the scenes of a batch; those of an iterator are not checked yet.
 
     Raises:
-        SceneError: something else.
+        SceneError: not a scene, a sequence or an iterator of scenes.
     """
     if isinstance(scenes, Scene):
         return scenes
@@ -42,10 +42,10 @@ def scenes_of(scenes: Any) -> Scene | Iterable[Scene]:
 
 
 def cameras_of(cameras: Cameras) -> Sequence[Mapping[str, Any] | Tensor | None]:
-    """The cameras of a batch one by one; None stands for each scene's own.
+    """Return the cameras of a batch as a sequence; None stands for each scene's own.
 
     Raises:
-        SceneError: something else.
+        SceneError: not a sequence of blocks or poses, nor a tensor of poses.
     """
     if cameras is None:
         return [None]
@@ -71,7 +71,7 @@ def cameras_of(cameras: Cameras) -> Sequence[Mapping[str, Any] | Tensor | None]:
 
 
 def _pose(key: str, value: Any, expected: str) -> Tensor:
-    """A tensor as it is, an array as one; lists of numbers in float64. Shapes are not looked at."""
+    """Return a tensor; lists of numbers become float64. Shapes are not checked."""
     if isinstance(value, Tensor):
         if value.layout is not torch.strided:
             raise SceneError(key, f"a {value.layout} tensor", expected)
@@ -83,10 +83,10 @@ def _pose(key: str, value: Any, expected: str) -> Tensor:
 
 
 def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[str, Tensor]] | None:
-    """The parameters of each scene of a batch; None where there are none.
+    """Return the parameters of each scene of a batch; None without parameters.
 
     Raises:
-        SceneError: tensors without a leading dimension, or of different ones; neither a mapping nor a sequence of mappings.
+        SceneError: no mapping to tensors with equal leading dimensions, and no sequence of mappings.
     """
     if params is None:
         return None
@@ -123,15 +123,15 @@ def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[
 
 
 def seeds_of(seed: Seeds, scenes: int | None, cameras: int) -> Callable[[int, int], Any]:
-    """The seed of scene ``s`` and camera ``c`` (None: the scene's own).
+    """Return a function of scene ``s`` and camera ``c`` that gives the seed (None: the scene's own).
 
     Args:
-        seed: as it was given.
-        scenes: how many there are; None: that is not known.
-        cameras: how many there are.
+        seed: the caller's argument.
+        scenes: number of scenes; None if not known.
+        cameras: number of cameras.
 
     Raises:
-        SceneError: too few or too many.
+        SceneError: too few or too many seeds.
     """
     if seed is None or isinstance(seed, int):
         return lambda s, c: seed
@@ -154,11 +154,11 @@ def seeds_of(seed: Seeds, scenes: int | None, cameras: int) -> Callable[[int, in
 
 @contextmanager
 def named(scene: str, camera: int | None) -> Iterator[None]:
-    """Errors within say which scene of a batch they are about, and those of a camera's block which camera.
+    """Make errors raised within name the scene of a batch and, for camera blocks, the camera.
 
     Args:
-        scene: such as ``scenes[3]``; "" where there is but one.
-        camera: its number; None where scenes have their own.
+        scene: name such as ``scenes[3]``; "" if there is only one.
+        camera: index of the camera; None for a scene's own.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Cases by topic, a file each with a tuple ``CASES``."""
+"""The cases by topic: each module has a tuple ``CASES``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ __all__ = ["all_cases"]
 
 
 def all_cases() -> dict[str, tuple[Case, ...]]:
-    """The cases of every topic."""
+    """Return the cases of all topics."""
     names = sorted(module.name for module in iter_modules(__path__) if not module.name.startswith("_"))
     return {name: import_module(f"{__name__}.{name}").CASES for name in names}

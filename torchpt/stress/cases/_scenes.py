@@ -1,4 +1,4 @@
-"""Small scenes that several topics use."""
+"""Small scenes for several topics."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from typing import Any
 
 __all__ = ["SKY", "ball", "facing", "floor_seen", "furnace", "room"]
 
-#: Light from everywhere.
+#: Constant environment of radiance 1.
 SKY = {"sky": {"type": "constant", "radiance": 1.0}}
 
 
 def facing(width: float = 0.5, distance: float = 4.0) -> dict[str, Any]:
-    """A camera of parallel rays that looks down the z axis."""
+    """Return an orthographic camera that looks down the z axis."""
     return {"type": "orthographic", "origin": [0, 0, distance], "target": [0, 0, 0], "width": width}
 
 
 def furnace(material: dict[str, Any], **shape: Any) -> dict[str, Any]:
-    """A ball of a material under light from everywhere, seen whole and nothing else: its picture is how much it reflects."""
+    """Return a white furnace: a ball under a constant environment that fills the picture, which shows its albedo."""
     return {
         "camera": facing(1.0),
         "shapes": {"ball": {"type": "sphere", "material": material, **shape}},
@@ -25,14 +25,14 @@ def furnace(material: dict[str, Any], **shape: Any) -> dict[str, Any]:
 
 
 def ball(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0), **keys: Any) -> dict[str, Any]:
-    """A sphere."""
+    """Return a sphere."""
     return {"type": "sphere", "radius": radius, "center": list(centre), **keys}
 
 
 def floor_seen(
     lights: dict[str, Any] | None, shapes: dict[str, Any] | None = None, albedo: float = 0.5, near: float = 1e-3
 ) -> dict[str, Any]:
-    """The middle of a diffuse square in z = 0, seen from aside and from so near that nothing above it is in the way."""
+    """Return a diffuse square in z = 0, seen from the side and so close that nothing above it is in the way."""
     return {
         "camera": {"type": "perspective", "origin": [near, 0, near], "target": [0, 0, 0], "up": [0, 0, 1], "fov": 1e-3},
         "shapes": {
@@ -44,7 +44,7 @@ def floor_seen(
 
 
 def room(albedo: float, emission: float = 1.0) -> dict[str, Any]:
-    """The inside of a sphere whose wall shines and reflects, seen from its middle."""
+    """Return the inside of a sphere whose wall emits and reflects, seen from its centre."""
     return {
         "camera": {"type": "perspective", "origin": [0, 0, 0], "target": [0, 0, 1], "fov": 60},
         "shapes": {

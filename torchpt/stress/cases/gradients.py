@@ -1,4 +1,4 @@
-"""Derivatives at the ends of their parameters: finite, and those of a closed form or of float64."""
+"""Gradients at extreme values of parameters: finite, and equal to a closed form or to finite differences."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def slope(
     depth: int = 2,
     seed: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """The mean of a picture, and its derivatives by a parameter, in float64."""
+    """Return the mean of a picture and its derivative by a parameter, in float64."""
     scene = load(described, device=harness.device)
     given = scene.params[name] if value is None else torch.as_tensor(value).expand(scene.params[name].shape)
     wanted = given.detach().clone().to(scene.device, scene.params[name].dtype).requires_grad_()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", EdgeWarning)  # no edge is in sight: the interior alone is compared
+        warnings.simplefilter("ignore", EdgeWarning)  # no edge is visible: only the interior is compared
         picture = render(
             scene,
             params={name: wanted},
@@ -52,21 +52,21 @@ def slope(
 
 
 def off(found: Tensor, expected: float) -> float:
-    """How far a derivative is from what it is to be, relative to that; infinite where it is no number."""
+    """Return the relative error of a derivative; infinite if it is not finite."""
     if not bool(torch.isfinite(found).all()):
         return math.inf
     return abs(float(found.sum()) - expected) / (abs(expected) or 1.0)
 
 
 def by_albedo(harness: Harness, value: float) -> float:
-    """A ball that gives back its albedo: 1."""
+    """Differentiate the albedo of a ball in a furnace: 1."""
     scene = furnace({"type": "diffuse", "reflectance": value})
     _, found = slope(harness, scene, "shapes.ball.material.reflectance", spp=256)
     return off(found, 1.0)
 
 
 def by_emission(harness: Harness, value: float) -> float:
-    """A disk of light one radius above a grey floor: a quarter."""
+    """Differentiate the emission of a disk of radius 1 at height 1 above a grey floor: 1/4."""
     turn = [{"rotate": {"axis": [1, 0, 0], "angle": 180}}, {"translate": [0, 0, 1]}]
     scene = floor_seen(None, {"lamp": {"type": "disk", "emission": value, "transform": turn}})
     _, found = slope(harness, scene, "shapes.lamp.emission", spp=256)
@@ -74,7 +74,7 @@ def by_emission(harness: Harness, value: float) -> float:
 
 
 def by_sky(harness: Harness, value: float) -> float:
-    """Light from everywhere on a grey ball: a half."""
+    """Differentiate the environment of a grey ball: 1/2."""
     scene = {
         **furnace({"type": "diffuse", "reflectance": 0.5}),
         "lights": {"sky": {"type": "constant", "radiance": value}},
@@ -84,7 +84,7 @@ def by_sky(harness: Harness, value: float) -> float:
 
 
 def by_roughness(harness: Harness, alpha: float) -> float:
-    """A metal ball: no number is lost, and what is found is what differences of the same samples give."""
+    """Differentiate the roughness of a metal ball: equal to finite differences with the same samples."""
     scene, name = furnace({"type": "roughconductor", "reflectance": 1.0, "alpha": alpha}), "shapes.ball.material.alpha"
     _, found = slope(harness, scene, name)
     step = alpha * 2.0**-8
@@ -94,14 +94,14 @@ def by_roughness(harness: Harness, alpha: float) -> float:
 
 
 def by_little_roughness(harness: Harness, alpha: float) -> float:
-    """Where a metal is nearly smooth its derivative is all noise, but made of numbers."""
+    """Differentiate a very small roughness: all noise, but finite."""
     scene = furnace({"type": "roughconductor", "reflectance": 1.0, "alpha": alpha})
     _, found = slope(harness, scene, "shapes.ball.material.alpha")
     return 0.0 if bool(torch.isfinite(found).all()) else math.inf
 
 
 def by_index(harness: Harness, index: float) -> float:
-    """Smooth glass under even light gives back 1 whatever its index: 0."""
+    """Differentiate the index of smooth glass in a furnace, whose radiance is 1: 0."""
     _, found = slope(
         harness, furnace({"type": "dielectric", "int_ior": index}), "shapes.ball.material.int_ior", depth=16
     )
@@ -109,7 +109,7 @@ def by_index(harness: Harness, index: float) -> float:
 
 
 def by_a_vertex(harness: Harness, size: float) -> float:
-    """A triangle without area among others: its corners have derivatives, and they are numbers."""
+    """Differentiate the vertices of a mesh with a triangle of no area: finite."""
     points = [
         [-1.0, -1.0, 0.0],
         [1.0, -1.0, 0.0],

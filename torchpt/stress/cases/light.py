@@ -1,4 +1,4 @@
-"""Lights near and far, dim and bright, few and many; paths long and short."""
+"""Lights near and far, dim and bright, few and many; short and long paths."""
 
 from __future__ import annotations
 
@@ -20,39 +20,39 @@ ALBEDO = 0.5
 
 
 def lamp(kind: str, height: float, **keys: Any) -> dict[str, Any]:
-    """A shape that shines down from so far above the floor."""
+    """Return a shape at ``height`` that emits down onto the floor."""
     turn = [{"rotate": {"axis": [1, 0, 0], "angle": 180}}] if kind in ("disk", "rectangle") else []
     return {"lamp": {"type": kind, "emission": 1.0, "transform": [*turn, {"translate": [0, 0, height]}], **keys}}
 
 
 def disk_above(harness: Harness, height: float) -> float:
-    """A disk of radius 1, one-sided: E = π / (1 + h²)."""
+    """Compare a one-sided disk of radius 1 with E = π / (1 + h²)."""
     expected = ALBEDO / (1.0 + height**2)
     scene = floor_seen(None, lamp("disk", height), near=min(1e-3, height / 2))
     return relative(harness.render(scene, spp=256, max_depth=2), expected)
 
 
 def ball_above(harness: Harness, height: float) -> float:
-    """A ball of radius 1 whose lowest point is so far up: E = π / (1 + h)²."""
+    """Compare a ball of radius 1, its lowest point at ``height``, with E = π / (1 + h)²."""
     expected = ALBEDO / (1.0 + height) ** 2
     scene = floor_seen(None, lamp("sphere", 1.0 + height), near=min(1e-3, height / 2))
     return relative(harness.render(scene, spp=256, max_depth=2), expected)
 
 
 def point_above(harness: Harness, height: float) -> float:
-    """A point: E = I / h²."""
+    """Compare a point light with E = I / h²."""
     light = {"it": {"type": "point", "position": [0, 0, height], "intensity": 1.0}}
     return relative(harness.render(floor_seen(light), max_depth=2), ALBEDO / math.pi / height**2)
 
 
 def inside_a_light(harness: Harness, radius: float) -> float:
-    """A floor within a ball that shines inwards receives π."""
+    """Compare a floor inside an emissive ball with E = π."""
     ball = {"type": "sphere", "radius": radius, "emission": 1.0, "flip_normals": True}
     return relative(harness.render(floor_seen(None, {"ball": ball}), spp=256, max_depth=2), ALBEDO)
 
 
 def radiance(harness: Harness, value: float) -> float:
-    """Light from everywhere of any strength: so many times the picture of strength 1."""
+    """Compare a constant environment with ``value`` times the picture of radiance 1."""
     scene = furnace({"type": "diffuse", "reflectance": ALBEDO})
     one = harness.render(scene)
     return relative(
@@ -61,20 +61,20 @@ def radiance(harness: Harness, value: float) -> float:
 
 
 def area_radiance(harness: Harness, value: float) -> float:
-    """The same of a disk."""
+    """Compare an emissive disk of radiance ``value`` with its closed form."""
     return relative(
         harness.render(floor_seen(None, lamp("disk", 1.0, emission=value)), max_depth=2), ALBEDO * value / 2
     )
 
 
 def many(harness: Harness, number: float) -> float:
-    """So many points that share the power of one."""
+    """Compare ``number`` point lights with one of the same power."""
     lights = {f"p{k}": {"type": "point", "position": [0, 0, 2], "intensity": 1.0 / number} for k in range(int(number))}
     return relative(harness.render(floor_seen(lights), max_depth=2), ALBEDO / math.pi / 4)
 
 
 def one_of_many(harness: Harness, number: float) -> float:
-    """So many points of which one is a million times brighter."""
+    """Compare ``number`` point lights, one of them a million times brighter, with their sum."""
     lights = {f"p{k}": {"type": "point", "position": [0, 0, 2], "intensity": 1e-6} for k in range(int(number) - 1)}
     lights["bright"] = {"type": "point", "position": [0, 0, 2], "intensity": 1.0}
     expected = (1.0 + 1e-6 * (number - 1)) * ALBEDO / math.pi / 4
@@ -82,7 +82,7 @@ def one_of_many(harness: Harness, number: float) -> float:
 
 
 def sun(harness: Harness, value: float) -> float:
-    """A map with one texel of this radiance straight above, else 1: half of its power, by its cosine and solid angle."""
+    """Compare an environment map with one bright texel with float64."""
     height, width = 64, 128
     texels = torch.ones(height, width, 3)
     row, column = 16, 32
@@ -99,7 +99,7 @@ def sun(harness: Harness, value: float) -> float:
 
 
 def black_map(harness: Harness, lit: float) -> float:
-    """A map that is black but for so many rows."""
+    """Compare an environment map that is black but for ``lit`` rows with float64."""
     texels = torch.zeros(16, 32, 3)
     texels[: int(lit)] = 1.0
     with tempfile.TemporaryDirectory() as folder:
@@ -112,23 +112,23 @@ def black_map(harness: Harness, lit: float) -> float:
 
 
 def closed_room(harness: Harness, depth: float) -> float:
-    """A room of albedo .9: the series of so many terms."""
+    """Compare a closed room of albedo 0.9 with the series of ``depth`` terms."""
     expected = (1 - 0.9**depth) / 0.1
     return relative(harness.render(room(0.9), spp=256, max_depth=int(depth)), expected)
 
 
 def bright_room(harness: Harness, absorbed: float) -> float:
-    """A room whose walls absorb so little, paths without end: 1 over that."""
+    """Compare a closed room of unbounded paths with 1 / ``absorbed``."""
     return relative(harness.render(room(1.0 - absorbed), spp=64, max_depth=-1), 1.0 / absorbed)
 
 
 def white_room(harness: Harness, depth: float) -> float:
-    """A room of albedo 1: as many as there are edges."""
+    """Compare a closed room of albedo 1 with the number of its edges, ``depth``."""
     return relative(harness.render(room(1.0), spp=16, max_depth=int(depth)), depth)
 
 
 def nothing(harness: Harness, which: float) -> float:
-    """Scenes without shapes, without light, and a camera in a solid: black or the sky, to the bit."""
+    """Render scenes without shapes, without light, and from inside a solid: black, or the sky."""
     black = {"type": "diffuse", "reflectance": 0.0}
     scenes = (
         ({"camera": facing()}, 0.0),

@@ -1,4 +1,4 @@
-"""Roughness, index and albedo at their ends."""
+"""Extreme roughness, index and albedo."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ INDEX = tuple(10.0 ** (k / 4) for k in range(-12, 13))
 
 
 def gain(harness: Harness, material: dict[str, Any]) -> float:
-    """By how much a ball gives back more than it receives; infinite where it gives back nothing at all."""
+    """Return the excess of a ball's albedo in a furnace over 1; infinite for a black picture."""
     mean = float(harness.render(furnace(material), spp=256, max_depth=-1).mean())
     return max(mean - 1.0, 0.0) if mean > 0.0 else math.inf
 
 
 def beside_float64(harness: Harness, material: dict[str, Any], spp: int = 16) -> float:
-    """How far a ball's reflectance is from that of float64, by the same random numbers."""
+    """Return the relative difference of a ball's albedo from that in float64, with the same random numbers."""
     scene = furnace(material)
     return relative(harness.render(scene, spp=spp, max_depth=8), harness.exact().render(scene, spp=spp, max_depth=8))
 
 
 def rough(kind: str, **more: Any):
-    """A material by its roughness."""
+    """Return a function from roughness to material."""
     return lambda alpha: {"type": kind, "alpha": alpha, **more}
 
 
@@ -39,29 +39,29 @@ PLASTIC = rough("roughplastic", diffuse_reflectance=1.0)
 
 
 def one_direction(harness: Harness, alpha: float) -> float:
-    """A pair of roughnesses of which one is 0."""
+    """Render metals whose roughness is 0 along one direction: no energy is gained."""
     pairs = ({"alpha_u": 0.0, "alpha_v": alpha}, {"alpha_u": alpha, "alpha_v": 0.0})
     return max(gain(harness, {"type": "roughconductor", "reflectance": 1.0, **pair}) for pair in pairs)
 
 
 def glass_in_a_furnace(harness: Harness, index: float) -> float:
-    """Smooth glass neither takes nor gives."""
+    """Compare smooth glass in a furnace with 1."""
     return relative(harness.render(furnace({"type": "dielectric", "int_ior": index}), max_depth=-1), 1.0)
 
 
 def plastic(harness: Harness, index: float) -> float:
-    """A coat over white keeps nothing."""
+    """Compare white plastic in a furnace with 1."""
     material = {"type": "plastic", "diffuse_reflectance": 1.0, "int_ior": index, "nonlinear": True}
     return relative(harness.render(furnace(material), spp=256, max_depth=-1), 1.0)
 
 
 def thin_glass(harness: Harness, index: float) -> float:
-    """A pane."""
+    """Compare a thin pane in a furnace with 1."""
     return relative(harness.render(furnace({"type": "thindielectric", "int_ior": index}), max_depth=-1), 1.0)
 
 
 def grazing(harness: Harness, height: float) -> float:
-    """A square seen at so small an angle, under light from everywhere: no more than one comes back."""
+    """Return the excess over 1 of a square in a furnace, seen at a grazing angle."""
     angle = math.asin(height)
     camera = {
         "type": "orthographic",
@@ -87,13 +87,13 @@ def grazing(harness: Harness, height: float) -> float:
 
 
 def albedo(harness: Harness, value: float) -> float:
-    """A ball of this albedo gives back so many times what a white one does."""
+    """Compare a ball of albedo ``value`` with that multiple of a white one."""
     some, white = (harness.render(furnace({"type": "diffuse", "reflectance": r}), max_depth=2) for r in (value, 1.0))
     return relative(some, white.mean() * value)
 
 
 def backs(harness: Harness, alpha: float) -> float:
-    """The back of a two-sided metal is its front."""
+    """Compare the back of a two-sided metal with its front."""
     scenes = []
     for turn in (0, 180):
         shape = {

@@ -1,4 +1,4 @@
-"""Counters, sums and weights where float32 and int32 end."""
+"""Counters, sums and weights at the limits of float32 and int32."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["CASES"]
 
 
 def sums(harness: Harness, number: float) -> float:
-    """The mean of so many samples of 0.1."""
+    """Compare the mean of ``number`` samples of 0.1 with 0.1."""
     film = Film(4, 4, 1, torch.device("cpu"))
     chunk = torch.full((3, 1000, 16), 0.1)
     for k in range(int(number) // 1000):
@@ -25,7 +25,7 @@ def sums(harness: Harness, number: float) -> float:
 
 
 def late_samples(harness: Harness, first: float) -> float:
-    """Numbers of 2^12 samples from this one on: off the mean of a half, in standard deviations over 4."""
+    """Return the deviation from 1/2 of the mean of 2^12 random numbers from sample ``first`` on, in units of 4 sigma."""
     worst = 0.0
     for kind in KINDS:
         if KINDS[kind].needs_count:
@@ -41,7 +41,7 @@ def late_samples(harness: Harness, first: float) -> float:
 
 
 def weights(harness: Harness, density: float) -> float:
-    """Both weights of a pair of densities make one."""
+    """Compare the sum of both MIS weights of a pair of densities with 1."""
     a = torch.tensor([density, density, 1.0, math.inf, density]).float()
     b = torch.tensor([1.0, density, density, 1.0, 0.0]).float()
     total = power_heuristic(a, b) + power_heuristic(b, a)

@@ -1,4 +1,4 @@
-"""Sizes, distances, and shapes that nearly are none."""
+"""Extreme sizes and distances, and degenerate shapes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WHITE = {"type": "diffuse", "reflectance": 1.0}
 
 
 def still_life(scale: float = 1.0, shift: float = 0.0, turn: float = 0.0) -> dict[str, Any]:
-    """A floor, a ball, a box and a lamp, scaled, turned about x, and shifted along what is no axis."""
+    """Return a floor, a ball, a box and a lamp: scaled, turned about x, and shifted off the axes."""
     step = [shift, 0.7 * shift, -0.3 * shift]
     moved = [{"rotate": {"axis": [1, 0, 0], "angle": turn}}, {"scale": scale}, {"translate": step}]
 
@@ -51,21 +51,21 @@ def still_life(scale: float = 1.0, shift: float = 0.0, turn: float = 0.0) -> dic
 
 
 def at_scale(harness: Harness, scale: float) -> float:
-    """The picture of a scene of another size."""
+    """Compare the picture of a scaled scene."""
     return relative_difference(
         harness.render(still_life(scale), size=24, spp=16), harness.render(still_life(), size=24, spp=16)
     )
 
 
 def far_away(harness: Harness, shift: float) -> float:
-    """The picture of a scene far from the origin."""
+    """Compare the picture of a scene far from the origin."""
     return relative_difference(
         harness.render(still_life(shift=shift), size=24, spp=16), harness.render(still_life(), size=24, spp=16)
     )
 
 
 def turned(harness: Harness, angle: float) -> float:
-    """The picture of a scene that is turned with its camera. Its frames, and so its noise, are others."""
+    """Compare the picture of a scene turned with its camera; its shading frames, and so its noise, differ."""
     plain, other = (harness.render(still_life(), size=24, spp=64, seed=seed) for seed in (1, 2))
     return relative_difference(harness.render(still_life(turn=angle), size=24, spp=64), plain) / relative_difference(
         other, plain
@@ -73,7 +73,7 @@ def turned(harness: Harness, angle: float) -> float:
 
 
 def little_on_large(harness: Harness, radius: float) -> float:
-    """A white ball on a white floor of 1e3 under white light: a ray that starts inside of what it left darkens it."""
+    """Render a white ball on a white floor of 1e3 in a furnace: 1, unless rays start inside the surface that they leave."""
     scene = {
         "camera": {"type": "perspective", "origin": [0, 6 * radius, 3 * radius], "target": [0, 0, radius], "up": [0, 0, 1],
                    "fov": 20},
@@ -85,7 +85,7 @@ def little_on_large(harness: Harness, radius: float) -> float:
 
 
 def flat_room(harness: Harness, height: float) -> float:
-    """A closed room so low, whose walls shine 1 and give back half: 2 wherever one looks, or something leaked."""
+    """Render a low closed room whose walls emit 1 and reflect half: 2 everywhere, unless it leaks."""
     walls = {"type": "cube", "flip_normals": True, "emission": 1.0, "material": {"type": "diffuse", "reflectance": 0.5}}
     scene = {
         "camera": {
@@ -101,7 +101,7 @@ def flat_room(harness: Harness, height: float) -> float:
 
 
 def grid(number: int, material: dict[str, Any] = WHITE, **keys: Any) -> dict[str, Any]:
-    """A square of ``2 number²`` triangles."""
+    """Return a square of ``2 number²`` triangles."""
     x = np.linspace(-1, 1, number + 1)
     points = np.stack([*np.meshgrid(x, x, indexing="ij"), np.zeros((number + 1,) * 2)], -1).reshape(-1, 3)
     first = (np.arange(number)[:, None] * (number + 1) + np.arange(number)).reshape(-1)
@@ -110,13 +110,13 @@ def grid(number: int, material: dict[str, Any] = WHITE, **keys: Any) -> dict[str
 
 
 def seams(harness: Harness, number: float) -> float:
-    """Black light passes where a square of many triangles leaks at an edge that they share."""
+    """Render an emissive square of many triangles: pixels differ from 1 where it leaks at a shared edge."""
     scene = {"camera": facing(1.9), "shapes": {"square": grid(int(number), emission=1.0)}}
     return float((harness.render(scene, size=64, spp=16, max_depth=1) - 1.0).abs().max())
 
 
 def degenerate(harness: Harness, _: float) -> float:
-    """Slivers and triangles of no area among the others change nothing."""
+    """Compare a mesh with slivers and triangles of no area added."""
     plain = grid(8)
     bad = {**plain, "vertices": [*plain["vertices"], [0, 0, 0], [1, 1, 0], [0.5, 0.5, 0], [0, 0, 1e-30], [1e-38, 0, 0]]}
     n = len(plain["vertices"])
@@ -126,7 +126,7 @@ def degenerate(harness: Harness, _: float) -> float:
 
 
 def all_in_one_place(harness: Harness, number: float) -> float:
-    """So many triangles with one centroid: all Morton codes are equal, and the first of them is met."""
+    """Compare ``number`` equal triangles, whose Morton codes are all the same, with one of them."""
     three = [[-3.0, -3.0, 0.0], [3.0, -3.0, 0.0], [0.0, 6.0, 0.0]]
     mesh = {"type": "mesh", "vertices": three, "faces": [[0, 1, 2]] * int(number), "material": WHITE}
     one = {**mesh, "faces": [[0, 1, 2]]}
@@ -136,7 +136,7 @@ def all_in_one_place(harness: Harness, number: float) -> float:
 
 
 def along_the_axes(harness: Harness, axis: float) -> float:
-    """Rays that are parallel to an axis and lie in planes of boxes."""
+    """Trace rays along an axis, in planes of boxes."""
     way = [0.0, 0.0, 0.0]
     way[int(axis) % 3] = 4.0 if axis < 3 else -4.0
     up = [0.0, 1.0, 0.0] if int(axis) % 3 != 1 else [1.0, 0.0, 0.0]
@@ -147,7 +147,7 @@ def along_the_axes(harness: Harness, axis: float) -> float:
 
 
 def small_far_sphere(harness: Harness, distance: float) -> float:
-    """A ball lit from the eye, so far away: its discriminant is a small difference of large numbers."""
+    """Compare a distant ball lit from the camera with a closed form; its discriminant is a difference of large numbers."""
     half = np.arctan(1.0 / distance) / 2
     scene = {
         "camera": {
@@ -168,7 +168,7 @@ def small_far_sphere(harness: Harness, distance: float) -> float:
 
 
 def one_pixel_wide(harness: Harness, width: float) -> float:
-    """A film of so many pixels by one."""
+    """Render a film of ``width`` by one pixel."""
     scene = load(furnace({"type": "diffuse"}, emission=0.5), device=harness.device)
     film = {"width": int(width), "height": 1, "filter": "box"}
     only = {"type": "path", "max_depth": 1}

@@ -1,4 +1,4 @@
-"""Surfaces that touch, mirror, are shaded as if they were round, or wear textures of any size."""
+"""Surfaces that touch, are mirrored, have smooth normals, or textures of any scale."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WHITE = {"type": "diffuse", "reflectance": 1.0}
 
 
 def round_mesh(rings: int, **keys: Any) -> dict[str, Any]:
-    """A ball of few triangles with the normals of a round one."""
+    """Return a ball of few triangles with the normals of a sphere."""
     polar, around = np.linspace(0, np.pi, rings + 1)[1:-1], np.linspace(0, 2 * np.pi, 2 * rings, endpoint=False)
     belts = [[np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)] for a in polar for b in around]
     points, wide = [[0.0, 0.0, 1.0], *belts, [0.0, 0.0, -1.0]], len(around)
@@ -38,7 +38,7 @@ def round_mesh(rings: int, **keys: Any) -> dict[str, Any]:
 
 
 def shaded_round(harness: Harness, rings: float) -> float:
-    """Normals that lean off the surface bring no light of their own."""
+    """Return the excess over 1 of coarse balls with smooth normals in a furnace."""
     worst = 0.0
     for material in (WHITE, {"type": "roughconductor", "reflectance": 1.0, "alpha": 0.3}, {"type": "conductor"}):
         scene = {"camera": facing(2.2), "shapes": {"it": round_mesh(int(rings), material=material)}, "lights": SKY}
@@ -47,7 +47,7 @@ def shaded_round(harness: Harness, rings: float) -> float:
 
 
 def touching(harness: Harness, size: float) -> float:
-    """White boxes side by side on a white floor, under white light: a ray that is lost where they touch darkens them."""
+    """Render touching white boxes on a white floor in a furnace: 1, unless rays are lost where they touch."""
     boxes = {
         f"b{k}": {
             "type": "cube",
@@ -69,7 +69,7 @@ def touching(harness: Harness, size: float) -> float:
 
 
 def mirrored(harness: Harness, scale: float) -> float:
-    """The front of what is mirrored stays its front."""
+    """Compare emissive shapes with mirrored ones, whose front stays the front."""
     pictures = []
     for z in (scale, -scale):
         shape = round_mesh(8, emission=1.0, transform=[{"scale": [1, 1, z]}])
@@ -81,7 +81,7 @@ def mirrored(harness: Harness, scale: float) -> float:
 
 
 def checks(harness: Harness, scale: float) -> float:
-    """Squares of black and white however small: their mean, and black where the first is larger than the ball."""
+    """Check the mean of a checkerboard at any scale; it is black where the first square is larger than the ball."""
     board = {"type": "checkerboard", "color0": 0.0, "color1": 1.0, "scale": [scale, scale]}
     found = float(harness.render(furnace({"type": "diffuse", "reflectance": board}), spp=256, max_depth=2).mean())
     if scale > 1e6:  # one square and the next have the same float32 coordinates
@@ -90,7 +90,7 @@ def checks(harness: Harness, scale: float) -> float:
 
 
 def no_room_for_uv(harness: Harness, span: float) -> float:
-    """An anisotropic metal on a mesh whose texture coordinates span this: where they give no frame the normal does."""
+    """Render an anisotropic metal with texture coordinates of range ``span``, which may define no tangent frame."""
     mesh = round_mesh(6, material={"type": "roughconductor", "alpha_u": 0.05, "alpha_v": 0.4, "reflectance": 1.0})
     mesh["uvs"] = (np.asarray(mesh["vertices"])[:, :2] * span).tolist()
     found = harness.render({"camera": facing(1.0), "shapes": {"it": mesh}, "lights": SKY}, max_depth=2)
