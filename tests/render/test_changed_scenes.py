@@ -136,8 +136,10 @@ def test_what_a_batch_returns_can_be_used_outside_of_inference_mode(scene: torch
 def test_renders_that_are_taken_alone_have_all_threads(scene: torchpt.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a batch, while other pictures are traced."""
     threads: list[int] = []
-    go = Run.go
-    monkeypatch.setattr(Run, "go", lambda self, told: (threads.append(self.engine.budget.threads), go(self, told))[1])
+    sample_all = Run.sample_all
+    monkeypatch.setattr(
+        Run, "sample_all", lambda self, told: (threads.append(self.engine.budget.threads), sample_all(self, told))[1]
+    )
     timed = torchpt.load({**SCENE, "render": {"spp": 4, "time_limit": 100.0}}, "cpu")
     torchpt.render_batch([scene, timed], threads=2, compile="on")
     assert threads == [2]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.compiler.function import lanewise
+from torchpt.compiler.function import compile_lanewise
 from torchpt.core.errors import SceneError
 from torchpt.math.vectors import luminance
 from torchpt.physics.parts import Parameters
@@ -263,7 +263,7 @@ def test_compiled_is_eager(name: str, opened: Callable[..., Opened]):
             slopes = list(inclines(table, at)) if not coloured and name in MAPPED else []
             return [read(table, at, coloured), *slopes]
 
-        eager, compiled = stage(*inputs), lanewise(stage, inputs)(*inputs)
+        eager, compiled = stage(*inputs), compile_lanewise(stage, inputs)(*inputs)
         for a, b in zip(eager, compiled, strict=True):
             off = (a - b).abs() > 1e-4 * (1 + a.abs())
             assert float(off.float().mean()) < 0.005  # a coordinate rounded otherwise lies across an edge

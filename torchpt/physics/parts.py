@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchpt.core.tree import UNPRINTED
+from torchpt.core.tree import NOT_FINGERPRINTED
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.shapes.quadrics import Quadric
 from torchpt.physics.textures import Node
@@ -102,8 +102,8 @@ class Part:
     colors: np.ndarray | None = None
     smooth: bool = False
     dropped: int = 0
-    source: str = field(default="", metadata=UNPRINTED)
-    ignored: tuple[str, ...] = field(default=(), metadata=UNPRINTED)
+    source: str = field(default="", metadata=NOT_FINGERPRINTED)
+    ignored: tuple[str, ...] = field(default=(), metadata=NOT_FINGERPRINTED)
 
 
 @dataclass(frozen=True)

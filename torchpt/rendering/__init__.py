@@ -19,14 +19,14 @@ May import: ``gradients`` and what lies below. (It is not called ``render``: tha
 
 from __future__ import annotations
 
-from torchpt.rendering.many import Entry, render_many
+from torchpt.rendering.many import QueuedRender, render_many
 from torchpt.rendering.result import Progress, Rendering
 from torchpt.rendering.run import Run, render_scene
 from torchpt.scene.prepare import SceneCache, kernels_of, loop_facts, looped, make_wave, rebound, scene_cache
 
 __all__ = [
-    "Entry",
     "Progress",
+    "QueuedRender",
     "Rendering",
     "Run",
     "SceneCache",

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import in_transform
+from torchpt.core.autograd import is_transformed
 from torchpt.core.errors import SceneError
 from torchpt.math.transforms import affine
 from torchpt.physics.cameras import opencv
@@ -136,7 +136,7 @@ def from_opengl(
     }
     if K is None:
         angle = _tensor(fov, "fov", ())
-        if not in_transform(angle) and not 0.0 < float(angle) < 180.0:
+        if not is_transformed(angle) and not 0.0 < float(angle) < 180.0:
             raise SceneError("fov", fov, "an angle in degrees above 0 and below 180")
         if fov_axis not in FOV_AXES:
             raise SceneError("fov_axis", fov_axis, f"one of {', '.join(FOV_AXES)}")
@@ -277,7 +277,7 @@ def _numbers(value: Any, key: str, expected: str) -> Tensor:
         found = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise SceneError(key, value, expected) from None
-    if not in_transform(found) and not bool(found.isfinite().all()):
+    if not is_transformed(found) and not bool(found.isfinite().all()):
         raise SceneError(key, value, "finite numbers")
     return found
 
@@ -285,7 +285,7 @@ def _numbers(value: Any, key: str, expected: str) -> Tensor:
 def _rotation(value: Any) -> Tensor:
     """A rotation in float64."""
     found = _tensor(value, "R", (3, 3))
-    if not in_transform(found):
+    if not is_transformed(found):
         try:
             opencv.rotation(found.detach().tolist())
         except Refused as error:
@@ -333,11 +333,11 @@ def _pose(matrix: Any) -> Tensor:
     if found.shape not in ((4, 4), (3, 4)):
         raise SceneError("matrix", f"shape {tuple(found.shape)}", "a matrix (4, 4) or (3, 4)")
     last = found.new_tensor([0.0, 0.0, 0.0, 1.0])
-    if len(found) == 4 and not in_transform(found) and not found[3].detach().equal(last):
+    if len(found) == 4 and not is_transformed(found) and not found[3].detach().equal(last):
         raise SceneError("matrix", found[3].tolist(), "a matrix whose last row is 0 0 0 1")
     axes = found[:3, :3]
     lengths = torch.linalg.vector_norm(axes, dim=0)
-    if not in_transform(lengths) and not bool((lengths > 0.0).all()):
+    if not is_transformed(lengths) and not bool((lengths > 0.0).all()):
         raise SceneError("matrix", matrix, "finite numbers, and axes of a length")
     return torch.cat((axes / lengths, found[:3, 3:]), 1)
 

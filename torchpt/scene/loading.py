@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from torchpt.core.memory import needing
-from torchpt.core.threads import lasting
+from torchpt.core.memory import explain_out_of_memory
+from torchpt.core.threads import outside_inference_mode
 from torchpt.physics.bsdfs import Bsdf
 from torchpt.scene.devices import device_of
 from torchpt.scene.formats.description import Source, read_description, settings
@@ -59,11 +59,11 @@ def _load(
 ) -> Scene:
     start = time.perf_counter()
     tensors = Tensors()
-    with needing("the scene file"):
+    with explain_out_of_memory("the scene file"):
         may_hold_tensors = bool(overrides) or isinstance(source, Mapping)
         description = read_description(source, bsdfs, tensors.taken_from if may_hold_tensors else None, overrides)
     chosen = device_of(settings(description).render.device if device is None else device)
-    with lasting():
+    with outside_inference_mode():
         scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))
     scene.params |= traced(tensors, scene.description, scene.built, scene.params)
     scene.load_seconds = time.perf_counter() - start

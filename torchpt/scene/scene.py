@@ -19,8 +19,8 @@ from torch import Tensor
 from torchpt import search
 from torchpt.core.autograd import outside_transforms
 from torchpt.core.errors import SceneError
-from torchpt.core.memory import Meter, mb, retried
-from torchpt.core.threads import lasting, settle
+from torchpt.core.memory import MemoryMeter, mb, retry_out_of_memory
+from torchpt.core.threads import outside_inference_mode, warm_up
 from torchpt.physics.bsdfs import Bsdf
 from torchpt.physics.cameras import Camera
 from torchpt.physics.cameras.opencv import PinholeMatrices, extrinsics
@@ -80,13 +80,15 @@ class Scene:
         own_models: tuple[Bsdf, ...] = (),
         traced: Collection[str] = (),
     ) -> None:
-        settle()
-        meter = Meter(device)
+        warm_up()
+        meter = MemoryMeter(device)
         meter.base()  # only now all modules are there
         before = meter.peak()
         self.load_seconds = 0.0
         self.description, self.device, self.own_models = description, device, own_models
-        self._built: Built = retried("the files and shapes of the scene", lambda: build_parts(description, traced))
+        self._built: Built = retry_out_of_memory(
+            "the files and shapes of the scene", lambda: build_parts(description, traced)
+        )
         # Geometry far from the origin would lose its detail in float32 before it can be moved there.
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {
@@ -137,7 +139,7 @@ class Scene:
             SceneError: what is wrong with the camera.
         """
         view = object.__new__(type(self))
-        with lasting():
+        with outside_inference_mode():
             own = through(self.description, self._built, self.params, camera, {} if film is None else film)
         view.__dict__.update(self.__dict__ | own)
         view._origin = self.origin
@@ -185,7 +187,7 @@ class Scene:
         return held | {"params": {name: _leaf(value) for name, value in self.params.items()}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        settle()
+        warm_up()
         self.__dict__.update(state)
         self._begin()
 
@@ -299,7 +301,7 @@ class Scene:
             self._refresh()
             key = dtype, uv, choice
             if key not in self._worlds:
-                with lasting(), torch.no_grad():
+                with outside_inference_mode(), torch.no_grad():
                     self._worlds[key] = self._assemble(self.merged(None), dtype, uv, choice)
             return self._worlds[key]
 

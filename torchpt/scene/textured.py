@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import in_transform, outside_transforms
+from torchpt.core.autograd import is_transformed, outside_transforms
 from torchpt.core.errors import NotBuiltError, SceneError
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Parameters
@@ -107,7 +107,7 @@ def _is_texels(value: object, dimensions: int) -> bool:
 
 def _plain(value: Tensor, loaded: np.ndarray) -> Tensor:
     """Texels apart from their tape; where transforms of ``torch.func`` hide them, others of their shape stand for them."""
-    if in_transform(value):
+    if is_transformed(value):
         return torch.full(value.shape, float(loaded.mean()), dtype=value.dtype, device=value.device)
     return value.detach()
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from torchpt.core.errors import NotBuiltError, SceneError
-from torchpt.core.tree import UNPRINTED
+from torchpt.core.tree import NOT_FINGERPRINTED
 from torchpt.spec import Map, Refused, unsupported
 from torchpt.spec.parameters import REQUIRED, Spec, spec_of
 from torchpt.spec.reading import within
@@ -319,7 +319,7 @@ class ParsedParams:
     kind: Any
     values: dict[str, Any]
     given: frozenset[str] = field(
-        default=frozenset(), repr=False, metadata=UNPRINTED
+        default=frozenset(), repr=False, metadata=NOT_FINGERPRINTED
     )  # a default that is stated is no other one
 
     @property

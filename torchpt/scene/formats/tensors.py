@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import in_transform
+from torchpt.core.autograd import is_transformed
 from torchpt.core.errors import SceneError
 
 __all__ = ["Key", "Tensors"]
@@ -79,7 +79,7 @@ class Tensors:
 
 def _numbers(tensor: Tensor, key: Key) -> np.ndarray:
     """A tensor's values, apart from it: what is done to the tensor later does not change them."""
-    if in_transform(tensor):
+    if is_transformed(tensor):
         expected = "plain numbers: hand tensors under torch.func to render(params=...)"
         raise SceneError(".".join(map(str, key)), "a tensor under a transform of torch.func", expected)
     try:

@@ -19,7 +19,7 @@ from torchpt.physics.parts import Part, Source
 from torchpt.physics.shapes.geometry import KINDS, Geometry
 from torchpt.scene.space import Space
 from torchpt.scene.world.primitives import Primitives
-from torchpt.search.bounds import chosen, primitive_bounds
+from torchpt.search.bounds import primitive_bounds, select_primitives
 from torchpt.spec import Refused
 from torchpt.spec.schema import refused
 
@@ -127,7 +127,7 @@ def lights_of(
         solid=solid,
         shapes=shapes_of(solid),
     )
-    low, high = (box.double() for box in primitive_bounds(chosen(geometry, prim)))
+    low, high = (box.double() for box in primitive_bounds(select_primitives(geometry, prim)))
     return replace(lights, choice=choice_of(lights, power, (low, high), choice))
 
 
