@@ -11,7 +11,7 @@ import torch
 
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.threads import TaskQueue, one_thread, without_autocast
-from torchpt.engines.engine import Block, Share
+from torchpt.engines.engine import Block, TaskResult
 from torchpt.rendering.result import Rendering
 from torchpt.rendering.run import Run
 
@@ -57,7 +57,7 @@ def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
     Raises:
         Exception: the error that an entry's ``failed`` raises; all other renders are cancelled.
     """
-    queue = TaskQueue[QueuedRender, Share](torch.get_num_threads())
+    queue = TaskQueue[QueuedRender, TaskResult](torch.get_num_threads())
     waiting, begun = iter(entries), dict[int, QueuedRender]()
     try:
         while True:
@@ -92,7 +92,7 @@ def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
 
 
 @contextmanager
-def _single_threaded(queue: TaskQueue[QueuedRender, Share]) -> Iterator[None]:
+def _single_threaded(queue: TaskQueue[QueuedRender, TaskResult]) -> Iterator[None]:
     """Let tensor operations use one thread while the pool traces: torch's team would wait for busy cores, and spin."""
     with one_thread() if queue.pending else nullcontext():
         yield
@@ -108,7 +108,7 @@ def _errors_to(entry: QueuedRender) -> Iterator[None]:
         raise
 
 
-def _collect(queue: TaskQueue[QueuedRender, Share], begun: dict[int, QueuedRender], most: int) -> None:
+def _collect(queue: TaskQueue[QueuedRender, TaskResult], begun: dict[int, QueuedRender], most: int) -> None:
     """Collect results of the pool until at most ``most`` tasks are pending."""
     while True:
         found = queue.next(wait=queue.pending > most)

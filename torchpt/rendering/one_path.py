@@ -311,9 +311,9 @@ class _PathBuilder:
 def _bsdf_sample(output: VertexOutput) -> BsdfSampleRecord:
     drawn, carried, chance, after = output.drawn, output.carried, output.chance, output.leaving
     assert drawn is not None and carried is not None and output.surface is not None
-    goes_on, weight, relief = float(after.t_max) > 0.0, drawn.weight, output.surface.relief
-    if relief is not None:
-        weight = weight * relief.shadowing(drawn.d)
+    goes_on, weight, perturbed_normal = float(after.t_max) > 0.0, drawn.weight, output.surface.perturbed_normal
+    if perturbed_normal is not None:
+        weight = weight * perturbed_normal.shadowing(drawn.d)
     return BsdfSampleRecord(
         wi=_first_lane(drawn.d),
         pdf=float(drawn.pdf),

@@ -15,7 +15,7 @@ from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import LostRankError, OutputError, RenderError, SceneError, warn_once
 from torchpt.core.memory import Budget, MemoryMeter, check_memory, explain_out_of_memory, mb, retry_out_of_memory
 from torchpt.core.threads import limited_threads, without_autocast
-from torchpt.engines.engine import Block, Forward, Share, Tasks, forward_tensors
+from torchpt.engines.engine import Block, Forward, TaskResult, Tasks, forward_tensors
 from torchpt.native import compile_time
 from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts, Wave
@@ -191,14 +191,14 @@ class Run:
             else:
                 if rest:
                     assert self.tasks is not None
-                    self.tasks.take_rest(rest, self.task_finished)
+                    self.tasks.retry_blocks(rest, self.task_finished)
                 self.taken = self.settings.render.spp
                 self.stop.update(self.taken, self.seconds_of_sampling(), None)
         return self._final()
 
     def _final(self) -> Rendering:
         loaded("compiled" if self.engine.compiled else "eager")
-        self.engine.dismiss(keeps=self.settings.render.max_memory is None)
+        self.engine.release_workers(keeps=self.settings.render.max_memory is None)
         return finished_rendering(self)
 
     def _all(self) -> None:
@@ -450,7 +450,7 @@ class Run:
         self.left = sum(pixel_set.film.width * pixel_set.film.height * samples for pixel_set, _, samples in spans)
         return self.engine.run(spans, self.task_finished)
 
-    def task_finished(self, share: Share | None) -> bool:
+    def task_finished(self, share: TaskResult | None) -> bool:
         """Add the counts of a finished task; return True if the render is to stop."""
         if share is None:
             return self._advanced(0, False)
