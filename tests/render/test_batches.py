@@ -294,7 +294,7 @@ def test_scenes_by_tensor_operations_are_rendered_before_the_next_is_loaded():
 def test_memory_that_runs_out_by_tensor_operations(monkeypatch):
     scenes = [room(0.2), room(0.3)]
     expected = torchpt.render_batch(scenes, compile="off")
-    plain, taken = tensors.brought, []
+    plain, taken = tensors.weighted_radiance, []
 
     def limited(wave, state, *args, **rest):
         if len(state.lane) > 500:
@@ -302,7 +302,7 @@ def test_memory_that_runs_out_by_tensor_operations(monkeypatch):
         taken.append(state)
         return plain(wave, state, *args, **rest)
 
-    monkeypatch.setattr(tensors, "brought", limited)
+    monkeypatch.setattr(tensors, "weighted_radiance", limited)
     assert torch.equal(torchpt.render_batch(scenes, compile="off"), expected) and len(taken) > 4
 
 
@@ -378,7 +378,7 @@ def counted(monkeypatch):
     plain = loop_kernels.Kernels._make
 
     def make(self, key, *rest):
-        known = self.handed._kernels.get(key)
+        known = self.kernel_cache._kernels.get(key)
         kernel = plain(self, key, *rest)
         if known is None or kernel is not known[0]:
             made["tables"].append(key[0])
@@ -555,7 +555,7 @@ def test_a_picture_that_renders_alone_is_not_blamed_for_one_before(monkeypatch):
 def test_nothing_piles_up():
     """Workers go from scene to scene, and scenes without gradients go once they are rendered."""
     made, alive, seen = [], weakref.WeakSet(), []
-    plain = engine.Worker.__init__
+    plain = engine.KernelsEngine.__init__
 
     def counting(self, *args):
         made.append(True)
@@ -572,7 +572,7 @@ def test_nothing_piles_up():
         seen.append(len(alive))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine.Worker, "__init__", counting)
+        patch.setattr(engine.KernelsEngine, "__init__", counting)
         torchpt.render_batch(scenes(), threads=2, on_progress=watch)
     assert len(made) <= 4 and max(seen) <= 8
 

@@ -12,7 +12,7 @@ from trials import film_of
 import torchpt
 from torchpt.core.errors import SceneError
 from torchpt.engines.kernels import programs
-from torchpt.engines.kernels.threads import Loop
+from torchpt.engines.kernels.threads import KernelsForward
 from torchpt.rendering import looped, scene_cache
 from torchpt.rendering.api import Rendering, render_scene
 from torchpt.scene.formats.description import settings
@@ -29,13 +29,13 @@ def run(scene: torchpt.Scene, spp: int, mode: str | bool, seed: int = 1, **more:
 def passes(monkeypatch) -> list[int]:
     """Samples of each pass that the loop took."""
     taken: list[int] = []
-    original = Loop.run
+    original = KernelsForward.run
 
-    def noted(self: Loop, spans: Any, each: Any) -> bool:
+    def noted(self: KernelsForward, spans: Any, each: Any) -> bool:
         taken.append(spans[0][2])
         return original(self, spans, each)
 
-    monkeypatch.setattr(Loop, "run", noted)
+    monkeypatch.setattr(KernelsForward, "run", noted)
     return taken
 
 

@@ -121,9 +121,9 @@ SCENES = {
     "cornell_box": {"generate", "emit", "bounce"},
     "cornell_spheres": {"generate", "emit", "bounce"},
     "veach_mis": {"generate", "emit", "bounce"},
-    "shapes_and_maps": {"generate", "settle", "emit", "escape", "bounce", "transmit", "sift"},
-    "env_teapot": {"generate", "settle", "escape", "bounce"},
-    "many_lights": {"generate", "settle", "emit", "bounce"},
+    "shapes_and_maps": {"generate", "sort_lanes", "emit", "escape", "bounce", "transmit", "list_transmitting"},
+    "env_teapot": {"generate", "sort_lanes", "escape", "bounce"},
+    "many_lights": {"generate", "sort_lanes", "emit", "bounce"},
 }
 FAST = ("cornell_box",)
 

@@ -24,7 +24,7 @@ from torchpt.core.errors import RenderError, SceneError, warn_once
 from torchpt.core.memory import is_out_of_memory, release_memory
 from torchpt.engines.kernels import layout
 from torchpt.engines.kernels import threads as spare
-from torchpt.engines.kernels.engine import Worker
+from torchpt.engines.kernels.engine import KernelsEngine
 
 #: How allocations fail, on a CPU and on CUDA.
 FAILURES: dict[str, Callable[[], Exception]] = {
@@ -168,7 +168,7 @@ def backward_failing(
 ) -> tuple[torch.Tensor, int]:
     """The gradient where operations within chunks fail, and how many operations there were."""
     module = importlib.import_module("torchpt.gradients." + {"autograd": "tape", "replay": "replay"}[adjoint])
-    counted, original = [0], module.piece
+    counted, original = [0], module.chunk_sums
 
     def failing(*args: Any) -> Any:
         with Fails(lambda k: which(counted[0] + k), MemoryError) as mode:
@@ -178,7 +178,7 @@ def backward_failing(
                 counted[0] += mode.count
 
     with monkeypatch.context() as patched:
-        patched.setattr(module, "piece", failing)
+        patched.setattr(module, "chunk_sums", failing)
         return gradient(scene, adjoint), counted[0]
 
 
@@ -226,25 +226,25 @@ def test_the_compiled_loop_goes_on_with_one_thread_and_fewer_lanes(box, monkeypa
 
 @pytest.mark.parametrize("method", ["trace", "layers"])
 def test_chunks_of_the_loop_are_added_whole(box, monkeypatch, method):
-    whole, kept, calls = looped(box), getattr(Worker, method), [0]
+    whole, kept, calls = looped(box), getattr(KernelsEngine, method), [0]
 
-    def failing(self: Worker, *args: Any) -> Any:
+    def failing(self: KernelsEngine, *args: Any) -> Any:
         calls[0] += 1
         found = kept(self, *args)
         if calls[0] % 5 == 3 and calls[0] < 30:
             raise MemoryError
         return found
 
-    monkeypatch.setattr(Worker, method, failing)
+    monkeypatch.setattr(KernelsEngine, method, failing)
     assert same(looped(box), whole)
 
 
 @pytest.mark.slow
 def test_the_loop_ends_in_a_line_where_nothing_fits(box, monkeypatch):
-    def failing(self: Worker, *args: Any) -> Any:
+    def failing(self: KernelsEngine, *args: Any) -> Any:
         raise MemoryError
 
-    monkeypatch.setattr(Worker, "trace", failing)
+    monkeypatch.setattr(KernelsEngine, "trace", failing)
     with pytest.raises(RenderError, match="not enough memory for the compiled loop on one thread"):
         looped(box)
 
@@ -400,15 +400,15 @@ def test_memory_of_threads_goes_where_a_chunk_needs_it(box, monkeypatch, capsys)
     torchpt.render(box, spp=1, film=film_of(64, 60), threads=2)
     whole, calls, there = torchpt.render(box, spp=2, film=film_of(64, 60)), [0], []
     torchpt.render(torchpt.load("veach_mis", "cpu"), spp=1, film=film_of(8, 8), threads=1)
-    trace = Worker.trace
+    trace = KernelsEngine.trace
 
-    def failing(self: Worker, *args: Any) -> Any:
+    def failing(self: KernelsEngine, *args: Any) -> Any:
         calls[0] += 1
         there.append(len(spare._kept))
         if calls[0] == 1:
             raise MemoryError
         return trace(self, *args)
 
-    monkeypatch.setattr(Worker, "trace", failing)
+    monkeypatch.setattr(KernelsEngine, "trace", failing)
     assert torch.equal(torchpt.render(box, spp=2, film=film_of(64, 60), threads=2), whole)
     assert there[0] and not there[-1] and "memory ran out" in capsys.readouterr().err

@@ -7,19 +7,19 @@ from dataclasses import dataclass, field
 from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts
 
-__all__ = ["TASKS", "Block", "Share", "Span"]
+__all__ = ["TASKS", "Block", "SampleRange", "TaskResult"]
 
 #: Tasks of a pass for each thread, so that none waits long for the last one.
 TASKS = 6
 
 #: A plate, the first sample of all its pixels, and how many.
-Span = tuple[PixelSet, int, int]
+SampleRange = tuple[PixelSet, int, int]
 #: A plate, its first pixel and how many, the first sample and how many of each.
 Block = tuple[PixelSet, int, int, int, int]
 
 
 @dataclass
-class Share:
+class TaskResult:
     """Results of a task beside its samples.
 
     Attributes:

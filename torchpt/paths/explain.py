@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchpt.core.tree import leaves
 from torchpt.math.vectors import take
-from torchpt.paths.nonfinite import Place
+from torchpt.paths.nonfinite import SampleId
 from torchpt.paths.state import Emission, PathState, VertexOutput
 from torchpt.paths.walk import Observer, Population
 from torchpt.paths.wave import Wave
@@ -63,7 +63,7 @@ class Legible(Population, Protocol):
         ...
 
     @property
-    def clear(self) -> Sequence[Tensor]:
+    def transmittance(self) -> Sequence[Tensor]:
         """Return how much gets through of the light that was sampled at the vertex before, model by model."""
         ...
 
@@ -124,14 +124,14 @@ class Scattering:
         lanes: ``(n,)``.
         model: number of the BSDF model.
         output: what its surfaces made of the paths.
-        clear: ``(n,)`` how much of the light that was sampled gets through; None where none was.
+        transmittance: ``(n,)`` how much of the light that was sampled gets through; None where none was.
     """
 
     depth: int
     lanes: Tensor
     model: int
     output: VertexOutput
-    clear: Tensor | None
+    transmittance: Tensor | None
 
 
 Event = CameraRay | Intersection | EmitterHit | Scattering
@@ -176,9 +176,9 @@ class Explainer(Observer[Legible]):
 
     def left(self, paths: Legible) -> None:
         """See :class:`Observer`."""
-        clear = iter(paths.clear)
+        transmittance = iter(paths.transmittance)
         for model, lanes, output in paths.outputs:
-            arrived = None if output.shadow is None else next(clear)
+            arrived = None if output.shadow is None else next(transmittance)
             self.keep(Scattering(paths.depth - 1, lanes, model, output, arrived))
 
 
@@ -222,7 +222,7 @@ class NonFiniteCause:
         return self.cause if self.cause == "not repeated" else f"{'nan' if self.nan else 'infinite'} {self.cause}"
 
 
-def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[Place]) -> list[NonFiniteCause]:
+def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[SampleId]) -> list[NonFiniteCause]:
     """The faults of samples, each traced again by tensor operations.
 
     Args:
@@ -230,7 +230,7 @@ def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[Place]) -> list
         wave: of their render.
         places: of the samples.
     """
-    found: dict[Place, NonFiniteCause] = {}
+    found: dict[SampleId, NonFiniteCause] = {}
     for streams in sorted({(place.first, place.streams) for place in places}):
         own = [place for place in places if (place.first, place.streams) == streams]
         found |= zip(own, _again(trace, wave, own, Streams(*streams)), strict=True)
@@ -238,7 +238,7 @@ def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[Place]) -> list
 
 
 @torch.no_grad()
-def _again(trace: Trace, wave: Wave, places: Sequence[Place], streams: Streams) -> list[NonFiniteCause]:
+def _again(trace: Trace, wave: Wave, places: Sequence[SampleId], streams: Streams) -> list[NonFiniteCause]:
     """The same for samples of the same streams."""
     watch = _Watch(wave.context.world, len(places))
     x, y, sample = (
@@ -336,7 +336,7 @@ def _of_vertex(event: Scattering, world: World) -> Iterator[tuple[str, Tensor]]:
         for value in leaves(surface.parameters):
             if value.dim() and value.shape[-1] == len(spoiled):
                 yield of(read, value.reshape(-1, len(spoiled)))
-        yield of("surface" if surface.relief is None else "texture", torch.cat((surface.frame.n, surface.wo)))
+        yield of("surface" if surface.perturbed_normal is None else "texture", torch.cat((surface.frame.n, surface.wo)))
     if direct is not None:
         unlit = torch.isfinite(brought).all(0)
         factors = [("light", direct.radiance), ("light", direct.sample.weight), ("bsdf", direct.reflected)]

@@ -22,8 +22,8 @@ from torchpt.core.errors import AssetError, OutputError
 from torchpt.core.files import check_regular
 from torchpt.core.tree import fingerprint
 from torchpt.core.version import __version__
-from torchpt.images.write import check_writable, place_of, reason_of, temporary_beside
-from torchpt.paths.nonfinite import NonFinite, Place
+from torchpt.images.write import check_writable, output_path, temporary_beside, write_error
+from torchpt.paths.nonfinite import NonFinite, SampleId
 from torchpt.rendering.error import FIRST_ROUND
 from torchpt.rendering.stopping import BLOCK, Stop
 from torchpt.scene.fingerprint import fingerprints
@@ -181,7 +181,7 @@ class Keeper:
             self.seconds += self._took
 
     def _write(self, state: State) -> None:
-        destination = place_of(self.path, (self.path.suffix.lower(),))
+        destination = output_path(self.path, (self.path.suffix.lower(),))
         temporary = temporary_beside(destination)
         text = json.dumps({"format": _FORMAT, "of": self._of, **state.facts})
         arrays = {name: value.detach().cpu().numpy() for name, value in state.arrays.items()}
@@ -192,7 +192,7 @@ class Keeper:
                 os.fsync(file.fileno())
             os.replace(temporary, destination)
         except (OSError, ValueError) as problem:
-            raise OutputError(self.path, reason_of(problem, destination)) from None
+            raise OutputError(self.path, write_error(problem, destination)) from None
         finally:
             with suppress(OSError):  # it is only there after a failure
                 temporary.unlink()
@@ -364,7 +364,7 @@ def _finite(values: Iterable[Tensor]) -> bool:
     return all(bool(torch.isfinite(value).all()) for value in values)
 
 
-def _is_there(run: Run, place: Place, samples: int) -> bool:
+def _is_there(run: Run, place: SampleId, samples: int) -> bool:
     """Return True for a sample that a plate of the render takes."""
     x, y, width, height = run.wave.crop
     pixel_sets = [run.picture] if run.twice is None else [run.picture, run.twice.pixel_set]

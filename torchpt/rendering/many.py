@@ -11,7 +11,7 @@ import torch
 
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.threads import Crew, one_thread, without_autocast
-from torchpt.engines.engine import Block, Share
+from torchpt.engines.engine import Block, TaskResult
 from torchpt.rendering.result import Rendering
 from torchpt.rendering.run import Run
 
@@ -57,7 +57,7 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
     Raises:
         Exception: what an entry's ``failed`` raises; the others are given up then.
     """
-    crew = Crew[Entry, Share](torch.get_num_threads())
+    crew = Crew[Entry, TaskResult](torch.get_num_threads())
     waiting, begun = iter(entries), dict[int, Entry]()
     try:
         while True:
@@ -92,7 +92,7 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
 
 
 @contextmanager
-def _beside(crew: Crew[Entry, Share]) -> Iterator[None]:
+def _beside(crew: Crew[Entry, TaskResult]) -> Iterator[None]:
     """While all cores trace, tensor operations of this thread are its own: a team would wait for a core, and spin meanwhile."""
     with one_thread() if crew.pending else nullcontext():
         yield
@@ -108,7 +108,7 @@ def _blamed(entry: Entry) -> Iterator[None]:
         raise
 
 
-def _drain(crew: Crew[Entry, Share], begun: dict[int, Entry], most: int) -> None:
+def _drain(crew: Crew[Entry, TaskResult], begun: dict[int, Entry], most: int) -> None:
     """Take in what threads have done, until no more than ``most`` blocks are pending."""
     while True:
         found = crew.next(wait=crew.pending > most)

@@ -15,7 +15,7 @@ from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import LostRankError, OutputError, RenderError, SceneError, warn_once
 from torchpt.core.memory import Budget, Meter, check_memory, mb, needing, retried
 from torchpt.core.threads import limited_threads, without_autocast
-from torchpt.engines.engine import Block, Forward, Share, Tasks, forward_tensors
+from torchpt.engines.engine import Block, Forward, TaskResult, Tasks, forward_tensors
 from torchpt.native import compile_time
 from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts, Wave
@@ -173,14 +173,14 @@ class Run:
             else:
                 if rest:
                     assert self.tasks is not None
-                    self.tasks.take_rest(rest, self.took)
+                    self.tasks.retry_blocks(rest, self.took)
                 self.taken = self.settings.render.spp
                 self.stop.told(self.taken, self.seconds_of_sampling(), None)
         return self._final()
 
     def _final(self) -> Rendering:
         loaded("compiled" if self.engine.compiled else "eager")
-        self.engine.dismiss(keeps=self.settings.render.max_memory is None)
+        self.engine.release_workers(keeps=self.settings.render.max_memory is None)
         return final(self)
 
     def _all(self) -> None:
@@ -428,7 +428,7 @@ class Run:
         self.left = sum(pixel_set.film.width * pixel_set.film.height * samples for pixel_set, _, samples in spans)
         return self.engine.run(spans, self.took)
 
-    def took(self, share: Share | None) -> bool:
+    def took(self, share: TaskResult | None) -> bool:
         """Count what a task brought; returns whether the render is to stop."""
         if share is None:
             return self._advanced(0, False)

@@ -132,7 +132,7 @@ def make_wave(
         centre=scene.space.shift,
         first=_first(scene, integrator, world, own) if like is None else like.first,
     )
-    return wave if rays is None else wave.along(_given(scene, *rays, dtype))
+    return wave if rays is None else wave.with_rays(_given(scene, *rays, dtype))
 
 
 def _given(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:

@@ -31,23 +31,23 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PLACE",
-    "begin",
-    "block",
+    "accumulate",
+    "attenuate_shadow_rays",
+    "begin_shadow_rays",
     "bounce",
-    "deposit",
     "emit",
     "escape",
-    "find",
     "generate",
     "kinds_of",
     "layers",
+    "list_transmitting",
     "nearest",
     "occluded",
-    "retire",
+    "search_nearest",
+    "search_occluded",
     "search_words",
-    "settle",
-    "sift",
-    "through",
+    "sort_lanes",
+    "terminate",
     "transmit",
 ]
 
@@ -81,7 +81,7 @@ def _ray(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> list[int]:
 # -- kernels that do nothing else
 
 
-def find(trace: Trace, passed: bool) -> Sinks:
+def search_nearest(trace: Trace, passed: bool) -> Sinks:
     """The nearest hits of all rays of an arena: of paths, or (``passed``) of rays that pass surfaces."""
     rows = trace.layout.passed if passed else trace.layout.state
     names = ("pass_o", "pass_d", "pass_t") if passed else ("o", "d", "t_max")
@@ -89,7 +89,7 @@ def find(trace: Trace, passed: bool) -> Sinks:
     return Sinks(write=rows.nodes(trace.tracer, t=hit.t, prim=hit.prim, u=hit.u, v=hit.v))
 
 
-def block(trace: Trace) -> Sinks:
+def search_occluded(trace: Trace) -> Sinks:
     """Write which shadow rays are blocked."""
     rows, tracer = trace.layout.state, trace.tracer
     blocked = occluded(tracer, *rows.read(tracer, "shadow_o", "shadow_d", "shadow_t").values())
@@ -133,7 +133,7 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
     salts = trace.salts()
     pixels = layout.state.read(tracer, "prim")["prim"] if chosen else torch.empty(0)
     rays = layout.state.read(tracer, "o", "d") if given else {}
-    unseen: dict[str, Tensor] = {}
+    passthrough: dict[str, Tensor] = {}
     with tracer:
         chunk = dict(zip(PLACE, place.to(torch.int64).unbind(), strict=True))
         # Lanes run over the chunk's pixels, then over its samples.
@@ -153,33 +153,33 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
         else:
             state = vertex.generate(layout.plan, wave.camera, wave.filter, x, y, key, salts)
         if wave.filter.signed:
-            unseen["weight"] = wave.filter.weight(Draws(layout.plan.sampler, key, salts).two(Dimension.PIXEL))
-        state = wave.begun(state)
+            passthrough["weight"] = wave.filter.weight(Draws(layout.plan.sampler, key, salts).two(Dimension.PIXEL))
+        state = wave.with_optional_fields(state)
     sinks = Sinks()
     if layout.fused:
-        _searched(trace, sinks, state, unseen)
+        _searched(trace, sinks, state, passthrough)
     else:
-        sinks.write += trace.kept(state, unseen)
+        sinks.write += trace.kept(state, passthrough)
     return sinks
 
 
-def settle(trace: Trace, shadow: bool) -> Sinks:
+def sort_lanes(trace: Trace, shadow: bool) -> Sinks:
     """Settle what the lanes of the arena met: light of their shadow rays, lists of lanes by model, ends of paths."""
     tracer, rows = trace.tracer, trace.layout.state
-    state, unseen = trace.state()
+    state, passthrough = trace.state()
     prim = rows.read(tracer, "prim")["prim"]
     sinks = Sinks()
     if shadow:
-        arrived = rows.read(tracer, "shadow_radiance", "clear", "blocked")
+        arrived = rows.read(tracer, "shadow_radiance", "transmittance", "blocked")
         with tracer:
             light = arrived["shadow_radiance"]
-            if "clear" in arrived:
-                radiance = torch.addcmul(state.radiance, light, arrived["clear"])
+            if "transmittance" in arrived:
+                radiance = torch.addcmul(state.radiance, light, arrived["transmittance"])
             else:
                 radiance = state.radiance + torch.where(arrived["blocked"] != 0, 0.0, light)
         state = replace(state, radiance=radiance)
         sinks.write += rows.nodes(tracer, radiance=radiance)
-    _, notes = trace.sorted(sinks, state, prim, unseen)
+    _, notes = trace.sorted(sinks, state, prim, passthrough)
     sinks.notes += notes
     return sinks
 
@@ -199,25 +199,25 @@ def emit(trace: Trace) -> Sinks:
 
 def escape(trace: Trace) -> Sinks:
     """Light from outside, and the ends of those paths."""
-    state, unseen = trace.state()
+    state, passthrough = trace.state()
     hit, wave = trace.hit(), trace.layout.wave
     context = wave.context.at(trace.salts())
     with trace.tracer:
         radiance = state.radiance + wave.integrator.escape(context, VertexInput(state, hit)).brought
-    return Sinks(scatter=[trace.ended(-1, state.lane, radiance, unseen)])
+    return Sinks(scatter=[trace.ended(-1, state.lane, radiance, passthrough)])
 
 
-def retire(trace: Trace) -> Sinks:
+def terminate(trace: Trace) -> Sinks:
     """Ends of paths that are cut."""
-    state, unseen = trace.state()
-    return Sinks(scatter=[trace.ended(-1, state.lane, state.radiance, unseen)])
+    state, passthrough = trace.state()
+    return Sinks(scatter=[trace.ended(-1, state.lane, state.radiance, passthrough)])
 
 
 def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
     """One vertex of the paths on surfaces of a model."""
     layout, tracer = trace.layout, trace.tracer
     salts = trace.salts()
-    state, unseen = trace.state()
+    state, passthrough = trace.state()
     hit = trace.hit()
     with tracer:
         context = layout.wave.context.at(salts, roulette=roulette)
@@ -225,35 +225,37 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
         check_output(layout.wave.integrator, output)
     after, shadow = output.leaving, output.shadow
     if not layout.fused:
-        return _with_shadow(trace, after, shadow, output.splat, unseen)
+        return _with_shadow(trace, after, shadow, output.splat, passthrough)
     sinks = Sinks(shadows=int(shadow is not None))
     if shadow is not None:
         blocked = occluded(tracer, shadow.o, shadow.d, shadow.t_max)
         with tracer:
             radiance = after.radiance + torch.where(blocked, 0.0, shadow.radiance)
         after = replace(after, radiance=radiance)
-    _searched(trace, sinks, after, unseen)
+    _searched(trace, sinks, after, passthrough)
     return sinks
 
 
 # -- the two ways in which lanes go on
 
 
-def _searched(trace: Trace, sinks: Sinks, state: PathState, unseen: dict[str, Tensor]) -> None:
+def _searched(trace: Trace, sinks: Sinks, state: PathState, passthrough: dict[str, Tensor]) -> None:
     """Search inside the kernel: the lanes that go on are packed together, the others end."""
     hit = nearest(trace.tracer, state.o, state.d, state.t_max)
-    on, notes = trace.sorted(sinks, state, hit.prim, unseen)
-    rows = trace.kept(state, unseen)
+    on, notes = trace.sorted(sinks, state, hit.prim, passthrough)
+    rows = trace.kept(state, passthrough)
     rows += trace.layout.state.nodes(trace.tracer, t=hit.t, prim=hit.prim, u=hit.u, v=hit.v)
     sinks.pack.append(Pack(on, tuple(rows), 0, tuple(notes)))
 
 
 def _with_shadow(
-    trace: Trace, state: PathState, shadow: Shadow | None, splat: Splat | None, unseen: dict[str, Tensor]
+    trace: Trace, state: PathState, shadow: Shadow | None, splat: Splat | None, passthrough: dict[str, Tensor]
 ) -> Sinks:
     """Search later: all lanes are kept, with the shadow rays that are still to be searched."""
     tracer, rows = trace.tracer, trace.layout.state
-    sinks = Sinks(shift=0, write=trace.kept(state, unseen), shadows=int(shadow is not None) + int(splat is not None))
+    sinks = Sinks(
+        shift=0, write=trace.kept(state, passthrough), shadows=int(shadow is not None) + int(splat is not None)
+    )
     if "shadow_o" not in rows:
         return sinks
     with tracer:
@@ -283,13 +285,13 @@ def _with_shadow(
 
 # ---- Rays through what lets them pass, as kernels
 #
-# Rays of paths: ``sift`` lists those that something may let pass; ``transmit`` holds some up and sends the others on behind it,
-# once from the paths' arena and then (``again``) from that of the rays on their way, until the walk has none left. Shadow rays:
-# ``begin`` and ``through`` do the same with the light that is left; the loop around them is in
-# :mod:`torchpt.engines.kernels.engine`.
+# Rays of paths: ``list_transmitting`` lists the lanes whose hit may let them pass. ``transmit`` stops some of them and moves
+# the others behind the surface, first from the arena of the paths, then (``again``) from the arena of the rays in transit,
+# until the walk has none left. Shadow rays: ``begin_shadow_rays`` and ``attenuate_shadow_rays`` multiply their transmittance
+# surface by surface; the loop around them is in :mod:`torchpt.engines.kernels.engine`.
 
 
-def sift(trace: Trace) -> Sinks:
+def list_transmitting(trace: Trace) -> Sinks:
     """A list of the rays that the stage ``transmit`` is asked for."""
     rows, tracer, layout = trace.layout.state, trace.tracer, trace.layout
     given = rows.read(tracer, "prim", "t_max")
@@ -341,7 +343,7 @@ def transmit(trace: Trace, again: bool) -> Sinks:
     return sinks
 
 
-def begin(trace: Trace) -> Sinks:
+def begin_shadow_rays(trace: Trace) -> Sinks:
     """Shadow rays that meet what may let light pass become rays that pass surfaces; what is known of the others."""
     layout, tracer = trace.layout, trace.tracer
     ray = layout.state.read(tracer, "shadow_o", "shadow_d", "shadow_t", "blocked")
@@ -351,32 +353,36 @@ def begin(trace: Trace) -> Sinks:
         one = torch.ones_like(t_max)
         if "blocked" in ray:
             on, off = ray["blocked"] == 2, ray["blocked"] != 2
-            clear = torch.where(ray["blocked"] == 0, one, 0.0)
+            transmittance = torch.where(ray["blocked"] == 0, one, 0.0)
         else:
-            on, off, clear = t_max > 0, t_max <= 0, one
-    onward = layout.passed.nodes(tracer, pass_o=o, pass_d=d, pass_t=t_max, home=home, clear=one)
-    return _passed(trace, on, onward, off, home, clear)
+            on, off, transmittance = t_max > 0, t_max <= 0, one
+    onward = layout.passed.nodes(tracer, pass_o=o, pass_d=d, pass_t=t_max, home=home, transmittance=one)
+    return _passed(trace, on, onward, off, home, transmittance)
 
 
-def through(trace: Trace) -> Sinks:
+def attenuate_shadow_rays(trace: Trace) -> Sinks:
     """Let light through a surface in part, and send the shadow rays on that still carry some."""
     layout, tracer = trace.layout, trace.tracer
     hit = trace.hit(layout.passed)
-    o, d, t_max, home, clear = layout.passed.read(tracer, "pass_o", "pass_d", "pass_t", "home", "clear").values()
+    o, d, t_max, home, transmittance = layout.passed.read(
+        tracer, "pass_o", "pass_d", "pass_t", "home", "transmittance"
+    ).values()
     with tracer:
         opacity = opacity_at(layout.world, o, d, hit, 0.0)
-        clear = clear * (1.0 - opacity)
+        transmittance = transmittance * (1.0 - opacity)
         on = (hit.prim >= 0) & (opacity < 1)
         off = ~on
         behind = beyond(layout.world, o, d, hit)
         rest = (t_max - hit.t).clamp_min(0.0)
-    onward = layout.passed.nodes(tracer, pass_o=behind, pass_d=d, pass_t=rest, home=home, clear=clear)
-    return _passed(trace, on, onward, off, home, clear)
+    onward = layout.passed.nodes(tracer, pass_o=behind, pass_d=d, pass_t=rest, home=home, transmittance=transmittance)
+    return _passed(trace, on, onward, off, home, transmittance)
 
 
-def _passed(trace: Trace, on: Tensor, onward: list[tuple[int, int]], off: Tensor, home: Tensor, clear: Tensor) -> Sinks:
+def _passed(
+    trace: Trace, on: Tensor, onward: list[tuple[int, int]], off: Tensor, home: Tensor, transmittance: Tensor
+) -> Sinks:
     """Shadow rays that go on are packed; of those that do not, what is clear goes home to their paths."""
-    known = tuple(trace.layout.state.nodes(trace.tracer, clear=clear))
+    known = tuple(trace.layout.state.nodes(trace.tracer, transmittance=transmittance))
     done = Scatter(trace.node(off), trace.node(home), known, slots=True)
     return Sinks(pack=[Pack(trace.node(on), tuple(onward), 0)], scatter=[done])
 
@@ -387,17 +393,17 @@ def _passed(trace: Trace, on: Tensor, onward: list[tuple[int, int]], off: Tensor
 def layers(trace: Trace, model: int, names: tuple[str, ...]) -> Sinks:
     """Write what the first surfaces of a model are."""
     wave = trace.layout.wave
-    state, unseen = trace.state()
+    state, passthrough = trace.state()
     hit = trace.hit()
     with trace.tracer:
         values = aov.values(names, wave.context, model, state.o, state.d, hit, wave.centre)
-        if "weight" in unseen:
-            values = aov.weighted(values, unseen["weight"])
+        if "weight" in passthrough:
+            values = aov.weighted(values, passthrough["weight"])
     nodes = [node for name in names for node in trace.tracer.nodes(values[name])]
     return Sinks(scatter=[Scatter(-1, trace.node(state.lane), tuple(enumerate(nodes)), slots=True)])
 
 
-def deposit(trace: Trace, channels: int, clamp: bool) -> Sinks:
+def accumulate(trace: Trace, channels: int, clamp: bool) -> Sinks:
     """One sample of each pixel added to sums; those that are not finite are counted, and taken as black."""
     tracer, graph = trace.tracer, trace.tracer.graph
     trace.tensors = 2

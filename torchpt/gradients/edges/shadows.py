@@ -27,7 +27,7 @@ from torchpt.gradients.edges.traced import Traced, Use
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.sampling import Discrete, concentric_disk, uniform_sphere, uniform_triangle
 from torchpt.math.vectors import cross, dot, largest, luminance, rows, take
-from torchpt.paths.roulette import chance_of, survived
+from torchpt.paths.roulette import russian_roulette, survival_probability
 from torchpt.paths.vertex import light_radiance
 from torchpt.physics.lights import KINDS, SURFACES, fine
 from torchpt.physics.lights.base import Environment, taken
@@ -620,7 +620,9 @@ class Shadows:
             alive = largest(carried) > 0
             if k > _ROULETTE:
                 draws = self.traced.draws(take(key, lane), k)
-                alive, carried = survived(chance_of(None, 1.0, largest(carried), None), draws, alive, carried)
+                alive, carried = russian_roulette(
+                    survival_probability(None, 1.0, largest(carried), None), draws, alive, carried
+                )
             on = alive.nonzero().squeeze(1)
             lane, carried = take(lane, on), take(carried, on)
             spot = met(self.traced, take(o, on), take(d, on))

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.threads import sum_all
-from torchpt.images.texels import TEXELS, check_source, radiance_of, read_texels, texels_of
+from torchpt.images.texels import TEXELS, check_source, read_texels, texels_from_array, texels_to_radiance
 from torchpt.math.sampling import Cells, invert_linear
 from torchpt.math.vectors import azimuth, dot, luminance, safe_reciprocal, take
 from torchpt.physics.ibl.equirect import Cell, angles
@@ -268,7 +268,7 @@ class Envmap(Environment):
         "path": Path(None, doc="the picture: `.exr`, `.hdr` or 8-bit; of several the first that is there"),
         "data": Other(
             None,
-            reader=texels_of,
+            reader=texels_from_array,
             words=TEXELS,
             doc="in place of a file: an array, a tensor or rows of numbers, the first at the top; linear, but for uint8",
         ),
@@ -293,9 +293,9 @@ class Envmap(Environment):
         """See :class:`Light`."""
         spec = Texels(doc="radiance `(H, W, 3)`, before `scale`")
         if values["data"] is not None:
-            return {"texels": (radiance_of(values["data"], "data", "data"), spec)}
+            return {"texels": (texels_to_radiance(values["data"], "data", "data"), spec)}
         file = find("path")
-        return {"texels": (radiance_of(read_texels(file), str(file), "path"), spec)}
+        return {"texels": (texels_to_radiance(read_texels(file), str(file), "path"), spec)}
 
     @classmethod
     def row(cls, scene: Setting) -> Row:

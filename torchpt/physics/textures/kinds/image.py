@@ -12,7 +12,7 @@ from torchpt.core.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, Texels, read_texels
 from torchpt.images.colour import srgb_to_linear
 from torchpt.images.decode import MAX_PIXELS
-from torchpt.images.texels import TEXELS, check_source, texels_of
+from torchpt.images.texels import TEXELS, check_source, texels_from_array
 from torchpt.physics.textures.atlas import WRAPS, ImageNode
 from torchpt.physics.textures.base import CHANNELS, Mapped, Node, Opening
 from torchpt.spec import Choice, Color, Other, Path, Refused, Whole
@@ -41,7 +41,7 @@ class Image(Mapped):
         ),
         "data": Other(
             None,
-            reader=texels_of,
+            reader=texels_from_array,
             words=TEXELS,
             doc="in place of a file: an array, a tensor or rows of numbers, the first at the top; linear, but for uint8",
         ),
