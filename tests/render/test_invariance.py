@@ -209,7 +209,7 @@ def test_the_same_bits(scene_of, monkeypatch, name, mode):
     scene, wish = scene_of(name), ROWS[name].wish
     whole = shot(scene, wish, mode)
     assert whole.complete and float(whole.image.amax()) > 0
-    monkeypatch.setattr(threads, "FEWEST", 16)  # else a film so small is one task
+    monkeypatch.setattr(threads, "MIN_TASK_LANES", 16)  # else a film so small is one task
     for column, changed in COLUMNS[mode].items():
         assert same(shot(scene, wish, mode, **changed), whole), column
     if mode == "compiled":
@@ -244,7 +244,7 @@ def test_tasks_of_the_loop(scene_of, monkeypatch, tasks, fewest):
     scene, wish = scene_of("opacity"), {"film": {"filter": "mitchell", "aovs": LAYERS, **film_of(37, 23)}}
     whole = shot(scene, wish, "compiled", spp=15)
     monkeypatch.setattr(threads, "TASKS", tasks)
-    monkeypatch.setattr(threads, "FEWEST", fewest)
+    monkeypatch.setattr(threads, "MIN_TASK_LANES", fewest)
     assert same(shot(scene, wish, "compiled", spp=15, threads=2), whole)
 
 

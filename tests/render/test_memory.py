@@ -389,7 +389,7 @@ def test_memory_of_threads_is_bounded_and_holds_no_scene(monkeypatch):
     gc.collect()
     assert watch() is None and spare._kept
     for size, left in ((max(sizes), 1), (max(sizes) - 1, 0)):
-        monkeypatch.setattr(spare, "MOST", size)
+        monkeypatch.setattr(spare, "MAX_KEPT_BYTES", size)
         torchpt.render(torchpt.load("cornell_box", "cpu"), spp=1, film=film_of(64, 60), threads=2)
         assert len(spare._kept) <= left
 

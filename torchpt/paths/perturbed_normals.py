@@ -43,10 +43,10 @@ def perturb_normal(
     """Return the shading frame about the normal of a normal or bump map, and the unperturbed normal.
 
     The vectors of a normal map are relative to the tangent along u, its cross product with the shading normal, and that normal.
-    The heights of a bump map displace the surface along its normal (Blinn, *Simulation of Wrinkled Surfaces*, 1978). The back of
-    a surface shows the mirror image. A perturbed normal that faces away from the viewer is mirrored about the unperturbed one
-    (after Schuessler, Heitz, Hanika, Dachsbacher, *Microfacet-based Normal Mapping*, 2017). All as Mitsuba's ``normalmap`` and
-    ``bumpmap``.
+    The heights of a bump map displace the surface along its normal (Blinn, *Simulation of Wrinkled Surfaces*, 1978). The back
+    of a surface shows the mirror image. A perturbed normal that faces away from the viewer is mirrored about the unperturbed
+    one (after Schuessler, Heitz, Hanika, Dachsbacher, *Microfacet-based Normal Mapping*, 2017). All as Mitsuba's ``normalmap``
+    and ``bumpmap``.
 
     Args:
         textures: textures of the model.

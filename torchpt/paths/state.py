@@ -126,7 +126,7 @@ class Field:
         name: its key in ``state.extra``, where it is ``(N,)``, or ``(rows, N)`` for several rows.
         rows: how many numbers it has.
         start: its value where paths begin.
-        whole: True: a 32-bit integer (int64 to stages) without derivatives. False: a number of the lanes' dtype, differentiated.
+        whole: True: a 32-bit integer (int64 to stages), without derivatives. False: of the lanes' dtype, differentiated.
 
     Raises:
         ValueError: ``rows`` below 1, or a ``start`` with a fraction where the field is whole.
@@ -245,8 +245,8 @@ class DirectLight:
         sample: the points on the lights.
         radiance: ``(3, n)`` of the light, with its textures.
         reflected: ``(3, n)`` value of the BSDF times the cosine.
-        share: ``(n,)`` factor of the shading normal: below 1 where perturbed normals shadow, 0 on the back of a one-sided surface
-            and where the two normals disagree; None: 1.
+        share: ``(n,)`` factor of the shading normal: below 1 where perturbed normals shadow, 0 on the back of a one-sided
+            surface and where the two normals disagree; None: 1.
         pdf: ``(n,)`` density with which BSDF sampling would have chosen the direction; None without MIS.
         weight: ``(n,)`` MIS weight; None: 1.
     """

@@ -22,7 +22,7 @@ __all__ = ["beyond", "non_opaque", "opacity_at", "times_map", "transmit"]
 
 
 def opacity_at(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:
-    """Return the opacity ``(N,)`` of the surfaces that rays ``o, d`` hit, textures included; ``miss`` where they hit nothing."""
+    """Return the opacity ``(N,)`` of the surfaces that rays ``o, d`` hit, textures included; ``miss`` where there is no hit."""
     assert world.materials.opacity is not None
     missed = hit.prim < 0
     slot = world.geometry.slot(hit.prim).clamp_min(0)
