@@ -393,7 +393,7 @@ def radiance(
 
 
 class _Layers(Observer[Paths]):
-    """Reads layers off first surfaces, and ends the walk there."""
+    """Evaluates layers of first surfaces, and ends the walk there."""
 
     def __init__(self, wave: Wave, names: tuple[str, ...], follow_shape: bool) -> None:
         self.names, self.context, self.centre = names, replace(wave.context, follow_shape=follow_shape), wave.centre
