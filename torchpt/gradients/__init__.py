@@ -70,7 +70,7 @@ def gradients(
     """
     integrator = settings.integrator
     if attached and integrator.own_transmit:
-        expected = "one whose rays are held up by surfaces alone, where geometry is differentiated"
+        expected = "one without a transmit of its own, where geometry is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)
     if (attached or film_space) and integrator.splats:
         expected = "one whose samples light their own pixels alone, where geometry or the camera is differentiated"
@@ -85,7 +85,9 @@ def gradients(
         if kind == "replay" and integrator.own_transmit and (carried or scene_tape.differentiates_opacity):
             what = "its fields" if carried else "opacity"
             raise NotBuiltError(
-                "adjoint", "replay", f"autograd, as {integrator.name} holds rays up and {what} is differentiated"
+                "adjoint",
+                "replay",
+                f"autograd, as {integrator.name} has a transmit of its own and {what} is differentiated",
             )
         sums = scene_tape.sums()
         # Integrators that end at the first surface have a single vertex: a tape is enough.
