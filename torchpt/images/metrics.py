@@ -93,9 +93,9 @@ def relmse(image: Tensor, reference: Tensor, floor: float = FLOOR) -> float:
 def relmse_trimmed(image: Tensor, reference: Tensor, share: float = TRIMMED, floor: float = FLOOR) -> float:
     """Return `relmse` without the fraction ``share`` of pixels with the largest errors.
 
-    The error of a pixel is the mean of ``(x - ref)² / (ref² + floor)`` over its channels. Of N pixels the ``⌊share N⌋`` with the
-    largest errors are left out; below 1,000 pixels the default leaves out none, and the result is `relmse`. Values that are not
-    finite are not left out.
+    The error of a pixel is the mean of ``(x - ref)² / (ref² + floor)`` over its channels. Of N pixels the ``⌊share N⌋`` with
+    the largest errors are left out; below 1,000 pixels the default leaves out none, and the result is `relmse`. Values that are
+    not finite are not left out.
 
     Args:
         image: ``(H, W, C)``.
