@@ -35,6 +35,7 @@ __all__ = [
     "Tasks",
     "backward_kernels",
     "backward_tensors",
+    "describe_kernels",
     "forward_kernels",
     "forward_tensors",
     "hits",
@@ -42,7 +43,6 @@ __all__ = [
     "layers",
     "radiance",
     "seen",
-    "told",
     "trace",
     "weighted_radiance",
 ]
@@ -142,7 +142,7 @@ def forward_kernels(kernels: Kernels, threads: int | None = None, strict: bool =
     return KernelsForward(kernels, threads or torch.get_num_threads(), kernels.wave.integrator.clamp, strict)
 
 
-def told(kernels: Kernels) -> dict[str, Any]:
+def describe_kernels(kernels: Kernels) -> dict[str, Any]:
     """Return a description of the compiled loop, for the summary of a render."""
     search = (
         "inside the stages" if kernels.fused else "kernels of packets" if kernels.packets else kernels.wave.accel.name

@@ -23,7 +23,7 @@ from torchpt.images.png import sanitize_png
 
 __all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "decode_image", "existing_image", "oiio_error"]
 
-MAX_PIXELS = 64 * 2**20  # a header may claim anything: refuse before memory is asked for
+MAX_PIXELS = 64 * 2**20  # a header may claim anything: checked before memory is allocated
 FLOAT_FORMATS = (".exr", ".hdr")
 INTEGER_FORMATS = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tga")
 READABLE = FLOAT_FORMATS + INTEGER_FORMATS

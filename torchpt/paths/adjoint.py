@@ -139,7 +139,7 @@ def bounce(
         return next_hit
 
     with torch.enable_grad():
-        vertex, given = _given(context.plan, vertex)
+        vertex, input_leaves = _with_leaves(context.plan, vertex)
         output = stage(replace(context, search=found), model, vertex)
         after, shadow = output.leaving, output.shadow
         pairs = [(after.throughput, cotangents.throughput), (after.radiance, cotangents.radiance)]
@@ -154,7 +154,7 @@ def bounce(
                 pairs.append((shadow.radiance, cotangents.radiance * passed))
         if output.splat is not None and splat is not None:
             pairs.append(splat(output.splat))
-        return _back(pairs, given, extra_leaves)
+        return _vjp(pairs, input_leaves, extra_leaves)
 
 
 def gather(
@@ -174,8 +174,8 @@ def gather(
         extra_leaves: as for :func:`bounce`.
     """
     with torch.enable_grad():
-        vertex, given = _given(context.plan, vertex)
-        return _back([(stage(context, vertex).brought, radiance)], given, extra_leaves)
+        vertex, input_leaves = _with_leaves(context.plan, vertex)
+        return _vjp([(stage(context, vertex).brought, radiance)], input_leaves, extra_leaves)
 
 
 def splatted(clamp: float | None, cotangent: Tensor, splat: Splat, transmittance: Tensor) -> tuple[Tensor, Tensor]:
@@ -195,7 +195,7 @@ def splatted(clamp: float | None, cotangent: Tensor, splat: Splat, transmittance
 
 
 @dataclass(frozen=True)
-class _Given:
+class _InputLeaves:
     """Autograd leaves in place of the inputs of a vertex; None where no cotangent is wanted."""
 
     throughput: Tensor
@@ -205,7 +205,7 @@ class _Given:
     extra: Mapping[str, Tensor]
 
 
-def _given(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _Given]:
+def _with_leaves(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _InputLeaves]:
     """Return the vertex with autograd leaves in place of its differentiable inputs, and these leaves."""
 
     def leaf(x: Tensor) -> Tensor:
@@ -223,13 +223,13 @@ def _given(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _Given]:
         extra={**state.extra, **extra},
     )
     chance = None if hit.chance is None else leaf(hit.chance)
-    return VertexInput(state, replace(hit, chance=chance)), _Given(throughput, o, d, chance, extra)
+    return VertexInput(state, replace(hit, chance=chance)), _InputLeaves(throughput, o, d, chance, extra)
 
 
-def _back(pairs: list[tuple[Tensor, Tensor]], given: _Given, extra_leaves: LeafSource) -> InputCotangents:
+def _vjp(pairs: list[tuple[Tensor, Tensor]], input_leaves: _InputLeaves, extra_leaves: LeafSource) -> InputCotangents:
     """Differentiate (output, cotangent) pairs with respect to the inputs of a vertex and the extra leaves."""
     pairs = [(y, g) for y, g in pairs if y.requires_grad]
-    own, rest = leaves(given), list(extra_leaves())
+    own, rest = leaves(input_leaves), list(extra_leaves())
     grads: Sequence[Any] = [None] * (len(own) + len(rest))
     if pairs:
         outputs, wanted = [y for y, _ in pairs], [g for _, g in pairs]
@@ -239,7 +239,12 @@ def _back(pairs: list[tuple[Tensor, Tensor]], given: _Given, extra_leaves: LeafS
     def of(leaf: Tensor | None) -> Tensor | None:
         return None if leaf is None else found[id(leaf)]
 
-    extra = {name: of(leaf) for name, leaf in given.extra.items()}
+    extra = {name: of(leaf) for name, leaf in input_leaves.extra.items()}
     return InputCotangents(
-        of(given.throughput), of(given.o), of(given.d), of(given.chance), tuple(grads[len(own) :]), extra
+        of(input_leaves.throughput),
+        of(input_leaves.o),
+        of(input_leaves.d),
+        of(input_leaves.chance),
+        tuple(grads[len(own) :]),
+        extra,
     )

@@ -30,15 +30,15 @@ __all__ = [
     "Event",
     "Explainer",
     "Intersection",
-    "Legible",
     "NonFiniteCause",
+    "ReadablePopulation",
     "Scattering",
     "Trace",
     "causes_of_samples",
 ]
 
 
-class Legible(Population, Protocol):
+class ReadablePopulation(Population, Protocol):
     """A population whose tensors an observer may read: its engine keeps the outputs of stages."""
 
     @property
@@ -135,10 +135,10 @@ class Scattering:
 
 Event = CameraRay | Intersection | EmitterHit | Scattering
 #: Traces camera rays of a wave with an observer, and returns their radiance ``(3, N)``.
-Trace = Callable[[Wave, PathState, Observer[Legible]], Tensor]
+Trace = Callable[[Wave, PathState, Observer[ReadablePopulation]], Tensor]
 
 
-class Explainer(Observer[Legible]):
+class Explainer(Observer[ReadablePopulation]):
     """Records all events along the paths of a walk; for few lanes.
 
     Args:
@@ -160,20 +160,20 @@ class Explainer(Observer[Legible]):
         """Record camera rays."""
         self.keep(CameraRay(state.lane, state))
 
-    def arrived(self, paths: Legible) -> bool:
+    def arrived(self, paths: ReadablePopulation) -> bool:
         """See :class:`Observer`."""
         state = paths.state
         self.keep(Intersection(paths.depth, state.lane, replace(state, radiance=state.radiance.clone()), paths.met))
         return False
 
-    def gathered(self, paths: Legible) -> None:
+    def gathered(self, paths: ReadablePopulation) -> None:
         """See :class:`Observer`."""
         for index, light in paths.emissions:
             prim = take(paths.met.prim, index)
             slot = None if bool((prim < 0).any()) else self.world.geometry.slot(prim)
             self.keep(EmitterHit(paths.depth, take(paths.state.lane, index), slot, light))
 
-    def left(self, paths: Legible) -> None:
+    def left(self, paths: ReadablePopulation) -> None:
         """See :class:`Observer`."""
         transmittance = iter(paths.transmittance)
         for model, lanes, output in paths.outputs:
@@ -184,18 +184,18 @@ class Explainer(Observer[Legible]):
 #: Names of causes, and their descriptions.
 CAUSES = {
     "camera": "a camera ray",
-    "surface": "the point that was met, or its normals",
-    "texture": "what textures gave the material, normal and bump maps included",
-    "material": "the parameters of the material",
-    "emission": "light of a surface that the path met",
-    "environment": "light of the environment that the path escaped to",
-    "light": "a light that was sampled: what it brings, or its density",
-    "bsdf": "a value, density or weight of the material's model",
-    "throughput": "what the path carries on: a product of weights, each of them finite",
+    "surface": "a hit point or its normals",
+    "texture": "a value of a texture, normal and bump maps included",
+    "material": "a parameter of a material",
+    "emission": "the contribution of an emitter that a path hit",
+    "environment": "the contribution of the environment to a path that hit nothing",
+    "light": "a light sample: its radiance, weight or contribution",
+    "bsdf": "a value, pdf or weight of a BSDF",
+    "throughput": "the throughput of a path: a product of weights, each of them finite",
     "ray": "the ray that leaves a surface",
-    "preview": "what the first surface shows, of integrators that go no further",
-    "sum": "the sum of light, or its product with the filter's weight, each of them finite",
-    "not repeated": "nothing: traced again by tensor operations, the sample is finite",
+    "preview": "the shading of the first surface, of integrators that stop there",
+    "sum": "the sum of contributions, or its product with the filter weight, each of them finite",
+    "not repeated": "none: traced again by tensor operations, the sample is finite",
 }
 
 
@@ -232,28 +232,28 @@ def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[SampleId]) -> l
     found: dict[SampleId, NonFiniteCause] = {}
     for streams in sorted({(place.first, place.streams) for place in places}):
         own = [place for place in places if (place.first, place.streams) == streams]
-        found |= zip(own, _again(trace, wave, own, Streams(*streams)), strict=True)
+        found |= zip(own, _find_causes(trace, wave, own, Streams(*streams)), strict=True)
     return [found[place] for place in places]
 
 
 @torch.no_grad()
-def _again(trace: Trace, wave: Wave, places: Sequence[SampleId], streams: Streams) -> list[NonFiniteCause]:
+def _find_causes(trace: Trace, wave: Wave, places: Sequence[SampleId], streams: Streams) -> list[NonFiniteCause]:
     """Return the causes for samples that belong to the same randomizations."""
-    watch = _Watch(wave.context.world, len(places))
+    finder = _CauseFinder(wave.context.world, len(places))
     x, y, sample = (
         torch.tensor([getattr(place, name) for place in places], device=wave.centre.device)
         for name in ("x", "y", "sample")
     )
     state = wave.rays_of(x, y, sample, streams)
-    watch.began(state)
-    radiance = trace(wave, state, watch)
-    if not watch.full:  # a walk that was ended early returns no radiance
-        watch.look("sum", radiance, torch.arange(len(places), device=x.device), 0, None)
+    finder.began(state)
+    radiance = trace(wave, state, finder)
+    if not finder.full:  # a walk that was ended early returns no radiance
+        finder.look("sum", radiance, torch.arange(len(places), device=x.device), 0, None)
     rest = NonFiniteCause("not repeated", False, 0)
-    return [fault or rest for fault in watch.faults]
+    return [cause or rest for cause in finder.causes]
 
 
-class _Watch(Explainer):
+class _CauseFinder(Explainer):
     """Finds the first value of each lane that is not finite, and records no events.
 
     Args:
@@ -261,19 +261,19 @@ class _Watch(Explainer):
         lanes: number of lanes.
 
     Attributes:
-        faults: cause of each lane; None: not found yet.
+        causes: cause of each lane; None: not found yet.
     """
 
     def __init__(self, world: World, lanes: int) -> None:
         super().__init__(world)
-        self.faults: list[NonFiniteCause | None] = [None] * lanes
+        self.causes: list[NonFiniteCause | None] = [None] * lanes
 
     @property
     def full(self) -> bool:
         """Return True once the cause of every lane is known."""
-        return None not in self.faults
+        return None not in self.causes
 
-    def arrived(self, paths: Legible) -> bool:
+    def arrived(self, paths: ReadablePopulation) -> bool:
         """See :class:`Explainer`. End the walk once all causes are known: a path with NaN might go on for ever."""
         super().arrived(paths)
         return self.full
@@ -297,9 +297,9 @@ class _Watch(Explainer):
         bad = ~torch.isfinite(value).all(0)
         for n in bad.nonzero().squeeze(1).tolist():  # of KEPT lanes at most
             lane = int(lanes[n])
-            if self.faults[lane] is None:
+            if self.causes[lane] is None:
                 nan = bool(torch.isnan(value[:, n]).any())
-                self.faults[lane] = NonFiniteCause(cause, nan, depth, -1 if slot is None else int(slot[n]))
+                self.causes[lane] = NonFiniteCause(cause, nan, depth, -1 if slot is None else int(slot[n]))
 
 
 def _checks(event: Event, world: World) -> Iterator[tuple[str, Tensor]]:

@@ -280,7 +280,7 @@ def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
     with torch.no_grad():
         if not looped(settings, scene.device, torch.float32):
             return {"stages": "eager, by tensor operations"}
-        return engine.told(kernels_of(scene, make_wave(scene, settings, None, torch.float32)))
+        return engine.describe_kernels(kernels_of(scene, make_wave(scene, settings, None, torch.float32)))
 
 
 def loop_of(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Tasks:

@@ -103,7 +103,7 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_shape: bool) ->
     """See :func:`torchpt.paths.adjoint.bounce`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
-    state, hit, rows = _given(trace)
+    state, hit, rows = _inputs(trace)
     extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
     cotangents = VertexCotangents(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
     next_hit = Hit(*(rows[name] for name in HIT)) if kernels.taped.plan.attached else None
@@ -123,32 +123,32 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_shape: bool) ->
         input_cotangents = adjoint.bounce(
             integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, gathers.leaves, landed
         )
-    return _ended(trace, gathers, state, input_cotangents, {})
+    return _stores(trace, gathers, state, input_cotangents, {})
 
 
 def emit_vjp(trace: Trace, follow_shape: bool) -> Sinks:
     """See :func:`torchpt.paths.adjoint.gather`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
-    state, hit, rows = _given(trace)
+    state, hit, rows = _inputs(trace)
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
         context = kernels.taped.at(salts, follow_shape)
         stage, vertex = trace.layout.wave.integrator.emit, VertexInput(state, hit)
         input_cotangents = adjoint.gather(stage, context, vertex, rows["radiance"], gathers.leaves)
-    return _ended(trace, gathers, state, input_cotangents, rows)
+    return _stores(trace, gathers, state, input_cotangents, rows)
 
 
 def escape_vjp(trace: Trace) -> Sinks:
     """See :func:`torchpt.paths.adjoint.gather`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
-    state, hit, rows = _given(trace)
+    state, hit, rows = _inputs(trace)
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
         stage, vertex = trace.layout.wave.integrator.escape, VertexInput(state, hit)
         input_cotangents = adjoint.gather(stage, kernels.taped.at(salts), vertex, rows["radiance"], gathers.leaves)
-    return _ended(trace, gathers, state, input_cotangents, rows)
+    return _stores(trace, gathers, state, input_cotangents, rows)
 
 
 def store_hits(trace: Trace) -> Sinks:
@@ -178,7 +178,7 @@ def _begun(trace: Trace) -> tuple[Any, Tracer]:
     return trace.layout, trace.tracer
 
 
-def _given(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
+def _inputs(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
     """Return path state, hits, and the fields of the slots."""
     state, _ = trace.state()
     hit = trace.hit()
@@ -187,7 +187,7 @@ def _given(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
     return state, hit, slots.read(tracer, *slots_read(kernels), place=lane)
 
 
-def _ended(
+def _stores(
     trace: Trace,
     gathers: _RecordedGathers,
     state: PathState,

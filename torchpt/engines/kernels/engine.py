@@ -24,7 +24,7 @@ from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD
 from torchpt.engines.kernels.layout import HIT, Memory, Rows, path_state, state_values
 from torchpt.engines.kernels.programs import Kernel, Kernels
-from torchpt.engines.kernels.stages import PLACE
+from torchpt.engines.kernels.stages import CHUNK_FIELDS
 from torchpt.paths.integrators.base import check_output
 from torchpt.paths.layers import LAYERS
 from torchpt.paths.state import Shadow, Splat, VertexInput, no_shadow
@@ -57,14 +57,14 @@ class Calls:
 
     Attributes:
         counters: see :class:`torchpt.engines.kernels.layout.Layout`.
-        place: pixels and samples of the chunk, see :data:`torchpt.engines.kernels.stages.PLACE`.
+        place: pixels and samples of the chunk, see :data:`torchpt.engines.kernels.stages.CHUNK_FIELDS`.
         slots: radiance of the chunk's samples.
     """
 
     def __init__(self, kernels: Kernels, halt: threading.Event) -> None:
         self.kernels, self._halt = kernels, halt
         self.counters = np.zeros(kernels.models + 6, np.int64)
-        self.place = np.zeros(len(PLACE), np.int32)
+        self.place = np.zeros(len(CHUNK_FIELDS), np.int32)
         self.slots = Memory(3)
         self._prepared: dict[int, tuple[Any, Any, int, tuple[tuple[int, str], ...], range]] = {}
         self._keep: list[Kernel] = []

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from torchpt.paths.wave import Wave
 
 __all__ = [
-    "PLACE",
+    "CHUNK_FIELDS",
     "accumulate",
     "attenuate_shadow_rays",
     "begin_shadow_rays",
@@ -119,7 +119,7 @@ def search_words(wave: Wave) -> Any:
 
 #: Integers that identify the samples of a chunk: first pixel and number of pixels; randomization (counted from ``stream``) and
 #: point of the first sample; first randomization and how many share the samples; corner and width of the crop; film width.
-PLACE = ("first", "pixels", "turn", "point", "stream", "streams", "x", "y", "crop", "film")
+CHUNK_FIELDS = ("first", "pixels", "turn", "point", "stream", "streams", "x", "y", "crop", "film")
 
 
 def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
@@ -129,13 +129,13 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
     rays, else they are camera rays.
     """
     layout, tracer, wave = trace.layout, trace.tracer, trace.layout.wave
-    place = trace.uniform("place", torch.ones(len(PLACE), dtype=torch.int32))
+    place = trace.uniform("place", torch.ones(len(CHUNK_FIELDS), dtype=torch.int32))
     salts = trace.salts()
     pixels = layout.state.read(tracer, "prim")["prim"] if chosen else torch.empty(0)
     rays = layout.state.read(tracer, "o", "d") if given else {}
     passthrough: dict[str, Tensor] = {}
     with tracer:
-        chunk = dict(zip(PLACE, place.to(torch.int64).unbind(), strict=True))
+        chunk = dict(zip(CHUNK_FIELDS, place.to(torch.int64).unbind(), strict=True))
         # Lanes run over the chunk's pixels, then over its samples.
         lane = torch.arange(tracer.lanes)
         sample = torch.div(lane, chunk["pixels"], rounding_mode="floor")
