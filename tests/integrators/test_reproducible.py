@@ -185,7 +185,7 @@ def test_the_audit_covers_what_waves_use(monkeypatch):
         return call
 
     monkeypatch.setattr(Wave, "rays", recorded(Wave.rays))
-    monkeypatch.setattr(tensors, "brought", recorded(tensors.brought))
+    monkeypatch.setattr(tensors, "weighted_radiance", recorded(tensors.weighted_radiance))
     materials = torchpt.load(showcase(), device="cpu")
     for strategy in ("mis", "light", "uniform"):
         shoot(materials, 2, 0, "sobol", {"strategy": strategy, "max_depth": 4}, film_of(16), accel="brute")

@@ -104,7 +104,8 @@ FEATURES: dict[str, Feature] = {
         ("world.textures.tables", "world.geometry.tangents"),
     ),
     "opacity": Feature(
-        ("paths/transmission.py",), lambda scene: _material(scene, opacity=0.5), ("world.materials.opacity",), ("clear",)
+        ("paths/transmission.py",), lambda scene: _material(scene, opacity=0.5), ("world.materials.opacity",),
+        ("transmittance",),
     ),
     "constant sky": Feature(
         ("physics/lights/kinds/constant.py",),

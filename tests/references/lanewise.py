@@ -259,8 +259,8 @@ def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recor
                 _compare_apart(found, name, after, shadow, values)
                 continue
             if shadow is not None:
-                clear = engine.clear(shadow)
-                after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))
+                transmittance = engine.transmittance(shadow)
+                after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, transmittance))
             _compare_fused(found, name, kernels, after, engine.hits(after, depth + 1), values, on, ended)
     for state, hit, index in recorder.emits:
         light = vertex.emit(wave.context, VertexInput(rows(state, index), rows(hit, index))).brought
@@ -347,19 +347,24 @@ def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorde
         n = len(index)
         one = torch.ones(n)
         here = arena(
-            kernels, shadow_o=shadow.o, shadow_d=shadow.d, shadow_t=shadow.t_max, clear=one, key=state.key[:, index]
+            kernels,
+            shadow_o=shadow.o,
+            shadow_d=shadow.d,
+            shadow_t=shadow.t_max,
+            transmittance=one,
+            key=state.key[:, index],
         )
         worker.search.light(here, n)
-        taken = kernels.state.take(here, np.arange(n), ("clear", "blocked"))
-        arrived = taken["clear"] if "clear" in taken else (taken["blocked"] == 0).float()
+        taken = kernels.state.take(here, np.arange(n), ("transmittance", "blocked"))
+        arrived = taken["transmittance"] if "transmittance" in taken else (taken["blocked"] == 0).float()
         lit = shadow.t_max > 0
-        found.add("light", "clear", engine.clear(shadow)[lit], arrived[lit])
+        found.add("light", "transmittance", engine.transmittance(shadow)[lit], arrived[lit])
 
 
 def _first_hits(found: Differences, wave: Wave, kernels: Kernels, pixels: int, samples: int) -> None:
     """The preview has no vertices beyond the first: samples are compared whole."""
     tally = RayCounts()
-    eager = tensors.brought(wave, wave.rays(0, pixels, 0, samples), tally)
+    eager = tensors.weighted_radiance(wave, wave.rays(0, pixels, 0, samples), tally)
     worker = KernelsEngine(kernels)
     took = worker.trace(Chunk(0, pixels, 0, samples))
     assert took.rays == tally.rays

@@ -294,7 +294,7 @@ def test_scenes_by_tensor_operations_are_rendered_before_the_next_is_loaded():
 def test_memory_that_runs_out_by_tensor_operations(monkeypatch):
     scenes = [room(0.2), room(0.3)]
     expected = torchpt.render_batch(scenes, compile="off")
-    plain, taken = tensors.brought, []
+    plain, taken = tensors.weighted_radiance, []
 
     def limited(wave, state, *args, **rest):
         if len(state.lane) > 500:
@@ -302,7 +302,7 @@ def test_memory_that_runs_out_by_tensor_operations(monkeypatch):
         taken.append(state)
         return plain(wave, state, *args, **rest)
 
-    monkeypatch.setattr(tensors, "brought", limited)
+    monkeypatch.setattr(tensors, "weighted_radiance", limited)
     assert torch.equal(torchpt.render_batch(scenes, compile="off"), expected) and len(taken) > 4
 
 

@@ -116,16 +116,16 @@ def test_what_goes_where_after_a_hit():
         dead = torch.arange(n) % 10 == 0
         state = replace(state, t_max=state.t_max.masked_fill(dead, 0.0))
         hit = replace(hit, prim=hit.prim.masked_fill(dead, -1))
-        light, clear = torch.rand(3, n), torch.rand(n)
+        light, transmittance = torch.rand(3, n), torch.rand(n)
         here = arena(
             kernels, **{name: getattr(state, name) for name in ("lane", "t_max", "radiance", "key")},
-            **{name: getattr(hit, name) for name in HIT}, shadow_radiance=light, clear=clear,
+            **{name: getattr(hit, name) for name in HIT}, shadow_radiance=light, transmittance=transmittance,
         )  # fmt: skip
         worker.calls.clear()
         lists = worker.room(1).lists
         worker.calls.run(kernels.sort_lanes(True), n, here, here, lists=lists)
         _, places = worker.calls.counted()
-        wanted = torch.addcmul(state.radiance, light, clear)
+        wanted = torch.addcmul(state.radiance, light, transmittance)
         held = kernels.state.take(here, np.arange(n), ("radiance",))["radiance"]
         assert torch.allclose(held, wanted, rtol=1e-6, atol=0)
         key = wave.context.world.materials.key[wave.context.world.geometry.slot(hit.prim) + 1].long()

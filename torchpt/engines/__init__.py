@@ -1,10 +1,10 @@
-"""Engines: who runs the events of a path.
+"""Engines run the stages of paths: with tensor operations on any device, or with compiled kernels on a CPU.
 
-``engine.py`` is the door: who has samples to take or paths to go back along asks there, and finds the interfaces on one page.
-``tensors*.py`` is plain torch on any device: the reference, and what derivatives and models of a caller's own run by.
-``kernels/`` is a CPU's: stages as compiled loops over lanes, in arenas of a thread. Both serve :func:`torchpt.paths.walk.walk`,
-whose ``Engine`` says what a vertex asks of them, and give the same pictures but for rounding. ``taken_over.py`` has the
-functions of physics that run otherwise where an engine does (:mod:`torchpt.core.dispatch`).
+``engine.py`` has the interfaces of forward and backward engines, and the functions that make them; the rooms above import only
+this file. ``tensors*.py`` is plain torch on any device: the reference, also for gradients and for models of a user's own.
+``kernels/`` is for CPUs: stages as compiled loops over lanes, in the memory of one thread. Both implement the ``Engine`` of
+:mod:`torchpt.paths.walk`, and their pictures differ only by rounding. ``dispatch.py`` registers kernels in place of functions
+of physics (:mod:`torchpt.core.dispatch`).
 
 May import: ``paths``, ``search``, ``compiler``, ``physics`` and below; none of these imports an engine. Start with
 ``engine.py``, then ``tensors.py``.

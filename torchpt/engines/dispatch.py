@@ -1,6 +1,6 @@
-"""Functions that physics declares and that engines take over.
+"""Implementations that engines register for dispatched functions of physics.
 
-On a CPU those of whole tensors are kernels of the lane compiler. Two are written otherwise where a stage is traced.
+On a CPU, functions of whole tensors run as kernels of the lane compiler. Two others have another form while a stage is traced.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ hashing.reverse_bits.register(bits.reverse_bits)
 def _times_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Any:
     if not tracing():
         return NotImplemented
-    # In a loop over lanes each lane takes the same steps.
+    # Every lane of a kernel takes the same steps, so the texture is read in all lanes and selected by the mask.
     return torch.where(textured, opacity * opacity_map(world, interact(world, o, d, hit)), opacity)
 
 

@@ -1,4 +1,4 @@
-"""The door of the engines: what they do for those above, and who is picked. Nobody above imports an engine by name."""
+"""Interfaces of engines for the rooms above, and the functions that make an engine for a wave."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from torchpt.engines import work
 from torchpt.engines.kernels.engine import LANES as LANES_OF_KERNELS
 from torchpt.engines.kernels.programs import Kernels
 from torchpt.engines.kernels.threads import KernelsForward
-from torchpt.engines.tensors import brought, hits, layers, radiance, seen, trace
+from torchpt.engines.tensors import hits, layers, radiance, seen, trace, weighted_radiance
 from torchpt.engines.tensors_forward import TensorsForward
 from torchpt.engines.work import TASKS, Block, TaskResult
 from torchpt.paths.walk import Engine, Population
 from torchpt.paths.wave import Wave
 
-if TYPE_CHECKING:  # the way back is imported where somebody goes it
+if TYPE_CHECKING:  # backward engines are imported when first used
     from torchpt.math.sums import ChunkGradientSums, GradientSums
     from torchpt.paths.adjoint import Tape
 
@@ -35,7 +35,6 @@ __all__ = [
     "Tasks",
     "backward_kernels",
     "backward_tensors",
-    "brought",
     "describe_kernels",
     "forward_kernels",
     "forward_tensors",
@@ -45,6 +44,7 @@ __all__ = [
     "radiance",
     "seen",
     "trace",
+    "weighted_radiance",
 ]
 
 P = TypeVar("P", bound=Population)
@@ -56,11 +56,11 @@ S = TypeVar("S", contravariant=True)
 
 
 class Forward(Protocol):
-    """Takes samples of a render and adds them to its films, the same sums however it cuts the work.
+    """Renders samples and adds them to the films; the sums do not depend on threads or chunks.
 
     Attributes:
-        compiled: whether by kernels.
-        budget: threads and lanes that it has at the moment.
+        compiled: True: it runs kernels.
+        budget: threads and lanes at the moment; they shrink when memory runs out.
     """
 
     compiled: bool
@@ -68,82 +68,82 @@ class Forward(Protocol):
 
     @property
     def seconds(self) -> float:
-        """Return the seconds that were spent on making kernels."""
+        """Return the seconds spent on making kernels."""
         ...
 
     def rows(self, layers: Mapping[str, Any]) -> int:
-        """Return how many 32-bit numbers a lane takes in a thread, where the picture has such layers; 0: it is measured."""
+        """Return how many 32-bit numbers a lane takes in each thread, for these layers; 0: unknown, memory is measured."""
         ...
 
-    def run(self, spans: Sequence[work.Span], each: Callable[[TaskResult | None], bool]) -> bool:
-        """Take samples of every pixel of plates; return whether all were taken.
+    def run(self, spans: Sequence[work.SampleRange], each: Callable[[TaskResult | None], bool]) -> bool:
+        """Render samples of every pixel of pixel sets; return True if all were rendered.
 
         Args:
-            spans: plates, with the first sample and how many are to be taken.
+            spans: pixel sets, each with its first sample and number of samples.
             each: called in this thread after every task, and now and then with None; returning True ends the render.
         """
         ...
 
     def release_workers(self, keeps: bool) -> None:
-        """Give up the memory of threads, or keep it for the next render of the same structure."""
+        """Release the memory of threads, or (``keeps``) keep it for the next render of the same structure."""
 
 
 class Tasks(Forward, Protocol):
-    """One whose tasks others may deal to threads, among those of other renders."""
+    """A forward engine whose tasks a caller may schedule on threads, among those of other renders."""
 
-    def blocks(self, spans: Sequence[work.Span], tasks: int) -> list[Block]:
-        """Cut samples of plates into blocks of pixels: ``tasks`` for each plate, as far as they repay."""
+    def blocks(self, spans: Sequence[work.SampleRange], tasks: int) -> list[Block]:
+        """Split the samples of pixel sets into blocks of pixels: ``tasks`` for each set, unless blocks get too small."""
         ...
 
     def task(self, block: Block) -> TaskResult:
-        """Take a block, in a thread of its own."""
+        """Render a block; called on any thread."""
         ...
 
     def retry_blocks(self, blocks: list[Block], each: Callable[[TaskResult | None], bool]) -> bool:
-        """Take blocks for which there was no memory, by fewer threads or lanes; else as :meth:`run`."""
+        """Render blocks that ran out of memory again, with fewer threads or lanes; else as :meth:`run`."""
         ...
 
     def halt(self) -> None:
-        """End the render: tasks stop at their next kernel."""
+        """Cancel the render: tasks stop at their next kernel."""
 
 
 def forward_tensors(wave: Wave, budget: Budget) -> Forward:
-    """Return who takes samples by tensor operations, in pieces of as many lanes as a budget has."""
+    """Return a forward engine of tensor operations, in pieces of as many lanes as the budget allows."""
     return TensorsForward(wave, budget)
 
 
 def kernels_of(wave: Wave, own: Sequence[int], before: Kernels | None = None) -> Kernels:
-    """Return the kernels of a render; models that no kernel can be made of are named in ``eager``.
+    """Return the kernels of a render; its ``eager`` lists models that cannot be compiled, with the reasons.
 
     Args:
         wave: of the render.
-        own: numbers of the models that are the caller's: it is tried at once whether kernels can be made of them.
-        before: those of another render, whose tables are taken over where they are made of the same tensors.
+        own: indices of the user's own models, which are compiled at once to find out whether they can be.
+        before: kernels of another render; its tables are shared where they were made of the same tensors.
     """
     packets = uses_packets(wave)
     opaque = wave.context.world.materials.opacity is None and not wave.integrator.own_transmit
     fused = packets and opaque and wave.first is None and not wave.integrator.splats
     kernels = Kernels(wave, packets, fused, before, fixed=not own)
     eager = kernels.probe(own) if wave.integrator.light else {}
-    if eager and kernels.fused:  # what runs as tensor operations hands its rays to the search structure
+    if eager and kernels.fused:  # stages that run as tensor operations need searches between the stages
         kernels = Kernels(wave, packets, False)
     kernels.eager = eager
     return kernels
 
 
 def forward_kernels(kernels: Kernels, threads: int | None = None, strict: bool = False) -> Tasks:
-    """Return who takes samples by kernels.
+    """Return a forward engine of kernels.
 
     Args:
         kernels: of the render.
-        threads: None: as many as torch's.
-        strict: whether a task ends at a sample that is not finite; whoever is told of it ends the render.
+        threads: None: as many as torch uses.
+        strict: True: a task ends at its first chunk with a sample that is not finite; the caller has to end the render.
     """
     return KernelsForward(kernels, threads or torch.get_num_threads(), kernels.wave.integrator.clamp, strict)
 
 
 def describe_kernels(kernels: Kernels) -> dict[str, Any]:
-    """Tell how a render runs by kernels."""
+    """Return a description of the compiled loop, for the summary of a render."""
     search = (
         "inside the stages" if kernels.fused else "kernels of packets" if kernels.packets else kernels.wave.accel.name
     )
@@ -157,49 +157,49 @@ def describe_kernels(kernels: Kernels) -> dict[str, Any]:
     }
 
 
-# ---- The way back
+# ---- Backward passes
 
 
 class Backward(Engine[P], Protocol[P, M, S]):
-    """An engine that also goes back along the vertices of a chunk's paths, one chunk after the other.
+    """An engine that also pulls cotangents back through the vertices of a chunk's paths, one chunk after the other.
 
-    Of a walk it keeps the first :data:`KEPT` populations as they are until it walks again; the others are gone two vertices
-    on. Derivatives by what a vertex was given lie with the samples, where the vertex before finds them.
+    It keeps the first :data:`KEPT` populations of a walk until the next walk; later ones are overwritten two vertices on.
+    Cotangents of a vertex's inputs are stored by sample, where the VJP of the vertex before reads them.
     """
 
     wave: Wave
 
     def begin(self, span: Span, sums: S) -> P:
-        """Start the paths of a chunk by its rays; derivatives are added to ``sums`` from now on."""
+        """Start the paths of a chunk at the camera; from now on gradients are added to ``sums``."""
         ...
 
     def mark(self, paths: P) -> M:
-        """Copy a population with its hits, not sorted yet."""
+        """Return a copy of a population with its hits, before it is sorted: a checkpoint."""
         ...
 
     def resume(self, mark: M) -> P:
-        """Start there once more; what the paths brought so far is not in what they bring then."""
+        """Start again from a mark; radiance found before it is left out of the samples."""
         ...
 
     def radiance_of_samples(self) -> Tensor:
-        """Return what the paths from the camera brought ``(3, samples * pixels)``, weighted by the filter."""
+        """Return the radiance of the samples ``(3, samples * pixels)``, weighted by the filter."""
         ...
 
     def receive(self, cotangent: Tensor) -> None:
-        """Take the cotangents of that, with which the way back begins."""
+        """Set the cotangent of :meth:`radiance_of_samples`, the start of the backward pass."""
 
     def vjp(self, paths: P) -> None:
-        """Pull cotangents back through a vertex, once those of all vertices behind it were."""
+        """Pull cotangents back through a vertex, after all vertices behind it."""
 
     def vjp_rays(self) -> None:
-        """Pull them back through the rays that the paths began with."""
+        """Pull cotangents back through the first rays of the paths."""
 
 
 class BackwardKernels(Protocol):
-    """The kernels of a way back.
+    """The kernels of a backward pass.
 
     Attributes:
-        eager_vjps: stages that run by tensor operations (``("bounce", model, ...)``, ``("emit", ...)``), and why.
+        eager_vjps: stages that run as tensor operations (``("bounce", model, ...)``, ``("emit", ...)``), with the reasons.
     """
 
     eager_vjps: dict[tuple[Any, ...], str]
@@ -209,21 +209,21 @@ class BackwardKernels(Protocol):
         ...
 
     def bytes_per_lane(self, levels: int) -> int:
-        """Return what a lane costs that keeps so many vertices."""
+        """Return the bytes that a lane takes if ``levels`` vertices are kept."""
         ...
 
 
 def uses_packets(wave: Wave) -> bool:
-    """Return True where kernels search by packets, which know no quadrics."""
+    """Return True where packet kernels search the primitives; they do not support quadrics."""
     return wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
 
 
 def backward_tensors(tape: Tape, cotangent: Tensor | None) -> Backward[Any, Any, GradientSums]:
-    """Return the way back by tensor operations.
+    """Return a backward engine of tensor operations.
 
     Args:
-        tape: the wave, and what is differentiated in it.
-        cotangent: ``(3, H W)`` of the picture, over the samples of a pixel, where paths have splats.
+        tape: the wave and its differentiated tensors.
+        cotangent: ``(3, H W)`` of the picture, divided by the samples a pixel; None for an integrator without splats.
     """
     from torchpt.engines.tensors_backward import TensorsBackward
 
@@ -231,12 +231,12 @@ def backward_tensors(tape: Tape, cotangent: Tensor | None) -> Backward[Any, Any,
 
 
 def backward_kernels(tape: Tape, own: Sequence[int], cotangent: Tensor | None) -> BackwardKernels:
-    """Return the kernels of a way back, which make an engine for each thread.
+    """Return the kernels of a backward pass, which make a backward engine for each thread.
 
     Args:
-        tape: as of :func:`backward_tensors`.
-        own: numbers of the models of which no kernel may be made.
-        cotangent: as of :func:`backward_tensors`.
+        tape: as for :func:`backward_tensors`.
+        own: indices of the user's own models, which are compiled at once to find out whether they can be.
+        cotangent: as for :func:`backward_tensors`.
     """
     from torchpt.engines.kernels.backward import VjpKernels
 

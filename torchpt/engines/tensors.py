@@ -1,7 +1,7 @@
-"""The events of paths by tensor operations: any device, float32 or float64, under a tape or without, models of any kind.
+"""The engine of tensor operations: any device, float32 or float64, with or without autograd, models of any kind.
 
-The readable reference for kernels. Each verb is a few operations on all lanes of a wave, or a stage
-(:mod:`torchpt.paths.vertex`) on those that it concerns.
+It is the readable reference for kernels. Each method is a few operations on all lanes of a wave, or a stage
+(:mod:`torchpt.paths.vertex`) on some of the lanes.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from torchpt.physics.film.splats import LARGEST, Splats
 from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Hit
 
-__all__ = ["Paths", "TensorsEngine", "brought", "hits", "layers", "radiance", "seen", "trace"]
+__all__ = ["Paths", "TensorsEngine", "hits", "layers", "radiance", "seen", "trace", "weighted_radiance"]
 
-#: Groups before lanes are sorted.
+#: Value of `Paths.ends` before lanes are sorted.
 _UNSORTED = Ends(torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.int64))
 
 
 @dataclass
 class RaysInTransit:
-    """Rays on their way through what lets them pass.
+    """Rays that have passed surfaces, or may pass their next hit.
 
     Attributes:
-        lanes: of the population.
-        state: the rays, from where they go on.
-        hit: what they meet next.
-        before: ``(n,)`` how far they have come.
-        step: how many times they went on.
+        lanes: ``(n,)`` their lanes in the population.
+        state: the rays, with origins behind the surfaces that they passed.
+        hit: their next hits.
+        before: ``(n,)`` distance from the start of the path segment to the origin.
+        step: number of steps so far.
     """
 
     lanes: Tensor
@@ -55,23 +55,22 @@ class RaysInTransit:
 
 @dataclass
 class Paths:
-    """Paths of a wave at a vertex; lanes are those of the state.
+    """The population of this engine: paths of a wave at a vertex. Lanes are those of the state.
 
     Attributes:
-        state: of the paths as they arrive.
-        depth: of the vertex.
-        hit: what their rays met; None where that is not known yet.
-        in_transit: rays that are still on their way to it; None where nothing lets rays pass.
-        ends: lanes that met light by chance, once they are sorted.
-        groups: number and lanes of each BSDF model that was met; None before lanes are sorted.
-        pending: shadow rays from the vertex before, with the first lane that they bring light to.
-        clear: how much of their light gets through ``(n,)``, one for each of ``pending``, once they are traced.
-        splats: light from the vertex before to other pixels, with the lanes of the wave that it comes from.
-        splat_transmittance: how much of it gets through, likewise.
-        emissions: light that lanes met here by chance, where an engine keeps it.
-        outputs: of the vertex before: number of the BSDF model, lanes of the wave, and what its surfaces made of them, where an
-            engine keeps it.
-        passed: ``clear`` and ``splat_transmittance`` of the light that was sampled here, where an engine goes back.
+        state: the paths as they arrive.
+        depth: number of the vertex.
+        hit: hits of their rays; None: not searched yet.
+        in_transit: rays that may still pass their hits; None where everything is opaque.
+        ends: lanes that hit an emitter or nothing, once they are sorted.
+        groups: index and lanes of each BSDF model that was hit; None before lanes are sorted.
+        pending: shadow rays from the vertex before, with the first lane of each group.
+        transmittance: ``(n,)`` of each of ``pending``, once they are traced.
+        splats: splats from the vertex before, with the lanes of the wave that they come from.
+        splat_transmittance: ``(n,)`` of each of ``splats``, likewise.
+        emissions: lanes and emission at this vertex, where the engine keeps them.
+        outputs: index of the BSDF model, lanes of the wave and stage outputs of the vertex before, where the engine keeps them.
+        passed: ``transmittance`` and ``splat_transmittance`` of the shadow rays that leave this vertex, in a backward engine.
     """
 
     state: PathState
@@ -81,7 +80,7 @@ class Paths:
     ends: Ends = field(default=_UNSORTED)
     groups: list[tuple[int, Tensor]] | None = None
     pending: list[tuple[int, Shadow]] = field(default_factory=list)
-    clear: list[Tensor] = field(default_factory=list)
+    transmittance: list[Tensor] = field(default_factory=list)
     splats: list[tuple[Tensor, Splat]] = field(default_factory=list)
     splat_transmittance: list[Tensor] = field(default_factory=list)
     emissions: list[tuple[Tensor, Emission]] = field(default_factory=list)
@@ -90,24 +89,24 @@ class Paths:
 
     @property
     def met(self) -> Hit:
-        """Return what the rays met, which is known by now."""
+        """Return the hits, which must be known."""
         assert self.hit is not None
         return self.hit
 
 
 class TensorsEngine:
-    """The engine of one wave.
+    """The engine of tensor operations, for one wave.
 
     Args:
-        wave: the scene's stages, search and first surfaces.
-        lanes: how many camera rays the paths are of.
-        tally: counts rays and paths that are cut short.
-        keeps: whether populations keep what stages returned, for an observer.
-        splats: gets what the paths bring to other pixels; None: nobody asks.
+        wave: stages, acceleration structure and settings.
+        lanes: number of camera samples.
+        tally: counts rays and truncated paths.
+        keeps: True: populations keep stage outputs, for an observer.
+        splats: a list to append splats to; None: splats are dropped.
 
     Attributes:
-        radiance: ``(3, lanes)`` what ended paths brought.
-        lost: ``(lanes,)`` bool: those with splats that are not finite; None: the integrator has no splats.
+        radiance: ``(3, lanes)`` radiance of samples whose paths have ended.
+        lost: ``(lanes,)`` bool, True for samples with a splat that is not finite; None: the integrator has no splats.
     """
 
     def __init__(
@@ -126,12 +125,12 @@ class TensorsEngine:
         self._clear(lanes)
 
     def _clear(self, lanes: int) -> None:
-        """Begin with so many camera rays, none of which brought anything yet."""
+        """Set the radiance of ``lanes`` samples to zero."""
         self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=self.wave.centre.device)
         self.lost = torch.zeros_like(self.radiance[0], dtype=torch.bool) if self.wave.integrator.splats else None
 
     def spawn(self, state: PathState) -> Paths:
-        """Start paths with rays."""
+        """Return the population of paths that start with rays."""
         return Paths(self.wave.with_optional_fields(state))
 
     def intersect(self, paths: Paths) -> bool:
@@ -147,12 +146,12 @@ class TensorsEngine:
         return paths.in_transit is not None
 
     def _nearest(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
-        """Find the nearest surfaces, opaque or not."""
+        """Return the nearest hits, opaque or not."""
         t, prim, u, v = self.wave.accel.intersect(o, d, t_max)
         return Hit(t.to(self.plan.dtype), prim.to(torch.int64), u.to(self.plan.dtype), v.to(self.plan.dtype))
 
     def _may_transmit(self, state: PathState, hit: Hit) -> Tensor:
-        """Return the lanes that the stage ``transmit`` is asked for."""
+        """Return the lanes that the stage ``transmit`` runs for."""
         if self.wave.integrator.own_transmit:
             some = state.t_max > 0
         else:
@@ -183,7 +182,7 @@ class TensorsEngine:
             check_fields(self.wave.integrator, own)
             paths.state = map_leaves(lambda all, new: all.index_copy(-1, there, new), paths.state, own)
         behind = self._nearest(state.o, state.d.detach(), state.t_max)
-        # Distances are counted from where the ray began; the step over a surface is below their rounding.
+        # Distances are counted from the start of the segment; the offset across a surface is below their rounding error.
         values = {"t": behind.t + before, "prim": behind.prim, "u": behind.u, "v": behind.v}
         paths.hit = replace(hit, **{name: getattr(hit, name).index_copy(0, home, x) for name, x in values.items()})
         again = self._may_transmit(state, behind)
@@ -193,13 +192,13 @@ class TensorsEngine:
         return True
 
     def hits(self, state: PathState, depth: int) -> Hit:
-        """Return what rays meet on their way to a vertex, behind what lets them pass; they are not counted."""
+        """Return the hits of rays on their way to a vertex, behind all surfaces that they pass; the rays are not counted."""
         paths = Paths(state, depth)
         find(TensorsEngine(self.wave, 0), paths)
         return paths.met
 
     def sort(self, paths: Paths) -> Counts:
-        """See :class:`torchpt.paths.walk.Engine`: one sort of small keys and one transfer of the counts."""
+        """See :class:`torchpt.paths.walk.Engine`. Needs one sort of small keys and one transfer of the counts."""
         paths.ends, paths.groups = partition(self.world, paths.met)
         return Counts([len(index) for _, index in paths.groups], len(paths.ends.emissive), len(paths.ends.missed))
 
@@ -215,14 +214,14 @@ class TensorsEngine:
         self._end(paths, paths.ends.missed)
 
     def _gather(self, paths: Paths, index: Tensor, stage: Callable[[StageContext, VertexInput], Emission]) -> None:
-        """Add light that the lanes ``index`` met by chance."""
+        """Run an emission stage on the lanes ``index`` and add the contributions."""
         found = stage(self._context(paths), self._input(paths, index))
         paths.state.radiance.scatter_add_(1, index.expand(3, -1), found.brought)
         if self.keeps:
             paths.emissions.append((index, found))
 
     def _context(self, paths: Paths, roulette: float = 0.0) -> StageContext:
-        """Return what the stages of a vertex read beside their lanes."""
+        """Return the stage context of a vertex."""
         follow_shape, salt = (
             follows_shape(self.plan, self.world, paths.depth),
             salts(paths.depth, paths.state.lane.device),
@@ -264,11 +263,11 @@ class TensorsEngine:
         whole = paths.state.radiance
         parts, done = [], 0
         for start, shadow in paths.pending:
-            paths.clear.append(self.clear(shadow))
+            paths.transmittance.append(self.transmittance(shadow))
             end = start + len(shadow.t_max)
             if start > done:
                 parts.append(whole[:, done:start])
-            parts.append(torch.addcmul(whole[:, start:end], shadow.radiance, paths.clear[-1]))
+            parts.append(torch.addcmul(whole[:, start:end], shadow.radiance, paths.transmittance[-1]))
             done = end
         if parts:
             if done < whole.shape[1]:
@@ -276,45 +275,45 @@ class TensorsEngine:
             paths.state = replace(paths.state, radiance=parts[0] if len(parts) == 1 else torch.cat(parts, 1))
         paths.pending.clear()
         for lane, splat in paths.splats:
-            paths.splat_transmittance.append(self.clear(splat.light))
+            paths.splat_transmittance.append(self.transmittance(splat.light))
             self._splat(lane, splat, paths.splat_transmittance[-1])
 
-    def _splat(self, lane: Tensor, splat: Splat, clear: Tensor) -> None:
-        """Note the light of splats that gets through; one that is not finite is left out, and its sample's own light too."""
-        value = splat.light.radiance * clear
+    def _splat(self, lane: Tensor, splat: Splat, transmittance: Tensor) -> None:
+        """Record splats that arrive. One that is not finite is left out and makes its sample NaN."""
+        value = splat.light.radiance * transmittance
         finite = (value.detach().abs() < LARGEST).all(0)
-        comes = (splat.pixel >= 0) & (clear.detach() != 0)
+        comes = (splat.pixel >= 0) & (transmittance.detach() != 0)
         assert self.lost is not None
         self.lost = self.lost.index_copy(0, lane, take(self.lost, lane) | (comes & ~finite))
         if self.splats is not None:
             on = (comes & finite).nonzero().squeeze(1)
             self.splats.append(Splats(take(lane, on), take(splat.pixel, on), take(value, on)))
 
-    def brought(self) -> Tensor:
-        """Return the radiance ``(3, lanes)`` of all paths, which ended; NaN where a splat of theirs is not finite."""
+    def path_radiance(self) -> Tensor:
+        """Return the radiance ``(3, lanes)`` of all samples, once all paths ended; NaN where a splat is not finite."""
         return self.radiance if self.lost is None else torch.where(self.lost, math.nan, self.radiance)
 
-    def clear(self, shadow: Shadow) -> Tensor:
-        """Return how much of the light gets through ``(n,)``: 0 or 1 where all surfaces are opaque.
+    def transmittance(self, shadow: Shadow) -> Tensor:
+        """Return the transmittance of shadow rays ``(n,)``: the product of ``1 - opacity`` over all surfaces that they hit.
 
-        Else it is the product of ``1 - opacity`` over all surfaces between the ends of the rays.
+        Where all surfaces are opaque it is 0 or 1, by an any-hit search.
         """
         if self.world.materials.opacity is None:
             return (~self.wave.accel.occluded(shadow.o, shadow.d, shadow.t_max)).to(self.plan.dtype)
-        clear = torch.ones_like(shadow.t_max)
+        transmittance = torch.ones_like(shadow.t_max)
         o, d, t_max = shadow.o.detach(), shadow.d.detach(), shadow.t_max
         lanes = torch.arange(len(t_max), device=t_max.device)
         while len(lanes):
             hit = self._nearest(o, d, t_max)
             opacity = opacity_at(self.world, o, d, hit, 0.0)
-            clear = clear.index_copy(0, lanes, take(clear, lanes) * (1.0 - opacity))
+            transmittance = transmittance.index_copy(0, lanes, take(transmittance, lanes) * (1.0 - opacity))
             on = ((hit.prim >= 0) & (opacity.detach() < 1)).nonzero().squeeze(1)
             passed, o, d = rows(hit, on), take(o, on), take(d, on)
             lanes, t_max = take(lanes, on), (take(t_max, on) - passed.t).clamp_min(0.0)
             if len(lanes):
                 with torch.no_grad():
                     o = beyond(self.world, o, d, passed)
-        return clear
+        return transmittance
 
     def terminate(self, paths: Paths, truncated: bool) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -327,14 +326,14 @@ class TensorsEngine:
                 self.tally.truncated += len(index)
 
     def _end(self, paths: Paths, index: Tensor | None) -> None:
-        """End paths at lanes (None: all): what they carry goes to their samples."""
+        """End the paths at lanes ``index`` (None: all): store their radiance with their samples."""
         state = paths.state
         if index is None or len(index):
             self.radiance.scatter_(1, take(state.lane, index).expand(3, -1), take(state.radiance, index))
 
 
 def escaped(wave: Wave, state: PathState, ends: Ends) -> Tensor:
-    """Return the lanes that escape to the environment; rays that nothing carries any more bring nothing from there."""
+    """Return the lanes that get the radiance of the environment: rays without a hit, but for those that a medium ended."""
     index = ends.missed
     return index[take(state.t_max, index) > 0] if wave.integrator.own_transmit else index
 
@@ -346,35 +345,35 @@ def trace(
     observer: Observer[Paths] | None = None,
     splats: list[Splats] | None = None,
 ) -> Tensor:
-    """Return the radiance ``(3, N)`` that rays bring.
+    """Return the radiance ``(3, N)`` along rays, not weighted by the filter.
 
     Args:
         wave: of a scene.
-        state: camera rays, or such as begin elsewhere; N lanes without radiance.
-        tally: counts what it takes.
-        observer: looks on, and finds what stages returned in populations.
-        splats: gets what they bring to other pixels; None: nobody asks.
+        state: camera rays, or rays that start elsewhere; N lanes without radiance.
+        tally: counts rays and truncated paths.
+        observer: gets the callbacks of the walk; populations then keep stage outputs.
+        splats: a list to append splats to; None: splats are dropped.
     """
     engine = TensorsEngine(wave, len(state.lane), tally, observer is not None, splats)
     if len(state.lane):
         walk(engine, engine.spawn(state), wave.integrator.limits, observer)
-    return engine.brought()
+    return engine.path_radiance()
 
 
 def hits(wave: Wave, state: PathState) -> Hit:
-    """Return what camera rays meet, behind what lets them pass."""
+    """Return the first hits of camera rays, behind all surfaces that they pass."""
     engine = TensorsEngine(wave, 0)
     return engine.hits(engine.spawn(state).state, 1)
 
 
-def brought(
+def weighted_radiance(
     wave: Wave,
     state: PathState,
     tally: RayCounts | None = None,
     observer: Observer[Paths] | None = None,
     splats: list[Splats] | None = None,
 ) -> Tensor:
-    """Return the radiance ``(3, N)`` of camera rays weighted by the filter; arguments as of :func:`trace`."""
+    """Return the radiance ``(3, N)`` of camera rays times their filter weights; arguments as for :func:`trace`."""
     found = trace(wave, state, tally, observer, splats)
     return found * wave.weight(state) if wave.filter.signed else found
 
@@ -388,13 +387,13 @@ def radiance(
     pixel_set: PixelSet | None = None,
     splats: list[Splats] | None = None,
 ) -> Tensor:
-    """Return the radiance ``(3, samples, pixels)`` of consecutive pixels of a plate, weighted by the filter."""
+    """Return the radiance ``(3, samples, pixels)`` of consecutive pixels of a pixel set, weighted by the filter."""
     state = wave.rays(first_pixel, pixels, first_sample, samples, pixel_set)
-    return brought(wave, state, splats=splats).view(3, samples, pixels)
+    return weighted_radiance(wave, state, splats=splats).view(3, samples, pixels)
 
 
 class _Layers(Observer[Paths]):
-    """Reads layers off first surfaces, and ends the walk there."""
+    """Evaluates layers of first surfaces, and ends the walk there."""
 
     def __init__(self, wave: Wave, names: tuple[str, ...], follow_shape: bool) -> None:
         self.names, self.context, self.centre = names, replace(wave.context, follow_shape=follow_shape), wave.centre
@@ -413,9 +412,9 @@ class _Layers(Observer[Paths]):
 
 
 def seen(wave: Wave, names: tuple[str, ...], state: PathState, follow_shape: bool = False) -> dict[str, Tensor]:
-    """Return the layers ``names`` of first surfaces that camera rays meet, each ``(C, N)``; a miss is 0 in all of them.
+    """Return the layers ``names`` of the first hits of camera rays, each ``(C, N)``; 0 where a ray hits nothing.
 
-    They are not weighted by the filter. ``follow_shape``: whether points follow the rays and the geometry, for derivatives.
+    They are not weighted by the filter. ``follow_shape``: True: points are intersected anew along their rays, for derivatives.
     """
     engine, layer = TensorsEngine(wave, len(state.lane)), _Layers(wave, names, follow_shape)
     walk(engine, engine.spawn(state), wave.integrator.limits, layer)
@@ -432,7 +431,7 @@ def layers(
     pixel_set: PixelSet | None = None,
     follow_shape: bool = False,
 ) -> dict[str, Tensor]:
-    """Return the layers ``names`` of consecutive pixels of a plate, each ``(C, samples, pixels)``, weighted by the filter."""
+    """Return the layers ``names`` of consecutive pixels, each ``(C, samples, pixels)``, weighted by the filter."""
     state = wave.rays(first_pixel, pixels, first_sample, samples, pixel_set)
     found = seen(wave, names, state, follow_shape)
     if wave.filter.signed:

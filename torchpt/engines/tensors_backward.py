@@ -1,7 +1,7 @@
-"""The way back by tensor operations: on CUDA, in float64, and where no kernels can be made.
+"""The backward engine of tensor operations: for CUDA, float64, and stages that cannot be compiled.
 
-What is handed from vertex to vertex lies by lanes: each path has one, and reads there what those behind it ask of the ray that
-left.
+Cotangents between vertices are stored by sample: the VJP of a vertex reads the cotangents of the rays that left it, and writes
+those of the rays that came.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ __all__ = ["TensorsBackward"]
 
 
 class TensorsBackward(TensorsEngine):
-    """The engine of one chunk after the other that also goes back; see :class:`torchpt.engines.engine.Backward`.
+    """Backward engine of tensor operations; see :class:`torchpt.engines.engine.Backward`.
 
     Args:
-        tape: the wave, and what is differentiated in it.
-        cotangent: ``(3, H W)`` of the picture, over the samples of a pixel: what splats read.
+        tape: the wave and its differentiated tensors.
+        cotangent: ``(3, H W)`` of the picture, divided by the samples a pixel, for the VJP of splats.
     """
 
     def __init__(self, tape: Tape, cotangent: Tensor | None = None) -> None:
         super().__init__(tape.wave, 0)
         self.tape, self.taped, self._cotangent = tape, tape.taped, cotangent
-        # What is asked of what lets rays pass is asked under a tape.
+        # Traces rays through differentiated opacity on a tape.
         self._under_tape = TensorsEngine(replace(tape.wave, context=tape.taped.context), 0)
         self._rows = ("throughput", "o", "d") if self.plan.attached else ("throughput",)
 
@@ -60,19 +60,19 @@ class TensorsBackward(TensorsEngine):
         return Paths(state, mark.depth, mark.hit)
 
     def scatter(self, paths: Paths, roulette: float) -> Paths:
-        """See :class:`torchpt.paths.walk.Engine`; how much of the light got through is kept with the vertex it left."""
+        """See :class:`torchpt.paths.walk.Engine`. The transmittance of shadow rays is kept with the vertex that they leave."""
         after = super().scatter(paths, roulette)
-        paths.passed = after.clear, after.splat_transmittance
+        paths.passed = after.transmittance, after.splat_transmittance
         return after
 
     def radiance_of_samples(self) -> Tensor:
         """See :class:`torchpt.engines.engine.Backward`."""
-        found = self.brought()
+        found = self.path_radiance()
         return found if self._weight is None else found * self._weight
 
     def receive(self, cotangent: Tensor) -> None:
         """See :class:`torchpt.engines.engine.Backward`."""
-        # What the rest of its path asks of each lane's ray, and what that ray met.
+        # By sample: cotangents of the radiance and of the ray that leaves the vertex at hand, and the hit of that ray.
         self._radiance_cotangent = cotangent if self._weight is None else cotangent * self._weight
         self._ray_cotangents = {name: torch.zeros_like(cotangent) for name in self._rows}
         for own in self.wave.integrator.fields:
@@ -83,7 +83,7 @@ class TensorsBackward(TensorsEngine):
         self._met = Hit(zero.clone(), none, zero.clone(), zero.clone())
 
     def vjp(self, paths: Paths) -> None:
-        """See :class:`torchpt.engines.engine.Backward`: lanes came grouped by the models before, and are taken by sample."""
+        """See :class:`torchpt.engines.engine.Backward`. Lanes are sorted by sample, the order in which gradients are added."""
         depth, order = paths.depth, paths.state.lane.argsort()
         place = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
         state, hit = rows(paths.state, order), rows(paths.met, order)
@@ -91,10 +91,12 @@ class TensorsBackward(TensorsEngine):
         chance, chance_cotangent = self._chance(state, depth)
         hit = replace(hit, chance=chance)
         if depth < self.wave.integrator.limits.last:
-            clear, splat_transmittance = (iter(kept) for kept in paths.passed)
+            transmittance, splat_transmittance = (iter(kept) for kept in paths.passed)
             for model, came in paths.groups or ():
                 index, turn = take(place, came).sort()
-                self._bounce(model, depth, clear, splat_transmittance, turn, state, hit, index, chance_cotangent)
+                self._bounce(
+                    model, depth, transmittance, splat_transmittance, turn, state, hit, index, chance_cotangent
+                )
         self._light(ends, depth, state, hit, chance_cotangent)
         if chance is not None and chance_cotangent is not None:
             self.sums.add_each(torch.autograd.grad(chance, self.tape.tables, chance_cotangent, allow_unused=True))
@@ -103,7 +105,7 @@ class TensorsBackward(TensorsEngine):
                 getattr(self._met, name).index_copy_(0, state.lane, getattr(hit, name))
 
     def _chance(self, state: PathState, depth: int) -> tuple[Tensor | None, Tensor | None]:
-        """The chance to get here under a tape, where it has derivatives, and zeros for what is asked of it."""
+        """Return the probability factor of passed surfaces on a tape, with a zero cotangent to add to; None: no derivative."""
         if not self.tape.differentiates_opacity:
             return None, None
         with torch.enable_grad(), recording_gathers(self.sums):
@@ -120,7 +122,7 @@ class TensorsBackward(TensorsEngine):
         self,
         model: int,
         depth: int,
-        clear: Iterator[Tensor],
+        transmittance: Iterator[Tensor],
         splat_transmittance: Iterator[Tensor],
         turn: Tensor,
         state: PathState,
@@ -128,7 +130,7 @@ class TensorsBackward(TensorsEngine):
         index: Tensor,
         chance_cotangent: Tensor | None,
     ) -> None:
-        """Back through what happened at the surfaces of a model, at lanes ``index``."""
+        """Pull cotangents back through the surfaces of a model, at lanes ``index``."""
         lane = take(state.lane, index)
         next_hit = rows(self._met, lane) if self.plan.attached else None
         cotangents = VertexCotangents(
@@ -141,12 +143,14 @@ class TensorsBackward(TensorsEngine):
         )
 
         def passed(shadow: Shadow) -> Tensor:
-            kept = next(clear)
-            return self._under_tape.clear(shadow) if self.tape.differentiates_opacity else take(kept, turn)
+            kept = next(transmittance)
+            return self._under_tape.transmittance(shadow) if self.tape.differentiates_opacity else take(kept, turn)
 
         def landed(splat: Splat) -> tuple[Tensor, Tensor]:
             kept = next(splat_transmittance)
-            through = self._under_tape.clear(splat.light) if self.tape.differentiates_opacity else take(kept, turn)
+            through = (
+                self._under_tape.transmittance(splat.light) if self.tape.differentiates_opacity else take(kept, turn)
+            )
             assert self._cotangent is not None
             return adjoint.splatted(self.wave.integrator.clamp, self._cotangent, splat, through)
 
@@ -164,7 +168,7 @@ class TensorsBackward(TensorsEngine):
             chance_cotangent.index_add_(0, index, input_cotangents.chance)
 
     def _light(self, ends: Ends, depth: int, state: PathState, hit: Hit, chance_cotangent: Tensor | None) -> None:
-        """Back through light that was met by chance; what a bounce asks of the same lanes is there already."""
+        """Pull cotangents back through emission, and add to those of the bounce in the same lanes."""
         table, integrator = self.world.lights, self.wave.integrator
         if table is None:
             return
@@ -205,8 +209,8 @@ class TensorsBackward(TensorsEngine):
             state = self.taped.rays(*self._span)
             pairs = [(x, self._ray_cotangents[name]) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
             if pairs:
-                rays, chance_cotangent = [x for x, _ in pairs], [g for _, g in pairs]
-                self.sums.add_each(torch.autograd.grad(rays, self.tape.tables, chance_cotangent, allow_unused=True))
+                rays, cotangents = [x for x, _ in pairs], [g for _, g in pairs]
+                self.sums.add_each(torch.autograd.grad(rays, self.tape.tables, cotangents, allow_unused=True))
 
     def _tables(self) -> Sequence[Tensor]:
         return self.tape.tables

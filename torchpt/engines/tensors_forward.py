@@ -1,4 +1,4 @@
-"""Samples by tensor operations, in pieces, each all or nothing: no allocation that fails leaves half a piece in the films."""
+"""A forward engine of tensor operations. A piece is added to the films whole or not at all, even if an allocation fails."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from torchpt.physics.film.splats import Splats
 
 __all__ = ["TensorsForward"]
 
-#: How often it is tried to write what is computed already.
+#: Attempts to add a computed piece to the films while memory is short.
 ATTEMPTS = 16
 
 
 class TensorsForward:
-    """Takes samples, see :class:`torchpt.engines.engine.Forward`.
+    """Forward engine of tensor operations, see :class:`torchpt.engines.engine.Forward`.
 
     Args:
         wave: of the render.
-        budget: lanes of a piece.
+        budget: number of lanes of a piece.
     """
 
     compiled = False
@@ -39,10 +39,10 @@ class TensorsForward:
         self.wave, self.budget = wave, budget
 
     def rows(self, layers: Mapping[str, Any]) -> int:
-        """Return 0: no memory is taken beforehand."""
+        """Return 0: no memory is allocated beforehand."""
         return 0
 
-    def run(self, spans: Sequence[work.Span], each: Callable[[TaskResult | None], bool]) -> bool:
+    def run(self, spans: Sequence[work.SampleRange], each: Callable[[TaskResult | None], bool]) -> bool:
         """See :class:`torchpt.engines.engine.Forward`."""
         for pixel_set, first, count in spans:
             pixels = pixel_set.film.width * pixel_set.film.height
@@ -52,25 +52,25 @@ class TensorsForward:
         return True
 
     def _take(self, pixel_set: PixelSet, span: Span) -> None:
-        """Take a piece: all of it, or nothing where it raises."""
+        """Render a piece and add it to the films; if it raises, nothing was added."""
         piece = _piece(self.wave, pixel_set, span)
         self._share = TaskResult(piece.tally, span[1] * span[3], piece.lost, piece.light)
         piece.write()
 
     def release_workers(self, keeps: bool) -> None:
-        """See :class:`torchpt.engines.engine.Forward`: there is nothing to keep."""
+        """See :class:`torchpt.engines.engine.Forward`. There is no memory to keep."""
 
 
 @dataclass
 class Piece:
-    """A piece that is computed and not yet in the films.
+    """A computed piece that is not in the films yet.
 
     Attributes:
-        tally: rays and paths.
+        tally: counts of rays and truncated paths.
         lost: samples that were not finite.
-        light: before and after the clamp.
-        writes: places, and what they are to hold then.
-        splats: the same of sums of splats: these, places in their last axis, values.
+        light: sum of radiance before and after the clamp.
+        writes: views of films, and the new values for them.
+        splats: sums of splats, indices along their last axis, and the new values there.
     """
 
     tally: RayCounts = field(default_factory=RayCounts)
@@ -80,10 +80,10 @@ class Piece:
     splats: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list)
 
     def write(self) -> None:
-        """Put it into the films. Nothing is allocated; and as it says what places hold, not what is added, it can be repeated.
+        """Write the piece to the films. It stores final values and does not add, so a failed attempt can be repeated.
 
         Raises:
-            RenderError: copying failed for want of memory again and again.
+            RenderError: all attempts ran out of memory.
         """
         for _ in range(ATTEMPTS):
             if fits_in_memory(self._copied):
@@ -98,13 +98,13 @@ class Piece:
 
 
 def _piece(wave: Wave, pixel_set: PixelSet, span: Span) -> Piece:
-    """Compute a piece: samples ``span`` of a plate."""
+    """Compute a piece: the samples ``span`` of a pixel set."""
     piece = Piece()
     first, pixels, sample, samples = span
     if wave.integrator.light:
         splats: list[Splats] = []
-        brought = tensors.brought(wave, wave.rays(*span, pixel_set), piece.tally, splats=splats)
-        radiance = brought.view(3, samples, pixels)
+        radiance = tensors.weighted_radiance(wave, wave.rays(*span, pixel_set), piece.tally, splats=splats)
+        radiance = radiance.view(3, samples, pixels)
         finite = torch.isfinite(radiance).all(0)
         if not bool(finite.all()):
             piece.lost = NonFinite.of(radiance, first, sample, wave.crop, pixel_set)

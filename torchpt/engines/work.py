@@ -1,4 +1,4 @@
-"""What is asked of an engine that takes samples, and what a part of that came to."""
+"""Units of work of a forward engine, and the result of a task."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from dataclasses import dataclass, field
 from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts
 
-__all__ = ["TASKS", "Block", "Span", "TaskResult"]
+__all__ = ["TASKS", "Block", "SampleRange", "TaskResult"]
 
-#: Tasks of a pass for each thread, so that none waits long for the last one.
+#: Tasks of a pass for each thread: enough that no thread waits long for the last task.
 TASKS = 6
 
-#: A plate, the first sample of all its pixels, and how many.
-Span = tuple[PixelSet, int, int]
-#: A plate, its first pixel and how many, the first sample and how many of each.
+#: A pixel set, the first sample of each of its pixels, and the number of samples.
+SampleRange = tuple[PixelSet, int, int]
+#: A pixel set, its first pixel, number of pixels, first sample and number of samples of each pixel.
 Block = tuple[PixelSet, int, int, int, int]
 
 
 @dataclass
 class TaskResult:
-    """Results of a task beside its samples.
+    """Result of a task; its samples are in the films already.
 
     Attributes:
-        tally: rays and paths.
-        samples: camera samples taken.
+        tally: counts of rays and truncated paths.
+        samples: number of camera samples.
         lost: samples that were not finite.
-        light: before and after the clamp.
-        rest: what memory did not suffice for.
+        light: sum of radiance before and after the clamp.
+        rest: blocks that ran out of memory, to be rendered again.
     """
 
     tally: RayCounts

@@ -1,12 +1,12 @@
-"""How gradients are taken: an argument of ``render``, not another integrator; and what of a render they go through.
+"""Backward passes of a render: the argument ``adjoint`` of ``render`` chooses the method; integrators stay the same.
 
-==================  =============================================================================
-``replay.py``       ``replay``, the default: paths traced again, and gone back along vertex by vertex; start here
-``tape.py``         ``autograd``: chunks rendered again under a plain tape
-``parameters.py``   from parameters to what waves read, differentiated once a backward pass
-``camera.py``       what the camera's gradient is where no surface moves: what it sees is held in place
-``edges/``          what silhouettes and shadow edges that move add
-==================  =============================================================================
+==================  ==========================================================================================
+``replay.py``       ``replay``, the default: path replay, paths traced again and differentiated by vertex; start here
+``tape.py``         ``autograd``: chunks rendered again on one autograd tape
+``parameters.py``   from parameters to the tensors of waves, differentiated once a backward pass
+``camera.py``       gradients with respect to the camera in film space, where no surface moves
+``edges/``          boundary terms of silhouettes and shadow edges that move
+==================  ==========================================================================================
 
 May import: ``scene`` and what lies below.
 """
@@ -48,21 +48,21 @@ def gradients(
     rays: tuple[Tensor, Tensor] | None = None,
     by_rays: bool = False,
 ) -> list[Tensor]:
-    """Derivatives by the parameters ``wanted``, by rays, and by the weights of the caller's own models.
+    """Return gradients of parameters ``wanted``, of rays, and of the weights of the user's own models, in this order.
 
     Args:
-        scene: what is rendered.
-        settings: of the backward pass: its seed, its samples.
-        params: tensors in place of the scene's.
-        wanted: names of those that are differentiated.
+        scene: the scene.
+        settings: of the backward pass, with its own seed and samples a pixel.
+        params: parameters in place of the scene's.
+        wanted: names of the parameters to differentiate.
         dtype: of the lanes.
-        attached: whether geometry is differentiated.
+        attached: True: geometry is differentiated.
         kind: ``replay`` or ``autograd``.
-        cotangent: derivatives of a loss by the pixels ``(3, H W)``.
-        film_space: whether what the camera sees is held in place (:func:`film_space_applies`), and the picture moves over it.
-        ranks: those that share the pixels, which are the same on each.
-        rays: in place of the camera's, see :func:`torchpt.scene.prepare.make_wave`.
-        by_rays: whether they are differentiated: their origins and directions follow the parameters.
+        cotangent: derivatives of the loss with respect to the pixels ``(3, H W)``.
+        film_space: True: first hits stay in place while the camera moves, see :func:`film_space_applies`.
+        ranks: processes that share the pixels; arguments are the same on all of them.
+        rays: rays in place of camera rays, see :func:`torchpt.scene.prepare.make_wave`.
+        by_rays: True: gradients of their origins and directions are returned too.
 
     Raises:
         SceneError: ``render.max_memory`` is too small for it.
@@ -70,7 +70,7 @@ def gradients(
     """
     integrator = settings.integrator
     if attached and integrator.own_transmit:
-        expected = "one whose rays are held up by surfaces alone, where geometry is differentiated"
+        expected = "one without a transmit of its own, where geometry is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)
     if (attached or film_space) and integrator.splats:
         expected = "one whose samples light their own pixels alone, where geometry or the camera is differentiated"
@@ -85,10 +85,12 @@ def gradients(
         if kind == "replay" and integrator.own_transmit and (carried or scene_tape.differentiates_opacity):
             what = "its fields" if carried else "opacity"
             raise NotBuiltError(
-                "adjoint", "replay", f"autograd, as {integrator.name} holds rays up and {what} is differentiated"
+                "adjoint",
+                "replay",
+                f"autograd, as {integrator.name} has a transmit of its own and {what} is differentiated",
             )
         sums = scene_tape.sums()
-        # Integrators that end at the first surface have but one vertex to keep.
+        # Integrators that end at the first surface have a single vertex: a tape is enough.
         if film_space:
             film_space_backward(scene_tape, settings, cotangent, sums)
         elif kind == "replay" and isinstance(scene_tape.wave.integrator, PathIntegrator):

@@ -1,23 +1,22 @@
-"""Gradients by the camera: what it sees stays in place, and the picture moves over it.
+"""Gradients with respect to the camera in film space: first hits stay in place, and their projections move over the film.
 
-A loss is an integral over the film, ``∫ C(p) L(p) dp``: ``C`` are the cotangents of pixels, each under its filter, ``L`` the
-radiance that is seen at ``p``. A point that is held on its surface while the camera moves is seen at ``p(θ)``, and sends as
-much light to it as before, but for what its material makes of another direction. So, by parts,
+A loss is an integral over the film, ``∫ C(p) L(p) dp``, where ``C`` is the cotangent of the pixels under their filters and
+``L`` the radiance seen at ``p``. A first hit that stays on its surface while the camera moves is projected to ``p(θ)``. Its
+radiance toward the camera changes only because the BSDF depends on the direction. Integration by parts gives
 
     d/dθ ∫ C L dp  =  ∫ (C div u + u · ∇C) L dp  +  ∫ C dL/dθ dp  +  edges,      u = dp/dθ.
 
-The first term weighs paths by how their film area changes, and by the slopes of filters. Filters are seen together: a path
-counts in all pixels in which its place lies, as a gradient of a smooth loss has little of the slope of one filter. A box has
-jumps in place of slopes, and there paths through the borders of pixels carry light from one to the next. The second term is the
-material's part. It is the material form of Zhang et al. (*Path-Space Differentiable Rendering*, 2020) with the first point
-held too, and the borders are the boundary of its pixel.
+The first term weights paths by the change of their film area and by the slope of the filters. A path is added to all pixels
+whose filters cover it, since the slopes of neighbouring filters nearly cancel for a smooth loss. A box filter has jumps instead
+of slopes: there, paths through the borders of pixels carry light from one pixel to the next. The second term is the derivative
+of the BSDF. This is the material form of Zhang et al. (*Path-Space Differentiable Rendering*, 2020) with the first hit held
+too; the borders are the boundary of its pixel.
 
-No derivative is taken of what happens behind the first point. Where that slides along its surface while later points stay,
-the geometry term of two points at distance r has a derivative of the order of 1/r: near the corners of a room its absolute
-value has no mean, and the visibility between all points changes. Here edges are only those where nearer things hide others.
-With the radiance ``L`` behind and the motions of both sides they are ``∮ C L (u_near - u_behind) · n``: nothing where the
-camera turns or its angle of view changes, which moves both alike, and nothing at creases. :mod:`torchpt.gradients.edges` takes
-that term.
+Nothing behind the first hit is differentiated. If the first hit slid along its surface while later vertices stay, the geometry
+term of two points at distance r would have a derivative of order 1/r: near the corners of a room it is not absolutely
+integrable, and the visibility between all points changes. Here edges are only silhouettes on the film. With the radiance ``L``
+behind and the motion of both sides, their term is ``∮ C L (u_near - u_behind) · n``: zero where the camera rotates or its field
+of view changes, which moves both sides alike, and zero at creases. :mod:`torchpt.gradients.edges` computes it.
 """
 
 from __future__ import annotations
@@ -48,17 +47,17 @@ from torchpt.spec import Moves
 
 __all__ = ["film_space_applies", "film_space_backward", "needs_direction_gradients"]
 
-#: Makes the seed of paths through borders another one.
+#: Xor mask that gives these paths a seed of their own.
 _OTHER = 0x2545F491
 
-#: How samples ``(3, ...)`` count in pixels.
+#: Maps samples ``(3, ...)`` to their values in pixels: finite, and clamped.
 Count = Callable[[Tensor], Tensor]
 
 
 def film_space_applies(scene: Scene, settings: Settings, wanted: Iterable[str]) -> bool:
-    """Return True where gradients by the parameters ``wanted`` are taken in this form.
+    """Return True if gradients with respect to parameters ``wanted`` can be computed in film space.
 
-    The camera moves, no surface does, and every ray ends at the first one: what lets some rays pass has no place to be held at.
+    The camera moves and no surface does, and everything is opaque: a ray that passes surfaces has no first hit to hold.
     """
     moving = [name for name in wanted if scene.spec(name).moves is Moves.SURFACES]
     of_camera = bool(moving) and all(name.startswith("camera.") for name in moving)
@@ -68,20 +67,20 @@ def film_space_applies(scene: Scene, settings: Settings, wanted: Iterable[str]) 
 
 
 def needs_direction_gradients(scene: Scene, wanted: Iterable[str]) -> bool:
-    """Return True where directions follow surfaces in it: those behind mirrors and glass, or where others ask for it."""
+    """Return True if directions need derivatives in film space: behind delta lobes, or for parameters of other objects."""
     owners = [*scene.built.parts, *scene.built.copies]
     bent = any(material.model.delta for owner in owners for material in owner.material.all())
     return bent or attached(scene, [name for name in wanted if not name.startswith("camera.")])
 
 
 def film_space_backward(scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums) -> None:
-    """Reverse mode in this form, a chunk at a time.
+    """Add the gradients of a render to ``sums``, in film space, a chunk at a time.
 
     Args:
-        scene_tape: what waves read.
+        scene_tape: the wave and its leaves.
         settings: of the backward pass.
-        cotangent: derivatives by the pixels ``(3, H W)``.
-        sums: what is added to.
+        cotangent: of the pixels ``(3, H W)``.
+        sums: gradient sums to add to.
 
     Raises:
         RenderError: not even the tape of a single lane fits in memory.
@@ -112,21 +111,21 @@ def film_space_backward(scene_tape: SceneTape, settings: Settings, cotangent: Te
 
 @dataclass(frozen=True)
 class _HeldPoints:
-    """Surfaces that are seen at places of the film, held where they are."""
+    """First hits that stay in place while the camera moves, and their projections."""
 
-    state: PathState  # camera rays that follow the camera to the points
-    x: Tensor  # (N,) where on the film, in pixels, differentiable
+    state: PathState  # camera rays to the points, differentiable in the camera
+    x: Tensor  # (N,) position on the film in pixels, differentiable
     y: Tensor  # (N,) likewise
-    stretch: Tensor  # (N,) of value 1: film area, differentiable
+    stretch: Tensor  # (N,) relative film area: 1, differentiable
 
 
 def interior(primal: Wave, wave: Wave, span: Span) -> Tensor:
-    """Radiance ``(3, samples, pixels)`` whose derivative is that of pixels under a box, but for their borders.
+    """Return radiance ``(3, samples, pixels)`` with the derivative of pixels under a box filter, without the border term.
 
     Args:
-        primal: a wave of detached parameters.
-        wave: the same under a tape.
-        span: as of :func:`torchpt.engines.engine.radiance`.
+        primal: the wave with detached parameters.
+        wave: the same wave on a tape.
+        span: arguments of :func:`torchpt.engines.engine.radiance`.
     """
     with torch.no_grad():
         state = primal.rays(*span)
@@ -137,16 +136,16 @@ def interior(primal: Wave, wave: Wave, span: Span) -> Tensor:
 def borders(
     primal: Wave, wave: Wave, vertical: bool, span: Span, samples: int, cotangent: Tensor, count: Count
 ) -> Tensor:
-    """Return what moves through borders of pixels is worth, ``(3, N)``: values are 0, derivatives are not.
+    """Return the loss of light that moves through borders of pixels ``(3, N)``: the values are 0, their derivatives are not.
 
     Args:
-        primal: a wave of detached parameters.
-        wave: the same under a tape.
-        vertical: borders between neighbours in a row; else in a column.
-        span: first border, how many, first sample, how many of them.
-        samples: of each border, in all.
-        cotangent: derivatives by the pixels ``(3, H W)``.
-        count: how samples count in pixels.
+        primal: the wave with detached parameters.
+        wave: the same wave on a tape.
+        vertical: True: borders between neighbours in a row. False: in a column.
+        span: first border, number of borders, first sample, number of samples.
+        samples: number of samples of each border over all spans.
+        cotangent: of the pixels ``(3, H W)``.
+        count: see :data:`Count`.
     """
     x0, y0, width, _ = primal.crop
     columns = width + 1 if vertical else width
@@ -163,23 +162,23 @@ def borders(
 
 
 def borders_of(primal: Wave) -> tuple[tuple[bool, int], ...]:
-    """Upright borders and others: whether they are, and how many."""
+    """Return the number of vertical borders and of horizontal ones, as pairs of ``vertical`` and number."""
     _, _, width, height = primal.crop
     return (True, (width + 1) * height), (False, width * (height + 1))
 
 
 def splats(primal: Wave, wave: Wave, span: Span, samples: int, cotangent: Tensor, count: Count) -> Tensor:
-    """Return what places all over the film are worth ``(3, N)``, for filters that end without a jump.
+    """Return the loss of samples all over the film ``(3, N)``, for filters that are continuous at their radius.
 
-    Each path counts in all pixels that see its place: what the derivatives of neighbouring filters have in common cancels.
+    Each path is added to all pixels whose filters cover it, so that the slopes of neighbouring filters cancel.
 
     Args:
-        primal: a wave of detached parameters.
-        wave: the same under a tape.
-        span: first cell, how many, first sample, how many of them; cells are those of :func:`cells`.
-        samples: of each cell, in all.
-        cotangent: derivatives by the pixels ``(3, H W)``.
-        count: how samples count in pixels.
+        primal: the wave with detached parameters.
+        wave: the same wave on a tape.
+        span: first cell, number of cells, first sample, number of samples; see :func:`cells`.
+        samples: number of samples of each cell over all spans.
+        cotangent: of the pixels ``(3, H W)``.
+        count: see :data:`Count`.
     """
     x0, y0, width, _ = primal.crop
     beyond = _beyond(primal)
@@ -202,18 +201,18 @@ def splats(primal: Wave, wave: Wave, span: Span, samples: int, cotangent: Tensor
 
 
 def cells(primal: Wave) -> int:
-    """Return how many cells of a pixel's size there are that any pixel sees."""
+    """Return the number of cells of a pixel's size that the filter of any pixel covers."""
     _, _, width, height = primal.crop
     return (width + 2 * _beyond(primal)) * (height + 2 * _beyond(primal))
 
 
 def _beyond(primal: Wave) -> int:
-    """Return how many pixels a filter reaches beyond its own."""
+    """Return how many pixels a filter extends beyond its own."""
     return math.ceil(primal.filter.radius - 0.5)
 
 
 def _filter(primal: Wave, away: Tensor) -> Tensor:
-    """The filter's profile ``(N,)`` at distances, of integral 1, differentiable."""
+    """Return the normalized profile of the filter ``(N,)`` at distances ``away``, differentiable."""
     filter, place = primal.filter, away.detach().cpu().double().numpy()
     ends = np.linspace(-filter.radius, filter.radius, (1 << 12) + 1, dtype=np.float64)
     middle = 0.5 * (ends[1:] + ends[:-1])
@@ -224,13 +223,13 @@ def _filter(primal: Wave, away: Tensor) -> Tensor:
 
 
 def _of_pixel(cotangent: Tensor, column: Tensor, row: Tensor, width: int) -> Tensor:
-    """Return what is asked ``(3, N)`` of pixels; nothing beyond the picture."""
+    """Return the cotangents ``(3, N)`` of pixels; 0 outside the picture."""
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < cotangent.shape[1] // width)
     return torch.where(inside, take(cotangent, torch.where(inside, row * width + column, 0)), 0.0)
 
 
 def _cells(primal: Wave, span: Span, columns: int, samples: int, stream: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Columns and rows ``(N,)`` of cells or borders, places within them ``(2, N)`` and keys of paths of their own."""
+    """Return columns and rows ``(N,)`` of cells or borders, random offsets in them ``(2, N)``, and sampler keys."""
     first, count, start, several = span
     device = primal.centre.device
     cell = torch.arange(first, first + count, device=device).repeat(several)
@@ -242,19 +241,19 @@ def _cells(primal: Wave, span: Span, columns: int, samples: int, stream: int) ->
 
 
 def _rays(primal: Wave, x: Tensor, y: Tensor, key: Tensor) -> PathState:
-    """Camera rays through places of the film."""
+    """Return camera rays through positions ``x, y`` of the film."""
     dtype = primal.context.plan.dtype
     o, d = primal.camera.rays(x.to(dtype), y.to(dtype), None)
     return camera_state(o.expand_as(d), d, key)
 
 
 def _radiance(wave: Wave, state: PathState) -> Tensor:
-    """Radiance ``(3, N)`` that camera rays bring."""
+    """Return the radiance ``(3, N)`` along camera rays."""
     return trace(wave, state)
 
 
 def _hold_points(primal: Wave, wave: Wave, state: PathState) -> _HeldPoints:
-    """Return what camera rays of detached parameters meet, as a camera under a tape sees it."""
+    """Return the first hits of camera rays with detached parameters, projected by the camera on the tape."""
     world = primal.context.world
     with torch.no_grad():
         hit = hits(primal, state)
@@ -262,7 +261,7 @@ def _hold_points(primal: Wave, wave: Wave, state: PathState) -> _HeldPoints:
         at = interact(world, state.o, state.d, replace(hit, prim=hit.prim.clamp_min(0)), True)
         p, n = torch.where(missed, 0.0, at.p), torch.where(missed, 0.0, at.ng)
     origin = wave.camera.origin()
-    offset = torch.where(missed, state.d, p - origin)  # what is infinitely far moves with no step of the camera
+    offset = torch.where(missed, state.d, p - origin)  # infinitely far points do not move with the camera
     x, y, scale = wave.camera.project(offset)
     area = scale * torch.where(missed, 1.0, dot(n, offset).abs())
     value = area.detach()

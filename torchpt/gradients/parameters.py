@@ -1,7 +1,7 @@
-"""From parameters to what waves read, differentiated once a backward pass, and what moves with which parameter.
+"""From parameters to the tensors of waves, and back once a backward pass; and which parameters move geometry.
 
-The *assembly* makes world, camera and what belongs to them of the parameters (:mod:`torchpt.scene.world`). Chunks of lanes are
-differentiated with respect to its tensors, and their sums go back through it at the end.
+:mod:`torchpt.scene.world` builds world and camera from the parameters on an autograd tape. Chunks of lanes are differentiated
+with respect to the tensors of the world; their gradient sums are pulled back to the parameters once, at the end.
 """
 
 from __future__ import annotations
@@ -26,40 +26,40 @@ from torchpt.spec import Moves
 __all__ = ["SceneTape", "attached"]
 
 
-# ---- What parameters move: decided once, from their specs, so that a derivative by a colour costs nothing for geometry
+# ---- Which parameters move geometry, by their specs: gradients of colours then need no derivatives of geometry
 
 
 def attached(scene: Scene, names: Iterable[str]) -> bool:
-    """Whether any of the parameters moves surfaces or the camera, or bends rays that a delta lobe sends on."""
+    """Return True if a parameter moves surfaces or the camera, or changes the direction of rays behind delta lobes."""
     owners = [*scene.built.parts, *scene.built.copies]
     bending = {material.name for owner in owners for material in owner.material.all() if material.bends}
 
     def moves(name: str) -> bool:
         moved = scene.spec(name).moves
-        if moved is Moves.RAYS:  # by the material's name, or by a texture that any of them may read
+        if moved is Moves.RAYS:  # a parameter of such a material, or of a texture that it may read
             return any(name.startswith(f"{own}.") for own in bending) or bool(bending and "textures." in name)
         return moved is Moves.SURFACES
 
     return any(map(moves, names))
 
 
-# ---- From parameters to what waves read, differentiated once a backward pass
+# ---- From parameters to the tensors of waves, and back once a backward pass
 
 
 class SceneTape(Tape):
-    """Tensors that the waves of a backward pass read, as functions of parameters.
+    """The tape of a backward pass: tensors of the wave as functions of the parameters.
 
     Args:
-        scene: whose.
+        scene: the scene.
         settings: of the backward pass.
-        params: tensors in place of the scene's.
-        wanted: names of those that are differentiated.
-        captured: tensors that stages use by themselves, such as weights of modules.
+        params: parameters in place of the scene's.
+        wanted: names of the parameters to differentiate.
+        captured: differentiated tensors that stages hold by themselves, such as weights of modules.
         dtype: of the lanes.
-        attached: whether geometry is differentiated.
-        ranks: those that share the pixels; None: there is but one process.
-        rays: in place of the camera's, see :func:`torchpt.scene.prepare.make_wave`.
-        by_rays: whether they are differentiated too.
+        attached: True: geometry is differentiated.
+        ranks: processes that share the pixels; None: a single process.
+        rays: rays in place of camera rays, see :func:`torchpt.scene.prepare.make_wave`.
+        by_rays: True: rays are differentiated too.
     """
 
     def __init__(
@@ -105,11 +105,11 @@ class SceneTape(Tape):
         super().__init__(wave, _over(wave, leaf), [leaves[id(one)] for one in ones], ones, tuple(captured))
 
     def blocks(self, pixels: int, samples: int) -> list[tuple[int, int]]:
-        """Consecutive pixels, first and how many, that this process takes: the same ones by kernels and without."""
+        """Return the blocks of consecutive pixels, first and number, of this process; the same for all engines."""
         return blocks(pixels, samples, self._ranks)
 
     def through(self, budget: Budget, work: Callable[[Span], None], pixels: int, samples: int) -> None:
-        """Work on them, piece by piece."""
+        """Call ``work`` with the chunks of these blocks, as large as the budget allows."""
         for start, count in self.blocks(pixels, samples):
 
             def moved(span: Span, start: int = start) -> None:
@@ -119,11 +119,11 @@ class SceneTape(Tape):
                 pass
 
     def sums(self) -> GradientSums:
-        """Sums of the gradients of the leaves, and of what is held."""
+        """Return zero gradient sums for the leaves and the captured tensors."""
         return GradientSums(self.tables)
 
     def gradients(self, sums: GradientSums) -> list[Tensor]:
-        """Gradients of the parameters, of rays, and of what is held, from those of the leaves."""
+        """Return gradients of parameters, rays and captured tensors from the gradient sums of the leaves."""
         found = sums.gradients()
         pairs = [(y, g) for y, g in zip(self._outputs, found, strict=False) if g is not None]
         own: Sequence[Tensor | None] = [None] * len(self._inputs)
@@ -134,7 +134,7 @@ class SceneTape(Tape):
 
 
 def _over(wave: Wave, change: Callable[[Tensor], Tensor]) -> Wave:
-    """A wave with other tensors; stages run as tensor operations."""
+    """Return the wave with ``change`` applied to all of its tensors."""
     context = wave.context
     own = context.world, context.pixel, wave.camera, wave.first, wave.given
     world, pixel, camera, first, given = map_leaves(change, own)

@@ -1,10 +1,11 @@
-"""Path replay: paths are traced again from their random numbers, without a tape, and then gone back along vertex by vertex.
+"""Path replay backpropagation: paths are traced again from their random numbers, and differentiated vertex by vertex.
 
-An engine keeps the last vertices of a walk that it can; a vertex is differentiated alone, from the last one to the first. Paths
-of more vertices are traced again in parts, from marks on the way: of n vertices there are never more marks than
-:data:`MARKS` a level, and a part between two of them is again taken in parts, so that what is kept grows with log n at most.
+The forward half of a replay needs no tape: it keeps the path states of the vertices, and each vertex is differentiated alone,
+from the last to the first. If a walk has more vertices than an engine keeps, it is split at marks (checkpoints of the path
+state), and each part is traced again; a part that is still too long is split in turn. With at most :data:`MARKS` marks a level,
+memory grows with the logarithm of the depth.
 
-(Vicini, Speierer, Jakob 2021, *Path Replay Backpropagation*, and Griewank, Walther 2000, *Revolve*, for the marks.)
+Vicini, Speierer, Jakob 2021, *Path Replay Backpropagation*; for the marks Griewank, Walther 2000, *Revolve*.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from torchpt.scene.settings import Settings
 
 __all__ = ["replay_paths"]
 
-#: Lanes of a chunk of tensors. Always the same: sums of other chunks would be rounded otherwise.
+#: Lanes of a chunk of tensors, by device. Fixed, since sums over other chunks would round differently.
 LANES = {"cpu": 1 << 16, "cuda": 1 << 20}
-#: Bytes of a vertex that is kept: state, hit and groups of a lane.
+#: Bytes of a lane at a vertex that is kept: state, hit and groups.
 BYTES_PER_VERTEX = 240
-#: Marks of a walk.
+#: Greatest number of marks of a walk.
 MARKS = 8
 
 
@@ -44,12 +45,12 @@ MARKS = 8
 
 
 class VertexRecorder(Observer[Any]):
-    """Keeps the vertices of a walk; where they are too many, marks on the way instead.
+    """Records the populations of a walk; of a walk with too many vertices, marks instead.
 
     Args:
-        engine: whose.
-        first: number of the vertex that the walk begins at.
-        mark: to begin there once more; None: by camera rays.
+        engine: the engine of the walk.
+        first: number of the vertex that the walk starts at.
+        mark: the mark of that vertex; None: the walk starts with camera rays.
     """
 
     def __init__(self, engine: Backward[Any, Any, Any], first: int, mark: Any) -> None:
@@ -76,13 +77,13 @@ class VertexRecorder(Observer[Any]):
 
 
 class Chunk:
-    """A chunk of samples that is replayed.
+    """Replays a chunk of samples.
 
     Args:
-        engine: runs it.
+        engine: the backward engine.
         settings: of the backward pass.
-        span: its samples.
-        sums: what is added to.
+        span: pixels and samples of the chunk.
+        sums: gradient sums to add to.
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class Chunk:
         self.engine, self.settings, self.span, self.sums = engine, settings, span, sums
 
     def run(self, pixels: Tensor) -> None:
-        """Add what a loss asks, by the pixels ``(3, H W)`` of the picture."""
+        """Add the gradients of the chunk for cotangents ``pixels (3, H W)`` of the picture."""
         first, count, _, samples = self.span
         with torch.no_grad():
             keeper = self._forward(1, None, None)
@@ -102,14 +103,14 @@ class Chunk:
             self.engine.vjp_rays()
 
     def _forward(self, first: int, mark: Any, end: int | None) -> VertexRecorder:
-        """Trace paths from a mark (None: the camera) to vertex ``end`` (None: to their ends)."""
+        """Trace paths from a mark (None: from the camera) to vertex ``end`` (None: to their ends)."""
         paths = self.engine.begin(self.span, self.sums) if mark is None else self.engine.resume(mark)
         keeper = VertexRecorder(self.engine, first, mark)
         walk(self.engine, paths, self.engine.wave.integrator.limits, keeper, end)
         return keeper
 
     def _back(self, keeper: VertexRecorder, end: int | None) -> None:
-        """Go back along what was kept, or from mark to mark."""
+        """Differentiate the recorded vertices, or replay the walk from mark to mark."""
         for paths in reversed(keeper.kept):
             self.engine.vjp(paths)
         keeper.kept.clear()
@@ -119,23 +120,23 @@ class Chunk:
             end = first
 
 
-# ---- All chunks: over threads by kernels, where these can be made; else one after the other by tensor operations
+# ---- All chunks: by kernels on threads if possible, else one after the other by tensor operations
 
 
 def replay_paths(
     scene: Scene, scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums
 ) -> None:
-    """Reverse mode by replaying paths; as :func:`torchpt.gradients.tape.tape`, but memory hardly grows with depth.
+    """Add the gradients of a render to ``sums`` by path replay; memory hardly grows with depth.
 
-    Sums are joined in the order of chunks, whichever thread took them. Chunks of tensor operations have fewer lanes only
-    where an allocation failed.
+    Sums of chunks are merged in the order of chunks, independent of threads. Chunks of tensor operations have fewer lanes only
+    after an allocation failed.
 
     Args:
-        scene: what is rendered.
-        scene_tape: what waves read.
+        scene: the scene.
+        scene_tape: the wave and its leaves.
         settings: of the backward pass.
-        cotangent: derivatives by the pixels ``(3, H W)``.
-        sums: what is added to.
+        cotangent: of the pixels ``(3, H W)``.
+        sums: gradient sums to add to.
 
     Raises:
         RenderError: not even a single lane fits in memory.
@@ -166,7 +167,7 @@ def replay_paths(
 def chunk_sums(
     scene_tape: SceneTape, settings: Settings, cotangent: Tensor, share: Tensor | None, span: Span
 ) -> GradientSums:
-    """Return the sums of a chunk of tensor operations."""
+    """Return the gradient sums of a chunk, by tensor operations."""
     sums = scene_tape.sums()
     engine = backward_tensors(scene_tape, share)
     Chunk(engine, settings, span, sums).run(cotangent)
@@ -176,7 +177,7 @@ def chunk_sums(
 def _over_threads(
     kernels: BackwardKernels, scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums
 ) -> str:
-    """Take all chunks by kernels; return why that cannot be, or ""."""
+    """Replay all chunks by kernels on threads; return why that is not possible, or ""."""
     wave, cotangent = scene_tape.wave, cotangent.float()
     budget = _budget(kernels, settings)
     blocks = scene_tape.blocks(wave.crop[2] * wave.crop[3], settings.render.spp)
@@ -225,7 +226,7 @@ def _budget_of_tensors(device: torch.device, settings: Settings) -> Budget:
 
 
 def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
-    """Yield the chunks of blocks of pixels, first and how many: always the same."""
+    """Yield the chunks of blocks of pixels (first, number), independent of threads."""
     for sample in range(0, samples, LANES_OF_KERNELS):
         count = min(LANES_OF_KERNELS, samples - sample)
         step = max(LANES_OF_KERNELS // count, 1)
@@ -235,7 +236,7 @@ def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
 
 
 def _budget(kernels: BackwardKernels, settings: Settings) -> Budget:
-    """Return how many threads there are, fewer where the arenas of all would take more than half of ``render.max_memory``."""
+    """Return the budget of threads: fewer than torch has if their arenas would take more than half of ``render.max_memory``."""
     threads = torch.get_num_threads()
     budget = Budget(torch.device("cpu"), LANES_OF_KERNELS, threads, what="a gradient", instead="one thread")
     limit, depth = settings.render.max_memory, settings.integrator.limits.max_depth
@@ -246,7 +247,7 @@ def _budget(kernels: BackwardKernels, settings: Settings) -> Budget:
 
 
 def _compiled(scene_tape: SceneTape, settings: Settings) -> bool:
-    """Return True where kernels may be made: on a CPU, in float32, without derivatives by weights of modules or opacity."""
+    """Return True if kernels support this: a CPU, float32, no gradients with respect to weights of modules or opacity."""
     wave = scene_tape.wave
     if wave.centre.device.type != "cpu" or wave.context.plan.dtype != torch.float32 or settings.render.compile == "off":
         return False

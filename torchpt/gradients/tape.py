@@ -1,4 +1,4 @@
-"""The plain tape: a chunk of lanes is rendered again under autograd. The reference, and what any integrator can do."""
+"""``adjoint=autograd``: chunks of lanes rendered again on an autograd tape. The reference, for any integrator."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from torchpt.scene.settings import Settings
 __all__ = ["chunk_by_chunk", "clamped_samples", "sample_cotangents", "tape", "tape_per_lane"]
 
 
-# ---- What a loss asks of single samples, of what it asks of the picture's pixels
+# ---- From cotangents of pixels to cotangents of samples
 
 
 def sample_cotangents(settings: Settings, radiance: Tensor, pixels: Tensor) -> Tensor:
-    """Derivatives ``(3, samples, n)`` by the radiance of samples, of those ``(3, n)`` by pixels.
+    """Return the cotangents of samples ``(3, samples, n)`` from those of their pixels.
 
-    A pixel is the mean of its samples as they are :func:`clamped_samples`.
+    A pixel is the mean of its :func:`clamped_samples`.
 
     Args:
         settings: of the backward pass.
-        radiance: of the samples, likewise.
-        pixels: of their pixels.
+        radiance: of the samples ``(3, samples, n)``.
+        pixels: cotangents of the pixels ``(3, n)``.
     """
     finite = torch.isfinite(radiance).all(0)
     cotangent = pixels[:, None] * (finite.to(radiance.dtype) / settings.render.spp)
@@ -41,7 +41,7 @@ def sample_cotangents(settings: Settings, radiance: Tensor, pixels: Tensor) -> T
     if clamp is None:
         return cotangent
     values = torch.where(finite, radiance, 0.0)
-    # Of v c / m, m the largest channel: what is asked of v, and what it takes back of the channel that is m.
+    # VJP of v c / m, where m is the largest channel: through v, and through the channel that is m.
     most, channel = values.abs().max(0, keepdim=True)
     scale = (clamp / most.clamp_min(clamp)).squeeze(0)
     back = (cotangent * values).sum(0, keepdim=True) * scale / most.clamp_min(clamp)
@@ -50,34 +50,34 @@ def sample_cotangents(settings: Settings, radiance: Tensor, pixels: Tensor) -> T
 
 
 def clamped_samples(settings: Settings, values: Tensor) -> Tensor:
-    """Return samples ``(3, ...)`` as pixels count them, differentiable: none that is not finite, each within the clamp."""
+    """Return samples ``(3, ...)`` as they are added to pixels, differentiable: clamped, and 0 where not finite."""
     values = torch.where(torch.isfinite(values.detach()).all(0), values, 0.0)
     clamp = settings.integrator.clamp
     return values if clamp is None else values * clamp_scale(values, clamp)
 
 
-# ---- The plain tape: a chunk of lanes is rendered again under autograd. The reference, and what any integrator can do
+# ---- The tape, a chunk at a time
 
 
-#: Lanes of a chunk. Always the same, as sums of others would be rounded otherwise.
+#: Lanes of a chunk by device. Fixed, since sums over other chunks would round differently.
 LANES = {"cpu": 1 << 16, "cuda": 1 << 18}
 #: Bytes of a chunk's tape where memory is not limited.
 TAPE_BYTES = 1 << 29
-#: Vertices of a path that memory is planned for where its depth is without end.
+#: Vertices of a path that memory is estimated for where ``max_depth`` is -1.
 ASSUMED_DEPTH = 64
 
-#: From a chunk to values that depend on the leaves of an assembly, and what is asked of them.
+#: Maps a chunk to values that depend on the leaves of a tape, and their cotangents.
 ChunkLoss = Callable[[Span], tuple[Tensor, Tensor]]
 
 
 def tape(scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums) -> None:
-    """Reverse mode on a plain tape, a chunk of pixels at a time: memory grows with depth, not with the picture.
+    """Add the gradients of a render to ``sums``, on an autograd tape a chunk at a time: memory grows with depth.
 
     Args:
-        scene_tape: what waves read.
+        scene_tape: the wave and its leaves.
         settings: of the backward pass.
-        cotangent: derivatives by the pixels ``(3, H W)``.
-        sums: what is added to.
+        cotangent: of the pixels ``(3, H W)``.
+        sums: gradient sums to add to.
 
     Raises:
         RenderError: not even the tape of a single lane fits in memory.
@@ -90,7 +90,7 @@ def tape(scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: Gra
         share = sample_cotangents(
             settings, radiance.detach(), cotangent[:, span[0] : span[0] + span[1]].to(radiance.dtype)
         )
-        # What is not finite must not meet its share of 0.
+        # Samples that are not finite are 0, since NaN times a cotangent of 0 is NaN.
         values = torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0)
         if not wave.integrator.splats:
             return values, share
@@ -105,15 +105,15 @@ def tape(scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: Gra
 def chunk_by_chunk(
     scene_tape: SceneTape, settings: Settings, sums: GradientSums, chunk_loss: ChunkLoss, count: int, samples: int
 ) -> None:
-    """Add the derivatives of a part of a loss, chunk by chunk.
+    """Add the gradients of values with known cotangents to ``sums``, chunk by chunk.
 
     Args:
-        scene_tape: with the leaves.
+        scene_tape: the wave and its leaves.
         settings: of the backward pass.
-        sums: what is added to.
-        chunk_loss: makes the tape of a chunk.
-        count: of what chunks are made of: pixels, say.
-        samples: of each.
+        sums: gradient sums to add to.
+        chunk_loss: returns the values of a chunk and their cotangents.
+        count: number of items that chunks are made of, such as pixels.
+        samples: number of samples of each item.
 
     Raises:
         RenderError: not even the tape of a single lane fits in memory.
@@ -126,19 +126,19 @@ def chunk_by_chunk(
 
 
 def chunk_sums(scene_tape: SceneTape, chunk_loss: ChunkLoss, span: Span) -> GradientSums:
-    """Return the sums of a chunk."""
+    """Return the gradient sums of a chunk."""
     found = scene_tape.sums()
     with torch.enable_grad(), recording_gathers(found):
         values, cotangent = chunk_loss(span)
-    if values.requires_grad:  # else nothing in these pixels depends on the parameters
+    if values.requires_grad:  # False: nothing in these pixels depends on the parameters
         leaves = [*scene_tape.leaves, *scene_tape.captured]
-        with one_thread():  # several round sums over lanes otherwise
+        with one_thread():  # several threads would round sums over lanes in another way
             found.add_each(torch.autograd.grad(values, leaves, cotangent.to(values.dtype), allow_unused=True))
     return found
 
 
 def _budget(settings: Settings, scene_tape: SceneTape) -> Budget:
-    """Chunks of always the same size, or, where that is more than ``render.max_memory`` leaves, of what fits."""
+    """Return the budget of a chunk: a fixed number of lanes, or fewer where ``render.max_memory`` needs it."""
     device, each = scene_tape.wave.centre.device, tape_per_lane(settings)
     lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE_BYTES // each, 1))
     limit = settings.render.max_memory
@@ -148,6 +148,6 @@ def _budget(settings: Settings, scene_tape: SceneTape) -> Budget:
 
 
 def tape_per_lane(settings: Settings) -> int:
-    """Bytes that the tape of a lane is expected to take: each vertex keeps about what a lane takes without one."""
+    """Return an estimate of the bytes of one lane's tape: each vertex stores about what a lane takes without a tape."""
     limits = settings.integrator.limits
     return BYTES_PER_LANE * max(limits.max_depth if 0 <= limits.max_depth < ASSUMED_DEPTH else ASSUMED_DEPTH, 1)

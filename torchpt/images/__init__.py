@@ -1,8 +1,8 @@
-"""Pictures: files in and out, colour, and how far one is from another.
+"""Images: reading and writing files, colour, error metrics, denoising.
 
-``read.py`` and ``write.py`` are the doors: start there. ``decode.py`` and ``header.py`` know the formats, ``layers.py`` the
-layers of an EXR, ``movie.py`` moving pictures, ``metrics.py`` the measures, ``colour.py`` tone mapping, ``denoiser.py`` the
-denoiser.
+``read.py`` and ``write.py`` are the entry points: start there. ``decode.py`` and ``header.py`` handle the formats,
+``layers.py`` the layers of an EXR, ``texels.py`` images for textures, ``movie.py`` GIF and MP4, ``metrics.py`` and
+``comparison.py`` error metrics, ``colour.py`` tone mapping, ``denoiser.py`` Open Image Denoise.
 
 May import: ``core``, ``math``, ``spec``.
 """

@@ -1,11 +1,11 @@
-"""From scene-linear radiance to what a screen shows: exposure, tone curve, transfer function; and back.
+"""From scene-linear radiance to display values and back: exposure, tone curve, transfer function.
 
 All functions take and return float tensors of any shape (colours in the last axis, RGB with the primaries of sRGB).
-Linear radiance enters unbounded; display values lie in 0..1.
+Linear radiance is unbounded; display values lie in 0..1.
 
-Colour libraries have the same functions (tests hold ours against kornia's). These lie on the way to every picture: their
-powers are taken piece by piece, so that a picture has the same bits on any number of threads, and importing one of those
-takes longer than a small render.
+Colour libraries have the same functions, and tests compare these with kornia's. They stand here because every picture needs
+them: powers are computed in pieces, so that a picture has the same bits on any number of threads, and importing kornia takes
+longer than a small render.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ def _power(x: Tensor, exponent: float) -> Tensor:
 
 
 def linear_to_srgb(x: Tensor) -> Tensor:
-    """Linear light to sRGB-encoded values (IEC 61966-2-1); negative values are taken as 0."""
+    """Encode linear values as sRGB (IEC 61966-2-1); negative values become 0."""
     x = x.clamp(min=0)
     return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * _power(x.clamp(min=0.0031308), 1 / 2.4) - 0.055)
 
 
 def srgb_to_linear(x: Tensor) -> Tensor:
-    """sRGB-encoded values to linear light (IEC 61966-2-1)."""
+    """Decode sRGB values to linear values (IEC 61966-2-1)."""
     return torch.where(x <= 0.04045, x / 12.92, _power((x.clamp(min=0.04045) + 0.055) / 1.055, 2.4))
 
 
 def _reinhard(x: Tensor) -> Tensor:
-    """Reinhard et al. 2002, equation 3, a channel at a time so that nothing leaves 0..1."""
+    """Apply the curve of Reinhard et al. 2002, equation 3, to each channel, so that values stay in 0..1."""
     return x / (1 + x)
 
 
 def _aces(x: Tensor) -> Tensor:
-    """Narkowicz 2015, "ACES filmic tone mapping curve": a fit of the ACES reference transforms."""
+    """Apply Narkowicz 2015, "ACES filmic tone mapping curve": a fit of the ACES reference transforms."""
     return (x * (2.51 * x + 0.03)) / (x * (2.43 * x + 0.59) + 0.14)
 
 
 def _filmic(x: Tensor) -> Tensor:
-    """Hable 2010, "Filmic tonemapping operators" (Uncharted 2): exposure bias 2, white point 11.2."""
+    """Apply Hable 2010, "Filmic tonemapping operators" (Uncharted 2), with exposure bias 2 and white point 11.2."""
 
     def curve(v: Tensor) -> Tensor:
         a, b, c, d, e, f = 0.15, 0.50, 0.10, 0.20, 0.02, 0.30
@@ -59,6 +59,7 @@ def _filmic(x: Tensor) -> Tensor:
     return curve(2 * x) / curve(torch.tensor(11.2, dtype=x.dtype, device=x.device))
 
 
+#: Tone curves by name.
 TONEMAPS: dict[str, Callable[[Tensor], Tensor]] = {
     "none": lambda x: x,
     "reinhard": _reinhard,
@@ -68,10 +69,10 @@ TONEMAPS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 def display(image: Tensor, exposure: float = 0.0, tonemap: str = "none", gamma: str | float = "srgb") -> Tensor:
-    """Linear radiance to display values in 0..1.
+    """Convert linear radiance to display values in 0..1.
 
     Args:
-        image: linear RGB, any shape. NaN and negative values come out black, infinity white.
+        image: linear RGB, any shape. NaN and negative values become black, infinity white.
         exposure: stops; every stop doubles the light before the tone curve.
         tonemap: a key of `TONEMAPS`.
         gamma: ``"srgb"``, or an exponent g: the output is ``linear ** g`` (for example 0.6, or 1/2.2).

@@ -1,4 +1,4 @@
-"""Two pictures side by side: every measure, or why there is none, their means, and what in them is no number."""
+"""Compare two images: all metrics (or the reason why one has no value), means, and counts of non-finite pixels."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from torchpt.images.metrics import METRICS, error_map
 
 __all__ = ["Comparison", "DisplayTransform", "compare", "comparison_map"]
 
-#: Measures of what a screen shows.
+#: Metrics of display values.
 OF_SHOWN = ("psnr", "ssim")
-#: Measures that only colours have.
+#: Metrics that are defined for colours only.
 OF_COLOURS = (*OF_SHOWN, "flip")
 
 
 @dataclass(frozen=True)
 class DisplayTransform:
-    """How a screen shows radiance, for the measures of `OF_SHOWN`: see `colour.display`."""
+    """Exposure, tone curve and gamma for the metrics of `OF_SHOWN`: see `colour.display`."""
 
     exposure: float = 0.0
     tonemap: str = "none"
     gamma: str | float = "srgb"
 
     def of(self, image: Tensor) -> Tensor:
-        """Display values 0..1; what is not finite is NaN, and not black or white as on a screen."""
+        """Return display values 0..1; values that are not finite become NaN, not black or white."""
         shown = display(image.double(), self.exposure, self.tonemap, self.gamma)
         return torch.where(torch.isfinite(image), shown, math.nan)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is to say about a picture and its reference.
+    """Result of comparing an image with a reference.
 
     Attributes:
-        metrics: name to value, for each of `METRICS`; NaN or infinite where there is none.
-        reasons: name to why it has no finite value.
-        nonfinite: pixels with a value that is not finite, in the picture and in the reference.
-        means: of each channel ``(C,)``, of the picture and of the reference, over the pixels that are finite in both.
-        ratio: of the mean of all channels to the reference's; NaN where that is 0.
+        metrics: value of each of `METRICS` by name; NaN or infinite where there is none.
+        reasons: by name, the reason why a metric has no finite value.
+        nonfinite: number of pixels with a value that is not finite, in the image and in the reference.
+        means: mean of each channel ``(C,)``, of the image and of the reference, over pixels that are finite in both.
+        ratio: mean over all channels of the image divided by that of the reference; NaN where that is 0.
     """
 
     metrics: dict[str, float]
@@ -55,16 +55,16 @@ class Comparison:
 def compare(
     image: Tensor, reference: Tensor, shown: DisplayTransform | None = None, colours: bool = True
 ) -> Comparison:
-    """Take all measures.
+    """Compute all metrics.
 
     Args:
-        image: ``(H, W, C)`` linear; of colours C is 1 or 3.
-        reference: the same.
-        shown: how a screen shows it, for ``psnr`` and ``ssim``; as it is, encoded for sRGB, where nothing is said.
-        colours: whether it is light or colour; other numbers (normals, depth) have no ``psnr``, ``ssim`` and ``flip``.
+        image: ``(H, W, C)`` linear; C is 1 or 3 for colours.
+        reference: of the same shape.
+        shown: display transform for ``psnr`` and ``ssim``; None: sRGB encoding alone.
+        colours: True: radiance or colours. False: other data (normals, depth), without ``psnr``, ``ssim`` and ``flip``.
 
     Raises:
-        ValueError: pictures of two shapes.
+        ValueError: the shapes differ.
     """
     if image.shape != reference.shape:
         raise ValueError(f"images differ in shape: {tuple(image.shape)} and {tuple(reference.shape)}")
@@ -100,12 +100,12 @@ def compare(
 
 
 def comparison_map(name: str, image: Tensor, reference: Tensor, shown: DisplayTransform | None = None) -> Tensor:
-    """The error map ``(H, W)`` of a measure as `compare` takes it: see `metrics.error_map`."""
+    """Return the error map ``(H, W)`` of a metric, with the display transform of `compare`: see `metrics.error_map`."""
     return error_map(name, *_seen(name, image, reference, shown or DisplayTransform()))
 
 
 def _seen(name: str, image: Tensor, reference: Tensor, shown: DisplayTransform) -> tuple[Tensor, Tensor]:
-    """The pictures as a measure takes them."""
+    """Return both images as a metric takes them: with three channels, or as display values."""
     if name in OF_COLOURS and image.shape[-1] == 1:
         image, reference = image.expand(*image.shape[:2], 3), reference.expand(*image.shape[:2], 3)
     return (shown.of(image), shown.of(reference)) if name in OF_SHOWN else (image, reference)

@@ -1,7 +1,7 @@
-"""Picture files to arrays as stored: OpenEXR, Radiance HDR and 16-bit colour PNG through OpenImageIO, the rest through Pillow.
+"""Decode image files to arrays as stored: EXR, HDR and 16-bit colour PNG by OpenImageIO, other formats by Pillow.
 
-A file is decoded as what its first bytes say it is, whatever its name ends in. The declared size is held against the cap,
-and as far as the format allows against the size of the file, before memory is asked for.
+The format is recognized by the first bytes of a file, whatever its name. Before memory is allocated, the declared size is
+checked against the limit and, where the format allows it, against the size of the file.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from torchpt.images.png import sanitize_png
 
 __all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "decode_image", "existing_image", "oiio_error"]
 
-MAX_PIXELS = 64 * 2**20  # a header may claim anything: refuse before memory is asked for
+MAX_PIXELS = 64 * 2**20  # a header may claim anything: checked before memory is allocated
 FLOAT_FORMATS = (".exr", ".hdr")
 INTEGER_FORMATS = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tga")
 READABLE = FLOAT_FORMATS + INTEGER_FORMATS
 
-_CHANNELS = 16  # most values a pixel, on average over the largest picture
+_CHANNELS = 16  # largest number of channels of an image with the largest number of pixels
 _SIGNATURES = {
     b"\x89PNG\r\n\x1a\n": ".png",
     b"\xff\xd8\xff": ".jpg",
@@ -37,20 +37,20 @@ _SIGNATURES = {
     b"#?RADIANCE": ".hdr",
     b"#?RGBE": ".hdr",
 }
-# Most pixels that one byte of a file can stand for: 8 of a 1-bit PNG, deflated by at most 1032 (zlib's technical notes);
-# JPEG, TGA, BMP and PNM stay below.
+# Most pixels that one byte of a file can encode: 8 of a 1-bit PNG, deflated by at most 1032 (zlib's technical notes); JPEG,
+# TGA, BMP and PNM encode fewer.
 _PIXELS_PER_BYTE = 8 * 1032
-_BAND = 2**20  # values read at a time, so that an absent rest is noticed before its memory is touched
+_BAND = 2**20  # values read at a time, so that a truncated file fails before all of its memory is touched
 
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """A picture file in memory, e.g. one that lies inside a GLB file or a data: URI.
+    """An image file in memory, for example from a GLB file or a data: URI.
 
     Attributes:
-        label: what errors call it: the file that holds it, and which of its images it is.
-        data: the bytes of the file.
-        kind: its format as a file ending without the dot, such as ``png``; empty where only the bytes can tell.
+        label: name for errors: the file that holds it, and its index there.
+        data: the bytes of the image file.
+        kind: its format as a file ending without the dot, such as ``png``; empty: unknown.
     """
 
     label: str
@@ -63,12 +63,12 @@ class EncodedImage:
 
 @dataclass(frozen=True)
 class Pixels:
-    """What a file stores.
+    """Pixels of a file, as stored.
 
     Attributes:
         values: ``(H, W, C)``, row 0 at the top: integers, booleans or float32.
-        white: the stored value that means 1.
-        channels: names of the channels of an EXR or HDR, else empty.
+        white: the stored value that stands for 1.
+        channels: channel names of an EXR or HDR; else empty.
     """
 
     values: NDArray[Any]
@@ -77,16 +77,16 @@ class Pixels:
 
     @property
     def eight_bit(self) -> bool:
-        """Whether no more than 8 bits a value were stored."""
+        """Return True if values are stored with at most 8 bits."""
         return self.values.dtype.kind in "ub" and self.white <= 255
 
 
 def existing_image(path: str | PathLike[str]) -> Path:
-    """The path of a picture file that is there.
+    """Return the path of an image file after checking that it exists.
 
     Raises:
-        SceneError: no path.
-        AssetError: an unknown ending, no such file, or no file.
+        SceneError: ``path`` is not a path.
+        AssetError: an unknown ending, no such file, or not a regular file.
     """
     path = as_path(path)
     if path.suffix.lower() not in READABLE:
@@ -102,7 +102,7 @@ def existing_image(path: str | PathLike[str]) -> Path:
 
 
 def decode_image(source: Path | EncodedImage, max_pixels: int) -> Pixels:
-    """Decodes a file that exists, or one in memory.
+    """Decode an existing file, or one in memory.
 
     Raises:
         AssetError: malformed, truncated, of more than ``max_pixels`` pixels, or CMYK.
@@ -142,7 +142,7 @@ def _head(source: Path | EncodedImage) -> bytes:
 
 
 def _check_size(label: str, width: int, height: int, channels: int, max_pixels: int, size: int | None = None) -> None:
-    """Refuse what is too large, or (of formats that the bound holds for) more than ``size`` bytes can stand for."""
+    """Raise an AssetError for an image that is empty, too large, or larger than a file of ``size`` bytes can encode."""
     if width < 1 or height < 1 or channels < 1:
         raise AssetError(label, f"has no pixels ({width} x {height}, {channels} channels)")
     if width * height > max_pixels or width * height * channels > _CHANNELS * max_pixels:
@@ -153,18 +153,18 @@ def _check_size(label: str, width: int, height: int, channels: int, max_pixels: 
 
 
 def _through_oiio(source: Path | EncodedImage, label: str, kind: str, stored: str, max_pixels: int) -> Pixels:
-    """All channels of the first part of a file that OpenImageIO reads."""
-    if isinstance(source, EncodedImage):  # it reads files only
+    """Decode all channels of the first part of a file with OpenImageIO."""
+    if isinstance(source, EncodedImage):  # OpenImageIO reads files only
         with tempfile.NamedTemporaryFile(suffix=kind) as file:
             file.write(source.data)
             file.flush()
             return _through_oiio(Path(file.name), label, kind, stored, max_pixels)
     import OpenImageIO as oiio
 
-    wishes = oiio.ImageSpec()
-    wishes.attribute("oiio:UnassociatedAlpha", 1)  # a PNG's colours as stored, not multiplied by alpha
-    wishes.attribute("oiio:RawColor", 1)
-    picture = oiio.ImageInput.open(str(source), wishes)
+    options = oiio.ImageSpec()
+    options.attribute("oiio:UnassociatedAlpha", 1)  # a PNG's colours as stored, not multiplied by alpha
+    options.attribute("oiio:RawColor", 1)
+    picture = oiio.ImageInput.open(str(source), options)
     if picture is None:
         raise AssetError(label, f"cannot be read ({oiio_error(oiio) or 'unknown format'})")
     try:
@@ -194,19 +194,19 @@ def _through_oiio(source: Path | EncodedImage, label: str, kind: str, stored: st
 
 
 def _through_pillow(source: Path | EncodedImage, label: str, kind: str, max_pixels: int) -> Pixels:
-    """A file of an integer format."""
+    """Decode a file of an integer format with Pillow."""
     from PIL.BmpImagePlugin import BmpImageFile
     from PIL.JpegImagePlugin import JpegImageFile
     from PIL.PngImagePlugin import PngImageFile
     from PIL.PpmImagePlugin import PpmImageFile
     from PIL.TgaImagePlugin import TgaImageFile
 
-    # The plugins themselves: each takes its own format only, and none warns of sizes that are checked here.
+    # The plugins are called directly: each reads only its own format, and none warns of sizes that are checked here.
     plugin = {".png": PngImageFile, ".jpg": JpegImageFile, ".jpeg": JpegImageFile, ".bmp": BmpImageFile}
     plugin |= {".tga": TgaImageFile, ".ppm": PpmImageFile, ".pgm": PpmImageFile}
     data = read_regular(source) if isinstance(source, Path) else source.data
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow warns of odd metadata, of which nothing is used
+        warnings.simplefilter("ignore")  # Pillow warns of odd metadata, which is not used
         return _pillow_pixels(plugin[kind](BytesIO(data)), label, len(data), max_pixels)
 
 
@@ -226,7 +226,7 @@ def _pillow_pixels(picture: Any, label: str, size: int, max_pixels: int) -> Pixe
     return Pixels(values[..., None] if values.ndim == 2 else values, _MODES[picture.mode])
 
 
-# Pillow's modes that are read, and the value that means 1
+# Pillow's modes that are supported, with the value that stands for 1
 _MODES = {
     **{"1": 1, "L": 255, "LA": 255, "P": 255, "RGB": 255, "RGBA": 255},
     **{"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I": 65535},
@@ -234,14 +234,14 @@ _MODES = {
 
 
 def oiio_error(teller: Any) -> str:
-    """What OpenImageIO, or one of its inputs, says is wrong: one line, empty where it says nothing."""
+    """Return the error message of OpenImageIO, or of one of its inputs, as one line; empty: none."""
     try:
         found = teller.geterror()
-    except UnicodeDecodeError:  # it tells bytes of the file as they are
+    except UnicodeDecodeError:  # the message quotes bytes of the file
         return "malformed"
     return _brief(found) if found.strip() else ""
 
 
 def _brief(problem: object) -> str:
-    """The first line of a decoder's complaint."""
+    """Return the first line of a decoder's message, shortened."""
     return (str(problem).strip().splitlines() or [type(problem).__name__])[0][:120]

@@ -1,8 +1,8 @@
-"""Noise taken out of a finished picture, by Intel's Open Image Denoise (its filter ``RT``; through the package pyoidn).
+"""Denoise a finished picture with Intel's Open Image Denoise (filter ``RT``, by the package pyoidn).
 
-The picture is taken as linear radiance (HDR). What first surfaces are like, albedo and normals, tells edges from noise; as
-lenses, opacity and pixel filters leave noise in them too, both are filtered first, each by itself, and then taken as clean,
-as the library's manual advises for final frames. Features seen in mirrors and through glass are told by the picture alone.
+The picture is linear radiance (HDR). Albedo and normals of first surfaces separate edges from noise. Lenses, opacity and pixel
+filters leave noise in them too, so each is filtered first by itself and then passed on as clean, as the library's manual
+advises for final frames. Features seen in mirrors and through glass are in the picture alone.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from torchpt.core.errors import RenderError
 
 __all__ = ["GUIDES", "check_denoiser", "denoise", "denoiser_version"]
 
-#: The layers that the denoiser looks at beside the picture.
+#: The layers that guide the denoiser.
 GUIDES = ("albedo", "normal")
-#: Pixels mirrored around the picture: the network sees black beyond its edge, and darkens or brightens what is near it (a
-#: grey picture of 33 x 17 pixels by up to 13 %, with the margin by 0.1 %).
+#: Width of a mirrored margin around the picture, in pixels. The network sees black beyond the edge and changes the brightness
+#: near it: of a grey picture of 33 x 17 pixels by up to 13 %, with the margin by 0.1 %.
 MARGIN = 16
 _LOWEST, _HIGHEST = 2.0**-126, float(np.finfo(np.float32).max)
 
@@ -30,24 +30,24 @@ Picture = NDArray[np.float32]
 
 
 def check_denoiser() -> None:
-    """Find out before a long render whether its picture can be denoised.
+    """Check before a long render that its picture can be denoised.
 
     Raises:
-        RenderError: the package is not installed, or its library does not run on this machine.
+        RenderError: the package pyoidn is not installed, or its library does not run on this machine.
     """
     _library()
 
 
 def denoiser_version() -> str:
-    """What denoised pictures depend on beside what they are made of: the package, whose wheel holds the library."""
+    """Return name and version of the denoiser's package, whose wheel contains the library."""
     return f"pyoidn {version('pyoidn')}"
 
 
 def denoise(image: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None) -> Tensor:
-    """A picture without its noise: a guess that looks right, and no estimate of anything.
+    """Return a denoised picture: plausible to look at, but biased by an unknown amount.
 
-    It is biased by an amount that nobody knows, so keep the noisy picture, and never compare or measure with this one as if
-    it had been rendered. The same picture comes back for any number of threads; it runs on the CPU wherever ``image`` is.
+    Keep the noisy picture, and do not measure errors with the denoised one as if it had been rendered. The result is the same
+    for any number of threads; the denoiser runs on the CPU wherever ``image`` is.
 
     Args:
         image: ``(H, W, 3)`` linear radiance of any scale; negative values count as 0.
@@ -60,7 +60,7 @@ def denoise(image: Tensor, albedo: Tensor | None = None, normal: Tensor | None =
     Raises:
         RenderError: the package pyoidn (extra ``denoise``) is not installed or does not run here, or a value of the picture
             is not finite.
-        ValueError: another shape, a normal without albedo, a tensor that requires gradients (there are none).
+        ValueError: another shape, a normal without albedo, or a tensor that requires gradients.
     """
     if normal is not None and albedo is None:
         raise ValueError("normal: the denoiser takes it beside albedo only")
@@ -91,7 +91,7 @@ def denoise(image: Tensor, albedo: Tensor | None = None, normal: Tensor | None =
 
 
 def _library() -> Any:
-    """The package, ready to run."""
+    """Return the package pyoidn after checking that it runs on this machine."""
     try:
         import pyoidn
     except ImportError:
@@ -108,28 +108,28 @@ def _library() -> Any:
 
 
 def _scale(pixels: NDArray[np.float64]) -> float:
-    """A power of two near the geometric mean of what is not black: the library takes values below 1e-8 for black."""
+    """Return a power of two near the geometric mean of the non-black pixels: the library treats values below 1e-8 as black."""
     brightness = pixels.max(2)
     lit = brightness[brightness > _LOWEST]
     return float(np.exp2(np.round(np.log2(lit).mean()))) if lit.size else 1.0
 
 
 def _framed(values: NDArray[np.float64]) -> Picture:
-    """A picture with its margin, as the library reads it."""
+    """Return the picture with a mirrored margin, float32 and contiguous."""
     around = ((MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0))
     return np.ascontiguousarray(np.pad(values.astype(np.float32), around, mode="symmetric"))
 
 
 def _filtered(library: Any, inputs: dict[str, Picture], flags: dict[str, bool]) -> Picture:
-    """What the filter makes of its inputs: one layer alone, or a picture with its layers.
+    """Run the filter on one layer alone, or on a picture with its layers.
 
     Raises:
-        RenderError: what the library says.
+        RenderError: with the message of the library.
     """
     output = np.empty_like(next(iter(inputs.values())))
     with library.Device() as device:
         device.set_int("numThreads", torch.get_num_threads())
-        device.set_bool("setAffinity", False)  # threads of this process are not its own to pin
+        device.set_bool("setAffinity", False)  # do not pin threads of this process
         device.commit()
         with library.Filter(device) as work:
             for name, values in {**inputs, "output": output}.items():

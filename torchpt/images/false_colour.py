@@ -1,4 +1,4 @@
-"""A number as a colour: from black over purple and orange to a pale yellow, evenly as the eye counts."""
+"""Map numbers to colours with the perceptually uniform colour map magma, from black to pale yellow."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from torch import Tensor
 
 __all__ = ["MAP", "NOT_FINITE", "false_colour"]
 
-#: Of matplotlib's maps one that also orders by lightness, for every kind of sight and for print.
+#: Name of a matplotlib colour map; its lightness rises too, for colour blindness and print.
 MAP = "magma"
-#: What is no number: a green that the other colours do not have.
+#: Colour of values that are not finite: a green that is not in the map.
 NOT_FINITE = (0.0, 1.0, 0.0)
 
 
 def false_colour(values: Tensor, top: float) -> Tensor:
-    """Values 0..``top`` as colours; beyond it they look like ``top``, and what is not finite is `NOT_FINITE`.
+    """Return the colours of values 0..``top``; larger ones get the colour of ``top``, non-finite ones `NOT_FINITE`.
 
     Args:
         values: any shape.
-        top: above 0.
+        top: the value of the brightest colour, above 0.
 
     Returns:
         ``(..., 3)`` display values 0..1, float32.

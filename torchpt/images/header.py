@@ -1,6 +1,6 @@
-"""What an EXR file says of its picture beside the pixels: facts by name, as attributes ``torchpt:NAME`` of its header.
+"""Metadata of an EXR file: values by name, stored as attributes ``torchpt:NAME`` of its header.
 
-EXR has no whole numbers beyond 32 bits that OpenImageIO would write: those are kept as their digits. Fractions are float32.
+OpenImageIO writes no integers beyond 32 bits to EXR: those are stored as text. Fractions are float32.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _DIGITS = re.compile(r"-?[1-9][0-9]{9,}\Z")
 
 
 def checked_header(header: Mapping[str, Fact]) -> dict[str, Fact]:
-    """Facts that a header can hold.
+    """Return the metadata after checking that a header can store it.
 
     Raises:
-        ValueError: a name that is no identifier, or a value that is no text, number or truth.
+        ValueError: a name that is not an identifier, or a value that is not printable text, a number or a bool.
     """
     for name, value in header.items():
         if not isinstance(name, str) or not _NAME.match(name):
@@ -40,28 +40,28 @@ def checked_header(header: Mapping[str, Fact]) -> dict[str, Fact]:
 
 
 def put_header(spec: Any, header: Mapping[str, Fact]) -> None:
-    """Put facts into an ``OpenImageIO.ImageSpec``."""
+    """Add metadata to an ``OpenImageIO.ImageSpec``."""
     for name, value in header.items():
-        if isinstance(value, int):  # truths too
+        if isinstance(value, int):  # bools too
             value = int(value) if -_SMALL <= value < _SMALL else str(value)
         spec.attribute(PREFIX + name, value)
 
 
 def read_header(path: str | PathLike[str]) -> dict[str, Fact]:
-    """Read what an EXR file that torchpt wrote says of its picture.
+    """Read the metadata of an EXR file that torchpt wrote.
 
-    ``torchpt render`` and ``Rendering.write`` write ``relmse``, ``relmse_low`` and ``relmse_high`` (where the picture knows its
-    error), ``spp``, ``seed``, ``load_seconds build_seconds compile_seconds render_seconds`` and others;
+    ``torchpt render`` and ``Rendering.write`` write ``relmse``, ``relmse_low`` and ``relmse_high`` (if the error was
+    estimated), ``spp``, ``seed``, ``load_seconds build_seconds compile_seconds render_seconds`` and others;
     docs/guides/error.md lists them. Other programs find them as attributes ``torchpt:relmse`` and so on.
 
     Args:
-        path: a picture file.
+        path: an image file.
 
     Returns:
-        Facts by name; empty for a file that has none, and for formats other than EXR. Fractions have float32's seven digits.
+        Values by name; empty for a file without metadata, and for formats other than EXR. Fractions have seven digits.
 
     Raises:
-        SceneError: ``path`` is none.
+        SceneError: ``path`` is not a path.
         AssetError: a file that is missing, of no known ending, or malformed.
     """
     path = existing_image(path)
@@ -88,7 +88,7 @@ def read_header(path: str | PathLike[str]) -> dict[str, Fact]:
 
 
 def _told(item: Any) -> tuple[str, Any]:
-    """Name and value of an attribute; other programs' need not be UTF-8, and none of those is ours."""
+    """Return name and value of an attribute; empty for one that is not UTF-8, which torchpt does not write."""
     try:
         return item.name, item.value
     except UnicodeDecodeError:
@@ -96,7 +96,7 @@ def _told(item: Any) -> tuple[str, Any]:
 
 
 def _read(value: Fact) -> Fact:
-    """A fact as it was; text of ten digits or more that 32 bits cannot hold was a whole number."""
+    """Return a value as it was before writing: text of ten digits or more was an integer beyond 32 bits."""
     if isinstance(value, str) and _DIGITS.match(value) and not -_SMALL <= int(value) < _SMALL:
         return int(value)
     return value

@@ -1,7 +1,7 @@
-"""How named layers become EXR channels and how a file's channels become layers again.
+"""Names of EXR channels for layers, and layers from the channels of a file.
 
-``image`` is the picture itself (``R G B``); the others carry their own name as a prefix (``albedo.R``). A layer of
-``film.aovs`` names its own channels; any other is named after its number of components.
+``image`` is the picture itself (``R G B``); channels of other layers have the name of the layer as a prefix (``albedo.R``). A
+layer of ``film.aovs`` defines its channel names; those of any other follow from its number of components.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ _ORDER = "RGBXYZUVA"
 
 
 def channel_names(layer: str, components: int) -> tuple[str, ...]:
-    """The EXR channels of a layer with so many components."""
+    """Return the names of the EXR channels of a layer with ``components`` components."""
     if layer == "image":
         known = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
         return known.get(components) or tuple(f"image.{i}" for i in range(components))
-    # By the module's name: nothing of a room below is imported before a layer is written.
+    # Imported by name, and only when a layer is written: the room `paths` lies above this one.
     own = import_module("torchpt.paths.layers").LAYERS.get(layer)
     if own is not None and len(own.channels) == components:
         return own.channels
@@ -37,7 +37,7 @@ def _rank(channel: str) -> tuple[int, int, str]:
 
 
 def group_channels(channels: tuple[str, ...] | list[str]) -> dict[str, list[int]]:
-    """Channel indices of each layer, components in order: the inverse of `channel_names`."""
+    """Return the channel indices of each layer, components in order: the inverse of `channel_names`."""
     groups: dict[str, list[int]] = {}
     for index, channel in enumerate(channels):
         prefix, _, last = channel.rpartition(".")

@@ -1,11 +1,11 @@
-"""How far a picture is from its reference, as one number: each measure is a function, and :data:`METRICS` names them.
+"""Error metrics of an image against a reference: each is a function, and :data:`METRICS` lists them by name.
 
-All take linear RGB ``(H, W, 3)`` of one size, on any device and of any floating type, and count in float64. ``mse relmse
-relmse_trimmed smape flip`` take radiance as it is; ``psnr`` and ``ssim`` are about values from 0 to ``peak``, so hand them
-what a screen shows (``torchpt.images.colour.display``). Where a picture holds a value that is not finite, so does the result.
+All take linear RGB ``(H, W, 3)`` of one size, on any device and of any floating type, and compute in float64. ``mse relmse
+relmse_trimmed smape flip`` take radiance as it is; ``psnr`` and ``ssim`` expect values from 0 to ``peak``, so pass display
+values (``torchpt.images.colour.display``). If an image has a value that is not finite, the result is not finite either.
 
-`error_map` says where the error lies; :data:`MAPS` names the measures that have one. `relative` and `symmetric` are the
-formulas value by value, for whoever has another numerator, such as a loss or an estimate of a variance.
+`error_map` returns the error of each pixel, for the metrics in :data:`MAPS`. `relative` and `symmetric` are the formulas value
+by value, for other numerators, such as in a loss or with an estimate of a variance.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ __all__ = [
     "trimmed",
 ]
 
-#: What the denominators of relMSE and SMAPE hold beside radiance, so that black pixels stay finite.
+#: Constant in the denominators of relMSE and SMAPE, so that black pixels stay finite.
 FLOOR = 1e-2
-#: Share of the pixels that :func:`relmse_trimmed` leaves out.
+#: Fraction of the pixels that :func:`relmse_trimmed` leaves out.
 TRIMMED = 1e-3
 
 
@@ -74,34 +74,34 @@ def _symmetric(image: Tensor, reference: Tensor, floor: float = FLOOR) -> Tensor
 
 
 def mse(image: Tensor, reference: Tensor) -> float:
-    """Mean squared error over pixels and channels: 0 for equal pictures.
+    """Return the mean squared error over pixels and channels: 0 for equal images.
 
     Raises:
-        ValueError: pictures of two sizes (so do all of these).
+        ValueError: the shapes differ (as for all metrics).
     """
     return float(_squared(image, reference).mean())
 
 
 def relmse(image: Tensor, reference: Tensor, floor: float = FLOOR) -> float:
-    """Relative mean squared error: the mean of ``(x - ref)² / (ref² + floor)`` (Rousselle et al. 2011, section 4.2).
+    """Return the relative mean squared error: the mean of ``(x - ref)² / (ref² + floor)`` (Rousselle et al. 2011, 4.2).
 
-    A few bright outliers carry it; where the reference is black it is ``x² / floor``.
+    A few bright outliers may dominate it; where the reference is black it is ``x² / floor``.
     """
     return float(_relative(image, reference, floor).mean())
 
 
 def relmse_trimmed(image: Tensor, reference: Tensor, share: float = TRIMMED, floor: float = FLOOR) -> float:
-    """`relmse` without the ``share`` of pixels that are furthest off.
+    """Return `relmse` without the fraction ``share`` of pixels with the largest errors.
 
-    A pixel's error is the mean of its channels' ``(x - ref)² / (ref² + floor)``. Of N pixels the ``⌊share N⌋`` with the
-    largest are left out, and the mean is over the others: by default none of fewer than 1,000 pixels, where this is
-    `relmse`. Values that are not finite are not trimmed away.
+    The error of a pixel is the mean of ``(x - ref)² / (ref² + floor)`` over its channels. Of N pixels the ``⌊share N⌋`` with
+    the largest errors are left out; below 1,000 pixels the default leaves out none, and the result is `relmse`. Values that are
+    not finite are not left out.
 
     Args:
         image: ``(H, W, C)``.
-        reference: the same.
-        share: of the pixels, 0 or more and below 1.
-        floor: as of `relmse`.
+        reference: of the same shape.
+        share: fraction of the pixels, 0 or more and below 1.
+        floor: as for `relmse`.
 
     Raises:
         ValueError: a share outside ``[0, 1)``.
@@ -115,22 +115,22 @@ def relmse_trimmed(image: Tensor, reference: Tensor, share: float = TRIMMED, flo
 
 
 def trimmed(errors: Tensor, share: float = TRIMMED) -> Tensor:
-    """Return where the smallest of ``errors (N,)`` stand, in rising order: all but the ``⌊share N⌋`` largest."""
-    left_out = math.floor(share * errors.numel() * (1 + 1e-12))  # 0.001 of 3,000 are 3, whatever the product rounds to
+    """Return the indices of ``errors (N,)`` in rising order, without the ``⌊share N⌋`` largest."""
+    left_out = math.floor(share * errors.numel() * (1 + 1e-12))  # 0.001 of 3,000 is 3, however the product is rounded
     return errors.argsort()[: errors.numel() - left_out]
 
 
 def smape(image: Tensor, reference: Tensor, floor: float = FLOOR) -> float:
-    """Symmetric mean absolute percentage error, 0..1: the mean of ``|x - ref| / (|x| + |ref| + floor)``.
+    """Return the symmetric mean absolute percentage error, 0..1: the mean of ``|x - ref| / (|x| + |ref| + floor)``.
 
     Vogels et al. 2018, *Denoising with Kernel Prediction and Asymmetric Loss Functions*, equation 3. Unlike `relmse` it is
-    not carried by a few bright pixels.
+    not dominated by a few bright pixels.
     """
     return float(_symmetric(image, reference, floor).mean())
 
 
 def psnr(image: Tensor, reference: Tensor, peak: float = 1.0) -> float:
-    """Peak signal-to-noise ratio in decibels, of values 0..``peak``; infinite for equal pictures."""
+    """Return the peak signal-to-noise ratio in decibels, of values 0..``peak``; infinite for equal images."""
     from kornia.metrics import psnr as kornia_psnr
 
     x, ref = _pair(image, reference)
@@ -138,18 +138,18 @@ def psnr(image: Tensor, reference: Tensor, peak: float = 1.0) -> float:
 
 
 def ssim(image: Tensor, reference: Tensor, peak: float = 1.0, window: int = 11) -> float:
-    """Mean structural similarity of values 0..``peak`` (Wang et al. 2004): 1 for equal pictures.
+    """Return the mean structural similarity of values 0..``peak`` (Wang et al. 2004): 1 for equal images.
 
-    Over all windows that lie within the picture, of ``window`` pixels (an odd number) and a Gaussian of 1.5 pixels.
+    The mean is over all windows of ``window`` pixels (odd) inside the image, with a Gaussian of 1.5 pixels.
 
     Raises:
-        ValueError: a picture smaller than the window.
+        ValueError: an image smaller than the window.
     """
     return float(_similar(image, reference, peak, window, "valid").mean())
 
 
 def _similar(image: Tensor, reference: Tensor, peak: float, window: int, padding: str) -> Tensor:
-    """Structural similarity ``(H, W, C)`` about each pixel: mirrored at the edges ("same"), or without them ("valid")."""
+    """Return the structural similarity ``(H, W, C)`` of each pixel; ``padding``: "same" mirrors at the edges, "valid" crops."""
     from kornia.metrics import ssim as kornia_ssim
 
     x, ref = _pair(image, reference)
@@ -160,7 +160,7 @@ def _similar(image: Tensor, reference: Tensor, peak: float, window: int, padding
 
 
 def flip(image: Tensor, reference: Tensor) -> float:
-    """Mean HDR-FLIP, 0..1: how visible differences are when one alternates the two, at the exposures that matter.
+    """Return the mean HDR-FLIP error, 0..1: the visibility of differences when the images alternate, over exposures.
 
     Andersson et al. 2021, *Visualizing Errors in Rendered High Dynamic Range Images*, by the authors' own evaluator, at 67
     pixels a degree. Negative values count as 0.
@@ -173,7 +173,7 @@ def flip(image: Tensor, reference: Tensor) -> float:
 
 
 def _flip(image: Tensor, reference: Tensor) -> tuple[Tensor, float]:
-    """The error ``(H, W)`` and its mean."""
+    """Return the FLIP error ``(H, W)`` and its mean."""
     x, ref = _pair(image, reference)
     if not (torch.isfinite(x).all() and torch.isfinite(ref).all()):
         return torch.full(x.shape[:2], math.nan, dtype=x.dtype), math.nan
@@ -190,7 +190,7 @@ def _flip(image: Tensor, reference: Tensor) -> tuple[Tensor, float]:
     return torch.from_numpy(errors)[..., 0].double(), float(mean)
 
 
-#: Name -> measure. Smaller is better, except for ``psnr`` and ``ssim``.
+#: Metrics by name. Smaller is better, except for ``psnr`` and ``ssim``.
 METRICS: dict[str, Callable[[Tensor, Tensor], float]] = {
     "relmse": relmse,
     "relmse_trimmed": relmse_trimmed,
@@ -201,7 +201,7 @@ METRICS: dict[str, Callable[[Tensor, Tensor], float]] = {
     "flip": flip,
 }
 
-#: Name -> the error of each pixel, ``(H, W)``; 0 where the pictures agree.
+#: Functions by name that return the error of each pixel, ``(H, W)``; 0 where the images agree.
 MAPS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "relmse": lambda image, reference: _relative(image, reference).mean(-1),
     "mse": lambda image, reference: _squared(image, reference).mean(-1),
@@ -212,22 +212,22 @@ MAPS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 
 
 def error_map(metric: str, image: Tensor, reference: Tensor) -> Tensor:
-    """Where a picture is off, by one of the measures: the mean over channels of each pixel's error.
+    """Return the error of each pixel by one of the metrics: the mean over channels.
 
-    The map's mean is the measure; of ``ssim`` the map is ``1 - ssim``, with the picture mirrored at its edges, and the
-    measure the mean of what lies 5 pixels or more inside. Where a pixel is not finite, so is the map: of ``ssim`` a
-    window about it, of ``flip`` the whole.
+    The mean of the map is the metric. The map of ``ssim`` is ``1 - ssim``, with the image mirrored at its edges; there the
+    metric is the mean over pixels at least 5 pixels inside. Where a pixel is not finite the map is not finite: with ``ssim`` in
+    a window about it, with ``flip`` everywhere.
 
     Args:
-        metric: a key of `MAPS`: ``relmse mse smape ssim flip``. ``psnr`` is of the whole picture: see ``mse``.
-        image: ``(H, W, C)`` as the measure takes it; of ``flip`` C is 3.
-        reference: the same.
+        metric: a key of `MAPS`: ``relmse mse smape ssim flip``. ``psnr`` has no map; use ``mse``.
+        image: ``(H, W, C)`` as for the metric; C is 3 for ``flip``.
+        reference: of the same shape.
 
     Returns:
         ``(H, W)`` float64 on the CPU.
 
     Raises:
-        ValueError: no such map; and as the measure does.
+        ValueError: an unknown metric, or as the metric raises.
         ImportError: as `flip`.
     """
     if metric not in MAPS:

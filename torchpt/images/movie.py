@@ -1,4 +1,4 @@
-"""Write moving pictures: whole or not at all, as pictures are. GIF by Pillow, MP4 by ffmpeg through imageio."""
+"""Write GIF (Pillow) and MP4 (ffmpeg through imageio); a failure leaves no partial file."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ __all__ = ["MOVIES", "check_movie", "write_movie"]
 
 Frame = NDArray[np.uint8]
 
-#: What players take for a mistake and slow down: a frame of a GIF that is shown for less than 2 hundredths of a second.
+#: Most frames a second by format. Players slow down a GIF whose frames last less than 2 hundredths of a second.
 _FASTEST = {".gif": 50.0, ".mp4": 240.0}
-#: H.264 in the colours of ITU-R BT.709, which players assume; its header first, so that a page can start to play.
+#: Options for H.264 in the colours of ITU-R BT.709, which players assume, with the header first for streaming.
 _H264 = [
     *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-colorspace", "bt709", "-color_primaries", "bt709"),
     *("-color_trc", "iec61966-2-1", "-color_range", "tv", "-movflags", "+faststart"),
@@ -31,11 +31,11 @@ _H264 = [
 
 
 def check_movie(path: str | PathLike[str], fps: float) -> None:
-    """Find out before a long render whether a moving picture can be written.
+    """Check before a long render that a movie can be written.
 
     Raises:
-        OutputError: an ending that is not written, more frames a second than it can show, a package that is not installed,
-            or a place that cannot be written.
+        OutputError: an unsupported ending, too many frames a second for the format, a package that is not installed, or a path
+            that cannot be written.
     """
     place = check_writable(path, tuple(MOVIES))
     kind = place.suffix.lower()
@@ -47,13 +47,13 @@ def check_movie(path: str | PathLike[str], fps: float) -> None:
 
 
 def write_movie(path: str | PathLike[str], frames: Iterable[Frame], fps: float) -> None:
-    """Write frames ``(H, W, 3)`` of one size, as a screen shows them, in the format that the file's ending names.
+    """Write frames ``(H, W, 3)`` of one size, 8-bit display values, in the format of the file's ending.
 
-    A ``.gif`` repeats for ever; its frames have 256 colours each, and last whole hundredths of a second that add up. An
-    ``.mp4`` holds H.264; a row or column is repeated where the height or width is odd.
+    A ``.gif`` loops for ever; each frame has 256 colours of its own and lasts whole hundredths of a second, rounded so that the
+    total is right. An ``.mp4`` is H.264; the last row or column is repeated if the height or width is odd.
 
     Raises:
-        OutputError: as `check_movie`, or an encoder that fails.
+        OutputError: as `check_movie`, or the encoder failed.
     """
     destination = output_path(path, tuple(MOVIES))
     temporary = temporary_beside(destination)
@@ -63,7 +63,7 @@ def write_movie(path: str | PathLike[str], frames: Iterable[Frame], fps: float) 
     except (OSError, ValueError, TypeError, ImportError) as problem:
         raise OutputError(path, write_error(problem, destination)) from problem
     finally:
-        with suppress(OSError):  # it is only there after a failure
+        with suppress(OSError):  # exists only after a failure
             temporary.unlink()
 
 
@@ -77,7 +77,7 @@ def _gif(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
         picture = Image.fromarray(frame).quantize(256)
         shown = picture.convert("RGB").tobytes()
         time = 10 * (round(100 * (number + 1) / fps) - round(100 * number / fps))
-        if pictures and shown == last:  # Pillow would do so too, and fail where nothing else is left
+        if pictures and shown == last:  # Pillow merges equal frames too, but fails if a single one is left
             times[-1] += time
         else:
             pictures.append(picture)
@@ -101,5 +101,5 @@ def _mp4(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
             writer.append_data(np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
 
 
-#: File ending -> what writes it.
+#: Writers by file ending.
 MOVIES: dict[str, Callable[[Path, Iterable[Frame], float], None]] = {".gif": _gif, ".mp4": _mp4}

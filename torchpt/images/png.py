@@ -1,4 +1,4 @@
-"""PNG files made safe for libpng, which tells its complaints to the standard error stream of the process."""
+"""Check PNG files before libpng reads them, since libpng prints its errors to the standard error stream of the process."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 __all__ = ["sanitize_png"]
 
 _CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}
-# first column and row of a pass, and steps between them (PNG specification, 8.2: Adam7)
+# first column, first row, step of columns and step of rows of each pass (PNG specification, 8.2: Adam7)
 _PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 
 
 def sanitize_png(data: bytes) -> bytes:
-    """A PNG of 16 bits a value with nothing but its header, transparent colour and pixels, all of which are sound.
+    """Return a PNG of 16 bits a value with only its header, transparent colour and pixels, after checking all of them.
 
     Args:
-        data: the file; its declared size has been accepted.
+        data: bytes of the file; its declared size must have been checked.
 
     Raises:
-        ValueError: what is wrong with it.
+        ValueError: a malformed or truncated file.
     """
     width, height, depth, color, compression, filtering, interlace = struct.unpack(">IIBBBBB", data[16:29])
     if depth != 16 or color not in _CHANNELS or compression or filtering or interlace > 1:

@@ -1,4 +1,4 @@
-"""Read pictures: colours become linear light."""
+"""Read image files as tensors of linear values."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ __all__ = ["read_image", "read_layers"]
 
 
 def read_image(path: str | PathLike[str], linear: bool = False) -> Tensor:
-    """Read the picture of a file.
+    """Read an image file.
 
     Args:
         path: a file ending in ``.exr .hdr .png .jpg .jpeg .ppm .pgm .bmp .tga``.
-        linear: what the numbers of an integer format mean. False (the default): colours, sRGB-encoded, which are
-            decoded to linear light. True: data (normals, roughness, masks), which is returned as stored, scaled to
-            0..1. EXR and HDR are linear by definition: no difference. An alpha channel is never decoded.
+        linear: for integer formats. False (the default): values are sRGB colours and are decoded to linear ones. True: values
+            are data (normals, roughness, masks), and are returned as stored, scaled to 0..1. EXR and HDR are always linear. An
+            alpha channel is never decoded.
 
     Returns:
-        ``(H, W, C)`` float32 on the CPU, row 0 at the top; C is 1 (grey), 2 (grey, alpha), 3 or 4 (RGB, alpha). Of an
-        EXR with layers, the picture ``R G B [A]``; where it has none, its first layer.
+        ``(H, W, C)`` float32 on the CPU, row 0 at the top; C is 1 (grey), 2 (grey, alpha), 3 or 4 (RGB, alpha). From an EXR
+        with layers the channels ``R G B [A]``, or else its first layer.
 
     Raises:
-        SceneError: ``path`` is none.
-        AssetError: a file that is missing, of no known ending, malformed, truncated, CMYK or larger than 64 Mpixel.
+        SceneError: ``path`` is not a path.
+        AssetError: a file that is missing, of unknown format, malformed, truncated, CMYK or larger than 64 Mpixel.
     """
     pixels = decode_image(existing_image(path), MAX_PIXELS)
     image = _tensor(select_picture(pixels))
@@ -45,10 +45,10 @@ def read_image(path: str | PathLike[str], linear: bool = False) -> Tensor:
 
 
 def read_layers(path: str | PathLike[str]) -> dict[str, Tensor]:
-    """Read every layer of an EXR: name to ``(H, W, C)`` float32; the picture itself is called ``image``.
+    """Read all layers of an EXR: ``(H, W, C)`` float32 by name; the picture itself is ``image``.
 
-    The picture's alpha channel ``A`` is a layer of its own, ``alpha``. Other formats hold one layer, ``image``, as
-    `read_image` returns it.
+    The picture's alpha channel ``A`` is the layer ``alpha``. Other formats have one layer, ``image``, as `read_image` returns
+    it.
 
     Raises:
         SceneError, AssetError: as `read_image`.

@@ -1,4 +1,4 @@
-"""Pictures as textures take them, of files and of numbers in a scene: as stored, and whether they may be sRGB."""
+"""Images for textures, from files and from arrays in a scene: values as stored, and whether they may be sRGB-encoded."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ TEXELS = "texels (H, W, C), channels last, or (H, W), C from 1 to 4: finite numb
 
 @dataclass(frozen=True)
 class Texels:
-    """A picture's numbers.
+    """Values of an image, not decoded.
 
     Attributes:
         values: ``(H, W, C)`` float32, row 0 at the top, as stored; integer formats are scaled to 0..1. C is 1 (grey),
             2 (grey, alpha), 3 or 4 (RGB, alpha).
-        eight_bit: whether the file stores no more than 8 bits a value: colours are then sRGB by custom.
+        eight_bit: True: stored with at most 8 bits a value, so colours are sRGB-encoded by convention.
     """
 
     values: NDArray[np.float32]
@@ -48,14 +48,14 @@ class Texels:
 
 
 def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MAX_PIXELS) -> Texels:
-    """Reads a picture without decoding its colours.
+    """Read an image without decoding its colours.
 
     Args:
         source: a file ending in ``.exr .hdr .png .jpg .jpeg .ppm .pgm .bmp .tga``, or one in memory.
-        max_pixels: larger pictures are refused before memory is asked for.
+        max_pixels: larger images are refused before memory is allocated.
 
     Raises:
-        AssetError: a file that is missing, of no known kind, malformed, truncated, too large, CMYK, of more than 4
+        AssetError: a file that is missing, of unknown format, malformed, truncated, too large, CMYK, of more than 4
             channels, or with a value that is not finite.
     """
     file = source if isinstance(source, EncodedImage) else existing_image(source)
@@ -75,10 +75,10 @@ def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MA
 
 
 def texels_from_array(value: Any) -> Texels:
-    """Return numbers as a picture ``(H, W, C)``: row 0 at the top, linear; of 8 or 16 bits they are scaled to 0..1 as a file's.
+    """Return an array as an image ``(H, W, C)``, row 0 at the top; uint8 and uint16 are scaled to 0..1.
 
     Raises:
-        Refused: another shape, numbers that are not finite in float32, or too many of them.
+        Refused: another shape, values that are not finite in float32, or too many pixels.
     """
     if not isinstance(value, np.ndarray | list | tuple):
         raise Refused(TEXELS)
@@ -102,12 +102,12 @@ def texels_from_array(value: Any) -> Texels:
 
 
 def texels_to_radiance(read: Texels, source: str, key: str) -> NDArray[np.float32]:
-    """Return a picture as radiance ``(H, W, 3)``: grey ones in all channels, 8-bit ones decoded from sRGB, no alpha.
+    """Return an image as radiance ``(H, W, 3)``: grey repeated in all channels, 8-bit values decoded from sRGB, alpha dropped.
 
     Args:
-        read: the picture.
-        source: what errors call it.
-        key: the parameter that names it, for the error.
+        read: the image.
+        source: its name for errors.
+        key: the scene parameter that refers to it, for errors.
 
     Raises:
         Refused: a negative value.
@@ -121,10 +121,10 @@ def texels_to_radiance(read: Texels, source: str, key: str) -> NDArray[np.float3
 
 
 def check_source(values: Mapping[str, Any]) -> None:
-    """Check that a picture comes from the file ``path`` or from the numbers ``data``.
+    """Check that exactly one of ``path`` and ``data`` is given.
 
     Raises:
-        Refused: it comes from neither, or from both.
+        Refused: neither or both are given.
     """
     if values["path"] is None and values["data"] is None:
         raise Refused("a file path or data (one of them is required)", None, ("path",))
@@ -133,7 +133,7 @@ def check_source(values: Mapping[str, Any]) -> None:
 
 
 def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:
-    """Whether a PNG declares an alpha channel, or transparent colours; False for any other file."""
+    """Return True for a PNG with an alpha channel or a transparent colour; False for any other file."""
     try:
         data = source.data if isinstance(source, EncodedImage) else read_regular(source)
     except OSError:
@@ -149,7 +149,7 @@ def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:
 
 
 def select_picture(pixels: Pixels) -> NDArray:
-    """The picture ``R G B [A]`` of a file with layers, or its first layer; else all there is."""
+    """Return the channels ``R G B [A]`` of a file with layers, or its first layer; of other files all channels."""
     if not pixels.channels or pixels.values.dtype.kind != "f":
         return pixels.values
     groups = group_channels(pixels.channels)

@@ -1,7 +1,7 @@
-"""Write pictures: whole or not at all.
+"""Write image files; a failure leaves no partial file.
 
-A file is encoded beside its destination under a name of its own and then moved over it, so a reader never sees half a
-picture and a failure leaves what was there before.
+A file is encoded under a temporary name in the same folder and then moved to its destination, so a reader never sees half an
+image, and after a failure the old file is still there.
 """
 
 from __future__ import annotations
@@ -41,28 +41,28 @@ def write_image(
     gamma: str | float = "srgb",
     header: Mapping[str, Fact] | None = None,
 ) -> None:
-    """Write a picture in the format that the file's ending names.
+    """Write an image in the format of the file's ending.
 
-    ``.exr`` holds float32 and the layers, as channels of one part; ``.hdr`` holds RGBE (steps of 0.4 % of the
-    brightest channel, no negative values): both keep linear radiance untouched. ``.png .jpg .jpeg .ppm`` hold 8 bits
-    of what `colour.display` makes of it.
+    ``.exr`` stores float32 and all layers, as channels of one part; ``.hdr`` stores RGBE (steps of 0.4 % of the brightest
+    channel, no negative values): both store linear radiance. ``.png .jpg .jpeg .ppm`` store the values of `colour.display` in
+    8 bits.
 
     Args:
-        path: where to; an existing file is replaced.
-        image: ``(H, W, C)`` linear, C = 1, 3 or 4 (alpha is kept by EXR and PNG).
-        layers: name to ``(H, W, C)`` or ``(H, W)``; kept by ``.exr`` only. The names of `film.aovs` get the usual
+        path: the file; an existing one is replaced.
+        image: ``(H, W, C)`` linear, C = 1, 3 or 4 (alpha is stored in EXR and PNG).
+        layers: ``(H, W, C)`` or ``(H, W)`` by name; stored in ``.exr`` only. Layers named in `film.aovs` get the usual
             channels: ``albedo.R/G/B normal.X/Y/Z Z position.X/Y/Z uv.U/V object_id A variance.R/G/B
             samples``.
         exposure: stops (8-bit formats).
         tonemap: none, reinhard, aces or filmic (8-bit formats).
         gamma: ``"srgb"`` or an exponent (8-bit formats).
-        header: facts by name (letters, digits and _), each printable text or a number; kept by ``.exr`` only, as attributes
+        header: printable text or numbers by name (letters, digits and _); stored in ``.exr`` only, as attributes
             ``torchpt:NAME``, and read by :func:`torchpt.read_header`.
 
     Raises:
-        SceneError: ``path`` is none.
-        OutputError: an ending that is not written, or a place that cannot be written.
-        ValueError: an image or layer of another shape, a header that no file could hold.
+        SceneError: ``path`` is not a path.
+        OutputError: an unsupported ending, or a path that cannot be written.
+        ValueError: an image or layer of another shape, or a header that cannot be stored.
     """
     destination = output_path(path)
     pixels, facts = _pixels("image", image), checked_header(header or {})
@@ -89,22 +89,22 @@ def write_image(
     except (OSError, ValueError) as problem:
         raise OutputError(path, write_error(problem, destination)) from problem
     finally:
-        with suppress(OSError):  # it is only there after a failure
+        with suppress(OSError):  # exists only after a failure
             temporary.unlink()
 
 
 def check_writable(path: str | PathLike[str], endings: tuple[str, ...] = WRITABLE) -> Path:
-    """Find out before a long render whether its picture can be written; leaves nothing behind.
+    """Check before a long render that its image can be written; creates no file.
 
     Args:
-        path: where to.
-        endings: the formats that count.
+        path: the file.
+        endings: supported endings.
 
     Returns:
-        The file itself, links resolved.
+        The path with symbolic links resolved.
 
     Raises:
-        OutputError: an ending that is not written, a folder that is missing or cannot be written, a folder in the way.
+        OutputError: an unsupported ending, a folder that is missing or not writable, or a path that is a folder.
     """
     destination = output_path(path, endings)
     try:
@@ -122,13 +122,17 @@ def check_writable(path: str | PathLike[str], endings: tuple[str, ...] = WRITABL
 
 
 def output_path(path: str | PathLike[str], endings: tuple[str, ...] = WRITABLE) -> Path:
-    """The file that is meant, links resolved; an ending that is not among those accepted is an OutputError."""
+    """Return the path with symbolic links resolved.
+
+    Raises:
+        OutputError: an unsupported ending, or a device or pipe.
+    """
     destination = as_path(path)
     if destination.suffix.lower() not in endings:
         problem = f"cannot write the kind {destination.suffix!r}" if destination.suffix else "needs an ending"
         raise OutputError(path, f"{problem}; accepted: {' '.join(endings)}")
     try:
-        found = Path(os.path.realpath(destination))  # a link stays a link: its target is replaced
+        found = Path(os.path.realpath(destination))  # replace the target of a link, not the link
         if found.exists() and not (found.is_file() or found.is_dir()):
             raise OutputError(path, "is a device or pipe, no file that could be replaced")
     except (OSError, ValueError) as problem:
@@ -137,12 +141,12 @@ def output_path(path: str | PathLike[str], endings: tuple[str, ...] = WRITABLE) 
 
 
 def temporary_beside(destination: Path) -> Path:
-    """A name that nothing has yet, where a file is made before it is moved to its place."""
+    """Return an unused temporary path in the folder of the destination, with the same ending."""
     return destination.parent / f".torchpt-{secrets.token_hex(8)}{destination.suffix.lower()}"
 
 
 def write_error(problem: Exception, destination: Path) -> str:
-    """Why a file could not be written, for an OutputError."""
+    """Return the reason why a file could not be written, for an OutputError."""
     if not destination.parent.exists():
         return f"cannot be written: there is no folder {destination.parent}"
     return f"cannot be written ({getattr(problem, 'strerror', None) or problem})"
@@ -212,10 +216,10 @@ def _encode_float(temporary: Path, pixels: np.ndarray, channels: list[str], fact
 
 
 def _try_bytes(path: Path, size: int) -> None:
-    """Write as many zeros as an encoder may have wanted to write: it failed and does not tell the system's reason.
+    """Write zeros of the size of the image, to get the system's reason for the failure of an encoder that reports none.
 
     Raises:
-        OSError: the system's: the disk is full, the file may not grow, its folder is gone.
+        OSError: of the system: the disk is full, the file may not grow, its folder is gone.
     """
     block = bytes(min(size, 2**20))
     with open(path, "wb") as file:
@@ -229,12 +233,12 @@ def _encode_integer(temporary: Path, levels: np.ndarray) -> None:
     kind = {".png": "PNG", ".ppm": "PPM"}.get(temporary.suffix, "JPEG")
     options: dict[str, Any] = {"quality": 95} if kind == "JPEG" else {}
     encoded = BytesIO()
-    Image.fromarray(levels).save(encoded, kind, **options)  # a kind by name: else Pillow imports all that it knows
+    Image.fromarray(levels).save(encoded, kind, **options)  # with the format's name Pillow imports only that plugin
     temporary.write_bytes(encoded.getvalue())
 
 
 def _levels(pixels: np.ndarray, alpha: bool, exposure: float, tonemap: str, gamma: str | float) -> np.ndarray:
-    """The bytes that a screen shows, ``(H, W, 3)``, or 4 where there is an alpha channel and the format keeps it."""
+    """Return display values as bytes ``(H, W, 3)``, or ``(H, W, 4)`` if the image and the format (``alpha``) have alpha."""
     shown = display(torch.from_numpy(_rgb(pixels)), exposure, tonemap, gamma)
     if alpha and pixels.shape[2] == 4:
         coverage = torch.nan_to_num(torch.from_numpy(pixels[..., 3:]), nan=0.0).clamp(0, 1)

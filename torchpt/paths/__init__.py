@@ -1,19 +1,20 @@
-"""What happens along a path, and in which order; nothing of how it is run.
+"""Path tracing as pure functions of tensors: the loop over vertices, the stages, and the records between them.
 
-====================  ==================================================================================
-``walk.py``           the one loop over vertices, and the interfaces of an engine and an observer: start here
-``state.py``          the state of paths, and the records that stages read and return
-``vertex.py``         the stages: camera rays, light that is met or sampled, the bounce
-``roulette.py``       which paths go on, and by how much more those count
-``surface.py``        points on surfaces with their materials resolved
-``transmission.py``   what lets rays pass
-``integrators/``      what an integrator is, and one kind a file
-``layers.py``         layers (AOVs), one entry each
-``wave.py``           what a render fixes for all of its waves
-``adjoint.py``        stages gone back through, for gradients
-``explain.py``        the observer that keeps what happened along a path
-``lost.py``           samples that are not finite
-====================  ==================================================================================
+========================  ==============================================================================
+``walk.py``               the loop over vertices, and the interfaces of an engine and an observer: start here
+``state.py``              the state of paths, and the records that stages read and return
+``vertex.py``             the stages: camera rays, emitters that are hit, light sampling, BSDF sampling
+``roulette.py``           Russian roulette
+``surface.py``            surface points with their materials resolved
+``perturbed_normals.py``  normal and bump maps
+``transmission.py``       opacity: rays that pass surfaces
+``integrators/``          the base class of integrators, and one kind a file
+``layers.py``             layers (AOVs), a class each
+``wave.py``               everything that one render fixes for its waves
+``adjoint.py``            vector-Jacobian products of the stages
+``explain.py``            an observer that records the events along a path
+``nonfinite.py``          samples that are NaN or infinite
+========================  ==============================================================================
 
-An engine (:mod:`torchpt.engines`) runs the events. May import: ``physics``, ``search`` and what lies below.
+An engine (:mod:`torchpt.engines`) runs the stages. May import: ``physics``, ``search`` and the rooms below them.
 """

@@ -1,7 +1,7 @@
-"""Stages of the wavefront turned around: what a loss asks of what a vertex was given, from what it asks of what that hands on.
+"""Vector-Jacobian products of the path stages: cotangents of a stage's outputs in, cotangents of its inputs out.
 
-Each function runs a stage of :mod:`torchpt.paths.vertex` under a tape of its own and goes back along it at once. They are
-tensor functions of single vertices, so that the lane compiler can make kernels of them as it does of the stages.
+Each function runs a stage of :mod:`torchpt.paths.vertex` on an autograd tape of its own and differentiates it at once. They are
+tensor functions of single vertices, so the lane compiler makes kernels of them as it does of the stages.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ __all__ = ["InputCotangents", "Tape", "VertexCotangents", "bounce", "gather", "s
 
 @dataclass
 class Tape:
-    """A wave and what is differentiated in it.
+    """A wave with and without gradients, and the tensors that gradients are computed for.
 
     Attributes:
-        wave: with plain tensors.
-        taped: the same with leaves in place of those tensors that are differentiated.
+        wave: the primal wave, all tensors detached.
+        taped: the same wave with autograd leaves in place of differentiated tensors.
         leaves: these leaves.
-        primals: the tensors that they stand for.
-        captured: tensors that stages use by themselves and that are differentiated too, such as weights of modules.
+        primals: the detached tensor of each leaf.
+        captured: differentiated tensors that stages hold by themselves, such as weights of modules.
     """
 
     wave: Wave
@@ -43,12 +43,12 @@ class Tape:
 
     @property
     def tables(self) -> tuple[Tensor, ...]:
-        """Return all tensors that derivatives are summed for, in the order of their sums."""
+        """Return all tensors with gradient sums, in the order of the sums."""
         return (*self.leaves, *self.captured)
 
     @property
     def differentiates_opacity(self) -> bool:
-        """Return True where it is differentiated by what lets rays pass surfaces."""
+        """Return True if a gradient with respect to opacity, or an opacity texture, is wanted."""
         world = self.taped.context.world
         opacity, maps = world.materials.opacity, world.textures.opacity
         if opacity is None:
@@ -59,14 +59,14 @@ class Tape:
 
 @dataclass(frozen=True)
 class VertexCotangents:
-    """Derivatives of a loss by what n paths hand on, ``(3, n)`` each.
+    """Cotangents of the outputs of a vertex on n paths, ``(3, n)`` each.
 
     Attributes:
-        radiance: with respect to the radiance that they bring.
-        throughput: of the rays that leave.
-        o: of their origins; None where no geometry is differentiated.
+        radiance: of the radiance of the samples.
+        throughput: of the throughput of the rays that leave.
+        o: of their origins; None where geometry is not differentiated.
         d: of their directions; likewise.
-        extra: of what the integrator carries along, by name.
+        extra: of the integrator's own fields, by name.
     """
 
     radiance: Tensor
@@ -78,13 +78,13 @@ class VertexCotangents:
 
 @dataclass(frozen=True)
 class InputCotangents:
-    """Derivatives with respect to what a vertex was given; None where it does not depend on that.
+    """Cotangents of the inputs of a vertex; None where the outputs do not depend on an input.
 
     Attributes:
-        throughput, o, d: of the rays that came ``(3, n)``.
+        throughput, o, d: of the incoming rays ``(3, n)``.
         chance: of :attr:`torchpt.physics.shapes.geometry.Hit.chance` ``(n,)``.
-        extra_leaves: of the tensors that were asked for.
-        extra: of what the integrator carries along, by name.
+        extra_leaves: of the tensors of the :data:`LeafSource`, in its order.
+        extra: of the integrator's own fields, by name.
     """
 
     throughput: Tensor | None
@@ -95,9 +95,9 @@ class InputCotangents:
     extra: Mapping[str, Tensor | None] = field(default_factory=dict)
 
     def of_rays(self, state: PathState, attached: bool) -> Iterator[tuple[str, Tensor | None, Tensor]]:
-        """Yield what is asked of the rays that came: its name, derivatives (None: nothing), and a tensor of their shape.
+        """Yield name, cotangent (None: zero) and a tensor of its shape, for each field of the incoming rays.
 
-        ``attached``: whether geometry is differentiated.
+        ``attached``: True where geometry is differentiated, so that origins and directions have cotangents.
         """
         for name in ("throughput", "o", "d") if attached else ("throughput",):
             yield name, getattr(self, name), state.throughput
@@ -105,6 +105,7 @@ class InputCotangents:
             yield EXTRA + name, found, state.extra[name]
 
 
+#: Returns further tensors that gradients are wanted for, called after the stage ran: recorded gathers, tables, weights.
 LeafSource = Callable[[], Sequence[Tensor]]
 
 
@@ -114,23 +115,23 @@ def bounce(
     model: int,
     vertex: VertexInput,
     next_hit: Hit | None,
-    clear: Callable[[Shadow], Tensor],
+    transmittance: Callable[[Shadow], Tensor],
     cotangents: VertexCotangents,
     extra_leaves: LeafSource,
     splat: Callable[[Splat], tuple[Tensor, Tensor]] | None = None,
 ) -> InputCotangents:
-    """Go back through what happens at surfaces.
+    """Return the VJP of the stage of surfaces.
 
     Args:
-        stage: what happens, such as :func:`torchpt.paths.vertex.bounce`.
-        context: as of the stage, its world with leaves where derivatives are wanted.
-        model: as of the stage.
-        vertex: as of the stage.
-        next_hit: what the rays that leave met; None where geometry is not differentiated.
-        clear: how much of the light of shadow rays gets through.
-        cotangents: what is asked of what the vertex hands on.
-        extra_leaves: tensors whose derivatives are wanted too, asked for after the stage ran.
-        splat: says what splats bring to other pixels ``(3, n)``, differentiable, and the cotangents of these.
+        stage: such as :func:`torchpt.paths.vertex.bounce`.
+        context: as for the stage; its world has autograd leaves where gradients are wanted.
+        model: as for the stage.
+        vertex: as for the stage.
+        next_hit: hits of the rays that leave; None where geometry is not differentiated.
+        transmittance: returns the transmittance ``(n,)`` of shadow rays.
+        cotangents: of the outputs of the vertex.
+        extra_leaves: see :data:`LeafSource`.
+        splat: returns the contributions of splats to their pixels ``(3, n)``, differentiable, and their cotangents.
     """
 
     def found(_: PathState) -> Hit:
@@ -146,7 +147,7 @@ def bounce(
             pairs += [(after.o, cotangents.o), (after.d, cotangents.d)]
         pairs += [(after.extra[name], cotangent) for name, cotangent in cotangents.extra.items()]
         if shadow is not None:
-            passed = clear(shadow)
+            passed = transmittance(shadow)
             if passed.requires_grad:
                 pairs.append((shadow.radiance * passed, cotangents.radiance))
             else:
@@ -163,13 +164,13 @@ def gather(
     radiance: Tensor,
     extra_leaves: LeafSource,
 ) -> InputCotangents:
-    """Go back through light that was met by chance.
+    """Return the VJP of a stage that adds emission to paths.
 
     Args:
-        stage: what was met, such as :func:`torchpt.paths.vertex.emit` or :func:`torchpt.paths.vertex.escape`.
+        stage: such as :func:`torchpt.paths.vertex.emit` or :func:`torchpt.paths.vertex.escape`.
         context: as for :func:`bounce`.
-        vertex: as of the stage.
-        radiance: what is asked of the samples' ``(3, n)``.
+        vertex: as for the stage.
+        radiance: cotangent of the radiance of the samples ``(3, n)``.
         extra_leaves: as for :func:`bounce`.
     """
     with torch.enable_grad():
@@ -177,25 +178,25 @@ def gather(
         return _vjp([(stage(context, vertex).brought, radiance)], input_leaves, extra_leaves)
 
 
-def splatted(clamp: float | None, cotangent: Tensor, splat: Splat, clear: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what splats bring to pixels ``(3, n)``, differentiable, and its cotangents.
+def splatted(clamp: float | None, cotangent: Tensor, splat: Splat, transmittance: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the contributions of splats to their pixels ``(3, n)``, differentiable, and their cotangents.
 
     Args:
-        clamp: bound on what one brings.
-        cotangent: ``(3, H W)`` of the picture, over the samples of a pixel.
-        splat: of n lanes.
-        clear: ``(n,)`` how much of its light gets through.
+        clamp: upper bound of a contribution; None: unbounded.
+        cotangent: ``(3, H W)`` of the picture, divided by the samples a pixel.
+        splat: splats of n lanes.
+        transmittance: ``(n,)`` of their shadow rays.
     """
-    value = splat.light.radiance * clear
+    value = splat.light.radiance * transmittance
     with torch.no_grad():
         counts = (splat.pixel >= 0) & (value.abs() < LARGEST).all(0)
-        pairs = torch.where(counts, take(cotangent, splat.pixel.clamp_min(0)), 0.0)
-    return value if clamp is None else value * clamp_scale(value, clamp), pairs
+        own = torch.where(counts, take(cotangent, splat.pixel.clamp_min(0)), 0.0)
+    return value if clamp is None else value * clamp_scale(value, clamp), own
 
 
 @dataclass(frozen=True)
 class _InputLeaves:
-    """Leaves in the place of what a vertex was given; None where nothing is asked of it."""
+    """Autograd leaves in place of the inputs of a vertex; None where no cotangent is wanted."""
 
     throughput: Tensor
     o: Tensor | None
@@ -205,7 +206,7 @@ class _InputLeaves:
 
 
 def _with_leaves(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _InputLeaves]:
-    """Return the vertex with leaves for what may be differentiated, and these."""
+    """Return the vertex with autograd leaves in place of its differentiable inputs, and these leaves."""
 
     def leaf(x: Tensor) -> Tensor:
         return x.detach().requires_grad_()
@@ -226,6 +227,7 @@ def _with_leaves(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _InputLe
 
 
 def _vjp(pairs: list[tuple[Tensor, Tensor]], input_leaves: _InputLeaves, extra_leaves: LeafSource) -> InputCotangents:
+    """Differentiate (output, cotangent) pairs with respect to the inputs of a vertex and the extra leaves."""
     pairs = [(y, g) for y, g in pairs if y.requires_grad]
     own, rest = leaves(input_leaves), list(extra_leaves())
     grads: Sequence[Any] = [None] * (len(own) + len(rest))

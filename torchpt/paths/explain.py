@@ -1,8 +1,7 @@
-"""Explain what happened along paths: one observer keeps every event, for a path that is printed and for samples that are lost.
+"""Record the events along paths, to print a path or to find the cause of a sample that is not finite.
 
-Where a sample is not finite it is traced again, and the first value that is not finite names the cause: stage by stage what
-goes into a sample is looked at (light that was met, light that was sampled, what the path carries on), and only where one of
-these is not finite it is asked which of their factors was the first.
+A sample that is not finite is traced again. At each vertex the contributions of emission and light sampling, the throughput and
+the next ray are checked; where one of them is not finite, the first of its factors that is not finite names the cause.
 """
 
 from __future__ import annotations
@@ -40,41 +39,41 @@ __all__ = [
 
 
 class ReadablePopulation(Population, Protocol):
-    """Paths whose tensors may be looked at, of an engine that keeps what its stages returned."""
+    """A population whose tensors an observer may read: its engine keeps the outputs of stages."""
 
     @property
     def state(self) -> PathState:
-        """Return the paths as they arrive."""
+        """Return the paths as they arrive at the vertex."""
         ...
 
     @property
     def met(self) -> Hit:
-        """Return what their rays met."""
+        """Return the hits of their rays."""
         ...
 
     @property
     def emissions(self) -> Sequence[tuple[Tensor, Emission]]:
-        """Return the light that lanes met here by chance."""
+        """Return lanes and emission of the emitters and the environment that were hit at this vertex."""
         ...
 
     @property
     def outputs(self) -> Sequence[tuple[int, Tensor, VertexOutput]]:
-        """Return, of the vertex before, number of the BSDF model, lanes of the wave, what its surfaces made of them."""
+        """Return index of the BSDF model, lanes of the wave and stage outputs, all of the vertex before."""
         ...
 
     @property
-    def clear(self) -> Sequence[Tensor]:
-        """Return how much gets through of the light that was sampled at the vertex before, model by model."""
+    def transmittance(self) -> Sequence[Tensor]:
+        """Return the transmittance of the shadow rays of the vertex before, model by model."""
         ...
 
 
 @dataclass(frozen=True)
 class CameraRay:
-    """Camera rays, as they left.
+    """Start of paths at the camera.
 
     Attributes:
-        lanes: ``(n,)`` int64 places in the wave, as in all events.
-        state: of them.
+        lanes: ``(n,)`` int64 indices of the samples in the wave, as in all events.
+        state: the camera rays.
     """
 
     lanes: Tensor
@@ -86,10 +85,10 @@ class Intersection:
     """Hits of rays at a vertex.
 
     Attributes:
-        depth: of the vertex, from 1.
+        depth: number of the vertex, from 1.
         lanes: ``(n,)``.
-        state: with which they came; its radiance is that before the vertex.
-        hit: what the search found.
+        state: the paths as they arrive; their radiance is that before the vertex.
+        hit: the nearest hits.
     """
 
     depth: int
@@ -100,13 +99,13 @@ class Intersection:
 
 @dataclass(frozen=True)
 class EmitterHit:
-    """Light that paths met by chance.
+    """Emission that was added where paths hit an emitter, or nothing.
 
     Attributes:
-        depth: of the vertex.
+        depth: number of the vertex.
         lanes: ``(n,)``.
-        slot: ``(n,)`` of the surface, see :class:`~torchpt.physics.shapes.geometry.Interaction`; None: it is the environment.
-        light: what they met.
+        slot: ``(n,)`` of the emitter, see :class:`~torchpt.physics.shapes.geometry.Interaction`; None: the environment.
+        light: the emission and its MIS weight.
     """
 
     depth: int
@@ -117,36 +116,36 @@ class EmitterHit:
 
 @dataclass(frozen=True)
 class Scattering:
-    """A vertex from which paths may go on.
+    """Light sample and BSDF sample at a vertex.
 
     Attributes:
-        depth: of it.
+        depth: number of the vertex.
         lanes: ``(n,)``.
-        model: number of the BSDF model.
-        output: what its surfaces made of the paths.
-        clear: ``(n,)`` how much of the light that was sampled gets through; None where none was.
+        model: index of the BSDF model.
+        output: outputs of the stage.
+        transmittance: ``(n,)`` of the shadow rays; None where no light was sampled.
     """
 
     depth: int
     lanes: Tensor
     model: int
     output: VertexOutput
-    clear: Tensor | None
+    transmittance: Tensor | None
 
 
 Event = CameraRay | Intersection | EmitterHit | Scattering
-#: From camera rays of a wave to the radiance that they bring, while an observer looks on.
+#: Traces camera rays of a wave with an observer, and returns their radiance ``(3, N)``.
 Trace = Callable[[Wave, PathState, Observer[ReadablePopulation]], Tensor]
 
 
 class Explainer(Observer[ReadablePopulation]):
-    """Keeps what happens along the paths of a walk; to be used for few lanes.
+    """Records all events along the paths of a walk; for few lanes.
 
     Args:
         world: the scene's tensors.
 
     Attributes:
-        events: in order.
+        events: the events in order.
     """
 
     def __init__(self, world: World) -> None:
@@ -154,11 +153,11 @@ class Explainer(Observer[ReadablePopulation]):
         self.events: list[Event] = []
 
     def keep(self, event: Event) -> None:
-        """Take an event."""
+        """Record an event."""
         self.events.append(event)
 
     def began(self, state: PathState) -> None:
-        """Look at camera rays."""
+        """Record camera rays."""
         self.keep(CameraRay(state.lane, state))
 
     def arrived(self, paths: ReadablePopulation) -> bool:
@@ -176,39 +175,39 @@ class Explainer(Observer[ReadablePopulation]):
 
     def left(self, paths: ReadablePopulation) -> None:
         """See :class:`Observer`."""
-        clear = iter(paths.clear)
+        transmittance = iter(paths.transmittance)
         for model, lanes, output in paths.outputs:
-            arrived = None if output.shadow is None else next(clear)
+            arrived = None if output.shadow is None else next(transmittance)
             self.keep(Scattering(paths.depth - 1, lanes, model, output, arrived))
 
 
-#: Causes, and what each says.
+#: Names of causes, and their descriptions.
 CAUSES = {
     "camera": "a camera ray",
-    "surface": "the point that was met, or its normals",
-    "texture": "what textures gave the material, normal and bump maps included",
-    "material": "the parameters of the material",
-    "emission": "light of a surface that the path met",
-    "environment": "light of the environment that the path escaped to",
-    "light": "a light that was sampled: what it brings, or its density",
-    "bsdf": "a value, density or weight of the material's model",
-    "throughput": "what the path carries on: a product of weights, each of them finite",
+    "surface": "a hit point or its normals",
+    "texture": "a value of a texture, normal and bump maps included",
+    "material": "a parameter of a material",
+    "emission": "the contribution of an emitter that a path hit",
+    "environment": "the contribution of the environment to a path that hit nothing",
+    "light": "a light sample: its radiance, weight or contribution",
+    "bsdf": "a value, pdf or weight of a BSDF",
+    "throughput": "the throughput of a path: a product of weights, each of them finite",
     "ray": "the ray that leaves a surface",
-    "preview": "what the first surface shows, of integrators that go no further",
-    "sum": "the sum of light, or its product with the filter's weight, each of them finite",
-    "not repeated": "nothing: traced again by tensor operations, the sample is finite",
+    "preview": "the shading of the first surface, of integrators that stop there",
+    "sum": "the sum of contributions, or its product with the filter weight, each of them finite",
+    "not repeated": "none: traced again by tensor operations, the sample is finite",
 }
 
 
 @dataclass(frozen=True)
 class NonFiniteCause:
-    """The reason why a sample is not finite.
+    """The cause of a sample that is not finite.
 
     Attributes:
         cause: a key of :data:`CAUSES`.
-        nan: whether the first value that was not finite was NaN; else it was infinite.
-        depth: of the vertex, from 1; 0: at the camera, or after the path.
-        slot: of the surface there, see :class:`~torchpt.physics.shapes.geometry.Interaction`; -1: it was on none.
+        nan: True: the first value that was not finite was NaN. False: infinite.
+        depth: number of the vertex, from 1; 0: at the camera, or after the path.
+        slot: of the surface there, see :class:`~torchpt.physics.shapes.geometry.Interaction`; -1: no surface.
     """
 
     cause: str
@@ -218,17 +217,17 @@ class NonFiniteCause:
 
     @property
     def name(self) -> str:
-        """Return the name that samples are counted by."""
+        """Return the name under which samples are counted."""
         return self.cause if self.cause == "not repeated" else f"{'nan' if self.nan else 'infinite'} {self.cause}"
 
 
 def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[SampleId]) -> list[NonFiniteCause]:
-    """The faults of samples, each traced again by tensor operations.
+    """Return the cause of each sample that is not finite, by tracing it again with tensor operations.
 
     Args:
-        trace: by tensor operations.
-        wave: of their render.
-        places: of the samples.
+        trace: traces camera rays with tensor operations.
+        wave: of the render.
+        places: the samples.
     """
     found: dict[SampleId, NonFiniteCause] = {}
     for streams in sorted({(place.first, place.streams) for place in places}):
@@ -239,7 +238,7 @@ def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[SampleId]) -> l
 
 @torch.no_grad()
 def _find_causes(trace: Trace, wave: Wave, places: Sequence[SampleId], streams: Streams) -> list[NonFiniteCause]:
-    """The same for samples of the same streams."""
+    """Return the causes for samples that belong to the same randomizations."""
     finder = _CauseFinder(wave.context.world, len(places))
     x, y, sample = (
         torch.tensor([getattr(place, name) for place in places], device=wave.centre.device)
@@ -248,21 +247,21 @@ def _find_causes(trace: Trace, wave: Wave, places: Sequence[SampleId], streams: 
     state = wave.rays_of(x, y, sample, streams)
     finder.began(state)
     radiance = trace(wave, state, finder)
-    if not finder.full:  # a path that is given up has brought nothing
+    if not finder.full:  # a walk that was ended early returns no radiance
         finder.look("sum", radiance, torch.arange(len(places), device=x.device), 0, None)
     rest = NonFiniteCause("not repeated", False, 0)
     return [cause or rest for cause in finder.causes]
 
 
 class _CauseFinder(Explainer):
-    """Finds the first value of each lane that is not finite, and keeps no events.
+    """Finds the first value of each lane that is not finite, and records no events.
 
     Args:
         world: the scene's tensors.
-        lanes: how many.
+        lanes: number of lanes.
 
     Attributes:
-        causes: by lane; None where none was found yet.
+        causes: cause of each lane; None: not found yet.
     """
 
     def __init__(self, world: World, lanes: int) -> None:
@@ -271,16 +270,16 @@ class _CauseFinder(Explainer):
 
     @property
     def full(self) -> bool:
-        """Return True where every lane has its fault."""
+        """Return True once the cause of every lane is known."""
         return None not in self.causes
 
     def arrived(self, paths: ReadablePopulation) -> bool:
-        """See :class:`Explainer`: paths that carry what is not finite may have no end, and need none here."""
+        """See :class:`Explainer`. End the walk once all causes are known: a path with NaN might go on for ever."""
         super().arrived(paths)
         return self.full
 
     def keep(self, event: Event) -> None:
-        """See :class:`Explainer`."""
+        """Check an event for values that are not finite."""
         slot = None
         depth = 0 if isinstance(event, CameraRay) else event.depth
         if isinstance(event, EmitterHit):
@@ -293,7 +292,7 @@ class _CauseFinder(Explainer):
             self.look(cause, value, event.lanes, depth, slot)
 
     def look(self, cause: str, value: Tensor, lanes: Tensor, depth: int, slot: Tensor | None) -> None:
-        """Blame ``value (C, n)`` or ``(n,)`` for the lanes ``(n,)`` where it is not finite, unless something was before."""
+        """Record ``cause`` for the lanes ``(n,)`` where ``value (C, n)`` or ``(n,)`` is the first that is not finite."""
         value = value if value.dim() == 2 else value[None]
         bad = ~torch.isfinite(value).all(0)
         for n in bad.nonzero().squeeze(1).tolist():  # of KEPT lanes at most
@@ -304,7 +303,7 @@ class _CauseFinder(Explainer):
 
 
 def _checks(event: Event, world: World) -> Iterator[tuple[str, Tensor]]:
-    """Causes with values ``(C, n)`` or ``(n,)``, in the order in which the values come about."""
+    """Yield causes with values ``(C, n)`` or ``(n,)``, in the order in which the stages compute them."""
     if isinstance(event, CameraRay):
         yield "camera", torch.cat((event.state.o, event.state.d))
     elif isinstance(event, Intersection):
@@ -317,14 +316,14 @@ def _checks(event: Event, world: World) -> Iterator[tuple[str, Tensor]]:
 
 
 def _of_vertex(event: Scattering, world: World) -> Iterator[tuple[str, Tensor]]:
-    """The same at a vertex from which paths may go on."""
+    """Yield causes and values of a vertex at which paths scatter."""
     output = event.output
     after, surface, at, direct, drawn = output.leaving, output.surface, output.at, output.direct, output.drawn
     goes_on = after.t_max > 0
     ray = torch.where(goes_on, torch.cat((after.o, after.d)), 0.0)
     brought = torch.zeros_like(after.throughput) if output.shadow is None else output.shadow.radiance
     own = torch.zeros_like(brought) if drawn is not None else after.radiance
-    # Factors may be anything where what they make is finite: a density is infinite of a delta.
+    # A factor may be infinite where the product is finite, such as the pdf of a delta lobe.
     spoiled = ~torch.isfinite(torch.cat((brought, own, after.throughput, ray))).all(0)
 
     def of(cause: str, value: Tensor) -> tuple[str, Tensor]:

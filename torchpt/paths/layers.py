@@ -1,6 +1,6 @@
-"""Layers (AOVs): pictures of something other than light, one entry each, and the values of those of first surfaces.
+"""Layers (AOVs): pictures of quantities other than radiance, and their values at first surfaces.
 
-A layer is a class of this file with a name; :data:`LAYERS` finds it. One more is one more class.
+A layer is a class of this file with a name; :data:`LAYERS` finds it. To add a layer, add a class.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from torchpt.physics.world import World
 __all__ = ["LAYERS", "FilmLayer", "Layer", "Seen", "SurfaceLayer", "surface_layer", "values", "weighted"]
 
 
-# ---- Two sorts of layers: what the first surface is, and what the film knows
+# ---- Base classes: layers of the first surface, and layers of the film's sums
 
 
 @dataclass(frozen=True)
 class Seen:
-    """First surfaces of one BSDF model; n lanes.
+    """First surface points of one BSDF model, as layers read them; n lanes.
 
     Attributes:
         world: the scene's tensors.
-        model: number of the BSDF model.
+        model: index of the BSDF model.
         d: directions ``(3, n)`` of the camera rays.
-        hit: what they met; ``t`` is the distance.
-        at: the points.
-        point: where textures are read; None where the model reads none.
-        centre: ``(3,)`` float64, from the lanes' coordinates to the scene's own.
+        hit: their hits; ``t`` is the distance.
+        at: the surface points.
+        point: texture coordinates of the points; None where the model has no textures.
+        centre: ``(3,)`` float64 to add to the lanes' coordinates for those of the scene.
         dtype: of the lanes.
     """
 
@@ -51,12 +51,12 @@ class Seen:
 
 
 class Layer:
-    """A layer of pictures.
+    """Base class of layers.
 
     Attributes:
-        name: as ``film.aovs`` lists it.
-        channels: their names in EXR files.
-        light: whether it is of the light, so that an integrator without light has none.
+        name: its entry in ``film.aovs``.
+        channels: names of its channels in EXR files.
+        light: True: made of radiance, so integrators that estimate none do not have it.
     """
 
     name: ClassVar[str] = ""
@@ -65,12 +65,12 @@ class Layer:
 
 
 class SurfaceLayer(Layer):
-    """A layer of what the first surface is; 0 where there is none.
+    """A quantity of the first surface; 0 where a camera ray hits nothing.
 
     Attributes:
-        averaged: whether a pixel shows the mean of its samples; else it shows its first one, as names have no average.
-        length: whether it is a length, or a place: counted in the scene's units.
-        uv: whether it reads texture coordinates, whether or not a texture does.
+        averaged: True: a pixel is the mean of its samples. False: its first sample, for identifiers, which have no mean.
+        length: True: a length or position, converted to scene units.
+        uv: True: needs texture coordinates, even in a scene without textures.
     """
 
     averaged: ClassVar[bool] = True
@@ -79,12 +79,12 @@ class SurfaceLayer(Layer):
 
     @classmethod
     def values(cls, seen: Seen) -> Tensor:
-        """Return the values ``(C, n)`` at first surfaces; a pure function of tensors, traced for the compiled loop too."""
+        """Return the values ``(C, n)`` at first surfaces. A pure function of tensors: kernels are traced from it."""
         raise NotImplementedError
 
 
 class FilmLayer(Layer):
-    """A layer that the film makes of its sums of radiance."""
+    """A layer computed from the film's sums of radiance."""
 
     @classmethod
     def of(cls, film: Film, counts: Tensor) -> Tensor:
@@ -92,12 +92,12 @@ class FilmLayer(Layer):
 
         Args:
             film: sums of radiance.
-            counts: samples that each pixel of the picture holds ``(pixels,)``; of a pilot both of its values.
+            counts: number of samples of each pixel ``(pixels,)``; for error probes, of both estimates.
         """
         raise NotImplementedError
 
 
-# ---- The layers, in the order that lists name them
+# ---- The layers, in the order in which lists show them
 
 
 class Albedo(SurfaceLayer):
@@ -166,7 +166,7 @@ class Uv(SurfaceLayer):
 
 
 class ObjectId(SurfaceLayer):
-    """The order of the shape in the scene, from 1; a pixel shows what its first sample met."""
+    """The index of the shape in the scene, from 1; a pixel shows the hit of its first sample."""
 
     name = "object_id"
     channels = ("object_id",)
@@ -179,7 +179,7 @@ class ObjectId(SurfaceLayer):
 
 
 class Alpha(SurfaceLayer):
-    """The share of the pixel that surfaces cover, by their opacity; 0 where the sky is seen. The picture's alpha channel."""
+    """The fraction of the pixel that surfaces cover, opacity included: the alpha channel of the picture."""
 
     name = "alpha"
     channels = ("A",)
@@ -191,7 +191,7 @@ class Alpha(SurfaceLayer):
 
 
 class Variance(FilmLayer):
-    """The variance of the picture's mean, from the spread of its randomizations; infinite where there is only one."""
+    """The variance of the pixel's mean, estimated from the spread of its randomizations; infinite with only one."""
 
     name = "variance"
     channels = ("variance.R", "variance.G", "variance.B")
@@ -205,7 +205,7 @@ class Variance(FilmLayer):
 
 
 class Samples(FilmLayer):
-    """How many samples of light the pixel is a mean of: `sampler.adaptive` says where; a pilot may hold twice as many."""
+    """The number of radiance samples of the pixel. It varies with `sampler.adaptive`; an error probe may have twice as many."""
 
     name = "samples"
     channels = ("samples",)
@@ -217,7 +217,7 @@ class Samples(FilmLayer):
         return counts.double().reshape(film.height, film.width, 1)
 
 
-#: The layers of this file by name.
+#: All layers of this file by name.
 LAYERS: dict[str, type[Layer]] = {
     kind.name: kind
     for kind in tuple(vars().values())
@@ -229,7 +229,7 @@ LAYERS: dict[str, type[Layer]] = {
 
 
 def surface_layer(name: str) -> type[SurfaceLayer]:
-    """Return the layer of a name, which is one of the first surface."""
+    """Return the class of a layer of the first surface."""
     layer = LAYERS[name]
     assert issubclass(layer, SurfaceLayer)
     return layer
@@ -238,7 +238,7 @@ def surface_layer(name: str) -> type[SurfaceLayer]:
 def values(
     names: tuple[str, ...], context: StageContext, model: int, o: Tensor, d: Tensor, hit: Hit, centre: Tensor
 ) -> dict[str, Tensor]:
-    """Return the layers ``names``, each ``(C, n)``, where rays ``o, d`` hit surfaces of BSDF model number ``model``.
+    """Return the layers ``names``, each ``(C, n)``, where rays ``o, d`` hit surfaces of BSDF model ``model``.
 
     ``centre``: see :class:`torchpt.paths.wave.Wave`.
     """
@@ -253,5 +253,5 @@ def values(
 
 
 def weighted(layers: dict[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
-    """Return layers times the weights ``(N,)`` of their samples, where they are averaged."""
+    """Return averaged layers times the filter weights ``(N,)`` of their samples, and the others as they are."""
     return {name: value * weight if surface_layer(name).averaged else value for name, value in layers.items()}

@@ -1,7 +1,7 @@
-"""Samples that are not finite: how many there were, and which the first ones are. They count as black.
+"""Samples that are NaN or infinite: their number, and the identity of the first ones. They count as black.
 
-Renders only count; what is kept is enough to trace a few of them again (:mod:`torchpt.paths.explain`), since a path is a
-function of its pixel, sample and stream.
+A path is a function of its pixel, sample and randomization, so the identity is enough to trace it again and find the cause
+(:mod:`torchpt.paths.explain`).
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from torchpt.physics.samplers import Streams
 
 __all__ = ["KEPT", "NonFinite", "SampleId"]
 
-#: How many are kept, and traced again: the first ones of the picture, whichever thread took them.
+#: How many of the samples are recorded, and traced again: the first of the picture, independent of threads.
 KEPT = 64
 
 
 @dataclass(frozen=True)
 class SampleId:
-    """One sample.
+    """Identity of one sample.
 
     Attributes:
-        sample: its number in the pixel.
-        y, x: the pixel on the whole film.
-        first, streams: which streams share the pixel's samples, see :class:`torchpt.physics.samplers.Streams`.
-        nan: whether it was NaN; else it was infinite.
+        sample: index in the pixel.
+        y, x: row and column of the pixel on the whole film.
+        first, streams: randomizations that share the pixel's samples, see :class:`torchpt.physics.samplers.Streams`.
+        nan: True: it was NaN. False: infinite.
     """
 
     sample: int
@@ -41,7 +41,7 @@ class SampleId:
 
     @property
     def sort_key(self) -> tuple[int, ...]:
-        """By which they are ordered: those of the picture first, then those of pilots, each as they are taken."""
+        """Return the sort key: samples of the picture first, then those of error probes, each in the order of sampling."""
         return self.first, self.sample, self.y, self.x
 
     def __str__(self) -> str:
@@ -50,12 +50,12 @@ class SampleId:
 
 @dataclass
 class NonFinite:
-    """Samples that were not finite.
+    """Counts of samples that were not finite.
 
     Attributes:
-        nan: how many held a NaN.
+        nan: how many had a NaN in a channel.
         infinite: how many of the others were infinite.
-        places: the first :data:`KEPT` of them, in order.
+        places: the first :data:`KEPT` of them, sorted.
     """
 
     nan: int = 0
@@ -64,27 +64,27 @@ class NonFinite:
 
     @property
     def count(self) -> int:
-        """Return how many there were."""
+        """Return the number of samples that were not finite."""
         return self.nan + self.infinite
 
     def add(self, other: NonFinite) -> None:
-        """Count those of ``other`` too."""
+        """Add the counts and samples of ``other``."""
         if other.count:
             self.nan += other.nan
             self.infinite += other.infinite
             self.places = sorted([*self.places, *other.places], key=lambda place: place.sort_key)[:KEPT]
 
     def plain(self) -> dict[str, Any]:
-        """As plain values, for a checkpoint."""
+        """Return a dict of plain values, for a checkpoint."""
         places = [[p.sample, p.y, p.x, p.first, p.streams, p.nan] for p in self.places]
         return {"nan": self.nan, "infinite": self.infinite, "places": places}
 
     @staticmethod
     def read(facts: dict[str, Any]) -> NonFinite:
-        """Return what :meth:`plain` made.
+        """Return the counts from the dict that :meth:`plain` made.
 
         Raises:
-            ValueError: something that it does not make.
+            ValueError: a malformed dict.
         """
         try:
             counts, places = [facts["nan"], facts["infinite"]], facts["places"]
@@ -103,14 +103,14 @@ class NonFinite:
         crop: tuple[int, int, int, int],
         pixel_set: PixelSet | None = None,
     ) -> NonFinite:
-        """Those of a chunk. It looks at every value: to be asked only where some are known to be lost.
+        """Return the counts of a chunk. It reads every value: call it only where some sample is not finite.
 
         Args:
             radiance: ``(3, samples, pixels)``.
-            first_pixel: of the plate's.
-            first_sample: of theirs.
+            first_pixel: index of the first pixel in the pixel set.
+            first_sample: index of the first sample of each pixel.
             crop: ``(x, y, width, height)`` of the picture on the film.
-            pixel_set: what is sampled; None: the picture, by one stream.
+            pixel_set: None: all pixels of the picture, with one randomization.
         """
         bad = ~torch.isfinite(radiance).all(0)
         nan = torch.isnan(radiance).any(0)

@@ -1,4 +1,4 @@
-"""Normal and bump maps: the frame that they tilt, and how much light the relief that they stand for lets through."""
+"""Normal and bump maps: the perturbed shading frame, and the shadowing of the relief that a map stands for."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ __all__ = ["PerturbedNormal", "perturb_normal"]
 
 @dataclass(frozen=True)
 class PerturbedNormal:
-    """What a normal or bump map did to the shading normal."""
+    """The shading normal before a normal or bump map, and the roughness of a surface whose facets tilt as the map does."""
 
-    normal: Tensor  # (3, N) without the map, turned as the frame is
-    alpha2: Tensor  # (N,) squared roughness of a surface whose facets lean as the map does
+    normal: Tensor  # (3, N) shading normal without the map, on the same side as the frame
+    alpha2: Tensor  # (N,) squared roughness for the shadowing term
 
     def shadowing(self, w: Tensor) -> Tensor:
-        """How much of the light from unit directions ``w (3, N)`` the relief lets through ``(N,)``.
+        """Return the shadowing factor ``(N,)``, 0 to 1, of light from unit directions ``w (3, N)``.
 
-        Smith's masking by the facets that the tilt stands for, which takes the place of the hard edge where mapped and true
-        horizon differ (Conty Estevez, Lecocq, Stein, *A Microfacet-Based Shadowing Function to Solve the Bump Terminator
-        Problem*, Ray Tracing Gems, 2019).
+        Smith's masking function in place of the hard edge between the horizons of the two normals (Conty Estevez, Lecocq,
+        Stein, *A Microfacet-Based Shadowing Function to Solve the Bump Terminator Problem*, Ray Tracing Gems, 2019).
         """
         square = dot(w, self.normal).square().clamp_min(1e-12)
         return 2.0 / (1.0 + (1.0 + self.alpha2 * (1.0 - square).clamp_min(0.0) / square).sqrt())
@@ -41,20 +40,21 @@ def perturb_normal(
     at: Interaction,
     side: Tensor | None,
 ) -> tuple[Frame, PerturbedNormal]:
-    """The frame about the normal of a normal or bump map, and what the map did.
+    """Return the shading frame about the normal of a normal or bump map, and the unperturbed normal.
 
-    A normal map's vectors are relative to the shading normal, the tangent along u, and their cross product. A bump map's
-    heights move the surface along its normal (Blinn, *Simulation of Wrinkled Surfaces*, 1978). What is seen from behind is
-    the mirror image. A normal that turns from the eye is mirrored about the surface's own (after Schuessler, Heitz,
-    Hanika, Dachsbacher, *Microfacet-based Normal Mapping*, 2017): all as Mitsuba's ``normalmap`` and ``bumpmap``.
+    The vectors of a normal map are relative to the tangent along u, its cross product with the shading normal, and that normal.
+    The heights of a bump map displace the surface along its normal (Blinn, *Simulation of Wrinkled Surfaces*, 1978). The back
+    of a surface shows the mirror image. A perturbed normal that faces away from the viewer is mirrored about the unperturbed
+    one (after Schuessler, Heitz, Hanika, Dachsbacher, *Microfacet-based Normal Mapping*, 2017). All as Mitsuba's ``normalmap``
+    and ``bumpmap``.
 
     Args:
-        textures: of the model.
-        row: of the materials in it.
-        local: what a normal map holds there ``(3, N)``; None where there is a bump map.
-        slope: of a bump map's heights with respect to u and v ``(N,)``; None where there is a normal map.
-        d: directions of the rays that came.
-        at: the points.
+        textures: textures of the model.
+        row: ``(N,)`` rows of the materials in it.
+        local: ``(3, N)`` values of the normal map; None for a bump map.
+        slope: derivatives of the bump map's height with respect to u and v, ``(N,)`` each; None for a normal map.
+        d: ``(3, N)`` directions of the incoming rays.
+        at: the surface points.
         side: see :class:`torchpt.paths.surface.Surface`.
     """
     assert at.tangent is not None

@@ -1,4 +1,4 @@
-"""Russian roulette: which paths go on, and by how much more those count."""
+"""Russian roulette: end paths at random, and divide the throughput of the survivors by their survival probability."""
 
 from __future__ import annotations
 
@@ -9,25 +9,26 @@ from torchpt.physics.samplers import Dimension, Draws
 
 __all__ = ["DEEP", "DEEP_CAP", "LEAST", "russian_roulette", "survival_probability"]
 
-#: Where nothing else ends paths, those of more vertices than this may be ended whatever they carry. Before it a cap below 1
-#: would only cost: each vertex of a path that loses nothing multiplies its variance by one over the cap.
+#: With ``max_depth`` -1 paths of more vertices than this have a survival probability of at most ``DEEP_CAP``, whatever their
+#: throughput. For shorter paths a cap below 1 only adds noise: each vertex of a path that loses nothing multiplies its variance
+#: by 1 / cap.
 DEEP = 1000
-#: The most that those survive with. A path that loses the share ``a`` of its light has finite variance where the cap is above
-#: ``(1 - a)^2``, and a thousand more vertices on average end one that loses nothing.
+#: Bound of the survival probability beyond ``DEEP`` vertices. A path that loses the share ``a`` of its light at each vertex has
+#: finite variance if the cap is above ``(1 - a)^2``; one that loses nothing ends after another thousand vertices on average.
 DEEP_CAP = 0.999
-#: The least chance that paths survive with where derivatives are wanted. What a path carries says little of its derivative:
-#: that by a colour of 0 is all of what a path would carry if the colour were 1.
+#: Lower bound of the survival probability under differentiation. A small throughput does not mean a small derivative: with
+#: respect to a reflectance of 0 the derivative is the throughput that a reflectance of 1 would give.
 LEAST = 0.25
 
 
 def russian_roulette(chance: Tensor, draws: Draws, alive: Tensor, throughput: Tensor) -> tuple[Tensor, Tensor]:
-    """Return which paths are alive after roulette ``(N,)``, and their throughput ``(3, N)``.
+    """Play roulette; return the mask of paths that are alive ``(N,)`` and their throughput ``(3, N)``.
 
     Args:
-        chance: to survive ``(N,)``, see :func:`survival_probability`.
-        draws: the vertex's random numbers.
-        alive: before.
-        throughput: before.
+        chance: survival probability ``(N,)``, see :func:`survival_probability`.
+        draws: random numbers of the vertex.
+        alive: ``(N,)`` bool before roulette.
+        throughput: ``(3, N)`` before roulette.
     """
     alive = alive & (draws.one(Dimension.ROULETTE) < chance)
     return alive, throughput / torch.where(alive, chance, 1.0)
@@ -36,18 +37,18 @@ def russian_roulette(chance: Tensor, draws: Draws, alive: Tensor, throughput: Te
 def survival_probability(
     chance: float | None, cap: float, brightest: Tensor, eta: Tensor | None, tape: bool = False
 ) -> Tensor:
-    """Return the chance with which paths survive ``(N,)``.
+    """Return the survival probability of paths ``(N,)``.
 
     Args:
-        chance: a constant one; None: as much as a path can still bring, ``min(cap, throughput * eta^2)``.
-        cap: of that.
+        chance: a constant probability; None: ``min(cap, throughput * eta^2)``.
+        cap: upper bound.
         brightest: largest component of the throughput ``(N,)``.
-        eta: index of refraction along the path ``(N,)``, where there is refraction.
-        tape: whether derivatives are wanted: no path is then ended because it carries little, see :data:`LEAST`.
+        eta: index of refraction at the path's end over that at the camera ``(N,)``; None where nothing refracts.
+        tape: True under differentiation: the probability is then at least :data:`LEAST`.
     """
     if chance is not None:
         return torch.full_like(brightest, chance)
-    # Radiance is scaled at refraction; what a path can still bring is not.
+    # Refraction scales radiance by 1 / eta^2, which the path gets back when it leaves the glass.
     expected = brightest if eta is None else brightest * eta * eta
     expected = expected.clamp_max(float(cap))
     return expected.clamp_min(min(LEAST, cap)) if tape else expected

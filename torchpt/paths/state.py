@@ -1,7 +1,7 @@
-"""The records of paths: their state, and what stages read and return.
+"""Records of paths: their state, and the inputs and outputs of stages.
 
-A stage is a pure function of a :class:`StageContext` and a :class:`VertexInput`. What happens at a surface returns a
-:class:`VertexOutput` with every intermediate that an observer may ask for: compiled stages drop what nobody reads.
+A stage is a pure function of a :class:`StageContext` and a :class:`VertexInput`. The stage of a surface returns a
+:class:`VertexOutput` with all intermediate values that an observer may read; compiled stages drop those that nobody reads.
 """
 
 from __future__ import annotations
@@ -50,87 +50,86 @@ __all__ = [
 
 @dataclass(frozen=True)
 class PathState:
-    """One path a lane."""
+    """State of paths, one path a lane."""
 
     o: Tensor  # (3, N) ray origin
     d: Tensor  # (3, N) ray direction, unit
     t_max: Tensor  # (N,) the largest float; 0 once the path has ended
     throughput: Tensor  # (3, N)
     radiance: Tensor  # (3, N) gathered so far
-    pdf: Tensor  # (N,) with which d was drawn: inf where emission counts whole, 0 where it does not count
-    lane: Tensor  # (N,) int64 place in the wave
-    key: Tensor  # (2, N) int32 of the sampler
+    pdf: Tensor  # (N,) density with which d was sampled: inf where emission counts whole, 0 where it does not count
+    lane: Tensor  # (N,) int64 index of the sample in the wave
+    key: Tensor  # (2, N) int32 key of the sampler
     eta: Tensor | None = None  # (N,) index of refraction here over that at the camera; None where nothing refracts
-    #: (3, N) the vertex that d leaves, and its normal as `lights.sample` was given it; None where the choice of lights is the
-    #: same everywhere.
+    #: (3, N) the vertex that d leaves, and the normal that `lights.sample` was given there; None where the light sampler does
+    #: not depend on the point.
     p: Tensor | None = None
     n: Tensor | None = None
-    #: By name what the integrator carries along, see :class:`torchpt.paths.state.Field`; `(N,)` or `(rows, N)` each.
+    #: The integrator's own fields by name, see :class:`torchpt.paths.state.Field`; `(N,)` or `(rows, N)` each.
     extra: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Shadow:
-    """Shadow rays and what the light brings where they pass."""
+    """Shadow rays, and the radiance that is added to a path where its shadow ray is not blocked."""
 
     o: Tensor  # (3, N)
     d: Tensor  # (3, N)
-    t_max: Tensor  # (N,) in units of |d|; 0 where the light brings nothing
-    radiance: Tensor  # (3, N)
+    t_max: Tensor  # (N,) in units of |d|; 0 where the contribution is zero
+    radiance: Tensor  # (3, N) contribution of the light sample
 
 
-# ---- What a render asks of the stages
+# ---- Static configuration of the stages
 
 
 #: mis: light and BSDF sampling combined; bsdf, light: one of them; uniform: directions uniform over the hemisphere.
 STRATEGIES = ("mis", "bsdf", "light", "uniform")
-#: ``t_max`` of a path that goes on; times 0 it is that of one that ended.
+#: ``t_max`` of a path that goes on. Finite, so that its product with 0 is the ``t_max`` of a path that ended.
 T_MAX = torch.finfo(torch.float32).max
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a render asks of the stages; static."""
+    """Static configuration of a render's stages: the same for all lanes and vertices."""
 
     sampler: Points
-    strategy: str
-    rr_prob: float | None
-    dtype: torch.dtype
-    tape: bool  # whether derivatives are wanted
-    attached: bool  # whether they are wanted with respect to geometry
+    strategy: str  # one of STRATEGIES
+    rr_prob: float | None  # constant survival probability; None: by throughput
+    dtype: torch.dtype  # of the lanes
+    tape: bool  # derivatives are wanted
+    attached: bool  # geometry is differentiated too
 
 
-# ---- The records of a path vertex: what its stages read and return
+# ---- The records of a path vertex: inputs and outputs of its stages
 
 
 def no_search(state: PathState) -> Hit:
-    """Stand for a search in stages that must not ask for one."""
+    """Raise an AssertionError: the default search of stages that must not search."""
     raise AssertionError("hits are found between stages where no geometry is differentiated")
 
 
 def no_shadow(state: PathState) -> Shadow:
-    """Return shadow rays for the lanes of paths that bring no light."""
+    """Return shadow rays of length 0 and radiance 0, one for each path."""
     nothing = torch.zeros_like(state.o)
     return Shadow(nothing, nothing, torch.zeros_like(state.t_max), nothing)
 
 
-#: What names of fields begin with where they stand beside those of a path's state.
+#: Prefix of an integrator's fields where their names stand beside those of the path state.
 EXTRA = "extra."
 
 
 @dataclass(frozen=True)
 class Field:
-    """One more number, or several, that an integrator carries along its paths; engines lay them out.
+    """A field of an integrator's own in the path state: one number or several; engines allocate it.
 
     Attributes:
-        name: under which stages find it in ``state.extra``, as ``(N,)``, or ``(rows, N)`` where there are several.
+        name: its key in ``state.extra``, where it is ``(N,)``, or ``(rows, N)`` for several rows.
         rows: how many numbers it has.
         start: its value where paths begin.
-        whole: whether it is an integer of 32 bits (int64 to stages), without derivatives; else it is of the lanes' dtype and
-            is differentiated.
+        whole: True: a 32-bit integer (int64 to stages), without derivatives. False: of the lanes' dtype, differentiated.
 
     Raises:
-        ValueError: no rows, or a start that is not whole where the field is.
+        ValueError: ``rows`` below 1, or a ``start`` with a fraction where the field is whole.
     """
 
     name: str
@@ -143,7 +142,7 @@ class Field:
             raise ValueError(f"the field {self.name}: rows >= 1, and a whole start where it is whole")
 
     def begin(self, like: Tensor) -> Tensor:
-        """Return the values of paths that begin; ``like (N,)`` tells how many, their dtype and device."""
+        """Return the initial values for N paths; ``like (N,)`` has their dtype and device."""
         shape = (len(like),) if self.rows == 1 else (self.rows, len(like))
         dtype = torch.int64 if self.whole else like.dtype
         return torch.full(shape, self.start, dtype=dtype, device=like.device)
@@ -151,21 +150,20 @@ class Field:
 
 @dataclass(frozen=True)
 class StageContext:
-    """Inputs of a stage that do not change from lane to lane.
+    """Inputs of a stage that are the same for all lanes.
 
-    A wave has one for all of its vertices; :meth:`at` adds what belongs to a depth.
+    A wave has one for all of its vertices; :meth:`at` returns it with the values of one vertex.
 
     Attributes:
-        plan: static needs of the render.
+        plan: static configuration of the render.
         world: the scene's tensors.
-        pixel: how large a pixel is in the world, see :func:`torchpt.paths.surface.texture_point_at`; None where nothing
-            asks.
-        salts: names of the random dimensions at this depth, see :func:`torchpt.physics.samplers.salts`.
-        follow_shape: whether points slide along their rays, see :func:`torchpt.physics.shapes.interact`.
-        roulette: the most that roulette lets paths survive with; 0: it does not play.
-        search: finds the hits of rays that leave; called only where ``plan.attached``.
-        camera: that took the picture; None for an integrator without splats.
-        crop: ``(x, y, width, height)`` of the picture on the camera's film; likewise.
+        pixel: ``(5,)`` pixel footprint, see :func:`torchpt.paths.surface.texture_point_at`; None: textures are not filtered.
+        salts: hashed random dimensions of this vertex, see :func:`torchpt.physics.samplers.salts`.
+        follow_shape: True: hit points are intersected anew along their rays, see :func:`torchpt.physics.shapes.interact`.
+        roulette: upper bound of the survival probability; 0: no roulette at this vertex.
+        search: returns the hits of rays that leave; called only where ``plan.attached``.
+        camera: the camera of the picture; None for an integrator without splats.
+        crop: ``(x, y, width, height)`` of the picture on the camera's film; None likewise.
     """
 
     plan: Plan
@@ -185,17 +183,17 @@ class StageContext:
         roulette: float = 0.0,
         search: Callable[[PathState], Hit] = no_search,
     ) -> StageContext:
-        """Return the same at a vertex."""
+        """Return the context of one vertex: a copy with its dimensions, bound of roulette and search."""
         return replace(self, salts=salts, follow_shape=follow_shape, roulette=roulette, search=search)
 
 
 @dataclass(frozen=True)
 class VertexInput:
-    """Inputs of a stage by lane.
+    """Inputs of a stage that differ from lane to lane.
 
     Attributes:
-        state: of the paths as they arrive.
-        hit: what their rays met.
+        state: the paths as they arrive at the vertex.
+        hit: the nearest hits of their rays.
     """
 
     state: PathState
@@ -204,15 +202,15 @@ class VertexInput:
 
 @dataclass(frozen=True)
 class Transmission:
-    """One step of rays through what may let them pass.
+    """Result of one step of rays through surfaces that are not opaque, or through media.
 
     Attributes:
-        on: ``(n,)`` bool: which rays go on; the others end at what they met.
-        o: ``(3, n)`` where those go on from that pass straight on; their distances are counted from where they began.
-        scattered: ``(n,)`` bool: which rays something between surfaces scattered; None: none.
-        state: these rays as they go on: their origins, directions, densities and fields may be others, and ``t_max`` 0 ends
-            them; their throughput stays.
-        chance: ``(n,)`` 1, with the derivative of the chance to stop or to pass; None: it has none.
+        on: ``(n,)`` bool, True where the ray goes on; the others stop at their hit.
+        o: ``(3, n)`` new origins of rays that pass straight on; ``t`` is still counted from where such a ray began.
+        scattered: ``(n,)`` bool, True where a medium scattered the ray; None: nowhere.
+        state: the scattered rays, with new origins, directions, pdfs and fields; ``t_max`` 0 ends a path. Their throughput is
+            not changed.
+        chance: ``(n,)`` ones that carry the derivative of the probability to stop or to pass; None: it has no derivative.
     """
 
     on: Tensor
@@ -224,13 +222,13 @@ class Transmission:
 
 @dataclass(frozen=True)
 class Emission:
-    """Light that paths met by chance.
+    """Emission of emitters, or of the environment, that rays of paths hit.
 
     Attributes:
-        radiance: ``(3, n)`` of it.
-        pdf: ``(n,)`` density in solid angle with which it would have been sampled.
-        weight: ``(n,)`` of MIS.
-        brought: ``(3, n)`` to the samples.
+        radiance: ``(3, n)`` emitted toward the path.
+        pdf: ``(n,)`` density per solid angle with which light sampling would have chosen the point.
+        weight: ``(n,)`` MIS weight.
+        brought: ``(3, n)`` contribution to the sample: throughput × radiance × weight.
     """
 
     radiance: Tensor
@@ -241,15 +239,16 @@ class Emission:
 
 @dataclass(frozen=True)
 class DirectLight:
-    """Light that was sampled at a vertex.
+    """A light sample at a vertex (next event estimation), before its shadow ray is traced.
 
     Attributes:
-        sample: a point on the lights.
+        sample: the points on the lights.
         radiance: ``(3, n)`` of the light, with its textures.
-        reflected: ``(3, n)`` what the BSDF, with the cosine, makes of it.
-        share: ``(n,)`` of that: less than 1 where normals lean, and 0 on a back that is black; None: all.
-        pdf: ``(n,)`` with which the BSDF would have drawn the direction; None where nobody asks.
-        weight: ``(n,)`` of MIS; None: 1.
+        reflected: ``(3, n)`` value of the BSDF times the cosine.
+        share: ``(n,)`` factor of the shading normal: below 1 where perturbed normals shadow, 0 on the back of a one-sided
+            surface and where the two normals disagree; None: 1.
+        pdf: ``(n,)`` density with which BSDF sampling would have chosen the direction; None without MIS.
+        weight: ``(n,)`` MIS weight; None: 1.
     """
 
     sample: LightSample
@@ -262,27 +261,27 @@ class DirectLight:
 
 @dataclass(frozen=True)
 class Drawn:
-    """The next ray as the BSDF gave it."""
+    """The next ray, sampled from the BSDF."""
 
-    o: Tensor  # (3, n) detached
-    d: Tensor  # (3, n) in the world, detached but for what `attach` adds
-    wi: Tensor  # (3, n) local; that of a delta follows its parameters
+    o: Tensor  # (3, n) origin, detached
+    d: Tensor  # (3, n) direction in the world, detached until `attach`
+    wi: Tensor  # (3, n) direction in the local frame; that of a delta lobe is differentiable
     pdf: Tensor  # (n,) detached; inf where the lobe is a delta
     weight: Tensor  # (3, n) = eval / pdf
-    least: Tensor  # (n,) positive where a path may go on
-    sharp: Tensor | None  # (n,) bool: whether the lobe is a delta; None: the model has none
+    least: Tensor  # (n,) positive where the sample is valid and the path may go on
+    sharp: Tensor | None  # (n,) bool, True where the lobe is a delta; None: the model has no delta
     eta: Tensor | None  # see BsdfSample
 
 
 @dataclass(frozen=True)
 class Splat:
-    """Light that a vertex sends to pixels other than its sample's own.
+    """Radiance that a vertex adds to pixels other than the one of its own sample.
 
-    A pixel of a picture of N pixels gets what comes to it, over the samples a pixel. The pixel has no derivative.
+    A pixel holds the sum of its splats divided by the number of samples a pixel. The choice of the pixel has no derivative.
 
     Attributes:
-        pixel: ``(n,)`` int64: of the picture, counted row by row; -1: none.
-        light: shadow rays whose light it is; those with ``t_max`` 0 pass everything.
+        pixel: ``(n,)`` int64 index of the pixel in the picture, row by row; -1: no splat.
+        light: shadow rays with the radiance to add where they arrive; one with ``t_max`` 0 always arrives.
     """
 
     pixel: Tensor
@@ -291,19 +290,19 @@ class Splat:
 
 @dataclass(frozen=True)
 class VertexOutput:
-    """Results of a vertex on surfaces of one BSDF model.
+    """Outputs of a vertex on surfaces of one BSDF model.
 
     Attributes:
-        leaving: the paths with their next rays; of those that ended ``t_max`` is 0.
-        next_hit: what these rays met, where that had to be found already.
-        shadow: shadow rays whose light is still to be added; None where no light is sampled.
-        at: the points.
-        splat: light to other pixels; None where there is none. Only of integrators that say that they have ``splats``.
-        surface: with its material; None where nobody asked for it.
-        direct: the light that was sampled; None where none was.
-        drawn: the direction that the BSDF gave; None where paths end here.
+        leaving: the paths with their next rays; ``t_max`` is 0 where a path ended.
+        next_hit: the hits of these rays, where geometry is differentiated; else None.
+        shadow: shadow rays with contributions still to be added; None where no light is sampled.
+        at: the surface points.
+        splat: radiance for other pixels; None: none. Only integrators that declare ``splats`` return it.
+        surface: the points with their materials; None where the stage did not resolve them.
+        direct: the light sample; None where no light was sampled.
+        drawn: the BSDF sample; None where paths end here.
         carried: ``(3, n)`` throughput before roulette; None where paths end here.
-        chance: ``(n,)`` to survive roulette; None where it does not play.
+        chance: ``(n,)`` survival probability; None without roulette.
     """
 
     leaving: PathState

@@ -1,4 +1,4 @@
-"""Points on surfaces with their materials resolved: textures, shading normals, bumps, opacity, footprints."""
+"""Surface points with their materials resolved: textures, shading normals, bump maps, opacity, texture footprints."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ __all__ = [
 ]
 
 
-#: Seen more slantingly than this (as a cosine), a footprint grows no further.
+#: Lower bound of the cosine by which a footprint grows at grazing angles.
 _SLANT = 1e-3
 
 
 def texture_point_at(world: World, number: int, at: Interaction, pixel: Tensor | None) -> TexturePoint | None:
-    """Where the textures of model ``number`` are read; None where it reads none.
+    """Return the texture coordinates, footprints and vertex colours of points; None where the model has no textures.
 
     Args:
         world: the scene's tensors.
-        number: of the model.
-        at: the points.
-        pixel: how large a pixel is in the world, see :meth:`torchpt.cameras.Camera.pixel`; None: a point.
+        number: index of the BSDF model.
+        at: the surface points.
+        pixel: ``(5,)`` pixel footprint, see :meth:`torchpt.cameras.Camera.pixel`; None: textures are not filtered.
     """
     textures = world.materials.textures[number]
     if textures is None:
@@ -52,10 +52,10 @@ def texture_point_at(world: World, number: int, at: Interaction, pixel: Tensor |
 
 
 def _footprint(at: Interaction, pixel: Tensor) -> Tensor:
-    """Area ``(N,)`` in texture coordinates of what a pixel covers of the surface; 0 where it has no coordinates.
+    """Return the area ``(N,)`` that a pixel covers on the surface, in texture coordinates; 0 where a surface has none.
 
-    Every vertex of a path counts as if the camera saw it directly (Pharr, Jakob, Humphreys, *Physically Based Rendering*,
-    4th edition, 10.1.3). Of the ellipse that a pixel is on the surface, the area: filters here are round.
+    Every vertex of a path is treated as if the camera saw it directly (Pharr, Jakob, Humphreys, *Physically Based Rendering*,
+    4th edition, 10.1.3). Texture filters are isotropic, so the area of the pixel's ellipse is enough.
     """
     assert at.tangent is not None and at.bitangent is not None
     away = torch.addcmul(pixel[0:3, None], at.p, pixel[3], value=-1)
@@ -70,24 +70,24 @@ def _footprint(at: Interaction, pixel: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface point with its material resolved."""
+    """Surface points with their material resolved, of one BSDF model."""
 
-    frame: Frame  # about the shading normal, turned to the side of wo where light does not pass through
-    side: Tensor | None  # (N,) -1 where it was turned around; None where light passes through
+    frame: Frame  # about the shading normal, flipped to the side of wo unless the model transmits
+    side: Tensor | None  # (N,) -1 where the normal was flipped, else 1; None where the model transmits
     front_mask: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
     parameters: bsdfs.Parameters  # lane values of the BSDF
-    wo: Tensor  # (3, N) local
-    perturbed_normal: PerturbedNormal | None  # None where no map bends the normals
+    wo: Tensor  # (3, N) in the frame
+    perturbed_normal: PerturbedNormal | None  # None without a normal or bump map
 
 
 def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Tensor | None = None) -> Surface:
-    """Resolve the material at surface points.
+    """Return surface points with their materials resolved.
 
     Args:
         world: the scene's tensors.
-        number: of the model that all of them have.
-        d: directions ``(3, N)`` of the rays that came.
-        at: the points.
+        number: index of the BSDF model that all points have.
+        d: directions ``(3, N)`` of the incoming rays.
+        at: the surface points.
         pixel: see :func:`texture_point_at`.
     """
     model, row = world.materials.models[number], take(world.materials.row, at.slot)
@@ -113,7 +113,7 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
 def parameters_at(
     world: World, number: int, row: Tensor, at: Interaction, point: TexturePoint | None
 ) -> bsdfs.Parameters:
-    """Lane values of the BSDF ``number`` at rows ``(N,)``; ``point`` where textures are read."""
+    """Return the parameters of BSDF model ``number`` for each lane, at rows ``row (N,)``, textures included."""
     values, textures = bsdfs.gather(world.materials.parameters[number], row), world.materials.textures[number]
     if textures is None:
         return values
@@ -128,7 +128,7 @@ def _filled(
     row: Tensor,
     point: TexturePoint,
 ) -> bsdfs.Parameters:
-    """Values with those that textures give."""
+    """Return the parameters with textured ones replaced by their texture values."""
     filled = dict(values)
     for key, reading in readings.items():
         if isinstance(reading, TextureBinding):
@@ -145,7 +145,7 @@ def _read(world: World, binding: TextureBinding, row: Tensor, point: TexturePoin
 
 
 def _mapped_value(world: World, maps: NodeMap, at: Interaction, coloured: bool) -> Tensor:
-    """What textures by primitive give at points; any number where a surface has none."""
+    """Return the values of per-primitive textures at points; arbitrary where a surface has no texture."""
     row, point = take(maps.nodes, at.slot).clamp_min(0), TexturePoint(surface_uv(world, at))
     first, *others = (world.textures.tables[number] for number in maps.tables)
     if maps.table is None:
@@ -159,7 +159,7 @@ def _mapped_value(world: World, maps: NodeMap, at: Interaction, coloured: bool) 
 
 
 def opacity_map(world: World, at: Interaction) -> Tensor:
-    """What textures make of the opacity ``(N,)`` of surfaces; 1 where they have no such texture."""
+    """Return the factor ``(N,)`` of opacity textures at surface points; 1 where there is no texture."""
     maps = world.textures.opacity
     assert maps is not None
     value = _mapped_value(world, maps, at, False)
@@ -171,7 +171,7 @@ def opacity_map(world: World, at: Interaction) -> Tensor:
 
 
 def emission_map(world: World, at: Interaction) -> Tensor:
-    """What textures make of the emission of surfaces ``(3, N)``; 1 where they have no such texture."""
+    """Return the factor ``(3, N)`` of emission textures at surface points; 1 where there is no texture."""
     maps = world.textures.emission
     assert maps is not None
     value = _mapped_value(world, maps, at, True)
@@ -179,7 +179,7 @@ def emission_map(world: World, at: Interaction) -> Tensor:
 
 
 def shading_normal(world: World, number: int, d: Tensor, at: Interaction, point: TexturePoint | None) -> Tensor:
-    """The shading normal ``(3, N)`` on the shape's own outside, maps included."""
+    """Return the shading normal ``(3, N)`` on the shape's outside, normal and bump maps included."""
     textures = world.materials.textures[number]
     if textures is None or (textures.normal is None and textures.bump is None):
         return at.ns
@@ -198,7 +198,7 @@ def _mapped(
     at: Interaction,
     side: Tensor | None,
 ) -> tuple[Frame, PerturbedNormal]:
-    """The frame about the normal of a normal or bump map, and what the map did."""
+    """Return the shading frame of a normal or bump map, and the unperturbed normal."""
     local = None if textures.normal is None else _read(world, textures.normal, row, point)
     slope = None
     if local is None:

@@ -1,7 +1,7 @@
-"""Let rays pass: surfaces that are not opaque let a ray through by chance, and shadow rays in part.
+"""Opacity: rays of paths pass a surface with probability ``1 - opacity``; shadow rays are weakened by that factor.
 
-Passing is no vertex of a path: the direction, the place it was drawn from and the depth stay. Scenes without opacity have none
-of this.
+Passing a surface is no vertex of a path: direction, depth, and the vertex that the direction was sampled at stay the same.
+Scenes in which everything is opaque run none of this.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["beyond", "non_opaque", "opacity_at", "times_map", "transmit"]
 
 
 def opacity_at(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:
-    """Opacity ``(N,)`` of the surfaces that rays ``o, d`` hit, textures included; ``miss`` where they hit nothing."""
+    """Return the opacity ``(N,)`` of the surfaces that rays ``o, d`` hit, textures included; ``miss`` where there is no hit."""
     assert world.materials.opacity is not None
     missed = hit.prim < 0
     slot = world.geometry.slot(hit.prim).clamp_min(0)
@@ -35,19 +35,19 @@ def opacity_at(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Ten
 
 @dispatched
 def times_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Tensor:
-    """Multiply opacity ``(N,)`` by that of textures in the lanes ``textured (N,)``."""
+    """Multiply ``opacity (N,)`` by the opacity texture in the lanes where the mask ``textured (N,)`` is True."""
     some = textured.nonzero().squeeze(1)
     at = interact(world, take(o, some), take(d, some), rows(hit, some))
     return opacity.index_copy(0, some, take(opacity, some) * opacity_map(world, at))
 
 
 def beyond(world: World, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
-    """Origins behind the surfaces that were hit ``(3, N)``."""
+    """Return ray origins ``(3, N)`` just behind the surfaces that were hit."""
     return offset_origin(world, interact(world, o, d, hit), d)
 
 
 def non_opaque(world: World, prim: Tensor) -> Tensor:
-    """Return which primitives ``(N,)`` may let a ray pass."""
+    """Return True ``(N,)`` for primitives that may let a ray pass."""
     assert world.materials.opacity is not None
     slot = world.geometry.slot(prim).clamp_min(0)
     may_pass = take(world.materials.opacity, slot) < 1
@@ -57,9 +57,9 @@ def non_opaque(world: World, prim: Tensor) -> Tensor:
 
 
 def transmit(context: StageContext, vertex: VertexInput) -> Transmission:
-    """Let rays pass surfaces by chance: each surface stops one with the chance of its opacity.
+    """Stop each ray at its hit with the probability of the opacity there; let the others pass.
 
-    The stage is asked for rays that met something which may let them pass.
+    The stage runs for rays whose hit may let them pass.
     """
     world, state, hit = context.world, vertex.state, vertex.hit
     opacity = opacity_at(world, state.o, state.d, hit, 1.0)

@@ -1,8 +1,7 @@
-"""What happens at a vertex: the stages of path tracing, and the sampling that they are made of.
+"""The stages of path tracing at a vertex, and the sampling routines that they are made of.
 
-A stage is a pure function of lanes (:mod:`torchpt.paths.state` has what they read and return). A Python ``if`` asks only what
-the scene or the settings hold, so a stage leaves out what is not needed, and compiles to one graph whatever the number of
-lanes.
+A stage is a pure function of lanes; :mod:`torchpt.paths.state` has its input and output records. A Python ``if`` depends on the
+scene and the settings only, never on lane values, so a stage compiles to one graph whatever the number of lanes.
 """
 
 from __future__ import annotations
@@ -63,22 +62,22 @@ __all__ = [
 ]
 
 
-# ---- Next event estimation: a point on a light for each surface point, and what it brings there
+# ---- Next event estimation: a light sample for each surface point, and its contribution
 #
-# :func:`shade` = surface -> light -> shadow ray. Whether the ray is blocked is asked later, by whoever runs the stage.
+# :func:`shade` = surface -> light sample -> shadow ray. The engine traces the shadow ray after the stage.
 
 
-#: Shadow rays end this fraction of their length short of the light, beside the offset off its surface.
+#: Fraction of its length by which a shadow ray ends before the light, beside the offset from the light's surface.
 SHORTEN = 1e-4
 
 
 def shade(
     context: StageContext, model: int, state: PathState, at: Interaction
 ) -> tuple[Surface, DirectLight | None, Shadow | None]:
-    """Resolve the material at surface points of a BSDF model and sample a light for each.
+    """Resolve the material at surface points of one BSDF model and sample a light for each.
 
     Returns:
-        The surface; the light and the shadow rays to it (None where no light is sampled).
+        The surface; the light samples and their shadow rays (None where no light is sampled).
     """
     plan, world = context.plan, context.world
     surface, kind = surface_at(world, model, state.d, at, context.pixel), world.materials.models[model]
@@ -104,15 +103,18 @@ def shade(
 def shading_weight(
     world: World, model: int, at: Interaction, surface: Surface, light: Tensor, wi: Tensor
 ) -> Tensor | None:
-    """Return the share ``(n,)`` of light that a surface lets pass before its BSDF is asked; None: all.
+    """Return the factor ``(n,)`` on light from a direction, beside the BSDF: shading normals and one-sided surfaces.
+
+    It is 0 where the direction lies on different sides of the geometric and the shading normal, and on the back of a one-sided
+    surface; perturbed normals shadow in part. None: 1 everywhere.
 
     Args:
         world: the scene's tensors.
-        model: number of the BSDF model.
-        at: the points.
-        surface: with its material.
+        model: index of the BSDF model.
+        at: the surface points.
+        surface: the points with their material.
         light: ``(3, n)`` direction to the light.
-        wi: the same in the surface's frame.
+        wi: the same direction in the surface's frame.
     """
     share: Tensor | None = None
     if has_shading_normals(world, model):
@@ -131,20 +133,20 @@ def sample_light(context: StageContext, model: int, state: PathState, at: Intera
     table = world.lights
     assert table is not None
     draws = Draws(plan.sampler, state.key, context.salts)
-    # The density of a light that a ray meets is asked for from where the ray left. That is where a reflected one will leave,
-    # unless paths keep the vertex itself, or nothing that can be met shines.
+    # The pdf of an emitter that a ray hits is evaluated at the ray's origin. So lights are sampled from the origin of a
+    # reflected ray, unless paths keep the vertex itself, or no emitter can be hit.
     kept = lights.local(table) or table.row_of_prim is None
     x = at.p if kept else offset_origin(world, at, -state.d)
     n = None if world.materials.models[model].transmits else surface.frame.n
     numbers, which = draws.two(Dimension.LIGHT), None
     if table.choice is not None:
-        # One number chooses the light and goes on to the place on it, so that both are stratified together.
+        # The number that chooses the light is used again for the point on it, so that both are stratified together.
         which = lights.fine(torch.stack((numbers[0], draws.one(Dimension.LIGHT_DIGITS))))
     return lights.sample(table, x, which, numbers.to(plan.dtype), OFFSET, n, plan.strategy == "mis")
 
 
 def light_radiance(world: World, light: LightSample) -> Tensor:
-    """Radiance ``(3, N)`` of the points on lights, textures of emission and opacity included."""
+    """Return the radiance ``(3, N)`` of light samples, textures of emission and opacity included."""
     if light.at is None:
         return light.radiance
     share = torch.ones_like(light.radiance)
@@ -158,9 +160,9 @@ def light_radiance(world: World, light: LightSample) -> Tensor:
 def _shadow_ray(
     plan: Plan, world: World, at: Interaction, light: LightSample, radiance: Tensor, weight: Tensor
 ) -> Shadow:
-    """The ray to a point on a light that brings ``radiance``; of length 0 where that is none.
+    """Return the shadow rays of light samples with contributions ``radiance``; of length 0 where the contribution is 0.
 
-    Under a tape it is of length 0 where the sample has no ``weight (n,)``: a colour that is 0 has a derivative.
+    Under differentiation they have length 0 where ``weight (n,)`` is 0 instead: a reflectance of 0 has a derivative.
     """
     o = offset_origin(world, at, light.wi)
     d = light.target - o
@@ -181,35 +183,40 @@ def has_shading_normals(world: World, model: int) -> bool:
 
 
 def same_hemisphere(at: Interaction, surface: Surface, world_wi: Tensor, wi: Tensor) -> Tensor:
-    """Positive where a direction lies on the same side of both normals: a shading normal must not let light through."""
+    """Return values that are positive where a direction lies on the same side of the geometric and the shading normal.
+
+    Elsewhere the shading normal would let light through the surface.
+    """
     same = dot(world_wi, at.ng) * wi[2]
     return same if surface.side is None else same * surface.side
 
 
-# ---- Where a path goes behind a surface, and whether it does
+# ---- BSDF sampling: the next ray of a path, its throughput, roulette
 #
-# :func:`scatter` = :func:`sample_bsdf` (BSDF sampling) -> :func:`attach` (only under derivatives) -> :func:`continue_paths` (throughput and
-# roulette) -> :func:`next_ray`. Each hands a record to the next.
+# :func:`scatter` = :func:`sample_bsdf` (BSDF sampling) -> :func:`attach` (only under derivatives) -> :func:`continue_paths`
+# (throughput and roulette) -> :func:`next_ray`. Each hands a record to the next.
 
 
 @dataclass(frozen=True)
 class Continuation:
-    """Quantities that paths carry on, after roulette."""
+    """Throughput of paths behind a vertex, after roulette."""
 
     alive: Tensor  # (n,) bool
     throughput: Tensor  # (3, n)
     eta: Tensor | None  # see PathState
     carried: Tensor  # (3, n) throughput before roulette
-    chance: Tensor | None  # (n,) to survive roulette; None where it does not play
+    chance: Tensor | None  # (n,) survival probability; None without roulette
 
 
 def scatter(
     context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface
 ) -> tuple[PathState, Hit | None, Drawn, Continuation]:
-    """Draw the next direction from the BSDF and let roulette decide who goes on.
+    """Sample the next direction from the BSDF and play roulette.
 
-    Where derivatives with respect to geometry are wanted, the next hit is found here already, since the throughput must
-    follow both ends of the ray; it is returned beside the state.
+    Where geometry is differentiated the next hit is searched here, since the throughput depends on both ends of the ray.
+
+    Returns:
+        The paths with their next rays, their hits (None: not searched yet), the BSDF samples, throughput and roulette.
     """
     plan = context.plan
     draws = Draws(plan.sampler, state.key, context.salts)
@@ -223,7 +230,7 @@ def scatter(
 
 
 def sample_bsdf(context: StageContext, model: int, at: Interaction, surface: Surface, draws: Draws) -> Drawn:
-    """Draw a direction from the BSDF, or from the hemisphere (strategy ``uniform``), and the ray that leaves along it."""
+    """Sample a direction from the BSDF, or uniformly (strategy ``uniform``), and return the ray along it."""
     plan, world = context.plan, context.world
     kind = world.materials.models[model]
     u = draws.two(Dimension.BSDF).to(plan.dtype)
@@ -238,7 +245,7 @@ def sample_bsdf(context: StageContext, model: int, at: Interaction, surface: Sur
     sharp = torch.isinf(pdf) if kind.delta else None
     d = surface.frame.to_world(sample.wi).detach()
     o = offset_origin(world, at, d)
-    # Least of what must be positive for the path to go on: comparisons cost more than minima.
+    # The minimum of all values that must be positive for a valid sample: minima are cheaper than comparisons.
     least = pdf
     if has_shading_normals(world, model):
         least = torch.minimum(least, same_hemisphere(at, surface, d, sample.wi.detach()))
@@ -250,9 +257,10 @@ def sample_bsdf(context: StageContext, model: int, at: Interaction, surface: Sur
 def attach(
     context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface, drawn: Drawn
 ) -> tuple[Drawn, Hit | None]:
-    """Return what was drawn with derivatives: direction and density are constants, the integrand follows the parameters.
+    """Return the BSDF sample with derivatives: direction and pdf are constants, the integrand depends on the parameters.
 
-    Where geometry is differentiated (``plan.attached``) the next hit is found, and the direction follows both of its ends.
+    Where geometry is differentiated (``plan.attached``) the next hit is searched, and the direction depends on both ends of the
+    ray.
     """
     plan, world = context.plan, context.world
     kind, frame = world.materials.models[model], surface.frame
@@ -266,7 +274,7 @@ def attach(
         again = value * (measure / torch.where(alive & ~torch.isinf(pdf), pdf, 1.0))
         weight = again if sharp is None else torch.where(sharp, weight, again)
     if plan.attached:
-        # The direction of a delta follows the surface that it leaves; the next point slides along it.
+        # The direction of a delta lobe depends on the surface that it leaves; the next hit is intersected anew along it.
         d = follow if sharp is None else torch.where(sharp, frame.to_world(drawn.wi), follow)
     return replace(drawn, d=d, weight=weight), hit
 
@@ -274,13 +282,13 @@ def attach(
 def continue_paths(
     plan: Plan, state: PathState, surface: Surface, drawn: Drawn, draws: Draws, roulette: float
 ) -> Continuation:
-    """Throughput behind the surface, and which paths go on: those that carry something, and that roulette lets live."""
+    """Return the throughput behind the surface and the mask of paths that go on: not black, and alive after roulette."""
     weight = drawn.weight
     if surface.perturbed_normal is not None:
         weight = weight * surface.perturbed_normal.shadowing(drawn.d)
     throughput = state.throughput * weight
     brightest = largest(throughput.detach())
-    # Under a tape a path that carries nothing goes on: what it would meet is the derivative by a colour that is 0.
+    # Under differentiation black paths go on: the light behind is the derivative with respect to a reflectance of 0.
     alive = (drawn.least if plan.tape else torch.minimum(drawn.least, brightest)) > 0
     eta = state.eta
     if eta is not None and drawn.eta is not None:
@@ -301,18 +309,18 @@ def next_ray(
     drawn: Drawn,
     continuation: Continuation,
 ) -> PathState:
-    """Return the paths with the rays that leave the surface; those that ended have rays of length 0."""
+    """Return the paths with the rays that leave the surface; paths that ended have rays of length 0."""
     plan, world = context.plan, context.world
     on = continuation.alive.to(plan.dtype)
-    # What MIS is to know of the density, should the ray meet a light.
+    # The pdf that weights emission by MIS if the ray hits a light.
     if plan.strategy == "mis" and world.lights is not None:
         pdf = drawn.pdf
     else:
-        alone = plan.strategy == "light" and world.lights is not None  # lights are not to be counted twice
+        alone = plan.strategy == "light" and world.lights is not None  # light sampling has counted lights already
         pdf = torch.full_like(drawn.pdf, 0.0 if alone else math.inf)
         if alone and drawn.sharp is not None:
             pdf = torch.where(drawn.sharp, drawn.pdf, pdf)
-    # A path that carries what is not finite must not end unseen: no comparison holds for NaN, so it would count as dark.
+    # A throughput that is NaN ends the path, since comparisons with NaN are false. Added to radiance, it is still reported.
     radiance = state.radiance if plan.tape else state.radiance + continuation.throughput * 0.0
     leaving = PathState(
         o=drawn.o,
@@ -329,18 +337,15 @@ def next_ray(
     if state.p is None:
         return leaving
     n = torch.zeros_like(at.p) if world.materials.models[model].transmits else surface.frame.n
-    # Copies: no two tensors of a state share memory.
+    # Cloned, since no two tensors of a state may share memory.
     return replace(leaving, p=at.p.detach().clone(), n=n.detach().clone())
 
 
-# ---- The stages of the wavefront: pure functions of lanes (:mod:`torchpt.paths.state` has what they read and return)
-#
-# Python ``if`` here asks only what the scene or the settings hold (:class:`~torchpt.paths.state.Plan` is static), so a stage
-# leaves out what is not needed, and compiles to one graph whatever the number of lanes.
+# ---- The stages: camera rays, emitters and environment that rays hit, scattering at surfaces
 
 
 def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
-    """Camera rays through pixels ``x, y (N,)``, at places drawn from the filter (and on the lens, where there is one)."""
+    """Return camera rays through pixels ``x, y (N,)``, at points sampled from the filter (and on the lens, if any)."""
     draws = Draws(plan.sampler, key, salts)
     offset = filter.offset(draws.two(Dimension.PIXEL)).to(plan.dtype)
     lens = draws.two(Dimension.LENS).to(plan.dtype) if camera.lens else None
@@ -349,16 +354,16 @@ def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, k
     ones = torch.ones_like(d)
     forever = torch.full((n,), math.inf, dtype=plan.dtype, device=d.device)
     lane = torch.arange(n, device=d.device)
-    # No two tensors of a state share memory: `radiance` is added to in place.
+    # Cloned, since `radiance` is added to in place and no two tensors of a state may share memory.
     return PathState(o.expand(3, n).clone(), d, forever, ones, torch.zeros_like(d), forever.clone(), lane, key)
 
 
 def emit(context: StageContext, vertex: VertexInput) -> Emission:
-    """Return what paths gather from the emitters that they hit."""
+    """Return the emission of the emitters that paths hit, weighted by MIS."""
     world, state = context.world, vertex.state
     assert world.lights is not None
     at = interact(world, state.o, state.d, vertex.hit, context.follow_shape)
-    # Where lights are chosen by place the density is that at the vertex itself, which is not quite where the ray begins.
+    # Where the light sampler depends on the point, its pdf is that at the vertex itself, which differs from the ray's origin.
     x = state.o if state.p is None else state.p
     radiance, pdf = lights.emitted(world.lights, x, at, state.d, state.n)
     if world.textures.emission is not None:
@@ -367,22 +372,22 @@ def emit(context: StageContext, vertex: VertexInput) -> Emission:
 
 
 def escape(context: StageContext, vertex: VertexInput) -> Emission:
-    """Return what paths gather from the environment that they escape to."""
+    """Return the radiance of the environment along rays that hit nothing, weighted by MIS."""
     assert context.world.lights is not None
     return _gathered(vertex, *lights.environment(context.world.lights, vertex.state.d))
 
 
 def _gathered(vertex: VertexInput, radiance: Tensor, light_pdf: Tensor) -> Emission:
     state, hit = vertex.state, vertex.hit
-    # With the derivative of the chance that the rays came here.
+    # `chance` is 1 with the derivative of the probability that the ray passed the surfaces before.
     throughput = state.throughput if hit.chance is None else state.throughput * hit.chance
-    # PathState.pdf is inf where emission counts whole and 0 where it does not count: the heuristic's own limits.
+    # PathState.pdf is inf where emission counts whole and 0 where it does not count: limits of the power heuristic.
     weight = power_heuristic(state.pdf, light_pdf).detach()
     return Emission(radiance, light_pdf, weight, throughput * radiance * weight)
 
 
 def bounce(context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
-    """Return what surfaces of one BSDF model make of paths: light that is sampled, the next ray, roulette."""
+    """Return the outputs of a vertex on surfaces of one BSDF model: light sample, next ray, roulette."""
     world, state, hit = context.world, vertex.state, vertex.hit
     at = interact(world, state.o, state.d, hit, context.follow_shape)
     if hit.chance is not None:

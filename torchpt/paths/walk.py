@@ -1,8 +1,8 @@
-"""The one loop over the vertices of paths: the order of events along a path, whoever runs them.
+"""The loop over the vertices of paths: the order of stages along a path, the same for every engine.
 
-Forward renders, first surfaces, layers, the first half of a replay and a path that is printed all come through :func:`walk`.
-A *population* is some thousand paths at one vertex. The walk never looks into it but for its depth: an engine made it, and only
-that engine can read it.
+Forward renders, first-surface previews, layers, the forward half of path replay and printed paths all run :func:`walk`. A
+*population* is some thousand paths at one vertex. The walk reads its depth and nothing else: only the engine that made it knows
+its memory.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torchpt.paths.integrators.base import Limits
 
 __all__ = ["KEPT", "Counts", "Engine", "Observer", "Population", "find", "walk"]
 
-#: Vertices, one after the other, that an engine keeps at once for the way back.
+#: Consecutive vertices that an engine keeps at once for a backward pass.
 KEPT = 16
 
 
@@ -24,7 +24,7 @@ class Population(Protocol):
 
     @property
     def depth(self) -> int:
-        """Return the number of the vertex, from 1: the first that a camera ray meets."""
+        """Return the number of the vertex: 1 is the first hit of the camera ray."""
         ...
 
 
@@ -34,12 +34,12 @@ Q = TypeVar("Q", bound=Population, contravariant=True)
 
 @dataclass(slots=True)
 class Counts:
-    """Numbers of lanes of a population by what they met, known to the host: one transfer a vertex.
+    """Numbers of lanes of a population by the kind of their hit, on the host: one transfer a vertex.
 
     Attributes:
-        scatter: lanes by BSDF model.
-        emissive: lanes that met an emitter; they are counted by their models too.
-        missed: lanes that met nothing, where that means something.
+        scatter: lanes on each BSDF model.
+        emissive: lanes that hit an emitter; ``scatter`` counts them too.
+        missed: lanes that hit nothing, if the scene has an environment.
     """
 
     scatter: Sequence[int]
@@ -48,63 +48,63 @@ class Counts:
 
 
 class Engine(Protocol[P]):
-    """An engine runs the events of paths. Verbs take whole populations; none returns a tensor to the walk."""
+    """The stages of a vertex on whole populations. No method returns a tensor to the walk."""
 
     def intersect(self, paths: P) -> bool:
-        """Find the nearest hits; return whether any ray is still on its way. Nothing to do where hits are known already."""
+        """Find the nearest hits, unless they are known; return True if :meth:`transmit` has to be called."""
         ...
 
     def transmit(self, paths: P) -> bool:
-        """Take one step through what lets rays pass: opacity, null, media; return whether any ray is still on its way."""
+        """Take one step through opacity, ``null`` or media; return True while any ray is still in transit."""
         ...
 
     def sort(self, paths: P) -> Counts:
-        """List lanes by what they met."""
+        """List lanes by the kind of their hit: BSDF model, emitter, none."""
         ...
 
     def emit(self, paths: P) -> None:
         """Add the light of emitters that were hit, weighted by MIS."""
 
     def escape(self, paths: P) -> None:
-        """Add the light of the environment, and end the paths that met nothing."""
+        """Add the light of the environment, and end the paths that hit nothing."""
 
     def scatter(self, paths: P, roulette: float) -> P:
         """Sample lights and BSDFs, play roulette, and return the paths that go on.
 
-        ``roulette``: the most that it lets paths survive with; 0: it does not play.
+        ``roulette``: upper bound of the survival probability; 0: no roulette at this vertex.
         """
         ...
 
     def occlude(self, paths: P) -> None:
-        """Resolve pending light: add what gets through."""
+        """Trace the pending shadow rays, and add their contributions times transmittance."""
 
     def terminate(self, paths: P, truncated: bool) -> None:
-        """End all paths that remain; ``truncated``: they are counted as cut short."""
+        """End all paths that remain; ``truncated``: count them as truncated."""
 
 
 class Observer(Generic[Q]):
-    """An observer looks on: replays keep populations, layers read the first surface, a debugger prints one path.
+    """Callbacks of the walk: path replay keeps populations, layers read the first surface, a debugger prints one path.
 
-    The first two may return True, which ends the walk there.
+    :meth:`arrived` and :meth:`sorted` may return True, which ends the walk.
     """
 
     def arrived(self, paths: Q) -> bool:
-        """Look at paths that have their hits but are not sorted yet."""
+        """Read paths that have their hits but are not sorted yet."""
         return False
 
     def sorted(self, paths: Q, counts: Counts) -> bool:
-        """Look at paths that are about to gather light and to scatter."""
+        """Read sorted paths, before emission is added and they scatter."""
         return False
 
     def gathered(self, paths: Q) -> None:
-        """Look at paths that have the light that they met by chance."""
+        """Read paths after the emission of their hits, or of the environment, was added."""
 
     def left(self, paths: Q) -> None:
-        """Look at paths behind a vertex, once the light that was sampled there is resolved."""
+        """Read paths behind a vertex, after its shadow rays were traced."""
 
 
 def find(engine: Engine[P], paths: P) -> None:
-    """Find what the rays of a population meet, behind what lets them pass."""
+    """Find the hits of a population's rays, behind all surfaces and media that they pass."""
     if engine.intersect(paths):
         while engine.transmit(paths):
             pass
@@ -116,11 +116,11 @@ def walk(
     """Take a population from its vertex to the ends of all its paths.
 
     Args:
-        engine: runs the events.
-        paths: of that engine.
-        limits: where paths end.
-        observer: looks on, and may end the walk.
-        until: vertex at which the walk is to stop, before rays to it are searched for; None: it goes on to the ends.
+        engine: runs the stages.
+        paths: a population of that engine.
+        limits: maximum depth, and where roulette begins.
+        observer: gets the callbacks, and may end the walk.
+        until: vertex at which the walk stops, before the rays to it are searched; None: it goes on until all paths ended.
     """
     last, endless = limits.last, limits.endless
     if last < paths.depth:

@@ -1,4 +1,4 @@
-"""What a render fixes for all of its waves, the pixels that samples go to, and what is counted of them."""
+"""The tensors and settings that all waves of a render share, the pixels that samples are added to, and ray counts."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ if TYPE_CHECKING:
 __all__ = ["Bounce", "PixelSet", "RayCounts", "Rays", "Wave", "camera_state", "clamp_scale", "with_detached_geometry"]
 
 
-# ---- Counts of what waves trace
+# ---- Ray counts
 
 
 @dataclass
 class RayCounts:
-    """Counts of rays and paths.
+    """Counts of rays and truncated paths.
 
     Attributes:
-        rays: that were searched for, those of shadows too.
-        truncated: paths that were still alive at :data:`torchpt.paths.integrators.base.ENDLESS`.
+        rays: rays that were traced, shadow rays included.
+        truncated: paths that were still alive at depth :data:`torchpt.paths.integrators.base.ENDLESS`.
     """
 
     rays: int = 0
     truncated: int = 0
 
 
-# ---- What samples go to: sums of the pixels of a picture, or of some of them
+# ---- Pixel sets: the films that samples are added to
 
 
 @dataclass
 class PixelSet:
-    """Pixels that are sampled alike.
+    """Pixels that get the same number of samples, with their films.
 
     Attributes:
         film: sums of radiance.
-        layers: sums of layers of first surfaces, by name.
-        streams: where their samples come from.
-        places: which pixels of the picture they are ``(n,)`` int64, row by row, where the lanes live; None: all.
+        layers: films of the layers of first surfaces, by name.
+        streams: randomizations that their samples belong to.
+        places: ``(n,)`` int64 indices of the pixels in the picture, row by row, on the lanes' device; None: all pixels.
     """
 
     film: Film
@@ -62,29 +62,29 @@ class PixelSet:
     places: Tensor | None = None
 
 
-# ---- The bound on what a single path may bring: ``integrator.clamp``
+# ---- The firefly clamp: ``integrator.clamp``
 
 
 def clamp_scale(values: Tensor, clamp: float) -> Tensor:
-    """Return what samples ``(3, ...)`` are scaled with ``(...)``, so that no channel is beyond ``clamp``; hue stays."""
+    """Return the factors ``(...)`` that keep all channels of samples ``(3, ...)`` within ``clamp``; hue is kept."""
     return clamp / values.abs().amax(0).clamp_min(clamp)
 
 
-# ---- One render's waves: a pure function from a range of pixels and samples to radiance
+# ---- Waves: from a range of pixels and samples to camera rays
 
 
-#: A stage of the surfaces of one BSDF model.
+#: The stage of a vertex on surfaces of one BSDF model.
 Bounce = Callable[[StageContext, int, VertexInput], VertexOutput]
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays that paths begin with in place of a camera's: one for each pixel of a picture of one row.
+    """Rays that paths start with in place of camera rays: one for each pixel of a picture with a single row.
 
     Attributes:
         o: origins ``(3, N)``, in the lanes' coordinates.
         d: unit directions ``(3, N)``.
-        number: ``(N,)`` int64 of the pixels whose random numbers they have; None: of their own.
+        number: ``(N,)`` int64 indices of the pixels whose random numbers they use; None: those of their own pixel.
     """
 
     o: Tensor
@@ -94,19 +94,19 @@ class Rays:
 
 @dataclass(frozen=True)
 class Wave:
-    """All that a render fixes for its waves.
+    """The tensors and settings that all waves of one render share.
 
     Attributes:
-        context: what stages read beside their lanes.
-        integrator: what makes radiance of camera rays.
-        accel: the search.
-        camera: on the whole film.
-        filter: reconstruction filter.
-        sampler: random numbers.
+        context: inputs of stages that are the same for all lanes.
+        integrator: has the stages and limits of the paths.
+        accel: the acceleration structure.
+        camera: the camera of the whole film.
+        filter: the reconstruction filter.
+        sampler: makes the keys of random numbers.
         crop: ``(x, y, width, height)`` of the picture on the film.
-        centre: ``(3,)`` float64, see Space.shift.
-        first: what happens at first surfaces; None where paths go on.
-        given: rays in place of the camera's; None: the camera's.
+        centre: ``(3,)`` float64 origin of the lanes' coordinates, see Space.shift.
+        first: shading of first surfaces, of an integrator that stops there; None: paths go on.
+        given: rays that paths start with; None: camera rays.
     """
 
     context: StageContext
@@ -122,13 +122,21 @@ class Wave:
 
     @property
     def bounce(self) -> Bounce:
-        """Return what happens at surfaces: a stage."""
+        """Return the stage of surfaces."""
         return self.integrator.bounce if self.first is None else self.first.bounce
 
     def rays(
         self, first_pixel: int, pixels: int, first_sample: int, samples: int, pixel_set: PixelSet | None = None
     ) -> PathState:
-        """Rays of consecutive pixels of a plate (the picture, row by row); lanes run over pixels, then over samples."""
+        """Return camera rays of consecutive pixels and samples; lanes run over pixels, then over samples.
+
+        Args:
+            first_pixel: index in the pixel set.
+            pixels: how many.
+            first_sample: index of the first sample of each pixel.
+            samples: how many of each.
+            pixel_set: None: all pixels of the picture, row by row.
+        """
         device = self.centre.device
         x0, y0, width, _ = self.crop
         place = torch.arange(first_pixel, first_pixel + pixels, device=device)
@@ -141,15 +149,15 @@ class Wave:
         )
 
     def rays_of(self, x: Tensor, y: Tensor, sample: Tensor, streams: Streams | None = None) -> PathState:
-        """Return rays of single samples: the camera's, or those that are given.
+        """Return the first rays of single samples.
 
         Args:
-            x: of pixels on the whole film ``(N,)`` int64.
-            y: of them, likewise.
-            sample: of theirs ``(N,)`` int64.
-            streams: which share a pixel's samples; None: those of the picture.
+            x: column of the pixel on the whole film ``(N,)`` int64.
+            y: its row, likewise.
+            sample: index of the sample in the pixel ``(N,)`` int64.
+            streams: randomizations that share the samples of a pixel; None: those of the picture.
         """
-        # Numbered on the whole film, so that a crop shows the very pixels of the full picture.
+        # Pixels are numbered on the whole film, so that a crop has the same samples as the full picture.
         pixel = y * self.camera.resolution[0] + x
         if self.given is not None:
             number = pixel if self.given.number is None else take(self.given.number, pixel)
@@ -160,15 +168,15 @@ class Wave:
         return generate(self.context.plan, self.camera, self.filter, x, y, key, salts(0, self.centre.device))
 
     def with_rays(self, rays: Rays) -> Wave:
-        """Return the wave whose paths begin with rays; no filter weighs them."""
+        """Return the wave whose paths start with ``rays``; samples have no filter weights."""
         n = rays.d.shape[1]
-        # Of filters that weigh nothing nothing is asked: kernels are those of renders.
+        # A filter without weights is kept, so that the kernels of renders fit.
         filter = filter_of("box", rays.d.device) if self.filter.signed else self.filter
         camera = replace(self.camera, resolution=(n, 1))
         return replace(self, camera=camera, crop=(0, 0, n, 1), filter=filter, given=rays)
 
     def with_optional_fields(self, state: PathState) -> PathState:
-        """Return rays with what only some scenes and integrators ask of a path that begins."""
+        """Return the paths with the initial values of fields that only some scenes and integrators use."""
         world = self.context.world
         if any(model.refracts for model in world.materials.models):
             state = replace(state, eta=torch.ones_like(state.t_max))
@@ -185,12 +193,12 @@ class Wave:
 
 
 def with_detached_geometry(wave: Wave) -> Wave:
-    """Return the wave as where no geometry is differentiated: the same values, and hits found between stages."""
+    """Return the wave with geometry not differentiated: the same values, with searches between the stages."""
     return replace(wave, context=replace(wave.context, plan=replace(wave.context.plan, attached=False)))
 
 
 def camera_state(o: Tensor, d: Tensor, key: Tensor) -> PathState:
-    """Return paths that begin with rays ``o, d (3, N)``, d unit, and draw by ``key``."""
+    """Return the state of paths that start with rays ``o, d (3, N)``, d unit; ``key`` is that of their random numbers."""
     n = d.shape[1]
     forever = torch.full((n,), math.inf, dtype=d.dtype, device=d.device)
     lane, nothing = torch.arange(n, device=d.device), torch.zeros_like(d)

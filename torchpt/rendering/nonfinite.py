@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from torchpt.engines.engine import brought
+from torchpt.engines.engine import weighted_radiance
 from torchpt.paths.nonfinite import NonFinite, SampleId
 from torchpt.paths.state import PathState
 from torchpt.paths.wave import Wave
@@ -52,7 +52,7 @@ def describe_sample(scene: Scene, wave: Wave, place: SampleId) -> str:
 
 
 def _trace(wave: Wave, state: PathState, observer: Any) -> Tensor:
-    return brought(wave, state, observer=observer)
+    return weighted_radiance(wave, state, observer=observer)
 
 
 def _named(wave: Wave, place: SampleId) -> str:

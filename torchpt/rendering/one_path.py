@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError
 from torchpt.core.threads import limited_threads
-from torchpt.engines.engine import brought
+from torchpt.engines.engine import weighted_radiance
 from torchpt.paths.explain import CameraRay, EmitterHit, Explainer, Intersection, Scattering
 from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.paths.integrators.path import PathIntegrator
@@ -187,7 +187,7 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         x, y, number = (torch.tensor([value], device=scene.device) for value in (*pixel, sample))
         state = wave.rays_of(x, y, number)
         explainer.began(state)
-        radiance = brought(wave, state, observer=explainer)
+        radiance = weighted_radiance(wave, state, observer=explainer)
         return _PathBuilder(scene, explainer).build(settings, pixel, sample, radiance)
 
 
@@ -236,11 +236,11 @@ class _PathBuilder:
     def _vertex(self, met: Intersection, shone: EmitterHit | None, bounced: Scattering | None) -> Vertex:
         radiance = met.state.radiance if shone is None else met.state.radiance + shone.light.brought
         light, output = None, None if bounced is None else bounced.output
-        if bounced is not None and bounced.clear is not None:
+        if bounced is not None and bounced.transmittance is not None:
             output = bounced.output
             assert output.direct is not None and output.shadow is not None
-            light = self._light_sample(output.direct, output.shadow.radiance, bounced.clear)
-            radiance = torch.addcmul(output.leaving.radiance, output.shadow.radiance, bounced.clear)
+            light = self._light_sample(output.direct, output.shadow.radiance, bounced.transmittance)
+            radiance = torch.addcmul(output.leaving.radiance, output.shadow.radiance, bounced.transmittance)
         wo, escaped = _first_lane(-met.state.d), int(met.hit.prim) < 0
         emission = None if shone is None else self._emission(shone)
         if escaped:
@@ -281,7 +281,7 @@ class _PathBuilder:
             _first_lane(light.brought),
         )
 
-    def _light_sample(self, direct: DirectLight, brought: Tensor, clear: Tensor) -> LightSampleRecord:
+    def _light_sample(self, direct: DirectLight, brought: Tensor, transmittance: Tensor) -> LightSampleRecord:
         sample, reflected = direct.sample, direct.reflected
         return LightSampleRecord(
             light=self.names.light(0 if sample.row is None else int(sample.row)),
@@ -290,8 +290,8 @@ class _PathBuilder:
             arriving=_first_lane(direct.radiance * sample.weight),
             bsdf=_first_lane(reflected if direct.share is None else reflected * direct.share),
             mis_weight=1.0 if direct.weight is None else float(direct.weight),
-            visible=float(clear) if bool((brought != 0).any()) else None,
-            contribution=_first_lane(brought * clear),
+            visible=float(transmittance) if bool((brought != 0).any()) else None,
+            contribution=_first_lane(brought * transmittance),
         )
 
     def _why_ended(self) -> str:

@@ -1,14 +1,14 @@
-"""Waves on a CPU as compiled loops: a thread takes a chunk of lanes through all of its path.
+"""Compiled wavefront path tracing on a CPU: a thread takes a chunk of lanes from the camera to the ends of all paths.
 
-The stages are the same tensor functions that run eagerly; :mod:`torchpt.compiler` makes kernels of them. Between two kernels of
-a chunk there is neither an operator of torch nor a barrier between threads.
+The stages are the tensor functions that also run eagerly; :mod:`torchpt.compiler` compiles them to kernels. Between two kernels
+of a chunk there is neither an operator of torch nor a barrier between threads.
 
 =================  =======================================================================================
-``threads.py``     which thread takes which chunk, and how samples add up to a picture: start here
-``engine.py``      the engine of a thread: the events of a walk by kernels, how they are called, what rays meet
-``programs.py``    the kernels of a render, made when they are first asked for, and shared by structure
-``stages.py``      how the stages are traced: camera rays, search, emission, bounce, ends, layers, the film
-``layout.py``      what a path carries, and where; loads, stores and lists that traces have in common
-``backward.py``    the same for path replay
+``threads.py``     tasks on threads, and adding samples to the film: start here
+``engine.py``      the engine of one thread: kernel calls, ray searches, and the stages of a walk
+``programs.py``    the kernels of a render, compiled on first use, and shared between renders
+``stages.py``      the functions that trace kernels: camera rays, search, emission, bounce, layers, film
+``layout.py``      rows of the path state in memory; loads, stores and lists that kernels share
+``backward.py``    kernels and engine of path replay
 =================  =======================================================================================
 """

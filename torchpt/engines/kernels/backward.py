@@ -1,9 +1,9 @@
-"""Path replay by kernels: chunks traced again over threads, and gone back along vertex by vertex.
+"""Path replay by kernels: chunks are traced again on threads, and cotangents pulled back vertex by vertex.
 
-The operators of the backward pass are nodes as those of the stage are. A look-up in a table that is differentiated is taken
-for an input of the lane, and its derivative is written to a row beside a row of the index: whoever runs the kernel adds them
-up. What is handed from vertex to vertex lies in *slots*, by the samples' own numbers: each path reads there what those behind
-it ask of the ray that left, and leaves what it asks of the ray that came.
+A kernel of a VJP traces a stage with its autograd tape, so operators of the backward pass become nodes as those of the stage
+do. A look-up in a differentiated table becomes an input of the lane; its gradient is written to rows beside a row of the index,
+and the engine adds them up after the kernel. Cotangents between vertices are stored in *slots* by sample: a VJP reads the
+cotangents of the rays that left the vertex, and writes those of the rays that came.
 """
 
 from __future__ import annotations
@@ -49,32 +49,31 @@ __all__ = [
 ]
 
 
-# ---- Vertices of paths gone back along, as kernels: each traces a stage of :mod:`torchpt.paths.adjoint`, its tape included
+# ---- Kernels of VJPs: each traces a function of :mod:`torchpt.paths.adjoint`, its tape included
 
 
-#: What lies in slots: what is asked of a sample's radiance and of its ray, how much of the light of its latest shadow ray got
-#: through, and what its next ray met.
+#: Fields of slots: cotangents of a sample's radiance and ray, transmittance of its latest shadow ray, hit of its next ray.
 SLOTS: Fields = {
     "radiance": ((3,), "f"),
     "throughput": ((3,), "f"),
     "o": ((3,), "f"),
     "d": ((3,), "f"),
-    "clear": ((), "f"),
+    "transmittance": ((), "f"),
     **HIT,
 }
-#: With splats: how much of the light of the latest one got through.
+#: Field of slots with splats: transmittance of the latest splat.
 _SPLAT: Fields = {"splat_transmittance": ((), "f")}
 
 
 def slots_of(layout: Layout) -> Fields:
-    """Return what lies in slots, with what is asked of the numbers that an integrator carries along."""
+    """Return the fields of slots, with the cotangents of the integrator's own fields."""
     carried = layout.wave.integrator.fields
     extra = {EXTRA + own.name: ((own.rows,) if own.rows > 1 else (), "f") for own in carried if not own.whole}
     return {**SLOTS, **extra, **(_SPLAT if layout.wave.integrator.splats else {})}
 
 
 class _RecordedGathers:
-    """Look-ups of a trace in tables that are differentiated."""
+    """Records the gathers of a trace from differentiated tables, and makes them inputs of the lane."""
 
     def __init__(self, tracer: Tracer, kernels: VjpKernels) -> None:
         self.tracer, self.kernels = tracer, kernels
@@ -96,7 +95,7 @@ class _RecordedGathers:
         return self._known[key]
 
     def leaves(self) -> list[Tensor]:
-        """Inputs of the lane, then the tables themselves."""
+        """Return the gathered values as inputs of the lane, then the tables themselves."""
         return [*(leaf for _, _, leaf in self.taken), *self.kernels.tape.leaves]
 
 
@@ -109,8 +108,8 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_shape: bool) ->
     cotangents = VertexCotangents(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
     next_hit = Hit(*(rows[name] for name in HIT)) if kernels.taped.plan.attached else None
 
-    def clear(_: Shadow) -> Tensor:
-        return rows["clear"]
+    def transmittance(_: Shadow) -> Tensor:
+        return rows["transmittance"]
 
     integrator, cotangent = trace.layout.wave.integrator, kernels.cotangent
 
@@ -122,7 +121,7 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_shape: bool) ->
         context = kernels.taped.at(salts, follow_shape, roulette)
         vertex = VertexInput(state, hit)
         input_cotangents = adjoint.bounce(
-            integrator.bounce, context, model, vertex, next_hit, clear, cotangents, gathers.leaves, landed
+            integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, gathers.leaves, landed
         )
     return _stores(trace, gathers, state, input_cotangents, {})
 
@@ -153,25 +152,25 @@ def escape_vjp(trace: Trace) -> Sinks:
 
 
 def store_hits(trace: Trace) -> Sinks:
-    """Write what the rays and shadow rays of an arena met, for the vertex before."""
+    """Write hits of rays and transmittance of shadow rays from an arena to the slots, for the VJP of the vertex before."""
     layout, tracer = trace.layout, trace.tracer
     lane = layout.state.read(tracer, "lane")["lane"]
     hit = layout.state.read(tracer, *HIT)
-    light = layout.state.read(tracer, "clear", "blocked")
+    light = layout.state.read(tracer, "transmittance", "blocked")
     splat = layout.state.read(tracer, *_SPLAT)
     slots = Rows(slots_of(layout))
     with tracer:
-        clear = light["clear"] if "clear" in light else torch.zeros(tracer.lanes)
-        if "blocked" in light and "clear" not in light:
-            clear = (light["blocked"] == 0).to(torch.float32)
-    rows = tuple(slots.nodes(tracer, clear=clear, **hit, **splat))
+        transmittance = light["transmittance"] if "transmittance" in light else torch.zeros(tracer.lanes)
+        if "blocked" in light and "transmittance" not in light:
+            transmittance = (light["blocked"] == 0).to(torch.float32)
+    rows = tuple(slots.nodes(tracer, transmittance=transmittance, **hit, **splat))
     return Sinks(scatter=[Scatter(-1, trace.node(lane), rows, slots=True)])
 
 
 def slots_read(kernels: VjpKernels) -> tuple[str, ...]:
-    """Return the names of what a vertex reads of the slots."""
+    """Return the fields of the slots that the VJP of a vertex reads."""
     extra = tuple(name for name in slots_of(kernels) if name.startswith(EXTRA) or name in _SPLAT)
-    return (*SLOTS, *extra) if kernels.taped.plan.attached else ("radiance", "throughput", "clear", *extra)
+    return (*SLOTS, *extra) if kernels.taped.plan.attached else ("radiance", "throughput", "transmittance", *extra)
 
 
 def _begun(trace: Trace) -> tuple[Any, Tracer]:
@@ -180,7 +179,7 @@ def _begun(trace: Trace) -> tuple[Any, Tracer]:
 
 
 def _inputs(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
-    """State, hit, and what lies in the slots."""
+    """Return path state, hits, and the fields of the slots."""
     state, _ = trace.state()
     hit = trace.hit()
     tracer, lane, slots = trace.tracer, trace.node(state.lane), Rows(slots_of(trace.layout))
@@ -195,7 +194,7 @@ def _stores(
     input_cotangents: InputCotangents,
     added: dict[str, Tensor],
 ) -> Sinks:
-    """Rows of derivatives by tables, and what is asked of the ray that came; ``added`` to what lies there."""
+    """Return stores of table gradients to rows, and of cotangents of the incoming ray to slots, plus ``added`` if given."""
     kernels: Any = trace.layout
     tracer, graph = trace.tracer, trace.tracer.graph
     fields: dict[str, Tensor] = {}
@@ -221,10 +220,10 @@ def _stores(
             if known is not None:
                 mine = [graph.binary("add", "f", a, b) for a, b in zip(known, mine, strict=True)]
             columns[key] = mine
-    places_of: dict[int, int] = {}  # rows of indices
+    places_of: dict[int, int] = {}  # row of each node of an index
 
     def written(nodes: list[int]) -> int:
-        """Rows of their own, side by side; returns the first."""
+        """Append stores of nodes to consecutive new rows; return the first row."""
         first = len(sinks.write)
         sinks.write += [(first + k, node) for k, node in enumerate(nodes)]
         return first
@@ -248,7 +247,7 @@ def _stores(
     return sinks
 
 
-# ---- The kernels of a backward pass: those of the paths as they are traced again, and those that go back along them
+# ---- The kernels of a backward pass: those that trace paths again, and those of VJPs
 
 
 _STAGES = {"bounce": bounce_vjp, "emit": emit_vjp, "escape": escape_vjp}
@@ -258,14 +257,14 @@ class VjpKernels(Kernels):
     """The kernels of one backward pass.
 
     Args:
-        tape: the wave, and what is differentiated in it.
+        tape: the wave and its differentiated tensors.
         packets: see :class:`~torchpt.engines.kernels.layout.Layout`.
-        cotangent: ``(3, H W)`` float32 of the picture, over the samples of a pixel: what splats read.
+        cotangent: ``(3, H W)`` float32 of the picture, divided by the samples a pixel, for the VJP of splats.
 
     Attributes:
-        taped: what stages read where they are gone back along.
-        numbers_of: which of the leaves a tensor is, by its id.
-        eager_vjps: stages that no kernel can be made of, and why.
+        taped: stage context with autograd leaves.
+        numbers_of: index of a leaf by its id.
+        eager_vjps: stages that cannot be compiled, with the reasons.
         slots: rows of :func:`torchpt.engines.kernels.backward.slots_of`.
     """
 
@@ -284,7 +283,7 @@ class VjpKernels(Kernels):
         self.eager_vjps: dict[tuple[Any, ...], str] = {}
 
     def vjp_kernel(self, key: tuple[Any, ...]) -> Kernel | None:
-        """Return the kernel of a stage's VJP; None where none can be made, see :attr:`eager_vjps`.
+        """Return the kernel of a stage's VJP; None if it cannot be compiled, see :attr:`eager_vjps`.
 
         ``key``: ``("bounce", model, roulette, follow_shape)``, ``("emit", follow_shape)`` or ``("escape",)``.
         """
@@ -305,31 +304,31 @@ class VjpKernels(Kernels):
         return KernelsBackward(self)
 
     def bytes_per_lane(self, levels: int) -> int:
-        """Return what a lane costs that keeps so many vertices."""
+        """Return the bytes that a lane takes if ``levels`` vertices are kept."""
         return 4 * (levels + 2) * (self.state.count + self.models + 2)
 
 
-# ---- The engine of one thread that also goes back
+# ---- The backward engine of one thread
 
 
 @dataclass(frozen=True)
 class Mark:
-    """The arena of a vertex as it was before lanes were listed."""
+    """Checkpoint of a replay: copy of an arena before its lanes were listed."""
 
     depth: int
     words: np.ndarray
 
 
 class KernelsBackward(KernelsEngine):
-    """See :class:`torchpt.engines.engine.Backward`: the way back from arena to arena.
+    """Backward engine of kernels in one thread; see :class:`torchpt.engines.engine.Backward`.
 
-    Lanes lie in an arena as they come; stages are gone back through in the order of samples, as :mod:`torchpt.math.sums` asks.
+    Gradients are added in the order of samples, as :mod:`torchpt.math.sums` requires, not in that of lanes.
 
     Args:
         kernels: of the backward pass.
     """
 
-    keeps_splats = False  # it goes back along their vertices
+    keeps_splats = False  # their VJP needs the vertices, not the splats
 
     def __init__(self, kernels: VjpKernels) -> None:
         super().__init__(kernels)
@@ -337,7 +336,10 @@ class KernelsBackward(KernelsEngine):
         self._levels: list[Paths] = []
         self._sample_slots = Memory(kernels.slots.count)
         self._results = Memory(1)
-        self._sorted = Memory(2), np.zeros(CAPACITY, np.uint8)  # slots of a list's lanes, and what sorting takes
+        self._sorted = (
+            Memory(2),
+            np.zeros(CAPACITY, np.uint8),
+        )  # slots of a list's lanes, and scratch memory for sorting
         self._first = 1
 
     def begin(self, span: Span, sums: ChunkGradientSums) -> Paths:
@@ -351,7 +353,7 @@ class KernelsBackward(KernelsEngine):
         return paths
 
     def room(self, depth: int) -> Paths:
-        """See :class:`KernelsEngine`: the first vertices of a part are all kept, of those behind two take turns."""
+        """See :class:`KernelsEngine`. The first `KEPT` vertices of a walk are all kept; behind them two buffers alternate."""
         number = depth - self._first
         if number >= KEPT:
             return self._rooms[number % 2]
@@ -381,8 +383,8 @@ class KernelsBackward(KernelsEngine):
         """See :class:`torchpt.engines.engine.Backward`."""
         n, first = cotangent.shape[1], self.back.slots.first("radiance")
         self._sample_slots.words[:, :n] = 0
-        asked = cotangent if self._weight is None else cotangent * self._weight
-        self._sample_slots.floats[first : first + 3, :n] = asked.numpy()
+        weighted = cotangent if self._weight is None else cotangent * self._weight
+        self._sample_slots.floats[first : first + 3, :n] = weighted.numpy()
 
     def vjp(self, paths: Paths) -> None:
         """See :class:`torchpt.engines.engine.Backward`."""
@@ -405,7 +407,7 @@ class KernelsBackward(KernelsEngine):
             calls.run(kernels.store_hits(), paths.count, paths.arena, paths.arena, slots=self._sample_slots)
 
     def _one(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
-        """Back through one stage on the lanes of a list, by its kernel or by tensor operations."""
+        """Pull cotangents back through one stage on the lanes of a list, by its kernel or by tensor operations."""
         kernel = self.back.vjp_kernel(key)
         slots = self._by_sample(paths, places, count) if kernel is None or kernel.program.sums else None
         if kernel is None:
@@ -424,7 +426,7 @@ class KernelsBackward(KernelsEngine):
                 self.sums.add_rows(number, words[index, :count], values, slots)
 
     def _by_sample(self, paths: Paths, places: Memory, count: int) -> np.ndarray:
-        """Sort the lanes of a list by their samples; return the slots of these, rising."""
+        """Sort the lanes of a list by sample; return their slots in rising order."""
         from torchpt.math.sum_kernels import sort_by_sample
 
         lanes, (memory, taken) = paths.arena.words[self.back.state.first("lane")], self._sorted
@@ -437,7 +439,7 @@ class KernelsBackward(KernelsEngine):
         return self._results if len(self._results.words) >= rows else Memory(rows)
 
     def _eagerly(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
-        """Back through a stage by tensor operations, for what no kernel can be made of."""
+        """Pull cotangents back through a stage by tensor operations, if it cannot be compiled."""
         kernels, integrator, salt = self.back, self.wave.integrator, salts(paths.depth, torch.device("cpu"))
         plan = kernels.taped.plan
         lanes = places.words[0, :count]
@@ -446,8 +448,8 @@ class KernelsBackward(KernelsEngine):
         lane = state.lane.numpy()
         rows = kernels.slots.take(self._sample_slots, lane, slots_read(kernels))
 
-        def clear(_: Shadow) -> Tensor:
-            return rows["clear"]
+        def transmittance(_: Shadow) -> Tensor:
+            return rows["transmittance"]
 
         def landed(splat: Splat) -> tuple[Tensor, Tensor]:
             assert kernels.cotangent is not None
@@ -462,7 +464,7 @@ class KernelsBackward(KernelsEngine):
                 _, model, roulette, follow_shape = key
                 context = kernels.taped.at(salt, follow_shape, roulette)
                 input_cotangents = adjoint.bounce(
-                    integrator.bounce, context, model, vertex, next_hit, clear, cotangents, self._tables, landed
+                    integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, self._tables, landed
                 )
             else:
                 stage = integrator.emit if key[0] == "emit" else integrator.escape
@@ -481,7 +483,7 @@ class KernelsBackward(KernelsEngine):
         return self.back.tape.tables
 
     def vjp_rays(self) -> None:
-        """See :class:`torchpt.engines.engine.Backward`: by tensor operations."""
+        """See :class:`torchpt.engines.engine.Backward`. Runs tensor operations."""
         if not self.back.taped.plan.attached:
             return
         chunk, first, n = self._chunk, self.back.slots.first, self._chunk.pixels * self._chunk.samples
@@ -490,6 +492,6 @@ class KernelsBackward(KernelsEngine):
             pairs = [(x, first(name)) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
             if not pairs:
                 return
-            asked = [torch.from_numpy(self._sample_slots.floats[row : row + 3, :n].copy()) for _, row in pairs]
-            found = torch.autograd.grad([x for x, _ in pairs], self._tables(), asked, allow_unused=True)
+            cotangents = [torch.from_numpy(self._sample_slots.floats[row : row + 3, :n].copy()) for _, row in pairs]
+            found = torch.autograd.grad([x for x, _ in pairs], self._tables(), cotangents, allow_unused=True)
         self.sums.add_each(found)

@@ -1,11 +1,11 @@
-"""The engine by kernels: the events of a walk on a chunk of lanes, in one thread and in memory of its own.
+"""The engine of kernels: the stages of a walk on a chunk of lanes, in one thread and in memory of its own.
 
-A chunk is some thousand samples, one path a lane. Paths lie in an *arena* (:mod:`~torchpt.engines.kernels.layout`); `scatter`
-takes them from one arena to the other, without those that ended. Where the search is inside of the stages (``fused``), lanes
-come with their hits and are listed by what they met: `intersect` and `occlude` have nothing to do, and `sort` reads counters.
-Else rays are searched between stages, and the kernel ``sort_lanes`` adds the light of the last shadow rays, lists lanes and ends
-paths. A path that ends writes its radiance to the slot of its sample; :mod:`~torchpt.engines.kernels.threads` adds slots to
-the film.
+A chunk is some thousand samples, one path a lane. The path state is stored in an *arena*
+(:mod:`~torchpt.engines.kernels.layout`); `scatter` moves the paths that go on from one arena to the other. Where the search is
+part of the stages (``fused``), paths arrive with their hits and lists of lanes: `intersect` and `occlude` do nothing, and
+`sort` reads counters. Else rays are searched between stages, and the kernel ``sort_lanes`` adds the contributions of shadow
+rays, lists lanes and ends paths. A path that ends writes its radiance to the *slot* of its sample;
+:mod:`~torchpt.engines.kernels.threads` adds slots to the film.
 """
 
 from __future__ import annotations
@@ -38,26 +38,26 @@ from torchpt.search import Accel
 __all__ = ["LANES", "Calls", "Chunk", "ChunkSearch", "Halted", "KernelsEngine", "Paths", "bounce_eagerly"]
 
 
-# ---- How one thread calls kernels: counters, and arguments that are filled in once
+# ---- Kernel calls of one thread: counters, and arguments that are prepared once
 
 
 _WORD = {name: k for k, name in enumerate(HEAD)}
 
 
 class Halted(Exception):
-    """The render is to end."""
+    """Raised where a kernel is called after the render was cancelled."""
 
 
 class Calls:
-    """Calls of a render's kernels by one thread.
+    """Calls the kernels of a render from one thread.
 
     Args:
         kernels: of the render.
-        halt: set where the render is to end.
+        halt: set to cancel the render.
 
     Attributes:
         counters: see :class:`torchpt.engines.kernels.layout.Layout`.
-        place: which samples the chunk holds, see :data:`torchpt.engines.kernels.stages.CHUNK_FIELDS`.
+        place: pixels and samples of the chunk, see :data:`torchpt.engines.kernels.stages.CHUNK_FIELDS`.
         slots: radiance of the chunk's samples.
     """
 
@@ -72,17 +72,17 @@ class Calls:
         self._uniforms = {"place": self.place.ctypes.data}
 
     def unbind(self) -> None:
-        """Let go of the render and its kernels."""
+        """Drop all references to the render and its kernels."""
         del self.kernels, self._halt
         self._prepared.clear()
         self._keep.clear()
 
     def rebind(self, kernels: Kernels, halt: threading.Event) -> None:
-        """Go on with the kernels of another render of the same structure, whose memory looks the same."""
+        """Use the kernels of another render of the same structure, which has the same memory layout."""
         self.kernels, self._halt = kernels, halt
 
     def clear(self) -> None:
-        """Start to count anew."""
+        """Set all counters to 0."""
         self.counters[:] = 0
 
     def counted(self) -> tuple[int, list[int]]:
@@ -90,7 +90,7 @@ class Calls:
         return int(self.counters[0]), self.counters[1 : self.kernels.models + 3].tolist()
 
     def set_dimensions(self, depth: int, step: int = 0) -> None:
-        """Set the vertex, or the step on the way there, whose random dimensions kernels draw from."""
+        """Set the random dimensions of kernels to those of a vertex, and of a step of transmission before it."""
         known = self._salts.get((depth, step))
         if known is None:
             known = self._salts[depth, step] = salts(depth, torch.device("cpu"), step)
@@ -110,15 +110,15 @@ class Calls:
 
         Args:
             kernel: of the render.
-            count: how many lanes.
+            count: number of lanes.
             source: the arena that it reads.
             target: the arena that it writes.
-            places: the lanes, where the kernel takes them by a list.
-            lists: what it notes lanes in.
-            slots: where it writes what belongs to samples; the radiance's own where None.
+            places: list of lanes, if the kernel reads lanes by a list.
+            lists: lists that it appends lanes to.
+            slots: memory for results by sample; None: the radiance of the samples.
 
         Raises:
-            Halted: where the render is to end.
+            Halted: the render was cancelled.
         """
         if self._halt.is_set():
             raise Halted
@@ -138,7 +138,7 @@ class Calls:
         call(address, count)
 
     def _arguments(self, kernel: Kernel) -> tuple[Any, Any, int, tuple[tuple[int, str], ...], range]:
-        """A kernel's arguments: what is always the same is filled in, and it is said where the rest goes."""
+        """Return the argument words of a kernel with constant ones filled in, and the indices of the others."""
         program = kernel.program
         start = len(HEAD) + len(program.uniforms)
         words = (ctypes.c_int64 * (start + program.lists))()
@@ -148,11 +148,11 @@ class Calls:
         if self.kernels.search is not None:
             words[_WORD["search"]] = ctypes.addressof(self.kernels.search)
         uniforms = tuple((len(HEAD) + k, name) for k, name in enumerate(program.uniforms))
-        self._keep.append(kernel)  # so that its id stays its own
+        self._keep.append(kernel)  # a reference, so that its id is not reused
         return words, program.call, ctypes.addressof(words), uniforms, range(start, start + program.lists)
 
 
-# ---- A vertex by tensor operations, for models that no kernel can be made of, on the lanes of an arena
+# ---- A vertex by tensor operations on lanes of an arena, for models that cannot be compiled
 
 
 def bounce_eagerly(
@@ -166,21 +166,21 @@ def bounce_eagerly(
     start: int,
     depth: int,
 ) -> int:
-    """Do what the kernel of a bounce does where the search is no part of it.
+    """Run the stage of surfaces with tensor operations in place of its kernel.
 
     Args:
         kernels: of the render.
-        model: its number.
-        roulette: see :func:`torchpt.paths.vertex.bounce`.
-        source: the arena of the paths.
-        target: where they go, from lane ``start`` on.
-        places: the lanes concerned.
-        count: how many.
-        start: first place in ``target``.
-        depth: of the vertex.
+        model: index of the BSDF model.
+        roulette: see :class:`torchpt.paths.state.StageContext`.
+        source: the arena to read paths from.
+        target: the arena to write them to.
+        places: list of the lanes.
+        count: number of lanes.
+        start: first lane in ``target``.
+        depth: number of the vertex.
 
     Returns:
-        How many shadow rays it asks for.
+        The number of shadow rays, those of splats included.
     """
     rows, lanes = kernels.state, places.words[0, :count]
     with torch.no_grad():
@@ -204,14 +204,14 @@ def _named(light: Shadow) -> dict[str, Tensor]:
     return {"o": light.o, "d": light.d, "t": light.t_max, "radiance": light.radiance}
 
 
-# ---- What the rays of a chunk meet, where that is asked between stages: by packets, or by the search structure
+# ---- Searches between stages: by packet kernels, or by the acceleration structure
 #
-# Surfaces that are not opaque let rays pass by chance and shadow rays in part: such rays move to an arena of their own and are
-# searched again from behind the surface, until each is stopped or has met nothing.
+# Rays that hit surfaces that are not opaque move to an arena of their own and are searched again from behind the surface, until
+# each is stopped or hits nothing.
 
 
 class ChunkSearch:
-    """The search of one thread's chunks.
+    """Searches the rays of one thread's chunks.
 
     Args:
         calls: of the thread.
@@ -223,20 +223,20 @@ class ChunkSearch:
         self.transmitting = Memory(1)
 
     def nearest(self, arena: Memory, count: int) -> None:
-        """Write the hits of the arena's rays beside them: the nearest surfaces, opaque or not."""
+        """Find the nearest hits, opaque or not, of the arena's rays, and write them to the arena."""
         self._trace(arena, self.kernels.state, "o", "d", "t_max", count)
 
     def transmit(self, arena: Memory, count: int, depth: int, step: int) -> int:
-        """Take a step through what lets rays pass.
+        """Take one step through surfaces or media that rays may pass.
 
         Args:
-            arena: of the paths; hits of rays that are held up are written there.
-            count: how many paths there are, at the first step; then how many rays are on their way.
-            depth: of the vertex that they come to.
-            step: of the rays, from 0.
+            arena: of the paths; hits of rays that stop are written to it.
+            count: number of paths at step 0; then number of rays in transit.
+            depth: number of the vertex that the rays come to.
+            step: from 0.
 
         Returns:
-            How many rays are still on their way.
+            The number of rays still in transit.
         """
         kernels, calls = self.kernels, self.calls
         calls.set_dimensions(depth, step)
@@ -258,7 +258,7 @@ class ChunkSearch:
         return left
 
     def light(self, arena: Memory, count: int) -> None:
-        """Write how much of the light of the arena's shadow rays arrives."""
+        """Trace the arena's shadow rays, and write to it whether they are blocked, or their transmittance."""
         kernels, calls, rows = self.kernels, self.calls, self.kernels.state
         if not kernels.packets:
             o, d, t_max = (_row(arena.floats, rows, f"shadow_{name}", n) for name, n in (("o", 3), ("d", 3), ("t", 1)))
@@ -278,7 +278,7 @@ class ChunkSearch:
             source, target = target, source
 
     def _trace(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: int) -> None:
-        """The nearest surface of each ray, opaque or not."""
+        """Find the nearest hit, opaque or not, of each ray in the rows ``o, d, t_max``."""
         if self.kernels.packets:
             self.calls.run(self.kernels.search_nearest(rows is self.kernels.passed), count, memory, memory)
             return
@@ -301,16 +301,16 @@ def _row(memory: np.ndarray, rows: Rows, name: str, count: int) -> np.ndarray:
     return memory[first : first + count]
 
 
-# ---- The engine by kernels: the events of a walk on a chunk of lanes, in one thread and in memory of its own
+# ---- The engine of one thread
 
 
-#: Lanes of a chunk.
+#: Greatest number of lanes of a chunk.
 LANES = CAPACITY - VECTORS.width
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Consecutive pixels of a plate (None: of the picture), and consecutive samples of each."""
+    """Consecutive pixels of a pixel set (None: of the picture), and consecutive samples of each."""
 
     first_pixel: int
     pixels: int
@@ -321,20 +321,20 @@ class Chunk:
 
 @dataclass
 class Paths:
-    """Paths of a chunk at a vertex.
+    """The population of this engine: paths of a chunk at a vertex.
 
     Attributes:
-        arena: what they carry, lane by lane.
-        lists: lanes by what they met: by model, at an emitter, nowhere.
-        depth: of the vertex.
-        count: how many lanes there are.
-        arrived: whether their hits are in the arena already.
-        listed: whether lanes are in the lists already.
-        shadows: whether light from the vertex before is still pending.
-        in_transit: how many rays are on their way through what lets them pass.
-        step: how many times they went on.
-        groups: how many lanes each model has.
-        places: how many lanes are in each list.
+        arena: the path state, a column a lane.
+        lists: lists of lanes: one a BSDF model, then of lanes on emitters, then of lanes without a hit.
+        depth: number of the vertex.
+        count: number of lanes.
+        arrived: True: hits are in the arena.
+        listed: True: lanes are in the lists.
+        shadows: True: contributions of shadow rays from the vertex before are still pending.
+        in_transit: number of rays that may still pass their hits.
+        step: number of steps that these took.
+        groups: number of lanes on each model.
+        places: number of lanes in each list.
     """
 
     arena: Memory
@@ -351,17 +351,17 @@ class Paths:
 
 
 class KernelsEngine:
-    """The engine of one thread: takes chunks through their paths.
+    """The engine of kernels in one thread: traces chunks of paths.
 
     Args:
         kernels: of the render.
-        halt: set where the render is to end; None: it never is.
+        halt: set to cancel the render; None: it cannot be cancelled.
 
     Attributes:
         slots: radiance of the chunk's samples.
-        shown: layers of the chunk's samples, once they were asked for.
-        tally: rays and paths of the chunk.
-        splats: what its samples bring to other pixels, where it ``keeps_splats``.
+        shown: layers of the chunk's samples; None before `layers` was called.
+        tally: counts of rays and truncated paths of the chunk.
+        splats: splats of the chunk's samples, if ``keeps_splats``.
     """
 
     keeps_splats: ClassVar[bool] = True
@@ -378,15 +378,15 @@ class KernelsEngine:
         self._rooms = [self._room() for _ in range(2)]
 
     def _room(self) -> Paths:
-        """Memory for the paths of a vertex."""
+        """Return new memory for the paths of a vertex."""
         return Paths(Memory(self.kernels.state.count), [Memory(1) for _ in range(self.kernels.models + 2)])
 
     def room(self, depth: int) -> Paths:
-        """Return the memory of a vertex: two take turns."""
+        """Return the memory for a vertex; two buffers alternate."""
         return self._rooms[depth % 2]
 
     def unbind(self) -> int:
-        """Let go of the render; return the bytes that are kept for another one of the same structure."""
+        """Drop all references to the render; return the bytes of memory kept for another one of the same structure."""
         held = [
             self.slots,
             *self.search.passed,
@@ -400,7 +400,7 @@ class KernelsEngine:
         return sum(memory.words.nbytes for memory in held)
 
     def rebind(self, kernels: Kernels, halt: threading.Event) -> None:
-        """Go on with another render of the same structure, after `unbind`: fresh memory would cost time."""
+        """Reuse the memory for another render of the same structure, after `unbind`."""
         self.kernels, self.wave = kernels, kernels.wave
         self.calls.rebind(kernels, halt)
         self.search.kernels = kernels
@@ -413,13 +413,13 @@ class KernelsEngine:
         return self.tally
 
     def mark_lost(self) -> None:
-        """Make samples NaN, all of whose paths ended, where a splat of theirs is not finite."""
+        """Set samples to NaN whose splats are not finite, once all paths ended."""
         for lanes in self._lost:
             self.slots.floats[:3, lanes] = np.nan
         self._lost.clear()
 
     def layers(self, chunk: Chunk, names: tuple[str, ...]) -> int:
-        """Fill ``shown`` with layers of the first surfaces, channel after channel; return how many rays it took."""
+        """Fill ``shown`` with layers of the first surfaces, channel after channel; return the number of rays."""
         count = chunk.pixels * chunk.samples
         channels = sum(len(LAYERS[name].channels) for name in names)
         if self.shown is None or len(self.shown.words) != channels:
@@ -429,7 +429,7 @@ class KernelsEngine:
         return count
 
     def start(self, chunk: Chunk) -> None:
-        """Say which samples are next."""
+        """Set the pixels and samples of the next chunk."""
         wave, pixel_set = self.wave, chunk.pixel_set
         streams = wave.sampler.streams if pixel_set is None else pixel_set.streams
         x, y, width, _ = wave.crop
@@ -443,7 +443,7 @@ class KernelsEngine:
         ).astype(np.int32)  # fmt: skip
 
     def spawn(self, chunk: Chunk) -> Paths:
-        """Start the paths of a chunk by its rays; where the search is inside of the stages with their first hits."""
+        """Return the population of a chunk's camera rays, with their first hits if the search is part of the stages."""
         self.start(chunk)
         kernels, calls, given = self.kernels, self.calls, self.wave.given
         self.splats, self._lost = [], []
@@ -454,7 +454,7 @@ class KernelsEngine:
         calls.clear()
         calls.set_dimensions(0)
         own = slice(chunk.first_pixel, chunk.first_pixel + chunk.pixels)
-        if places is not None or given is not None:  # they lie in the arena of the next vertex until then
+        if places is not None or given is not None:  # the kernel reads them from the arena of the next vertex
             source = self.room(2).arena
         if places is not None:
             chosen = places[own].numpy().astype(np.int32)
@@ -471,13 +471,13 @@ class KernelsEngine:
         return paths
 
     def _begin(self, paths: Paths, depth: int, count: int) -> Paths:
-        """Take memory for the paths of a vertex."""
+        """Initialize the memory of a vertex."""
         paths.depth, paths.count, paths.shadows, paths.groups = depth, count, False, ()
         paths.in_transit = paths.step = 0
         paths.arrived = paths.listed = self.kernels.fused
         return paths
 
-    # -- the events of a walk
+    # -- the stages of a walk
 
     def intersect(self, paths: Paths) -> bool:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -505,7 +505,7 @@ class KernelsEngine:
         return Counts(paths.groups, emissive, places[kernels.missed] if kernels.has_environment else 0)
 
     def _sort_lanes(self, paths: Paths) -> None:
-        """Add the light that was pending, list lanes by what they met, and end those that met nothing that shines."""
+        """Add pending contributions, list lanes by their hits, and end paths without a hit if there is no environment."""
         calls = self.calls
         calls.clear()
         calls.run(self.kernels.sort_lanes(paths.shadows), paths.count, paths.arena, paths.arena, lists=paths.lists)
@@ -525,8 +525,8 @@ class KernelsEngine:
     def terminate(self, paths: Paths, truncated: bool) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
         kernels, calls = self.kernels, self.calls
-        if not paths.groups:  # not sorted: all end where they are
-            if paths.listed:  # those that had ended before are no longer here
+        if not paths.groups:  # not sorted: all paths end
+            if paths.listed:  # compacted: paths that had ended are not in the arena
                 paths.count, _ = calls.counted()
             paths.arena.words[kernels.state.first("prim"), : paths.count] = -1
             paths.arena.floats[kernels.state.first("t_max"), : paths.count] = 0.0
@@ -566,7 +566,7 @@ class KernelsEngine:
         return after
 
     def occlude(self, paths: Paths) -> None:
-        """See :class:`torchpt.paths.walk.Engine`; the light itself is added where lanes are listed."""
+        """See :class:`torchpt.paths.walk.Engine`. The kernel ``sort_lanes`` adds the contributions later."""
         rows = self.kernels.state
         paths.shadows = "shadow_o" in rows
         if "splat_o" in rows:
@@ -575,18 +575,22 @@ class KernelsEngine:
             self.search.light(paths.arena, paths.count)
 
     def _splat(self, paths: Paths) -> None:
-        """Note the light of splats that gets through; one that is not finite is left out, and its sample's own light too."""
+        """Record splats that arrive. One that is not finite is left out and makes its sample NaN."""
         rows, floats, words, n = self.kernels.state, paths.arena.floats, paths.arena.words, paths.count
         splat, shadow = (slice(rows.first(f"{name}_o"), rows.first(f"{name}_radiance")) for name in ("splat", "shadow"))
-        own = words[shadow, :n].copy()  # the search reads rays in the rows of shadow rays
+        own = words[shadow, :n].copy()  # saved: the search reads the rows of shadow rays
         words[shadow, :n] = words[splat, :n]
         self.search.light(paths.arena, n)
         words[shadow, :n] = own
-        clear = floats[rows.first("clear"), :n] if "clear" in rows else words[rows.first("blocked"), :n] == 0
-        floats[rows.first("splat_transmittance"), :n] = clear
+        transmittance = (
+            floats[rows.first("transmittance"), :n]
+            if "transmittance" in rows
+            else words[rows.first("blocked"), :n] == 0
+        )
+        floats[rows.first("splat_transmittance"), :n] = transmittance
         pixel, first = words[rows.first("splat_pixel"), :n], rows.first("splat_radiance")
         value = floats[first : first + 3, :n] * floats[rows.first("splat_transmittance"), :n]
-        comes, finite = (pixel >= 0) & (clear != 0), (np.abs(value) < LARGEST).all(0)
+        comes, finite = (pixel >= 0) & (transmittance != 0), (np.abs(value) < LARGEST).all(0)
         lane, on = words[rows.first("lane"), :n].astype(np.int64), comes & finite
         if self.keeps_splats:
             parts = lane[on], pixel[on].astype(np.int64), value[:, on]
@@ -597,7 +601,7 @@ class KernelsEngine:
 
 
 class _Layers(Observer[Paths]):
-    """Reads layers off first surfaces, and ends the walk there."""
+    """Evaluates layers of first surfaces, and ends the walk there."""
 
     def __init__(self, worker: KernelsEngine, names: tuple[str, ...]) -> None:
         self.worker, self.names = worker, names

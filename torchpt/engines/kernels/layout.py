@@ -1,4 +1,4 @@
-"""What kernels read and write: the rows of a path in its arena, and the trace that turns a stage into a kernel."""
+"""Memory of kernels: the rows of the path state in an arena, and the trace that turns a stage into a kernel."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ __all__ = [
 ]
 
 
-# ---- What the rows of an arena hold: the numbers of a path's state, of a hit, of a shadow ray
+# ---- Rows of an arena: fields of the path state, of a hit, of a shadow ray
 
 
-#: Shape without lanes and node type of each field.
+#: Fields by name: shape without the lanes, and node type.
 Fields = dict[str, tuple[tuple[int, ...], str]]
 
-#: Fields of a hit, of a shadow ray, and of a ray that goes on behind a surface that it passed.
+#: Fields of a hit, and of a shadow ray.
 HIT: Fields = {"t": ((), "f"), "prim": ((), "l"), "u": ((), "f"), "v": ((), "f")}
 SHADOW: Fields = {
     "shadow_o": ((3,), "f"),
@@ -52,7 +52,7 @@ SHADOW: Fields = {
     "shadow_t": ((), "f"),
     "shadow_radiance": ((3,), "f"),
 }
-#: Fields of light to another pixel: its shadow ray, and how much of it gets through.
+#: Fields of a splat: its pixel, its shadow ray, and the transmittance of that.
 SPLAT: Fields = {
     "splat_pixel": ((), "l"),
     "splat_o": ((3,), "f"),
@@ -61,6 +61,7 @@ SPLAT: Fields = {
     "splat_radiance": ((3,), "f"),
     "splat_transmittance": ((), "f"),
 }
+#: Fields of a ray in transit: the ray, the distance before its origin, and its lane in the arena of paths.
 PASS: Fields = {
     "pass_o": ((3,), "f"),
     "pass_d": ((3,), "f"),
@@ -69,28 +70,28 @@ PASS: Fields = {
     "home": ((), "l"),
 }
 
-#: Fields of a path's state, those apart.
+#: Fields of every path state, without those of the integrator.
 _STATE = tuple(field.name for field in fields(PathState) if field.name != "extra")
 
 _DTYPES = {ty: dtype for dtype, ty in DTYPES.items()}
 
 
 def path_state(given: Mapping[str, Tensor]) -> PathState:
-    """Return paths from tensors by the names of rows; other names are passed over."""
+    """Return the path state from tensors by row name; other names are ignored."""
     extra = {name.removeprefix(EXTRA): value for name, value in given.items() if name.startswith(EXTRA)}
     known: dict[str, Any] = {name: value for name, value in given.items() if name in _STATE}
     return PathState(**known, extra=extra)
 
 
 def state_values(state: PathState) -> dict[str, Tensor]:
-    """Return tensors of paths by the names of rows."""
+    """Return the tensors of a path state by row name."""
     values = {name: getattr(state, name) for name in _STATE}
     extra = {EXTRA + name: value for name, value in state.extra.items()}
     return {name: value for name, value in values.items() if value is not None} | extra
 
 
 class Memory:
-    """Rows of 32-bit words, each with some to spare: kernels write whole vectors."""
+    """Rows of 32-bit words, padded at the end since kernels write whole vectors."""
 
     def __init__(self, rows: int) -> None:
         self.words = np.zeros((rows, CAPACITY), np.int32)
@@ -99,13 +100,13 @@ class Memory:
 
 
 class Rows:
-    """Rows of an arena by the names of the fields that they hold.
+    """Row numbers of an arena by field.
 
     Args:
-        fields: of the arena.
+        fields: fields of the arena, in the order of their rows.
 
     Attributes:
-        count: how many rows there are.
+        count: number of rows.
     """
 
     def __init__(self, fields: Fields) -> None:
@@ -121,17 +122,17 @@ class Rows:
 
     @property
     def state(self) -> tuple[str, ...]:
-        """Names of the rows that hold a path's state."""
+        """Return the names of the fields that belong to the path state."""
         return tuple(name for name in self._fields if name in _STATE or name.startswith(EXTRA))
 
     def first(self, name: str) -> int:
-        """The first row of a field."""
+        """Return the first row of a field."""
         return self._first[name]
 
     def read(self, tracer: Tracer, *names: str, place: int | None = None) -> dict[str, Tensor]:
-        """Fields as inputs of a trace; those that there are not are left out.
+        """Return fields as inputs of a trace; names without rows are left out.
 
-        ``place``: node of where they lie in the slots; None: they are the arena's, at the lane's own place.
+        ``place``: node of the index in the slots to read from; None: read the arena at the lane's own index.
         """
         inputs: dict[str, Tensor] = {}
         for name in names:
@@ -140,7 +141,7 @@ class Rows:
             shape, ty = self._fields[name]
             first, size = self._first[name], (*shape, tracer.lanes)
             dtype = _DTYPES[ty]
-            # The numbers are of no consequence: a trace asks for what is done, not for what comes out.
+            # Any values do: a trace records operations, not results.
             like = torch.rand(size) + 0.25 if dtype.is_floating_point else torch.zeros(size, dtype=dtype)
 
             def node(k: int, first: int = first, ty: str = ty) -> int:
@@ -152,7 +153,7 @@ class Rows:
         return inputs
 
     def take(self, memory: Memory, lanes: np.ndarray, names: tuple[str, ...]) -> dict[str, Tensor]:
-        """Fields of some lanes as tensors; those that there are not are left out."""
+        """Return fields of some lanes as tensors; names without rows are left out."""
         values = {}
         for name in names:
             if name in self._fields:
@@ -164,7 +165,7 @@ class Rows:
         return values
 
     def put(self, memory: Memory, start: int, values: dict[str, Tensor | None]) -> None:
-        """Fields of consecutive lanes from tensors; those that there are not are left out."""
+        """Write fields of consecutive lanes from tensors; names without rows are ignored."""
         for name, value in values.items():
             if name in self._fields and value is not None:
                 shape, ty = self._fields[name]
@@ -174,7 +175,7 @@ class Rows:
                 held[first : first + len(rows), start : start + rows.shape[1]] = rows.numpy()
 
     def nodes(self, tracer: Tracer, **fields: Tensor) -> list[tuple[int, int]]:
-        """Rows and nodes of results by field; numbers that all lanes share are spread."""
+        """Return pairs of row and node for results by field; values that all lanes share are broadcast."""
         pairs = []
         for name, value in fields.items():
             shape, ty = self._fields[name]
@@ -189,26 +190,26 @@ class Rows:
         return pairs
 
 
-# ---- What of a render decides the form of its kernels: which numbers a path carries, and which list of lanes is which
+# ---- The layout of a render: rows of the path state, and lists of lanes
 
 
 class Layout:
-    """The form of a render's kernels.
+    """The memory layout of a render's kernels.
 
     Args:
         wave: the render.
-        packets: whether primitives are so few that rays are searched by kernels; else the search structure is called.
-        fused: whether that is done inside of the stages.
+        packets: True: few primitives, searched by packet kernels. False: the acceleration structure is called.
+        fused: True: the search is part of the stages.
 
     Attributes:
-        state: rows of a path.
-        passed: rows of rays that pass surfaces which are not opaque.
-        models: how many BSDF models there are.
-        has_environment: whether something shines from outside.
-        has_emitters: whether a ray may meet an emitter.
-        has_opacity: whether a surface may let rays pass.
-        has_transmission: whether rays may pass anything, surfaces or what the integrator has between them.
-        listed: whether lanes are taken by lists: else all lanes of the arena are of the one model.
+        state: rows of the path state.
+        passed: rows of rays in transit.
+        models: number of BSDF models.
+        has_environment: the scene has an environment light.
+        has_emitters: a ray may hit an emitter.
+        has_opacity: some surface is not opaque.
+        has_transmission: rays may pass surfaces, or the integrator has its own ``transmit``.
+        listed: kernels read lanes by lists. False: all lanes of the arena are on the only model.
         numbers: tensors of the sampler.
     """
 
@@ -224,18 +225,18 @@ class Layout:
         self.has_transmission = self.has_opacity or wave.integrator.own_transmit
         self.listed = not fused or self.models > 1 or self.has_environment
         self.state = Rows(_path_fields(self))
-        self.passed = Rows({**PASS, "clear": ((), "f"), **_key_field(wave), **HIT})
+        self.passed = Rows({**PASS, "transmittance": ((), "f"), **_key_field(wave), **HIT})
 
-    # Lists 0 .. models - 1 are those of the models. Counter 0 counts the lanes of an arena, counter k + 1 those of list k.
+    # Lists 0 .. models - 1 belong to the models. Counter 0 counts the lanes of an arena, counter k + 1 those of list k.
 
     @property
     def emissive(self) -> int:
-        """The list of lanes that met an emitter."""
+        """Return the index of the list of lanes that hit an emitter."""
         return self.models if self.listed else 0
 
     @property
     def missed(self) -> int:
-        """The list of lanes that met nothing, where something shines from there."""
+        """Return the index of the list of lanes that hit nothing, in a scene with an environment."""
         return self.emissive + int(self.has_emitters)
 
 
@@ -244,7 +245,7 @@ def _key_field(wave: Wave) -> Fields:
 
 
 def _path_fields(layout: Layout) -> Fields:
-    """Fields of a path's state, those that a path of this scene begins with, and what travels with them."""
+    """Return the fields of the arena: the path state of this scene, filter weight, hit, shadow ray, splat."""
     wave, world = layout.wave, layout.world
     d = torch.zeros(3, 1)
     state = wave.with_optional_fields(camera_state(d, d, torch.zeros(wave.sampler.points.rows, 1, dtype=torch.int32)))
@@ -258,28 +259,28 @@ def _path_fields(layout: Layout) -> Fields:
     if not layout.fused and (shadows or wave.integrator.splats):
         fields |= SHADOW
         if layout.has_opacity:
-            fields["clear"] = ((), "f")
+            fields["transmittance"] = ((), "f")
         if not (layout.has_opacity and layout.packets):
             fields["blocked"] = ((), "i")
     return fields
 
 
-# ---- A stage on its way to become a kernel: what it reads of the arena, and how its results go back
+# ---- Traces: inputs of a stage from the arena, and stores of its results
 #
 # The functions of :mod:`~torchpt.engines.kernels.stages` take a :class:`Trace` and return sinks.
 
 
 class Trace:
-    """One stage being traced.
+    """Trace of one stage.
 
     Args:
-        tracer: records what is done to lanes, inside of ``with trace.tracer``.
+        tracer: records the operations on lanes, inside ``with trace.tracer``.
         layout: of the render.
 
     Attributes:
-        uniforms: names of the inputs that all lanes share, in the order of their slots.
-        tensors: how many inputs are tensors instead of rows of an arena.
-        sums: of :class:`torchpt.compiler.program.Program`.
+        uniforms: names of the arguments that all lanes share, in order.
+        tensors: number of inputs that are tensors instead of rows of an arena.
+        sums: see :class:`torchpt.compiler.program.Program`.
     """
 
     def __init__(self, tracer: Tracer, layout: Layout) -> None:
@@ -288,43 +289,43 @@ class Trace:
         self.tensors = 0
         self.sums: list[tuple[Any, ...]] = []
 
-    # -- what a stage reads
+    # -- inputs
 
     def uniform(self, name: str, like: Tensor) -> Tensor:
-        """An input that all lanes share; callers find it by its name."""
+        """Return an input that all lanes share, passed by name when the kernel is called."""
         self.uniforms.append(name)
         return self.tracer.uniform(like)
 
     def salts(self) -> Tensor:
-        """Names of the depth's random dimensions."""
+        """Return the hashed random dimensions of the vertex."""
         return self.uniform("salts", torch.zeros(len(Dimension), dtype=torch.int32))
 
     def state(self) -> tuple[PathState, dict[str, Tensor]]:
-        """The state of the paths, and what travels with them unseen by stages: the filter's ``weight``."""
+        """Return the path state, and rows that stages do not read but that are passed on: the filter ``weight``."""
         rows = self.layout.state
         return path_state(rows.read(self.tracer, *rows.state)), rows.read(self.tracer, "weight")
 
     def hit(self, rows: Rows | None = None) -> Hit:
-        """Return what the rays met."""
+        """Return the hits of the rays."""
         return Hit(**(rows or self.layout.state).read(self.tracer, *HIT))
 
     def place(self) -> Tensor:
-        """Return where in the arena each lane is."""
+        """Return the index of each lane in the arena."""
         numbers = torch.zeros(self.tracer.lanes, dtype=torch.int64)
         return self.tracer.lane(numbers, lambda _: self.tracer.graph.node("place", "l"))
 
-    # -- where results go
+    # -- results
 
     def node(self, result: Tensor) -> int:
-        """The node of a result that has one number a lane."""
+        """Return the node of a result with one number a lane."""
         return self.tracer.nodes(result)[0]
 
     def kept(self, state: PathState, passthrough: dict[str, Tensor]) -> list[tuple[int, int]]:
-        """The state as rows and nodes."""
+        """Return the path state as pairs of row and node."""
         return self.layout.state.nodes(self.tracer, **state_values(state), **passthrough)
 
     def ended(self, mask: int, lane: Tensor, radiance: Tensor, passthrough: dict[str, Tensor]) -> Scatter:
-        """Paths that end where the node ``mask`` holds (-1: all): their radiance goes to the slots of their samples."""
+        """Return the store of radiance to the slots of samples, for paths that end where node ``mask`` is true (-1: all)."""
         if "weight" in passthrough:
             with self.tracer:
                 radiance = radiance * passthrough["weight"]
@@ -334,10 +335,10 @@ class Trace:
     def sorted(
         self, sinks: Sinks, state: PathState, prim: Tensor, passthrough: dict[str, Tensor]
     ) -> tuple[int, list[AppendIndex]]:
-        """Sort the lanes by the surfaces that they met, and end those that do not go on.
+        """List lanes by model, emitter or missing hit, and end paths that neither hit a surface nor see an environment.
 
         Returns:
-            The mask of the lanes that go on, and the notes of their places.
+            The node of the mask of lanes that go on, and the appends to their lists.
         """
         layout, world = self.layout, self.layout.world
         with self.tracer:

@@ -1,8 +1,8 @@
-"""The kernels of a render: which there are, how each is made once, and what renders of the same structure share.
+"""The kernels of a render: compiled on first use, and shared between renders of the same structure.
 
 To add a kernel: write the function that traces it (in ``stages.py``; it takes a
-:class:`~torchpt.engines.kernels.layout.Trace` and returns sinks), give it a method of :class:`Kernels`, and run it where
-``engine.py`` needs it. What a path must carry for it is a row in ``layout.py``.
+:class:`~torchpt.engines.kernels.layout.Trace` and returns sinks), add a method to :class:`Kernels`, and call it in
+``engine.py``. New fields of the path state are rows in ``layout.py``.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ if TYPE_CHECKING:
 __all__ = ["Kernel", "KernelCache", "Kernels", "NamedTensors", "TensorVersion", "program_of"]
 
 
-# ---- The tensors that a render's kernels read, by name, and which of them another render has read before
+# ---- The tensors that kernels read, by name, with their versions
 
 
-#: A tensor, and which of the contents that it has had.
+#: A tensor and the version of its contents.
 TensorVersion = tuple[Tensor, object]
 
 
 class NamedTensors:
-    """The tensors of some records.
+    """The tensors of records by dotted path.
 
     Args:
-        records: by the name that the paths begin with.
-        before: those of another render: records that are the same ones are not walked through again.
+        records: records by the first part of the path.
+        before: tensors of another render: records that are the same objects are not traversed again.
 
     Attributes:
-        tensors: by path.
+        tensors: tensor by path.
         ids: path and tensor by the tensor's id.
-        states: by path, the tensor and which of its contents it has.
+        states: tensor and version by path.
     """
 
     def __init__(self, records: dict[str, Any], before: NamedTensors | None = None) -> None:
@@ -64,25 +64,25 @@ class NamedTensors:
             self._walked[name] = known[name] if same else (record, list(named_leaves(record, name)))
         self.tensors = dict(leaf for _, leaves in self._walked.values() for leaf in leaves)
         self.ids = {id(tensor): (path, tensor) for path, tensor in self.tensors.items()}
-        # A tensor is the same one only as long as nobody wrote into it; of inference tensors that cannot be known.
+        # Writes in place change the version; inference tensors have none, so they never count as unchanged.
         self.states: dict[str, TensorVersion] = {
             path: (tensor, object() if tensor.is_inference() else tensor._version)
             for path, tensor in self.tensors.items()
         }
 
     def has(self, path: str, state: TensorVersion) -> bool:
-        """Return True where a tensor is one that was read before, with the same numbers."""
+        """Return True if the tensor at ``path`` is the same object with the same contents as in ``state``."""
         tensor, version = self.states[path]
         return tensor is state[0] and version == state[1]
 
 
-# ---- What renders of one structure hand on to each other: kernels, and tables of tensors that are the same ones, unchanged
+# ---- The cache that renders of one structure share: kernels, and tables of unchanged tensors
 
 
 class KernelCache:
-    """The latest kernel of each stage and the latest table of each tensor, with the tensors that they were made of.
+    """Cache of the latest kernel of each stage and the latest table of each tensor, valid for unchanged tensors.
 
-    Renders that share it may run at the same time, on several threads.
+    Renders on several threads may share it at the same time.
     """
 
     def __init__(self) -> None:
@@ -92,7 +92,7 @@ class KernelCache:
         self._lock = threading.Lock()
 
     def kernel(self, key: Any, program: Program, leaves: NamedTensors) -> Kernel | None:
-        """The kernel of a stage where it was made of the same program and tensors; None where there is none such."""
+        """Return the cached kernel of a stage, if it was made of the same program and tensors; else None."""
         found = self._kernels.get(key)
         if found is None or found[0].program is not program or program.constants:
             return None
@@ -100,12 +100,12 @@ class KernelCache:
         return found[0] if same else None
 
     def tables(self, leaves: NamedTensors) -> dict[Any, Tensor]:
-        """Tables of a render's tensors as kernels read them, those that there are, by path and axis."""
+        """Return the cached tables of a render's tensors, by path and axis."""
         with self._lock:
             return {key: table for key, (state, table) in self._tables.items() if leaves.has(key[0], state)}
 
     def results(self, leaves: NamedTensors) -> dict[StepKey, Tensor]:
-        """Return what steps of prologues came to on a render's tensors, those that were taken, by name."""
+        """Return the cached results of prologue steps on a render's tensors, by name."""
         found: dict[StepKey, Tensor] = {}
         with self._lock:
             for states, results in self._results.values():
@@ -121,7 +121,7 @@ class KernelCache:
         results: dict[StepKey, Tensor],
         leaves: NamedTensors,
     ) -> None:
-        """Hand a kernel on, and all tables and results of steps of its render."""
+        """Store a kernel, and all tables and results of prologue steps of its render."""
         groups: dict[frozenset[str], dict[StepKey, Tensor]] = {}
         for name, result in results.items():
             groups.setdefault(name.leaves, {})[name] = result
@@ -132,7 +132,7 @@ class KernelCache:
             self._tables |= {place: (leaves.states[place[0]], table) for place, table in tables.items()}
 
 
-# ---- Programs of a render's stages: each is traced and compiled once for all scenes of one structure
+# ---- Programs: each stage is traced and compiled once for all scenes of one structure
 
 
 def program_of(
@@ -143,15 +143,15 @@ def program_of(
     build: Callable[[Trace], Sinks],
     listed: bool,
 ) -> Program:
-    """The program of a stage: of this process, from disk, or traced and compiled now.
+    """Return the program of a stage: cached in this process or on disk, or traced and compiled now.
 
     Args:
-        key: names the stage.
-        structure: what else the trace may ask of the render, but for the numbers in its tensors.
+        key: name and arguments of the stage.
+        structure: everything of the render that the trace may depend on, but for values of tensors.
         leaves: the tensors.
         layout: of the render.
         build: traces the stage.
-        listed: whether the kernel takes lanes by a list.
+        listed: True: the kernel reads lanes by a list.
     """
     return cache.program_of((key, structure), leaves.tensors, lambda: _traced(leaves, layout, build, listed))
 
@@ -178,35 +178,35 @@ def _traced(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], Sinks
     )
 
 
-# ---- The kernels of a render: which there are, and how each is made once
+# ---- The kernels of a render
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A stage's machine code with the tables of one scene."""
+    """Machine code of a stage with the tables of one scene."""
 
     program: Program
     tables: Tables
 
 
 class Kernels(Layout):
-    """The kernels of one render, made when they are first asked for.
+    """The kernels of one render, compiled on first use.
 
     Args:
         wave: the render.
         packets: see :class:`~torchpt.engines.kernels.layout.Layout`.
         fused: see there.
-        before: kernels of another render, whose tables are taken over where they are made of the same tensors.
-        fixed: whether a world says the same of itself as long as it is the same one; models of the caller's own may not.
+        before: kernels of another render; its tables are shared where they were made of the same tensors.
+        fixed: True: the structure of a world object never changes. False with models of a user's own, whose code may.
         cotangent: see :class:`~torchpt.engines.kernels.backward.VjpKernels`.
 
     Attributes:
-        eager: models whose stage does what no kernel can, and what that is; they run as tensor operations.
-        seconds: spent on making kernels.
-        structure: what renders have in common that can share kernels, and threads their memory.
-        kernel_cache: what renders of the same structure share.
-        search: what the search by packets reads; None where the search structure is called.
-        non_opaque: for each primitive whether a ray may pass it, as uint8, for the search structure.
+        eager: models whose stage cannot be compiled, with the reason; they run as tensor operations.
+        seconds: seconds spent on making kernels.
+        structure: key that is equal for renders that can share kernels and memory of threads.
+        kernel_cache: shared by renders of the same structure.
+        search: argument of packet searches; None where the acceleration structure is called.
+        non_opaque: uint8 for each primitive, 1 where a ray may pass it, for the acceleration structure.
     """
 
     def __init__(
@@ -235,8 +235,8 @@ class Kernels(Layout):
         same = fixed and before is not None and before.world is self.world
         self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
         own = (fingerprint(wave.integrator), wave.context.crop) if wave.integrator.own_stages else None
-        asked = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, own, self._leaves.tensors)
-        self.structure = (self._of_world, *map(signature, asked), packets, fused)
+        parts = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, own, self._leaves.tensors)
+        self.structure = (self._of_world, *map(signature, parts), packets, fused)
         alike = before is not None and before.structure == self.structure
         self.kernel_cache = before.kernel_cache if alike else KernelCache()  # pyright: ignore[reportOptionalMemberAccess]
         self._laid_out = self.kernel_cache.tables(self._leaves)
@@ -252,7 +252,7 @@ class Kernels(Layout):
         self.eager: dict[int, str] = {}
 
     def probe(self, numbers: Iterable[int]) -> dict[int, str]:
-        """Return which of the models' stages no kernel can be made of, and why."""
+        """Compile the stages of models; return those that cannot be compiled, with the reasons."""
         reasons = {}
         for number in numbers:
             try:
@@ -262,7 +262,7 @@ class Kernels(Layout):
         return reasons
 
     def rows(self, layers: Mapping[str, Any]) -> int:
-        """Rows of 32-bit numbers that a thread keeps for its lanes, see :mod:`torchpt.engines.kernels.engine`."""
+        """Return how many 32-bit numbers a thread allocates for each lane, see :mod:`torchpt.engines.kernels.engine`."""
         shown = sum(len(layer.channels) for layer in layers.values())
         return 2 * self.state.count + 2 * (self.models + 2) + 3 + shown
 
@@ -320,7 +320,7 @@ class Kernels(Layout):
         """See :func:`torchpt.engines.kernels.stages.attenuate_shadow_rays`."""
         return self._get(False, stages.attenuate_shadow_rays)
 
-    # -- what leaves a chunk
+    # -- results of a chunk
 
     def layers(self, model: int, names: tuple[str, ...]) -> Kernel:
         """See :func:`torchpt.engines.kernels.stages.layers`."""
@@ -330,10 +330,10 @@ class Kernels(Layout):
         """See :func:`torchpt.engines.kernels.stages.accumulate`."""
         return self._get(False, stages.accumulate, channels, clamp)
 
-    # -- how they are made
+    # -- compilation
 
     def _get(self, listed: bool, build: Callable[..., Sinks], *arguments: Any) -> Kernel:
-        """The kernel that ``build(trace, *arguments)`` traces; ``listed``: it takes lanes by a list, else all in order."""
+        """Return the kernel that ``build(trace, *arguments)`` traces; ``listed``: it reads lanes by a list, else in order."""
         key = (build.__name__, *arguments)
         made = self._made.get(key)
         if made is not None:
@@ -341,9 +341,9 @@ class Kernels(Layout):
         with self._lock:
             made = self._made.get(key)
             if made is None:
-                begin_shadow_rays = time.perf_counter()
+                start = time.perf_counter()
                 made = self._made[key] = self._make(key, listed, build, arguments)
-                self.seconds += time.perf_counter() - begin_shadow_rays
+                self.seconds += time.perf_counter() - start
             return made
 
     def _make(

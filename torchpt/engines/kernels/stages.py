@@ -1,7 +1,7 @@
-"""The stages of a render as kernels: camera rays, searches by packets, light, bounces, what lets rays pass, the film.
+"""Functions that trace kernels: camera rays, packet searches, emission, bounces, transmission, layers, the film.
 
-Each function takes a :class:`~torchpt.engines.kernels.layout.Trace`, runs a stage in it with the loads and stores around it,
-and returns its sinks. :mod:`torchpt.engines.kernels.programs` says which kernels there are.
+Each takes a :class:`~torchpt.engines.kernels.layout.Trace`, runs a stage in it with loads and stores around it, and returns its
+sinks (stores, appends, counts). :mod:`torchpt.engines.kernels.programs` has a method for each kernel.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ __all__ = [
 ]
 
 
-# ---- The search for few primitives, inside of kernels: each ray of a packet against every primitive
+# ---- The search of few primitives inside kernels: each ray of a packet against every primitive
 
 
 def nearest(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
-    """The nearest hits of rays."""
+    """Return the nearest hits of rays."""
     graph = tracer.graph
     hits = graph.node("nearest", "S", *_ray(tracer, o, d, t_max))
 
@@ -69,7 +69,7 @@ def nearest(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
 
 
 def occluded(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-    """Return which shadow rays are blocked ``(N,)``."""
+    """Return True ``(N,)`` for shadow rays that are blocked."""
     node = tracer.graph.node("occluded", "b", *_ray(tracer, o, d, t_max))
     return tracer.lane(torch.zeros(tracer.lanes, dtype=torch.bool), lambda _: node)
 
@@ -78,11 +78,11 @@ def _ray(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> list[int]:
     return [*tracer.nodes(o), *tracer.nodes(d), *tracer.nodes(t_max)]
 
 
-# -- kernels that do nothing else
+# -- kernels that only search
 
 
 def search_nearest(trace: Trace, passed: bool) -> Sinks:
-    """The nearest hits of all rays of an arena: of paths, or (``passed``) of rays that pass surfaces."""
+    """Write the nearest hits of all rays of an arena: of paths, or (``passed``) of rays in transit."""
     rows = trace.layout.passed if passed else trace.layout.state
     names = ("pass_o", "pass_d", "pass_t") if passed else ("o", "d", "t_max")
     hit = nearest(trace.tracer, *rows.read(trace.tracer, *names).values())
@@ -90,7 +90,7 @@ def search_nearest(trace: Trace, passed: bool) -> Sinks:
 
 
 def search_occluded(trace: Trace) -> Sinks:
-    """Write which shadow rays are blocked."""
+    """Write 1 for shadow rays that are blocked, else 0."""
     rows, tracer = trace.layout.state, trace.tracer
     blocked = occluded(tracer, *rows.read(tracer, "shadow_o", "shadow_d", "shadow_t").values())
     with tracer:
@@ -98,11 +98,11 @@ def search_occluded(trace: Trace) -> Sinks:
     return Sinks(write=rows.nodes(tracer, blocked=number))
 
 
-# -- what the search reads
+# -- arguments of the search
 
 
 def kinds_of(world: World) -> tuple[str, ...]:
-    """Kinds of primitives that a scene has, of those that packets search."""
+    """Return the kinds of primitives in a scene, of those that packets can search."""
     return tuple(kind for kind, count in zip(KINDS, world.geometry.counts, strict=False) if count)
 
 
@@ -112,21 +112,21 @@ def search_words(wave: Wave) -> Any:
     return accel.words
 
 
-# ---- The vertices of paths as kernels: camera rays, light that is met, the bounce, ends of paths
+# ---- Kernels of a vertex: camera rays, emission, the bounce, ends of paths
 #
 # Each function traces one stage of :mod:`torchpt.paths.vertex` with the loads and stores around it.
 
 
-#: Numbers that say which samples a chunk holds: the first pixel of the picture and how many there are; the stream and point
-#: of the first sample, the first stream and how many share the samples; the crop's corner and width, the film's width.
+#: Integers that identify the samples of a chunk: first pixel and number of pixels; randomization (counted from ``stream``) and
+#: point of the first sample; first randomization and how many share the samples; corner and width of the crop; film width.
 CHUNK_FIELDS = ("first", "pixels", "turn", "point", "stream", "streams", "x", "y", "crop", "film")
 
 
 def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
-    """Rays that paths begin with; with their first hits where the search is inside.
+    """Write the first rays of paths; with their hits where the search is part of the stages.
 
-    Row ``prim`` holds the numbers of ``chosen`` pixels; rows ``o`` and ``d`` hold rays that are ``given`` in place of the
-    camera's.
+    ``chosen``: row ``prim`` has the indices of the pixels, else they are consecutive. ``given``: rows ``o`` and ``d`` have the
+    rays, else they are camera rays.
     """
     layout, tracer, wave = trace.layout, trace.tracer, trace.layout.wave
     place = trace.uniform("place", torch.ones(len(CHUNK_FIELDS), dtype=torch.int32))
@@ -164,17 +164,17 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
 
 
 def sort_lanes(trace: Trace, shadow: bool) -> Sinks:
-    """Settle what the lanes of the arena met: light of their shadow rays, lists of lanes by model, ends of paths."""
+    """Append lanes to lists by their hits and end paths; ``shadow``: first add the contributions of shadow rays."""
     tracer, rows = trace.tracer, trace.layout.state
     state, passthrough = trace.state()
     prim = rows.read(tracer, "prim")["prim"]
     sinks = Sinks()
     if shadow:
-        arrived = rows.read(tracer, "shadow_radiance", "clear", "blocked")
+        arrived = rows.read(tracer, "shadow_radiance", "transmittance", "blocked")
         with tracer:
             light = arrived["shadow_radiance"]
-            if "clear" in arrived:
-                radiance = torch.addcmul(state.radiance, light, arrived["clear"])
+            if "transmittance" in arrived:
+                radiance = torch.addcmul(state.radiance, light, arrived["transmittance"])
             else:
                 radiance = state.radiance + torch.where(arrived["blocked"] != 0, 0.0, light)
         state = replace(state, radiance=radiance)
@@ -185,7 +185,7 @@ def sort_lanes(trace: Trace, shadow: bool) -> Sinks:
 
 
 def emit(trace: Trace) -> Sinks:
-    """Light of emitters that were met, added where the lanes are."""
+    """Add the emission of emitters that were hit to the paths in the arena."""
     tracer, layout = trace.tracer, trace.layout
     context = layout.wave.context.at(trace.salts())
     state, _ = trace.state()
@@ -198,7 +198,7 @@ def emit(trace: Trace) -> Sinks:
 
 
 def escape(trace: Trace) -> Sinks:
-    """Light from outside, and the ends of those paths."""
+    """Add the radiance of the environment, and end these paths."""
     state, passthrough = trace.state()
     hit, wave = trace.hit(), trace.layout.wave
     context = wave.context.at(trace.salts())
@@ -208,13 +208,13 @@ def escape(trace: Trace) -> Sinks:
 
 
 def terminate(trace: Trace) -> Sinks:
-    """Ends of paths that are cut."""
+    """End paths at the depth limit."""
     state, passthrough = trace.state()
     return Sinks(scatter=[trace.ended(-1, state.lane, state.radiance, passthrough)])
 
 
 def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
-    """One vertex of the paths on surfaces of a model."""
+    """Run the stage of surfaces of one BSDF model, and store the paths that go on."""
     layout, tracer = trace.layout, trace.tracer
     salts = trace.salts()
     state, passthrough = trace.state()
@@ -236,11 +236,11 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
     return sinks
 
 
-# -- the two ways in which lanes go on
+# -- the two ways to store paths that go on
 
 
 def _searched(trace: Trace, sinks: Sinks, state: PathState, passthrough: dict[str, Tensor]) -> None:
-    """Search inside the kernel: the lanes that go on are packed together, the others end."""
+    """Search inside the kernel: compact the lanes that go on, end the others."""
     hit = nearest(trace.tracer, state.o, state.d, state.t_max)
     on, appends = trace.sorted(sinks, state, hit.prim, passthrough)
     rows = trace.kept(state, passthrough)
@@ -251,7 +251,7 @@ def _searched(trace: Trace, sinks: Sinks, state: PathState, passthrough: dict[st
 def _with_shadow(
     trace: Trace, state: PathState, shadow: Shadow | None, splat: Splat | None, passthrough: dict[str, Tensor]
 ) -> Sinks:
-    """Search later: all lanes are kept, with the shadow rays that are still to be searched."""
+    """Search later: store all lanes, with their shadow rays and splats."""
     tracer, rows = trace.tracer, trace.layout.state
     sinks = Sinks(
         shift=0, write=trace.kept(state, passthrough), shadows=int(shadow is not None) + int(splat is not None)
@@ -283,16 +283,16 @@ def _with_shadow(
     return sinks
 
 
-# ---- Rays through what lets them pass, as kernels
+# ---- Kernels of transmission: rays that pass surfaces and media
 #
-# Rays of paths: ``list_transmitting`` lists those that something may let pass; ``transmit`` holds some up and sends the others on behind it,
-# once from the paths' arena and then (``again``) from that of the rays on their way, until the walk has none left. Shadow rays:
-# ``begin_shadow_rays`` and ``attenuate_shadow_rays`` do the same with the light that is left; the loop around them is in
-# :mod:`torchpt.engines.kernels.engine`.
+# Rays of paths: ``list_transmitting`` lists the lanes whose hit may let them pass. ``transmit`` stops some of them and moves
+# the others behind the surface, first from the arena of the paths, then (``again``) from the arena of the rays in transit,
+# until the walk has none left. Shadow rays: ``begin_shadow_rays`` and ``attenuate_shadow_rays`` multiply their transmittance
+# surface by surface; the loop around them is in :mod:`torchpt.engines.kernels.engine`.
 
 
 def list_transmitting(trace: Trace) -> Sinks:
-    """A list of the rays that the stage ``transmit`` is asked for."""
+    """Append lanes to the list of rays that the stage ``transmit`` runs for."""
     rows, tracer, layout = trace.layout.state, trace.tracer, trace.layout
     given = rows.read(tracer, "prim", "t_max")
     with tracer:
@@ -304,7 +304,7 @@ def list_transmitting(trace: Trace) -> Sinks:
 
 
 def transmit(trace: Trace, again: bool) -> Sinks:
-    """Hold rays up, or send them on; ``again``: those that are on their way."""
+    """Stop rays at their hits or move them on; ``again``: for rays in transit, else for rays of the list."""
     layout, tracer = trace.layout, trace.tracer
     salts = trace.salts()
     rows = layout.passed if again else layout.state
@@ -344,7 +344,7 @@ def transmit(trace: Trace, again: bool) -> Sinks:
 
 
 def begin_shadow_rays(trace: Trace) -> Sinks:
-    """Shadow rays that meet what may let light pass become rays that pass surfaces; what is known of the others."""
+    """Start the rays in transit of shadow rays that may pass surfaces; write the transmittance of all others."""
     layout, tracer = trace.layout, trace.tracer
     ray = layout.state.read(tracer, "shadow_o", "shadow_d", "shadow_t", "blocked")
     o, d, t_max = list(ray.values())[:3]
@@ -353,41 +353,45 @@ def begin_shadow_rays(trace: Trace) -> Sinks:
         one = torch.ones_like(t_max)
         if "blocked" in ray:
             on, off = ray["blocked"] == 2, ray["blocked"] != 2
-            clear = torch.where(ray["blocked"] == 0, one, 0.0)
+            transmittance = torch.where(ray["blocked"] == 0, one, 0.0)
         else:
-            on, off, clear = t_max > 0, t_max <= 0, one
-    onward = layout.passed.nodes(tracer, pass_o=o, pass_d=d, pass_t=t_max, home=home, clear=one)
-    return _passed(trace, on, onward, off, home, clear)
+            on, off, transmittance = t_max > 0, t_max <= 0, one
+    onward = layout.passed.nodes(tracer, pass_o=o, pass_d=d, pass_t=t_max, home=home, transmittance=one)
+    return _passed(trace, on, onward, off, home, transmittance)
 
 
 def attenuate_shadow_rays(trace: Trace) -> Sinks:
-    """Let light through a surface in part, and send the shadow rays on that still carry some."""
+    """Multiply the transmittance of shadow rays by that of their hit, and move those on whose transmittance is not 0."""
     layout, tracer = trace.layout, trace.tracer
     hit = trace.hit(layout.passed)
-    o, d, t_max, home, clear = layout.passed.read(tracer, "pass_o", "pass_d", "pass_t", "home", "clear").values()
+    o, d, t_max, home, transmittance = layout.passed.read(
+        tracer, "pass_o", "pass_d", "pass_t", "home", "transmittance"
+    ).values()
     with tracer:
         opacity = opacity_at(layout.world, o, d, hit, 0.0)
-        clear = clear * (1.0 - opacity)
+        transmittance = transmittance * (1.0 - opacity)
         on = (hit.prim >= 0) & (opacity < 1)
         off = ~on
         behind = beyond(layout.world, o, d, hit)
         rest = (t_max - hit.t).clamp_min(0.0)
-    onward = layout.passed.nodes(tracer, pass_o=behind, pass_d=d, pass_t=rest, home=home, clear=clear)
-    return _passed(trace, on, onward, off, home, clear)
+    onward = layout.passed.nodes(tracer, pass_o=behind, pass_d=d, pass_t=rest, home=home, transmittance=transmittance)
+    return _passed(trace, on, onward, off, home, transmittance)
 
 
-def _passed(trace: Trace, on: Tensor, onward: list[tuple[int, int]], off: Tensor, home: Tensor, clear: Tensor) -> Sinks:
-    """Shadow rays that go on are packed; of those that do not, what is clear goes home to their paths."""
-    known = tuple(trace.layout.state.nodes(trace.tracer, clear=clear))
+def _passed(
+    trace: Trace, on: Tensor, onward: list[tuple[int, int]], off: Tensor, home: Tensor, transmittance: Tensor
+) -> Sinks:
+    """Compact shadow rays that go on; write the transmittance of the others to the arena of their paths."""
+    known = tuple(trace.layout.state.nodes(trace.tracer, transmittance=transmittance))
     done = Scatter(trace.node(off), trace.node(home), known, slots=True)
     return Sinks(compact=[Compact(trace.node(on), tuple(onward), 0)], scatter=[done])
 
 
-# ---- What leaves a chunk, as kernels: layers of first surfaces, and samples added to the film
+# ---- Kernels of results: layers of first surfaces, and adding samples to the film
 
 
 def layers(trace: Trace, model: int, names: tuple[str, ...]) -> Sinks:
-    """Write what the first surfaces of a model are."""
+    """Write the layers of first surfaces of one BSDF model."""
     wave = trace.layout.wave
     state, passthrough = trace.state()
     hit = trace.hit()
@@ -400,7 +404,7 @@ def layers(trace: Trace, model: int, names: tuple[str, ...]) -> Sinks:
 
 
 def accumulate(trace: Trace, channels: int, clamp: bool) -> Sinks:
-    """One sample of each pixel added to sums; those that are not finite are counted, and taken as black."""
+    """Add one sample of each pixel to the film's sums; samples that are not finite are counted, and added as black."""
     tracer, graph = trace.tracer, trace.tracer.graph
     trace.tensors = 2
     sample = tracer.lane(torch.zeros(channels, tracer.lanes), lambda k: graph.node("tensor", "f", extra=(0, k)))

@@ -1,4 +1,4 @@
-"""Which thread takes which samples, and how they add up to a picture; renders that share the threads."""
+"""The forward engine of kernels: tasks on threads, adding samples to films, and memory that renders reuse."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from torchpt.physics.film import Film
 __all__ = ["KernelsForward", "keep_worker", "reuse_worker"]
 
 
-# ---- Workers that no render has at the moment: the next one of the same structure takes them over, as fresh memory costs time
+# ---- Idle engines, kept for the next render of the same structure, since new memory costs time
 
 
-#: Bytes of all that are kept; the oldest go first.
+#: Most bytes of idle engines; the oldest are dropped first.
 MAX_KEPT_BYTES = 64 << 20
 
 _lock = threading.Lock()
@@ -37,7 +37,7 @@ _kept: deque[tuple[Hashable, KernelsEngine, int]] = deque()
 
 
 def keep_worker(structure: Hashable, worker: KernelsEngine) -> None:
-    """Keep a worker for renders of a structure; it lets go of the render that it was of."""
+    """Keep the engine of a thread for renders of a structure; it drops its references to the old render."""
     size = worker.unbind()
     with _lock:
         _kept.append((structure, worker, size))
@@ -47,7 +47,7 @@ def keep_worker(structure: Hashable, worker: KernelsEngine) -> None:
 
 
 def reuse_worker(structure: Hashable) -> KernelsEngine | None:
-    """Return a worker for a render of a structure, the latest; None where there is none."""
+    """Remove and return the latest kept engine for a structure; None if there is none."""
     with _lock:
         for number in reversed(range(len(_kept))):
             if _kept[number][0] == structure:
@@ -63,7 +63,7 @@ def _release() -> None:
 
 
 def _after_fork() -> None:
-    """Take a new lock: another thread of the parent may have held the old one."""
+    """Replace the lock: a thread of the parent process may have held the old one."""
     global _lock
     _lock = threading.Lock()
 
@@ -73,28 +73,28 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
 
 
-# ---- Which thread takes which samples, and how they add up to a picture
+# ---- The forward engine
 
 
-#: Fewest lanes that repay a task.
+#: Fewest lanes of a task, unless the picture has fewer.
 MIN_TASK_LANES = 1024
-#: Pixels of a task, unless threads would be idle: a chunk of many samples of few pixels adds them up in as many steps.
+#: Fewest pixels of a task, unless threads would be idle: samples of a pixel are added one step each, so few pixels cost time.
 MIN_TASK_PIXELS = 128
 
 
 class KernelsForward:
-    """A render's tasks over threads; see :class:`torchpt.engines.engine.Tasks`.
+    """Forward engine of kernels: the tasks of a render on threads; see :class:`torchpt.engines.engine.Tasks`.
 
-    A pixel's samples are summed in their order, whichever thread takes them.
+    The samples of a pixel are added in their order, independent of threads.
 
     Args:
         kernels: of the render.
-        threads: how many.
-        clamp: largest contribution of a path, or None.
-        strict: whether a task ends at a sample that is not finite; whoever is told of it ends the render.
+        threads: number of threads.
+        clamp: largest component of a sample; None: unbounded.
+        strict: True: a task ends at its first chunk with a sample that is not finite; the caller has to end the render.
 
     Attributes:
-        budget: how many threads, and most lanes of a chunk.
+        budget: number of threads, and greatest number of lanes of a chunk.
     """
 
     compiled = True
@@ -114,28 +114,28 @@ class KernelsForward:
 
     @property
     def seconds(self) -> float:
-        """Return the seconds that were spent on making kernels."""
+        """Return the seconds spent on making kernels."""
         return self.kernels.seconds
 
     def rows(self, layers: Mapping[str, Any]) -> int:
-        """Return how many 32-bit numbers a lane takes in a thread, where the picture has such layers."""
+        """Return how many 32-bit numbers a lane takes in each thread, for these layers."""
         return self.kernels.rows(layers)
 
     def run(self, spans: Sequence[tuple[PixelSet, int, int]], each: Callable[[TaskResult | None], bool]) -> bool:
-        """Take samples of every pixel of plates.
+        """Render samples of every pixel of pixel sets.
 
         Args:
-            spans: plates, with the first sample and how many are to be taken.
+            spans: pixel sets, each with its first sample and number of samples.
             each: called in this thread after every task, and now and then with None while tasks run (or compile);
                 returning True ends the render: tasks stop at their next kernel.
 
         Returns:
-            Whether all were taken.
+            True if all samples were rendered.
         """
         return self.take(self.blocks(spans, self.budget.threads * TASKS), each)
 
     def blocks(self, spans: Sequence[tuple[PixelSet, int, int]], tasks: int) -> list[Block]:
-        """Cut samples of plates into blocks of pixels: ``tasks`` for each plate, as far as they repay."""
+        """Split the samples of pixel sets into blocks of pixels: ``tasks`` for each set, unless blocks get too small."""
         return [
             (pixel_set, start, size, first, count)
             for pixel_set, first, count in spans
@@ -143,7 +143,7 @@ class KernelsForward:
         ]
 
     def take(self, blocks: list[Block], each: Callable[[TaskResult | None], bool]) -> bool:
-        """Take blocks; ``each`` and what is returned are those of :meth:`run`."""
+        """Render blocks; ``each`` and the returned value as for :meth:`run`."""
         while blocks and not self._halt.is_set():
             blocks = self._round(blocks, each)
             if blocks:
@@ -151,11 +151,11 @@ class KernelsForward:
         return not self._halt.is_set()
 
     def retry_blocks(self, blocks: list[Block], each: Callable[[TaskResult | None], bool]) -> bool:
-        """Take blocks for which there was no memory, by fewer threads or lanes; else as :meth:`take`."""
+        """Render blocks that ran out of memory again, with fewer threads or lanes; else as :meth:`take`."""
         return self.take(self._smaller(blocks), each)
 
     def _round(self, blocks: list[Block], each: Callable[[TaskResult | None], bool]) -> list[Block]:
-        """Take blocks on threads; return what of them memory did not suffice for."""
+        """Render blocks on threads; return the blocks that ran out of memory."""
         rest: list[Block] = []
 
         def told(share: TaskResult | None) -> bool:
@@ -167,10 +167,10 @@ class KernelsForward:
         return rest
 
     def _smaller(self, blocks: list[Block]) -> list[Block]:
-        """Return the blocks that are left, for fewer threads, or cut for chunks of fewer lanes.
+        """Shrink the budget, and return the blocks split so that each fits into a chunk.
 
         Raises:
-            RenderError: there is no memory for one thread and a vector of lanes.
+            RenderError: not enough memory for one thread and one vector of lanes.
         """
         self._workers.clear()
         self.budget.shrink()
@@ -193,18 +193,18 @@ class KernelsForward:
             yield start, min(size, pixels - start)
 
     def release_workers(self, keeps: bool) -> None:
-        """Give up this render's workers, or keep them for the next one of its structure."""
+        """Release the engines of threads, or (``keeps``) keep them for the next render of the same structure."""
         while self._workers:
             worker = self._workers.pop()
             if keeps:
                 keep_worker(self.kernels.structure, worker)
 
     def halt(self) -> None:
-        """End the render: tasks stop at their next kernel."""
+        """Cancel the render: tasks stop at their next kernel."""
         self._halt.set()
 
     def task(self, block: Block) -> TaskResult:
-        """Take a block, in a thread of its own."""
+        """Render a block; called on any thread."""
         pixel_set, start, size, first, count = block
         share = TaskResult(RayCounts())
         sample = first
@@ -220,7 +220,7 @@ class KernelsForward:
                     break
             self._workers.append(worker)
         except Halted:
-            pass  # what was added so far counts
+            pass  # samples added so far count
         except Exception as error:
             if not is_out_of_memory(error):
                 raise
@@ -238,7 +238,7 @@ class KernelsForward:
         return worker
 
     def _chunk(self, worker: KernelsEngine, chunk: Chunk, pixel_set: PixelSet, share: TaskResult) -> None:
-        """Add a chunk to the films: all of it, or nothing where memory runs out."""
+        """Render a chunk and add it to the films: all of it, or nothing if memory runs out."""
         names, light = tuple(pixel_set.layers), self.kernels.wave.integrator.light
         rays = worker.layers(chunk, names) if names else 0
         for film in pixel_set.layers.values():
@@ -248,7 +248,7 @@ class KernelsForward:
             tally = worker.trace(chunk)
             share.tally.truncated += tally.truncated
             rays += tally.rays
-        # From here on a failure would leave half a chunk: what little is allocated must be there, or the render ends.
+        # From here on a failure would leave half a chunk in the films, so running out of memory ends the render.
         with explain_out_of_memory("the sums of a film"):
             if light:
                 self._radiance(worker, chunk, pixel_set, share)
@@ -272,7 +272,7 @@ class KernelsForward:
         share.light = share.light[0] + before, share.light[1] + float(np.ascontiguousarray(used).sum(dtype=np.float64))
 
     def _splats(self, worker: KernelsEngine, chunk: Chunk, film: Film, share: TaskResult) -> None:
-        """Add what a chunk's samples bring to other pixels."""
+        """Add the splats of a chunk's samples to the film."""
         before = after = 0.0
         for splats in worker.splats:
             assert film.splats is not None
@@ -323,6 +323,6 @@ class KernelsForward:
         return int(counters[0])
 
     def _lost(self, used: np.ndarray, chunk: Chunk) -> NonFinite:
-        """Return which samples of a chunk are not finite, of the radiance ``(3, samples * pixels)`` of all."""
+        """Return the counts of non-finite samples of a chunk with radiance ``used (3, samples * pixels)``."""
         radiance = torch.from_numpy(used).view(3, chunk.samples, chunk.pixels)
         return NonFinite.of(radiance, chunk.first_pixel, chunk.first_sample, self.kernels.wave.crop, chunk.pixel_set)

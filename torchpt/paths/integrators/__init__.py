@@ -1,7 +1,7 @@
-"""Integrators: what a picture estimates.
+"""Integrators: the quantity that a picture estimates, and the stages and limits of its paths.
 
-One kind a file in ``kinds/``: ``path`` (and ``direct``, which is ``path`` with one bounce of light) carries radiance, ``ibl``
-is a preview, ``aov`` shows layers.
+One kind a file in ``kinds/``: ``path`` (and ``direct``, which is ``path`` of depth 2) estimates radiance, ``ibl`` is a preview
+under an environment map, ``aov`` shows layers. ``base.py`` has their base class: start there.
 """
 
 from __future__ import annotations

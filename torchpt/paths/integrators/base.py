@@ -1,4 +1,4 @@
-"""Integrators: a kind's settings, what it asks of the stages, and where its paths end."""
+"""The base class of integrators: their parameters, stages, fields and limits."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 __all__ = ["ENDLESS", "LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits", "check_fields", "check_output"]
 
-#: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted. Of a million million
-#: paths that lose nothing none comes so far (``DEEP_CAP``): only those are cut that roulette was told to leave alone.
+#: With ``max_depth`` -1 roulette ends the paths; those that reach this depth are truncated, and counted. With ``DEEP_CAP`` not
+#: one path in 10^12 comes so far, even if it loses nothing: only a later ``rr_depth`` or ``rr_prob`` near 1 truncates paths.
 ENDLESS = 1 << 15
 
-#: Parameters that several kinds have.
+#: Parameters that several kinds share.
 STRATEGY: dict[str, Spec] = {
     "strategy": Choice(
         "mis",
@@ -54,12 +54,12 @@ SAMPLES: dict[str, Spec] = {
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of paths.
+    """Depth limits of paths.
 
     Attributes:
-        max_depth: vertices at most; -1: only roulette ends them.
-        rr_depth: roulette plays from this vertex on.
-        first_surface: whether paths end behind the first surface, with the light that is sampled there.
+        max_depth: greatest number of vertices; -1: only roulette ends paths.
+        rr_depth: first vertex with Russian roulette.
+        first_surface: True: paths end behind the first surface, after its light sample.
     """
 
     max_depth: int
@@ -68,32 +68,32 @@ class Limits:
 
     @property
     def endless(self) -> bool:
-        """Return True where roulette alone is to end paths."""
+        """Return True if only roulette ends paths."""
         return self.max_depth < 0
 
     @property
     def last(self) -> int:
-        """The vertex at which paths end that came so far."""
+        """Return the depth at which all remaining paths end."""
         return ENDLESS if self.endless else self.max_depth
 
     def roulette(self, depth: int) -> float:
-        """The most that roulette lets paths survive with at a vertex; 0 where it does not play."""
+        """Return the upper bound of the survival probability at vertex ``depth``; 0: no roulette there."""
         if depth < self.rr_depth:
             return 0.0
         return DEEP_CAP if self.max_depth < 0 and depth > DEEP else 1.0
 
 
 class Integrator(Valued):
-    """A kind of integrator; an instance holds the values of its parameters.
+    """Base class of integrators; an instance holds the values of its parameters.
 
     Attributes:
         name: its ``type`` in a scene file.
-        light: whether it estimates radiance; else the picture shows layers.
-        layers: layers that are shown where ``film.aovs`` names none.
-        lit: whether it sees the scene's lights; else its world has none.
-        fields: what its paths carry beside the state of every path.
-        splats: whether its surfaces send light to other pixels than a sample's own.
-        strategy, rr_prob, light_choice, clamp, strict: as for ``path``, where the kind has no such parameter.
+        light: True: it estimates radiance. False: the picture shows layers.
+        layers: layers shown where ``film.aovs`` lists none.
+        lit: True: it uses the scene's lights. False: its world has none.
+        fields: fields of its own in the path state.
+        splats: True: its stages add radiance to pixels other than a sample's own.
+        strategy, rr_prob, light_choice, clamp, strict: values for kinds without such a parameter; meaning as for ``path``.
     """
 
     name: ClassVar[str] = ""
@@ -116,36 +116,36 @@ class Integrator(Valued):
 
     @property
     def limits(self) -> Limits:
-        """Return where paths end."""
+        """Return the depth limits of paths."""
         return Limits(2, 3)
 
     def plan(self, sampler: Points, dtype: torch.dtype, tape: bool = False, attached: bool = False) -> Plan:
-        """Return what it asks of the stages."""
+        """Return the static configuration of the stages."""
         return Plan(sampler, self.strategy, self.rr_prob, dtype, tape, attached)
 
     def counted_in(self, unit: float) -> Self:
-        """The same with its lengths in a unit that is so long in the scene's: the lanes'."""
+        """Return a copy with parameters that are lengths divided by ``unit``, the world unit in scene units."""
         specs = parameters_of(type(self))
         lengths = {key: value / unit for key, value in self.values.items() if specs[key].length and value is not None}
         return self.but(**lengths) if lengths and unit != 1.0 else self
 
     def emit(self, context: StageContext, vertex: VertexInput) -> Emission:
-        """Return what paths gather from the emitters that they hit; a stage: a pure function of lanes."""
+        """Return the emission of emitters that paths hit. A stage: a pure function of lanes."""
         return stages.emit(context, vertex)
 
     def escape(self, context: StageContext, vertex: VertexInput) -> Emission:
-        """Return what paths gather from the environment that they escape to; a stage."""
+        """Return the radiance of the environment for paths that hit nothing. A stage."""
         return stages.escape(context, vertex)
 
     def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
-        """Return what surfaces of BSDF model number ``model`` make of paths; a stage."""
+        """Return the outputs of a vertex on surfaces of BSDF model ``model``. A stage."""
         return stages.bounce(context, model, vertex)
 
     def transmit(self, context: StageContext, vertex: VertexInput) -> Transmission:
-        """Return which rays pass what they met, or are scattered before it; a stage, taken step by step until all rays stop.
+        """Return which rays pass their hit or are scattered before it. A stage, repeated until all rays have stopped.
 
-        Where a kind has its own, it is asked for all rays, those that met nothing too, and asks this one which rays pass the
-        surface that they reach. Shadow rays are held up by surfaces alone: ``bounce`` weakens them by what lies between.
+        An integrator's own ``transmit`` runs for all rays, those without a hit included, and calls this one for the rays that
+        reach their surface. Only surfaces block shadow rays: ``bounce`` has to weaken them by media in between.
         """
         if context.world.materials.opacity is None:
             return Transmission(torch.zeros_like(vertex.hit.prim, dtype=torch.bool), vertex.state.o)
@@ -153,31 +153,31 @@ class Integrator(Valued):
 
     @property
     def foreign(self) -> bool:
-        """Return True for a class of a user's own, whose code may differ under the same name."""
+        """Return True for a class outside torchpt, whose code may differ under the same name."""
         return type(self).__module__.partition(".")[0] != "torchpt"
 
     @property
     def own_transmit(self) -> bool:
-        """Return True where something but surfaces may hold rays up."""
+        """Return True if the kind overrides :meth:`transmit`, so that more than surfaces may stop rays."""
         return type(self).transmit is not Integrator.transmit
 
     @property
     def own_stages(self) -> bool:
-        """Return True where it carries fields or has stages of its own, for which kernels are made anew."""
+        """Return True if the kind has fields, splats or stages of its own, which need kernels of their own."""
         kind, base = type(self), Integrator
         own = any(getattr(kind, name) is not getattr(base, name) for name in ("emit", "escape", "bounce", "transmit"))
         return own or bool(self.fields) or self.splats
 
     def first(self, world: World) -> FirstSurface | None:
-        """Return what happens at first surfaces, made once a scene and differentiable in its world; None: paths go on."""
+        """Return the shading of first surfaces, made once a scene and differentiable in its world; None: paths go on."""
         return None
 
 
 def check_output(integrator: Integrator, output: VertexOutput) -> None:
-    """Refuse what a stage made of surfaces where it is not what its integrator declares.
+    """Check that the outputs of a stage have the fields and splats that the integrator declares.
 
     Raises:
-        SceneError: names the field, see :func:`check_fields`, or ``splats``.
+        SceneError: a field is wrong, see :func:`check_fields`, or there are splats without ``splats = True``.
     """
     check_fields(integrator, output.leaving)
     if output.splat is not None and not integrator.splats:
@@ -185,10 +185,10 @@ def check_output(integrator: Integrator, output: VertexOutput) -> None:
 
 
 def check_fields(integrator: Integrator, state: PathState) -> None:
-    """Refuse paths that a stage left without a field that its integrator declares, or with one of another form.
+    """Check that paths have all fields that the integrator declares, in their shapes and dtypes, and no others.
 
     Raises:
-        SceneError: names the field.
+        SceneError: a field is missing, undeclared, or of another shape or dtype.
     """
     if not integrator.fields and not state.extra:
         return

@@ -1,4 +1,4 @@
-"""Integrators that stop at the first surface: one vertex, with at most one shadow ray from it."""
+"""Integrators that stop at the first surface: one vertex, with at most one shadow ray."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ __all__ = ["FirstSurface", "FirstSurfaceIntegrator"]
 
 
 class FirstSurface(ABC):
-    """Events at first surfaces.
+    """Shading of first surfaces.
 
-    Implementations are frozen dataclasses: kernels read their tensors as tables, and are made anew where another field differs.
+    Implementations are frozen dataclasses: kernels read their tensors as tables, and are compiled anew if other fields differ.
     """
 
     def again(self, world: World) -> FirstSurface:
-        """The same for its world under a tape: made anew where a derivative goes through it."""
+        """Return the shading for a world on an autograd tape: rebuilt where gradients flow through it, else itself."""
         return self
 
     def shadows(self, world: World) -> bool:
-        """Return True where :meth:`bounce` gives shadow rays for any model."""
+        """Return True if :meth:`bounce` returns shadow rays for any model."""
         return world.lights is not None
 
     @abstractmethod
     def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
-        """Return what surfaces of one BSDF model bring: pure, of n lanes.
+        """Return the paths with the radiance of surfaces of one BSDF model added, and shadow rays. A stage.
 
-        The paths leave with what the surfaces bring added to their radiance, and end there.
+        All paths end there.
         """
 
 
 class FirstSurfaceIntegrator(Integrator):
-    """Integrators whose radiance is what :meth:`first` says of the first surface, and what shines there by itself."""
+    """Base class of integrators whose radiance is the emission of the first surface and the shading of :meth:`first`."""
 
     @property
     def limits(self) -> Limits:

@@ -1,6 +1,6 @@
-"""Unidirectional path tracing with next event estimation, as a wavefront: how lanes are told apart at a vertex.
+"""Unidirectional path tracing with next event estimation, as a wavefront: lanes are grouped by BSDF model at each vertex.
 
-``max_depth`` and ``rr_depth`` count as Mitsuba's: 1 is emission only, 2 direct light.
+``max_depth`` and ``rr_depth`` count as in Mitsuba: 1 is emission only, 2 adds direct light.
 """
 
 from __future__ import annotations
@@ -20,15 +20,14 @@ __all__ = ["Ends", "PathIntegrator", "follows_shape", "partition"]
 
 
 class PathIntegrator(Integrator):
-    """Integrators that follow paths to their :attr:`limits`, vertex by vertex."""
+    """Base class of integrators that trace paths to their :attr:`limits`, vertex by vertex."""
 
 
 def follows_shape(plan: Plan, world: World, depth: int) -> bool:
-    """Return True where points at a vertex slide along their rays; see :func:`torchpt.physics.shapes.interact`.
+    """Return True where hit points are intersected anew along their rays; see :func:`torchpt.physics.shapes.interact`.
 
-    Under derivatives the camera's own point slides along its ray; later ones are held on their surface. In float64 the camera's
-    point is found anew, since the search rounds it to float32. Where a delta sends a ray on, its next point slides along it as
-    the camera's does.
+    Where geometry is differentiated, the first hit follows the camera ray, and so do hits behind delta lobes; all others keep
+    their place on the primitive. In float64 hits are intersected anew, since the search rounds to float32.
     """
     exact = plan.attached or plan.dtype == torch.float64
     return exact and (depth == 1 or any(model.delta for model in world.materials.models))
@@ -36,17 +35,17 @@ def follows_shape(plan: Plan, world: World, depth: int) -> bool:
 
 @dataclass(frozen=True)
 class Ends:
-    """Lanes ``(n,)`` whose paths meet light by chance."""
+    """Lanes ``(n,)`` of paths that hit an emitter, and of paths that hit nothing."""
 
     emissive: Tensor
     missed: Tensor
 
 
 def partition(world: World, hit: Hit) -> tuple[Ends, list[tuple[int, Tensor]]]:
-    """Sort lanes by what they hit; one sort of small keys and one transfer of the counts.
+    """Group lanes by the BSDF model of their hit: one sort of small keys and one transfer of the counts.
 
     Returns:
-        Which lanes hit an emitter or nothing, and for each model present its number and lanes.
+        The lanes that hit an emitter or nothing; index and lanes of each model that was hit.
     """
     models = len(world.materials.models)
     keys, order = torch.sort(take(world.materials.key, world.geometry.slot(hit.prim) + 1), stable=True)

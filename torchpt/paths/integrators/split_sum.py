@@ -1,4 +1,4 @@
-"""Split-sum shading of a material model under the sky: what each model is taken for is its own :meth:`Bsdf.split_sum`."""
+"""Split-sum shading of materials under an environment map; :meth:`Bsdf.preview` approximates each model for it."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ __all__ = ["under"]
 
 
 def under(sky: Sky, model: Bsdf, parameters: Parameters, n: Tensor, v: Tensor) -> Tensor:
-    """Radiance ``(3, N)`` toward unit ``v`` from materials under the sky, nothing in its way.
+    """Return the unshadowed radiance ``(3, N)`` that materials reflect and transmit toward unit ``v`` under the environment.
 
     Args:
-        sky: its maps.
-        model: one for all points.
-        parameters: lane values, as prepared.
-        n: unit normals ``(3, N)``, on the outside of what light passes through, else on the side of ``v``.
-        v: ``(3, N)``.
+        sky: prefiltered maps of the environment.
+        model: BSDF model of all points.
+        parameters: parameters of each lane, as prepared.
+        n: unit normals ``(3, N)``: on the outside of models that transmit, else on the side of ``v``.
+        v: unit directions ``(3, N)`` to the viewer.
     """
     return model.preview(parameters, lambda surface: _shaded(sky, surface, n, v))
 
 
 def _shaded(sky: Sky, surface: SplitSumMaterial, n: Tensor, v: Tensor) -> Tensor:
-    """What a surface reflects, and what passes it."""
+    """Return the radiance ``(3, N)`` that a surface reflects, plus what it transmits."""
     side = torch.copysign(torch.ones_like(n[0]), dot(n, v).detach())
     out = sky.reflected(n * side, v, surface)
     if surface.through is None:

@@ -1,4 +1,4 @@
-"""Layers without light."""
+"""Layers without light transport."""
 
 from __future__ import annotations
 

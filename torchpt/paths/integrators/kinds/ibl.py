@@ -1,6 +1,6 @@
-"""A preview by split sum: the first surface under the environment's prefiltered maps, and other lights with their shadows.
+"""A preview by the split-sum approximation: the first surface under prefiltered environment maps, plus lights with shadows.
 
-What the environment brings is not shadowed and no light is reflected twice: that is the preview's error.
+The environment casts no shadows and there is no indirect light: that is the error of the preview.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class Ibl(FirstSurfaceIntegrator):
 
 @dataclass(frozen=True)
 class Preview(FirstSurface):
-    """The environment ready for split-sum shading.
+    """Split-sum shading under the environment.
 
     Attributes:
-        sky: its maps; None where there is no environment.
-        turn: ``(3, 3)`` from the world to the maps' own space; None where they are the same.
+        sky: prefiltered maps; None: no environment.
+        turn: ``(3, 3)`` rotation from the world to the space of the maps; None: identity.
     """
 
     sky: Sky | None
@@ -53,7 +53,7 @@ class Preview(FirstSurface):
 
     @staticmethod
     def of(world: World) -> Preview:
-        """Of a scene's environment; differentiable in it."""
+        """Return the shading for a world; differentiable in its environment."""
         around = lights.surroundings(world.lights)
         if around is None:
             return Preview(None)
@@ -63,7 +63,7 @@ class Preview(FirstSurface):
         return Preview(Sky.of(maps(around.texels)), around.turn)
 
     def turned(self, d: Tensor) -> Tensor:
-        """Directions ``(3, N)`` of the world in the maps' own space."""
+        """Return world directions ``(3, N)`` in the space of the maps."""
         return d if self.turn is None else torch.stack([dot(self.turn[k][:, None], d) for k in range(3)])
 
     def again(self, world: World) -> Preview:
