@@ -12,7 +12,7 @@ from trials import coarse, film_of, shoot, spread, z_limit
 
 import torchpt
 from torchpt.core.errors import EdgeWarning, SceneError
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.physics import lights
 from torchpt.physics.lights.choice import MANY, ByTree, bounds_of, draw, probability
 from torchpt.physics.shapes import interact
@@ -95,14 +95,14 @@ def every_kind(sources: bool = True) -> dict[str, Any]:
 
 
 def test_few_lights_are_chosen_by_power_and_many_by_the_tree():
-    for count, kind in ((MANY - 1, Discrete), (MANY, ByTree)):
+    for count, kind in ((MANY - 1, Distribution1D), (MANY, ByTree)):
         scene = torchpt.load(
             {"camera": {"origin": [0, 0, 5], "target": [0, 0, 0]}, "shapes": bulbs(count)}, device="cpu"
         )
         table = scene.world(torch.float32)[0].lights
         assert table is not None and isinstance(table.choice, kind)
         assert lights.local(table) == (kind is ByTree)
-        for way, chosen in (("uniform", Discrete), ("power", Discrete), ("tree", ByTree)):
+        for way, chosen in (("uniform", Distribution1D), ("power", Distribution1D), ("tree", ByTree)):
             table = scene.world(torch.float32, choice=way)[0].lights
             assert table is not None and isinstance(table.choice, chosen)
 
@@ -110,7 +110,7 @@ def test_few_lights_are_chosen_by_power_and_many_by_the_tree():
 def test_uniform_choice_draws_all_lights_alike():
     scene = torchpt.load({"camera": {"origin": [0, 0, 5], "target": [0, 0, 0]}, "shapes": bulbs(30)}, device="cpu")
     table = scene.world(torch.float32, choice="uniform")[0].lights
-    assert table is not None and isinstance(table.choice, Discrete)
+    assert table is not None and isinstance(table.choice, Distribution1D)
     torch.testing.assert_close(table.choice.pmf, torch.full((30,), 1 / 30))
 
 
@@ -133,7 +133,7 @@ def test_bounds_hold_what_the_lights_draw():
     assert near == len(power) - 2  # but the sun and the sky
     count = 400
     for row in range(near):
-        only = Discrete.of(torch.eye(len(power))[row], torch.float64)
+        only = Distribution1D.of(torch.eye(len(power))[row], torch.float64)
         alone = replace(table, choice=only)
         x = torch.randn(3, count, generator=G, dtype=torch.float64) * 3
         u = torch.rand(2, count, generator=G, dtype=torch.float64)

@@ -159,7 +159,7 @@ class Wave:
         x, y = (a.to(self.context.plan.dtype) for a in (x, y))
         return generate(self.context.plan, self.camera, self.filter, x, y, key, salts(0, self.centre.device))
 
-    def along(self, rays: Rays) -> Wave:
+    def with_rays(self, rays: Rays) -> Wave:
         """Return the wave whose paths begin with rays; no filter weighs them."""
         n = rays.d.shape[1]
         # Of filters that weigh nothing nothing is asked: kernels are those of renders.
@@ -167,7 +167,7 @@ class Wave:
         camera = replace(self.camera, resolution=(n, 1))
         return replace(self, camera=camera, crop=(0, 0, n, 1), filter=filter, given=rays)
 
-    def begun(self, state: PathState) -> PathState:
+    def with_optional_fields(self, state: PathState) -> PathState:
         """Return rays with what only some scenes and integrators ask of a path that begins."""
         world = self.context.world
         if any(model.refracts for model in world.materials.models):

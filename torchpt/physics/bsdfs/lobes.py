@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math import microfacet
-from torchpt.math.microfacet import diffuse_passed, fresnel_dielectric
+from torchpt.math.microfacet import diffuse_transmittance, fresnel_dielectric
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
 from torchpt.physics.bsdfs.presets import INDICES
@@ -229,7 +229,7 @@ def over_base(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
     """A coat in the preview, over a base which light enters by what the coat's mean reflectance leaves."""
     eta, factor = parameters["eta"], parameters["specular_reflectance"]
     one = torch.ones_like(eta)
-    base = parameters["base"] * diffuse_passed(eta)
+    base = parameters["base"] * diffuse_transmittance(eta)
     f0 = reflectance_at_normal(eta)
     return SplitSumMaterial(base, tinted(f0, factor), tinted(one, factor), roughness, f0)
 

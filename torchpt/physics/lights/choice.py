@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.threads import sum_all
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import take
 from torchpt.physics.lights import tree
 from torchpt.physics.lights.base import COLUMNS
@@ -93,12 +93,12 @@ class ByTree:
     """A tree over the rows that lie somewhere; beside it those infinitely far, by power."""
 
     tree: LightTree
-    beside: Discrete | None  # over the tree and the rows after its own; None where there are none
-    even: Discrete | None  # over the rows of the tree; None where all draws are the tree's own
+    beside: Distribution1D | None  # over the tree and the rows after its own; None where there are none
+    even: Distribution1D | None  # over the rows of the tree; None where all draws are the tree's own
     share: Tensor  # () float64, of the draws of a row of the tree that are taken from `even`
 
 
-def choice_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: str) -> Discrete | ByTree | None:
+def choice_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: str) -> Distribution1D | ByTree | None:
     """How to choose among the rows of a table.
 
     Args:
@@ -111,19 +111,19 @@ def choice_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: 
     if len(power) == 1:
         return None
     if way in ("uniform", "power") or (way == "auto" and len(power) < MANY):
-        return Discrete.of((power > 0).double() if way == "uniform" else power, dtype)
+        return Distribution1D.of((power > 0).double() if way == "uniform" else power, dtype)
     bounds = bounds_of(lights, power, boxes)
     count = len(bounds.intensity)
     if not count or (way == "auto" and count < MANY):
-        return Discrete.of(power, dtype)
+        return Distribution1D.of(power, dtype)
     beside = None
     if count < len(power):
-        beside = Discrete.of(torch.cat((sum_all(power[:count]).reshape(1), power[count:])), dtype)
+        beside = Distribution1D.of(torch.cat((sum_all(power[:count]).reshape(1), power[count:])), dtype)
     shining = (power[:count] > 0).double()
     few = count <= FEW
     share = min(EVEN, EACH / max(float(shining.sum()), 1.0)) if few else 0.0
     part = torch.tensor(share, dtype=torch.float64, device=power.device)
-    return ByTree(tree.build(*astuple(bounds)), beside, Discrete.of(shining, dtype) if few else None, part)
+    return ByTree(tree.build(*astuple(bounds)), beside, Distribution1D.of(shining, dtype) if few else None, part)
 
 
 def local(lights: Lights | None) -> bool:
@@ -131,7 +131,7 @@ def local(lights: Lights | None) -> bool:
     return lights is not None and isinstance(lights.choice, ByTree)
 
 
-def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def draw(choice: Distribution1D | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Rows ``(N,)``, their probabilities ``(N,)``, and what the choice leaves of ``u``: ``(N,)`` float64 in [0, 1].
 
     The rest is uniform whatever was chosen. Who goes on with it keeps the stratification of light and place together.
@@ -142,7 +142,7 @@ def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> t
         x: reference points ``(3, N)``.
         n: normals ``(3, N)`` as :func:`torchpt.physics.lights.tree.sample` takes them, or None.
     """
-    if isinstance(choice, Discrete):
+    if isinstance(choice, Distribution1D):
         row, rest = choice.draw(u)
         return row, take(choice.pmf, row), rest
     if choice.beside is None:
@@ -177,9 +177,9 @@ def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     return p * (1.0 - share) + take(choice.even.pmf, row) * share
 
 
-def probability(choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
+def probability(choice: Distribution1D | ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """``(N,)`` with which :func:`draw` gives ``row (N,)`` at ``x, n``."""
-    if isinstance(choice, Discrete):
+    if isinstance(choice, Distribution1D):
         return take(choice.pmf, row)
     if choice.beside is None:
         return _chance(choice, row, x, n)
@@ -188,16 +188,16 @@ def probability(choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | N
     return torch.where(row < first, p, 1.0) * take(choice.beside.pmf, (row - (first - 1)).clamp_min(0))
 
 
-def environment(choice: Discrete | ByTree | None) -> Tensor | float:
+def environment(choice: Distribution1D | ByTree | None) -> Tensor | float:
     """The probability of the last row, which is the environment's where there is one."""
     if choice is None:
         return 1.0
-    chosen = choice if isinstance(choice, Discrete) else choice.beside
+    chosen = choice if isinstance(choice, Distribution1D) else choice.beside
     assert chosen is not None
     return chosen.pmf[-1]
 
 
-def without_last(choice: Discrete | ByTree) -> Discrete | ByTree:
+def without_last(choice: Distribution1D | ByTree) -> Distribution1D | ByTree:
     """The choice among all rows but the last, which is infinitely far and not the only one left."""
     if isinstance(choice, ByTree):
         beside = choice.beside
@@ -206,5 +206,5 @@ def without_last(choice: Discrete | ByTree) -> Discrete | ByTree:
     return _fewer(choice)
 
 
-def _fewer(choice: Discrete) -> Discrete:
-    return Discrete.of(choice.pmf[:-1], choice.pmf.dtype)
+def _fewer(choice: Distribution1D) -> Distribution1D:
+    return Distribution1D.of(choice.pmf[:-1], choice.pmf.dtype)

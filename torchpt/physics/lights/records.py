@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpt.math.sampling import Discrete
+    from torchpt.math.sampling import Distribution1D
     from torchpt.physics.lights.choice import ByTree
     from torchpt.physics.shapes.geometry import Interaction, Quadrics
 
@@ -22,7 +22,7 @@ class Lights:
     Columns are a primitive's own; what the others put there is said in their files in :mod:`torchpt.physics.lights.kinds`.
     """
 
-    choice: Discrete | ByTree | None  # over the rows; None where there is but one
+    choice: Distribution1D | ByTree | None  # over the rows; None where there is but one
     kinds: tuple[str, ...]  # kinds among the rows, in their order: of KINDS, then lights
     kind: Tensor | None  # (K,) index into `kinds`; None where there is but one
     p0: Tensor  # (3, K)

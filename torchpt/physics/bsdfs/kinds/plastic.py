@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchpt.math.microfacet import diffuse_passed, fresnel_dielectric
+from torchpt.math.microfacet import diffuse_transmittance, fresnel_dielectric
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
 from torchpt.physics.bsdfs.lobes import Coat, coated, over_base, share, tinted, weighed, with_delta
@@ -23,7 +23,7 @@ __all__ = ["Plastic"]
 class Plastic(Coat):
     """A polished coat over a diffuse base.
 
-    Its fit of the coat's mean reflectance (see ``diffuse_passed``) conserves energy to 0.02 %.
+    Its fit of the coat's mean reflectance (see ``diffuse_transmittance``) conserves energy to 0.02 %.
 
     Attributes:
         nonlinear: light that the coat throws back takes the base's colour again.
@@ -49,7 +49,7 @@ class Plastic(Coat):
     def prepare(self, values: Parameters) -> Parameters:
         """See :class:`Bsdf`."""
         eta = values["int_ior"] / values["ext_ior"]
-        return coated(values, eta, diffuse_passed(1.0 / eta), self.nonlinear)
+        return coated(values, eta, diffuse_transmittance(1.0 / eta), self.nonlinear)
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """The base, seen through the coat both ways."""

@@ -97,7 +97,7 @@ class RoughDielectric(Anisotropic, Glass):
         r = side.reflectance
         if self.energy_compensation:
             energy = energy_at(parameters["energy"], parameters, wo, (wo[2] < 0).to(wo.dtype))
-            value = visible * microfacet.correlated(cos_o, s_o, cos_i, s_i) / energy
+            value = visible * microfacet.height_correlated_masking(cos_o, s_o, cos_i, s_i) / energy
         else:
             value = visible * microfacet.masking(cos_i, s_i)
         colour = torch.where(
