@@ -16,8 +16,8 @@ from torchpt.rendering.api import render
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import Common, RenderOptions
-from torchpt.spec.arguments import check_names, spelled
+from torchpt.scene.settings import BatchOptions, RenderOptions
+from torchpt.spec.arguments import check_names, expand_signature
 
 __all__ = ["Renderer"]
 
@@ -55,7 +55,7 @@ class Renderer(nn.Module):
 
     steps: Tensor
 
-    @spelled
+    @expand_signature
     def __init__(
         self,
         scene: Scene,
@@ -64,7 +64,7 @@ class Renderer(nn.Module):
         seed: int = 0,
         rigid: bool = True,
         full: bool = False,
-        **options: Unpack[Common],
+        **options: Unpack[BatchOptions],
     ) -> None:
         super().__init__()
         check_names("Renderer", options, RenderOptions, ("names", "rigid"))
@@ -89,14 +89,14 @@ class Renderer(nn.Module):
         self.ranges, self.free = nn.ModuleList(ranges), nn.ParameterDict(free)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
-    @spelled
+    @expand_signature
     def forward(
         self,
         params: Mapping[str, Tensor] | None = None,
         *,
         seed: int | None = None,
         full: bool | None = None,
-        **options: Unpack[Common],
+        **options: Unpack[BatchOptions],
     ) -> Any:
         """Render the scene with the current parameters.
 
@@ -109,7 +109,7 @@ class Renderer(nn.Module):
         Returns:
             The picture ``(H, W, 3)``; with ``full=True`` a :class:`torchpt.Rendering`.
         """
-        given: Common = {**self.options, **options}
+        given: BatchOptions = {**self.options, **options}
         if seed is None:
             seed = self._next_seed(given.get("ranks") is not None)
         full = self.full if full is None else full

@@ -14,7 +14,7 @@ from torchpt.rendering.graphs import as_custom_op, with_graph_break
 from torchpt.rendering.requests import execute_request, prepare_request, prepare_trace_request
 from torchpt.scene import Scene
 from torchpt.scene.settings import FILTERS, CommonOptions, Settings, TraceOptions
-from torchpt.spec.arguments import check_names, spelled
+from torchpt.spec.arguments import check_names, expand_signature
 from torchpt.spec.schema import ParsedParams
 
 __all__ = ["Progress", "Rendering", "first_hit", "render", "render_scene", "trace"]
@@ -27,7 +27,7 @@ def render(scene: Scene, *, full: Literal[True], **options: Unpack[CommonOptions
 @overload
 def render(scene: Scene, *, full: bool, **options: Unpack[CommonOptions]) -> Tensor | Rendering: ...
 @as_custom_op
-@spelled
+@expand_signature
 def render(scene: Scene, *, full: bool = False, **options: Unpack[CommonOptions]) -> Tensor | Rendering:
     """Render a scene to linear RGB ``(H, W, 3)`` on the scene's device; differentiable in ``params``.
 
@@ -50,7 +50,7 @@ def render(scene: Scene, *, full: bool = False, **options: Unpack[CommonOptions]
 
 
 @with_graph_break
-@spelled
+@expand_signature
 def trace(
     scene: Scene,
     o: Tensor,

@@ -28,7 +28,7 @@ from torchpt.rendering.error import FIRST_ROUND
 from torchpt.rendering.stopping import BLOCK, StopRules
 from torchpt.scene.fingerprint import fingerprints
 from torchpt.scene.scene import Scene
-from torchpt.scene.settings import Settings, having
+from torchpt.scene.settings import Settings, settings_with
 from torchpt.spec import Role
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _array(data: bytes) -> np.ndarray:
 #: Seconds between two checkpoints are at least ``EVERY``, and ``PATIENCE`` times as long as writing the last one took.
 EVERY, PATIENCE = 5.0, 20.0
 #: Settings that may differ between a checkpoint and the render that resumes from it: samples do not depend on them.
-FREE = having(Role.FREE)
+FREE = settings_with(Role.FREE)
 #: Name of the JSON text among the arrays.
 _FACTS = "facts"
 _FORMAT = 3

@@ -22,8 +22,8 @@ from torchpt.rendering.result import denoise_rendering
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
 from torchpt.scene.formats.description import settings as complete
-from torchpt.scene.settings import SAMPLERS, Call, CommonOptions, Settings, blocks_of
-from torchpt.scene.textured import renew, with_texels
+from torchpt.scene.settings import SAMPLERS, CallArguments, CommonOptions, Settings, settings_of_call
+from torchpt.scene.texel_params import update_texels, with_texel_params
 from torchpt.scene.versions import AFTER, check_unchanged
 from torchpt.spec import Role
 
@@ -49,7 +49,7 @@ class RenderRequest:
     given: Scene
     scene: Scene
     settings: Settings
-    call: Call
+    call: CallArguments
     params: Mapping[str, Tensor]
     versions: Mapping[str, int] = field(default_factory=dict)
     rays: tuple[Tensor, Tensor] | None = None
@@ -81,7 +81,7 @@ class RenderRequest:
             RenderError: a parameter of the scene was replaced, or changed in place.
         """
         check_unchanged(self.versions, self.given.versions(), since)
-        renew(self.scene, self.given, self.params)
+        update_texels(self.scene, self.given, self.params)
 
 
 def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) -> RenderRequest:
@@ -92,15 +92,15 @@ def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) 
         RenderError: the denoiser is missing.
     """
     scene = as_scene(scene)
-    call = Call.of({**options, "full": full})
+    call = CallArguments.of({**options, "full": full})
     _check(scene, call, options.get("device"))
-    settings = complete(scene.description, blocks_of(options))
+    settings = complete(scene.description, settings_of_call(options))
     if not full:
         settings = _without_aovs(settings, options.get("film"))
     elif settings.film.denoise:
         check_denoiser()
     params = _parameters(scene, call.params, full)
-    textured = with_texels(scene, params)
+    textured = with_texel_params(scene, params)
     textured.check_own()
     request = RenderRequest(scene, textured, settings, call, params)
     return request.with_versions() if request.needs_gradients else request
@@ -231,7 +231,7 @@ def _without_aovs(settings: Settings, film: Mapping[str, Any] | None) -> Setting
     return replace(settings, film=settings.film.but(denoise=False, aovs=aovs))
 
 
-def _check(scene: Scene, call: Call, device: str | torch.device | None) -> None:
+def _check(scene: Scene, call: CallArguments, device: str | torch.device | None) -> None:
     """Raise SceneError for arguments of :func:`render` that do not fit the scene."""
     for name in call.params or {}:
         if not isinstance(name, str):

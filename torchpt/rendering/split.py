@@ -23,7 +23,7 @@ from torchpt.ranks import Group, dealt
 from torchpt.rendering.checkpoint import RenderState
 from torchpt.scene import Scene
 from torchpt.scene.fingerprint import fingerprints
-from torchpt.scene.settings import Settings, having
+from torchpt.scene.settings import Settings, settings_with
 from torchpt.spec import Role
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def render_fingerprint(
     scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
 ) -> bytes:
     """Return a hash of everything that ranks must have in common to share a render."""
-    free = having(Role.FREE, but=Role.FILES)  # ranks must have the same file settings
+    free = settings_with(Role.FREE, but=Role.FILES)  # ranks must have the same file settings
     free["render"] = (*free["render"], "device")
     own = settings.integrator if settings.integrator.foreign else None
     return tree.fingerprint((__version__, settings.plain(free), own, fingerprints(scene, params), dtype))

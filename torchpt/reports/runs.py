@@ -32,7 +32,7 @@ from torchpt.scene.formats.description import Description, overridden, read_desc
 from torchpt.scene.formats.overrides import told
 from torchpt.scene.prepare import SceneCache, scene_cache
 from torchpt.scene.scene import Scene
-from torchpt.scene.settings import Settings, having
+from torchpt.scene.settings import Settings, settings_with
 from torchpt.spec import Role
 
 __all__ = [
@@ -269,8 +269,8 @@ def from_file(path: str, size: tuple[int, int]) -> ReferencePicture:
 
 #: Settings on which runs do not depend, or that differ from run to run.
 _FREE = {
-    "film": (*having(Role.FREE)["film"], "aovs"),
-    "render": (*having(Role.FILES)["render"], "seed", "spp"),
+    "film": (*settings_with(Role.FREE)["film"], "aovs"),
+    "render": (*settings_with(Role.FILES)["render"], "seed", "spp"),
 }
 
 
@@ -461,7 +461,7 @@ def _swap_kernels(latest: Job | None, job: Job) -> None:
         latest.left = replace(scene_cache(latest.scene))
     if job.left is not None:
         keeper = scene_cache(job.scene)
-        keeper.kernels, keeper.first, keeper.dark = job.left.kernels, job.left.first, job.left.dark
+        keeper.kernels, keeper.first, keeper.without_lights = job.left.kernels, job.left.first, job.left.without_lights
 
 
 Wanted = tuple[Job, int, int, list[Run]]

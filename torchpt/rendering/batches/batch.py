@@ -23,9 +23,9 @@ from torchpt.rendering.batches.inputs import Cameras, Seeds, cameras_of, named, 
 from torchpt.rendering.requests import RenderRequest, execute_request, prepare_request
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import Common, RenderOptions
+from torchpt.scene.settings import BatchOptions, RenderOptions
 from torchpt.scene.versions import check_unchanged
-from torchpt.spec.arguments import check_names, spelled
+from torchpt.spec.arguments import check_names, expand_signature
 
 __all__ = ["Renderings", "render_batch"]
 
@@ -73,14 +73,14 @@ Pictures = Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]] | None
 @overload
 def render_batch(
     scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: Pictures = None, *, seed: Seeds = None,
-    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[False] = False, **options: Unpack[Common],
+    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[False] = False, **options: Unpack[BatchOptions],
 ) -> Tensor: ...  # fmt: skip
 @overload
 def render_batch(
     scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: Pictures = None, *, seed: Seeds = None,
-    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[True], **options: Unpack[Common],
+    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[True], **options: Unpack[BatchOptions],
 ) -> Renderings: ...  # fmt: skip
-@spelled
+@expand_signature
 def render_batch(
     scenes: Scene | Iterable[Scene],
     cameras: Cameras = None,
@@ -89,7 +89,7 @@ def render_batch(
     seed: Seeds = None,
     on_progress: Callable[[int, int | None], None] | None = None,
     full: bool = False,
-    **options: Unpack[Common],
+    **options: Unpack[BatchOptions],
 ) -> Tensor | Renderings:
     """Render S scenes by C cameras to linear RGB ``(S, C, H, W, 3)``; differentiable in ``params`` and poses.
 
@@ -171,7 +171,7 @@ def _pictures(
     sets: Sequence[Mapping[str, Tensor]] | None,
     seeds: Any,
     full: bool,
-    options: Common,
+    options: BatchOptions,
 ) -> Iterator[_Picture]:
     """Yield the pictures, those of a scene together; ``several``: they share one scene with different parameters."""
     like: dict[str, Any] = {}
@@ -204,7 +204,7 @@ def _ordered(
     params: Mapping[str, Tensor],
     seed: int | None,
     full: bool,
-    options: Common,
+    options: BatchOptions,
 ) -> RenderRequest:
     """Return the request for one picture."""
     if isinstance(camera, Tensor):

@@ -1,7 +1,7 @@
 """Tensors and arrays in a scene given as a dict: the numbers that are read, and where tensors that want gradients stood.
 
 Whatever reads a scene sees plain numbers, lists and arrays, so that ranges and errors are those of a file. What was written is
-kept beside them; :mod:`torchpt.scene.traced` makes the scene's parameters of it once more, on torch's tape.
+kept beside them; :mod:`torchpt.scene.dict_tensors` makes the scene's parameters of it once more, on torch's tape.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 from torchpt.core.autograd import is_transformed
 from torchpt.core.errors import SceneError
 
-__all__ = ["Key", "Tensors"]
+__all__ = ["DictTensors", "Key"]
 
 #: Where something stands: keys of mappings, and indices of lists.
 Key = tuple[str | int, ...]
@@ -26,7 +26,7 @@ _LISTED = 64
 _PLAIN = frozenset({int, float, str, bool, type(None)})
 
 
-class Tensors:
+class DictTensors:
     """What of one scene was written as tensors that require gradients.
 
     Attributes:
@@ -38,7 +38,7 @@ class Tensors:
         self.raw: dict[str, Any] = {}
         self.keys: list[Key] = []
 
-    def taken_from(self, raw: dict[str, Any]) -> dict[str, Any]:
+    def extract(self, raw: dict[str, Any]) -> dict[str, Any]:
         """The scene with numbers in place of tensors, once :func:`torchpt.scene.formats.yaml.plain` has bounded it.
 
         Raises:
