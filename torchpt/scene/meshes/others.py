@@ -1,7 +1,7 @@
-"""The long tail of mesh formats, through trimesh: OFF, 3MF, COLLADA, XAML, 3DXML. What is read of them is what it gives.
+"""Read further mesh formats by trimesh: OFF, 3MF, COLLADA, XAML, 3DXML.
 
-Nothing is run and nothing fetched: archives are refused above a size, document types in COLLADA as well, and pictures lie
-beside the file or below.
+Files are untrusted: archives are limited in size, COLLADA may not declare a document type, and images are read only from the
+file's folder and below; nothing is executed or fetched.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ _ENCODINGS = (
     b"windows-1252",
 )
 
-#: Bytes that an archive may unfold to.
+#: Most bytes that an archive may decompress to.
 MOST_UNFOLDED = 2**30
 
 
 def load_others(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
-    """The meshes of a file as trimesh reads it, moved by its nodes.
+    """Return the meshes of a file as trimesh reads it, in world space.
 
     Raises:
-        AssetError: a package that is not installed, a malformed file, a picture that is missing.
+        AssetError: a package that is not installed, a malformed file, a missing image.
     """
     kind = path.suffix.lower()
     missing = [name for name in PARSERS[kind] if find_spec(name) is None]
@@ -57,7 +57,7 @@ def load_others(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     try:
         _screen(path, data)
         with Notes() as notes, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of NumPy and of readers about themselves
+            warnings.simplefilter("ignore")  # NumPy's, and deprecations of the parsers
             scene, lost = _read(path, data)
     except (AssetError, MemoryError):
         raise
@@ -72,7 +72,7 @@ def load_others(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
 
 
 def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
-    """The scene, and names of files that it asks for and that are not there."""
+    """Return the ``trimesh.Scene`` of a file, and the names of missing files that it refers to."""
     import trimesh
     from trimesh.resolvers import FilePathResolver
 
@@ -98,7 +98,7 @@ def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
 
 
 def _screen(path: Path, data: bytes) -> None:
-    """Refuse archives that unfold to too much, and XML that declares entities."""
+    """Raise for archives that decompress to too many bytes, and for XML that declares entities."""
     texts = [data] if path.suffix.lower() == ".dae" else []
     if data.startswith(b"PK"):
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -110,6 +110,8 @@ def _screen(path: Path, data: bytes) -> None:
         plain = text.replace(b"\0", b"")  # of UTF-16
         declared = _ENCODING.search(plain[:200])
         if not _BEGINS.match(plain) or (declared and declared[1].lower() not in _ENCODINGS):
-            raise AssetError(path, "is no XML in UTF-8, UTF-16, ASCII or Latin-1")  # in which what follows would hide
+            raise AssetError(
+                path, "is no XML in UTF-8, UTF-16, ASCII or Latin-1"
+            )  # other encodings could hide a DOCTYPE
         if b"<!DOCTYPE" in plain or b"<!ENTITY" in plain:
             raise AssetError(path, "declares a document type, which is not read")
