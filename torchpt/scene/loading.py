@@ -1,4 +1,4 @@
-"""From what a user has to a :class:`Scene`."""
+"""Load a :class:`Scene` from a file, a name, text or a dict."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def load(
             tensors as in a dict.
 
     Raises:
-        SceneError: the description is wrong; says where and what is accepted.
-        AssetError: a file that it names is missing or malformed.
-        RenderError: the device is not there.
+        SceneError: a wrong key or value; the message says where and what is accepted.
+        AssetError: a missing or malformed file.
+        RenderError: the device is not available.
     """
     if torch.compiler.is_compiling():  # not before: this imports the compiler
         outside: Any = torch.compiler.disable(_load)
