@@ -1,4 +1,4 @@
-"""A scene through another camera: all but that is shared."""
+"""Views of a scene through another camera."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def through(
     camera: Mapping[str, Any],
     film: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """What of a scene another camera changes, by attribute: its description, what that came to, its parameters.
+    """Return the attributes of a scene that another camera changes: description, build and parameters.
 
     Args:
-        description: of the scene.
-        built: what it came to.
-        params: its tensors.
-        camera: the block of the other camera, as written.
-        film: film settings in place of the scene's own.
+        description: the scene's.
+        built: the scene's.
+        params: the scene's parameters.
+        camera: block of the other camera, as in a scene file.
+        film: film settings that override the scene's.
 
     Raises:
-        SceneError: what is wrong with the camera, or with the film.
+        SceneError: a wrong camera block or film.
     """
     if not isinstance(film, Mapping):
         raise SceneError("film", film, "a mapping")
