@@ -1,7 +1,7 @@
-"""Tensors of a dict as the scene's parameters: what is made of them is made again by torch, so that gradients reach them.
+"""Connect tensors in a scene dict to the scene's parameters, so that gradients flow from one to the other.
 
-A parameter that a tensor is, to the type, shape and device, *is* that tensor; any other is made of what was written, with the
-value that was read.
+A tensor that has the dtype, shape and device of its parameter becomes the parameter itself. Other parameters are computed
+from the tensors by torch; they keep the values that were read, so only their gradients come from the tensors.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _EXPECTED = (
     "have; scene.params lists what is differentiable"
 )
 
-#: Of a mesh, what is a parameter only where its gradients are wanted.
+#: Arrays of a mesh that are parameters only where they require gradients.
 _CORNERS = ("normals", "uvs")
 
 Params = Mapping[str, Tensor]
 
 
 def widened(description: Description, tensors: Tensors) -> Description:
-    """The description with all that tensors may change: a ``K`` in the middle of its picture may be moved from there."""
+    """Return the description with all parameters of ``K`` where it is a tensor, also those that have their usual values."""
     camera = description.camera
     if not any(key[0] == "K" for key in tensors.under("camera")):
         return description
@@ -49,21 +49,21 @@ def widened(description: Description, tensors: Tensors) -> Description:
 
 
 def corners_in(tensors: Tensors) -> set[str]:
-    """Names of meshes' normals and texture coordinates whose gradients are wanted: parameters of no other scene."""
+    """Return the dotted names of meshes' normals and texture coordinates that require gradients."""
     return {_dotted(("shapes", *key[:2])) for key in tensors.under("shapes") if len(key) > 1 and key[1] in _CORNERS}
 
 
 def traced(tensors: Tensors, description: Description, built: Built, params: Params) -> dict[str, Tensor]:
-    """The parameters that tensors of the dict give, by name, on their tape.
+    """Return the parameters that depend on tensors of the dict, by name, attached to their autograd graph.
 
     Args:
-        tensors: what was written.
-        description: what it was read as.
-        built: what that came to.
-        params: the parameters as they were read.
+        tensors: the dict and its tensors.
+        description: the description read from it.
+        built: the build of the description.
+        params: the scene's parameters as read.
 
     Raises:
-        SceneError: a tensor that requires gradients where nothing is differentiable.
+        SceneError: a tensor that requires gradients where no parameter depends on it.
     """
     read = _Reading(tensors, description, built, params, next(iter(params.values())).device)
     found: dict[str, Tensor] = {}
@@ -77,7 +77,7 @@ def traced(tensors: Tensors, description: Description, built: Built, params: Par
 
 @dataclass(frozen=True)
 class _Reading:
-    """What was written, and what it came to."""
+    """The dict with its tensors, and the scene built from it."""
 
     tensors: Tensors
     description: Description
@@ -86,13 +86,13 @@ class _Reading:
     device: torch.device
 
     def at(self, key: Key) -> Tensor:
-        """What stands at a key: a tensor itself, anything else as one."""
+        """Return the value at a key as a tensor."""
         written = self.tensors.at(key)
         return written if isinstance(written, Tensor) else tensor_of(written, self.device)
 
 
 def _whole(key: Key) -> Key:
-    """The key of what a number, a row or a step of a list belongs to."""
+    """Return a key up to its first list index."""
     return next((key[:n] for n, part in enumerate(key) if isinstance(part, int)), key)
 
 
@@ -101,25 +101,25 @@ def _dotted(key: Key) -> str:
 
 
 def _unread(key: Key, params: Params) -> bool:
-    """Whether a key is of a texture that nothing in the scene reads."""
+    """Return True for a key of a texture that no material uses."""
     return key[0] == "textures" and not any(re.match(rf"textures\.{re.escape(str(key[1]))}(\.|$)", n) for n in params)
 
 
 def _fitting(value: Tensor, own: Tensor) -> Tensor:
-    """A parameter made of tensors, in place of the one that was read."""
+    """Return a parameter computed from tensors, with dtype, device, shape and value of the one that was read."""
     if value.dtype == own.dtype and value.device == own.device and value.shape == own.shape:
         return value
     value = value.to(own.device, torch.promote_types(value.dtype, own.dtype))
     if value.dim() == 2 and own.dim() == 3:  # grey
         value = value[..., None]
-    if value.dim() == 3 and value.shape[2] != own.shape[2]:  # a light's: no alpha, and grey in all channels
+    if value.dim() == 3 and value.shape[2] != own.shape[2]:  # texels of a light: drop alpha, repeat grey
         value = value[..., :3] if value.shape[2] > 3 else value[..., :1]
-    # Not a bit but what was read: rounding here is not rounding there.
+    # Keep the bits of the value that was read: it was rounded differently.
     return own + (value - value.detach()).to(own.dtype).expand_as(own)
 
 
 def _made(key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
-    """Parameters that what stands at a key goes into, made of all that they are made of."""
+    """Yield the parameters that depend on the value at a key, by name."""
     block = key[0]
     if block == "camera" and len(key) > 1:
         yield from _camera(str(key[1]), read)
@@ -136,7 +136,7 @@ def _made(key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
 
 
 def _named(key: Key, name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
-    """The parameter of a name, or that of the texture whose ``data`` has it."""
+    """Yield the parameter of a name, or that of the texture whose ``data`` has the name."""
     for candidate in (name, name.removesuffix(".data")):
         if candidate in read.params:
             yield candidate, read.at(key)
@@ -173,7 +173,7 @@ def _shape(name: str, key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
 
 
 def _pose_of(name: str, shape: ParsedParams, read: _Reading) -> Tensor:
-    """A shape's pose: its own size and place, then its transform."""
+    """Return a shape's pose: its own size and position, then its transform."""
     written, device = read.tensors.raw["shapes"][name], read.device
     operations, specs = written.get("transform"), parameters_of(shape.kind)
     pose = transform([] if operations is None else operations, device)
@@ -183,8 +183,8 @@ def _pose_of(name: str, shape: ParsedParams, read: _Reading) -> Tensor:
 
 
 def _lights_of_file(stem: str, pose: Tensor, read: _Reading) -> Iterator[tuple[str, Tensor]]:
-    """What a mesh file's lights have of places, carried along with the mesh."""
-    way = pose @ torch.linalg.inv(pose.detach())  # one now, and the way from here where the mesh moves
+    """Yield positions and directions of a mesh file's lights, which move with the mesh."""
+    way = pose @ torch.linalg.inv(pose.detach())  # the identity, with the derivative of the pose
     for source in read.built.sources:
         if not source.name.startswith(f"{stem}.lights."):
             continue
@@ -196,7 +196,7 @@ def _lights_of_file(stem: str, pose: Tensor, read: _Reading) -> Iterator[tuple[s
 
 
 def _following(name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
-    """Parameters of a light that follow from others where nobody says them."""
+    """Yield parameters of a light whose defaults are functions of other parameters."""
     light, written = read.description.lights[name], read.tensors.raw["lights"][name]
     numbers = {key: value.to(read.device) for key, value in written.items() if isinstance(value, Tensor)}
     for key, spec in parameters_of(light.kind).items():
