@@ -318,7 +318,7 @@ def test_blocks_stand_in_place_of_the_objects_own() -> None:
     )
     assert "camera.width" in scene.params and "lights.sun.irradiance" in scene.params and len(scene.built.sources) == 1
     assert torchpt.render(scene, compile="off").shape == (18, 24, 3)
-    assert torchpt.from_trimesh(world(), film={"width": 7}, device="cpu").description.film == {"width": 7, "height": 18}
+    assert torchpt.from_trimesh(world(), film={"width": 8}, device="cpu").description.film == {"width": 8, "height": 6}
 
 
 def test_what_cannot_be_an_instance_is_a_mesh_again() -> None:

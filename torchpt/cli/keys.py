@@ -69,7 +69,9 @@ def unknown(key: str, words: Iterable[str] = ()) -> str:
         if name in known_keys(group):
             how = f"+{key}= adds it, as does `defaults: [default]` there"
             return f"{key}: expected a key of the file of {group} that is chosen; {how}"
-        return f"{key}: unknown key; known: {', '.join(f'{group}.{known}' for known in known_keys(group))}"
+        known = [f"{group}.{name}" for name in known_keys(group)]
+        near = difflib.get_close_matches(key, known, 1)
+        return f"{key}: unknown key; known: {', '.join(known)}" + (f"; did you mean {near[0]}?" if near else "")
     every = [f"{group}.{known}" for group in GROUPS for known in known_keys(group)]
     same = [known for known in every if known.endswith(f".{key}")]
     near = same or difflib.get_close_matches(key, [*every, *GROUPS, "scene", "out"], 1)

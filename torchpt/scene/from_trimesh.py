@@ -17,6 +17,7 @@ from torchpt.scene.meshes import FileLight, MeshPart
 from torchpt.scene.meshes.mesh import checked
 from torchpt.scene.meshes.trimesh_objects import Looks, lights_of, parts_of, placed_in
 from torchpt.scene.scene import Scene
+from torchpt.scene.settings import shaped
 from torchpt.scene.sources import labels_of
 
 __all__ = ["description_of", "from_trimesh"]
@@ -65,7 +66,8 @@ def from_trimesh(
         description["lights"] = lights
     for name, block in blocks.items():
         if block is not None:
-            description[name] = {**description.get(name, {}), **block}
+            below = description.get(name, {})
+            description[name] = below | (shaped(below, block) if name == "film" else dict(block))
     return load(description, device)
 
 

@@ -37,8 +37,8 @@ def load(
             ``render.device``, which is ``auto`` where it does not say.
         bsdfs: models of your own by the ``type`` that materials name them by. Gradients flow to their weights too.
         overrides: values of the scene's keys by dotted key: ``{"camera.fov": 20, "+shapes.ball": {"type": "sphere"},
-            "~lights.sky": None}`` sets one, adds a shape and removes a light (docs/scenes.md, *Overrides*). They may be
-            tensors as in a dict.
+            "~lights.sky": None}`` sets one, adds a shape and removes a light (docs/reference/scenes.md, *Overrides*). They may
+            be tensors as in a dict.
 
     Raises:
         SceneError: a wrong key or value; the message says where and what is accepted.

@@ -93,8 +93,8 @@ class Film(Valued):
     """The film block: size in pixels, reconstruction filter, AOVs, and tone mapping of 8-bit files."""
 
     parameters: ClassVar = {
-        "width": Whole(512, low=1, high=MAX_SIDE, doc="in pixels"),
-        "height": Whole(512, low=1, high=MAX_SIDE, doc="in pixels"),
+        "width": Whole(512, low=1, high=MAX_SIDE, doc="in pixels; said alone, the height follows in the scene's shape"),
+        "height": Whole(512, low=1, high=MAX_SIDE, doc="in pixels; said alone, the width follows"),
         "filter": Other(
             lambda _: _typed("filter", {}, "film.filter"),
             words=f"{', '.join(FILTERS)}, or a mapping",
