@@ -72,7 +72,7 @@ def from_trimesh(
 
 
 def description_of(source: Any) -> dict[str, Any]:
-    """The mapping that :func:`torchpt.load` takes: shapes, camera, film and lights of a trimesh object."""
+    """Return the scene dict of a trimesh object for :func:`torchpt.load`: shapes, camera, film and lights."""
     import trimesh
 
     if isinstance(source, trimesh.Trimesh):
