@@ -422,7 +422,7 @@ def refusals() -> list[Any]:
 def test_what_is_out_of_range_is_refused(name, key, described, value):
     with pytest.raises(SceneError, match=rf"lights\.it\.{key}"):
         loaded(name, **{key: value})
-    if not described.traced:
+    if not described.differentiable:
         return
     scene = loaded(name)
     own = "to_world" if key == "transform" else key

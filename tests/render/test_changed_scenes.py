@@ -13,7 +13,7 @@ from torch import Tensor
 import torchpt
 from torchpt.core.errors import RenderError, SceneError
 from torchpt.rendering.run import Run
-from torchpt.scene.versions import Editions
+from torchpt.scene.versions import VersionCounter
 
 WALL, BALL, SKY = "materials.wall.reflectance", "materials.ball.reflectance", "lights.sky.radiance"
 SCENE: dict[str, Any] = {
@@ -41,7 +41,7 @@ def gradient(scene: torchpt.Scene) -> tuple[Tensor, Tensor]:
 
 
 def test_editions_are_numbered() -> None:
-    versions, params = Editions(), {"a": torch.zeros(2), "b": torch.zeros(2)}
+    versions, params = VersionCounter(), {"a": torch.zeros(2), "b": torch.zeros(2)}
     first = versions.of(params)
     assert first == versions.of(params) and min(first.values()) > 0
     params["a"].add_(1)

@@ -20,7 +20,7 @@ from torchpt.rendering.stopping import Stop
 from torchpt.scene.formats.description import settings
 from torchpt.scene.settings import Render
 from torchpt.search import tree
-from torchpt.spec.schema import values_of
+from torchpt.spec.schema import read_params
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def shot(scene: torchpt.Scene, film: Any = None, sampler: Any = "sobol", **rende
 
 
 def rule(**wishes: Any) -> Stop:
-    return Stop(Render(**values_of(Render, wishes, "render", None).values))
+    return Stop(Render(**read_params(Render, wishes, "render", None).values))
 
 
 # -- the rules

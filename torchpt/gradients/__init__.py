@@ -28,7 +28,7 @@ from torchpt.gradients.tape import tape
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.ranks import Group
 from torchpt.scene import Scene
-from torchpt.scene.memory_estimate import loaded, memory_estimate
+from torchpt.scene.memory_estimate import mark_loaded, memory_estimate
 from torchpt.scene.settings import Settings
 
 __all__ = ["attached", "film_space_applies", "gradients"]
@@ -97,5 +97,5 @@ def gradients(
             tape(assembly, settings, cotangent, sums)
         if ranks is not None:
             sums.join_ranks(ranks)
-        loaded("tape")
+        mark_loaded("tape")
         return assembly.gradients(sums)

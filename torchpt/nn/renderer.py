@@ -17,7 +17,7 @@ from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
 from torchpt.scene.settings import Common, RenderOptions
-from torchpt.spec.arguments import check_names, spelled
+from torchpt.spec.arguments import check_names, expand_signature
 
 __all__ = ["Renderer"]
 
@@ -54,7 +54,7 @@ class Renderer(nn.Module):
 
     steps: Tensor
 
-    @spelled
+    @expand_signature
     def __init__(
         self,
         scene: Scene,
@@ -87,7 +87,7 @@ class Renderer(nn.Module):
         self.ranges, self.free = nn.ModuleList(ranges), nn.ParameterDict(free)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
-    @spelled
+    @expand_signature
     def forward(
         self,
         params: Mapping[str, Tensor] | None = None,

@@ -42,7 +42,7 @@ class Parameters(dict[str, np.ndarray]):
     def declare_all(self, prefix: str, kind: Any, values: Mapping[str, Any]) -> None:
         """Add those parameters of a kind that are traced and have a value; ``transform`` is called ``to_world``."""
         for key, spec in parameters_of(kind).items():
-            if not spec.traced:
+            if not spec.differentiable:
                 continue
             if key == "transform":
                 self.declare(f"{prefix}.to_world", np.eye(4) if values[key] is None else values[key], spec)

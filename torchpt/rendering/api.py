@@ -14,7 +14,7 @@ from torchpt.rendering.graphs import opaque, outside
 from torchpt.rendering.requests import ordered, ordered_along, rendered
 from torchpt.scene import Scene
 from torchpt.scene.settings import FILTERS, CommonOptions, Settings, TraceOptions
-from torchpt.spec.arguments import check_names, spelled
+from torchpt.spec.arguments import check_names, expand_signature
 from torchpt.spec.schema import ParsedParams
 
 __all__ = ["Progress", "Rendering", "first_hit", "render", "render_scene", "trace"]
@@ -27,7 +27,7 @@ def render(scene: Scene, *, full: Literal[True], **wishes: Unpack[CommonOptions]
 @overload
 def render(scene: Scene, *, full: bool, **wishes: Unpack[CommonOptions]) -> Tensor | Rendering: ...
 @opaque
-@spelled
+@expand_signature
 def render(scene: Scene, *, full: bool = False, **wishes: Unpack[CommonOptions]) -> Tensor | Rendering:
     """Render a scene to linear RGB ``(H, W, 3)`` on the scene's device; differentiable in ``params``.
 
@@ -50,7 +50,7 @@ def render(scene: Scene, *, full: bool = False, **wishes: Unpack[CommonOptions])
 
 
 @outside
-@spelled
+@expand_signature
 def trace(
     scene: Scene,
     o: Tensor,

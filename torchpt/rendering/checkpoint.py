@@ -28,7 +28,7 @@ from torchpt.rendering.error import FIRST_ROUND
 from torchpt.rendering.stopping import BLOCK, Stop
 from torchpt.scene.fingerprint import fingerprints
 from torchpt.scene.scene import Scene
-from torchpt.scene.settings import Settings, having
+from torchpt.scene.settings import Settings, settings_with
 from torchpt.spec import Role
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def _array(data: bytes) -> np.ndarray:
 #: Seconds between two checkpoints, at least; and at least so many times as long as it takes to write one.
 EVERY, PATIENCE = 5.0, 20.0
 #: Settings that may differ between a checkpoint and the render that goes on from it: no sample depends on them.
-FREE = having(Role.FREE)
+FREE = settings_with(Role.FREE)
 #: Name of the JSON text among the arrays.
 _FACTS = "facts"
 _FORMAT = 3

@@ -23,7 +23,7 @@ from torchpt.core.errors import RenderError
 from torchpt.rendering import Rendering
 from torchpt.scene import Scene
 from torchpt.scene.formats.description import settings
-from torchpt.scene.scene import numbered
+from torchpt.scene.scene import scene_by_number
 from torchpt.scene.settings import BLOCKS
 from torchpt.scene.versions import AFTER, check_unchanged
 
@@ -144,7 +144,7 @@ class _Order(NamedTuple):
     @classmethod
     def read(cls, number: int, text: str, seed: int) -> _Order:
         """Raises RenderError where the scene is gone."""
-        scene = numbered(int(number))
+        scene = scene_by_number(int(number))
         if scene is None:
             raise RenderError("the scene that this compiled graph renders is gone: keep a reference to it")
         wishes, names, wanted, double = ast.literal_eval(text)

@@ -22,8 +22,8 @@ from torchpt.rendering.result import denoise_rendering
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
 from torchpt.scene.formats.description import settings as complete
-from torchpt.scene.settings import SAMPLERS, Call, CommonOptions, Settings, blocks_of
-from torchpt.scene.textured import renew, with_texels
+from torchpt.scene.settings import SAMPLERS, Call, CommonOptions, Settings, settings_of_call
+from torchpt.scene.texel_params import update_texels, with_texel_params
 from torchpt.scene.versions import AFTER, check_unchanged
 from torchpt.spec import Role
 
@@ -81,7 +81,7 @@ class RenderRequest:
             RenderError: one of the scene's own parameters was replaced, or changed in place.
         """
         check_unchanged(self.versions, self.given.versions(), since)
-        renew(self.scene, self.given, self.params)
+        update_texels(self.scene, self.given, self.params)
 
 
 def ordered(scene: Scene, full: bool, **wishes: Unpack[CommonOptions]) -> RenderRequest:
@@ -94,13 +94,13 @@ def ordered(scene: Scene, full: bool, **wishes: Unpack[CommonOptions]) -> Render
     scene = as_scene(scene)
     call = Call.of({**wishes, "full": full})
     _check(scene, call, wishes.get("device"))
-    settings = complete(scene.description, blocks_of(wishes))
+    settings = complete(scene.description, settings_of_call(wishes))
     if not full:
         settings = _of_one_picture(settings, wishes.get("film"))
     elif settings.film.denoise:
         check_denoiser()
     params = _given(scene, call.params, full)
-    textured = with_texels(scene, params)
+    textured = with_texel_params(scene, params)
     textured.check_own()
     order = RenderRequest(scene, textured, settings, call, params)
     return order.noted() if order.taped else order

@@ -30,8 +30,15 @@ from torchpt.rendering.result import Progress, Rendering
 from torchpt.rendering.split import Split, stamp
 from torchpt.rendering.stopping import Stop
 from torchpt.scene import Scene
-from torchpt.scene.memory_estimate import BYTES_PER_LANE, FEWEST_OF_LOOP, LANES, check_film, loaded, memory_estimate
-from torchpt.scene.prepare import loop_of, looped, make_wave, surface_layers
+from torchpt.scene.memory_estimate import (
+    BYTES_PER_LANE,
+    FEWEST_OF_KERNELS,
+    LANES,
+    check_film,
+    mark_loaded,
+    memory_estimate,
+)
+from torchpt.scene.prepare import kernel_engine, make_wave, surface_layers, uses_kernels
 from torchpt.scene.settings import Settings
 
 __all__ = ["Run", "render_scene"]
@@ -75,7 +82,7 @@ class Run:
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
         meter, limit = Meter(self.device), settings.render.max_memory
         before = 0 if limit is None else meter.peak()
-        compiled = looped(settings, self.device, dtype)
+        compiled = uses_kernels(settings, self.device, dtype)
         self.wave = retried(
             lambda: f"a scene of {scene.told}",
             lambda: make_wave(scene, settings, params, dtype, like=like, rays=rays),
@@ -94,7 +101,7 @@ class Run:
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
             self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
             self.keeper.check(settings.render.resume)
-        self.tasks: Tasks | None = loop_of(scene, self.wave, self.eager, threads) if compiled else None
+        self.tasks: Tasks | None = kernel_engine(scene, self.wave, self.eager, threads) if compiled else None
         self.engine: Forward = self._by_tensors() if self.tasks is None else self.tasks
         rows = self.engine.rows(self.seen)
         how = "compiled" if self.engine.compiled else "eager"
@@ -103,7 +110,7 @@ class Run:
             loading = max(scene.peak, built - meter.base() if built > before else 0)
             check_memory(limit, self.device, self.need.least, loading)
             if self.engine.compiled:
-                self.engine.budget.fit(self.need.left(limit, meter.above()), 4 * rows, FEWEST_OF_LOOP)
+                self.engine.budget.fit(self.need.left(limit, meter.above()), 4 * rows, FEWEST_OF_KERNELS)
         films = mb(self.need.films)
         retried(lambda: f"films of {self.width} x {self.height} pixels, which take {films}", self._begin)
         self._compiled = self.compile_seconds()
@@ -179,7 +186,7 @@ class Run:
         return self._final()
 
     def _final(self) -> Rendering:
-        loaded("compiled" if self.engine.compiled else "eager")
+        mark_loaded("compiled" if self.engine.compiled else "eager")
         self.engine.dismiss(keeps=self.settings.render.max_memory is None)
         return final(self)
 

@@ -23,7 +23,7 @@ from torchpt.ranks import Group, dealt
 from torchpt.rendering.checkpoint import State
 from torchpt.scene import Scene
 from torchpt.scene.fingerprint import fingerprints
-from torchpt.scene.settings import Settings, having
+from torchpt.scene.settings import Settings, settings_with
 from torchpt.spec import Role
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ def _films(pixel_set: PixelSet) -> list[Film]:
 
 def stamp(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype) -> bytes:
     """Return a hash of what ranks must have in common to render one picture."""
-    free = having(Role.FREE, but=Role.FILES)  # upon files ranks must agree all the same
+    free = settings_with(Role.FREE, but=Role.FILES)  # upon files ranks must agree all the same
     free["render"] = (*free["render"], "device")
     own = settings.integrator if settings.integrator.foreign else None
     return tree.fingerprint((__version__, settings.plain(free), own, fingerprints(scene, params), dtype))

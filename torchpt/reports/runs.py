@@ -32,7 +32,7 @@ from torchpt.scene.formats.description import Description, overridden, read_desc
 from torchpt.scene.formats.overrides import told
 from torchpt.scene.prepare import SceneCache, scene_cache
 from torchpt.scene.scene import Scene
-from torchpt.scene.settings import Settings, having
+from torchpt.scene.settings import Settings, settings_with
 from torchpt.spec import Role
 
 __all__ = [
@@ -270,8 +270,8 @@ def from_file(path: str, size: tuple[int, int]) -> Truth:
 
 #: Settings that no run depends on, or that each has its own of.
 _FREE = {
-    "film": (*having(Role.FREE)["film"], "aovs"),
-    "render": (*having(Role.FILES)["render"], "seed", "spp"),
+    "film": (*settings_with(Role.FREE)["film"], "aovs"),
+    "render": (*settings_with(Role.FILES)["render"], "seed", "spp"),
 }
 
 

@@ -14,16 +14,16 @@ from torchpt.core.errors import SceneError
 from torchpt.core.files import configs
 from torchpt.images.metrics import METRICS
 from torchpt.scene.formats.yaml import plain, read_yaml
-from torchpt.scene.settings import BLOCKS, Render, having
-from torchpt.spec import Flag, Other, Refused, Role, Valued, Whole, parameters_of
-from torchpt.spec.schema import check_keys, values_of
+from torchpt.scene.settings import BLOCKS, Render, settings_with
+from torchpt.spec import Custom, Flag, FrozenConfig, Integer, Refused, Role, parameters_of
+from torchpt.spec.schema import check_keys, read_params
 
 __all__ = [
     "ERRORS",
     "LISTS",
     "MEASURES",
     "OWN_KEYS",
-    "RECORDS",
+    "UNTYPED_BLOCKS",
     "Extra",
     "Plan",
     "Reference",
@@ -45,9 +45,13 @@ __all__ = [
 LISTS = ("film.crop",)
 #: Settings that a study has its own way of saying, or that have no place in one.
 _TAKEN = {
-    **{f"render.{name}": "nothing: every run takes the samples that spp= says" for name in having(Role.ENDS)["render"]},
     **{
-        f"render.{name}": "nothing: a study that was stopped resumes by itself" for name in having(Role.FILES)["render"]
+        f"render.{name}": "nothing: every run takes the samples that spp= says"
+        for name in settings_with(Role.ENDS)["render"]
+    },
+    **{
+        f"render.{name}": "nothing: a study that was stopped resumes by itself"
+        for name in settings_with(Role.FILES)["render"]
     },
     "render.preview": "nothing: a study keeps every picture in its folder",
     "render.spp": "spp=[...], the steps of every curve",
@@ -270,42 +274,42 @@ def _extras(value: Any) -> tuple[dict[str, Any], ...]:
     return tuple(dict(item) for item in _list(value))
 
 
-class Asked(Valued):
+class Asked(FrozenConfig):
     """The keys that are the study's own, beside ``scene`` and ``reference``."""
 
     parameters: ClassVar = {
-        "spp": Other((4, 16, 64, 256), reader=_steps, words="growing numbers", doc="samples a pixel of each step"),
-        "seeds": Whole(5, low=2, high=1000, doc="independent runs of each step"),
+        "spp": Custom((4, 16, 64, 256), reader=_steps, words="growing numbers", doc="samples a pixel of each step"),
+        "seeds": Integer(5, low=2, high=1000, doc="independent runs of each step"),
         "seed": replace(parameters_of(Render)["seed"], doc="the seeds of all runs follow from it"),
-        "metrics": Other(
+        "metrics": Custom(
             ("relmse", "relmse_trimmed", "mse", "smape", "psnr", "ssim", "flip"),
             reader=_metrics,
             words="names of measures",
             doc="what is measured; curves show the first",
         ),
-        "target": Other(
+        "target": Custom(
             None, reader=_targets, words="errors > 0", doc="of the first measure: the time to reach them is told"
         ),
-        "extra": Other(
+        "extra": Custom(
             (), reader=_extras, words="a list of {name, seconds, file}", doc="other renderers' pictures, linear"
         ),
         "denoise": Flag(False, doc="beside every curve a second one, of the denoised pictures of its runs"),
-        "title": Other("Error against run time", reader=str, words="text", doc="of the page"),
+        "title": Custom("Error against run time", reader=str, words="text", doc="of the page"),
     }
 
 
-class Reference(Valued):
+class Reference(FrozenConfig):
     """How the reference is made, where it is no file."""
 
     parameters: ClassVar = {
-        "spp": Whole(None, low=1, doc="samples a pixel of each of its runs; 4 times the largest step"),
-        "seeds": Whole(8, low=2, high=1000, doc="independent runs that it is the mean of"),
+        "spp": Integer(None, low=1, doc="samples a pixel of each of its runs; 4 times the largest step"),
+        "seeds": Integer(8, low=2, high=1000, doc="independent runs that it is the mean of"),
     }
 
 
 OWN_KEYS = (*Asked.parameters, "scene", "reference", "overrides")
 #: For the tables of the docs.
-RECORDS = {"study": Asked, "reference": Reference}
+UNTYPED_BLOCKS = {"study": Asked, "reference": Reference}
 
 
 @dataclass(frozen=True)
@@ -414,7 +418,7 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
         raise SceneError(
             "scene", raw.get("scene"), "the name of a scene, a path ending in .yaml, or a list of them", file
         )
-    asked = values_of(Asked, {key: raw[key] for key in Asked.parameters if key in raw}, "", file, "a study")
+    asked = read_params(Asked, {key: raw[key] for key in Asked.parameters if key in raw}, "", file, "a study")
     if "flip" in asked["metrics"] and find_spec("flip_evaluator") is None:
         if "metrics" in asked.given:
             expected = "measures that are there (flip: pip install 'torchpt-renderer[compare]')"
@@ -457,7 +461,7 @@ def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> Pla
             raise SceneError("reference.file", files, f"a file for each of {', '.join(scenes)}", file)
         return Plan(dict(files), 0, 0, {})
     own = {key: value for key, value in raw.items() if key in parameters_of(Reference)}
-    made = values_of(Reference, own, "reference", file, "a reference")
+    made = read_params(Reference, own, "reference", file, "a reference")
     settings = flat({key: value for key, value in raw.items() if key not in own})
     for key, value in settings.items():
         if isinstance(value, list) and key not in LISTS:

@@ -5,7 +5,7 @@
 ``meshes/``           reads mesh files: triangles with their materials, lights and cameras
 ``settings.py``       the settings of a render, each declared once
 ``loading.py``        ``torchpt.load``: start here
-``build.py``          builds parts and parameters of a description, with ``shapes.py``, ``sources.py``, ``mesh_shapes.py``
+``build.py``          builds parts and parameters of a description, with ``shapes.py``, ``sources.py``, ``mesh_triangles.py``
 ``scene.py``          a scene: its parameters, and a cache of the worlds and trees built from them
 ``world/``            builds the world of parts and parameters: one differentiable function
 ``prepare.py``        builds the wave of a render, and chooses the engine

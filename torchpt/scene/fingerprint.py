@@ -14,17 +14,17 @@ from torch import Tensor
 
 from torchpt.core import tree
 from torchpt.core.errors import SceneError
-from torchpt.scene.build import Built
+from torchpt.scene.build import SceneBuild
 from torchpt.scene.scene import Scene
 
 __all__ = ["fingerprint", "fingerprints"]
 
 #: By scene, its build and the hashes of it.
-_known: WeakKeyDictionary[Scene, tuple[Built, dict[str, str]]] = WeakKeyDictionary()
+_known: WeakKeyDictionary[Scene, tuple[SceneBuild, dict[str, str]]] = WeakKeyDictionary()
 
 
 def fingerprints(scene: Scene, params: Mapping[str, Tensor] | None = None) -> dict[str, str]:
-    """Return hashes of a scene by part: its camera, its parameters by block, and each field of :class:`Built`.
+    """Return hashes of a scene by part: its camera, its parameters by block, and each field of :class:`SceneBuild`.
 
     They depend neither on the process and the device nor on the paths of the scene's files.
 

@@ -15,10 +15,10 @@ from torchpt.math.transforms import is_usable
 from torchpt.scene.loading import load
 from torchpt.scene.meshes import FileLight, MeshPart
 from torchpt.scene.meshes.mesh import checked
-from torchpt.scene.meshes.trimesh_objects import Looks, lights_of, parts_of, placed_in
+from torchpt.scene.meshes.trimesh_objects import MaterialConverter, lights_of, parts_of, placed_in
 from torchpt.scene.scene import Scene
-from torchpt.scene.settings import shaped
-from torchpt.scene.sources import labels_of
+from torchpt.scene.settings import keep_aspect
+from torchpt.scene.sources import unique_labels
 
 __all__ = ["description_of", "from_trimesh"]
 
@@ -67,7 +67,7 @@ def from_trimesh(
     for name, block in blocks.items():
         if block is not None:
             below = description.get(name, {})
-            description[name] = below | (shaped(below, block) if name == "film" else dict(block))
+            description[name] = below | (keep_aspect(below, block) if name == "film" else dict(block))
     return load(description, device)
 
 
@@ -85,7 +85,7 @@ def description_of(source: Any) -> dict[str, Any]:
     description: dict[str, Any] = {"shapes": shapes, **_view(source)}
     lights, _ = lights_of(source, _LABEL)
     if lights:
-        names = labels_of([light.name for light in lights])
+        names = unique_labels([light.name for light in lights])
         description["lights"] = {name: _light(light) for name, light in zip(names, lights, strict=True)}
     elif not glows:
         description["lights"] = {"sky": {"type": "constant", "radiance": 1.0}}
@@ -94,14 +94,14 @@ def description_of(source: Any) -> dict[str, Any]:
 
 def _shapes(source: Any) -> tuple[dict[str, Any], bool]:
     """Return the shapes block, a ``mesh`` for a geometry's first node and ``instance`` for others; True if any emits."""
-    looks, shapes, glows = Looks(_LABEL), {}, False
+    converter, shapes, glows = MaterialConverter(_LABEL), {}, False
     nodes = list(placed_in(source))
     first: dict[str, str] = {}
     known: dict[str, list[MeshPart]] = {}
-    labels = labels_of(["".join(c if c.isprintable() else "_" for c in node).strip() for node, _, _ in nodes])
+    labels = unique_labels(["".join(c if c.isprintable() else "_" for c in node).strip() for node, _, _ in nodes])
     for label, (_, name, matrix) in zip(labels, nodes, strict=True):
         if name not in known:
-            known[name] = checked(parts_of(source.geometry[name], str(name)[:80], looks), Path(_LABEL))
+            known[name] = checked(parts_of(source.geometry[name], str(name)[:80], converter), Path(_LABEL))
         emits = any("emission" in part.material.material for part in known[name] if part.material is not None)
         glows |= emits
         if name in first and not emits and is_usable(matrix):

@@ -17,13 +17,15 @@ from torchpt.scene.settings import Settings
 from torchpt.search import Accel
 
 if TYPE_CHECKING:
-    from torchpt.scene.build import Built
+    from torchpt.scene.build import SceneBuild
     from torchpt.scene.formats.description import Description
 
 __all__ = ["describe"]
 
 
-def describe(description: Description, built: Built, world: World, accel: Accel, settings: Settings) -> dict[str, Any]:
+def describe(
+    description: Description, built: SceneBuild, world: World, accel: Accel, settings: Settings
+) -> dict[str, Any]:
     """Return a nested dict of plain values: ``scene``, ``shapes``, ``built``, ``left_out``, ``settings``."""
     lights = world.lights
     shapes: dict[str, Any] = {}

@@ -12,10 +12,10 @@ from torchpt.core.memory import needing
 from torchpt.core.threads import lasting
 from torchpt.physics.bsdfs import Bsdf
 from torchpt.scene.devices import device_of
+from torchpt.scene.dict_tensors import params_from_tensors, vertex_attributes_in, with_all_intrinsics
 from torchpt.scene.formats.description import Source, read_description, settings
 from torchpt.scene.formats.tensors import Tensors
 from torchpt.scene.scene import Scene
-from torchpt.scene.traced import corners_in, traced, widened
 
 __all__ = ["load"]
 
@@ -64,7 +64,12 @@ def _load(
         description = read_description(source, bsdfs, tensors.taken_from if may_hold_tensors else None, overrides)
     chosen = device_of(settings(description).render.device if device is None else device)
     with lasting():
-        scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))
-    scene.params |= traced(tensors, scene.description, scene.built, scene.params)
+        scene = Scene(
+            with_all_intrinsics(description, tensors),
+            chosen,
+            tuple((bsdfs or {}).values()),
+            vertex_attributes_in(tensors),
+        )
+    scene.params |= params_from_tensors(tensors, scene.description, scene.built, scene.params)
     scene.load_seconds = time.perf_counter() - start
     return scene

@@ -34,15 +34,15 @@ if TYPE_CHECKING:
 
 __all__ = [
     "SceneCache",
+    "describe_engine",
+    "kernel_engine",
     "kernels_of",
-    "loop_facts",
-    "loop_of",
-    "looped",
     "make_wave",
     "own_models",
-    "rebound",
+    "rebuild_with_tape",
     "scene_cache",
     "surface_layers",
+    "uses_kernels",
 ]
 
 
@@ -189,7 +189,7 @@ def _filter(kind: type[Filter], values: tuple[tuple[str, Any], ...], device: tor
     return kind(dict(values), device)
 
 
-def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Wave:
+def rebuild_with_tape(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Wave:
     """Return an eager wave with world and camera rebuilt from ``params``, so that autograd records how they depend on them.
 
     Args:
@@ -257,7 +257,7 @@ def _pixel_of(world: World, camera: Camera) -> Tensor | None:
     return camera.pixel() if world.textures.filtered else None
 
 
-def looped(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool:
+def uses_kernels(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool:
     """Return True where a render runs as kernels, False where it runs as tensor operations.
 
     Raises:
@@ -286,15 +286,15 @@ def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kerne
     return engine.kernels_of(wave, own_models(scene, wave), before)
 
 
-def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
+def describe_engine(scene: Scene, settings: Settings) -> dict[str, Any]:
     """Describe how a render of the scene would run: by kernels, with their search, or by tensor operations."""
     with torch.no_grad():
-        if not looped(settings, scene.device, torch.float32):
+        if not uses_kernels(settings, scene.device, torch.float32):
             return {"stages": "eager, by tensor operations"}
         return engine.told(kernels_of(scene, make_wave(scene, settings, None, torch.float32)))
 
 
-def loop_of(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Tasks:
+def kernel_engine(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Tasks:
     """Return the kernel engine of a render on ``threads`` (None: torch's number); its kernels are cached with the scene.
 
     Models that cannot be compiled are appended to ``eager``, with the reason.

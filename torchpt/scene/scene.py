@@ -26,21 +26,21 @@ from torchpt.physics.cameras import Camera
 from torchpt.physics.cameras.opencv import PinholeMatrices, extrinsics
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.physics.world import World
-from torchpt.scene.build import Built, build_parts
+from torchpt.scene.build import SceneBuild, build_parts
 from torchpt.scene.devices import device_of
 from torchpt.scene.formats.description import Description, settings
 from torchpt.scene.info import describe
 from torchpt.scene.settings import Film, Settings
 from torchpt.scene.sources import check_sources
-from torchpt.scene.space import FARTHEST, Space, extent_of, middle_of
+from torchpt.scene.space import FARTHEST, Space, bounds_center, bounds_extent
 from torchpt.scene.validation import check_tensor, shared, validate_changes
-from torchpt.scene.versions import Editions, changes
-from torchpt.scene.view import through
+from torchpt.scene.versions import VersionCounter, changes
+from torchpt.scene.view import view_attributes
 from torchpt.scene.world import assemble
 from torchpt.search import Accel
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
-__all__ = ["Scene", "numbered"]
+__all__ = ["Scene", "scene_by_number"]
 
 #: Attributes that copies take over; all others are rebuilt on demand.
 _KEPT = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
@@ -49,7 +49,7 @@ _numbers = itertools.count(1)
 _scenes: WeakValueDictionary[int, Scene] = WeakValueDictionary()
 
 
-def numbered(number: int) -> Scene | None:
+def scene_by_number(number: int) -> Scene | None:
     """Return the scene with a number; None once it is gone."""
     return _scenes.get(number)
 
@@ -78,7 +78,7 @@ class Scene:
         description: Description,
         device: torch.device,
         own_models: tuple[Bsdf, ...] = (),
-        traced: Collection[str] = (),
+        vertex_params: Collection[str] = (),
     ) -> None:
         settle()
         meter = Meter(device)
@@ -86,7 +86,9 @@ class Scene:
         before = meter.peak()
         self.load_seconds = 0.0
         self.description, self.device, self.own_models = description, device, own_models
-        self._built: Built = retried("the files and shapes of the scene", lambda: build_parts(description, traced))
+        self._built: SceneBuild = retried(
+            "the files and shapes of the scene", lambda: build_parts(description, vertex_params)
+        )
         # Far from the origin, positions in float32 would lose detail before they are moved to it.
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {
@@ -98,10 +100,10 @@ class Scene:
         after = meter.peak()
         #: Peak bytes above those after import while the scene was read; 0 where unknown.
         self.peak = after - meter.base() if after > before else 0
-        self._begin()
-        self._vetted = self.versions()  # the reader has checked these values
+        self._reset_caches()
+        self._checked_versions = self.versions()  # the reader has checked these values
 
-    def _begin(self) -> None:
+    def _reset_caches(self) -> None:
         """Reset all caches."""
         self._space = Space(torch.from_numpy(self._built.centre).to(self.device), self._built.unit)
         self._lock = threading.RLock()
@@ -109,14 +111,15 @@ class Scene:
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._latest: dict[tuple[str, int | None], Accel] = {}  # to refit, or to reuse its topology
         # Versions of the parameters that the caches were built from; views of the scene share them.
-        self._sources, self._made_of = Editions(), dict[str, int]()
+        self._sources, self._made_of = VersionCounter(), dict[str, int]()
         self._origin: Scene | None = None
-        self._number()
+        self._assign_number()
 
-    def _number(self) -> None:
+    def _assign_number(self) -> None:
         """Take a new number and forget which versions were checked."""
-        self.textured: dict[Any, Scene] = {}  # of :mod:`torchpt.scene.textured`
-        self._editions, self._vetted = Editions(), dict[str, int]()  # current and checked versions by name
+        self.textured: dict[Any, Scene] = {}  # by :mod:`torchpt.scene.texel_params`
+        self._version_counter = VersionCounter()
+        self._checked_versions: dict[str, int] = {}
         #: Unique in this process; compiled graphs refer to the scene by it.
         self.number = next(_numbers)
         _scenes[self.number] = self
@@ -138,11 +141,11 @@ class Scene:
         """
         view = object.__new__(type(self))
         with lasting():
-            own = through(self.description, self._built, self.params, camera, {} if film is None else film)
+            own = view_attributes(self.description, self._built, self.params, camera, {} if film is None else film)
         view.__dict__.update(self.__dict__ | own)
         view._origin = self.origin
-        view._number()
-        view.trust(self)
+        view._assign_number()
+        view.mark_checked(self)
         return view
 
     def to(self, device: str | torch.device) -> Scene:
@@ -187,7 +190,7 @@ class Scene:
     def __setstate__(self, state: dict[str, Any]) -> None:
         settle()
         self.__dict__.update(state)
-        self._begin()
+        self._reset_caches()
 
     def weights(self) -> tuple[Tensor, ...]:
         """Return the tensors of the caller's BSDFs that require gradients."""
@@ -206,12 +209,12 @@ class Scene:
         held = sum(value.numel() * value.element_size() for value in self.params.values())
         return f"{len(self._built.parts)} parts with {triangles} vertices, whose parameters alone take {mb(held)}"
 
-    def use(self, built: Built) -> None:
+    def replace_build(self, built: SceneBuild) -> None:
         """Replace the build by one with the same names of parameters, before anything is cached."""
         self._built = built
 
     @property
-    def built(self) -> Built:
+    def built(self) -> SceneBuild:
         """Return the parts, instances and lights built from the description; immutable."""
         return self._built
 
@@ -220,14 +223,14 @@ class Scene:
         """Return the transform to the coordinates of lanes."""
         return self._space
 
-    def middle(self) -> np.ndarray:
+    def center(self) -> np.ndarray:
         """Return the centre ``(3,)`` of the bounding box of all surfaces, float64; the origin where there are none."""
-        return middle_of(self._built.parts, self._built.copies)
+        return bounds_center(self._built.parts, self._built.copies)
 
     @property
     def length(self) -> float:
         """Return the longest side of the bounding box of all surfaces, rounded to a power of two."""
-        return 2.0 ** round(math.log2(max(extent_of(self._built.parts, self._built.copies), 2.0**-100)))
+        return 2.0 ** round(math.log2(max(bounds_extent(self._built.parts, self._built.copies), 2.0**-100)))
 
     def check(self, params: Mapping[str, Tensor] | None) -> None:
         """Check parameters that are to replace the scene's in a render.
@@ -252,15 +255,15 @@ class Scene:
             SceneError: as :meth:`check`, or names that were removed or added.
         """
         with outside_transforms():
-            validate_changes(self, self._vetted)
+            validate_changes(self, self._checked_versions)
 
-    def trust(self, other: Scene) -> None:
+    def mark_checked(self, other: Scene) -> None:
         """Mark as checked the tensors that are shared with another scene and checked there."""
-        self._vetted = shared(self, other, other._vetted)
+        self._checked_versions = shared(self, other, other._checked_versions)
 
     def versions(self) -> dict[str, int]:
-        """Return version numbers of :attr:`params` by name; see :class:`torchpt.scene.versions.Editions`."""
-        return self._editions.of(self.params)
+        """Return version numbers of :attr:`params` by name; see :class:`torchpt.scene.versions.VersionCounter`."""
+        return self._version_counter.of(self.params)
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """Return all parameters, with those of ``params`` (checked before) in place of the scene's."""
@@ -337,7 +340,7 @@ class Scene:
         camera, values = self.description.camera, dict(self.description.camera.values)
         for key, spec in parameters_of(camera.kind).items():
             number = params.get(f"camera.{key}")
-            if spec.traced and number is not None:
+            if spec.differentiable and number is not None:
                 values[key] = (number.double() / self._space.unit if spec.length else number).to(dtype)
         pose = params["camera.to_world"]
         pose = torch.cat((self._space.pose(pose), pose[3:].double())).to(dtype)

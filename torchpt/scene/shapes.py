@@ -18,10 +18,10 @@ from torchpt.physics.textures import Node
 from torchpt.scene.formats.description import Description
 from torchpt.scene.formats.materials import check_material, plain_material, read_material
 from torchpt.scene.materials import declare, resolved
-from torchpt.scene.mesh_shapes import Mesh, ignored, mesh_of, solid
+from torchpt.scene.mesh_triangles import Mesh, ignored, mesh_of, solid
 from torchpt.scene.meshes import FileMaterial, MeshPart
-from torchpt.scene.sources import file_lights, labels_of
-from torchpt.scene.texels import Opener
+from torchpt.scene.sources import build_file_lights, unique_labels
+from torchpt.scene.texture_loader import TextureLoader
 from torchpt.spec import Pose, Vertices, parameters_of
 from torchpt.spec.schema import ParsedParams
 
@@ -60,8 +60,8 @@ class ShapeBuilder:
         sources: lights of mesh files, in the order of shapes.
     """
 
-    def __init__(self, description: Description, parameters: Parameters, opener: Opener) -> None:
-        self.description, self.parameters, self.opener = description, parameters, opener
+    def __init__(self, description: Description, parameters: Parameters, texture_loader: TextureLoader) -> None:
+        self.description, self.parameters, self.texture_loader = description, parameters, texture_loader
         self.sources: list[Source] = []
         self._slots: dict[str, ResolvedMaterial] = {}
         self._declared: set[int] = set()
@@ -122,10 +122,10 @@ class ShapeBuilder:
     def _meshes(self, owner: Owner, triangles: Triangles) -> list[Part]:
         """Return the parts of a mesh, one for each material of its file."""
         shape, pose = owner.shape, owner.to_world
-        mesh = mesh_of(triangles, owner.key, self.description, self.opener, materials=shape["material"] is None)
+        mesh = mesh_of(triangles, owner.key, self.description, self.texture_loader, materials=shape["material"] is None)
         lights = [light for piece in mesh.pieces for light in piece.lights]
-        self.sources += file_lights(lights, owner.key, pose, mesh.source, self.parameters)
-        labels = labels_of([piece.name for piece in mesh.pieces])
+        self.sources += build_file_lights(lights, owner.key, pose, mesh.source, self.parameters)
+        labels = unique_labels([piece.name for piece in mesh.pieces])
         parts: list[Part] = []
         known: dict[int, ResolvedMaterial] = {}
         for piece, label in zip(mesh.pieces, labels, strict=True):
@@ -153,9 +153,9 @@ class ShapeBuilder:
         known = self.description.materials
         if isinstance(given, str):
             if given not in self._slots:
-                self._slots[given] = resolved(known[given], f"materials.{given}", known, self.opener)
+                self._slots[given] = resolved(known[given], f"materials.{given}", known, self.texture_loader)
             return self._slots[given]
-        return resolved(plain_material() if given is None else given, f"{stem}.material", known, self.opener)
+        return resolved(plain_material() if given is None else given, f"{stem}.material", known, self.texture_loader)
 
     def _file_slot(self, own: FileMaterial, prefix: str, key: str, source: str) -> ResolvedMaterial:
         """Return a mesh file's own material.
@@ -166,7 +166,7 @@ class ShapeBuilder:
         try:
             material = read_material(own.material, key, BSDFS, None)
             check_material(material, key, {}, {}, None)
-            return resolved(material, key, {}, self.opener.sharing(f"{prefix}.textures"))
+            return resolved(material, key, {}, self.texture_loader.sharing(f"{prefix}.textures"))
         except SceneError as error:
             raise AssetError(source, f"material {own.name[:80]!r}: {error}") from None
 

@@ -20,7 +20,7 @@ from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.parts import Copy, Part, Source
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["FARTHEST", "Space", "centre_and_unit", "extent_of", "middle_of"]
+__all__ = ["FARTHEST", "Space", "bounds_center", "bounds_extent", "centre_and_unit"]
 
 #: A scene is moved to the origin where its distance from it is more than this many times its size.
 RECENTRE = 8.0
@@ -100,13 +100,13 @@ def centre_and_unit(
     return centre, _unit(lengths, (names[near], float(sizes[near])), file)
 
 
-def middle_of(parts: Sequence[Part], copies: Sequence[Copy]) -> Array:
+def bounds_center(parts: Sequence[Part], copies: Sequence[Copy]) -> Array:
     """Return the centre ``(3,)`` of the bounding box of all surfaces; the origin where there are none."""
     names, boxes, _ = _boxes(parts, copies)
     return 0.5 * (boxes.min((0, 1)) + boxes.max((0, 1))) if names else np.zeros(3)
 
 
-def extent_of(parts: Sequence[Part], copies: Sequence[Copy]) -> float:
+def bounds_extent(parts: Sequence[Part], copies: Sequence[Copy]) -> float:
     """Return the longest side of the bounding box of all surfaces; 1 where there are none."""
     names, boxes, _ = _boxes(parts, copies)
     return float((boxes.max((0, 1)) - boxes.min((0, 1))).max()) if names else 1.0

@@ -23,7 +23,7 @@ from torchpt.core.errors import AssetError, OutputError, SceneError
 from torchpt.core.files import as_path, read_regular
 from torchpt.scene.conventions import from_opengl, size_of, to_opengl
 from torchpt.spec import Refused, reading
-from torchpt.spec.schema import described
+from torchpt.spec.schema import read_typed
 
 if TYPE_CHECKING:
     from torchpt.scene.scene import Scene
@@ -241,7 +241,7 @@ def _seen(block: Any, size: tuple[int, int], key: str) -> tuple[Tensor, Tensor]:
         raise SceneError(key, sorted(map(str, block)), expected)
     if "K" in block:
         block = {"size": list(size), **block}
-    values = described("camera", {Perspective.name: Perspective}, block, key, None, Perspective.name).values
+    values = read_typed("camera", {Perspective.name: Perspective}, block, key, None, Perspective.name).values
     numbers = {
         name: torch.tensor(value, dtype=torch.float64) if isinstance(value, float) else value
         for name, value in values.items()

@@ -61,7 +61,7 @@ def shared(made: Scene, scene: Scene, validated_versions: dict[str, int]) -> dic
     """Return the validated versions of a scene ``made`` from another, for the tensors that both share."""
     before, now = scene.versions(), made.versions()
     return {
-        name: edition
-        for name, edition in now.items()
+        name: version
+        for name, version in now.items()
         if 0 < before.get(name, 0) == validated_versions.get(name) and made.params[name] is scene.params[name]
     }

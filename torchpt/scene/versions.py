@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchpt.core.errors import RenderError
 
-__all__ = ["AFTER", "Editions", "changes", "check_unchanged"]
+__all__ = ["AFTER", "VersionCounter", "changes", "check_unchanged"]
 
 #: Phrase for errors of a backward pass.
 AFTER = "after the picture whose gradient is asked for"
@@ -17,7 +17,7 @@ AFTER = "after the picture whose gradient is asked for"
 
 def changes(before: Mapping[str, int], now: Mapping[str, int]) -> dict[str, int]:
     """Return the versions that differ from ``before``, and those that cannot be compared (0 or negative)."""
-    return {name: edition for name, edition in now.items() if not 0 < edition == before.get(name)}
+    return {name: version for name, version in now.items() if not 0 < version == before.get(name)}
 
 
 def check_unchanged(before: Mapping[str, int], now: Mapping[str, int], since: str) -> None:
@@ -31,13 +31,13 @@ def check_unchanged(before: Mapping[str, int], now: Mapping[str, int], since: st
     Raises:
         RenderError: a parameter was replaced or changed in place.
     """
-    for name, edition in before.items():
-        if now.get(name) != edition:
+    for name, version in before.items():
+        if now.get(name) != version:
             hint = "hand it over by params, whose values a picture keeps, or change it later"
             raise RenderError(f"scene.params[{name!r}] was changed {since}: {hint}")
 
 
-class Editions:
+class VersionCounter:
     """Counter of versions of named tensors."""
 
     def __init__(self) -> None:

@@ -25,13 +25,13 @@ __all__ = [
     "Angle",
     "Choice",
     "Color",
-    "Corners",
+    "Custom",
     "Direction",
     "Flag",
     "Index",
+    "Integer",
     "Map",
     "Moves",
-    "Other",
     "Pair",
     "Path",
     "Point",
@@ -40,8 +40,8 @@ __all__ = [
     "Scalar",
     "Spec",
     "Texels",
+    "VertexAttribute",
     "Vertices",
-    "Whole",
     "spec_of",
 ]
 
@@ -102,7 +102,7 @@ class Spec:
     role: Role = field(default=Role.NONE, kw_only=True)
 
     #: True for a tensor of ``scene.params``; else the value is fixed once the scene is loaded.
-    traced: ClassVar[bool] = False
+    differentiable: ClassVar[bool] = False
     #: True for a position in the scene's own coordinates: kept in float64 where the scene lies far from the origin.
     place: ClassVar[bool] = False
     #: True where it takes three channels of a texture, else one.
@@ -160,7 +160,7 @@ class _Numbers(Spec):
     above: float | None = field(default=None, kw_only=True)
     below: float | None = field(default=None, kw_only=True)
 
-    traced: ClassVar[bool] = True
+    differentiable: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if isinstance(self.default, int | float) and not isinstance(self.default, bool):  # convert it as `read` does
@@ -345,7 +345,7 @@ def spec_of(value: Any) -> Spec:
 class _Vector(Spec):
     """Three numbers."""
 
-    traced: ClassVar[bool] = True
+    differentiable: ClassVar[bool] = True
 
     def read(self, value: Any) -> tuple[float, float, float]:
         """See :class:`Spec`."""
@@ -413,7 +413,7 @@ class Vertices(_Vector):
 
 
 @dataclass(frozen=True)
-class Corners(Vertices):
+class VertexAttribute(Vertices):
     """Vertex normals ``(V, 3)`` or texture coordinates ``(V, 2)`` of a mesh."""
 
     place: ClassVar[bool] = False
@@ -435,7 +435,7 @@ class Pose(Spec):
     operations: bool = field(default=True, kw_only=True)
     moves: Moves = field(default=Moves.SURFACES, kw_only=True)
 
-    traced: ClassVar[bool] = True
+    differentiable: ClassVar[bool] = True
     place: ClassVar[bool] = True
 
     @property
@@ -513,7 +513,7 @@ class Choice(Spec):
 
 
 @dataclass(frozen=True)
-class Whole(Spec):
+class Integer(Spec):
     """A whole number in a range, or one of a few other values.
 
     Attributes:
@@ -595,7 +595,7 @@ class Map(Spec):
 
 
 @dataclass(frozen=True)
-class Other(Spec):
+class Custom(Spec):
     """A value with a reader of its own.
 
     Attributes:

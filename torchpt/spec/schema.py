@@ -18,26 +18,26 @@ from torchpt.core.errors import NotBuiltError, SceneError
 from torchpt.core.tree import UNPRINTED
 from torchpt.spec import Map, Refused, unsupported
 from torchpt.spec.parameters import REQUIRED, Spec, spec_of
-from torchpt.spec.reading import within
+from torchpt.spec.reading import as_refused
 
 if TYPE_CHECKING:
     from typing import Self
 
 __all__ = [
     "Block",
+    "FrozenConfig",
     "Kinds",
-    "Memo",
     "ParsedParams",
-    "Valued",
+    "ResultCache",
     "check_keys",
-    "described",
     "dotted",
     "frozen",
     "parameters_of",
-    "refuse_foreign",
+    "read_params",
+    "read_typed",
     "refuse_not_built",
-    "refused",
-    "values_of",
+    "refuse_unused_keys",
+    "scene_error",
 ]
 
 
@@ -142,7 +142,7 @@ class Block(Spec):
 # ---- Kinds whose instances are the values of their parameters
 
 
-class Valued:
+class FrozenConfig:
     """A frozen record with an attribute for each parameter that its class declares.
 
     Args:
@@ -185,7 +185,7 @@ class Valued:
         raise AttributeError(f"{type(self).__name__} is frozen")
 
     def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and isinstance(other, Valued) and other.values == self.values
+        return type(other) is type(self) and isinstance(other, FrozenConfig) and other.values == self.values
 
     def __hash__(self) -> int:
         return hash((type(self), *self.values.values()))
@@ -231,7 +231,7 @@ def frozen(value: Any) -> Hashable:
     raise TypeError(kind.__name__)
 
 
-class Memo(Generic[T]):
+class ResultCache(Generic[T]):
     """A cache of results by the plain values that they were made from; the oldest entries are dropped.
 
     Args:
@@ -280,7 +280,7 @@ def check_keys(raw: Mapping[str, Any], known: Iterable[str], key: str, what: str
             raise SceneError(dotted(key, name), name, f"a known key of {what}{hint}: {', '.join(names)}", file)
 
 
-def refused(error: Refused, key: str, value: Any, file: str | None) -> SceneError:
+def scene_error(error: Refused, key: str, value: Any, file: str | None) -> SceneError:
     """Return the scene error for a refused value at ``key``."""
     shown = value if error.value is ... else error.value
     kind = NotBuiltError if error.not_built else SceneError
@@ -334,7 +334,7 @@ class ParsedParams:
 ReadTexture = Callable[[Mapping[str, Any], Spec], Any]
 
 
-def described(
+def read_typed(
     what: str,
     table: Mapping[str, Any],
     raw: Any,
@@ -383,7 +383,7 @@ def described(
 
 
 #: Blocks that were read, by the mapping as written.
-_known: Memo[ParsedParams] = Memo(4096)
+_known: ResultCache[ParsedParams] = ResultCache(4096)
 
 
 def _read(
@@ -396,10 +396,10 @@ def _read(
     check_keys({k: v for k, v in raw.items() if k not in later}, ("type", *names), key, words, file)
     rest = refuse_not_built(raw, later, key, ", ".join(names), file)
     values = {k: value for k, value in rest.items() if k != "type"}
-    return values_of(kind, values, key, file, words, texture)
+    return read_params(kind, values, key, file, words, texture)
 
 
-def values_of(
+def read_params(
     kind: Any,
     raw: Mapping[str, Any],
     key: str,
@@ -423,7 +423,7 @@ def values_of(
             try:
                 values[name] = _read_value(spec, given[name], texture)
             except Refused as error:
-                raise refused(error, dotted(key, name), given[name], file) from None
+                raise scene_error(error, dotted(key, name), given[name], file) from None
         elif spec.default is REQUIRED:
             raise SceneError(dotted(key, name), None, "a value (this key is required)", file)
         else:
@@ -436,11 +436,11 @@ def values_of(
         try:
             check(values, frozenset(given))
         except Refused as error:
-            raise refused(error, key, None, file) from None
+            raise scene_error(error, key, None, file) from None
     return ParsedParams(kind, values, frozenset(given))
 
 
-def refuse_foreign(what: str, table: Mapping[str, Any], raw: Any, default: str, file: str | None) -> None:
+def refuse_unused_keys(what: str, table: Mapping[str, Any], raw: Any, default: str, file: str | None) -> None:
     """Raise for a key that only other types of the table read, since it would have no effect.
 
     Args:
@@ -488,6 +488,6 @@ def _block(spec: Block, texture: ReadTexture | None, value: Any) -> ParsedParams
     if not isinstance(value, Mapping):
         raise Refused(spec.expected)
     try:
-        return values_of(spec.kind, value, "", None, spec.kind.__name__.lower(), texture)
+        return read_params(spec.kind, value, "", None, spec.kind.__name__.lower(), texture)
     except SceneError as error:
-        raise within(error) from None
+        raise as_refused(error) from None

@@ -18,7 +18,7 @@ from torchpt.scene.devices import device_of
 from torchpt.scene.formats.description import Description, overridden, read_description
 from torchpt.scene.scene import Scene
 from torchpt.scene.settings import Settings
-from torchpt.scene.space import extent_of
+from torchpt.scene.space import bounds_extent
 from torchpt.spec import Role
 from torchpt.stress.bench import Bench, apart
 from torchpt.stress.case import Case, powers
@@ -53,7 +53,7 @@ def cases_of(
     wishes = _small(settings)
     own = Scene(description, torch.device("cpu"))
     extent, pose = (
-        extent_of(own.built.parts, own.built.copies),
+        bounds_extent(own.built.parts, own.built.copies),
         np.asarray(own.built.parameters["camera.to_world"], np.float64),
     )
     known: dict[Bench, tuple[Tensor, Tensor]] = {}

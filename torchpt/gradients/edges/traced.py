@@ -16,7 +16,7 @@ from torchpt.paths.wave import PixelSet, Rays, Wave, clamp_scale
 from torchpt.physics.film import Film
 from torchpt.physics.samplers import Dimension, Draws, Sampler, salts
 from torchpt.scene import Scene
-from torchpt.scene.prepare import kernels_of, looped, make_wave
+from torchpt.scene.prepare import kernels_of, make_wave, uses_kernels
 from torchpt.scene.settings import SAMPLERS, Settings
 from torchpt.spec.schema import ParsedParams
 
@@ -38,7 +38,7 @@ class Along:
     def __init__(self, scene: Scene, settings: Settings, wave: Wave) -> None:
         self._scene, self._clamp = scene, wave.integrator.clamp
         # Kernels of a kind with stages of its own are made anew for each depth that is asked for.
-        compiled = looped(settings, scene.device, wave.context.plan.dtype) and not wave.integrator.own_stages
+        compiled = uses_kernels(settings, scene.device, wave.context.plan.dtype) and not wave.integrator.own_stages
         self._compiled = compiled
         self._kernels: Kernels | None = None
         self._keep = settings.render.max_memory is None

@@ -126,7 +126,7 @@ class Bsdf:
         return {
             key: value
             for key, value in values.items()
-            if value is not None and key not in Bsdf.parameters and (key not in specs or specs[key].traced)
+            if value is not None and key not in Bsdf.parameters and (key not in specs or specs[key].differentiable)
         }
 
     @classmethod

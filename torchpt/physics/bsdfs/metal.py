@@ -15,7 +15,7 @@ from torchpt.physics.bsdfs.presets import METALS
 from torchpt.physics.bsdfs.presets import metal as preset
 from torchpt.physics.bsdfs.records import SplitSumMaterial
 from torchpt.physics.bsdfs.specs import WHITE, reflectance
-from torchpt.spec import Color, Other, Refused
+from torchpt.spec import Color, Custom, Refused
 
 __all__ = ["Metal", "by_reflectance", "metal", "metal_colour", "mirrored"]
 
@@ -34,7 +34,7 @@ class Metal(Bsdf, part=True):
     """A part of a model: a metal by its name, by ``eta`` and ``k``, or by its reflectance at normal incidence."""
 
     parameters: ClassVar = {
-        "material": Other(
+        "material": Custom(
             None, reader=_name, words=f"{_MIRROR} (a perfect mirror), or a metal's name", doc="which metal"
         ),
         "eta": Color(None, texture=True, doc="the real part of its index, with `k`"),

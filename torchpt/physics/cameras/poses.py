@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torchpt.core.errors import SceneError
 from torchpt.math.transforms import affine, is_rigid, is_usable, look_at, tensor_of
 from torchpt.physics.cameras import opencv
-from torchpt.spec import Other, Point, Pose, Refused, Spec
+from torchpt.spec import Custom, Point, Pose, Refused, Spec
 
 __all__ = ["POSES", "UP", "pose_of", "posed"]
 
@@ -35,7 +35,7 @@ _REQUIRED = {
 class _Told(Point):
     """Three numbers that say where the camera stands: no tensor of the scene, the pose made of them is."""
 
-    traced: ClassVar[bool] = False
+    differentiable: ClassVar[bool] = False
     place: ClassVar[bool] = False
 
 
@@ -50,13 +50,13 @@ POSES: Mapping[str, Spec] = {
         operations=False,
         doc="in place of these: from its own space (it looks along +z, +y is up, +x left in the picture) to the world",
     ),
-    "R": Other(
+    "R": Custom(
         None,
         reader=opencv.rotation,
         words="three rows of a rotation",
         doc="in place of these, with `t`: OpenCV's rotation from the world to the camera (+x right, +y down, +z ahead)",
     ),
-    "t": Other(
+    "t": Custom(
         None,
         reader=opencv.translation,
         words="three finite numbers [x, y, z]",

@@ -119,7 +119,7 @@ class ComputedNode(Node):
         """Its parameters ``()`` or ``(3,)`` by name, in float64; of a number's node colours as three times the channel."""
         found = {}
         for key, spec in parameters_of(type(self.texture)).items():
-            value = parameters.get(f"{self.name}.{key}") if spec.traced else None
+            value = parameters.get(f"{self.name}.{key}") if spec.differentiable else None
             if value is not None:
                 value = value.double()
                 if isinstance(spec, Color) and self.channel is not None:

@@ -25,7 +25,7 @@ from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
 from torchpt.scene.settings import Common, RenderOptions
 from torchpt.scene.versions import check_unchanged
-from torchpt.spec.arguments import check_names, spelled
+from torchpt.spec.arguments import check_names, expand_signature
 
 __all__ = ["Renderings", "render_batch"]
 
@@ -80,7 +80,7 @@ def render_batch(
     scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: Pictures = None, *, seed: Seeds = None,
     on_progress: Callable[[int, int | None], None] | None = None, full: Literal[True], **wishes: Unpack[Common],
 ) -> Renderings: ...  # fmt: skip
-@spelled
+@expand_signature
 def render_batch(
     scenes: Scene | Iterable[Scene],
     cameras: Cameras = None,

@@ -1,7 +1,7 @@
 """Replace tensors in a scene dict by plain numbers, and remember the keys of those that require gradients.
 
 Readers see plain numbers, lists and arrays, so that ranges and errors are those of a file. The dict itself is kept;
-:mod:`torchpt.scene.traced` computes the scene's parameters from its tensors again, with gradients.
+:mod:`torchpt.scene.dict_tensors` computes the scene's parameters from its tensors again, with gradients.
 """
 
 from __future__ import annotations

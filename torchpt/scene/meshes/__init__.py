@@ -30,7 +30,7 @@ PARSERS: dict[str, tuple[str, ...]] = {
 #: File ending -> module of this package, whose ``load_<module>(path, data, materials)`` returns the parts.
 FORMATS = {
     **{".obj": "obj", ".ply": "ply", ".stl": "stl", ".glb": "gltf", ".gltf": "gltf"},
-    **dict.fromkeys(PARSERS, "others"),
+    **dict.fromkeys(PARSERS, "trimesh_formats"),
 }
 
 

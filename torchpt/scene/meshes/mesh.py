@@ -25,7 +25,7 @@ __all__ = [
     "displaced",
     "smooth_normals",
     "subdivided",
-    "too_many",
+    "too_many_parts",
     "transformed",
 ]
 
@@ -150,13 +150,13 @@ def checked(parts: list[MeshPart], path: Path) -> list[MeshPart]:
             index out of range.
     """
     if len(parts) > MOST_PARTS:
-        raise too_many(path)
+        raise too_many_parts(path)
     if not parts or all(len(part.faces) == 0 for part in parts):
         raise AssetError(path, "the mesh is empty (no face)")
     return [_checked(part, path) for part in parts if len(part.faces)]
 
 
-def too_many(path: Path) -> AssetError:
+def too_many_parts(path: Path) -> AssetError:
     """Return the error for a file of more than :data:`MOST_PARTS` parts."""
     return AssetError(path, f"has more than {MOST_PARTS} parts; at most so many are read")
 

@@ -11,7 +11,7 @@ from torchpt.core.files import is_regular, read_regular
 from torchpt.scene.meshes.mesh import FileMaterial, Rgb
 from torchpt.scene.meshes.mtl_material import COLORS, MAPS, NUMBERS, Map, Statements, material_of
 
-__all__ = ["beside", "decoded_lines", "read_mtl"]
+__all__ = ["decoded_lines", "find_file", "read_mtl"]
 
 # Options of a map statement -> most words that follow; options of up to three take numbers only.
 _OPTIONS = {
@@ -46,7 +46,7 @@ def decoded_lines(data: bytes) -> list[str]:
     return lines
 
 
-def beside(path: Path, name: str) -> Path | None:
+def find_file(path: Path, name: str) -> Path | None:
     """Return the file that a statement in ``path`` names, or None; backslashes, and a match of the last component, will do."""
     forward = name.replace("\\", "/")
     for form in dict.fromkeys((name, forward, forward.rpartition("/")[2])):
@@ -195,7 +195,7 @@ def _finished(name: str, statements: Statements, path: Path) -> FileMaterial:
     """Convert the statements of a material, once all its images are found."""
     files: dict[str, str] = {}
     for kind, found in statements.maps.items():
-        file = beside(path, found.name) or beside(path, found.name.partition("#")[0].strip())
+        file = find_file(path, found.name) or find_file(path, found.name.partition("#")[0].strip())
         if file is None:
             raise AssetError(path, f"line {found.line}: the image file {found.name[:80]!r} is missing")
         files[kind] = str(file.resolve())

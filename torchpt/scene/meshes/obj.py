@@ -13,8 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
-from torchpt.scene.meshes.mesh import MOST_PARTS, FileMaterial, MeshPart, corners_of_polygons, smooth_normals, too_many
-from torchpt.scene.meshes.mtl import beside, decoded_lines, read_mtl
+from torchpt.scene.meshes.mesh import (
+    MOST_PARTS,
+    FileMaterial,
+    MeshPart,
+    corners_of_polygons,
+    smooth_normals,
+    too_many_parts,
+)
+from torchpt.scene.meshes.mtl import decoded_lines, find_file, read_mtl
 
 __all__ = ["load_obj"]
 
@@ -58,7 +65,7 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     if all_normals is None and len(text.groups) > 1 and np.isfinite(positions).all():
         all_normals = smooth_normals(all_positions, all_faces)  # over the whole file: groups meet without a crease
     if len(text.groups) > MOST_PARTS:
-        raise too_many(path)
+        raise too_many_parts(path)
     parts = []
     order = np.argsort(owner, kind="stable")  # faces of a group stay in the order of the file
     ends = np.searchsorted(owner[order], np.arange(1, len(text.groups) + 1))
@@ -127,8 +134,8 @@ def _absolute(words: list[str], counts: tuple[int, int, int], path: Path, number
 def _libraries(text: _Text, path: Path) -> dict[str, FileMaterial]:
     known: dict[str, FileMaterial] = {}
     for name in text.libraries:
-        whole = beside(path, name)  # a name may hold blanks; else blanks separate several names
-        files = [whole] if whole is not None else [beside(path, word) for word in name.split()]
+        whole = find_file(path, name)  # a name may hold blanks; else blanks separate several names
+        files = [whole] if whole is not None else [find_file(path, word) for word in name.split()]
         if not files or None in files:  # MTL files are often missing; the shape can be rendered without
             text.ignored.append(f"mtllib {name} (no such file)")
         for file in files:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
 from torchpt.scene.meshes.mesh import FileMaterial, MeshPart, corners_of_polygons
-from torchpt.scene.meshes.ply_rows import misfit
+from torchpt.scene.meshes.ply_rows import find_mismatch
 
 __all__ = ["load_ply"]
 
@@ -299,14 +299,14 @@ class _Ascii:
 
     def wrong(self, problem: str) -> AssetError:
         """Return the error about the first row that does not match the header, else about ``problem``."""
-        return AssetError(self.path, misfit(self.data, self.start, self.elements) or problem)
+        return AssetError(self.path, find_mismatch(self.data, self.start, self.elements) or problem)
 
     def end(self) -> None:
         """Raise where words remain: rows do not match the header, though their total happened to suffice."""
         read = [element for element in self.elements if element.size and element.properties]
         last = next((number for number, element in enumerate(read) if element.name == "face"), len(read))
         if last >= len(read) - 1 and self.at < len(self.words):
-            found = misfit(self.data, self.start, self.elements)
+            found = find_mismatch(self.data, self.start, self.elements)
             if found is not None:
                 raise AssetError(self.path, found)
 

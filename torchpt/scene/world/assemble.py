@@ -25,12 +25,12 @@ from torchpt.scene.space import FARTHEST, Space
 from torchpt.scene.world.emitters import lights_of
 from torchpt.scene.world.materials import (
     Groups,
-    charts_of,
     groups_of,
     lane_material,
     node_map_of,
     opacity_maps_of,
     opacity_of,
+    vertex_attributes_of,
 )
 from torchpt.scene.world.primitives import Primitives, copies_of, copy_maps, corners_of_all, primitives_of
 
@@ -103,7 +103,7 @@ def assemble(
             bound=primitives.bound,
             flip=primitives.sign if primitives.counts[3] else None,
             normals=primitives.normals,
-            **charts_of(parts, corners, primitives.sizes, parameters, materials, groups.models, uv),
+            **vertex_attributes_of(parts, corners, primitives.sizes, parameters, materials, groups.models, uv),
             object_id=primitives.spread([owner.object_id for owner in owners]),
             quadrics=primitives.quadrics,
             copies=None if maps is None else copies_of(maps, copies, dtype),
@@ -125,7 +125,7 @@ def _lit_by(parts: Sequence[Part], corners: Sequence[Corners], primitives: Primi
         part.emission is not None and any(x.requires_grad for x in leaves(own))
         for part, own in zip(parts, corners, strict=True)
     )
-    return primitives if moving else primitives.still()
+    return primitives if moving else primitives.detached()
 
 
 def _materials(

@@ -21,7 +21,7 @@ from torchpt.scene.space import Space
 from torchpt.scene.world.primitives import Primitives
 from torchpt.search.bounds import chosen, primitive_bounds
 from torchpt.spec import Refused
-from torchpt.spec.schema import refused
+from torchpt.spec.schema import scene_error
 
 __all__ = ["lights_of"]
 
@@ -189,7 +189,7 @@ def _source(
     try:
         row = LIGHTS[source.kind].row(Setting(given, source.values, space.point, space.unit, reach, dtype))
     except Refused as error:
-        raise refused(error, source.name, None, None) from None
+        raise scene_error(error, source.name, None, None) from None
     blank = torch.zeros(3, dtype=torch.float64, device=space.centre.device)
     columns = (blank if x is None else x for x in (row.p0, row.e1, row.e2, row.normal, row.radiance))
     p0, e1, e2, normal, light = (x[:, None].to(dtype) for x in columns)

@@ -21,19 +21,19 @@ __all__ = [
     "Groups",
     "LaneMaterial",
     "OpacityTexture",
-    "charts_of",
     "groups_of",
     "lane_material",
     "node_map_of",
     "opacity_maps_of",
     "opacity_of",
+    "vertex_attributes_of",
 ]
 
 
 # ---- Vertex attributes: texture coordinates, tangents, vertex colours; each only where something reads it
 
 
-def charts_of(
+def vertex_attributes_of(
     parts: Sequence[Part],
     corners: Sequence[Corners],
     sizes: list[int],
@@ -286,7 +286,7 @@ def _textures(
         table, first = places[column[0]].table, column[0]
         return TextureBinding(table, rows, first.channel, any(node.filtered for node in column))
 
-    def relief(column: list[Node | None]) -> TextureBinding | None:
+    def map_binding(column: list[Node | None]) -> TextureBinding | None:
         nodes = [node for node in column if node is not None]
         return binding(nodes) if nodes else None
 
@@ -300,8 +300,8 @@ def _textures(
     readings = bound([one.readings for one in made])
     return MaterialTextures(
         readings,
-        relief([material.normal_map for material in materials]),
-        relief([material.bump_map for material in materials]),
+        map_binding([material.normal_map for material in materials]),
+        map_binding([material.bump_map for material in materials]),
         filtered=any(node.filtered for node in every),
         reads=tuple(sorted({node.reads for node in every})),
     )

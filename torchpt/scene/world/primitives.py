@@ -131,7 +131,7 @@ class Primitives:
     frame: Tensor | None  # (12, Q) float64: p0 e1 e2 e3 of the quadrics
     quadrics: Quadrics | None
 
-    def still(self) -> Primitives:
+    def detached(self) -> Primitives:
         """Return detached primitives."""
         own = {name: getattr(self, name) for name in ("p0", "p1", "p2", "e1", "e2", "face", "sign", "normal", "bound")}
         return replace(self, **{name: value.detach() for name, value in own.items()})

@@ -22,7 +22,7 @@ __all__ = ["CASES"]
 
 def slope(
     bench: Bench,
-    described: Mapping[str, Any],
+    read_typed: Mapping[str, Any],
     name: str,
     value: Any = None,
     spp: int = 64,
@@ -30,7 +30,7 @@ def slope(
     seed: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """The mean of a picture, and its derivatives by a parameter, in float64."""
-    scene = load(described, device=bench.device)
+    scene = load(read_typed, device=bench.device)
     given = scene.params[name] if value is None else torch.as_tensor(value).expand(scene.params[name].shape)
     wanted = given.detach().clone().to(scene.device, scene.params[name].dtype).requires_grad_()
     with warnings.catch_warnings():

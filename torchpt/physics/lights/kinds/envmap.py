@@ -36,7 +36,7 @@ from torchpt.math.vectors import azimuth, dot, luminance, safe_reciprocal, take
 from torchpt.physics.ibl.equirect import Cell, angles
 from torchpt.physics.lights.base import Environment, Row, Setting, Surroundings, bright
 from torchpt.physics.lights.records import Lights, LightSample
-from torchpt.spec import Moves, Other, Path, Pose, Scalar, Spec, Texels
+from torchpt.spec import Custom, Moves, Path, Pose, Scalar, Spec, Texels
 
 if TYPE_CHECKING:
     import numpy as np
@@ -266,7 +266,7 @@ class Envmap(Environment):
     name = "envmap"
     parameters: ClassVar = {
         "path": Path(None, doc="the picture: `.exr`, `.hdr` or 8-bit; of several the first that is there"),
-        "data": Other(
+        "data": Custom(
             None,
             reader=texels_of,
             words=TEXELS,

@@ -15,21 +15,21 @@ from torchpt.core.errors import NotBuiltError, SceneError
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Parameters
 from torchpt.physics.textures import Node
-from torchpt.scene.build import Built
+from torchpt.scene.build import SceneBuild
 from torchpt.scene.formats.textures import texture_of
 from torchpt.scene.scene import Scene
 from torchpt.scene.sources import check_coordinates
-from torchpt.scene.texels import Opener
+from torchpt.scene.texture_loader import TextureLoader
 from torchpt.spec import Refused
 
-__all__ = ["renew", "with_texels"]
+__all__ = ["update_texels", "with_texel_params"]
 
 
 #: Number of scenes with texels that are cached for one scene.
 KEPT = 4
 
 
-def with_texels(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
+def with_texel_params(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
     """Return the scene itself, or, where texels are given for numbers or colours of materials, one with textures there.
 
     The second shares parameters, meshes and images with the first, but not search structures.
@@ -47,8 +47,8 @@ def with_texels(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
         return _reading(scene, texels) if texels else scene
 
 
-def renew(made: Scene, scene: Scene, params: Mapping[str, Tensor]) -> None:
-    """Put a render's tensors into the scene that :func:`with_texels` returned, which other renders may share.
+def update_texels(made: Scene, scene: Scene, params: Mapping[str, Tensor]) -> None:
+    """Put a render's tensors into the scene that :func:`with_texel_params` returned, which other renders may share.
 
     Args:
         made: the scene with texels, or the scene itself.
@@ -57,7 +57,7 @@ def renew(made: Scene, scene: Scene, params: Mapping[str, Tensor]) -> None:
     """
     if made is not scene:
         with outside_transforms():
-            _bring(made, scene, _texels(scene, params))
+            _copy_params(made, scene, _texels(scene, params))
 
 
 def _texels(scene: Scene, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -76,21 +76,21 @@ def _reading(scene: Scene, texels: Mapping[str, Tensor]) -> Scene:
     made = scene.textured.get(key)
     if made is None:
         made = copy.copy(scene)
-        made.use(_built(scene, texels))
+        made.replace_build(_built(scene, texels))
         for oldest in list(scene.textured)[: max(0, len(scene.textured) + 1 - KEPT)]:
             scene.textured.pop(oldest, None)
         scene.textured[key] = made
-    _bring(made, scene, texels)
+    _copy_params(made, scene, texels)
     return made
 
 
-def _bring(made: Scene, scene: Scene, texels: Mapping[str, Tensor]) -> None:
+def _copy_params(made: Scene, scene: Scene, texels: Mapping[str, Tensor]) -> None:
     """Copy a scene's tensors, with texels in place of some, to the scene with textures."""
     for name, value in scene.params.items():
         new = texels.get(name, value)
         if name not in texels or not _same_memory(made.params[name], new):
             made.params[name] = new
-    made.trust(scene)
+    made.mark_checked(scene)
 
 
 def _same_memory(one: Tensor, other: Tensor) -> bool:
@@ -112,14 +112,14 @@ def _plain(value: Tensor, loaded: np.ndarray) -> Tensor:
     return value.detach()
 
 
-def _built(scene: Scene, texels: Mapping[str, Tensor]) -> Built:
+def _built(scene: Scene, texels: Mapping[str, Tensor]) -> SceneBuild:
     """Return the scene's build with texture nodes in place of numbers."""
     before, file = scene.built, scene.description.file
     parameters = Parameters()
     parameters |= before.parameters
     parameters.specs |= before.parameters.specs
     parameters.stated |= before.parameters.stated | texels.keys()
-    opener = Opener({}, scene.description.resolve, parameters, file)
+    texture_loader = TextureLoader({}, scene.description.resolve, parameters, file)
     materials = {m.name: m for owner in (*before.parts, *before.copies) for m in owner.material.all()}
     nodes: dict[str, dict[str, Node]] = {}
     for name, value in texels.items():
@@ -139,7 +139,7 @@ def _built(scene: Scene, texels: Mapping[str, Tensor]) -> Built:
             texture = texture_of({"type": "image", "data": array}, spec)
         except Refused as error:
             raise SceneError(f"params.{name}", error.value, error.expected) from None
-        nodes.setdefault(stem, {})[slot] = opener(texture, name)
+        nodes.setdefault(stem, {})[slot] = texture_loader(texture, name)
     parts = tuple(replace(part, material=_material(part.material, nodes)) for part in before.parts)
     copies = tuple(replace(copied, material=_material(copied.material, nodes)) for copied in before.copies)
     check_coordinates([*parts], texels, file)

@@ -18,14 +18,14 @@ from torchpt.math.transforms import tensor_of
 from torchpt.physics.cameras.opencv import USUAL, angles, numbers_of
 from torchpt.physics.cameras.poses import POSES, posed
 from torchpt.physics.shapes.base import Place, Size
-from torchpt.scene.build import Built
+from torchpt.scene.build import SceneBuild
 from torchpt.scene.formats.description import Description
 from torchpt.scene.formats.tensors import Key, Tensors
 from torchpt.spec import parameters_of
 from torchpt.spec.reading import transform
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["corners_in", "traced", "widened"]
+__all__ = ["params_from_tensors", "vertex_attributes_in", "with_all_intrinsics"]
 
 _EXPECTED = (
     "numbers without gradients (detach() them): no parameter of the scene is made of them, or none with the value that they "
@@ -38,7 +38,7 @@ _CORNERS = ("normals", "uvs")
 Params = Mapping[str, Tensor]
 
 
-def widened(description: Description, tensors: Tensors) -> Description:
+def with_all_intrinsics(description: Description, tensors: Tensors) -> Description:
     """Return the description with all parameters of ``K`` where it is a tensor, also those that have their usual values."""
     camera = description.camera
     if not any(key[0] == "K" for key in tensors.under("camera")):
@@ -48,12 +48,14 @@ def widened(description: Description, tensors: Tensors) -> Description:
     return replace(description, camera=ParsedParams(camera.kind, values, camera.given))
 
 
-def corners_in(tensors: Tensors) -> set[str]:
+def vertex_attributes_in(tensors: Tensors) -> set[str]:
     """Return the dotted names of meshes' normals and texture coordinates that require gradients."""
     return {_dotted(("shapes", *key[:2])) for key in tensors.under("shapes") if len(key) > 1 and key[1] in _CORNERS}
 
 
-def traced(tensors: Tensors, description: Description, built: Built, params: Params) -> dict[str, Tensor]:
+def params_from_tensors(
+    tensors: Tensors, description: Description, built: SceneBuild, params: Params
+) -> dict[str, Tensor]:
     """Return the parameters that depend on tensors of the dict, by name, attached to their autograd graph.
 
     Args:
@@ -81,7 +83,7 @@ class _Reading:
 
     tensors: Tensors
     description: Description
-    built: Built
+    built: SceneBuild
     params: Params
     device: torch.device
 
@@ -151,7 +153,7 @@ def _camera(name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
     elif name == "K":
         inner = tensor_of(read.tensors.at(("camera", "K")), read.device)
         yield from ((f"camera.{number}", value) for number, value in numbers_of(inner, camera["size"]).items())
-    elif name in specs and specs[name].traced:
+    elif name in specs and specs[name].differentiable:
         yield f"camera.{name}", read.at(("camera", name))
 
 

@@ -22,7 +22,7 @@ from torchpt.scene.meshes.gltf import MOST_PLACED
 from torchpt.scene.meshes.mesh import MeshPart
 from torchpt.scene.meshes.trimesh_objects import Notes, mesh_parts_of
 
-__all__ = ["load_others"]
+__all__ = ["load_trimesh_formats"]
 
 _BEGINS = re.compile(rb"(?:\xef\xbb\xbf|\xff\xfe|\xfe\xff)?\s*<")
 _ENCODING = re.compile(rb"<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)")
@@ -42,7 +42,7 @@ _ENCODINGS = (
 MOST_UNFOLDED = 2**30
 
 
-def load_others(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
+def load_trimesh_formats(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     """Return the meshes of a file as trimesh reads it, in world space.
 
     Raises:
