@@ -17,7 +17,15 @@ import torch
 import torchpt
 from torchpt.cli.arguments import GROUPS, path_keys
 from torchpt.core.errors import SceneError
-from torchpt.scene.settings import BLOCKS, UNTYPED_BLOCKS, Common, CommonOptions, Render, RenderOptions, TraceOptions
+from torchpt.scene.settings import (
+    BLOCKS,
+    UNTYPED_BLOCKS,
+    BatchOptions,
+    CommonOptions,
+    Render,
+    RenderOptions,
+    TraceOptions,
+)
 from torchpt.spec import Role, parameters_of
 from torchpt.spec.arguments import arguments_of, expand_signature
 
@@ -40,9 +48,9 @@ def scene() -> torchpt.Scene:
     [
         (torchpt.render, ("scene", "full"), CommonOptions),
         (torchpt.trace, ("scene", "o", "d", "spp", "seed", "params"), TraceOptions),
-        (torchpt.render_batch, ("scenes", "cameras", "params", "seed", "on_progress", "full"), Common),
-        (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "full"), Common),
-        (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), Common),
+        (torchpt.render_batch, ("scenes", "cameras", "params", "seed", "on_progress", "full"), BatchOptions),
+        (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "full"), BatchOptions),
+        (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), BatchOptions),
     ],
 )
 def test_signatures_spell_every_argument_out(function: Any, own: tuple[str, ...], form: Any) -> None:
@@ -96,7 +104,7 @@ def test_an_argument_without_a_spec_is_no_declaration() -> None:
 
 def test_what_a_function_says_itself_comes_first() -> None:
     @expand_signature
-    def f(scene: int, *, seed: int = 0, **wishes: Unpack[Common]) -> None:
+    def f(scene: int, *, seed: int = 0, **wishes: Unpack[BatchOptions]) -> None:
         """Do it."""
 
     assert tuple(inspect.signature(f).parameters)[:3] == ("scene", "seed", "spp")

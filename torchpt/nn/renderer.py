@@ -16,7 +16,7 @@ from torchpt.rendering.api import render
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import Common, RenderOptions
+from torchpt.scene.settings import BatchOptions, RenderOptions
 from torchpt.spec.arguments import check_names, expand_signature
 
 __all__ = ["Renderer"]
@@ -63,7 +63,7 @@ class Renderer(nn.Module):
         seed: int = 0,
         rigid: bool = True,
         full: bool = False,
-        **wishes: Unpack[Common],
+        **wishes: Unpack[BatchOptions],
     ) -> None:
         super().__init__()
         check_names("Renderer", wishes, RenderOptions, ("names", "rigid"))
@@ -94,7 +94,7 @@ class Renderer(nn.Module):
         *,
         seed: int | None = None,
         full: bool | None = None,
-        **wishes: Unpack[Common],
+        **wishes: Unpack[BatchOptions],
     ) -> Any:
         """Render.
 
@@ -108,7 +108,7 @@ class Renderer(nn.Module):
         Returns:
             The picture ``(H, W, 3)``; with ``full=True`` a :class:`torchpt.Rendering`.
         """
-        given: Common = {**self.wishes, **wishes}
+        given: BatchOptions = {**self.wishes, **wishes}
         if seed is None:
             seed = self._next_seed(given.get("ranks") is not None)
         full = self.full if full is None else full

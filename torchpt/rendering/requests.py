@@ -22,7 +22,7 @@ from torchpt.rendering.result import denoise_rendering
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
 from torchpt.scene.formats.description import settings as complete
-from torchpt.scene.settings import SAMPLERS, Call, CommonOptions, Settings, settings_of_call
+from torchpt.scene.settings import SAMPLERS, CallArguments, CommonOptions, Settings, settings_of_call
 from torchpt.scene.texel_params import update_texels, with_texel_params
 from torchpt.scene.versions import AFTER, check_unchanged
 from torchpt.spec import Role
@@ -49,7 +49,7 @@ class RenderRequest:
     given: Scene
     scene: Scene
     settings: Settings
-    call: Call
+    call: CallArguments
     params: Mapping[str, Tensor]
     versions: Mapping[str, int] = field(default_factory=dict)
     rays: tuple[Tensor, Tensor] | None = None
@@ -92,7 +92,7 @@ def ordered(scene: Scene, full: bool, **wishes: Unpack[CommonOptions]) -> Render
         RenderError: a denoiser that is not there.
     """
     scene = as_scene(scene)
-    call = Call.of({**wishes, "full": full})
+    call = CallArguments.of({**wishes, "full": full})
     _check(scene, call, wishes.get("device"))
     settings = complete(scene.description, settings_of_call(wishes))
     if not full:
@@ -231,7 +231,7 @@ def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Setti
     return replace(settings, film=settings.film.but(denoise=False, aovs=aovs))
 
 
-def _check(scene: Scene, call: Call, device: str | torch.device | None) -> None:
+def _check(scene: Scene, call: CallArguments, device: str | torch.device | None) -> None:
     """Refuse arguments of :func:`render` that do not fit the scene."""
     for name in call.params or {}:
         if not isinstance(name, str):

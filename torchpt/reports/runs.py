@@ -462,7 +462,7 @@ def _turn(latest: Job | None, job: Job) -> None:
         latest.left = replace(scene_cache(latest.scene))
     if job.left is not None:
         keeper = scene_cache(job.scene)
-        keeper.kernels, keeper.first, keeper.dark = job.left.kernels, job.left.first, job.left.dark
+        keeper.kernels, keeper.first, keeper.without_lights = job.left.kernels, job.left.first, job.left.without_lights
 
 
 Wanted = tuple[Job, int, int, list[Run]]

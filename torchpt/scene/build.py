@@ -14,8 +14,8 @@ from torchpt.physics.shapes.geometry import KINDS
 from torchpt.scene.formats.description import Description
 from torchpt.scene.materials import declare, resolved
 from torchpt.scene.mesh_triangles import warn_of_coplanar_refraction
-from torchpt.scene.shapes import Owner, ShapeBuilder
-from torchpt.scene.sources import build_lights, check_coordinates, declare_corners
+from torchpt.scene.shapes import ShapeBuilder, ShapeEntry
+from torchpt.scene.sources import build_lights, check_coordinates, declare_vertex_attributes
 from torchpt.scene.space import centre_and_unit
 from torchpt.scene.texture_loader import TextureLoader
 
@@ -67,7 +67,7 @@ def _built(description: Description, vertex_params: Collection[str]) -> SceneBui
     parameters = Parameters()
     texture_loader = TextureLoader(description.textures, description.resolve, parameters, description.file)
     builder = ShapeBuilder(description, parameters, texture_loader)
-    owners = [Owner(name, number, shape) for number, (name, shape) in enumerate(description.shapes.items(), 1)]
+    owners = [ShapeEntry(name, number, shape) for number, (name, shape) in enumerate(description.shapes.items(), 1)]
     parts = [part for owner in owners if not owner.shape.kind.copies for part in builder.parts(owner)]
     copies = [copy for owner in owners if owner.shape.kind.copies for copy in builder.copies(owner, parts)]
     for name, material in description.materials.items():
@@ -75,7 +75,7 @@ def _built(description: Description, vertex_params: Collection[str]) -> SceneBui
     sources = build_lights(description, parameters)
     sources = sorted([*sources, *builder.sources], key=lambda source: order(source.kind))
     parameters.declare_all("camera", description.camera.kind, description.camera.values)
-    declare_corners(parts, vertex_params, parameters)
+    declare_vertex_attributes(parts, vertex_params, parameters)
     check_coordinates(parts, parameters.stated, description.file)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     centre, unit = centre_and_unit(parts, copies, sources, parameters, description.camera, description.file)

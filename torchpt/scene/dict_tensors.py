@@ -20,7 +20,7 @@ from torchpt.physics.cameras.poses import POSES, posed
 from torchpt.physics.shapes.base import Place, Size
 from torchpt.scene.build import SceneBuild
 from torchpt.scene.formats.description import Description
-from torchpt.scene.formats.tensors import Key, Tensors
+from torchpt.scene.formats.tensors import DictTensors, Key
 from torchpt.spec import parameters_of
 from torchpt.spec.reading import transform
 from torchpt.spec.schema import ParsedParams
@@ -38,7 +38,7 @@ _CORNERS = ("normals", "uvs")
 Params = Mapping[str, Tensor]
 
 
-def with_all_intrinsics(description: Description, tensors: Tensors) -> Description:
+def with_all_intrinsics(description: Description, tensors: DictTensors) -> Description:
     """Return the description with all parameters of ``K`` where it is a tensor, also those that have their usual values."""
     camera = description.camera
     if not any(key[0] == "K" for key in tensors.under("camera")):
@@ -48,13 +48,13 @@ def with_all_intrinsics(description: Description, tensors: Tensors) -> Descripti
     return replace(description, camera=ParsedParams(camera.kind, values, camera.given))
 
 
-def vertex_attributes_in(tensors: Tensors) -> set[str]:
+def vertex_attributes_in(tensors: DictTensors) -> set[str]:
     """Return the dotted names of meshes' normals and texture coordinates that require gradients."""
     return {_dotted(("shapes", *key[:2])) for key in tensors.under("shapes") if len(key) > 1 and key[1] in _CORNERS}
 
 
 def params_from_tensors(
-    tensors: Tensors, description: Description, built: SceneBuild, params: Params
+    tensors: DictTensors, description: Description, built: SceneBuild, params: Params
 ) -> dict[str, Tensor]:
     """Return the parameters that depend on tensors of the dict, by name, attached to their autograd graph.
 
@@ -69,19 +69,19 @@ def params_from_tensors(
     """
     read = _Reading(tensors, description, built, params, next(iter(params.values())).device)
     found: dict[str, Tensor] = {}
-    for key in dict.fromkeys(map(_whole, tensors.keys)):
-        made = dict(_made(key, read))
-        if not made and not _unread(key, params):
+    for key in dict.fromkeys(map(_up_to_index, tensors.keys)):
+        made = dict(_dependent_params(key, read))
+        if not made and not _is_unused_texture(key, params):
             raise SceneError(_dotted(key), "a tensor that requires gradients", _EXPECTED, description.file)
         found |= made
-    return {name: _fitting(value, params[name]) for name, value in found.items()}
+    return {name: _cast_like(value, params[name]) for name, value in found.items()}
 
 
 @dataclass(frozen=True)
 class _Reading:
     """The dict with its tensors, and the scene built from it."""
 
-    tensors: Tensors
+    tensors: DictTensors
     description: Description
     built: SceneBuild
     params: Params
@@ -93,7 +93,7 @@ class _Reading:
         return written if isinstance(written, Tensor) else tensor_of(written, self.device)
 
 
-def _whole(key: Key) -> Key:
+def _up_to_index(key: Key) -> Key:
     """Return a key up to its first list index."""
     return next((key[:n] for n, part in enumerate(key) if isinstance(part, int)), key)
 
@@ -102,12 +102,12 @@ def _dotted(key: Key) -> str:
     return ".".join(map(str, key))
 
 
-def _unread(key: Key, params: Params) -> bool:
+def _is_unused_texture(key: Key, params: Params) -> bool:
     """Return True for a key of a texture that no material uses."""
     return key[0] == "textures" and not any(re.match(rf"textures\.{re.escape(str(key[1]))}(\.|$)", n) for n in params)
 
 
-def _fitting(value: Tensor, own: Tensor) -> Tensor:
+def _cast_like(value: Tensor, own: Tensor) -> Tensor:
     """Return a parameter computed from tensors, with dtype, device, shape and value of the one that was read."""
     if value.dtype == own.dtype and value.device == own.device and value.shape == own.shape:
         return value
@@ -120,7 +120,7 @@ def _fitting(value: Tensor, own: Tensor) -> Tensor:
     return own + (value - value.detach()).to(own.dtype).expand_as(own)
 
 
-def _made(key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
+def _dependent_params(key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
     """Yield the parameters that depend on the value at a key, by name."""
     block = key[0]
     if block == "camera" and len(key) > 1:
@@ -132,7 +132,7 @@ def _made(key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
     elif block == "lights" and len(key) > 2:
         name = _dotted(key)
         yield from _named(key, f"{name.removesuffix('.data')}.texels" if key[2] == "data" else name, read)
-        yield from _following(str(key[1]), read)
+        yield from _params_from_defaults(str(key[1]), read)
     elif block in ("materials", "textures"):
         yield from _named(key, _dotted(key), read)
 
@@ -163,7 +163,7 @@ def _shape(name: str, key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
     if part == "transform" or isinstance(parameters_of(shape.kind).get(part), Size | Place):
         pose = _pose_of(name, shape, read)
         yield from ((f"{owner.name}.to_world", pose) for owner in owners)
-        yield from _lights_of_file(stem, pose, read)
+        yield from _file_light_params(stem, pose, read)
     elif part == "material":
         rest = _dotted(key[3:])
         for own in dict.fromkeys(owner.material.name for owner in owners):
@@ -184,7 +184,7 @@ def _pose_of(name: str, shape: ParsedParams, read: _Reading) -> Tensor:
     return pose @ shape.kind.own({**shape.values, **sizes}) if sizes else pose
 
 
-def _lights_of_file(stem: str, pose: Tensor, read: _Reading) -> Iterator[tuple[str, Tensor]]:
+def _file_light_params(stem: str, pose: Tensor, read: _Reading) -> Iterator[tuple[str, Tensor]]:
     """Yield positions and directions of a mesh file's lights, which move with the mesh."""
     way = pose @ torch.linalg.inv(pose.detach())  # the identity, with the derivative of the pose
     for source in read.built.sources:
@@ -197,7 +197,7 @@ def _lights_of_file(stem: str, pose: Tensor, read: _Reading) -> Iterator[tuple[s
                 yield name, way[:3, :3] @ value + (0.0 if key == "direction" else way[:3, 3])
 
 
-def _following(name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
+def _params_from_defaults(name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
     """Yield parameters of a light whose defaults are functions of other parameters."""
     light, written = read.description.lights[name], read.tensors.raw["lights"][name]
     numbers = {key: value.to(read.device) for key, value in written.items() if isinstance(value, Tensor)}

@@ -24,7 +24,7 @@ __all__ = ["description_of", "from_trimesh"]
 
 _LABEL = "trimesh"
 #: From trimesh's camera space (looks along -z, +x right) to that of scenes (looks along +z, +x left).
-_TURN = np.diag([-1.0, 1.0, -1.0, 1.0])
+_CAMERA_AXES = np.diag([-1.0, 1.0, -1.0, 1.0])
 #: Field of view in degrees along the film's shorter side, for a source without a camera.
 _FOV = 45.0
 
@@ -127,7 +127,7 @@ def _view(source: Any) -> dict[str, Any]:
         if abs(down / across - 1.0) > 1e-9:
             pose["pixel_aspect"] = down / across
         return {
-            "camera": {**pose, "to_world": (matrix @ _TURN).tolist()},
+            "camera": {**pose, "to_world": (matrix @ _CAMERA_AXES).tolist()},
             "film": {"width": width, "height": height},
         }
     corners = source.bounds
@@ -135,7 +135,7 @@ def _view(source: Any) -> dict[str, Any]:
         corners = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
     matrix = look_at(np.array(corners, np.float64), fov=np.array([_FOV, _FOV]), pad=1.1)
     pose = {"type": "perspective", "fov": _FOV, "fov_axis": "smaller"}
-    return {"camera": {**pose, "to_world": (matrix @ _TURN).tolist()}}
+    return {"camera": {**pose, "to_world": (matrix @ _CAMERA_AXES).tolist()}}
 
 
 def _light(light: FileLight) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from torchpt.physics.bsdfs import Bsdf
 from torchpt.scene.devices import device_of
 from torchpt.scene.dict_tensors import params_from_tensors, vertex_attributes_in, with_all_intrinsics
 from torchpt.scene.formats.description import Source, read_description, settings
-from torchpt.scene.formats.tensors import Tensors
+from torchpt.scene.formats.tensors import DictTensors
 from torchpt.scene.scene import Scene
 
 __all__ = ["load"]
@@ -58,10 +58,10 @@ def _load(
     overrides: Mapping[str, Any] | None,
 ) -> Scene:
     start = time.perf_counter()
-    tensors = Tensors()
+    tensors = DictTensors()
     with needing("the scene file"):
         may_hold_tensors = bool(overrides) or isinstance(source, Mapping)
-        description = read_description(source, bsdfs, tensors.taken_from if may_hold_tensors else None, overrides)
+        description = read_description(source, bsdfs, tensors.extract if may_hold_tensors else None, overrides)
     chosen = device_of(settings(description).render.device if device is None else device)
     with lasting():
         scene = Scene(

@@ -79,7 +79,7 @@ def mesh_of(
 
 
 def _displaced(
-    piece: MeshPart, wish: ParsedParams, prefix: str, texture_loader: TextureLoader, source: str
+    piece: MeshPart, displacement: ParsedParams, prefix: str, texture_loader: TextureLoader, source: str
 ) -> MeshPart:
     """Apply a displacement map to a part of a mesh."""
     key = f"{prefix}.displacement"
@@ -90,22 +90,22 @@ def _displaced(
             if source
             else SceneError(key, "a mesh without uvs", "uvs beside it", texture_loader.file)
         )
-    faces = len(piece.faces) * 4 ** wish["subdivisions"]
+    faces = len(piece.faces) * 4 ** displacement["subdivisions"]
     if faces > MOST_FACES:
         expected = f"at most {MOST_FACES:,} faces ({faces:,} are asked for)"
-        raise SceneError(f"{key}.subdivisions", wish["subdivisions"], expected, texture_loader.file)
-    heights = texture_loader.values(wish["texture"], f"{key}.texture")
-    return displaced(piece, lambda uvs: wish["scale"] * heights(uvs), wish["subdivisions"])
+        raise SceneError(f"{key}.subdivisions", displacement["subdivisions"], expected, texture_loader.file)
+    heights = texture_loader.values(displacement["texture"], f"{key}.texture")
+    return displaced(piece, lambda uvs: displacement["scale"] * heights(uvs), displacement["subdivisions"])
 
 
 def ignored(piece: MeshPart, pose: np.ndarray) -> tuple[str, ...]:
     """Return the unsupported features of a part by name, and its file's cameras as blocks of a scene file."""
     own = piece.material
-    cameras = [_as_written(camera, pose) for camera in piece.cameras]
+    cameras = [_camera_text(camera, pose) for camera in piece.cameras]
     return (*piece.ignored, *cameras, *(() if own is None else own.ignored))
 
 
-def _as_written(camera: FileCamera, pose: np.ndarray) -> str:
+def _camera_text(camera: FileCamera, pose: np.ndarray) -> str:
     """Return a mesh file's camera as text of a camera block, transformed by ``pose``."""
     with np.errstate(over="ignore", invalid="ignore"):
         matrix = pose @ camera.matrix
@@ -236,14 +236,14 @@ def _overlap(a: Array, b: Array) -> bool:
         near = slice(int(starts[k]), int(ends[k]))
         budget -= near.stop - near.start + FACE
         alike = np.abs(second[near, :3] - first[k, :3]).max(1) <= ALIKE
-        if alike.any() and _share_area(a[k], b[near][alike], first[k, :3]):
+        if alike.any() and _overlaps_any(a[k], b[near][alike], first[k, :3]):
             return True
         if budget < 0:
             break
     return False
 
 
-def _share_area(face: Array, others: Array, normal: Array) -> bool:
+def _overlaps_any(face: Array, others: Array, normal: Array) -> bool:
     """Return True where a convex face ``(K, 3)`` overlaps any of ``(M, L, 3)`` in its plane (separating axis test)."""
     axis = int(np.abs(normal).argmax())
     keep = [k for k in range(3) if k != axis]

@@ -56,14 +56,14 @@ class SceneCache:
     Attributes:
         kernels: kernels of the latest render.
         first: integrator, world, and the ``FirstSurface`` made from them.
-        dark: a world, and a copy of it without lights.
+        without_lights: a world, and a copy of it without lights.
         camera: key of the latest camera on a film, and that camera.
         outlines: edges of the meshes, found by :mod:`torchpt.gradients.edges.curves`.
     """
 
     kernels: Kernels | None = None
     first: tuple[Integrator, World, FirstSurface] | None = None
-    dark: tuple[World, World] | None = None
+    without_lights: tuple[World, World] | None = None
     camera: tuple[Any, Camera] | None = None
     outlines: dict[str, Any] = field(default_factory=dict)
 
@@ -120,7 +120,7 @@ def make_wave(
         if accel.name == "brute" and not packets:
             accel = scene.accel("numba", threads, geometry if moved else None)
         if not integrator.lit:
-            world = _dark(scene, world, own)
+            world = _without_lights(scene, world, own)
     else:
         world, accel = like.context.world, like.accel
     points = points_of(settings.sampler)
@@ -139,15 +139,17 @@ def make_wave(
         centre=scene.space.shift,
         first=_first(scene, integrator, world, own) if like is None else like.first,
     )
-    return wave if rays is None else wave.along(_given(scene, *rays, dtype))
+    return wave if rays is None else wave.along(_lane_rays(scene, *rays, dtype))
 
 
-def _given(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
+def _lane_rays(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
     """Convert rays ``(..., 3)`` in the scene's coordinates to lanes, differentiable."""
     o, d = (x.reshape(-1, 3).T.double() for x in (o, d))
     origin = ((o - scene.space.centre[:, None]) / scene.space.unit).to(dtype).contiguous()
-    _refuse("o", o, torch.isfinite(origin).all(0), f"an origin that is finite in {str(dtype).removeprefix('torch.')}")
-    _refuse("d", d, torch.isfinite(d).all(0) & (d != 0).any(0), "a direction that is finite and not zero")
+    _check_rays(
+        "o", o, torch.isfinite(origin).all(0), f"an origin that is finite in {str(dtype).removeprefix('torch.')}"
+    )
+    _check_rays("d", d, torch.isfinite(d).all(0) & (d != 0).any(0), "a direction that is finite and not zero")
     unit = normalize(d)
     # Directions of unit length up to rounding keep their bits.
     near = (dot(d, d) - 1.0).abs() < 8.0 * torch.finfo(dtype).eps
@@ -155,7 +157,7 @@ def _given(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
     return Rays(origin, unit.to(dtype).contiguous())
 
 
-def _refuse(key: str, given: Tensor, good: Tensor, expected: str) -> None:
+def _check_rays(key: str, given: Tensor, good: Tensor, expected: str) -> None:
     """Raise for the first of the vectors ``(3, N)`` that is not ``good (N,)``.
 
     Raises:
@@ -234,14 +236,14 @@ def _first(scene: Scene, integrator: Integrator, world: World, own: bool) -> Fir
     return first
 
 
-def _dark(scene: Scene, world: World, own: bool) -> World:
+def _without_lights(scene: Scene, world: World, own: bool) -> World:
     """Return the world without lights, cached with the scene where the world is the scene's ``own``."""
     if not own:
         return replace(world, lights=None)
     keeper = scene_cache(scene)
-    if keeper.dark is None or keeper.dark[0] is not world:
-        keeper.dark = world, replace(world, lights=None)
-    return keeper.dark[1]
+    if keeper.without_lights is None or keeper.without_lights[0] is not world:
+        keeper.without_lights = world, replace(world, lights=None)
+    return keeper.without_lights[1]
 
 
 def _context(

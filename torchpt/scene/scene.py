@@ -31,10 +31,10 @@ from torchpt.scene.devices import device_of
 from torchpt.scene.formats.description import Description, settings
 from torchpt.scene.info import describe
 from torchpt.scene.settings import Film, Settings
-from torchpt.scene.sources import check_sources
-from torchpt.scene.space import FARTHEST, Space, bounds_center, bounds_extent
-from torchpt.scene.validation import check_tensor, shared, validate_changes
-from torchpt.scene.versions import VersionCounter, changes
+from torchpt.scene.sources import check_light_params
+from torchpt.scene.space import MAX_COORDINATE, Space, bounds_center, bounds_extent
+from torchpt.scene.validation import check_tensor, inherited_checks, validate_changes
+from torchpt.scene.versions import VersionCounter, changed_versions
 from torchpt.scene.view import view_attributes
 from torchpt.scene.world import assemble
 from torchpt.search import Accel
@@ -246,7 +246,7 @@ class Scene:
                 raise SceneError(f"params.{name}", name, f"a parameter of this scene such as {', '.join(close)}")
             check_tensor(name, value, self.params[name].shape, self.spec(name).texture)
             self.check_number(name, value.detach())
-        check_sources(self._built.sources, params or {}, self.merged(params))
+        check_light_params(self._built.sources, params or {}, self.merged(params))
 
     def check_own(self) -> None:
         """Check the tensors of :attr:`params` that were replaced or changed in place since the last check.
@@ -259,7 +259,7 @@ class Scene:
 
     def mark_checked(self, other: Scene) -> None:
         """Mark as checked the tensors that are shared with another scene and checked there."""
-        self._checked_versions = shared(self, other, other._checked_versions)
+        self._checked_versions = inherited_checks(self, other, other._checked_versions)
 
     def versions(self) -> dict[str, int]:
         """Return version numbers of :attr:`params` by name; see :class:`torchpt.scene.versions.VersionCounter`."""
@@ -288,7 +288,7 @@ class Scene:
             shown = value.tolist() if error.value is ... else error.value
             raise SceneError(f"params.{name}", shown, error.expected) from None
         if isinstance(spec, Pose) and spec.moves is Moves.SURFACES:
-            reach, place = FARTHEST * self._space.unit, value.double().cpu().numpy()[:3, 3]
+            reach, place = MAX_COORDINATE * self._space.unit, value.double().cpu().numpy()[:3, 3]
             if not np.abs(place - self._built.centre).max() <= reach:
                 expected = f"a place up to {reach:.3g} from the middle of this scene as it was loaded"
                 raise SceneError(f"params.{name}", place.tolist(), expected)
@@ -348,8 +348,8 @@ class Scene:
 
     def film_size(self, film: Mapping[str, Any] | None = None) -> tuple[int, int]:
         """Return width and height of the whole film in pixels; ``film``: settings that override the scene's."""
-        wished = settings(self.description, {"film": film or {}}).film
-        return wished.width, wished.height
+        film_settings = settings(self.description, {"film": film or {}}).film
+        return film_settings.width, film_settings.height
 
     def pinhole(
         self,
@@ -392,7 +392,7 @@ class Scene:
     def _refresh(self) -> None:
         """Clear the caches where a parameter other than the camera's was replaced or changed in place."""
         now, before = self._sources.of(self.params), self._made_of.copy()
-        changed = changes(before, now)
+        changed = changed_versions(before, now)
         gone = any(name not in now and not name.startswith("camera.") for name in before)
         if not changed and not gone:
             return

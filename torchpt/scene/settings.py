@@ -38,8 +38,8 @@ __all__ = [
     "SAMPLERS",
     "TYPED_BLOCKS",
     "UNTYPED_BLOCKS",
-    "Call",
-    "Common",
+    "BatchOptions",
+    "CallArguments",
     "CommonOptions",
     "Film",
     "Render",
@@ -188,7 +188,7 @@ def _truth(default: bool, doc: str) -> Argument:
 # `scripts/make_tables.py`).
 
 
-class _Samples(TypedDict, total=False):
+class _SampleOptions(TypedDict, total=False):
     """The argument that tables list first."""
 
     spp: Annotated[int | None, Integer(64, low=1, doc="samples a pixel, and the most that other limits let it take")]
@@ -271,7 +271,7 @@ class TraceOptions(TypedDict, total=False):
     ]
 
 
-class Common(_Samples, TraceOptions, total=False):
+class BatchOptions(_SampleOptions, TraceOptions, total=False):
     """Arguments of :func:`torchpt.render` that are the same for all pictures of a batch."""
 
     film: Annotated[
@@ -339,7 +339,7 @@ class Common(_Samples, TraceOptions, total=False):
     ]
 
 
-class CommonOptions(Common, total=False):
+class CommonOptions(BatchOptions, total=False):
     """Arguments of :func:`torchpt.render` beside the scene and ``full``."""
 
     seed: Annotated[int | None, Integer(0, high=MOST_SEED, doc="the same seed gives the same picture")]
@@ -401,31 +401,31 @@ class Render(FrozenConfig):
             raise Refused("false without render.checkpoint, the file to go on from", True, ("resume",))
 
 
-class Call(FrozenConfig):
+class CallArguments(FrozenConfig):
     """The arguments of :func:`torchpt.render` that are no settings of a scene file."""
 
     parameters: ClassVar = {name: s for name, s in _ARGUMENTS.items() if isinstance(s, Argument)}
 
     @classmethod
-    def of(cls, wishes: Mapping[str, Any]) -> Call:
+    def of(cls, options: Mapping[str, Any]) -> CallArguments:
         """Read such arguments.
 
         Raises:
             SceneError: a value that is not accepted.
         """
         values: dict[str, Any] = {}
-        for name in [name for name in cls.parameters if name in wishes]:
+        for name in [name for name in cls.parameters if name in options]:
             try:
-                values[name] = arguments_of(RenderOptions)[name].read(wishes[name])
+                values[name] = arguments_of(RenderOptions)[name].read(options[name])
             except Refused as error:
-                raise scene_error(error, name, wishes[name], None) from None
+                raise scene_error(error, name, options[name], None) from None
         return cls(**values)
 
 
-def settings_of_call(wishes: Mapping[str, Any]) -> dict[str, Any]:
+def settings_of_call(options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings among the arguments of a call, by block, without the device, which belongs to the scene."""
-    own = {name: wishes.get(name) for name in Render.parameters if name in _ARGUMENTS and name != "device"}
-    return {**{name: wishes.get(name) for name in BLOCKS}, "render": own}
+    own = {name: options.get(name) for name in Render.parameters if name in _ARGUMENTS and name != "device"}
+    return {**{name: options.get(name) for name in BLOCKS}, "render": own}
 
 
 #: The blocks without a type.

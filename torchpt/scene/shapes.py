@@ -25,11 +25,11 @@ from torchpt.scene.texture_loader import TextureLoader
 from torchpt.spec import Pose, Vertices, parameters_of
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["Owner", "ShapeBuilder"]
+__all__ = ["ShapeBuilder", "ShapeEntry"]
 
 
 @dataclass(frozen=True)
-class Owner:
+class ShapeEntry:
     """A shape of the scene, whose parts are built.
 
     Attributes:
@@ -66,12 +66,12 @@ class ShapeBuilder:
         self._slots: dict[str, ResolvedMaterial] = {}
         self._declared: set[int] = set()
 
-    def parts(self, owner: Owner) -> list[Part]:
+    def parts(self, owner: ShapeEntry) -> list[Part]:
         """Return the parts of a shape other than an instance."""
         triangles = owner.shape.kind.triangles(owner.shape.values)
         return self._primitives(owner) if triangles is None else self._meshes(owner, triangles)
 
-    def copies(self, owner: Owner, parts: list[Part]) -> list[Copy]:
+    def copies(self, owner: ShapeEntry, parts: list[Part]) -> list[Copy]:
         """Return the copies of an instance, one for each of the ``parts`` of its mesh."""
         key, file, shapes = owner.key, self.description.file, self.description.shapes
         of, material = owner.shape["of"], owner.shape["material"]
@@ -86,7 +86,7 @@ class ShapeBuilder:
             raise SceneError(f"{key}.transform", owner.to_world.tolist(), expected, file)
         made = []
         for part in (part for part in parts if part.shape == of):
-            slot = part.material if material is None else self._slot(material, key)
+            slot = part.material if material is None else self._material(material, key)
             if slot.emission is not None:
                 raise SceneError(
                     f"{key}.material", slot.name, "a material that does not emit: an instance cannot", file
@@ -97,7 +97,7 @@ class ShapeBuilder:
             made.append(Copy(key, owner.name, owner.number, part.name, slot, flip, pose))
         return made
 
-    def _primitives(self, owner: Owner) -> list[Part]:
+    def _primitives(self, owner: ShapeEntry) -> list[Part]:
         """Return the parts of a shape of primitives, which share its pose."""
         shape, pose = owner.shape, owner.to_world
         own = shape.kind.own(shape.values)
@@ -109,7 +109,7 @@ class ShapeBuilder:
                 raise SceneError(owner.key, pose.tolist(), expected, self.description.file)
         surfaces = shape.kind.surfaces(shape.values, pose)
         self._declare_pose(owner.key, pose, surfaces)
-        slot = self._slot(shape["material"], owner.key)
+        slot = self._material(shape["material"], owner.key)
         return [
             self._part(owner, owner.key, slot, surface, pose if surface.local is None else pose @ surface.local)
             for surface in surfaces
@@ -119,7 +119,7 @@ class ShapeBuilder:
         angles = any(PRIMITIVES[surface.kind].angles for surface in surfaces)
         self.parameters.declare(f"{stem}.to_world", pose, Pose(angles=angles))
 
-    def _meshes(self, owner: Owner, triangles: Triangles) -> list[Part]:
+    def _meshes(self, owner: ShapeEntry, triangles: Triangles) -> list[Part]:
         """Return the parts of a mesh, one for each material of its file."""
         shape, pose = owner.shape, owner.to_world
         mesh = mesh_of(triangles, owner.key, self.description, self.texture_loader, materials=shape["material"] is None)
@@ -134,13 +134,13 @@ class ShapeBuilder:
             self._declare_pose(stem, pose, [])
             own = piece.material if shape["material"] is None else None
             if own is None:
-                slot = self._slot(shape["material"], stem)
+                slot = self._material(shape["material"], stem)
             elif id(own) in known:  # parts of one material share its parameters and textures
                 slot = known[id(own)]
             else:
-                slot = known[id(own)] = self._file_slot(own, owner.key, f"{stem}.material", mesh.source)
+                slot = known[id(own)] = self._file_material(own, owner.key, f"{stem}.material", mesh.source)
             part = self._part(owner, stem, slot, Surface("triangle"), pose)
-            parts.append(_filled(part, piece, mesh))
+            parts.append(_with_triangles(part, piece, mesh))
         if all(len(part.faces) == 0 for part in parts if part.faces is not None):
             problem = "every face is degenerate (without area)"
             if mesh.source:
@@ -148,7 +148,7 @@ class ShapeBuilder:
             raise SceneError(f"{owner.key}.faces", "no face with area", "a face with area", self.description.file)
         return parts
 
-    def _slot(self, given: Any, stem: str) -> ResolvedMaterial:
+    def _material(self, given: Any, stem: str) -> ResolvedMaterial:
         """Return the material of a shape: a named one, one in place, or the default grey."""
         known = self.description.materials
         if isinstance(given, str):
@@ -157,7 +157,7 @@ class ShapeBuilder:
             return self._slots[given]
         return resolved(plain_material() if given is None else given, f"{stem}.material", known, self.texture_loader)
 
-    def _file_slot(self, own: FileMaterial, prefix: str, key: str, source: str) -> ResolvedMaterial:
+    def _file_material(self, own: FileMaterial, prefix: str, key: str, source: str) -> ResolvedMaterial:
         """Return a mesh file's own material.
 
         Raises:
@@ -170,7 +170,7 @@ class ShapeBuilder:
         except SceneError as error:
             raise AssetError(source, f"material {own.name[:80]!r}: {error}") from None
 
-    def _part(self, owner: Owner, stem: str, slot: ResolvedMaterial, surface: Surface, pose: np.ndarray) -> Part:
+    def _part(self, owner: ShapeEntry, stem: str, slot: ResolvedMaterial, surface: Surface, pose: np.ndarray) -> Part:
         """Return the part of a surface, without triangles, and declare its emission and the parameters of its material."""
         if slot is not self._slots.get(slot.name.removeprefix("materials.")) or id(slot) not in self._declared:
             declare(slot, self.parameters)
@@ -202,7 +202,7 @@ class ShapeBuilder:
         )
 
 
-def _filled(part: Part, piece: MeshPart, mesh: Mesh) -> Part:
+def _with_triangles(part: Part, piece: MeshPart, mesh: Mesh) -> Part:
     """Return a part with its triangles."""
     faces, dropped = solid(piece, part.to_world)
     return replace(

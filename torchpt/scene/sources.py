@@ -22,8 +22,8 @@ __all__ = [
     "build_file_lights",
     "build_lights",
     "check_coordinates",
-    "check_sources",
-    "declare_corners",
+    "check_light_params",
+    "declare_vertex_attributes",
     "unique_labels",
 ]
 
@@ -31,7 +31,7 @@ __all__ = [
 # ---- Texture coordinates and normals of meshes
 
 
-def declare_corners(parts: Sequence[Part], vertex_params: Collection[str], parameters: Parameters) -> None:
+def declare_vertex_attributes(parts: Sequence[Part], vertex_params: Collection[str], parameters: Parameters) -> None:
     """Declare the normals and texture coordinates that are named in ``vertex_params`` as parameters."""
     for part in parts if vertex_params else ():
         for key, value in (("normals", part.normals), ("uvs", part.uvs)):
@@ -92,7 +92,7 @@ def _file(description: Description, key: str, light: ParsedParams, parameter: st
     return description.resolve(light[parameter], f"{key}.{parameter}")
 
 
-def check_sources(sources: Sequence[Source], given: Collection[str], parameters: Mapping[str, Tensor]) -> None:
+def check_light_params(sources: Sequence[Source], given: Collection[str], parameters: Mapping[str, Tensor]) -> None:
     """Check replaced parameters of lights against each other.
 
     Args:

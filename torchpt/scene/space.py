@@ -20,16 +20,16 @@ from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.parts import Copy, Part, Source
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["FARTHEST", "Space", "bounds_center", "bounds_extent", "centre_and_unit"]
+__all__ = ["MAX_COORDINATE", "Space", "bounds_center", "bounds_extent", "centre_and_unit"]
 
 #: A scene is moved to the origin where its distance from it is more than this many times its size.
-RECENTRE = 8.0
+RECENTRE_DISTANCE = 8.0
 #: Scenes with all lengths between 1 / ORDINARY and ORDINARY keep their unit.
-ORDINARY = 2.0**30
+UNSCALED_RANGE = 2.0**30
 #: Largest ratio of the longest length to the smallest shape: with their geometric mean as unit, float32 holds both cubes.
-RANGE = 2.0**80
+MAX_RATIO = 2.0**80
 #: Largest coordinate in units: float32 does not hold cubes of larger ones.
-FARTHEST = 2.0**42
+MAX_COORDINATE = 2.0**42
 
 Array = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def centre_and_unit(
         raise SceneError(names[worst], [boxes[worst].min(0).tolist(), boxes[worst].max(0).tolist()], expected, file)
     low, high = boxes.min((0, 1)), boxes.max((0, 1))
     middle = 0.5 * (low + high)
-    if np.abs(middle).max() > RECENTRE * (high - low).max():
+    if np.abs(middle).max() > RECENTRE_DISTANCE * (high - low).max():
         centre = middle
     reaches = np.abs(boxes - centre).max((1, 2))
     far, near = int(reaches.argmax()), int(sizes.argmin())
@@ -153,11 +153,10 @@ def _unit(lengths: Sequence[tuple[str, float]], smallest: tuple[str, float], fil
     """Return 1, or a power of two near the geometric mean of the longest length and the smallest shape."""
     (far, longest), (near, size) = max(lengths, key=lambda item: item[1]), smallest
     longest = max(longest, size)
-    if longest > RANGE * size:
-        expected = (
-            f"a size of at least {longest / RANGE:.3g} beside a length of {longest:.3g} ({far}): float32 holds no more"
-        )
+    if longest > MAX_RATIO * size:
+        least = longest / MAX_RATIO
+        expected = f"a size of at least {least:.3g} beside a length of {longest:.3g} ({far}): float32 holds no more"
         raise SceneError(near, float(f"{size:.3g}"), expected, file)
-    if longest <= ORDINARY and size * ORDINARY >= 1.0:
+    if longest <= UNSCALED_RANGE and size * UNSCALED_RANGE >= 1.0:
         return 1.0
     return 2.0 ** round(0.5 * (math.log2(longest) + math.log2(size)))

@@ -33,13 +33,13 @@ __all__ = ["Frame", "frame_of", "read_transforms", "write_transforms"]
 _MOST = 256 * 2**20
 _NUMBERS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y")
 #: Coefficients of lens distortion, which is not supported: they must be 0.
-_BENT = ("k1", "k2", "k3", "k4", "p1", "p2")
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 _FOCAL = "a number > 0", lambda x: x > 0.0
 _SIDE = "a whole number in 1..16777216", lambda x: 1.0 <= x <= 2.0**24 and x.is_integer()
 _ANGLE = "an angle above 0 and below pi", lambda x: 1e-30 < x < math.pi
 #: Numbers with a range: the phrase for errors, and the test.
-_ENDS: dict[str, tuple[str, Callable[[float], bool]]] = {
+_RANGES: dict[str, tuple[str, Callable[[float], bool]]] = {
     "fl_x": _FOCAL,
     "fl_y": _FOCAL,
     "w": _SIDE,
@@ -137,7 +137,7 @@ def _number(path: Any, key: str, row: Mapping[str, Any], name: str) -> float | N
     value = row.get(name)
     if value is None:
         return None
-    expected, fits = _ENDS.get(name, ("a finite number", lambda _: True))
+    expected, fits = _RANGES.get(name, ("a finite number", lambda _: True))
     try:
         found = reading.number(value)
     except Refused:
@@ -152,9 +152,9 @@ def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
     model = row.get("camera_model", _MODELS[0])
     if model not in _MODELS or row.get("is_fisheye"):
         raise AssetError(path, f"{key}: a camera of model {model!r} is not built; one of {', '.join(_MODELS)}")
-    if any(_number(path, key, row, name) for name in _BENT):
+    if any(_number(path, key, row, name) for name in _DISTORTION):
         raise AssetError(
-            path, f"{key}: a lens that bends rays ({', '.join(_BENT)}) is not built; undistort the pictures"
+            path, f"{key}: a lens that bends rays ({', '.join(_DISTORTION)}) is not built; undistort the pictures"
         )
     image, matrix = row.get("file_path", ""), row.get("transform_matrix")
     if not isinstance(image, str):

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from torchpt.core.errors import RenderError
 
-__all__ = ["AFTER", "VersionCounter", "changes", "check_unchanged"]
+__all__ = ["AFTER", "VersionCounter", "changed_versions", "check_unchanged"]
 
 #: Phrase for errors of a backward pass.
 AFTER = "after the picture whose gradient is asked for"
 
 
-def changes(before: Mapping[str, int], now: Mapping[str, int]) -> dict[str, int]:
+def changed_versions(before: Mapping[str, int], now: Mapping[str, int]) -> dict[str, int]:
     """Return the versions that differ from ``before``, and those that cannot be compared (0 or negative)."""
     return {name: version for name, version in now.items() if not 0 < version == before.get(name)}
 

@@ -15,7 +15,7 @@ from torchpt.scene.build import SceneBuild
 from torchpt.scene.dict_tensors import params_from_tensors, with_all_intrinsics
 from torchpt.scene.formats.cameras import read_camera
 from torchpt.scene.formats.description import Description
-from torchpt.scene.formats.tensors import Tensors
+from torchpt.scene.formats.tensors import DictTensors
 from torchpt.scene.formats.yaml import plain
 
 __all__ = ["view_attributes"]
@@ -43,8 +43,8 @@ def view_attributes(
     if not isinstance(film, Mapping):
         raise SceneError("film", film, "a mapping")
     size = description.film | {name: value for name, value in film.items() if value is not None}
-    tensors = Tensors()
-    chosen = read_camera(tensors.taken_from(plain({"camera": camera}))["camera"], size, None)
+    tensors = DictTensors()
+    chosen = read_camera(tensors.extract(plain({"camera": camera}))["camera"], size, None)
     description = with_all_intrinsics(replace(description, camera=chosen), tensors)
     chosen, parameters = description.camera, Parameters()
     for name, value in built.parameters.items():

@@ -1,6 +1,6 @@
 """Declare keyword arguments once, in a ``TypedDict``: a static type and, by ``Annotated``, a spec for each.
 
-A function takes them as ``**wishes: Unpack[Form]``. Type checkers read the form; the run-time signature
+A function takes them as ``**options: Unpack[Form]``. Type checkers read the form; the run-time signature
 (``inspect.signature``, ``help``), checks and tables are made from it here.
 """
 
@@ -96,7 +96,7 @@ def arguments_of(form: Any) -> dict[str, DeclaredArgument]:
 
 
 def expand_signature(function: F) -> F:
-    """Spell out ``**wishes: Unpack[Form]`` in a function's run-time signature and at the end of its docstring."""
+    """Spell out ``**options: Unpack[Form]`` in a function's run-time signature and at the end of its docstring."""
     signature = inspect.signature(function, eval_str=True)
     *own, rest = signature.parameters.values()
     arguments = arguments_of(get_args(rest.annotation)[0])

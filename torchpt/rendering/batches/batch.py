@@ -23,7 +23,7 @@ from torchpt.rendering.batches.inputs import Cameras, Seeds, cameras_of, named, 
 from torchpt.rendering.requests import RenderRequest, ordered, rendered
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import Common, RenderOptions
+from torchpt.scene.settings import BatchOptions, RenderOptions
 from torchpt.scene.versions import check_unchanged
 from torchpt.spec.arguments import check_names, expand_signature
 
@@ -73,12 +73,12 @@ Pictures = Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]] | None
 @overload
 def render_batch(
     scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: Pictures = None, *, seed: Seeds = None,
-    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[False] = False, **wishes: Unpack[Common],
+    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[False] = False, **wishes: Unpack[BatchOptions],
 ) -> Tensor: ...  # fmt: skip
 @overload
 def render_batch(
     scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: Pictures = None, *, seed: Seeds = None,
-    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[True], **wishes: Unpack[Common],
+    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[True], **wishes: Unpack[BatchOptions],
 ) -> Renderings: ...  # fmt: skip
 @expand_signature
 def render_batch(
@@ -89,7 +89,7 @@ def render_batch(
     seed: Seeds = None,
     on_progress: Callable[[int, int | None], None] | None = None,
     full: bool = False,
-    **wishes: Unpack[Common],
+    **wishes: Unpack[BatchOptions],
 ) -> Tensor | Renderings:
     """Render S scenes by C cameras to linear RGB ``(S, C, H, W, 3)``; differentiable in ``params`` and poses.
 
@@ -171,7 +171,7 @@ def _pictures(
     sets: Sequence[Mapping[str, Tensor]] | None,
     seeds: Any,
     full: bool,
-    wishes: Common,
+    wishes: BatchOptions,
 ) -> Iterator[_Picture]:
     """Return the orders, picture by picture, those of a scene together; ``several``: scenes are one under other parameters."""
     like: dict[str, Any] = {}
@@ -204,7 +204,7 @@ def _ordered(
     params: Mapping[str, Tensor],
     seed: int | None,
     full: bool,
-    wishes: Common,
+    wishes: BatchOptions,
 ) -> RenderRequest:
     """Return the order of one picture."""
     if isinstance(camera, Tensor):

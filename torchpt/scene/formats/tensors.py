@@ -16,7 +16,7 @@ from torch import Tensor
 from torchpt.core.autograd import in_transform
 from torchpt.core.errors import SceneError
 
-__all__ = ["Key", "Tensors"]
+__all__ = ["DictTensors", "Key"]
 
 #: A position in nested mappings and lists: keys and indices.
 Key = tuple[str | int, ...]
@@ -26,7 +26,7 @@ _LISTED = 64
 _PLAIN = frozenset({int, float, str, bool, type(None)})
 
 
-class Tensors:
+class DictTensors:
     """The tensors of a scene dict that require gradients.
 
     Attributes:
@@ -38,7 +38,7 @@ class Tensors:
         self.raw: dict[str, Any] = {}
         self.keys: list[Key] = []
 
-    def taken_from(self, raw: dict[str, Any]) -> dict[str, Any]:
+    def extract(self, raw: dict[str, Any]) -> dict[str, Any]:
         """Return the scene with numbers in place of tensors; ``raw`` was bounded by :func:`torchpt.scene.formats.yaml.plain`.
 
         Raises:

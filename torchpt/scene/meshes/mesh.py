@@ -21,8 +21,8 @@ __all__ = [
     "FileMaterial",
     "MeshPart",
     "checked",
-    "corners_of_polygons",
     "displaced",
+    "polygon_fans",
     "smooth_normals",
     "subdivided",
     "too_many_parts",
@@ -191,7 +191,7 @@ def _checked(part: MeshPart, path: Path) -> MeshPart:
     return replace(part, normals=normals, uvs=uvs)
 
 
-def corners_of_polygons(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def polygon_fans(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Split polygons into fans of triangles: ``(F, 3)`` indices into the flat list of corners, in the order of polygons.
 
     Args:
@@ -242,7 +242,7 @@ def displaced(piece: MeshPart, heights: Callable[[Rows], Rows], subdivisions: in
     for _ in range(subdivisions):
         mesh = subdivided(mesh)
     assert mesh.normals is not None and mesh.uvs is not None
-    place, group = _places(mesh.vertices)
+    place, group = _unique_positions(mesh.vertices)
     direction = _averaged(_unit(mesh.normals), group, len(place))
     height = _averaged(heights(mesh.uvs)[:, None], group, len(place))
     vertices = place + _unit(direction) * height
@@ -278,7 +278,7 @@ def subdivided(mesh: MeshPart) -> MeshPart:
     )
 
 
-def _places(vertices: Rows) -> tuple[Rows, NDArray[np.int64]]:
+def _unique_positions(vertices: Rows) -> tuple[Rows, NDArray[np.int64]]:
     """Return the distinct positions, and the index of each vertex's position."""
     bits = (np.ascontiguousarray(vertices) + 0.0).view(np.uint64)  # + 0 makes -0 and 0 one
     mixed = bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)

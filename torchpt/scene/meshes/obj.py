@@ -17,7 +17,7 @@ from torchpt.scene.meshes.mesh import (
     MOST_PARTS,
     FileMaterial,
     MeshPart,
-    corners_of_polygons,
+    polygon_fans,
     smooth_normals,
     too_many_parts,
 )
@@ -57,7 +57,7 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     if not text.f:
         return []
     combos, index, counts = _corners(text, path, (len(positions), len(uvs), len(normals)))
-    triangles = corners_of_polygons(np.cumsum(counts) - counts, counts)  # (F, 3) into the flat corners
+    triangles = polygon_fans(np.cumsum(counts) - counts, counts)  # (F, 3) into the flat corners
     owner = np.repeat(np.array(text.face_groups), counts - 2)
     uvs[:, 1] = 1.0 - uvs[:, 1]
     all_positions, all_faces = positions[combos[:, 0]], index[triangles]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
-from torchpt.scene.meshes.mesh import FileMaterial, MeshPart, corners_of_polygons
+from torchpt.scene.meshes.mesh import FileMaterial, MeshPart, polygon_fans
 from torchpt.scene.meshes.ply_rows import find_mismatch
 
 __all__ = ["load_ply"]
@@ -105,7 +105,7 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], 
     colors = _colors(vertex, elements)
     own = FileMaterial("vertex colors", _COLORED) if materials and colors is not None else None
     starts = np.cumsum(counts) - counts
-    faces = items.astype(np.int64)[corners_of_polygons(starts, counts)] if len(counts) else np.zeros((0, 3), np.int64)
+    faces = items.astype(np.int64)[polygon_fans(starts, counts)] if len(counts) else np.zeros((0, 3), np.int64)
     return MeshPart("", vertices, faces, stack(("nx", "ny", "nz")), uvs, colors, own, tuple(ignored))
 
 

@@ -39,7 +39,7 @@ _ENCODINGS = (
 )
 
 #: Most bytes that an archive may decompress to.
-MOST_UNFOLDED = 2**30
+MAX_UNPACKED = 2**30
 
 
 def load_trimesh_formats(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
@@ -55,17 +55,17 @@ def load_trimesh_formats(path: Path, data: bytes, materials: bool) -> list[MeshP
         how = "pip install 'torchpt-renderer[formats]'"
         raise AssetError(path, f"reading {kind} needs {needs}{' and '.join(missing)}: {how}")
     try:
-        _screen(path, data)
+        _check_safe(path, data)
         with Notes() as notes, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # NumPy's, and deprecations of the parsers
-            scene, lost = _read(path, data)
+            scene, missing_files = _read(path, data)
     except (AssetError, MemoryError):
         raise
     except Exception as error:
         reason = (str(error).strip().splitlines() or [""])[0][:120]
         raise AssetError(path, f"malformed {kind} ({type(error).__name__}: {reason})") from None
-    if lost and materials:
-        raise AssetError(path, f"the file {lost[0][:80]!r} is missing")
+    if missing_files and materials:
+        raise AssetError(path, f"the file {missing_files[0][:80]!r} is missing")
     parts = mesh_parts_of(scene, str(path), materials=materials, most=max(MOST_PLACED, len(data)))
     ignored = tuple(dict.fromkeys((*parts[0].ignored, *notes.texts)))
     return [replace(parts[0], ignored=ignored), *parts[1:]]
@@ -76,7 +76,7 @@ def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
     import trimesh
     from trimesh.resolvers import FilePathResolver
 
-    lost: list[str] = []
+    missing_files: list[str] = []
 
     class Beside(FilePathResolver):
         def absolute(self, name: str) -> Path:
@@ -89,22 +89,22 @@ def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
             try:
                 return super().get(name)
             except Exception:
-                lost.append(name)
+                missing_files.append(name)
                 raise
 
     kind = path.suffix.lower().removeprefix(".")
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=Beside(str(path)), process=False)
-    return scene, lost
+    return scene, missing_files
 
 
-def _screen(path: Path, data: bytes) -> None:
+def _check_safe(path: Path, data: bytes) -> None:
     """Raise for archives that decompress to too many bytes, and for XML that declares entities."""
     texts = [data] if path.suffix.lower() == ".dae" else []
     if data.startswith(b"PK"):
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(info.file_size for info in archive.infolist())
-            if size > MOST_UNFOLDED:
-                raise AssetError(path, f"unfolds to {size} bytes, more than {MOST_UNFOLDED} are not read")
+            if size > MAX_UNPACKED:
+                raise AssetError(path, f"unfolds to {size} bytes, more than {MAX_UNPACKED} are not read")
             texts += [archive.read(info) for info in archive.infolist() if info.filename.lower().endswith(".dae")]
     for text in texts:
         plain = text.replace(b"\0", b"")  # of UTF-16

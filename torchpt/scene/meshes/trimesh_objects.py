@@ -46,7 +46,7 @@ _INNER = (*_FACTORS, "baseColorFactor", "baseColorTexture", "metallicRoughnessTe
 #: Pillow's modes that a PNG file holds.
 _MODES = ("1", "L", "LA", "RGB", "RGBA", "I;16", "I")
 #: Trimesh's defaults of ``SimpleMaterial``: the grey of its colours, and its exponent.
-_UNSAID, _UNSAID_EXPONENT = (102, 102, 102, 255), 1.0
+_DEFAULT_GREY, _DEFAULT_EXPONENT = (102, 102, 102, 255), 1.0
 
 
 class MaterialConverter:
@@ -116,12 +116,12 @@ class MaterialConverter:
         statements = Statements()
         files: dict[str, Any] = {}
         for key, value in (("kd", material.diffuse), ("ks", material.specular)):
-            if tuple(np.asarray(value).tolist()) != _UNSAID:
+            if tuple(np.asarray(value).tolist()) != _DEFAULT_GREY:
                 red, green, blue = (float(level) / 255.0 for level in value[:3])
                 statements.colors[key] = red, green, blue
         if material.diffuse[3] < 255:
             statements.numbers["d"] = float(material.diffuse[3]) / 255.0
-        if material.glossiness != _UNSAID_EXPONENT:
+        if material.glossiness != _DEFAULT_EXPONENT:
             statements.numbers["ns"] = float(material.glossiness)
         if material.image is not None:
             statements.maps["map_kd"] = Map("map_Kd", "", 0)

@@ -223,7 +223,7 @@ def groups_of(
     """
     members: dict[Kind, list[str]] = {}
     for name, material in made.items():
-        members.setdefault(_kind(materials[name], material), []).append(name)
+        members.setdefault(_group_key(materials[name], material), []).append(name)
     if not members:
         members[KINDS["diffuse"](), None] = []
     if len(members) > MOST_MODELS:
@@ -259,7 +259,7 @@ def _tabulated(model: Bsdf, values: Parameters) -> Parameters:
     return merged(values, model.tabulate(values))
 
 
-def _kind(material: ResolvedMaterial, made: LaneMaterial) -> Kind:
+def _group_key(material: ResolvedMaterial, made: LaneMaterial) -> Kind:
     """Return the key of a material's group; materials without textures share that of their BSDF."""
     if not made.readings and material.normal_map is None and material.bump_map is None:
         return made.model, None
