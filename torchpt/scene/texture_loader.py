@@ -18,7 +18,7 @@ __all__ = ["TextureLoader"]
 
 
 class TextureLoader:
-    """Opener of one scene's textures.
+    """Loader of one scene's textures.
 
     Args:
         textures: textures by name.
