@@ -432,7 +432,7 @@ FAULTS = (
         "changed_in_place",
         "scene/versions.py",
         "scene render",
-        "Editions.of",
+        "VersionCounter.of",
         "before is None or before[0]() is not value or before[1] != version",
         "before is None or before[0]() is not value",
         "a stale cache: a parameter changed in place by an optimizer still renders as it was",

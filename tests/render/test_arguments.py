@@ -167,7 +167,7 @@ def test_a_role_is_left_out() -> None:
 TOY = {
     "scene/settings.py": (
         "    checkpoint: Annotated[",
-        '    enough: Annotated[int | None, Whole(None, low=1, doc="samples that are enough", role=Role.ENDS)]\n',
+        '    enough: Annotated[int | None, Integer(None, low=1, doc="samples that are enough", role=Role.ENDS)]\n',
     ),
     "rendering/stopping.py": (
         "        self.share = min(",

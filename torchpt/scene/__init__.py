@@ -1,18 +1,18 @@
-"""From a scene file to what engines run: YAML -> description -> parts -> :class:`Scene` -> world and waves.
+"""Load scenes and prepare them for engines: YAML -> description -> parts -> :class:`Scene` -> world and wave.
 
 ====================  ==================================================================================
-``formats/``          the scene file, and the description that it comes to
-``meshes/``           mesh files as triangles with their materials, lights and cameras
+``formats/``          reads scene files and validates them: the description
+``meshes/``           reads mesh files: triangles with their materials, lights and cameras
 ``settings.py``       the settings of a render, each declared once
-``loading.py``        what ``torchpt.load`` does: start here
-``build.py``          from a description to parts and parameters, with ``shapes.py``, ``sources.py``, ``mesh_shapes.py``
-``scene.py``          a scene: its parameters, and what is made of them
-``world/``            from parts and parameters to a world: one differentiable function
-``prepare.py``        from a scene to what all waves of a render share, and which engine takes them
-``conventions.py``    cameras of other libraries; ``transforms_json.py`` those of NeRF's files
+``loading.py``        ``torchpt.load``: start here
+``build.py``          builds parts and parameters of a description, with ``shapes.py``, ``sources.py``, ``mesh_triangles.py``
+``scene.py``          a scene: its parameters, and a cache of the worlds and trees built from them
+``world/``            builds the world of parts and parameters: one differentiable function
+``prepare.py``        builds the wave of a render, and chooses the engine
+``conventions.py``    converts cameras of other libraries; ``transforms_json.py`` reads and writes those of NeRF datasets
 ====================  ==================================================================================
 
-May import: ``engines`` and what lies below.
+May import: ``engines`` and the layers below.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From a description to parts and parameters: files are read, names resolved, what cannot be hit is dropped and counted."""
+"""Build the parts and parameters of a description: read files, resolve names, drop faces without area."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ __all__ = ["SceneBuild", "build_parts"]
 
 @dataclass(frozen=True)
 class SceneBuild:
-    """Parts in the order of ``records.KINDS``, their parameters, and the lanes' own coordinates (:mod:`torchpt.scene.space`).
+    """Parts, parameters and coordinates of a scene, before any tensor of a device.
 
     Attributes:
-        parts: what can be hit.
+        parts: the surfaces, in the order of ``records.KINDS``.
         parameters: arrays by dotted name.
-        centre: ``(3,)`` float64, subtracted from all positions.
-        unit: what all lengths are divided by.
-        sources: lights that are no surfaces, in the order of ``lights.order``.
+        centre: ``(3,)`` float64, subtracted from all positions (:mod:`torchpt.scene.space`).
+        unit: divisor of all lengths.
+        sources: delta lights and environments, in the order of ``lights.order``.
         copies: instances of parts.
     """
 
@@ -44,15 +44,15 @@ class SceneBuild:
 
 
 def build_parts(description: Description, vertex_params: Collection[str] = ()) -> SceneBuild:
-    """Resolve a description.
+    """Build the parts and parameters of a description.
 
     Args:
-        description: of the scene.
-        vertex_params: dotted names of normals and texture coordinates that are to be parameters.
+        description: the scene's.
+        vertex_params: dotted names of normals and texture coordinates that become parameters.
 
     Raises:
-        SceneError: more than one environment, a shape that cannot be placed, or sizes too far apart for float32.
-        AssetError: a mesh file that is missing or malformed.
+        SceneError: more than one environment, a shape without a finite position, or sizes too far apart for float32.
+        AssetError: a missing or malformed mesh file.
 
     Warns:
         EnergyWarning: two refracting shapes touch.

@@ -1,10 +1,10 @@
-"""Cameras as other libraries have them: blocks of a scene made of theirs, and theirs made of a scene's camera.
+"""Convert cameras between scenes and other libraries, in both directions.
 
-All agree on a pinhole of ``fx fy cx cy`` in pixels; they differ in axes, in which way the pose goes, and in where pixels are
-counted from.
+All have a pinhole of ``fx fy cx cy`` in pixels; they differ in axes, in the direction of the pose, and in the coordinates of
+the first pixel.
 
 ====================  =======================================  ==================  ==========================
-whose                 axes of the camera                       pose                the first pixel's middle
+library               axes of the camera                       pose                centre of the first pixel
 ====================  =======================================  ==================  ==========================
 torchpt, Mitsuba      x left, y up, looks along +z             camera to world     (0.5, 0.5)
 OpenCV's, COLMAP      x right, y down, looks along +z          world to camera     (0.5, 0.5) in COLMAP
@@ -15,7 +15,7 @@ PyTorch3D             x left, y up, looks along +z             world to camera, 
                                                                rows times ``R``
 ====================  =======================================  ==================  ==========================
 
-Tensors go in and come out: gradients flow through both ways. Numbers, lists and arrays are taken as well.
+Gradients flow through tensors in both directions. Numbers, lists and arrays are accepted as well.
 """
 
 from __future__ import annotations
@@ -57,22 +57,22 @@ class OpenGLCamera(NamedTuple):
 
     matrix: Tensor  # (4, 4) camera to world; x right, y up, looks along -z
     K: Tensor  # (3, 3) in pixels from the picture's corner
-    fov: Tensor  # (2,) degrees along x and y, of a film whose middle it looks at
+    fov: Tensor  # (2,) degrees along x and y, of a principal point at the centre
     size: Size
 
 
 def from_opencv(K: Any, R: Any, t: Any, size: Size, first_pixel: float = 0.5) -> Block:
-    """A camera of OpenCV's matrices: a point ``X`` of the world lies at ``R X + t`` (+x right, +y down, +z ahead).
+    """Return the camera block for OpenCV's matrices: a world point ``X`` maps to ``R X + t`` (+x right, +y down, +z ahead).
 
     Args:
         K: ``(3, 3)`` in pixels, without skew.
         R: ``(3, 3)`` rotation.
         t: ``(3,)``.
-        size: width and height in pixels of the picture that ``K`` belongs to.
-        first_pixel: where ``K`` has the middle of the first pixel, along x and y: 0.5 as COLMAP, 0 as ``cv2``.
+        size: width and height in pixels of the image that ``K`` belongs to.
+        first_pixel: coordinate of the first pixel's centre in ``K``, along x and y: 0.5 as COLMAP, 0 as ``cv2``.
 
     Raises:
-        SceneError: numbers that are not finite or of another shape, an ``R`` that is no rotation, or no size.
+        SceneError: numbers that are not finite or of another shape, an ``R`` that is no rotation, a bad size.
     """
     inner, wide_and_tall = _with_offset(_tensor(K, "K", (3, 3)), 0.5 - _first_pixel(first_pixel)), size_of(size)
     pose = {"R": _rotation(R), "t": _tensor(t, "t", (3,))}
@@ -86,17 +86,17 @@ def to_opencv(
     dtype: torch.dtype = torch.float32,
     first_pixel: float = 0.5,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """``K (3, 3)``, ``R (3, 3)`` and ``t (3,)`` of a scene's camera.
+    """Return ``K (3, 3)``, ``R (3, 3)`` and ``t (3,)`` of a scene's camera.
 
     Args:
-        scene: whose.
-        params: tensors in place of the scene's; gradients flow to those of the camera, and to the scene's own.
-        film: film settings in place of the scene's own, such as ``width`` and ``height``.
-        dtype: of the matrices.
-        first_pixel: where ``K`` is to have the middle of the first pixel.
+        scene: the scene.
+        params: tensors in place of the scene's; gradients flow to the camera's parameters, here and in the scene.
+        film: film settings that override the scene's, such as ``width`` and ``height``.
+        dtype: dtype of the matrices.
+        first_pixel: coordinate of the first pixel's centre in ``K``.
 
     Raises:
-        SceneError: no scene, parameters or film settings that are wrong, or a camera that is no pinhole's.
+        SceneError: no scene, wrong parameters or film settings, or a camera other than a pinhole.
     """
     inner, rotation, translation = _seen(scene, params, film, dtype)
     return _with_offset(inner, _first_pixel(first_pixel) - 0.5).to(dtype), rotation.to(dtype), translation.to(dtype)
@@ -111,19 +111,19 @@ def from_opengl(
     size: Size | None = None,
     first_pixel: float = 0.5,
 ) -> Block:
-    """A camera of OpenGL's axes: of glTF, Blender and NeRF.
+    """Return the camera block for a camera with OpenGL's axes: glTF, Blender, NeRF.
 
     Args:
         matrix: ``(4, 4)`` or ``(3, 4)`` camera to world; x right, y up, looks along -z. A scale is ignored, as in glTF.
         fov: full angle in *degrees* (glTF's ``yfov`` and NeRF's ``camera_angle_x`` are radians).
-        fov_axis: what it spans: ``y`` for glTF's, ``x`` for NeRF's, ``larger`` for Blender's.
-        K: ``(3, 3)`` in place of ``fov``, in pixels of a picture of ``size``.
-        size: width and height in pixels of that picture.
-        first_pixel: where ``K`` has the middle of the first pixel.
+        fov_axis: axis of ``fov``: ``y`` for glTF, ``x`` for NeRF, ``larger`` for Blender.
+        K: ``(3, 3)`` in place of ``fov``, in pixels of an image of ``size``.
+        size: width and height in pixels of that image.
+        first_pixel: coordinate of the first pixel's centre in ``K``.
 
     Raises:
-        SceneError: neither a ``fov`` nor ``K``, or both; a ``K`` without ``size``; numbers that are not finite, of another
-            shape or out of range, or a matrix with an axis of no length.
+        SceneError: neither ``fov`` nor ``K``, or both; a ``K`` without ``size``; numbers that are not finite, of another
+            shape or out of range; a matrix with an axis of length 0.
     """
     if (fov is None) == (K is None):
         raise SceneError("fov", fov, "an angle in degrees, or K and size, one of the two")
@@ -150,7 +150,7 @@ def to_opengl(
     film: Mapping[str, Any] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> OpenGLCamera:
-    """A scene's camera with OpenGL's axes. Arguments and errors as :func:`to_opencv`."""
+    """Return a scene's camera with OpenGL's axes. Arguments and errors as :func:`to_opencv`."""
     inner, rotation, translation = _seen(scene, params, film, dtype)
     width, height = scene.film_size(film)
     matrix = affine(rotation.T * rotation.new_tensor([1.0, -1.0, -1.0]), -(rotation.T @ translation))
@@ -160,14 +160,14 @@ def to_opengl(
 
 
 def from_kornia(camera: PinholeCamera, index: int = 0) -> Block:
-    """One of the cameras of kornia's ``PinholeCamera``, in whose pixels the first one's middle is (0, 0).
+    """Return the camera block for one camera of kornia's ``PinholeCamera``, whose first pixel has its centre at (0, 0).
 
     Args:
         camera: the batch of cameras.
-        index: which of them.
+        index: index in the batch.
 
     Raises:
-        SceneError: no such camera.
+        SceneError: no ``PinholeCamera``, or an index out of range.
     """
     if not all(hasattr(camera, name) for name in ("extrinsics", "intrinsics", "width", "height")):
         raise SceneError("camera", camera, "kornia's PinholeCamera")
@@ -187,10 +187,9 @@ def to_kornia(
     film: Mapping[str, Any] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> PinholeCamera:
-    """A scene's camera as kornia's ``PinholeCamera``, a batch of one. Arguments and errors as :func:`to_opencv`.
+    """Return a scene's camera as kornia's ``PinholeCamera``, a batch of one. Arguments and errors as :func:`to_opencv`.
 
-    ``project`` gives pixels as kornia counts them: a point that is seen in the middle of ``image[row, column]`` lies at
-    ``(column, row)``.
+    Its ``project`` returns kornia's pixel coordinates: the centre of ``image[row, column]`` is ``(column, row)``.
     """
     from kornia.geometry.camera import PinholeCamera
 
@@ -204,22 +203,23 @@ def to_kornia(
 def from_pytorch3d(
     R: Any, T: Any, focal_length: Any, principal_point: Any = (0.0, 0.0), *, image_size: Any, in_ndc: bool = True
 ) -> Block:
-    """A camera of the numbers that PyTorch3D's ``PerspectiveCameras`` has: one camera, or a batch of one.
+    """Return the camera block for the arguments of PyTorch3D's ``PerspectiveCameras``: one camera, or a batch of one.
 
     Args:
-        R: ``(3, 3)``: a point is a row, and lies at ``X R + T`` in the camera's space.
+        R: ``(3, 3)``; a world point ``X`` is a row and maps to ``X R + T``.
         T: ``(3,)``.
         focal_length: ``()`` or ``(2,)``.
         principal_point: ``(2,)``.
         image_size: height and width in pixels, in this order.
-        in_ndc: whether the two before are in PyTorch3D's normalized coordinates, whose smaller side is 2 long; else in pixels.
+        in_ndc: True where ``focal_length`` and ``principal_point`` are in PyTorch3D's NDC, whose shorter side has length 2;
+            else they are in pixels.
 
     Raises:
         SceneError: numbers that are not finite or of another shape.
     """
     if type(in_ndc) is not bool:
         raise SceneError("in_ndc", in_ndc, "True or False")
-    # Ours is the same camera space, and R's columns are its axes in the world.
+    # The camera space is the same here, and R's columns are its axes in the world.
     rotation, translation = _rotation(R), _tensor(T, "T", (3,))
     tall, wide = size_of(_tensor(image_size, "image_size", (2,)), "image_size", "[height, width]")
     focal, point = _tensor(focal_length, "focal_length", None), _tensor(principal_point, "principal_point", (2,))
@@ -241,7 +241,7 @@ def to_pytorch3d(
     film: Mapping[str, Any] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> dict[str, Any]:
-    """What PyTorch3D's ``PerspectiveCameras(**numbers)`` takes, a batch of one. Arguments and errors as :func:`to_opencv`."""
+    """Return PyTorch3D's arguments of ``PerspectiveCameras`` for a batch of one. Arguments and errors as :func:`to_opencv`."""
     inner, rotation, translation = _seen(scene, params, film, dtype)
     wide, tall = scene.film_size(film)
     half, flip = min(wide, tall) * 0.5, rotation.new_tensor([-1.0, -1.0, 1.0])
@@ -258,7 +258,7 @@ def to_pytorch3d(
 def _seen(
     scene: Any, params: Mapping[str, Tensor] | None, film: Mapping[str, Any] | None, dtype: Any
 ) -> PinholeMatrices:
-    """A scene's camera in float64, once ``dtype``, which the caller is to give it, is one."""
+    """Return a scene's pinhole matrices in float64, after checking ``dtype``, to which callers convert."""
     if not hasattr(scene, "pinhole"):
         raise SceneError("scene", scene, "a scene from torchpt.load")
     if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
@@ -267,7 +267,7 @@ def _seen(
 
 
 def _numbers(value: Any, key: str, expected: str) -> Tensor:
-    """Finite numbers in float64; of a transform of ``torch.func``, where values are not to be looked at, whatever they are."""
+    """Return finite numbers as float64; under a transform of ``torch.func`` values cannot be read and are not checked."""
     given = value if isinstance(value, Tensor) else None
     if given is not None and (given.layout is not torch.strided or given.is_complex() or given.is_meta):
         raise SceneError(
@@ -283,7 +283,7 @@ def _numbers(value: Any, key: str, expected: str) -> Tensor:
 
 
 def _rotation(value: Any) -> Tensor:
-    """A rotation in float64."""
+    """Return a rotation in float64."""
     found = _tensor(value, "R", (3, 3))
     if not is_transformed(found):
         try:
@@ -294,12 +294,12 @@ def _rotation(value: Any) -> Tensor:
 
 
 def _first_pixel(value: Any) -> float:
-    """Where the middle of the first pixel is."""
+    """Return ``first_pixel`` as a float."""
     return float(_tensor(value, "first_pixel", ()))
 
 
 def _tensor(value: Any, key: str, shape: tuple[int, ...] | None) -> Tensor:
-    """Numbers in float64, of a shape or a batch of one."""
+    """Return numbers of a shape, or of a batch of one, in float64."""
     found = _numbers(value, key, "numbers")
     if shape is not None and found.shape == (1, *shape):
         found = found[0]
@@ -309,10 +309,10 @@ def _tensor(value: Any, key: str, shape: tuple[int, ...] | None) -> Tensor:
 
 
 def size_of(size: Any, key: str = "size", sides: str = "[width, height]") -> list[int]:
-    """Two sides of a picture in pixels, of whole numbers in any form.
+    """Return the two sides of an image in pixels as ints, from whole numbers of any type.
 
     Raises:
-        SceneError: something else.
+        SceneError: anything else.
     """
     expected = f"{sides} in pixels, whole numbers >= 1"
     try:
@@ -328,7 +328,7 @@ def size_of(size: Any, key: str = "size", sides: str = "[width, height]") -> lis
 
 
 def _pose(matrix: Any) -> Tensor:
-    """``(3, 4)`` of a ``(4, 4)`` or ``(3, 4)``, its axes of length 1."""
+    """Return ``(3, 4)`` of a ``(4, 4)`` or ``(3, 4)`` matrix, with axes of length 1."""
     found = _numbers(matrix, "matrix", "a matrix (4, 4) or (3, 4)")
     if found.shape not in ((4, 4), (3, 4)):
         raise SceneError("matrix", f"shape {tuple(found.shape)}", "a matrix (4, 4) or (3, 4)")
@@ -343,7 +343,7 @@ def _pose(matrix: Any) -> Tensor:
 
 
 def _with_offset(matrix: Tensor, offset: float) -> Tensor:
-    """``K`` with its principal point moved by the same number of pixels along both axes."""
+    """Return ``K`` with the principal point moved by ``offset`` pixels along both axes."""
     if offset == 0.0:
         return matrix
     return matrix + matrix.new_tensor([[0.0, 0.0, offset], [0.0, 0.0, offset], [0.0, 0.0, 0.0]])

@@ -1,4 +1,4 @@
-"""Names of devices."""
+"""Convert names of devices."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ __all__ = ["device_of"]
 
 
 def device_of(name: str | torch.device) -> torch.device:
-    """The device for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
+    """Return the device for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
 
     Raises:
-        SceneError: none of these.
-        RenderError: the device is not there.
+        SceneError: another name.
+        RenderError: the device is not available.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")

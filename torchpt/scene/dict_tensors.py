@@ -1,7 +1,7 @@
-"""Tensors of a dict as the scene's parameters: what is made of them is made again by torch, so that gradients reach them.
+"""Connect tensors in a scene dict to the scene's parameters, so that gradients flow from one to the other.
 
-A parameter that a tensor is, to the type, shape and device, *is* that tensor; any other is made of what was written, with the
-value that was read.
+A tensor that has the dtype, shape and device of its parameter becomes the parameter itself. Other parameters are computed
+from the tensors by torch; they keep the values that were read, so only their gradients come from the tensors.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from torchpt.spec import parameters_of
 from torchpt.spec.reading import transform
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["traced", "vertex_attributes_in", "with_all_intrinsics"]
+__all__ = ["params_from_tensors", "vertex_attributes_in", "with_all_intrinsics"]
 
 _EXPECTED = (
     "numbers without gradients (detach() them): no parameter of the scene is made of them, or none with the value that they "
     "have; scene.params lists what is differentiable"
 )
 
-#: Of a mesh, what is a parameter only where its gradients are wanted.
+#: Arrays of a mesh that are parameters only where they require gradients.
 _CORNERS = ("normals", "uvs")
 
 Params = Mapping[str, Tensor]
 
 
 def with_all_intrinsics(description: Description, tensors: DictTensors) -> Description:
-    """The description with all that tensors may change: a ``K`` in the middle of its picture may be moved from there."""
+    """Return the description with all parameters of ``K`` where it is a tensor, also those that have their usual values."""
     camera = description.camera
     if not any(key[0] == "K" for key in tensors.under("camera")):
         return description
@@ -49,35 +49,37 @@ def with_all_intrinsics(description: Description, tensors: DictTensors) -> Descr
 
 
 def vertex_attributes_in(tensors: DictTensors) -> set[str]:
-    """Names of meshes' normals and texture coordinates whose gradients are wanted: parameters of no other scene."""
+    """Return the dotted names of meshes' normals and texture coordinates that require gradients."""
     return {_dotted(("shapes", *key[:2])) for key in tensors.under("shapes") if len(key) > 1 and key[1] in _CORNERS}
 
 
-def traced(tensors: DictTensors, description: Description, built: SceneBuild, params: Params) -> dict[str, Tensor]:
-    """The parameters that tensors of the dict give, by name, on their tape.
+def params_from_tensors(
+    tensors: DictTensors, description: Description, built: SceneBuild, params: Params
+) -> dict[str, Tensor]:
+    """Return the parameters that depend on tensors of the dict, by name, attached to their autograd graph.
 
     Args:
-        tensors: what was written.
-        description: what it was read as.
-        built: what that came to.
-        params: the parameters as they were read.
+        tensors: the dict and its tensors.
+        description: the description read from it.
+        built: the build of the description.
+        params: the scene's parameters as read.
 
     Raises:
-        SceneError: a tensor that requires gradients where nothing is differentiable.
+        SceneError: a tensor that requires gradients where no parameter depends on it.
     """
     read = _Reading(tensors, description, built, params, next(iter(params.values())).device)
     found: dict[str, Tensor] = {}
-    for key in dict.fromkeys(map(_whole, tensors.keys)):
-        made = dict(_made(key, read))
-        if not made and not _unread(key, params):
+    for key in dict.fromkeys(map(_up_to_index, tensors.keys)):
+        made = dict(_dependent_params(key, read))
+        if not made and not _is_unused_texture(key, params):
             raise SceneError(_dotted(key), "a tensor that requires gradients", _EXPECTED, description.file)
         found |= made
-    return {name: _fitting(value, params[name]) for name, value in found.items()}
+    return {name: _cast_like(value, params[name]) for name, value in found.items()}
 
 
 @dataclass(frozen=True)
 class _Reading:
-    """What was written, and what it came to."""
+    """The dict with its tensors, and the scene built from it."""
 
     tensors: DictTensors
     description: Description
@@ -86,13 +88,13 @@ class _Reading:
     device: torch.device
 
     def at(self, key: Key) -> Tensor:
-        """What stands at a key: a tensor itself, anything else as one."""
+        """Return the value at a key as a tensor."""
         written = self.tensors.at(key)
         return written if isinstance(written, Tensor) else tensor_of(written, self.device)
 
 
-def _whole(key: Key) -> Key:
-    """The key of what a number, a row or a step of a list belongs to."""
+def _up_to_index(key: Key) -> Key:
+    """Return a key up to its first list index."""
     return next((key[:n] for n, part in enumerate(key) if isinstance(part, int)), key)
 
 
@@ -100,26 +102,26 @@ def _dotted(key: Key) -> str:
     return ".".join(map(str, key))
 
 
-def _unread(key: Key, params: Params) -> bool:
-    """Whether a key is of a texture that nothing in the scene reads."""
+def _is_unused_texture(key: Key, params: Params) -> bool:
+    """Return True for a key of a texture that no material uses."""
     return key[0] == "textures" and not any(re.match(rf"textures\.{re.escape(str(key[1]))}(\.|$)", n) for n in params)
 
 
-def _fitting(value: Tensor, own: Tensor) -> Tensor:
-    """A parameter made of tensors, in place of the one that was read."""
+def _cast_like(value: Tensor, own: Tensor) -> Tensor:
+    """Return a parameter computed from tensors, with dtype, device, shape and value of the one that was read."""
     if value.dtype == own.dtype and value.device == own.device and value.shape == own.shape:
         return value
     value = value.to(own.device, torch.promote_types(value.dtype, own.dtype))
     if value.dim() == 2 and own.dim() == 3:  # grey
         value = value[..., None]
-    if value.dim() == 3 and value.shape[2] != own.shape[2]:  # a light's: no alpha, and grey in all channels
+    if value.dim() == 3 and value.shape[2] != own.shape[2]:  # texels of a light: drop alpha, repeat grey
         value = value[..., :3] if value.shape[2] > 3 else value[..., :1]
-    # Not a bit but what was read: rounding here is not rounding there.
+    # Keep the bits of the value that was read: it was rounded differently.
     return own + (value - value.detach()).to(own.dtype).expand_as(own)
 
 
-def _made(key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
-    """Parameters that what stands at a key goes into, made of all that they are made of."""
+def _dependent_params(key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
+    """Yield the parameters that depend on the value at a key, by name."""
     block = key[0]
     if block == "camera" and len(key) > 1:
         yield from _camera(str(key[1]), read)
@@ -130,13 +132,13 @@ def _made(key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
     elif block == "lights" and len(key) > 2:
         name = _dotted(key)
         yield from _named(key, f"{name.removesuffix('.data')}.texels" if key[2] == "data" else name, read)
-        yield from _following(str(key[1]), read)
+        yield from _params_from_defaults(str(key[1]), read)
     elif block in ("materials", "textures"):
         yield from _named(key, _dotted(key), read)
 
 
 def _named(key: Key, name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
-    """The parameter of a name, or that of the texture whose ``data`` has it."""
+    """Yield the parameter of a name, or that of the texture whose ``data`` has the name."""
     for candidate in (name, name.removesuffix(".data")):
         if candidate in read.params:
             yield candidate, read.at(key)
@@ -151,7 +153,7 @@ def _camera(name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
     elif name == "K":
         inner = tensor_of(read.tensors.at(("camera", "K")), read.device)
         yield from ((f"camera.{number}", value) for number, value in numbers_of(inner, camera["size"]).items())
-    elif name in specs and specs[name].traced:
+    elif name in specs and specs[name].differentiable:
         yield f"camera.{name}", read.at(("camera", name))
 
 
@@ -161,7 +163,7 @@ def _shape(name: str, key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
     if part == "transform" or isinstance(parameters_of(shape.kind).get(part), Size | Place):
         pose = _pose_of(name, shape, read)
         yield from ((f"{owner.name}.to_world", pose) for owner in owners)
-        yield from _lights_of_file(stem, pose, read)
+        yield from _file_light_params(stem, pose, read)
     elif part == "material":
         rest = _dotted(key[3:])
         for own in dict.fromkeys(owner.material.name for owner in owners):
@@ -173,7 +175,7 @@ def _shape(name: str, key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
 
 
 def _pose_of(name: str, shape: ParsedParams, read: _Reading) -> Tensor:
-    """A shape's pose: its own size and place, then its transform."""
+    """Return a shape's pose: its own size and position, then its transform."""
     written, device = read.tensors.raw["shapes"][name], read.device
     operations, specs = written.get("transform"), parameters_of(shape.kind)
     pose = transform([] if operations is None else operations, device)
@@ -182,9 +184,9 @@ def _pose_of(name: str, shape: ParsedParams, read: _Reading) -> Tensor:
     return pose @ shape.kind.own({**shape.values, **sizes}) if sizes else pose
 
 
-def _lights_of_file(stem: str, pose: Tensor, read: _Reading) -> Iterator[tuple[str, Tensor]]:
-    """What a mesh file's lights have of places, carried along with the mesh."""
-    way = pose @ torch.linalg.inv(pose.detach())  # one now, and the way from here where the mesh moves
+def _file_light_params(stem: str, pose: Tensor, read: _Reading) -> Iterator[tuple[str, Tensor]]:
+    """Yield positions and directions of a mesh file's lights, which move with the mesh."""
+    way = pose @ torch.linalg.inv(pose.detach())  # the identity, with the derivative of the pose
     for source in read.built.sources:
         if not source.name.startswith(f"{stem}.lights."):
             continue
@@ -195,8 +197,8 @@ def _lights_of_file(stem: str, pose: Tensor, read: _Reading) -> Iterator[tuple[s
                 yield name, way[:3, :3] @ value + (0.0 if key == "direction" else way[:3, 3])
 
 
-def _following(name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
-    """Parameters of a light that follow from others where nobody says them."""
+def _params_from_defaults(name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
+    """Yield parameters of a light whose defaults are functions of other parameters."""
     light, written = read.description.lights[name], read.tensors.raw["lights"][name]
     numbers = {key: value.to(read.device) for key, value in written.items() if isinstance(value, Tensor)}
     for key, spec in parameters_of(light.kind).items():

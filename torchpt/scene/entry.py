@@ -1,4 +1,4 @@
-"""What functions that take scenes say to anything else."""
+"""Check the type of scenes that callers pass."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ __all__ = ["as_scene"]
 
 
 def as_scene(given: Any, key: str = "scene") -> Scene:
-    """A scene as it is.
+    """Return a scene unchanged.
 
     Args:
-        given: what stands where a scene is expected.
-        key: its name in errors.
+        given: the argument.
+        key: name of the argument in errors.
 
     Raises:
-        SceneError: it is none.
+        SceneError: not a scene.
     """
     if not isinstance(given, Scene):
         raise SceneError(key, given, "a scene from torchpt.load")

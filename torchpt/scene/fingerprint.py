@@ -1,6 +1,6 @@
-"""Hashes of all that a scene came to, by walking it: two scenes that differ in anything that is rendered have two.
+"""Hash everything that a scene was built from: scenes whose pictures may differ have different hashes.
 
-What a picture depends on beside these is the run's settings. No file is read again: what of it counts is what was made of it.
+Besides these hashes a picture depends on the settings only. Files are not read again: their loaded contents are hashed.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from torchpt.scene.scene import Scene
 
 __all__ = ["fingerprint", "fingerprints"]
 
-#: What scenes came to, and its hashes.
+#: By scene, its build and the hashes of it.
 _known: WeakKeyDictionary[Scene, tuple[SceneBuild, dict[str, str]]] = WeakKeyDictionary()
 
 
 def fingerprints(scene: Scene, params: Mapping[str, Tensor] | None = None) -> dict[str, str]:
-    """Return a hash of each part of a scene: its camera, its tensors by their blocks, and each field of what it came to.
+    """Return hashes of a scene by part: its camera, its parameters by block, and each field of :class:`SceneBuild`.
 
-    They are the same in every process and on every device, wherever the scene's files lie.
+    They depend neither on the process and the device nor on the paths of the scene's files.
 
     Args:
-        scene: whose tensors are hashed as they are now.
-        params: tensors in place of its own, by name.
+        scene: the scene, with the present values of its parameters.
+        params: tensors in place of the scene's, by name.
 
     Raises:
-        SceneError: a model of the caller's own that holds what has no contents to compare.
+        SceneError: a BSDF of the caller with an attribute that cannot be hashed.
     """
     tensors = {**scene.params, **(params or {})}
     parts: dict[str, Any] = {"camera": [scene.description.camera]}
@@ -46,12 +46,12 @@ def fingerprints(scene: Scene, params: Mapping[str, Tensor] | None = None) -> di
 
 
 def _build_hashes(scene: Scene) -> dict[str, str]:
-    """Return the hashes of what a scene came to; once, unless models of the caller's own may have changed since."""
+    """Return the hashes of a scene's build, cached unless it has BSDFs of the caller, which may change."""
     built, known = scene.built, _known.get(scene)
     if known is not None and known[0] is built:
         return known[1]
     parts = {field.name: getattr(built, field.name) for field in fields(built)}
-    del parts["parameters"]  # as it was loaded: its tensors count as they are now
+    del parts["parameters"]  # the values as loaded; the present ones are hashed with `params`
     found = _hashes(parts)
     if not scene.own_models:
         _known[scene] = built, found
@@ -63,5 +63,5 @@ def _hashes(parts: Mapping[str, Any]) -> dict[str, str]:
 
 
 def fingerprint(scene: Scene) -> str:
-    """Return one hash of a whole scene, see :func:`fingerprints`."""
+    """Return one hash of a whole scene; see :func:`fingerprints`."""
     return tree.fingerprint(fingerprints(scene)).hex()

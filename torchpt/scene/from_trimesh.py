@@ -1,4 +1,4 @@
-"""A ``trimesh.Scene`` as a scene: its meshes, materials, instances, lights and camera."""
+"""Convert ``trimesh.Scene`` objects: meshes, materials, instances, lights and camera."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from torchpt.scene.sources import unique_labels
 __all__ = ["description_of", "from_trimesh"]
 
 _LABEL = "trimesh"
-#: From trimesh's camera, which looks along -z with +x to the right, to ours, which looks along +z with +x to the left.
+#: From trimesh's camera space (looks along -z, +x right) to that of scenes (looks along +z, +x left).
 _CAMERA_AXES = np.diag([-1.0, 1.0, -1.0, 1.0])
-#: Degrees of view of a scene without a camera, along the film's shorter side.
+#: Field of view in degrees along the film's shorter side, for a source without a camera.
 _FOV = 45.0
 
 
@@ -40,22 +40,22 @@ def from_trimesh(
     render: Mapping[str, Any] | None = None,
     device: str | torch.device | None = None,
 ) -> Scene:
-    """A scene of a ``trimesh.Trimesh`` or ``trimesh.Scene`` (docs/reference/assets.md says what becomes of it).
+    """Load a scene from a ``trimesh.Trimesh`` or ``trimesh.Scene`` (docs/reference/assets.md has the rules).
 
     Args:
-        source: the object, which stays as it is.
-        camera: block of a scene file in place of the object's own camera. Where there is neither, one looks at all of it
-            along -z.
-        lights: block in place of the object's own lights. Where nothing shines, a sky of radiance 1 does.
-        film: block beside the size that the object's camera says.
-        integrator: block.
-        sampler: block.
-        render: block.
+        source: the object; it is not changed.
+        camera: camera block of a scene file, in place of the object's camera. Without either, a camera looks at the whole
+            object along -z.
+        lights: lights block, in place of the object's lights. Where nothing emits, a sky of radiance 1 is added.
+        film: film block; its keys override the size of the object's camera.
+        integrator: integrator block.
+        sampler: sampler block.
+        render: render block.
         device: as for :func:`torchpt.load`.
 
     Raises:
-        AssetError: nothing with a face, numbers that are not finite, a picture that cannot be used.
-        SceneError: a block that is wrong, a node's transform that has no inverse.
+        AssetError: no face, numbers that are not finite, an unsupported image.
+        SceneError: a wrong block, or a node's transform without an inverse.
     """
     blocks = {"film": film, "integrator": integrator, "sampler": sampler, "render": render}
     description = description_of(source)
@@ -72,7 +72,7 @@ def from_trimesh(
 
 
 def description_of(source: Any) -> dict[str, Any]:
-    """The mapping that :func:`torchpt.load` takes: shapes, camera, film and lights of a trimesh object."""
+    """Return the scene dict of a trimesh object for :func:`torchpt.load`: shapes, camera, film and lights."""
     import trimesh
 
     if isinstance(source, trimesh.Trimesh):
@@ -93,7 +93,7 @@ def description_of(source: Any) -> dict[str, Any]:
 
 
 def _shapes(source: Any) -> tuple[dict[str, Any], bool]:
-    """A ``mesh`` where a geometry comes first and ``instance``s of it after; whether any of them emits."""
+    """Return the shapes block, a ``mesh`` for a geometry's first node and ``instance`` for others; True if any emits."""
     converter, shapes, glows = MaterialConverter(_LABEL), {}, False
     nodes = list(placed_in(source))
     first: dict[str, str] = {}
@@ -113,14 +113,14 @@ def _shapes(source: Any) -> tuple[dict[str, Any], bool]:
 
 
 def _view(source: Any) -> dict[str, Any]:
-    """The camera, and the film that it has."""
+    """Return the camera block and its film block."""
     from trimesh.scene.cameras import look_at
 
     if source.has_camera:
         camera = source.camera
         width, height = (int(size) for size in camera.resolution)
         matrix = np.array(source.camera_transform, np.float64)
-        # A graph may scale its camera, which means nothing.
+        # A scale in the graph has no effect on a camera.
         matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-300)
         across, down = (float(length) for length in camera.focal)
         pose: dict[str, Any] = {"type": "perspective", "fov": float(camera.fov[0]), "fov_axis": "x"}
@@ -139,7 +139,7 @@ def _view(source: Any) -> dict[str, Any]:
 
 
 def _light(light: FileLight) -> dict[str, Any]:
-    """A light as a scene file has it."""
+    """Return a light as a block of a scene file."""
     if light.kind == "directional":
         place = {"direction": light.direction.tolist()}
     else:

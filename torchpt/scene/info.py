@@ -1,4 +1,4 @@
-"""What ``torchpt info`` tells: what the scene holds, what was built for it, what was left out."""
+"""Describe a scene for ``torchpt info``: contents, data structures, and features that it does not use."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ __all__ = ["describe"]
 def describe(
     description: Description, built: SceneBuild, world: World, accel: Accel, settings: Settings
 ) -> dict[str, Any]:
-    """A nested dict of plain values: ``scene``, ``shapes``, ``built``, ``left_out``, ``notes``, ``settings``."""
+    """Return a nested dict of plain values: ``scene``, ``shapes``, ``built``, ``left_out``, ``settings``."""
     lights = world.lights
     shapes: dict[str, Any] = {}
-    brought: dict[str, dict[str, str]] = {}  # lights that came with a mesh file
+    brought: dict[str, dict[str, str]] = {}  # lights of mesh files, by shape
     for source in built.sources:
         owner, _, label = source.name.rpartition(".lights.")
         if owner:
@@ -103,7 +103,7 @@ def _lights(lights: Lights) -> dict[str, Any]:
 
 
 def _left_out(description: Description, world: World, settings: Settings) -> list[str]:
-    """Features this scene does not need, for which there is no object, no tensor and no instruction."""
+    """Return the features that this scene does not use, for which nothing is built, stored or executed."""
     lights = world.lights
     absent = [f"{kind} primitives" for kind, n in zip(KINDS, world.geometry.counts, strict=True) if not n]
     present = {model.name for model in world.materials.models}
@@ -160,7 +160,7 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
 
 
 def _groups(world: World) -> dict[str, int]:
-    """Models by name, with what textures give them, and how many materials share each."""
+    """Return the number of materials by BSDF name, with the names of textured parameters."""
     found: dict[str, int] = {}
     for model, table, textures in zip(
         world.materials.models, world.materials.parameters, world.materials.textures, strict=True
@@ -185,6 +185,6 @@ def _keys(readings: dict[str, Any]) -> list[str]:
 
 
 def _rows(table: bsdfs.Parameters) -> int:
-    """How many materials share a model's stacked parameters."""
+    """Return the number of materials in a model's stacked parameters."""
     found = leaves(table)
     return max((value.shape[-1] if value.dim() < 2 or len(value) == 3 else len(value) for value in found), default=1)

@@ -1,4 +1,4 @@
-"""From what a user has to a :class:`Scene`."""
+"""Load a :class:`Scene` from a file, a name, text or a dict."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torchpt.core.memory import explain_out_of_memory
 from torchpt.core.threads import outside_inference_mode
 from torchpt.physics.bsdfs import Bsdf
 from torchpt.scene.devices import device_of
+from torchpt.scene.dict_tensors import params_from_tensors, vertex_attributes_in, with_all_intrinsics
 from torchpt.scene.formats.description import Source, read_description, settings
 from torchpt.scene.formats.tensors import DictTensors
-from torchpt.scene.params_from_tensors import params_from_tensors, vertex_attributes_in, with_all_intrinsics
 from torchpt.scene.scene import Scene
 
 __all__ = ["load"]
@@ -41,9 +41,9 @@ def load(
             be tensors as in a dict.
 
     Raises:
-        SceneError: the description is wrong; says where and what is accepted.
-        AssetError: a file that it names is missing or malformed.
-        RenderError: the device is not there.
+        SceneError: a wrong key or value; the message says where and what is accepted.
+        AssetError: a missing or malformed file.
+        RenderError: the device is not available.
     """
     if torch.compiler.is_compiling():  # not before: this imports the compiler
         outside: Any = torch.compiler.disable(_load)

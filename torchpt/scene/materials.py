@@ -1,4 +1,4 @@
-"""Materials resolved: textures opened, blends of models, and their numbers among the scene's parameters."""
+"""Resolve materials: open textures, build BSDFs and blends of them, and declare their parameters."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from torchpt.spec.schema import ParsedParams
 
 __all__ = ["declare", "resolved"]
 
-#: What makes the texture of a slot, by its dotted key, one that can be read.
+#: Opens the texture of a slot, by the slot's dotted key.
 Resolve = Callable[[TextureInput, str], Node]
 
 
 def resolved(
     material: ParsedParams, name: str, materials: Mapping[str, ParsedParams], resolve: Resolve | None = None
 ) -> ResolvedMaterial:
-    """What a material comes to: a model and what it is given.
+    """Build a material: its BSDF, its values and its opened textures.
 
     Args:
         material: the material.
         name: its dotted name, e.g. ``materials.red``.
         materials: all materials by name, for blends.
-        resolve: opens textures; without it only the model and the numbers can be asked for.
+        resolve: opens textures; None: they stay unopened, so only the model and its numbers can be used.
     """
     inner = {
         side: resolved(materials[item], f"materials.{item}", materials, resolve)
@@ -65,7 +65,7 @@ def resolved(
 
 
 def declare(material: ResolvedMaterial, parameters: Parameters) -> None:
-    """Add a material's numbers to the parameters; those of its textures are added as they are opened."""
+    """Add a material's numbers to the parameters; opening a texture adds the texture's."""
     specs = parameters_of(material.model)
     for key, value in material.own().items():
         if isinstance(value, float | tuple):

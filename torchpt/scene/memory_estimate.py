@@ -1,6 +1,6 @@
-"""What a render is foreseen to take beside its scene, by how it runs; in bytes.
+"""Estimate the memory of a render beside its scene, in bytes.
 
-The numbers are measured (docs/guides/stability.md). What is done where there is less, :mod:`torchpt.core.memory` says.
+The constants are measured (docs/guides/stability.md). :mod:`torchpt.core.memory` handles shortage.
 """
 
 from __future__ import annotations
@@ -27,43 +27,43 @@ __all__ = [
     "memory_estimate",
 ]
 
-#: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
+#: Lanes of a wave without a memory limit: enough to hide the cost of dispatch, few enough for the caches.
 LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
-#: Peak bytes a lane takes in a wave, measured on the Cornell box; under a tape each vertex keeps about this much.
+#: Peak bytes of a lane in a wave, measured on the Cornell box; under a tape each vertex keeps about as much.
 BYTES_PER_LANE = 640
-#: Lanes that repay a thread of the compiled loop.
+#: Fewest lanes for which another thread of kernels pays.
 FEWEST_OF_KERNELS = 1024
-#: Of machine code and tables of libraries, which are read from disk when they are first called, once a process.
+#: Bytes of machine code and tables of libraries, loaded on the first call of a process, by mode.
 CODE = {"eager": 75_000_000, "compiled": 54_000_000, "tape": 100_000_000}
-#: Of numba, which not all renders import.
+#: Bytes of numba, which only some renders import.
 NUMBA = 60_000_000
-#: Of the machine code of a material model, beside that.
+#: Bytes of the machine code of a BSDF model, in addition.
 CODE_OF_MODEL = 3_000_000
-#: Of a pixel while the picture is made of the films: alone, with pilots, with adaptive sampling, with layers of variance.
+#: Bytes of a pixel while the picture is computed from the films: plain, with error probes, adaptive, with variance layers.
 PICTURE, PILOTS, ADAPTIVE, VARIANCE = 64, 225, 160, 160
-#: Bytes a pixel of what is made of films in the end, and bytes of films that are taken without asking how many there are.
+#: Bytes of a pixel of the finished pictures; and size of films that is allocated without looking at free memory.
 PICTURES, SMALL = 80, 2**28
-#: What the least is above what was foreseen.
+#: Factor and bytes that are added to the estimate.
 SLACK, SPARE = 1.04, 3_000_000
 
-#: What has run in this process: its code is there.
+#: Modes that have run in this process, whose code is loaded.
 _ran: set[str] = set()
 
 
 def mark_loaded(how: str) -> None:
-    """Say that code of a kind is there."""
+    """Record that the code of a mode is loaded."""
     _ran.add(how)
 
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """Bytes that a render is to take beside what is held when it begins.
+    """Bytes that a render needs beyond those that are held when it begins.
 
     Attributes:
-        films: sums of samples, as long as it runs.
-        code: loaded while it runs.
-        waves: of the fewest lanes that it works with.
-        picture: made of the films at the end.
+        films: sums of samples, during the whole render.
+        code: code that the render loads.
+        waves: a wave of the fewest lanes.
+        picture: the pictures, at the end.
     """
 
     films: int
@@ -72,27 +72,27 @@ class MemoryEstimate:
     picture: int
 
     def least(self, held: int) -> int:
-        """The most that is held at once, beside ``held``; with some to spare."""
+        """Return the smallest memory limit with which the render can run, ``held`` bytes included, with a margin."""
         return int(SLACK * (held + self.films + self.code + max(self.waves, self.picture))) + SPARE
 
     def backward_bytes(self, held: int) -> int:
-        """The same of a backward pass, which has neither films nor a picture."""
+        """Return the smallest limit of a backward pass, which has neither films nor a picture."""
         return int(SLACK * (held + self.code + self.waves)) + SPARE
 
     def left(self, limit: int, held: int) -> int:
-        """What waves may have of a limit."""
+        """Return the bytes of a limit that are left for waves."""
         return limit - held - self.films - self.code - self.picture
 
 
 def memory_estimate(settings: Settings, device: torch.device, how: str, models: int, rows: int = 0) -> MemoryEstimate:
-    """What a render takes.
+    """Estimate the memory of a render.
 
     Args:
         settings: complete.
-        device: of the lanes; where it is not the CPU, code takes none of its memory.
-        how: ``eager``, ``compiled`` or ``tape``.
-        models: of materials.
-        rows: of 32-bit numbers that a thread of the compiled loop has for its lanes.
+        device: device of the lanes; other devices than the CPU hold no code.
+        how: the mode: ``eager``, ``compiled`` or ``tape``.
+        models: number of BSDF models.
+        rows: 32-bit numbers per lane in the workspace of a thread of kernels.
     """
     _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
     pixels = width * height
@@ -116,18 +116,18 @@ def memory_estimate(settings: Settings, device: torch.device, how: str, models: 
 def check_film(
     width: int, height: int, streams: int, layers: Sequence[int], device: torch.device, splats: bool = False
 ) -> None:
-    """Refuse a film that would end the process, with no word of the system's, before a byte of it is touched.
+    """Raise for a film that does not fit into memory, before it is allocated (the system would kill the process).
 
     Args:
-        width: of the picture (after a crop) in pixels.
-        height: of the picture in pixels.
-        streams: randomizations of the picture's samples.
-        layers: how many channels each layer has.
-        device: where the films lie.
-        splats: whether samples light other pixels than their own.
+        width: width of the picture (after a crop) in pixels.
+        height: height of the picture in pixels.
+        streams: number of randomizations.
+        layers: number of channels of each layer.
+        device: device of the films.
+        splats: True where samples add to other pixels than their own.
 
     Raises:
-        SceneError: it takes more memory than there is.
+        SceneError: the film needs more memory than is free.
     """
     pixels = width * height
     needed = Film.bytes_of(pixels, streams, splats=splats) + sum(

@@ -1,4 +1,4 @@
-"""Mesh shapes of a description as parts; parts that touch each other."""
+"""Load the triangles of mesh shapes, and warn of refracting shapes that touch."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from torchpt.spec.schema import ParsedParams
 __all__ = ["MOST_FACES", "Mesh", "ignored", "mesh_of", "solid", "warn_of_coplanar_refraction"]
 
 
-# ---- Meshes of a description: read, displaced, and without what has no area
+# ---- Triangles of a shape: reading, displacement, removal of faces without area
 
 
-#: Faces that a displaced mesh may come to.
+#: Most faces of a displaced mesh.
 MOST_FACES = 20_000_000
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles that have been read.
+    """Triangles of a shape.
 
     Attributes:
-        pieces: one for each material.
-        source: the file, or "".
-        flat: whether they are shaded flat, whatever normals there are.
+        pieces: the parts, one for each material.
+        source: path of the file; "trimesh" for an object, "" for arrays.
+        flat: True to shade with face normals.
     """
 
     pieces: list[MeshPart]
@@ -47,18 +47,18 @@ class Mesh:
 def mesh_of(
     triangles: Triangles, key: str, description: Description, texture_loader: TextureLoader, *, materials: bool
 ) -> Mesh:
-    """The triangles of a shape.
+    """Load the triangles of a shape.
 
     Args:
-        triangles: what the shape comes to.
+        triangles: the shape's file, object or arrays.
         key: its dotted key.
-        description: of the scene.
-        texture_loader: of textures.
-        materials: whether to read the file's own materials.
+        description: the scene's.
+        texture_loader: opens textures.
+        materials: True to read the file's own materials.
 
     Raises:
-        SceneError: a displacement that cannot be.
-        AssetError: a file that is missing or malformed.
+        SceneError: a displacement of a mesh without texture coordinates, or of too many faces.
+        AssetError: a missing or malformed file.
     """
     if triangles.path is not None:
         path = description.resolve(triangles.path, f"{key}.path")
@@ -79,9 +79,9 @@ def mesh_of(
 
 
 def _displaced(
-    piece: MeshPart, wish: ParsedParams, prefix: str, texture_loader: TextureLoader, source: str
+    piece: MeshPart, displacement: ParsedParams, prefix: str, texture_loader: TextureLoader, source: str
 ) -> MeshPart:
-    """A piece of a mesh under its displacement map."""
+    """Apply a displacement map to a part of a mesh."""
     key = f"{prefix}.displacement"
     if piece.uvs is None:
         problem = f"has no texture coordinates, which {key} needs"
@@ -90,23 +90,23 @@ def _displaced(
             if source
             else SceneError(key, "a mesh without uvs", "uvs beside it", texture_loader.file)
         )
-    faces = len(piece.faces) * 4 ** wish["subdivisions"]
+    faces = len(piece.faces) * 4 ** displacement["subdivisions"]
     if faces > MOST_FACES:
         expected = f"at most {MOST_FACES:,} faces ({faces:,} are asked for)"
-        raise SceneError(f"{key}.subdivisions", wish["subdivisions"], expected, texture_loader.file)
-    heights = texture_loader.values(wish["texture"], f"{key}.texture")
-    return displaced(piece, lambda uvs: wish["scale"] * heights(uvs), wish["subdivisions"])
+        raise SceneError(f"{key}.subdivisions", displacement["subdivisions"], expected, texture_loader.file)
+    heights = texture_loader.values(displacement["texture"], f"{key}.texture")
+    return displaced(piece, lambda uvs: displacement["scale"] * heights(uvs), displacement["subdivisions"])
 
 
 def ignored(piece: MeshPart, pose: np.ndarray) -> tuple[str, ...]:
-    """What of a mesh file is not used; cameras as a scene file would have them."""
+    """Return the unsupported features of a part by name, and its file's cameras as blocks of a scene file."""
     own = piece.material
-    cameras = [_as_written(camera, pose) for camera in piece.cameras]
+    cameras = [_camera_text(camera, pose) for camera in piece.cameras]
     return (*piece.ignored, *cameras, *(() if own is None else own.ignored))
 
 
-def _as_written(camera: FileCamera, pose: np.ndarray) -> str:
-    """A mesh file's camera as the block of a scene file, mesh under ``pose``."""
+def _camera_text(camera: FileCamera, pose: np.ndarray) -> str:
+    """Return a mesh file's camera as text of a camera block, transformed by ``pose``."""
     with np.errstate(over="ignore", invalid="ignore"):
         matrix = pose @ camera.matrix
         origin, ahead, up = matrix[:3, 3], -matrix[:3, 2], matrix[:3, 1]
@@ -117,11 +117,11 @@ def _as_written(camera: FileCamera, pose: np.ndarray) -> str:
 
 
 def solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
-    """Faces that have an area, and how many do not."""
+    """Return the faces that have an area, and the number of the others."""
     columns = pose[:3, :3] @ piece.vertices.T
     p0, p1, p2 = (columns[:, piece.faces[:, k]] for k in range(3))
     first, second = p1 - p0, p2 - p0
-    # Relative to the longest edge, so that neither tiny nor huge meshes are mistaken for degenerate ones.
+    # Relative to the longest edge, so that the test does not depend on a mesh's size.
     longest = np.maximum(np.abs(first), np.abs(second)).max(0)
     safe = np.where(longest > 0, longest, 1.0)
     (ax, ay, az), (bx, by, bz) = first / safe, second / safe
@@ -130,37 +130,36 @@ def solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
     return np.ascontiguousarray(piece.faces[kept]), int((~kept).sum())
 
 
-# ---- Refracting surfaces of two shapes that lie on each other: a ray meets one of them only, so it is in two media or in none
+# ---- Coplanar refracting faces of two shapes: a ray hits only one of them and so tracks the wrong medium
 
 
 Array = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
-#: How far two planes may lie apart and count as one, as a share of the scene's extent; and how far their normals may differ.
+#: Largest distance of two planes that count as one, relative to the scene's extent; largest difference of their normals.
 NEAR, ALIKE = 1e-6, 1e-5
-#: Pairs of faces that are looked at, at most: this is no search for meshes that go through each other.
+#: Most pairs of faces that are tested.
 PAIRS = 2_000_000
-#: Pairs that looking at one face costs as much as.
+#: Cost of a face in pairs.
 FACE = 100
-#: The corners of a rectangle in its own space.
+#: Corners of a rectangle in its own space.
 _SQUARE = np.array([[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]])
-#: Corners on the rim of a disk in its own space: between two of them the rim is .0012 radii away.
+#: Polygon for a disk in its own space; it deviates from the circle by at most 0.0012 radii.
 _RIM = np.array([[[math.cos(angle), math.sin(angle), 0.0] for angle in np.arange(64) * math.tau / 64]])
 
 
 @dataclass(frozen=True)
 class _Faces:
-    """Faces in the scene's space: polygons of as many corners as the part's have, ``(F, K, 3)``, and their shape."""
+    """Polygons ``(F, K, 3)`` of a part in the scene's space, and the name of its shape."""
 
     shape: str
     corners: Array
 
 
 def warn_of_coplanar_refraction(parts: Sequence[Part], copies: Sequence[Copy], file: str | None) -> None:
-    """Look for flat faces of two refracting shapes that share a plane and overlap in it.
+    """Warn of refracting shapes with flat faces that are coplanar and overlap.
 
     Warns:
-        EnergyWarning: two such shapes, once for each pair.
+        EnergyWarning: once for each pair of such shapes.
     """
     faces = list(_refracting(parts, copies))
     if len({one.shape for one in faces}) < 2:
@@ -199,10 +198,10 @@ def _refracting(parts: Sequence[Part], copies: Sequence[Copy]) -> Iterator[_Face
 
 
 def _faces(name: str, part: Part, pose: Array) -> Iterator[_Faces]:
-    """Those of a part under a pose, where it has flat ones."""
+    """Yield the flat faces of a part under a pose."""
     if part.kind == "rectangle":
         yield _Faces(name, _moved(_SQUARE, pose))
-    elif part.kind == "disk":  # caps of cylinders and cones too
+    elif part.kind == "disk":  # also the caps of cylinders and cones
         yield _Faces(name, _moved(_RIM, pose))
     elif part.vertices is not None and part.faces is not None:
         yield _Faces(name, _moved(part.vertices[part.faces], pose))
@@ -213,8 +212,8 @@ def _moved(corners: Array, pose: Array) -> Array:
 
 
 def _planes(corners: Array) -> Array:
-    """Unit normals and distances ``(F, 4)``; both sides of a plane are the same."""
-    a, b, c = (corners[:, k * corners.shape[1] // 3] for k in range(3))  # of many corners, those that lie well apart
+    """Return unit normals and distances of planes ``(F, 4)``, with the sign of normals made unique."""
+    a, b, c = (corners[:, k * corners.shape[1] // 3] for k in range(3))  # corners far apart from each other
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
     normals = normals / np.where(lengths > 0.0, lengths, 1.0)[:, None]
@@ -224,9 +223,9 @@ def _planes(corners: Array) -> Array:
 
 
 def _overlap(a: Array, b: Array) -> bool:
-    """Whether any face of ``a`` and any of ``b`` lie in one plane and share some of its area."""
+    """Return True where a face of ``a`` and one of ``b`` are coplanar and overlap."""
     low, high = np.maximum(a.min((0, 1)), b.min((0, 1))) - NEAR, np.minimum(a.max((0, 1)), b.max((0, 1))) + NEAR
-    a, b = (x[((x.max(1) >= low) & (x.min(1) <= high)).all(1)] for x in (a, b))  # those within both boxes
+    a, b = (x[((x.max(1) >= low) & (x.min(1) <= high)).all(1)] for x in (a, b))  # faces within both boxes
     budget = PAIRS
     first, second = _planes(a), _planes(b)
     order = np.argsort(second[:, 3])
@@ -237,15 +236,15 @@ def _overlap(a: Array, b: Array) -> bool:
         near = slice(int(starts[k]), int(ends[k]))
         budget -= near.stop - near.start + FACE
         alike = np.abs(second[near, :3] - first[k, :3]).max(1) <= ALIKE
-        if alike.any() and _share_area(a[k], b[near][alike], first[k, :3]):
+        if alike.any() and _overlaps_any(a[k], b[near][alike], first[k, :3]):
             return True
         if budget < 0:
             break
     return False
 
 
-def _share_area(face: Array, others: Array, normal: Array) -> bool:
-    """Whether a convex face ``(K, 3)`` and any of ``(M, L, 3)`` in its plane overlap: no side of either parts them."""
+def _overlaps_any(face: Array, others: Array, normal: Array) -> bool:
+    """Return True where a convex face ``(K, 3)`` overlaps any of ``(M, L, 3)`` in its plane (separating axis test)."""
     axis = int(np.abs(normal).argmax())
     keep = [k for k in range(3) if k != axis]
     p, q = face[:, keep], others[:, :, keep]

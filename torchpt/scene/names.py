@@ -1,4 +1,4 @@
-"""What lanes know by number as the scene file calls it: shapes, primitives, materials, lights."""
+"""Look up the scene file's names of shapes, materials and lights by their indices on lanes."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["Names", "SurfaceNames"]
 
 @dataclass(frozen=True)
 class SurfaceNames:
-    """A primitive.
+    """Names of a surface that was hit.
 
     Attributes:
-        shape: its shape's name in the scene.
-        kind: of the primitive, from ``records.KINDS``.
-        primitive: its number within its part of the shape, from 0.
-        material: its material's name.
-        model: the material's ``type``.
+        shape: name of the shape.
+        kind: kind of the primitive, from ``records.KINDS``.
+        primitive: index of the primitive in its part of the shape.
+        material: name of the material.
+        model: ``type`` of the material.
     """
 
     shape: str
@@ -36,21 +36,21 @@ class Names:
     """The names of one scene.
 
     Args:
-        built: what the scene came to.
-        world: its tensors.
+        built: the scene's parts, instances and lights.
+        world: the scene's tensors.
     """
 
     def __init__(self, built: SceneBuild, world: World) -> None:
         self._parts, self._copies, self._sources = built.parts, built.copies, built.sources
         self._ends = [0, *accumulate(1 if part.faces is None else len(part.faces) for part in built.parts)]
         rows = None if world.lights is None else world.lights.row_of_prim
-        self._shining: list[int] = []  # slots of the rows of lights that are surfaces
+        self._shining: list[int] = []  # slot of each row of an emissive surface
         if rows is not None:
             slots = (rows >= 0).nonzero().squeeze(1)
             self._shining = slots[rows[slots].argsort()].tolist()
 
     def surface(self, slot: int, prim: int) -> SurfaceNames:
-        """A surface by its :class:`~torchpt.physics.shapes.geometry.Interaction`'s slot and primitive."""
+        """Return the names of a surface by the slot and primitive of an Interaction."""
         number = bisect_right(self._ends, prim) - 1
         part, first = self._parts[number], self._ends[number]
         copied = slot >= self._ends[-1]
@@ -59,12 +59,12 @@ class Names:
         return SurfaceNames(owner.shape, part.kind, prim - first, name, owner.material.model.name)
 
     def owner(self, slot: int) -> str:
-        """The shape and material of a surface by its slot alone."""
+        """Return a text with the shape and material of a surface, by its slot."""
         owner = self._owner(slot)
         return f"shape {owner.shape}, material {owner.material.name.removeprefix('materials.')}"
 
     def shape(self, slot: int) -> tuple[str, str]:
-        """Return the names of the shape and of the material's ``type`` of a surface, by its slot alone."""
+        """Return the shape's name and the material's ``type`` of a surface, by its slot."""
         owner = self._owner(slot)
         return owner.shape, owner.material.model.name
 
@@ -73,7 +73,7 @@ class Names:
         return self._copies[slot - self._ends[-1]] if copied else self._parts[bisect_right(self._ends, slot) - 1]
 
     def light(self, row: int) -> str:
-        """A row of the table of lights: the name of its shape, or of the light."""
+        """Return the name of a row of the light table: that of its shape, or of its light."""
         if row < len(self._shining):
             return self.surface(self._shining[row], self._shining[row]).shape
         return self._sources[row - len(self._shining)].name.removeprefix("lights.")

@@ -1,4 +1,4 @@
-"""From a scene to what an engine runs: what all waves of a render share, and what a scene keeps for the next one."""
+"""Build the wave and the kernels of a render, and cache what later renders of the scene can use again."""
 
 from __future__ import annotations
 
@@ -46,19 +46,19 @@ __all__ = [
 ]
 
 
-# ---- What renders of a scene leave for the next one
+# ---- Cache of a scene, shared by its renders
 
 
 @dataclass
 class SceneCache:
-    """Of one scene.
+    """Objects of one scene that later renders use again.
 
     Attributes:
-        kernels: of its latest render by the compiled loop.
-        first: the integrator and the world that this was made of, and what happens at first surfaces.
-        without_lights: a world, and the same without lights.
-        camera: the latest one on a film, with what it was made of.
-        outlines: the edges of its meshes, as :mod:`torchpt.gradients.edges.curves` finds them.
+        kernels: kernels of the latest render.
+        first: integrator, world, and the ``FirstSurface`` made from them.
+        without_lights: a world, and a copy of it without lights.
+        camera: key of the latest camera on a film, and that camera.
+        outlines: edges of the meshes, found by :mod:`torchpt.gradients.edges.curves`.
     """
 
     kernels: Kernels | None = None
@@ -72,11 +72,11 @@ _scenes: WeakKeyDictionary[Scene, SceneCache] = WeakKeyDictionary()
 
 
 def scene_cache(scene: Scene) -> SceneCache:
-    """Return what is kept for a scene, as long as the scene is; views of it share it."""
+    """Return the cache of a scene, which lives as long as the scene; its views share it."""
     return _scenes.setdefault(scene.origin, SceneCache())
 
 
-# ---- What all waves of a render share, and how they run: as tensor operations, or as the compiled loop
+# ---- The wave of a render, and its engine: tensor operations or kernels
 
 
 def make_wave(
@@ -90,11 +90,18 @@ def make_wave(
     rays: tuple[Tensor, Tensor] | None = None,
     packets: bool = True,
 ) -> Wave:
-    """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``.
+    """Build the wave of a render.
 
-    ``like``: a wave of the same scene, settings and parameters, but for those of the camera: what it reads is read again.
-    ``rays``: origins and directions ``(..., 3)`` in the scene's coordinates, in place of the camera's.
-    ``packets``: False where a tree is to be searched even if packets would be quicker.
+    Args:
+        scene: the scene.
+        settings: complete settings.
+        params: tensors in place of the scene's, by name.
+        dtype: dtype of the lanes.
+        tape: see :class:`Plan`.
+        attached: see :class:`Plan`.
+        like: a wave that differs in the camera's parameters only; its world and search are used again.
+        rays: origins and directions ``(..., 3)`` in the scene's coordinates, in place of the camera's.
+        packets: False to search a tree even where packets would be faster.
 
     Raises:
         SceneError: a direction that is zero, or a ray that is not finite.
@@ -103,7 +110,7 @@ def make_wave(
     integrator = settings.integrator.counted_in(scene.space.unit)
     params = params or {}
     shaping = {name: value for name, value in params.items() if not name.startswith("camera.")}
-    own = not shaping  # the world is the scene's own, and what is made of it may be kept
+    own = not shaping  # the world is the scene's own, so objects made from it may be cached
     if like is None:
         uv = any(layer.uv for layer in surface_layers(settings).values())
         world, geometry = scene.world(dtype, shaping, uv, settings.light_choice)
@@ -136,7 +143,7 @@ def make_wave(
 
 
 def _lane_rays(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
-    """Return rays ``(..., 3)`` of the scene's coordinates as lanes have them, differentiable."""
+    """Convert rays ``(..., 3)`` in the scene's coordinates to lanes, differentiable."""
     o, d = (x.reshape(-1, 3).T.double() for x in (o, d))
     origin = ((o - scene.space.centre[:, None]) / scene.space.unit).to(dtype).contiguous()
     _check_rays(
@@ -144,17 +151,17 @@ def _lane_rays(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
     )
     _check_rays("d", d, torch.isfinite(d).all(0) & (d != 0).any(0), "a direction that is finite and not zero")
     unit = normalize(d)
-    # What is of unit length up to rounding keeps its bits.
+    # Directions of unit length up to rounding keep their bits.
     near = (dot(d, d) - 1.0).abs() < 8.0 * torch.finfo(dtype).eps
     unit = unit + torch.where(near, d - unit, 0.0).detach()
     return Rays(origin, unit.to(dtype).contiguous())
 
 
 def _check_rays(key: str, given: Tensor, good: Tensor, expected: str) -> None:
-    """Refuse the first of some vectors ``(3, N)`` that is not ``good (N,)``.
+    """Raise for the first of the vectors ``(3, N)`` that is not ``good (N,)``.
 
     Raises:
-        SceneError: names it.
+        SceneError: names the ray and its value.
     """
     bad = (~good).nonzero()
     if len(bad):
@@ -162,14 +169,14 @@ def _check_rays(key: str, given: Tensor, good: Tensor, expected: str) -> None:
 
 
 def _camera(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
-    """The camera on the film; the latest one where it was made of the same."""
+    """Return the camera on the film, from the cache where parameters, film and dtype are the same."""
     merged, film = scene.merged(params), settings.film
     if torch.is_grad_enabled():
         return scene.camera(film, merged, dtype)
     given = [value for name, value in merged.items() if name.startswith("camera.")]
     if any(value.is_inference() for value in given):
         return scene.camera(film, merged, dtype)
-    # By identity: what the ids are of is held beside them, so that they stay their own.
+    # Keyed by id; the objects are stored too, since an id is unique only while its object lives.
     held = (scene.description.camera, *given)
     made_of = ([id(value) for value in held], [value._version for value in given], film.width, film.height, dtype)
     keeper = scene_cache(scene)
@@ -180,14 +187,18 @@ def _camera(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtyp
 
 @lru_cache(maxsize=64)
 def _filter(kind: type[Filter], values: tuple[tuple[str, Any], ...], device: torch.device) -> Filter:
-    """A filter; renders of the same read the same tensors."""
+    """Return a filter, cached so that renders with equal filters share their tensors."""
     return kind(dict(values), device)
 
 
 def rebuild_with_tape(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Wave:
-    """An eager wave whose world and camera follow ``params`` under a tape, of one of the same parameters detached.
+    """Return an eager wave with world and camera rebuilt from ``params``, so that autograd records how they depend on them.
 
-    The search structure stays.
+    Args:
+        wave: made from the same values, detached. Its search structure is used again.
+        scene: the scene.
+        settings: complete settings.
+        params: tensors in place of the scene's, by name.
     """
     uv = any(layer.uv for layer in surface_layers(settings).values())
     world, _ = scene.world(wave.context.plan.dtype, params, uv, settings.light_choice)
@@ -199,12 +210,12 @@ def rebuild_with_tape(wave: Wave, scene: Scene, settings: Settings, params: Mapp
 
 
 def points_of(sampler: ParsedParams) -> Points:
-    """Return where the points lie, of the settings of a sampler."""
+    """Return the sampler that the settings describe."""
     return sampler.kind(**{key: value for key, value in sampler.values.items() if key not in ADAPTIVE})
 
 
 def surface_layers(settings: Settings) -> dict[str, type[SurfaceLayer]]:
-    """The layers of first surfaces that are wanted, by name; those for the denoiser alone come last."""
+    """Return the AOVs of first surfaces that a render needs, by name; the denoiser's guides come last."""
     names = (*(settings.film.aovs or settings.integrator.layers), *(GUIDES if settings.film.denoise else ()))
     if not names:
         return {}
@@ -213,7 +224,7 @@ def surface_layers(settings: Settings) -> dict[str, type[SurfaceLayer]]:
 
 
 def _first(scene: Scene, integrator: Integrator, world: World, own: bool) -> FirstSurface | None:
-    """Return what happens at first surfaces; kept with the scene, unless the world is not the scene's ``own``."""
+    """Return the integrator's ``FirstSurface``, cached with the scene where the world is the scene's ``own``."""
     if not own or torch.is_grad_enabled():
         return integrator.first(world)
     keeper = scene_cache(scene)
@@ -226,7 +237,7 @@ def _first(scene: Scene, integrator: Integrator, world: World, own: bool) -> Fir
 
 
 def _without_lights(scene: Scene, world: World, own: bool) -> World:
-    """The world without lights; one of the scene's ``own`` is kept with it."""
+    """Return the world without lights, cached with the scene where the world is the scene's ``own``."""
     if not own:
         return replace(world, lights=None)
     keeper = scene_cache(scene)
@@ -238,13 +249,13 @@ def _without_lights(scene: Scene, world: World, own: bool) -> World:
 def _context(
     plan: Plan, world: World, camera: Camera, crop: tuple[int, int, int, int], integrator: Integrator
 ) -> StageContext:
-    """Return what the stages of a render read beside their lanes."""
+    """Return the stage context of a render."""
     context = StageContext(plan, world, _pixel_of(world, camera))
     return replace(context, camera=camera, crop=crop) if integrator.splats else context
 
 
 def _pixel_of(world: World, camera: Camera) -> Tensor | None:
-    """Return what textures filtered by the pixel's footprint need of the camera; None where there are none."""
+    """Return the camera's footprint for filtered textures; None where no texture is filtered."""
     return camera.pixel() if world.textures.filtered else None
 
 
@@ -267,18 +278,18 @@ def uses_kernels(settings: Settings, device: torch.device, dtype: torch.dtype) -
 
 
 def own_models(scene: Scene, wave: Wave) -> list[int]:
-    """Return the numbers of the models that are the caller's own: no kernel may be made of them."""
+    """Return the indices of models that the caller wrote; they are not compiled."""
     models = wave.context.world.materials.models
     return [k for k, model in enumerate(models) if any(model is mine for mine in scene.own_models)]
 
 
 def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
-    """Return the kernels of a wave of a scene, see :func:`torchpt.engines.engine.kernels_of`."""
+    """Return the kernels of a scene's wave; see :func:`torchpt.engines.engine.kernels_of`."""
     return engine.kernels_of(wave, own_models(scene, wave), before)
 
 
 def describe_engine(scene: Scene, settings: Settings) -> dict[str, Any]:
-    """Tell how a render of the scene would run: as the compiled loop, and how that searches, or as tensor operations."""
+    """Describe how a render of the scene would run: by kernels, with their search, or by tensor operations."""
     with torch.no_grad():
         if not uses_kernels(settings, scene.device, torch.float32):
             return {"stages": "eager, by tensor operations"}
@@ -286,9 +297,9 @@ def describe_engine(scene: Scene, settings: Settings) -> dict[str, Any]:
 
 
 def kernel_engine(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Tasks:
-    """Return the compiled loop of a render on ``threads`` (None: as many as torch's), whose kernels are kept with the scene.
+    """Return the kernel engine of a render on ``threads`` (None: torch's number); its kernels are cached with the scene.
 
-    Materials without kernels join ``eager``.
+    Models that cannot be compiled are appended to ``eager``, with the reason.
     """
     keeper = scene_cache(scene)
     kernels = keeper.kernels = kernels_of(scene, wave, keeper.kernels)

@@ -1,4 +1,4 @@
-"""A loaded scene: its parameters as tensors, and the worlds and search structures made of them on demand."""
+"""A loaded scene: its parameters as tensors, and a cache of the worlds and search structures built from them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
 __all__ = ["Scene", "scene_by_number"]
 
-#: Of a scene, what copies of it have: all else is made of it on demand.
+#: Attributes that copies take over; all others are rebuilt on demand.
 _KEPT = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
 
 _numbers = itertools.count(1)
@@ -50,12 +50,12 @@ _scenes: WeakValueDictionary[int, Scene] = WeakValueDictionary()
 
 
 def scene_by_number(number: int) -> Scene | None:
-    """The scene of a number, where it is still there."""
+    """Return the scene with a number; None once it is gone."""
     return _scenes.get(number)
 
 
 def _leaf(value: Tensor) -> Tensor:
-    """A parameter as a copy apart from its tape has it: one made of others becomes a tensor of its own."""
+    """Return a leaf tensor: a parameter that is a result of autograd is detached, with gradients of its own."""
     return value if value.is_leaf else value.detach().requires_grad_()
 
 
@@ -63,13 +63,13 @@ class Scene:
     """A scene on one device.
 
     Attributes:
-        description: what was read.
-        device: where its tensors live.
-        own_models: BSDFs that the caller wrote.
-        load_seconds: that reading it took, its files included; 0 where nobody took the time.
+        description: the validated scene file.
+        device: device of the parameters.
+        own_models: BSDFs of the caller.
+        load_seconds: seconds of loading, files included; 0 where it was not measured.
         params: every tensor by dotted name (``materials.*``, ``shapes.*``, ``lights.*``, ``camera.*``): colours ``(3,)``,
-            vertices ``(V, 3)`` in the mesh's own space, poses ``(4, 4)``. Changing one in place takes effect at the
-            next render (which refuses places that no scene file could hold); to differentiate, hand replacements to
+            vertices ``(V, 3)`` in the mesh's own space, poses ``(4, 4)``. Changes in place take effect at the next
+            render, which checks them like a scene file; to differentiate, pass replacements to
             ``torchpt.render(scene, params=...)``.
     """
 
@@ -82,14 +82,14 @@ class Scene:
     ) -> None:
         warm_up()
         meter = MemoryMeter(device)
-        meter.base()  # only now all modules are there
+        meter.base()  # now that all modules are imported
         before = meter.peak()
         self.load_seconds = 0.0
         self.description, self.device, self.own_models = description, device, own_models
         self._built: SceneBuild = retry_out_of_memory(
             "the files and shapes of the scene", lambda: build_parts(description, vertex_params)
         )
-        # Geometry far from the origin would lose its detail in float32 before it can be moved there.
+        # Far from the origin, positions in float32 would lose detail before they are moved to it.
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {
             name: torch.from_numpy(value.copy()).to(
@@ -98,48 +98,46 @@ class Scene:
             for name, value in self._built.parameters.items()
         }
         after = meter.peak()
-        #: The most that was held above import while the scene was read; 0 where it is not known.
+        #: Peak bytes above those after import while the scene was read; 0 where unknown.
         self.peak = after - meter.base() if after > before else 0
         self._reset_caches()
-        self._checked_versions = self.versions()  # numbers of a file were checked as they were read
+        self._checked_versions = self.versions()  # the reader has checked these values
 
     def _reset_caches(self) -> None:
-        """Nothing is made of the parameters yet."""
+        """Reset all caches."""
         self._space = Space(torch.from_numpy(self._built.centre).to(self.device), self._built.unit)
         self._lock = threading.RLock()
         self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
         self._accels: dict[tuple[str, int | None], Accel] = {}
-        self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
-        # What these were made of; views of the scene have the same.
+        self._latest: dict[tuple[str, int | None], Accel] = {}  # to refit, or to reuse its topology
+        # Versions of the parameters that the caches were built from; views of the scene share them.
         self._sources, self._made_of = VersionCounter(), dict[str, int]()
         self._origin: Scene | None = None
         self._assign_number()
 
     def _assign_number(self) -> None:
-        """Become another scene than any before."""
-        self.textured: dict[Any, Scene] = {}  # of :mod:`torchpt.scene.texel_params`
-        self._version_counter, self._checked_versions = (
-            VersionCounter(),
-            dict[str, int](),
-        )  # and by name the edition that was checked
-        #: Of all scenes of this process, by which compiled graphs name it.
+        """Take a new number and forget which versions were checked."""
+        self.textured: dict[Any, Scene] = {}  # by :mod:`torchpt.scene.texel_params`
+        self._version_counter = VersionCounter()
+        self._checked_versions: dict[str, int] = {}
+        #: Unique in this process; compiled graphs refer to the scene by it.
         self.number = next(_numbers)
         _scenes[self.number] = self
 
     @property
     def origin(self) -> Scene:
-        """The scene that this is a view of (:meth:`seen_by`), else itself: what is made of either is made of that."""
+        """Return the scene that this is a view of (:meth:`seen_by`), else itself; caches belong to it."""
         return self if self._origin is None else self._origin
 
     def seen_by(self, camera: Mapping[str, Any], film: Mapping[str, Any] | None = None) -> Scene:
-        """This scene through another camera. Tensors are shared, and so is all that is made of them: nothing is built again.
+        """Return a view of this scene through another camera. It shares all other parameters, worlds and search structures.
 
         Args:
-            camera: its block, as in a scene file.
-            film: film settings in place of the scene's own, by whose size a ``K`` in pixels is read that does not say its own.
+            camera: camera block, as in a scene file.
+            film: film settings that override the scene's. A ``K`` without ``size`` is in pixels of the film.
 
         Raises:
-            SceneError: what is wrong with the camera.
+            SceneError: a wrong camera block or film.
         """
         view = object.__new__(type(self))
         with outside_inference_mode():
@@ -151,12 +149,12 @@ class Scene:
         return view
 
     def to(self, device: str | torch.device) -> Scene:
-        """The scene on a device, which may be ``auto``: itself where it is there already, else a copy.
+        """Return the scene on a device, or ``auto``: itself where it is on that device, else a copy.
 
-        Parameters stay on the tape of those that they were copied from, as tensors do; models of the caller's own are copied.
+        As with tensors, gradients flow from the copy's parameters to the originals; BSDFs of the caller are copied.
 
         Raises:
-            RenderError: the device is not there.
+            RenderError: the device is not available.
         """
         chosen = device_of(device)
         if chosen.type == self.device.type and chosen.index in (None, self.device.index or 0):
@@ -164,17 +162,17 @@ class Scene:
         return self._copied(chosen, {name: value.to(chosen) for name, value in self.params.items()}, {})
 
     def __copy__(self) -> Scene:
-        """Another scene of the same tensors."""
+        """Return another scene of the same tensors."""
         return self._copied(self.device, dict(self.params), None)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
-        """Another scene of copied tensors and models; what its description came to never changes, and is shared."""
+        """Return another scene of copied tensors and BSDFs; the immutable build is shared."""
         return self._copied(
             self.device, {name: copy.deepcopy(_leaf(value), memo) for name, value in self.params.items()}, memo
         )
 
     def _copied(self, device: torch.device, params: dict[str, Tensor], memo: dict[int, Any] | None) -> Scene:
-        """Another scene of other parameters; with copies of the caller's models where there is a ``memo``."""
+        """Return another scene with other parameters; with a ``memo``, the caller's BSDFs are copied too."""
         made = object.__new__(type(self))
         state = self.__dict__ | {"device": device, "params": params, "peak": 0}
         if memo is not None and self.own_models:
@@ -185,7 +183,7 @@ class Scene:
         return made
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy in another process is made of: files are not read again."""
+        """Return the state to pickle; unpickling reads no files."""
         held = {name: getattr(self, name) for name in _KEPT}
         return held | {"params": {name: _leaf(value) for name, value in self.params.items()}}
 
@@ -195,50 +193,50 @@ class Scene:
         self._reset_caches()
 
     def weights(self) -> tuple[Tensor, ...]:
-        """Tensors of the caller's own models that want gradients."""
+        """Return the tensors of the caller's BSDFs that require gradients."""
         found = {id(weight): weight for model in self.own_models for weight in model.weights() if weight.requires_grad}
         return tuple(found.values())
 
     @property
     def name(self) -> str:
-        """Of its file, without folder and ending; "" of a mapping."""
+        """Return the name of its file without folder and ending; "" for a mapping."""
         return Path(self.description.file or "").stem
 
     @property
     def told(self) -> str:
-        """Its size in words, for errors."""
+        """Return a phrase about its size, for errors."""
         triangles = sum(len(value) for name, value in self.params.items() if name.endswith(".vertices"))
         held = sum(value.numel() * value.element_size() for value in self.params.values())
         return f"{len(self._built.parts)} parts with {triangles} vertices, whose parameters alone take {mb(held)}"
 
     def replace_build(self, built: SceneBuild) -> None:
-        """Come to something else, of the same parameters by name, before anything was made of them."""
+        """Replace the build by one with the same names of parameters, before anything is cached."""
         self._built = built
 
     @property
     def built(self) -> SceneBuild:
-        """What its description came to, static."""
+        """Return the parts, instances and lights built from the description; immutable."""
         return self._built
 
     @property
     def space(self) -> Space:
-        """The lanes' own coordinates."""
+        """Return the transform to the coordinates of lanes."""
         return self._space
 
     def center(self) -> np.ndarray:
-        """The middle of the box around all that can be hit, ``(3,)`` float64; the origin where nothing can."""
+        """Return the centre ``(3,)`` of the bounding box of all surfaces, float64; the origin where there are none."""
         return bounds_center(self._built.parts, self._built.copies)
 
     @property
     def length(self) -> float:
-        """About how large the scene is, as a power of two: the side of the box around all that can be hit."""
+        """Return the longest side of the bounding box of all surfaces, rounded to a power of two."""
         return 2.0 ** round(math.log2(max(bounds_extent(self._built.parts, self._built.copies), 2.0**-100)))
 
     def check(self, params: Mapping[str, Tensor] | None) -> None:
-        """Refuse parameters that this scene cannot be rendered with.
+        """Check parameters that are to replace the scene's in a render.
 
         Raises:
-            SceneError: an unknown name, a tensor of another shape, numbers that no scene file could hold.
+            SceneError: an unknown name, a tensor of another shape, numbers that a scene file could not hold.
         """
         if params is not None and not isinstance(params, Mapping):
             raise SceneError("params", params, "a mapping from names of scene.params to tensors")
@@ -251,34 +249,38 @@ class Scene:
         check_light_params(self._built.sources, params or {}, self.merged(params))
 
     def check_own(self) -> None:
-        """Refuse what was put into :attr:`params`, or changed there in place, as :meth:`check` does; once for each change.
+        """Check the tensors of :attr:`params` that were replaced or changed in place since the last check.
 
         Raises:
-            SceneError: likewise, and names that are gone or new.
+            SceneError: as :meth:`check`, or names that were removed or added.
         """
         with outside_transforms():
             validate_changes(self, self._checked_versions)
 
     def mark_checked(self, other: Scene) -> None:
-        """Take what another scene checked of tensors that both have as checked."""
+        """Mark as checked the tensors that are shared with another scene and checked there."""
         self._checked_versions = inherited_checks(self, other, other._checked_versions)
 
     def versions(self) -> dict[str, int]:
-        """Numbers of what :attr:`params` hold: see :class:`torchpt.scene.versions.VersionCounter`."""
+        """Return version numbers of :attr:`params` by name; see :class:`torchpt.scene.versions.VersionCounter`."""
         return self._version_counter.of(self.params)
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
-        """All parameters, those of ``params`` (once checked) in place of the scene's."""
+        """Return all parameters, with those of ``params`` (checked before) in place of the scene's."""
         every = {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
-        # Tensors of torch.inference_mode have no place on a tape; their copies have.
+        # Autograd refuses tensors of torch.inference_mode, but not their clones.
         return {name: value.clone() if value.is_inference() else value for name, value in every.items()}
 
     def spec(self, name: str) -> Spec:
-        """What a parameter is."""
+        """Return the spec of a parameter."""
         return self._built.parameters.specs[name]
 
     def check_number(self, name: str, value: Tensor) -> None:
-        """Refuse numbers that no scene file could hold."""
+        """Check the values of a parameter.
+
+        Raises:
+            SceneError: numbers that a scene file could not hold.
+        """
         spec = self.spec(name)
         try:
             spec.check(value)
@@ -294,9 +296,13 @@ class Scene:
     def world(
         self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None, uv: bool = False, choice: str = "auto"
     ) -> tuple[World, Geometry]:
-        """The tensors that lanes gather from, and what the search sees; made once for the scene's own parameters.
+        """Return the world and the geometry for the search; cached for the scene's own parameters.
 
-        ``uv``: with texture coordinates, whether or not a texture reads them. ``choice``: how lights are chosen.
+        Args:
+            dtype: dtype of the lanes.
+            params: checked tensors in place of the scene's.
+            uv: True for texture coordinates even where no texture reads them.
+            choice: the light sampler, from ``lights.WAYS``.
         """
         if params:
             return self._assemble(self.merged(params), dtype, uv, choice)
@@ -309,10 +315,10 @@ class Scene:
             return self._worlds[key]
 
     def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
-        """A search structure: made for ``geometry``, or kept for the scene's own.
+        """Return a search structure: a new one for ``geometry``, else the cached one of the scene's own.
 
-        Where vertices move from render to render, as in an optimization, the latest one is refitted while it serves
-        (:meth:`Accel.refit`). Structures that are in use stay as they are.
+        A new one is made by refitting the latest where that is good enough (:meth:`Accel.refit`), since in an optimization
+        vertices move from render to render. The latest itself is not changed.
         """
         key = kind, threads
         with self._lock:
@@ -330,18 +336,18 @@ class Scene:
         return made
 
     def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
-        """The camera on a film of a given size, in the lanes' coordinates."""
+        """Return the camera on a film, in the coordinates of lanes."""
         camera, values = self.description.camera, dict(self.description.camera.values)
         for key, spec in parameters_of(camera.kind).items():
             number = params.get(f"camera.{key}")
-            if spec.vertex_params and number is not None:
+            if spec.differentiable and number is not None:
                 values[key] = (number.double() / self._space.unit if spec.length else number).to(dtype)
         pose = params["camera.to_world"]
         pose = torch.cat((self._space.pose(pose), pose[3:].double())).to(dtype)
         return camera.kind.on(pose, (film.width, film.height), values)
 
     def film_size(self, film: Mapping[str, Any] | None = None) -> tuple[int, int]:
-        """Width and height in pixels of the whole film, under film settings in place of the scene's own."""
+        """Return width and height of the whole film in pixels; ``film``: settings that override the scene's."""
         film_settings = settings(self.description, {"film": film or {}}).film
         return film_settings.width, film_settings.height
 
@@ -351,15 +357,15 @@ class Scene:
         film: Mapping[str, Any] | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> PinholeMatrices:
-        """The camera as OpenCV's matrices ``K`` in pixels, ``R`` and ``t``: see :mod:`torchpt.physics.cameras.opencv`.
+        """Return the camera as OpenCV's matrices ``K`` in pixels, ``R`` and ``t``; see :mod:`torchpt.physics.cameras.opencv`.
 
         Args:
-            params: tensors in place of the scene's, by name; gradients flow to those of the camera.
-            film: film settings in place of the scene's own, e.g. ``{"width": 640, "height": 480}``; a crop changes nothing.
-            dtype: of the matrices.
+            params: tensors in place of the scene's, by name; gradients flow to the camera's.
+            film: film settings that override the scene's, e.g. ``{"width": 640, "height": 480}``; a crop has no effect.
+            dtype: dtype of the matrices.
 
         Raises:
-            SceneError: parameters or film settings that are wrong, or a camera that is no pinhole's.
+            SceneError: wrong parameters or film settings, or a camera other than a pinhole.
         """
         self.check(params)
         merged, size = self.merged(params), settings(self.description, {"film": film or {}}).film
@@ -372,7 +378,7 @@ class Scene:
         return PinholeMatrices(matrix.to(dtype), turn.to(dtype), move.to(dtype))
 
     def info(self, settings: Settings) -> dict[str, Any]:
-        """What the scene holds, what was built for it and what was left out."""
+        """Return a description of the scene; see :mod:`torchpt.scene.info`."""
         world, _ = self.world(torch.float32, choice=settings.light_choice)
         threads = None if settings.render.threads == "auto" else int(settings.render.threads)
         return describe(self.description, self._built, world, self.accel(settings.render.accel, threads), settings)
@@ -384,7 +390,7 @@ class Scene:
         return assemble(built.parts, params, built.sources, self._space, dtype, built.copies, uv, choice)
 
     def _refresh(self) -> None:
-        """Forget what was made of parameters that have since been replaced or changed in place."""
+        """Clear the caches where a parameter other than the camera's was replaced or changed in place."""
         now, before = self._sources.of(self.params), self._made_of.copy()
         changed = changed_versions(before, now)
         gone = any(name not in now and not name.startswith("camera.") for name in before)
@@ -395,7 +401,7 @@ class Scene:
                 self.check_number(name, self.params[name].detach())
         self._made_of.clear()
         self._made_of.update(now)
-        if not gone and all(name.startswith("camera.") for name in changed):  # nothing that is kept depends on it
+        if not gone and all(name.startswith("camera.") for name in changed):  # nothing in the caches depends on it
             return
         self._worlds.clear()
         self._accels.clear()

@@ -1,4 +1,4 @@
-"""The run settings (film, integrator, sampler, render): built-in default < scene file < explicit override."""
+"""Settings of a render (film, integrator, sampler, render): built-in default < scene file < override."""
 
 from __future__ import annotations
 
@@ -55,15 +55,15 @@ __all__ = [
 BLOCKS = ("film", "integrator", "sampler", "render")
 MAX_SIDE = 65_536
 MAX_PIXELS = 2**28
-#: From this many samples a pixel on they are shared by four streams, below by two, where every pixel is to know its variance.
-#: Each takes something from Sobol' points (Cornell box, 64 spp: relMSE 0.38, 0.50, 0.58 of independent sampling for one, two,
-#: four); four make the variance of a single pixel less of a guess.
+#: With the AOV ``variance``, samples are split over four randomizations from this many samples a pixel on, below over two.
+#: More randomizations make Sobol' points less effective (Cornell box, 64 spp: relMSE 0.38, 0.50, 0.58 of independent sampling
+#: for one, two, four), but a pixel's variance less noisy.
 MANY_SAMPLES = 256
 #: The largest `render.seed`.
 MOST_SEED = 2**63 - 1
 
 
-#: What has a type: the kinds it may be of, and the one it is of where nothing is said.
+#: Blocks with a type: the table of kinds, and the default type.
 TYPED_BLOCKS: dict[str, tuple[Mapping[str, Any], str]] = {
     "integrator": (INTEGRATORS, "path"),
     "sampler": (SAMPLERS, "sobol"),
@@ -99,7 +99,7 @@ def _gamma(value: Any) -> float | str:
 
 
 class Film(FrozenConfig):
-    """The picture: its size in pixels, its reconstruction filter, and how 8-bit files show it."""
+    """The film block: size in pixels, reconstruction filter, AOVs, and tone mapping of 8-bit files."""
 
     parameters: ClassVar = {
         "width": Integer(
@@ -168,7 +168,7 @@ def _file(value: Any) -> str:
     raise Refused("null or a file path")
 
 
-#: How gradients are taken, the default first.
+#: Methods for gradients, the default first.
 ADJOINTS = ("replay", "autograd")
 _TYPE = "a type, or a mapping with `type` and its settings"
 _FILE = "null or a file path"
@@ -183,19 +183,19 @@ def _truth(default: bool, doc: str) -> Argument:
     return Argument(default, fits=lambda value: type(value) is bool, words="True or False", doc=doc)
 
 
-# The arguments of `render`, and with them the block `render`: each is declared here and nowhere else. Signatures, `help`,
-# checks, keys of the command line, files of configs/ and tables of the docs are made of this (`scripts/make_configs.py`,
+# The arguments of `render`, and with them the block `render`: each is declared here only. Signatures, `help`, checks, keys of
+# the command line, files of configs/ and tables of the docs are generated from this (`scripts/make_configs.py`,
 # `scripts/make_tables.py`).
 
 
 class _SampleOptions(TypedDict, total=False):
-    """What lists begin with."""
+    """The argument that tables list first."""
 
     spp: Annotated[int | None, Integer(64, low=1, doc="samples a pixel; a limit of time or error may end sooner")]
 
 
 class TraceOptions(TypedDict, total=False):
-    """Arguments of whatever traces paths."""
+    """Arguments of all functions that trace paths."""
 
     integrator: Annotated[
         str | Mapping[str, Any] | Integrator | None,
@@ -368,10 +368,10 @@ _ARGUMENTS = {name: argument.spec for name, argument in arguments_of(RenderOptio
 
 
 class Render(FrozenConfig):
-    """Settings of how the work is done; none of them but ``spp`` and ``seed`` changes what the picture converges to."""
+    """The render block: samples, seed, stop rules, device, threads, memory and files of a render."""
 
     parameters: ClassVar = {
-        **{name: _ARGUMENTS[name] for name in ("spp", "seed")},  # which lists begin with
+        **{name: _ARGUMENTS[name] for name in ("spp", "seed")},  # first in tables
         **{name: s for name, s in _ARGUMENTS.items() if name not in BLOCKS and not isinstance(s, Argument)},
         "preview": Custom(
             None,
@@ -384,12 +384,12 @@ class Render(FrozenConfig):
 
     @property
     def stops(self) -> dict[str, Any]:
-        """The stop rules that are set besides ``spp``, by name."""
+        """Return the stop rules that are set, other than ``spp``, by name."""
         every = {name: getattr(self, name) for name in settings_with(Role.ENDS)["render"]}
         return {name: value for name, value in every.items() if value is not None}
 
     def without(self, role: Role) -> Render:
-        """Return the same with the settings of a role left out."""
+        """Return a copy in which the settings of a role have their defaults."""
         return Render(
             **{name: value for name, value in self.values.items() if name not in settings_with(role)["render"]}
         )
@@ -402,16 +402,16 @@ class Render(FrozenConfig):
 
 
 class CallArguments(FrozenConfig):
-    """What a call of :func:`torchpt.render` says beside settings of the scene file."""
+    """The arguments of :func:`torchpt.render` that are no settings of a scene file."""
 
     parameters: ClassVar = {name: s for name, s in _ARGUMENTS.items() if isinstance(s, Argument)}
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> CallArguments:
-        """Return what arguments say, checked.
+        """Read such arguments.
 
         Raises:
-            SceneError: one that is not accepted.
+            SceneError: a value that is not accepted.
         """
         values: dict[str, Any] = {}
         for name in [name for name in cls.parameters if name in options]:
@@ -423,17 +423,17 @@ class CallArguments(FrozenConfig):
 
 
 def settings_of_call(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings among the arguments of a call by block; the device is none of them: it is the scene's."""
+    """Return the settings among the arguments of a call, by block, without the device, which belongs to the scene."""
     own = {name: options.get(name) for name in Render.parameters if name in _ARGUMENTS and name != "device"}
     return {**{name: options.get(name) for name in BLOCKS}, "render": own}
 
 
-#: The blocks without types.
+#: The blocks without a type.
 UNTYPED_BLOCKS: Mapping[str, type[FrozenConfig]] = {"film": Film, "render": Render}
 
 
 def settings_with(role: Role, but: Role = Role.NONE) -> dict[str, tuple[str, ...]]:
-    """Return the settings of a role by block, without those that have the role ``but`` too."""
+    """Return the names of settings with a role, by block, without those that also have the role ``but``."""
     return {
         block: tuple(name for name, s in parameters_of(record).items() if s.role & role and not s.role & but)
         for block, record in UNTYPED_BLOCKS.items()
@@ -442,13 +442,13 @@ def settings_with(role: Role, but: Role = Role.NONE) -> dict[str, tuple[str, ...
 
 @dataclass(frozen=True)
 class Settings:
-    """All run settings, complete.
+    """The complete settings of a render.
 
     Attributes:
-        film: the picture.
-        integrator: what it estimates.
-        sampler: where sample points come from.
-        render: how the work is done.
+        film: the film block.
+        integrator: the integrator.
+        sampler: the sampler's kind and values.
+        render: the render block.
     """
 
     film: Film
@@ -458,12 +458,12 @@ class Settings:
 
     @property
     def adaptive(self) -> bool:
-        """Return True where samples go where the error is."""
+        """Return True for adaptive sampling."""
         return bool(self.sampler.values.get("adaptive", False))
 
     @property
     def pilots(self) -> bool:
-        """Return True where one pixel of a block is sampled twice; ``auto``: where something asks for it."""
+        """Return True where error probes are sampled; ``auto``: where adaptive sampling or ``target_error`` needs them."""
         if not self.integrator.light or self.integrator.splats or "variance" in self.film.aovs:
             return False
         asked = self.adaptive or self.render.target_error is not None
@@ -471,17 +471,17 @@ class Settings:
 
     @property
     def streams(self) -> int:
-        """Return how many streams share the samples of a pixel: one, unless each pixel is to know its variance."""
+        """Return the number of randomizations of a pixel: one, or more for the AOV ``variance``."""
         spp = self.render.spp
         return min(spp, 4 if spp >= MANY_SAMPLES else 2) if "variance" in self.film.aovs else 1
 
     @property
     def light_choice(self) -> str:
-        """Return how a light is chosen; where no light is sampled it does not matter."""
+        """Return the name of the light sampler."""
         return self.integrator.light_choice
 
     def plain(self, without: Mapping[str, Collection[str]] = MappingProxyType({})) -> dict[str, Any]:
-        """Return them as a scene file would state them, but for the keys ``without``, by block."""
+        """Return the settings as plain values in the form of a scene file, without the keys ``without``, by block."""
         told = {name: _plain(getattr(self, name)) for name in BLOCKS}
         return {
             block: {k: v for k, v in keys.items() if k not in without.get(block, ())} for block, keys in told.items()
@@ -496,7 +496,7 @@ def _plain(value: Any) -> Any:
 
 
 def _set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
-    """The keys of a block that are really set (null means unset); a filter's or block's bare name is its type."""
+    """Return the keys of a block that are not null; a bare name stands for a block of that type."""
     if raw is None:
         return {}
     if isinstance(raw, str) and key.rpartition(".")[2] in TYPED_BLOCKS:
@@ -507,7 +507,7 @@ def _set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
 
 
 def _overlay(what: str, below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """``above`` over ``below``; keys of ``below`` that another type was meant to read do not follow."""
+    """Merge a block over another; where the type changes, keys that the new type does not have are dropped from ``below``."""
     table, default = TYPED_BLOCKS[what]
     before, after = below.get("type", default), above.get("type", below.get("type", default))
     if before != after and isinstance(after, str) and after in table:
@@ -517,11 +517,11 @@ def _overlay(what: str, below: dict[str, Any], above: dict[str, Any]) -> dict[st
 
 
 def keep_aspect(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys of a film over those of another: a width or a height alone keeps the other's shape.
+    """Complete the film keys of an override: a width or a height alone keeps the aspect ratio of the film below.
 
     Args:
-        below: whose shape is kept; what it does not say is the default.
-        above: that is set.
+        below: film keys of the scene; missing ones have their defaults.
+        above: film keys of the override.
     """
     sides = [name for name in ("width", "height") if above.get(name) is not None]
     if len(sides) != 1:
@@ -537,20 +537,20 @@ def keep_aspect(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str,
 
 
 def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None) -> Settings:
-    """Complete settings from the blocks of a scene file and explicit overrides, both by block name.
+    """Merge the blocks of a scene file and overrides, both by block name, to complete settings.
 
     Raises:
-        SceneError: an unknown block or key, a key that does nothing for the chosen type, a bad value.
-        NotBuiltError: a setting that this version does not build.
+        SceneError: an unknown block or key, a key that the chosen type does not have, a bad value.
+        NotBuiltError: a setting that this version does not support.
     """
     own = overrides.get("integrator")
-    if isinstance(own, Integrator):  # one of the caller's own kinds, or of ours, made already
+    if isinstance(own, Integrator):  # an instance from Python
         return _merge({**scene, "integrator": None}, {**overrides, "integrator": None}, file, own)
     given = {name: _plain_mappings(blocks) for name, blocks in (("scene", scene), ("overrides", overrides))}
     return _merged.get(file, given, lambda: _merge(scene, overrides, file))
 
 
-#: Settings by what was said of them: a loop of renders says the same again and again.
+#: Settings by the blocks that they were merged from: loops of renders merge the same ones again and again.
 _merged: ResultCache[Settings] = ResultCache(256)
 
 
@@ -592,7 +592,7 @@ def _merge(
 
 
 def _check_pilots(settings: Settings, file: str | None) -> None:
-    """Raise where what is asked for takes pilots and there can be none, or where every pixel is sampled twice anyway."""
+    """Raise where settings need error probes that other settings exclude, or probes are redundant."""
     film, render = settings.film, settings.render
     adaptive, variance = settings.adaptive, "variance" in film.aovs
     for key, wanted in (("sampler.adaptive", adaptive), ("render.target_error", render.target_error is not None)):
@@ -618,7 +618,7 @@ def _check_pilots(settings: Settings, file: str | None) -> None:
 
 
 def _open_end(raw: Mapping[str, Any], sampler: ParsedParams) -> None:
-    """Raise where something else than ``spp`` is to end a render whose points depend on their number."""
+    """Raise for a stop rule other than ``spp`` with a sampler whose points depend on their number."""
     for name in settings_with(Role.ENDS)["render"]:
         if sampler.kind.needs_count and raw.get(name) is not None:
             free = ", ".join(kind for kind in SAMPLERS if not SAMPLERS[kind].needs_count)
@@ -629,7 +629,7 @@ def _open_end(raw: Mapping[str, Any], sampler: ParsedParams) -> None:
 
 
 def _given(overrides: Mapping[str, Any], key: str) -> bool:
-    """Return True where the override names the key that is wrong."""
+    """Return True where the overrides contain the key of an error."""
     value: Any = overrides
     for part in key.split(".")[:3]:
         if not isinstance(value, Mapping) or value.get(part) is None:
@@ -651,5 +651,5 @@ def _block(block: str, raw: dict[str, Any]) -> Any:
 
 
 def _typed(what: str, raw: dict[str, Any], key: str) -> ParsedParams:
-    """A thing whose type picks its kind."""
+    """Read a block whose type names its kind."""
     return read_typed(what, TYPED_BLOCKS[what][0], raw, key, None, TYPED_BLOCKS[what][1])

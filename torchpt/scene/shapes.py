@@ -1,4 +1,4 @@
-"""Shapes of a description as parts: materials resolved, files read, everything that is a number declared."""
+"""Build the parts of shapes: resolve materials, read files, declare parameters."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ __all__ = ["ShapeBuilder", "ShapeEntry"]
 
 @dataclass(frozen=True)
 class ShapeEntry:
-    """A shape of a scene.
+    """A shape of the scene, whose parts are built.
 
     Attributes:
-        name: in the scene.
+        name: name in the scene.
         number: order in the scene, from 1.
-        shape: what it is.
+        shape: the kind and its values.
     """
 
     name: str
@@ -44,20 +44,20 @@ class ShapeEntry:
 
     @property
     def key(self) -> str:
-        """Its dotted key."""
+        """Return its dotted key."""
         return f"shapes.{self.name}"
 
     @property
     def to_world(self) -> np.ndarray:
-        """Its transform."""
+        """Return its transform ``(4, 4)``."""
         return self.shape.kind.to_world(self.shape.values)
 
 
 class ShapeBuilder:
-    """Makes parts of shapes.
+    """Builder of the parts of shapes.
 
     Attributes:
-        sources: lights that mesh files have beside the triangles, in the order in which they were met.
+        sources: lights of mesh files, in the order of shapes.
     """
 
     def __init__(self, description: Description, parameters: Parameters, texture_loader: TextureLoader) -> None:
@@ -67,12 +67,12 @@ class ShapeBuilder:
         self._declared: set[int] = set()
 
     def parts(self, owner: ShapeEntry) -> list[Part]:
-        """What a shape comes to; no instance."""
+        """Return the parts of a shape other than an instance."""
         triangles = owner.shape.kind.triangles(owner.shape.values)
         return self._primitives(owner) if triangles is None else self._meshes(owner, triangles)
 
     def copies(self, owner: ShapeEntry, parts: list[Part]) -> list[Copy]:
-        """An instance, as one copy of each of the ``parts`` of its mesh."""
+        """Return the copies of an instance, one for each of the ``parts`` of its mesh."""
         key, file, shapes = owner.key, self.description.file, self.description.shapes
         of, material = owner.shape["of"], owner.shape["material"]
         mesh = shapes.get(of)
@@ -98,7 +98,7 @@ class ShapeBuilder:
         return made
 
     def _primitives(self, owner: ShapeEntry) -> list[Part]:
-        """A shape of primitives that share one pose."""
+        """Return the parts of a shape of primitives, which share its pose."""
         shape, pose = owner.shape, owner.to_world
         own = shape.kind.own(shape.values)
         if own is not None:
@@ -120,7 +120,7 @@ class ShapeBuilder:
         self.parameters.declare(f"{stem}.to_world", pose, Pose(angles=angles))
 
     def _meshes(self, owner: ShapeEntry, triangles: Triangles) -> list[Part]:
-        """A shape of triangles: a part for each material of its file."""
+        """Return the parts of a mesh, one for each material of its file."""
         shape, pose = owner.shape, owner.to_world
         mesh = mesh_of(triangles, owner.key, self.description, self.texture_loader, materials=shape["material"] is None)
         lights = [light for piece in mesh.pieces for light in piece.lights]
@@ -135,7 +135,7 @@ class ShapeBuilder:
             own = piece.material if shape["material"] is None else None
             if own is None:
                 slot = self._material(shape["material"], stem)
-            elif id(own) in known:  # parts of one material share its row and its textures
+            elif id(own) in known:  # parts of one material share its parameters and textures
                 slot = known[id(own)]
             else:
                 slot = known[id(own)] = self._file_material(own, owner.key, f"{stem}.material", mesh.source)
@@ -149,7 +149,7 @@ class ShapeBuilder:
         return parts
 
     def _material(self, given: Any, stem: str) -> ResolvedMaterial:
-        """The material that the scene gives a shape, by name or its own; the grey of one that has none."""
+        """Return the material of a shape: a named one, one in place, or the default grey."""
         known = self.description.materials
         if isinstance(given, str):
             if given not in self._slots:
@@ -158,10 +158,10 @@ class ShapeBuilder:
         return resolved(plain_material() if given is None else given, f"{stem}.material", known, self.texture_loader)
 
     def _file_material(self, own: FileMaterial, prefix: str, key: str, source: str) -> ResolvedMaterial:
-        """A mesh file's own material.
+        """Return a mesh file's own material.
 
         Raises:
-            AssetError: something that a material cannot have; it names the file and the material.
+            AssetError: a wrong key or value; names the file and the material.
         """
         try:
             material = read_material(own.material, key, BSDFS, None)
@@ -171,7 +171,7 @@ class ShapeBuilder:
             raise AssetError(source, f"material {own.name[:80]!r}: {error}") from None
 
     def _part(self, owner: ShapeEntry, stem: str, slot: ResolvedMaterial, surface: Surface, pose: np.ndarray) -> Part:
-        """A surface of a shape, without what only triangles have; its emission and its material's numbers are declared."""
+        """Return the part of a surface, without triangles, and declare its emission and the parameters of its material."""
         if slot is not self._slots.get(slot.name.removeprefix("materials.")) or id(slot) not in self._declared:
             declare(slot, self.parameters)
             self._declared.add(id(slot))
@@ -203,7 +203,7 @@ class ShapeBuilder:
 
 
 def _with_triangles(part: Part, piece: MeshPart, mesh: Mesh) -> Part:
-    """A part with its triangles."""
+    """Return a part with its triangles."""
     faces, dropped = solid(piece, part.to_world)
     return replace(
         part,

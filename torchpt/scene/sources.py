@@ -1,4 +1,4 @@
-"""Texture coordinates and normals of meshes: those that gradients are wanted of, and meshes that lack what texels need."""
+"""Build the lights that are not emissive surfaces; declare and check texture coordinates and normals of meshes."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ __all__ = [
 ]
 
 
-# ---- Texture coordinates and normals of meshes: those that gradients are wanted of, and meshes that lack what texels need
+# ---- Texture coordinates and normals of meshes
 
 
 def declare_vertex_attributes(parts: Sequence[Part], vertex_params: Collection[str], parameters: Parameters) -> None:
-    """Make normals and texture coordinates of meshes parameters, those that are asked for by name."""
+    """Declare the normals and texture coordinates that are named in ``vertex_params`` as parameters."""
     for part in parts if vertex_params else ():
         for key, value in (("normals", part.normals), ("uvs", part.uvs)):
             if value is not None and f"{part.name}.{key}" in vertex_params:
@@ -40,17 +40,17 @@ def declare_vertex_attributes(parts: Sequence[Part], vertex_params: Collection[s
 
 
 def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str | None) -> None:
-    """Refuse texels on a mesh that does not say where they lie.
+    """Check that meshes with texels of the scene have texture coordinates.
 
-    A file's image goes over each triangle of such a mesh, as Mitsuba has it; nobody who writes down texels means that.
+    An image file would cover each triangle of such a mesh, as in Mitsuba, which is not what texels are written for.
 
     Args:
-        parts: all of the scene.
-        stated: names of texels that the scene states itself.
+        parts: all parts of the scene.
+        stated: names of texels that the scene gives as arrays.
         file: scene file for the error.
 
     Raises:
-        SceneError: such a mesh, by the name of the texels.
+        SceneError: a mesh without texture coordinates; names the texels.
     """
     if not stated:
         return
@@ -65,11 +65,11 @@ def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str 
                 raise SceneError(node.texels, "texels on a mesh without uvs", expected, file)
 
 
-# ---- Lights that are no surfaces: those of the scene's block, and those that mesh files bring
+# ---- Delta lights and environments, from the lights block and from mesh files
 
 
 def build_lights(description: Description, parameters: Parameters) -> list[Source]:
-    """The lights block; its numbers become parameters."""
+    """Return the lights of the lights block, and declare their parameters."""
     lights = description.lights
     around = [name for name, light in lights.items() if light.kind.environment]
     if len(around) > 1:
@@ -93,15 +93,15 @@ def _file(description: Description, key: str, light: ParsedParams, parameter: st
 
 
 def check_light_params(sources: Sequence[Source], given: Collection[str], parameters: Mapping[str, Tensor]) -> None:
-    """Refuse parameters that do not go together.
+    """Check replaced parameters of lights against each other.
 
     Args:
-        sources: of the scene.
-        given: names of the parameters that were replaced.
-        parameters: all of them.
+        sources: the scene's.
+        given: names of the replaced parameters.
+        parameters: all parameters.
 
     Raises:
-        SceneError: as the kinds' own checks of a scene file.
+        SceneError: as the ``check`` of the light's kind.
     """
     for source in sources:
         kind = LIGHTS[source.kind]
@@ -118,19 +118,19 @@ def check_light_params(sources: Sequence[Source], given: Collection[str], parame
 def build_file_lights(
     lights: list[FileLight], prefix: str, pose: np.ndarray, source: str, parameters: Parameters
 ) -> list[Source]:
-    """The lights of a mesh file, placed in the scene; their numbers become parameters."""
+    """Return the lights of a mesh file, transformed to the scene, and declare their parameters."""
     sources = []
     for light, label in zip(lights, unique_labels([light.name for light in lights]), strict=True):
         stem = f"{prefix}.lights.{label}"
         with np.errstate(over="ignore", invalid="ignore"):
             position, direction = apply_points(pose, light.position), pose[:3, :3] @ light.direction
             direction = direction / np.abs(direction).max()
-            # Twice as far lies what a spot aims at.
+            # A spot's target lies up to twice as far.
             held = np.isfinite(np.array([2.0 * position, direction]).astype(np.float32)).all()
         if not held:
             raise AssetError(source, f"light {light.name!r} has no finite place under the transform of {prefix}")
         direction = direction / np.linalg.norm(direction)
-        # A target as far off as the origin, so that the difference of the two is as exact as they are.
+        # The target is as far as the light is from the origin, so that their difference keeps its precision.
         target = position + direction * max(1.0, np.abs(position).max())
         places = {"position": position, "direction": direction, "target": target}
         values = {key: places.get(key, light.numbers.get(key)) for key in parameters_of(LIGHTS[light.kind])}
@@ -140,8 +140,8 @@ def build_file_lights(
 
 
 def unique_labels(names: list[str]) -> list[str]:
-    """Distinct labels without dots for the pieces of a mesh."""
-    labels: dict[str, None] = {}  # in order, and quick to textures up
+    """Return distinct labels without dots for the parts of a mesh."""
+    labels: dict[str, None] = {}  # an ordered set
     for number, name in enumerate(names):
         base = name.replace(".", "_") or f"part{number}"
         label, again = base, number

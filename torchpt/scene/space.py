@@ -1,7 +1,7 @@
-"""The lanes' own coordinates: where their origin lies in the scene, and which length they count as one.
+"""The coordinates of lanes: their origin in the scene, and their unit of length.
 
-Searches, areas and densities square lengths and multiply three of them, and float32 holds cubes of 1e-12 to 1e12 only. So a
-scene whose lengths lie far from one is rendered in a unit of its own. That is a power of two: nothing is rounded by it.
+Searches, areas and densities compute squares and cubes of lengths, and float32 holds cubes of 1e-12 to 1e12 only. So a scene
+whose lengths are far from 1 is rendered in another unit. It is a power of two, so that scaling rounds nothing.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from torchpt.spec.schema import ParsedParams
 
 __all__ = ["MAX_COORDINATE", "Space", "bounds_center", "bounds_extent", "centre_and_unit"]
 
-#: A scene is moved to the origin where it lies further away than this many times its own size.
+#: A scene is moved to the origin where its distance from it is more than this many times its size.
 RECENTRE_DISTANCE = 8.0
-#: Lengths from one over this to this are left as they are.
+#: Scenes with all lengths between 1 / ORDINARY and ORDINARY keep their unit.
 UNSCALED_RANGE = 2.0**30
-#: The longest length over the smallest shape, at most: about their geometric mean the cubes of both are within float32.
+#: Largest ratio of the longest length to the smallest shape: with their geometric mean as unit, float32 holds both cubes.
 MAX_RATIO = 2.0**80
-#: Units from the origin beyond which float32 loses cubes of coordinates.
+#: Largest coordinate in units: float32 does not hold cubes of larger ones.
 MAX_COORDINATE = 2.0**42
 
 Array = NDArray[np.float64]
@@ -36,27 +36,27 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Space:
-    """The lanes' coordinates.
+    """Transform from the scene's coordinates to those of lanes.
 
     Attributes:
-        centre: ``(3,)`` float64, where their origin lies in the scene's.
-        unit: how long their unit is in the scene's; a power of two.
+        centre: ``(3,)`` float64, their origin in the scene's coordinates.
+        unit: length of their unit in the scene's units; a power of two.
     """
 
     centre: Tensor
     unit: float
 
     def point(self, p: Tensor) -> Tensor:
-        """A point ``(3,)`` of the scene, in float64."""
+        """Transform a point ``(3,)`` of the scene, in float64."""
         return (p.double() - self.centre) / self.unit
 
     def pose(self, to_world: Tensor) -> Tensor:
-        """The map ``(..., 3, 4)`` into these coordinates, from one ``(..., 4, 4)`` into the scene's; in float64."""
+        """Convert transforms ``(..., 4, 4)`` to the scene into ``(..., 3, 4)`` to these coordinates, in float64."""
         pose = to_world.double()
         return torch.cat((pose[..., :3, :3], pose[..., :3, 3:4] - self.centre[:, None]), -1) / self.unit
 
     def matrix(self) -> Tensor:
-        """From these coordinates to the scene's, ``(4, 4)`` float64."""
+        """Return the transform ``(4, 4)`` from these coordinates to the scene's, float64."""
         matrix = torch.eye(4, dtype=torch.float64, device=self.centre.device)
         matrix[:3, :3] *= self.unit
         matrix[:3, 3] = self.centre
@@ -64,7 +64,7 @@ class Space:
 
     @property
     def shift(self) -> Tensor:
-        """The scene's own origin seen from this one ``(3,)``, turned around, in units of this space."""
+        """Return :attr:`centre` in units of these coordinates ``(3,)``."""
         return self.centre / self.unit
 
 
@@ -76,10 +76,10 @@ def centre_and_unit(
     camera: ParsedParams,
     file: str | None,
 ) -> tuple[Array, float]:
-    """Where the origin of the lanes' coordinates is put ``(3,)``, and their unit.
+    """Choose the origin ``(3,)`` and the unit of the coordinates of lanes.
 
     Raises:
-        SceneError: a shape that lies beyond float32, or lengths too far apart for it.
+        SceneError: a shape beyond the range of float32, or lengths too far apart for it.
     """
     names, boxes, sizes = _boxes(parts, copies)
     centre = np.zeros(3)
@@ -101,19 +101,19 @@ def centre_and_unit(
 
 
 def bounds_center(parts: Sequence[Part], copies: Sequence[Copy]) -> Array:
-    """The middle of the box around all that can be hit, ``(3,)``; the origin where nothing can."""
+    """Return the centre ``(3,)`` of the bounding box of all surfaces; the origin where there are none."""
     names, boxes, _ = _boxes(parts, copies)
     return 0.5 * (boxes.min((0, 1)) + boxes.max((0, 1))) if names else np.zeros(3)
 
 
 def bounds_extent(parts: Sequence[Part], copies: Sequence[Copy]) -> float:
-    """The longest side of the box around all that can be hit; 1 where nothing can."""
+    """Return the longest side of the bounding box of all surfaces; 1 where there are none."""
     names, boxes, _ = _boxes(parts, copies)
     return float((boxes.max((0, 1)) - boxes.min((0, 1))).max()) if names else 1.0
 
 
 def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Array, Array]:
-    """Names ``N``, corners ``(N, 8, 3)`` of boxes in the scene, and largest extents ``(N,)`` of all that can be hit."""
+    """Return, for all parts and copies, names, corners ``(N, 8, 3)`` of bounding boxes in the scene, and longest sides."""
     cube = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
     own: dict[str, Array] = {}
     found = []
@@ -122,7 +122,7 @@ def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Ar
         if part.vertices is not None and part.faces is not None:
             used = np.zeros(len(part.vertices), bool)
             used[part.faces.reshape(-1)] = True
-            points = part.vertices[used]  # vertices of no face have no say
+            points = part.vertices[used]  # vertices without a face do not count
             if not len(points):
                 continue
             corners = own[part.name] = 0.5 * (points.max(0) + points.min(0)) + cube * (0.5 * np.ptp(points, axis=0))
@@ -132,14 +132,14 @@ def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Ar
         return [], np.zeros((0, 8, 3)), np.zeros(0)
     poses = np.stack([pose for _, _, pose in found])
     turned = np.stack([corners for _, corners, _ in found]) @ poses[:, :3, :3].transpose(0, 2, 1)
-    # A size is told before the move: far off, the difference of two corners would lose it.
+    # Sizes are taken before the translation: far from the origin, differences of corners would lose precision.
     return [name for name, _, _ in found], turned + poses[:, None, :3, 3], np.ptp(turned, axis=1).max(1)
 
 
 def _reaches(
     sources: Sequence[Source], parameters: Mapping[str, Array], camera: ParsedParams, centre: Array
 ) -> list[tuple[str, float]]:
-    """Other lengths that lanes hold, by key."""
+    """Return the lengths of camera and lights that lanes hold, by key."""
     found = [("camera", float(np.abs(parameters["camera.to_world"][:3, 3] - centre).max()))]
     found += [(f"camera.{key}", float(camera[key])) for key in camera.kind.reaches]
     for source in sources:
@@ -150,11 +150,12 @@ def _reaches(
 
 
 def _unit(lengths: Sequence[tuple[str, float]], smallest: tuple[str, float], file: str | None) -> float:
-    """One, or a power of two near the geometric mean of the longest length and the smallest shape."""
+    """Return 1, or a power of two near the geometric mean of the longest length and the smallest shape."""
     (far, longest), (near, size) = max(lengths, key=lambda item: item[1]), smallest
     longest = max(longest, size)
     if longest > MAX_RATIO * size:
-        expected = f"a size of at least {longest / MAX_RATIO:.3g} beside a length of {longest:.3g} ({far}): float32 holds no more"
+        least = longest / MAX_RATIO
+        expected = f"a size of at least {least:.3g} beside a length of {longest:.3g} ({far}): float32 holds no more"
         raise SceneError(near, float(f"{size:.3g}"), expected, file)
     if longest <= UNSCALED_RANGE and size * UNSCALED_RANGE >= 1.0:
         return 1.0

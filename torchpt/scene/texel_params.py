@@ -1,4 +1,4 @@
-"""Texels where a scene has a number or a colour: the scene with a texture in that place, made once and kept beside it."""
+"""Accept texels as ``params`` where a material has a number or a colour: build and cache a scene with a texture there."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from torchpt.spec import Refused
 __all__ = ["update_texels", "with_texel_params"]
 
 
-#: Scenes with texels that are kept beside one, the latest.
+#: Number of scenes with texels that are cached for one scene.
 KEPT = 4
 
 
 def with_texel_params(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
-    """The scene itself, or where texels are given for numbers and colours of its materials one that reads them there.
+    """Return the scene itself, or, where texels are given for numbers or colours of materials, one with textures there.
 
-    The second one shares the tensors, meshes and pictures of the first; its search structures are its own.
+    The second shares parameters, meshes and images with the first, but not search structures.
 
     Args:
-        scene: as it was loaded.
-        params: tensors in place of its own.
+        scene: the scene as loaded.
+        params: tensors in place of the scene's.
 
     Raises:
-        SceneError: texels where the scene's materials cannot read any, that are out of range, or on a mesh without uvs.
-        NotBuiltError: texels for what a material tabulates.
+        SceneError: texels for a parameter that takes no texture, out of range, or on a mesh without uvs.
+        NotBuiltError: texels for a parameter that the BSDF tabulates.
     """
     with outside_transforms():
         texels = _texels(scene, params or {})
@@ -48,12 +48,12 @@ def with_texel_params(scene: Scene, params: Mapping[str, Tensor] | None) -> Scen
 
 
 def update_texels(made: Scene, scene: Scene, params: Mapping[str, Tensor]) -> None:
-    """Bring what :func:`with_texel_params` made of a scene up to date, as other renders may have put their texels in since.
+    """Put a render's tensors into the scene that :func:`with_texel_params` returned, which other renders may share.
 
     Args:
-        made: it, or the scene itself where no texels were given.
-        scene: as it was loaded.
-        params: of the render.
+        made: the scene with texels, or the scene itself.
+        scene: the scene as loaded.
+        params: the render's tensors.
     """
     if made is not scene:
         with outside_transforms():
@@ -61,7 +61,7 @@ def update_texels(made: Scene, scene: Scene, params: Mapping[str, Tensor]) -> No
 
 
 def _texels(scene: Scene, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Texels that stand where a scene was loaded with numbers, apart from their tape."""
+    """Return the detached texels given for parameters that were loaded as numbers or colours."""
     loaded = scene.built.parameters
     return {
         name: _plain(value, loaded[name])
@@ -71,7 +71,7 @@ def _texels(scene: Scene, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _reading(scene: Scene, texels: Mapping[str, Tensor]) -> Scene:
-    # By size, so that threads that render with different ones at a time do not share a scene.
+    # Keyed by size too: threads that render with texels of different sizes must not share a scene.
     key = tuple(sorted((name, tuple(value.shape)) for name, value in texels.items()))
     made = scene.textured.get(key)
     if made is None:
@@ -85,7 +85,7 @@ def _reading(scene: Scene, texels: Mapping[str, Tensor]) -> Scene:
 
 
 def _copy_params(made: Scene, scene: Scene, texels: Mapping[str, Tensor]) -> None:
-    """Put the tensors of a scene, and texels in place of some, into the one that reads texels."""
+    """Copy a scene's tensors, with texels in place of some, to the scene with textures."""
     for name, value in scene.params.items():
         new = texels.get(name, value)
         if name not in texels or not _same_memory(made.params[name], new):
@@ -94,7 +94,7 @@ def _copy_params(made: Scene, scene: Scene, texels: Mapping[str, Tensor]) -> Non
 
 
 def _same_memory(one: Tensor, other: Tensor) -> bool:
-    """Whether two tensors are one, of which one is apart from its tape maybe."""
+    """Return True where two tensors are the same memory; one may be detached."""
     layout = one.dtype, one.shape, one.stride()
     return one.data_ptr() == other.data_ptr() and layout == (other.dtype, other.shape, other.stride())
 
@@ -106,14 +106,14 @@ def _is_texels(value: object, dimensions: int) -> bool:
 
 
 def _plain(value: Tensor, loaded: np.ndarray) -> Tensor:
-    """Texels apart from their tape; where transforms of ``torch.func`` hide them, others of their shape stand for them."""
+    """Return detached texels; under transforms of ``torch.func``, which hide values, others of the same shape."""
     if is_transformed(value):
         return torch.full(value.shape, float(loaded.mean()), dtype=value.dtype, device=value.device)
     return value.detach()
 
 
 def _built(scene: Scene, texels: Mapping[str, Tensor]) -> SceneBuild:
-    """What the scene came to, with nodes in place of numbers."""
+    """Return the scene's build with texture nodes in place of numbers."""
     before, file = scene.built, scene.description.file
     parameters = Parameters()
     parameters |= before.parameters
@@ -147,6 +147,6 @@ def _built(scene: Scene, texels: Mapping[str, Tensor]) -> SceneBuild:
 
 
 def _material(material: ResolvedMaterial, nodes: Mapping[str, Mapping[str, Node]]) -> ResolvedMaterial:
-    """A material that reads nodes, by its name and their slots; so do those that it blends."""
+    """Return a material with the texture nodes of its name, by slot; also inside blends."""
     inner = tuple(_material(one, nodes) for one in material.inner)
     return replace(material, values={**material.values, **nodes.get(material.name, {})}, inner=inner)

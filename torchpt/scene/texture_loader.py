@@ -1,4 +1,4 @@
-"""Textures opened: their numbers become parameters, slots become nodes that read them. Every file is read once."""
+"""Open textures: declare their parameters, and make a texture node for each slot. Every file is read once."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["TextureLoader"]
 
 
 class TextureLoader:
-    """Opens the textures of one scene.
+    """Loader of one scene's textures.
 
     Args:
-        textures: the named ones.
-        resolve: from a path as written and its dotted key to a file.
-        parameters: where their numbers go, by dotted name: ``textures.NAME`` or the slot's own name.
+        textures: textures by name.
+        resolve: returns the file for paths as written and a dotted key.
+        parameters: gets the textures' parameters, as ``textures.NAME.*`` or under the slot's own name.
         file: scene file for errors.
     """
 
@@ -36,22 +36,22 @@ class TextureLoader:
     ) -> None:
         self._textures, self._resolve, self._parameters, self.file = textures, resolve, parameters, file
         self._pictures: dict[Any, Any] = {}
-        self._nodes: dict[str, Node] = {}  # of materials, which many shapes may share
+        self._nodes: dict[str, Node] = {}  # by key: many shapes may share a material
         self._shared: dict[str, dict[str, str]] = {}
 
     def __call__(self, slot: TextureInput, key: str) -> Node:
-        """The node of the slot ``key``.
+        """Return the texture node of the slot ``key``.
 
         Raises:
-            SceneError: a channel that is not there, a value that the slot does not accept.
-            AssetError: an image that is missing or malformed.
+            SceneError: a missing channel, or a value that the slot does not accept.
+            AssetError: a missing or malformed image.
         """
         if key not in self._nodes:
             self._nodes[key] = self._opened(slot, key, key, self._parameters)
         return self._nodes[key]
 
     def _opened(self, slot: TextureInput, key: str, name: str, parameters: Parameters) -> Node:
-        """The node of a slot whose texture, where it is written there, is called ``name``."""
+        """Return the node of a slot; ``name``: dotted name of the parameters of a texture that is written in place."""
         texture, channel = slot.texture, None
         if isinstance(texture, Named):
             name, channel, texture = f"textures.{texture.texture}", texture.channel, self._textures[texture.texture]
@@ -59,10 +59,10 @@ class TextureLoader:
         return texture.kind.open(texture.values, opening)
 
     def sharing(self, prefix: str) -> Callable[[TextureInput, str], Node]:
-        """The same for the materials of a mesh file, whose images are named after themselves and shared.
+        """Return a function like this object for the materials of a mesh file, whose images are named after their files.
 
         Args:
-            prefix: dotted name before theirs.
+            prefix: dotted prefix of the images' names.
         """
 
         def opened(slot: TextureInput, key: str) -> Node:
@@ -79,8 +79,8 @@ class TextureLoader:
         return opened
 
     def values(self, slot: TextureInput, key: str) -> Callable[[np.ndarray], np.ndarray]:
-        """A number texture as a function from texture coordinates ``(V, 2)`` to values ``(V,)``, float64."""
-        own = Parameters()  # what shapes the mesh is spent with it: no parameter of the scene
+        """Return a number texture as a function from texture coordinates ``(V, 2)`` to values ``(V,)``, float64."""
+        own = Parameters()  # used once to displace the mesh: no parameters of the scene
         node = self._opened(slot, key, key, own).at_points()
         given = {name: torch.from_numpy(value) for name, value in own.items()}
         table = node.table([node], given, torch.float64, torch.device("cpu"))

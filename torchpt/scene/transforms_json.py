@@ -1,9 +1,9 @@
-"""``transforms.json``: the cameras of a set of pictures, as NeRF, instant-ngp and nerfstudio keep them.
+"""Read and write ``transforms.json``, the cameras of a set of images in the format of NeRF, instant-ngp and nerfstudio.
 
-``transform_matrix`` is camera to world with OpenGL's axes (x right, y up, looks along -z). ``fl_x fl_y cx cy`` are pixels from
-the picture's corner, ``w h`` its size; ``camera_angle_x`` is the full angle along x in radians, and counts where there is no
-``fl_x``. A frame may have all of them itself, else those at the top of the file count. Without ``w`` and ``h`` there are angles
-alone, and the one along x counts: pixels are squares.
+``transform_matrix`` is camera to world with OpenGL's axes (x right, y up, looks along -z). ``fl_x fl_y cx cy`` are in pixels
+from the image's corner, ``w h`` is its size. ``camera_angle_x`` is the full angle along x in radians, used without ``fl_x``.
+Keys of a frame override those at the top of the file. Without ``w`` and ``h`` only the angle along x is used, and pixels are
+square.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ __all__ = ["Frame", "frame_of", "read_transforms", "write_transforms"]
 
 _MOST = 256 * 2**20
 _NUMBERS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y")
-#: What bends rays, or turns the picture otherwise: none of it is built, so it must be 0.
+#: Coefficients of lens distortion, which is not supported: they must be 0.
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 _FOCAL = "a number > 0", lambda x: x > 0.0
 _SIDE = "a whole number in 1..16777216", lambda x: 1.0 <= x <= 2.0**24 and x.is_integer()
 _ANGLE = "an angle above 0 and below pi", lambda x: 1e-30 < x < math.pi
-#: What is accepted of numbers that have ends.
+#: Numbers with a range: the phrase for errors, and the test.
 _RANGES: dict[str, tuple[str, Callable[[float], bool]]] = {
     "fl_x": _FOCAL,
     "fl_y": _FOCAL,
@@ -50,11 +50,11 @@ _RANGES: dict[str, tuple[str, Callable[[float], bool]]] = {
 
 
 class Frame(NamedTuple):
-    """A picture and its camera."""
+    """An image and its camera."""
 
-    image: str  # the picture's file, as written: relative to the folder of transforms.json
-    camera: dict[str, Any]  # the block of a scene
-    size: tuple[int, int] | None  # width and height in pixels; None where the file does not say
+    image: str  # path of the image as written, relative to the folder of transforms.json
+    camera: dict[str, Any]  # camera block of a scene
+    size: tuple[int, int] | None  # width and height in pixels; None where the file has none
 
 
 def frame_of(
@@ -63,16 +63,16 @@ def frame_of(
     params: Mapping[str, Tensor] | None = None,
     film: Mapping[str, Any] | None = None,
 ) -> Frame:
-    """A scene's camera as a frame: as numbers, without gradients.
+    """Return a scene's camera as a frame of plain numbers, without gradients.
 
     Args:
-        scene: whose camera.
-        image: the picture's file, as it is to be written: text or a path.
+        scene: the scene.
+        image: path of the image, as it is to be written.
         params: tensors in place of the scene's.
-        film: film settings in place of the scene's own.
+        film: film settings that override the scene's.
 
     Raises:
-        SceneError: no scene or no file's name, parameters or film settings that are wrong, or a camera that is no pinhole's.
+        SceneError: no scene or no path, wrong parameters or film settings, or a camera other than a pinhole.
     """
     name = _file(image, "image")
     with torch.no_grad():
@@ -81,13 +81,13 @@ def frame_of(
 
 
 def read_transforms(path: str | os.PathLike[str]) -> list[Frame]:
-    """The frames of a ``transforms.json``, in its order.
+    """Return the frames of a ``transforms.json``, in its order.
 
-    ``torchpt.load({"camera": frame.camera, "film": {"width": w, "height": h}, ...})`` is a scene as a frame sees it.
+    ``torchpt.load({"camera": frame.camera, "film": {"width": w, "height": h}, ...})`` loads a scene with a frame's camera.
 
     Raises:
-        SceneError: ``path`` is none.
-        AssetError: a file that is missing or malformed, or a camera whose lens bends rays.
+        SceneError: ``path`` is no path.
+        AssetError: a missing or malformed file, or a camera with lens distortion.
     """
     try:
         whole = json.loads(read_regular(as_path(path), _MOST))
@@ -102,17 +102,16 @@ def read_transforms(path: str | os.PathLike[str]) -> list[Frame]:
 
 
 def write_transforms(path: str | os.PathLike[str], frames: Iterable[Frame]) -> None:
-    """Write a ``transforms.json``; numbers that all frames share stand at its top.
+    """Write a ``transforms.json``, with the numbers that all frames share at its top.
 
     Args:
-        path: of the file.
-        frames: of :func:`frame_of` or :func:`read_transforms`; others may have a path as ``image``, and need ``to_world`` or
-            ``R`` and ``t``, and ``K`` or ``fov`` with what may stand beside it.
+        path: path of the file.
+        frames: frames from :func:`frame_of` or :func:`read_transforms`, or others whose camera block has ``to_world`` or
+            ``R`` and ``t``, and ``K`` or ``fov``.
 
     Raises:
-        SceneError: ``path`` is none, no frames, a frame without a size, a camera in another form, or one that no scene could
-            have.
-        OutputError: it cannot be written.
+        SceneError: ``path`` is no path, no frames, a frame without a size, or a wrong camera block.
+        OutputError: the file cannot be written.
     """
     place = as_path(path)
     if not isinstance(frames, Iterable):
@@ -134,7 +133,7 @@ def write_transforms(path: str | os.PathLike[str], frames: Iterable[Frame]) -> N
 
 
 def _number(path: Any, key: str, row: Mapping[str, Any], name: str) -> float | None:
-    """A number of a frame, where it has it."""
+    """Return a number of a frame; None where it is missing."""
     value = row.get(name)
     if value is None:
         return None
@@ -149,7 +148,7 @@ def _number(path: Any, key: str, row: Mapping[str, Any], name: str) -> float | N
 
 
 def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
-    """A frame of the file, of its own keys and those at the top."""
+    """Convert a frame of the file; ``row``: its keys merged over those at the top."""
     model = row.get("camera_model", _MODELS[0])
     if model not in _MODELS or row.get("is_fisheye"):
         raise AssetError(path, f"{key}: a camera of model {model!r} is not built; one of {', '.join(_MODELS)}")
@@ -180,7 +179,7 @@ def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
 
 
 def _inner(known: Mapping[str, float], size: tuple[int, int]) -> list[list[float]]:
-    """``K``: along each axis what is said of it, in pixels, as an angle, or along the other axis."""
+    """Return ``K``; the focal length along an axis is that in pixels, else that of the angle, else that of the other axis."""
     focal: list[float | None] = []
     for axis, side in zip("xy", size, strict=True):
         angle = known.get(f"camera_angle_{axis}")
@@ -191,14 +190,14 @@ def _inner(known: Mapping[str, float], size: tuple[int, int]) -> list[list[float
 
 
 def _plain(value: Any) -> Any:
-    """Tensors and arrays as numbers and lists of them."""
+    """Convert tensors and arrays to numbers and lists."""
     if isinstance(value, Tensor | np.ndarray):
         return value.tolist()
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _file(image: Any, key: str) -> str:
-    """A picture's file as it is written: with slashes, whatever the system has."""
+    """Return the path of an image as text, with forward slashes."""
     found = image.as_posix() if isinstance(image, PurePath) else image
     found = os.fspath(found) if isinstance(found, str | os.PathLike) else None
     if not isinstance(found, str):
@@ -207,7 +206,7 @@ def _file(image: Any, key: str) -> str:
 
 
 def _row(frame: Frame, key: str) -> dict[str, Any]:
-    """A frame as the file has it."""
+    """Convert a frame to its form in the file."""
     if not isinstance(frame, Frame):
         raise SceneError(key, frame, "a Frame, of frame_of(scene, image) or read_transforms")
     wide, tall = size_of(frame.size, f"{key}.size")
@@ -230,7 +229,7 @@ def _row(frame: Frame, key: str) -> dict[str, Any]:
 
 
 def _seen(block: Any, size: tuple[int, int], key: str) -> tuple[Tensor, Tensor]:
-    """``K (3, 3)`` on a film of ``size`` and camera to world ``(4, 4)`` of a block, read as a scene reads it."""
+    """Read a camera block as a scene does; return ``K (3, 3)`` on a film of ``size``, and camera to world ``(4, 4)``."""
     from torchpt.physics.cameras.kinds.perspective import Perspective
 
     if not isinstance(block, Mapping):

@@ -1,4 +1,4 @@
-"""Parameters of a scene that were replaced, or changed in place: checked once for each change."""
+"""Check parameters of a scene that were replaced or changed in place, once for each change."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["check_tensor", "inherited_checks", "validate_changes"]
 
 
 def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], texels: bool = False) -> None:
-    """Refuse what is no floating tensor of a shape, for a parameter; ``texels``: that might have its place.
+    """Check that a parameter's value is a dense floating tensor of a shape; ``texels``: errors mention texels as well.
 
     Raises:
-        SceneError: it is not, or it holds no numbers.
+        SceneError: it is not, or it is on the device meta.
     """
     found, dense, others = value, True, ", or texels (H, W, C)" if texels else ""
     if isinstance(value, Tensor):
@@ -30,13 +30,13 @@ def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], 
             return
         found = "a tensor on the device meta" if value.is_meta else (tuple(value.shape), value.dtype)
         found = found if dense else f"a {value.layout} tensor"
-        others = "" if floats and value.dim() == 3 else others  # texels were looked at before
+        others = "" if floats and value.dim() == 3 else others  # texels were checked before
     kind = "floating tensor" if dense else "dense floating tensor"
     raise SceneError(f"params.{name}", found, f"a {kind} of shape {tuple(shape)}{others}")
 
 
 def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:
-    """Check what was not yet; ``validated_versions`` is brought up to date: by name the edition that was checked.
+    """Check the parameters whose version differs from ``validated_versions``, and update that mapping.
 
     Raises:
         SceneError: see :meth:`Scene.check_own`.
@@ -58,7 +58,7 @@ def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:
 
 
 def inherited_checks(made: Scene, scene: Scene, validated_versions: dict[str, int]) -> dict[str, int]:
-    """Of what was checked of a scene, that which another one made of it has too: the same tensors, as they were checked."""
+    """Return the validated versions of a scene ``made`` from another, for the tensors that both share."""
     before, now = scene.versions(), made.versions()
     return {
         name: version

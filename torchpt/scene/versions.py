@@ -1,4 +1,4 @@
-"""Which of a scene's tensors are others than they were, or were changed in place."""
+"""Count versions of a scene's tensors, to find those that were replaced or changed in place."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from torchpt.core.errors import RenderError
 
 __all__ = ["AFTER", "VersionCounter", "changed_versions", "check_unchanged"]
 
-#: Since when a scene may not have changed whose gradient is asked for.
+#: Phrase for errors of a backward pass.
 AFTER = "after the picture whose gradient is asked for"
 
 
 def changed_versions(before: Mapping[str, int], now: Mapping[str, int]) -> dict[str, int]:
-    """Of editions, those that are others than before, and those of which nobody can tell."""
+    """Return the versions that differ from ``before``, and those that cannot be compared (0 or negative)."""
     return {name: version for name, version in now.items() if not 0 < version == before.get(name)}
 
 
 def check_unchanged(before: Mapping[str, int], now: Mapping[str, int], since: str) -> None:
-    """Refuse to go on with another scene than it was.
+    """Raise where parameters have changed.
 
     Args:
-        before: editions that are to be the same.
-        now: those of all parameters.
-        since: when they were taken, for the error.
+        before: versions that must not have changed.
+        now: versions of all parameters.
+        since: phrase of when ``before`` was taken, for the error.
 
     Raises:
-        RenderError: one of the scene's own parameters was replaced, or changed in place.
+        RenderError: a parameter was replaced or changed in place.
     """
     for name, version in before.items():
         if now.get(name) != version:
@@ -38,15 +38,15 @@ def check_unchanged(before: Mapping[str, int], now: Mapping[str, int], since: st
 
 
 class VersionCounter:
-    """Numbers what tensors hold, by their names, as far as it is asked for."""
+    """Counter of versions of named tensors."""
 
     def __init__(self) -> None:
-        self._latest: dict[str, tuple[ref[Tensor], int, int]] = {}  # tensor, its version, number
+        self._latest: dict[str, tuple[ref[Tensor], int, int]] = {}  # tensor, torch's version, ours
 
     def of(self, params: Mapping[str, Tensor]) -> dict[str, int]:
-        """By name a number, which is another one once there is another tensor, or torch counts a change in place.
+        """Return version numbers by name; one changes when its tensor is replaced, or changed in place by torch's count.
 
-        Tensors of ``torch.inference_mode`` count no changes: their numbers are negative. That of what is no tensor is 0.
+        Tensors of ``torch.inference_mode`` do not count changes; their versions are negative. Other objects have version 0.
         """
         found: dict[str, int] = {}
         for name, value in params.items():

@@ -1,4 +1,4 @@
-"""A scene through another camera: all but that is shared."""
+"""Views of a scene through another camera."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 from torchpt.core.errors import SceneError
 from torchpt.physics.parts import Parameters
 from torchpt.scene.build import SceneBuild
+from torchpt.scene.dict_tensors import params_from_tensors, with_all_intrinsics
 from torchpt.scene.formats.cameras import read_camera
 from torchpt.scene.formats.description import Description
 from torchpt.scene.formats.tensors import DictTensors
 from torchpt.scene.formats.yaml import plain
-from torchpt.scene.params_from_tensors import params_from_tensors, with_all_intrinsics
 
 __all__ = ["view_attributes"]
 
@@ -28,17 +28,17 @@ def view_attributes(
     camera: Mapping[str, Any],
     film: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """What of a scene another camera changes, by attribute: its description, what that came to, its parameters.
+    """Return the attributes of a scene that another camera changes: description, build and parameters.
 
     Args:
-        description: of the scene.
-        built: what it came to.
-        params: its tensors.
-        camera: the block of the other camera, as written.
-        film: film settings in place of the scene's own.
+        description: the scene's.
+        built: the scene's.
+        params: the scene's parameters.
+        camera: block of the other camera, as in a scene file.
+        film: film settings that override the scene's.
 
     Raises:
-        SceneError: what is wrong with the camera, or with the film.
+        SceneError: a wrong camera block or film.
     """
     if not isinstance(film, Mapping):
         raise SceneError("film", film, "a mapping")

@@ -1,11 +1,11 @@
-"""What kinds of things declare: their parameters, once, and the tables that find the kinds.
+"""Declarations of parameters, and the tables that find the kinds that declare them.
 
 A *kind* is a class with a ``name`` (its ``type`` in a scene file) and ``parameters`` (a :class:`Spec` by name), one a file in
-the folder ``kinds/`` of its room. Schema, errors, defaults, the checks of ``scene.params``, what a gradient must know, config
-files and the tables of the docs are made of these.
+the folder ``kinds/`` of its package. The schema of scene files, errors, defaults, the checks of ``scene.params``, config files
+and the tables of the docs are all made from these declarations; gradients read from them what a parameter moves.
 
-``parameters.py`` has the specs: start there. ``schema.py`` has the tables of kinds and reads whole blocks; ``reading.py`` reads
-plain numbers; ``arguments.py`` spells the signatures of functions whose arguments are declared.
+Start with ``parameters.py``, which has the specs. ``schema.py`` has the tables of kinds and reads whole blocks; ``reading.py``
+reads plain values; ``arguments.py`` writes the signatures of functions whose keyword arguments are declared.
 
 May import: ``core``, ``math``.
 """

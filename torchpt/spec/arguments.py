@@ -1,7 +1,7 @@
-"""Keyword arguments that are declared once, in a ``TypedDict``: a static type and, by ``Annotated``, a spec for each.
+"""Declare keyword arguments once, in a ``TypedDict``: a static type and, by ``Annotated``, a spec for each.
 
-A function takes them as ``**options: Unpack[Form]``. Type checkers read the form; what is seen at run time
-(``inspect.signature``, ``help``), checks and tables are made of it here.
+A function takes them as ``**options: Unpack[Form]``. Type checkers read the form; the run-time signature
+(``inspect.signature``, ``help``), checks and tables are made from it here.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class Argument(Spec):
-    """Spec of an argument of a call in Python that is no setting of a scene file; ``words`` say what is accepted.
+    """Spec of an argument that only Python calls take, no scene file; ``words`` say what is accepted.
 
     Attributes:
-        fits: whether a value is accepted.
+        fits: returns True for a value that is accepted.
     """
 
     fits: Callable[[Any], bool] = field(default=lambda _: True, kw_only=True, hash=False)
@@ -45,11 +45,11 @@ class Argument(Spec):
 
 @dataclass(frozen=True)
 class DeclaredArgument:
-    """A keyword argument.
+    """A keyword argument as its ``TypedDict`` declares it.
 
     Attributes:
-        type: as it is annotated.
-        spec: what is accepted, and what stands for None.
+        type: its annotation, without the spec.
+        spec: says what is accepted and which value None stands for.
     """
 
     type: Any
@@ -57,24 +57,24 @@ class DeclaredArgument:
 
     @property
     def default(self) -> Any:
-        """Return the default in Python: None where that may be given, as a scene file may say it, else the spec's own."""
+        """Return the default in Python: None where the type allows it (the scene file may set the value), else the spec's."""
         return None if type(None) in get_args(self.type) else self.spec.default
 
     @property
     def accepted(self) -> str:
-        """Return what is accepted besides None, in words."""
+        """Return a phrase of what is accepted besides None."""
         return self.spec.expected.removeprefix("null or ").removeprefix("null, ")
 
     @property
     def stands_for(self) -> str:
-        """Return what None, as the default, stands for; "" where that is for no value."""
+        """Return a phrase of the value that None, as the default, stands for; "" where there is none."""
         return "" if self.default is not None or self.spec.default is None else f"None: {self.spec.default}"
 
     def read(self, value: Any) -> Any:
-        """Return a value as it was given, checked.
+        """Check a value and return it; the spec's default for None.
 
         Raises:
-            Refused: it is not accepted.
+            Refused: the value is not accepted.
         """
         return self.spec.default if value is None and self.default is None else self.spec.read(value)
 
@@ -84,7 +84,7 @@ def arguments_of(form: Any) -> dict[str, DeclaredArgument]:
     """Return the arguments that a ``TypedDict`` declares by name, those of its bases first.
 
     Raises:
-        TypeError: one without a spec.
+        TypeError: an argument without a spec.
     """
     found: dict[str, DeclaredArgument] = {}
     for name, hint in get_type_hints(form, include_extras=True).items():
@@ -115,16 +115,16 @@ def expand_signature(function: F) -> F:
 
 
 def check_names(call: str, given: Collection[str], form: Any, own: Collection[str] = ()) -> None:
-    """Refuse arguments that a form does not declare, in Python's own words.
+    """Raise Python's own error for arguments that a form does not declare, with the closest name.
 
     Args:
-        call: who takes them, such as ``render_batch``.
-        given: names that were given.
-        form: a ``TypedDict``.
-        own: names that ``call`` takes itself, which may be meant.
+        call: name of the function, such as ``render_batch``.
+        given: names of the arguments of this call.
+        form: the ``TypedDict``.
+        own: further arguments of ``call``, as suggestions.
 
     Raises:
-        TypeError: an unknown one.
+        TypeError: an unknown argument.
     """
     known = arguments_of(form)
     for name in given:

@@ -1,4 +1,4 @@
-"""The parameters that kinds declare: numbers, colours, places, choices, and how each is read, checked and converted."""
+"""Specs of the parameters that kinds declare: numbers, colours, points, poses, choices; each reads and checks its values."""
 
 from __future__ import annotations
 
@@ -46,25 +46,25 @@ __all__ = [
 ]
 
 
-# ---- What a spec is: one parameter of a kind, and what it accepts
+# ---- Spec: the declaration of one parameter
 
 
 class Moves(Enum):
-    """What a parameter moves: what the derivative with respect to it must follow, or cannot."""
+    """The geometry that a parameter moves, which its derivative must follow."""
 
     NOTHING = 0
-    SURFACES = 1  #: or the camera: points slide, and silhouettes move
-    SHADOWS = 2  #: a light: shadow edges move, and no point does
-    RAYS = 3  #: rays that a delta lobe sends on
+    SURFACES = 1  #: surfaces or the camera: hit points and silhouettes move
+    SHADOWS = 2  #: a light: edges of shadows move, hit points do not
+    RAYS = 3  #: the directions that a delta lobe samples
 
 
 class Role(enum.Flag):
-    """What a setting has to do with the samples of a picture."""
+    """The influence of a setting on the samples of a picture."""
 
     NONE = 0
-    FREE = enum.auto()  #: nothing: no sample depends on it
-    ENDS = enum.auto()  #: it is a stop rule: it may end a render before ``spp`` samples are taken
-    FILES = enum.auto()  #: it says which files are written on the way
+    FREE = enum.auto()  #: no sample depends on it
+    ENDS = enum.auto()  #: a stop rule: it may end a render before ``spp`` samples are taken
+    FILES = enum.auto()  #: it decides which files are written during the render
 
 
 class _Required(Enum):
@@ -74,23 +74,23 @@ class _Required(Enum):
         return "required"
 
 
-#: In place of a default: a value must be given.
+#: Stands in place of a default where a value must be given.
 REQUIRED = _Required.REQUIRED
 
 
 @dataclass(frozen=True)
 class Spec:
-    """One parameter.
+    """Declaration of one parameter.
 
     Attributes:
-        default: its value where none is given: :data:`REQUIRED`, None (it may be left out), a value, or a function of the
-            other values by name.
-        doc: what it is, for tables and help: a phrase without a full stop.
-        texture: whether a texture may give it.
-        length: whether it is a length in the scene's units.
-        moves: what changes place with it.
-        words: what errors say is accepted; by default made of the bounds.
-        role: of a run setting.
+        default: the value of a key that is left out: a value, None (stays unset), a function of the dict of the other
+            values, or :data:`REQUIRED`.
+        doc: description for tables and help: a phrase without a full stop.
+        texture: True where a texture may give the value.
+        length: True for a length in the scene's units.
+        moves: the geometry that the parameter moves.
+        words: phrase of what is accepted, for errors; by default made from the bounds.
+        role: influence of a run setting on samples.
     """
 
     default: Any = REQUIRED
@@ -101,47 +101,47 @@ class Spec:
     words: str = field(default="", kw_only=True)
     role: Role = field(default=Role.NONE, kw_only=True)
 
-    #: Whether it is a tensor of ``scene.params``; else it is fixed once the scene is loaded.
+    #: True for a tensor of ``scene.params``; else the value is fixed once the scene is loaded.
     differentiable: ClassVar[bool] = False
-    #: Whether it is a place, in the scene's own coordinates: kept in float64 where the scene lies far from the origin.
+    #: True for a position in the scene's own coordinates: kept in float64 where the scene lies far from the origin.
     place: ClassVar[bool] = False
-    #: How many channels of a texture it takes.
+    #: True where it takes three channels of a texture, else one.
     coloured: ClassVar[bool] = False
-    #: Whether a texture's numbers stand for no colours, so that 8-bit files are not decoded.
+    #: True where texels are plain numbers, so that 8-bit image files are read without sRGB decoding.
     linear: ClassVar[bool] = True
 
     @property
     def accepted(self) -> str:
-        """What is accepted, in words."""
+        """Return a phrase of what is accepted, without textures."""
         raise NotImplementedError
 
     @property
     def expected(self) -> str:
-        """The same, with a texture where one may stand."""
+        """Return a phrase of all that is accepted, textures included; errors print it."""
         return f"{self.words or self.accepted}{', or a texture' if self.texture else ''}"
 
     @property
     def brief(self) -> str:
-        """The same without lists of names, for tables."""
+        """Return :attr:`expected` without lists of names, for tables."""
         return self.expected
 
     def read(self, value: Any) -> Any:
-        """A value as written, checked.
+        """Check a value as a scene file or a caller writes it, and return it converted.
 
         Raises:
-            Refused: it is not accepted.
+            Refused: the value is not accepted.
         """
         raise NotImplementedError
 
     def check(self, value: Tensor) -> None:
-        """Refuse numbers that no scene file could hold, in a tensor that takes the parameter's place.
+        """Check the numbers of a tensor that is to replace the parameter in ``scene.params``.
 
         Raises:
-            Refused: says what is accepted.
+            Refused: numbers that a scene file could not hold.
         """
 
 
-# ---- Specs of numbers: one, three for a colour, or the texels of an image; in a range
+# ---- Specs of numbers in a range: scalars, colours, the texels of an image
 
 
 @dataclass(frozen=True)
@@ -149,10 +149,10 @@ class _Numbers(Spec):
     """Numbers in a range.
 
     Attributes:
-        low: least that is accepted; None: any.
-        high: greatest.
-        above: what all must be above.
-        below: what all must be below.
+        low: closed lower bound; None: none.
+        high: closed upper bound; None: none.
+        above: open lower bound; None: none.
+        below: open upper bound; None: none.
     """
 
     low: float | None = field(default=0.0, kw_only=True)
@@ -163,13 +163,13 @@ class _Numbers(Spec):
     differentiable: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if isinstance(self.default, int | float) and not isinstance(self.default, bool):  # as a file's would be read
+        if isinstance(self.default, int | float) and not isinstance(self.default, bool):  # convert it as `read` does
             grey = float(self.default)
             object.__setattr__(self, "default", (grey, grey, grey) if self.coloured else grey)
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Least and greatest number that float32 holds among those accepted, open ends included."""
+        """Return the closed bounds, with the limits of float32 for missing ones."""
         return -LARGEST if self.low is None else self.low, LARGEST if self.high is None else self.high
 
     @property
@@ -186,7 +186,7 @@ class _Numbers(Spec):
         return f" {words}" if words else ""
 
     def _fits(self, number: float) -> bool:
-        """Whether a number is in the range, as the float32 that it becomes."""
+        """Return True for a number that lies in the range after rounding to float32."""
         low, high = self.bounds
         if not low <= number <= high:
             return False
@@ -200,7 +200,7 @@ class _Numbers(Spec):
         if not bool(torch.isfinite(value.float()).all()):
             raise Refused("numbers finite in float32", "a value that is not finite in float32")
         low, high = self.bounds
-        # What is rounded on its way here is not refused for it.
+        # Rounding on the way here must not get a value refused.
         slack = getattr(self, "slack", 0.0)
         bad = (value < low - 1e-6 * abs(low) - slack) | (value > high + 1e-6 * abs(high) + slack)
         rounded = value.float()
@@ -215,7 +215,7 @@ class _Numbers(Spec):
 
 @dataclass(frozen=True)
 class Scalar(_Numbers):
-    """A number."""
+    """A single number."""
 
     @property
     def accepted(self) -> str:
@@ -232,7 +232,7 @@ class Scalar(_Numbers):
 
 @dataclass(frozen=True)
 class Color(_Numbers):
-    """A linear RGB colour: three numbers, or one for all."""
+    """A linear RGB colour: three numbers, or one for all channels."""
 
     coloured: ClassVar[bool] = True
     linear: ClassVar[bool] = False
@@ -271,7 +271,7 @@ class Index(Scalar):
     """An index of refraction: a number, or the name of a medium.
 
     Attributes:
-        media: index of refraction by name, in lower case.
+        media: indices of refraction by the medium's name in lower case.
     """
 
     low: float | None = field(default=1e-3, kw_only=True)
@@ -310,10 +310,10 @@ class Index(Scalar):
 
 @dataclass(frozen=True)
 class Texels(_Numbers):
-    """An image ``(H, W, C)`` that a file holds: never written in a scene, but a tensor of it.
+    """An image ``(H, W, C)``: comes from a file, and is a tensor of ``scene.params``.
 
     Attributes:
-        slack: how far beyond the range is taken for rounding.
+        slack: tolerance for rounding beyond the bounds.
     """
 
     slack: float = field(default=0.0, kw_only=True)
@@ -325,10 +325,10 @@ class Texels(_Numbers):
 
 
 def spec_of(value: Any) -> Spec:
-    """A spec, or the plain default that stands for one: a number, or three for a colour; without bounds, or a texture.
+    """Return a spec unchanged; for a plain default (a number, or three for a colour) an unbounded spec that takes textures.
 
     Raises:
-        Refused: neither.
+        Refused: neither a spec nor such a default.
     """
     if isinstance(value, Spec):
         return value
@@ -338,7 +338,7 @@ def spec_of(value: Any) -> Spec:
     return Scalar(reading.number(value, expected), low=None, texture=True)
 
 
-# ---- Specs of places: points, directions, poses, and the vertices of a mesh
+# ---- Specs of geometry: points, directions, poses, and the vertices of a mesh
 
 
 @dataclass(frozen=True)
@@ -361,7 +361,7 @@ class _Vector(Spec):
 
 @dataclass(frozen=True)
 class Point(_Vector):
-    """A point of the scene."""
+    """A point in the scene's coordinates."""
 
     place: ClassVar[bool] = True
 
@@ -373,7 +373,7 @@ class Point(_Vector):
 
 @dataclass(frozen=True)
 class Direction(_Vector):
-    """A direction; its length does not matter."""
+    """A direction of any length but zero."""
 
     @property
     def accepted(self) -> str:
@@ -396,7 +396,7 @@ class Direction(_Vector):
 
 @dataclass(frozen=True)
 class Vertices(_Vector):
-    """Points ``(V, 3)`` of a mesh in its own space."""
+    """Vertex positions ``(V, 3)`` of a mesh in its own space."""
 
     moves: Moves = field(default=Moves.SURFACES, kw_only=True)
 
@@ -414,20 +414,20 @@ class Vertices(_Vector):
 
 @dataclass(frozen=True)
 class VertexAttribute(Vertices):
-    """Normals ``(V, 3)`` or coordinates ``(V, 2)`` of a mesh: a tensor of the scene where its gradients are wanted."""
+    """Vertex normals ``(V, 3)`` or texture coordinates ``(V, 2)`` of a mesh."""
 
     place: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
 class Pose(Spec):
-    """Where a thing stands: ``(4, 4)``, from its own space to the world.
+    """A transform ``(4, 4)`` from an object's own space to the world.
 
     Attributes:
-        angles: whether it must keep angles (rotation, reflection, uniform scale).
-        rigid: whether a tensor in its place must keep lengths too (rotation, reflection). What is written is not held to it
-            here: kinds say what goes with a pose, and how a scale is meant.
-        operations: whether it is written as a list of operations; else as a matrix.
+        angles: True where it must keep angles (rotation, reflection, uniform scale).
+        rigid: True where a tensor that replaces it must keep lengths too (rotation, reflection). Values in files are not
+            checked for it here: a kind may read a scale in its own way.
+        operations: True where files give a list of operations or a matrix; else a matrix only.
     """
 
     angles: bool = field(default=False, kw_only=True)
@@ -469,12 +469,12 @@ class Pose(Spec):
             raise Refused("a pose without scale or shear (torchpt.nn.Renderer keeps one so)", matrix.tolist())
 
 
-# ---- Specs of what is fixed once a scene is loaded: flags, words, whole numbers, files, and whatever a function reads
+# ---- Specs of values that are fixed once a scene is loaded: flags, names, whole numbers, files, and values with a reader
 
 
 @dataclass(frozen=True)
 class Flag(Spec):
-    """True or false."""
+    """A boolean."""
 
     @property
     def accepted(self) -> str:
@@ -488,11 +488,11 @@ class Flag(Spec):
 
 @dataclass(frozen=True)
 class Choice(Spec):
-    """One of some words.
+    """One of several names.
 
     Attributes:
-        names: the words.
-        booleans: which word a YAML boolean stands for.
+        names: the names.
+        booleans: the name that each YAML boolean stands for.
     """
 
     names: tuple[str, ...] = field(default=(), kw_only=True)
@@ -514,12 +514,12 @@ class Choice(Spec):
 
 @dataclass(frozen=True)
 class Integer(Spec):
-    """A whole number in a range, or one of some other values.
+    """A whole number in a range, or one of a few other values.
 
     Attributes:
-        low: least.
-        high: greatest.
-        also: what else is accepted.
+        low: smallest number, included.
+        high: largest number, included.
+        also: other values that are accepted.
     """
 
     low: int = field(default=0, kw_only=True)
@@ -550,7 +550,7 @@ class Pair(Spec):
     """Two numbers, along u and along v.
 
     Attributes:
-        single: whether one number stands for both.
+        single: True where one number may stand for both.
     """
 
     single: bool = field(default=False, kw_only=True)
@@ -567,7 +567,7 @@ class Pair(Spec):
 
 @dataclass(frozen=True)
 class Path(Spec):
-    """A file's path, or several of which the first that is there is used."""
+    """The path of a file, or a list of paths of which the first that exists is used."""
 
     @property
     def accepted(self) -> str:
@@ -581,12 +581,12 @@ class Path(Spec):
 
 @dataclass(frozen=True)
 class Map(Spec):
-    """A texture that gives numbers, or its name; read by whoever reads textures (:data:`torchpt.spec.schema.ReadTexture`)."""
+    """A texture of numbers, or its name; :data:`torchpt.spec.schema.ReadTexture` reads it."""
 
     texture: bool = field(default=True, kw_only=True)
     words: str = field(default="the name of a texture", kw_only=True)
 
-    #: Numbers that it may give, as of a number that a texture may give.
+    #: Bounds of its numbers, as those of a :class:`Scalar` with a texture.
     bounds: ClassVar[tuple[float, float]] = (-LARGEST, LARGEST)
 
     def read(self, value: Any) -> Any:
@@ -596,10 +596,10 @@ class Map(Spec):
 
 @dataclass(frozen=True)
 class Custom(Spec):
-    """Whatever a function reads.
+    """A value with a reader of its own.
 
     Attributes:
-        reader: from the value as written to the parameter's; raises :class:`Refused`.
+        reader: returns the parameter's value for the value as written; raises :class:`Refused`.
     """
 
     reader: Callable[[Any], Any] = field(default=lambda value: value, kw_only=True, hash=False)

@@ -1,4 +1,4 @@
-"""Plain values read: each function takes what a file or a caller gave to a value, or says what is accepted instead.
+"""Read plain values: each function checks and converts a value from a file or a caller, or raises :class:`Refused`.
 
 Numbers are strict: no booleans, no numeric text, nothing that is not finite in float32.
 """
@@ -42,10 +42,10 @@ class Refused(ValueError):
     """A value that is not accepted.
 
     Attributes:
-        expected: what is.
-        value: the part of it that is wrong; ``...``: all of it.
-        at: where in it that part lies.
-        not_built: whether it would be right in a version that builds more.
+        expected: phrase of what is accepted.
+        value: the element that is wrong; ``...``: the whole value.
+        at: keys and indices that lead to that element.
+        not_built: True where the format knows the value and this version does not support it.
     """
 
     def __init__(
@@ -56,12 +56,12 @@ class Refused(ValueError):
 
 
 def as_refused(error: SceneError) -> Refused:
-    """The same refusal of a part of a value, by its key relative to the value."""
+    """Return a :class:`Refused` for an error about an element, with the element's key relative to the value."""
     return Refused(error.expected, error.value, tuple(part for part in error.key.split(".") if part))
 
 
 def number(value: Any, expected: str = "a finite number") -> float:
-    """A finite float from an int or float (numpy's too), never from a boolean or text."""
+    """Return a finite float from an int or float (numpy's too), never from a boolean or text."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
         raise Refused(expected)
     if not -LARGEST <= value <= LARGEST:  # false for NaN too
@@ -70,7 +70,7 @@ def number(value: Any, expected: str = "a finite number") -> float:
 
 
 def vector(value: Any, expected: str = "three finite numbers [x, y, z]") -> tuple[float, float, float]:
-    """Three finite numbers from a list, tuple or array."""
+    """Return three finite numbers from a list, tuple or array."""
     if not isinstance(value, list | tuple | np.ndarray) or len(value) != 3:
         raise Refused(expected)
     x, y, z = (number(item, expected) for item in value)
@@ -78,7 +78,7 @@ def vector(value: Any, expected: str = "three finite numbers [x, y, z]") -> tupl
 
 
 def bounded(value: Any, low: float, high: float, expected: str) -> float:
-    """A finite float in ``low..high``."""
+    """Return a finite float in ``low..high``."""
     result = number(value, expected)
     if not low <= result <= high:
         raise Refused(expected)
@@ -86,7 +86,7 @@ def bounded(value: Any, low: float, high: float, expected: str) -> float:
 
 
 def pair(value: Any, expected: str, *, single: bool = False) -> tuple[float, float]:
-    """Two finite numbers; with ``single`` one number stands for both."""
+    """Return two finite numbers; with ``single`` one number may stand for both."""
     if single and not isinstance(value, list | tuple | np.ndarray):
         value = (value, value)
     if not isinstance(value, list | tuple | np.ndarray) or len(value) != 2:
@@ -95,7 +95,7 @@ def pair(value: Any, expected: str, *, single: bool = False) -> tuple[float, flo
 
 
 def file_paths(value: Any) -> tuple[str, ...]:
-    """One file path, or a list of candidates of which the first existing one is used."""
+    """Return file paths, from one path or a list of candidates of which the first that exists is to be used."""
     paths = tuple(value) if isinstance(value, list | tuple) else (value,)
     if not paths or not all(isinstance(path, str) and path.strip() and path.isprintable() for path in paths):
         raise Refused("a file path, or a list of them (the first that is there is used)")
@@ -103,21 +103,21 @@ def file_paths(value: Any) -> tuple[str, ...]:
 
 
 def flag(value: Any) -> bool:
-    """A boolean."""
+    """Return a boolean."""
     if not isinstance(value, bool):
         raise Refused("true or false")
     return value
 
 
 def text(value: Any) -> str:
-    """A line of text that is not blank."""
+    """Return a line of text that is not blank."""
     if not isinstance(value, str) or not value.strip() or not value.isprintable():
         raise Refused("printable text")
     return value
 
 
 def transform(value: Any, device: torch.device | None = None) -> Any:
-    """Return a list of operations, or a matrix, as one ``(4, 4)``; both as :func:`torchpt.math.transforms.compose` has them."""
+    """Return the ``(4, 4)`` of a matrix or of a list of operations as in :func:`torchpt.math.transforms.compose`."""
     rows = list | np.ndarray | Tensor
     if isinstance(value, np.ndarray | Tensor) or (isinstance(value, list) and value and isinstance(value[0], rows)):
         return matrix(value) if device is None else transforms.matrix4(value, "", device)
@@ -128,7 +128,7 @@ def transform(value: Any, device: torch.device | None = None) -> Any:
 
 
 def matrix(value: Any) -> NDArray[np.float64]:
-    """An affine ``(4, 4)`` matrix that can be inverted."""
+    """Return an affine ``(4, 4)`` matrix that can be inverted."""
     try:
         found = transforms.matrix4(value, "")
     except SceneError as error:
@@ -139,7 +139,7 @@ def matrix(value: Any) -> NDArray[np.float64]:
 
 
 def rows(value: Any, columns: int, what: str) -> NDArray[np.float64]:
-    """``(V, columns)`` float64 from nested lists or an array; checked and converted in bulk."""
+    """Return ``(V, columns)`` float64 from nested lists or an array, checked and converted in bulk."""
     expected = f"a list of {what}, finite numbers each"
     if isinstance(value, list | tuple):
         if not value or not set(map(type, value)) <= {list, tuple} or set(map(len, value)) != {columns}:
@@ -162,14 +162,14 @@ def rows(value: Any, columns: int, what: str) -> NDArray[np.float64]:
 
 
 def _first_bad(value: Any, columns: int, expected: str) -> None:
-    """Raises for the first row of a list that is not ``columns`` numbers."""
+    """Raise for the first row of a list that is not ``columns`` numbers."""
     for index, row in enumerate(value):
         if not isinstance(row, list | tuple) or len(row) != columns or not all(type(x) in (int, float) for x in row):
             raise Refused(expected, row, (index,))
 
 
 def faces(value: Any) -> NDArray[np.int64]:
-    """``(F, 3)`` int64 from lists of three or more indices; polygons are split into fans."""
+    """Return triangles ``(F, 3)`` int64 from lists of three or more indices; polygons are split into fans."""
     expected = "a list of faces, each three or more vertex indices (whole numbers >= 0)"
     if isinstance(value, list | tuple):
         lists = bool(value) and set(map(type, value)) <= {list, tuple}
@@ -196,7 +196,7 @@ _SIZE = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([kKMGT]?)(i?)[bB]?\s*\Z")
 
 
 def memory_size(value: Any) -> int | None:
-    """Bytes from a whole number or text such as ``4GB`` (10^9) or ``512 MiB`` (2^20)."""
+    """Return bytes from a whole number or text such as ``4GB`` (10^9) or ``512 MiB`` (2^20); None for None."""
     expected = "null, a number of bytes, or a size such as 4GB or 512MiB"
     if value is None:
         return None

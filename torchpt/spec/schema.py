@@ -1,4 +1,4 @@
-"""Kinds and their values: tables of kinds, declarations read by name, and checks of whole blocks."""
+"""Find kinds by name, collect the parameters that they declare, and read whole blocks of a scene file by them."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ __all__ = [
 ]
 
 
-# ---- Tables of kinds: the files of a folder, each imported when its kind is asked for
+# ---- Tables of kinds: the files of a folder, each imported when its kind is looked up
 
 
 K = TypeVar("K")
 
 
 class Kinds(Mapping[str, type[K]], Generic[K]):
-    """The kinds in a folder by name: ``point`` is the class with ``name = "point"`` in ``point.py``.
+    """Mapping of the kinds in a folder by name: ``point`` is the class with ``name = "point"`` in ``point.py``.
 
     Args:
         package: the folder, as a dotted name.
-        first: names that lists begin with; the others follow in the alphabet's order.
+        first: names that lists begin with; the others follow in alphabetical order.
     """
 
     def __init__(self, package: str, first: tuple[str, ...] = ()) -> None:
@@ -61,7 +61,7 @@ class Kinds(Mapping[str, type[K]], Generic[K]):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of all kinds; nothing is imported for it but the folder itself."""
+        """Return the names of all kinds, without importing their files."""
         found = find_spec(self.package)
         assert found is not None and found.submodule_search_locations is not None
         every = [module.name for module in iter_modules(list(found.submodule_search_locations))]
@@ -89,7 +89,7 @@ class Kinds(Mapping[str, type[K]], Generic[K]):
         return name in self.names
 
     def file(self, name: str) -> Path:
-        """The file of a kind."""
+        """Return the path of the file that defines a kind."""
         return Path(str(import_module(f"{self.package}.{name}").__file__))
 
 
@@ -98,10 +98,10 @@ def _named(kind: type[Any], module: Any, name: str) -> bool:
 
 
 def parameters_of(kind: Any) -> dict[str, Spec]:
-    """What a kind declares, that of the classes it is made of first.
+    """Return the parameters that a kind declares, those of its base classes first.
 
     Args:
-        kind: a class, or an instance where each declares parameters of its own.
+        kind: a class, or an instance that declares parameters of its own.
     """
     own = kind if isinstance(kind, type) else type(kind)
     found = dict(_of_class(own))
@@ -125,10 +125,10 @@ def _specs_in(names: Mapping[str, Any]) -> dict[str, Spec]:
 
 @dataclass(frozen=True)
 class Block(Spec):
-    """A mapping with parameters of its own.
+    """Spec of a nested mapping.
 
     Attributes:
-        kind: what declares them.
+        kind: declares the parameters of the mapping.
     """
 
     kind: Any = field(default=None, kw_only=True)
@@ -146,10 +146,10 @@ class FrozenConfig:
     """A frozen record with an attribute for each parameter that its class declares.
 
     Args:
-        values: of the parameters, as they are once read; those left out have their defaults.
+        values: values of parameters as :meth:`Spec.read` returns them; the others have their defaults.
 
     Raises:
-        TypeError: a value of no parameter, or none for one that must be given.
+        TypeError: an unknown parameter, or no value for a required one.
     """
 
     parameters: ClassVar[Mapping[str, Spec]] = {}
@@ -171,11 +171,11 @@ class FrozenConfig:
 
     @property
     def values(self) -> dict[str, Any]:
-        """Of the parameters by name."""
+        """Return the values of all parameters by name."""
         return {name: self.__dict__[name] for name in parameters_of(type(self))}
 
     def but(self, **values: Any) -> Self:
-        """The same with some other values."""
+        """Return a copy with some values replaced."""
         return type(self)(**{**self.values, **values})
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -195,28 +195,28 @@ class FrozenConfig:
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """Refuse values that do not go together.
+        """Check values of several parameters against each other.
 
         Raises:
-            Refused: says which, and what is accepted.
+            Refused: values that exclude each other.
         """
 
 
-# ---- What plain values were read as, kept by what they say: the same surfaces and settings are read again and again
+# ---- Cache of results by plain values: the same materials and settings are read again and again
 
 
 T = TypeVar("T")
-#: Longer lists are data of their own: not worth a key.
+#: Longer lists are bulk data, which costs more to hash than to read.
 LONGEST = 64
-#: Values that are their own keys, beside their type: 1, 1.0 and true are not the same.
+#: Types whose values are hashed together with the type: 1, 1.0 and true are different.
 _PLAIN = frozenset((int, bool, str, type(None)))
 
 
 def frozen(value: Any) -> Hashable:
-    """A key that only values of the same types and numbers share, to the bit.
+    """Return a cache key that two values share only where their types and numbers are equal to the bit.
 
     Raises:
-        TypeError: something else than plain values in lists and dicts, or a long list.
+        TypeError: anything but plain values in lists and dicts, or a list longer than :data:`LONGEST`.
     """
     kind = type(value)
     if kind in _PLAIN:
@@ -232,10 +232,10 @@ def frozen(value: Any) -> Hashable:
 
 
 class ResultCache(Generic[T]):
-    """Results by what they were made of; the oldest ones go.
+    """A cache of results by the plain values that they were made from; the oldest entries are dropped.
 
     Args:
-        most: how many are kept.
+        most: largest number of entries.
     """
 
     def __init__(self, most: int) -> None:
@@ -243,12 +243,12 @@ class ResultCache(Generic[T]):
         self._known: dict[Hashable, T] = {}
 
     def get(self, names: Hashable, values: Any, make: Callable[[], T]) -> T:
-        """What ``make`` makes of ``values``, which it is not to keep or change; errors are not kept.
+        """Return the cached result for ``values``, or call ``make`` and cache what it returns; errors are not cached.
 
         Args:
-            names: what else it depends on, by identity or value.
-            values: plain ones; for others nothing is kept.
-            make: called where the result is not known.
+            names: everything else that the result depends on; hashable.
+            values: plain values; for others ``make`` is called each time.
+            make: computes the result; must neither keep nor change ``values``.
         """
         try:
             key = names, frozen(values)
@@ -262,16 +262,16 @@ class ResultCache(Generic[T]):
         return found
 
 
-# ---- Checks of mappings, and refusals as :class:`SceneError` with the key that is wrong
+# ---- Checks of mappings, and conversion of :class:`Refused` to a :class:`SceneError` with the dotted key
 
 
 def dotted(*parts: str | int) -> str:
-    """A dotted key; empty parts vanish."""
+    """Join names to a dotted key; empty ones are left out."""
     return ".".join(str(part) for part in parts if part != "")
 
 
 def check_keys(raw: Mapping[str, Any], known: Iterable[str], key: str, what: str, file: str | None) -> None:
-    """Raises a SceneError for the first key that is not known, with the known ones and the closest of them."""
+    """Raise a SceneError for the first unknown key, with the known keys and the closest one."""
     names = list(known)
     for name in raw:
         if name not in names:
@@ -281,7 +281,7 @@ def check_keys(raw: Mapping[str, Any], known: Iterable[str], key: str, what: str
 
 
 def scene_error(error: Refused, key: str, value: Any, file: str | None) -> SceneError:
-    """The refusal of a value as the error that names its key."""
+    """Return the scene error for a refused value at ``key``."""
     shown = value if error.value is ... else error.value
     kind = NotBuiltError if error.not_built else SceneError
     return kind(dotted(key, *error.at), shown, error.expected, file)
@@ -290,10 +290,10 @@ def scene_error(error: Refused, key: str, value: Any, file: str | None) -> Scene
 def refuse_not_built(
     raw: Mapping[str, Any], later: Mapping[str, object], key: str, available: str, file: str | None
 ) -> dict[str, Any]:
-    """The mapping without its planned keys, once none of them asks for anything.
+    """Return the mapping without the keys of ``later``, which the format knows and this version does not support.
 
     Raises:
-        NotBuiltError: a planned key whose value is neither null nor the one that asks for nothing.
+        NotBuiltError: such a key with a value that is neither null nor its neutral value.
     """
     for name, nothing in later.items():
         value = raw.get(name)
@@ -303,35 +303,34 @@ def refuse_not_built(
     return {name: value for name, value in raw.items() if name not in later}
 
 
-# ---- Mappings of a scene file as kinds and the values of their parameters: schema and errors made of what kinds declare
+# ---- Reading of blocks: the kind that ``type`` names, and the values of its parameters
 
 
 @dataclass(frozen=True)
 class ParsedParams:
-    """A thing of a scene file.
+    """A block of a scene file after reading: its kind, and the values of the kind's parameters.
 
     Attributes:
-        kind: what it is: a class that declares ``parameters``.
-        values: of all its parameters by name, defaults filled in.
-        given: names of those that the file states.
+        kind: the class (or instance) that declares ``parameters``.
+        values: values of all parameters by name, defaults filled in.
+        given: names of the parameters that the file sets.
     """
 
     kind: Any
     values: dict[str, Any]
-    given: frozenset[str] = field(
-        default=frozenset(), repr=False, metadata=NOT_FINGERPRINTED
-    )  # a default that is stated is no other one
+    # Not part of the fingerprint: a default that the file sets renders the same picture.
+    given: frozenset[str] = field(default=frozenset(), repr=False, metadata=NOT_FINGERPRINTED)
 
     @property
     def name(self) -> str:
-        """Its ``type``."""
+        """Return its ``type``."""
         return self.kind.name
 
     def __getitem__(self, parameter: str) -> Any:
         return self.values[parameter]
 
 
-#: Reads what stands in place of a number or a colour, where a texture may: from the mapping as written and the spec.
+#: Reads the texture that stands in place of a number or a colour: from the mapping as written, and the parameter's spec.
 ReadTexture = Callable[[Mapping[str, Any], Spec], Any]
 
 
@@ -344,20 +343,20 @@ def read_typed(
     default: str = "",
     texture: ReadTexture | None = None,
 ) -> ParsedParams:
-    """The thing of a mapping whose ``type`` picks its kind from a table.
+    """Read a mapping whose ``type`` names a kind of a table.
 
     Args:
-        what: what the table holds, e.g. ``light``; a key of :data:`torchpt.spec.unsupported.TYPES` where some are not built.
+        what: name of the table for errors, e.g. ``light``; the key in :data:`torchpt.spec.unsupported.TYPES` too.
         table: the kinds.
         raw: the mapping as written.
         key: its dotted key.
-        file: scene file for errors.
-        default: the type where none is given; without one ``type`` is required.
-        texture: reads textures that stand in place of numbers and colours.
+        file: scene file, for errors.
+        default: the type where ``type`` is missing; "": ``type`` is required.
+        texture: reads textures in place of numbers and colours; None: none are accepted.
 
     Raises:
         SceneError: no mapping, an unknown type, an unknown key, a bad value.
-        NotBuiltError: a type or key that the format knows and this version does not build.
+        NotBuiltError: a type or key that the format knows and this version does not support.
     """
     planned = unsupported.TYPES.get(what, {})
     types = ", ".join([*table, *planned])
@@ -377,20 +376,20 @@ def read_typed(
     def read() -> ParsedParams:
         return _read(what, kind, name, raw, key, file, texture)
 
-    if not isinstance(kind, type):  # an instance of the caller's own, which may change
+    if not isinstance(kind, type):  # an instance may change between calls
         return read()
     found = _known.get((what, kind, texture), raw, read)
     return ParsedParams(kind, dict(found.values), found.given)
 
 
-#: Things by what was written of them.
+#: Blocks that were read, by the mapping as written.
 _known: ResultCache[ParsedParams] = ResultCache(4096)
 
 
 def _read(
     what: str, kind: Any, name: str, raw: Mapping[str, Any], key: str, file: str | None, texture: ReadTexture | None
 ) -> ParsedParams:
-    """A thing of a kind that is known."""
+    """Read a mapping whose kind is known."""
     words = f"{what} type {name}"
     names = list(parameters_of(kind))
     later = {**unsupported.KEYS.get(what, {}), **unsupported.KEYS.get(name, {})}
@@ -408,12 +407,12 @@ def read_params(
     words: str | None = None,
     texture: ReadTexture | None = None,
 ) -> ParsedParams:
-    """The values of a kind's parameters, from a mapping that holds nothing else; null means unset.
+    """Read the values of a kind's parameters from a mapping without ``type``; null means unset.
 
-    A kind's own ``check(values, given)`` may fill in values that follow from others, as a camera does with its pose.
+    The kind's ``check(values, given)``, if any, may fill in values that follow from others, as a camera does with its pose.
 
     Raises:
-        SceneError: an unknown key, a bad value, or values that the kind's own ``check(values, given)`` refuses.
+        SceneError: an unknown key, a bad value, or values that ``check`` refuses.
     """
     specs = parameters_of(kind)
     given = {name: value for name, value in raw.items() if value is not None}
@@ -442,14 +441,14 @@ def read_params(
 
 
 def refuse_unused_keys(what: str, table: Mapping[str, Any], raw: Any, default: str, file: str | None) -> None:
-    """Raises for a key of a block that another type of the table reads: it could be accepted only to do nothing.
+    """Raise for a key that only other types of the table read, since it would have no effect.
 
     Args:
-        what: what the table holds, which is the block's key too.
+        what: name of the table, and key of the block.
         table: the kinds.
         raw: the block as written.
-        default: the type where none is given.
-        file: scene file for the error.
+        default: the type where ``type`` is missing.
+        file: scene file, for the error.
     """
     name = raw.get("type", default) if isinstance(raw, Mapping) else None
     if not isinstance(name, str) or name not in table:
@@ -466,10 +465,10 @@ def refuse_unused_keys(what: str, table: Mapping[str, Any], raw: Any, default: s
 
 
 def _read_value(spec: Spec, value: Any, texture: ReadTexture | None) -> Any:
-    """Return the value of a parameter, or the texture that stands in its place.
+    """Return the value of a parameter, or the texture in its place.
 
     Raises:
-        Refused: it is not accepted.
+        Refused: the value is not accepted.
     """
     if isinstance(spec, Block):
         return _block(spec, texture, value)

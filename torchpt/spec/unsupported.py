@@ -1,19 +1,19 @@
-"""What the scene format knows but this version does not build: the one table.
+"""Types and keys that the scene format knows and this version does not support.
 
-Whoever builds a thing deletes its row here. Until then giving it is a :class:`~torchpt.core.errors.NotBuiltError`; its keys
-are listed so that a misspelt key is still named as unknown.
+Using one raises a :class:`~torchpt.core.errors.NotBuiltError`. The keys of a type are listed so that a misspelt key is still
+reported as unknown. An implementation deletes its row.
 """
 
 from __future__ import annotations
 
 __all__ = ["KEYS", "TYPES"]
 
-#: kind of thing -> its types that are not built -> the keys each of them takes beside ``type``.
+#: Name of a table of kinds -> its unsupported types -> the keys of each beside ``type``.
 TYPES: dict[str, dict[str, tuple[str, ...]]] = {
     "integrator": {
         "bdpt": ("max_depth", "rr_depth", "rr_prob", "clamp", "strict"),
     },
 }
 
-#: kind of thing -> keys of built types that are not built -> the value that asks for nothing.
+#: Name of a table or type -> its unsupported keys -> the value of each that changes nothing.
 KEYS: dict[str, dict[str, object]] = {}

@@ -1,1 +1,1 @@
-"""The scene file: YAML, fields, validation, and the description that they come to."""
+"""Read scene files: YAML, composition, overrides, validation; the result is a :class:`~.description.Description`."""

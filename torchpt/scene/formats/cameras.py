@@ -1,4 +1,4 @@
-"""The camera of a scene file."""
+"""Read the camera block of a scene file."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ __all__ = ["read_camera"]
 
 
 def read_camera(raw: Any, film: Mapping[str, Any], file: str | None) -> ParsedParams:
-    """The camera of a scene file's block.
+    """Read the camera block.
 
     Args:
-        raw: as written.
-        film: the film block as written, by whose size a ``K`` in pixels is read that does not say its own.
-        file: scene file for errors.
+        raw: the block as written.
+        film: the film block as written; its size is that of a ``K`` without ``size``.
+        file: scene file, for errors.
 
     Raises:
-        SceneError: what is wrong with it.
+        SceneError: a wrong key or value.
     """
     if isinstance(raw, Mapping) and raw.get("K") is not None and raw.get("size") is None:
         size = [film.get("width"), film.get("height")]

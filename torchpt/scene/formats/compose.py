@@ -1,11 +1,11 @@
-"""Scenes of several layers: files that a scene names in ``defaults``, its own keys; :mod:`.overrides` come on top.
+"""Merge the layers of a scene: the files in its ``defaults``, then its own keys; :mod:`.overrides` come last.
 
-Layers are merged as they are written, before anything of them is read:
+Layers are merged as written, before validation:
 
 - Mappings are merged key by key; lists, numbers and text of a later layer replace those of an earlier one.
 - A mapping that names another ``type`` than the one below it replaces it as a whole. The camera, ``integrator``, ``sampler``
   and ``film.filter`` keep the keys that their new type reads too.
-- A null unsets: a texture, material, shape or light is removed by it, which has to be there.
+- A null unsets a key; it removes a texture, material, shape or light, which must exist.
 - Relative paths start at the folder of the file that they stand in; those of overrides at the current one.
 """
 
@@ -34,15 +34,15 @@ __all__ = [
     "over", "path_in", "placed", "prefixes", "skeleton", "things", "with_size",
 ]  # fmt: skip
 
-#: Blocks that hold things by name.
+#: Blocks that map names to blocks, and what errors call one of those.
 NAMED = {"textures": "texture", "materials": "material", "shapes": "shape", "lights": "light"}
 #: Keys of a scene.
 KEYS = ("version", "defaults", "camera", *BLOCKS, *NAMED)
 #: Keys whose values are paths.
 PATHS = ("path",)
-#: Files that a scene may consist of, and how deep they may name each other.
+#: Most files of a scene, and the greatest depth of their ``defaults``.
 MAX_FILES, MAX_LEVELS = 64, 8
-#: What has a type and keeps what another type reads too: its kinds, and its type where none is said.
+#: Blocks that keep the keys shared by both types when the type changes: their kinds and their default type.
 KEEPING: dict[tuple[str, ...], tuple[Mapping[str, Any], str]] = {
     ("camera",): (CAMERAS, CAMERAS.names[0]),
     ("integrator",): TYPED_BLOCKS["integrator"],
@@ -58,19 +58,19 @@ Parts = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Layers:
-    """Which file of a scene each of its keys comes from.
+    """The files of a scene, with the keys that come from each.
 
     Attributes:
-        layers: file, and its keys without values, the lowest first; the file of overrides is None.
+        layers: file and tree of its keys, the lowest layer first; the file of overrides is None.
     """
 
     layers: tuple[tuple[str | None, Any], ...] = field(default=())
 
     def file_of(self, key: str, otherwise: str | None) -> str | None:
-        """Return the file that a key comes from: of those that know most of its parts the last one.
+        """Return the file that a key comes from: the last of those that have the longest prefix of it.
 
         Args:
-            key: dotted.
+            key: dotted key.
             otherwise: the file of a scene that has one layer only.
         """
         found, best = otherwise, -1
@@ -88,7 +88,7 @@ class Layers:
 
 
 def _known_parts(tree: Any, key: str) -> int:
-    """Return how many letters of a dotted key a tree of keys has."""
+    """Return the length of the longest prefix of a dotted key that a tree of keys has."""
     known = 0
     while isinstance(tree, dict) and key:
         name = next((name for name in prefixes(key) if name in tree), None)
@@ -99,7 +99,7 @@ def _known_parts(tree: Any, key: str) -> int:
 
 
 def prefixes(key: str) -> Iterator[str]:
-    """Yield the beginnings of a dotted key that may be a name, the longest first: names may hold dots."""
+    """Yield the prefixes of a dotted key that may be a name, the longest first: names may hold dots."""
     parts = key.split(".")
     for count in range(len(parts), 0, -1):
         yield ".".join(parts[:count])
@@ -116,16 +116,16 @@ def skeleton(raw: Any) -> Any:
 def compose(
     raw: dict[str, Any], file: str | None, base: Path, places: Sequence[Path] = ()
 ) -> tuple[dict[str, Any], Layers]:
-    """Return a scene merged with the files that its ``defaults`` name, and where its keys come from.
+    """Merge a scene with the files in its ``defaults``; return it with the files of its keys.
 
     Args:
         raw: the scene as written, bounded by :func:`torchpt.scene.formats.yaml.plain`.
         file: the scene file, for errors.
         base: the folder that its relative paths start from.
-        places: folders where names are looked for too, before those that ship.
+        places: further folders to look up names in, before the scenes that ship.
 
     Raises:
-        SceneError: a file that is not there, that names itself, too many of them; a removal of what is not there.
+        SceneError: a missing file, a cycle, too many files, or a removal of a name that does not exist.
     """
     if "defaults" not in raw:
         return raw, Layers()
@@ -135,11 +135,11 @@ def compose(
 
 
 class _Reader:
-    """Reads the files of one scene.
+    """Reader of the files of one scene.
 
     Args:
         base: the folder that relative paths start from once all are merged.
-        places: folders where names are looked for that are not beside the file that names them.
+        places: folders to look up names in that are not beside the file with the ``defaults``.
     """
 
     def __init__(self, base: Path, places: Sequence[Path]) -> None:
@@ -168,7 +168,7 @@ class _Reader:
         return _merged(below, own, file, strict="defaults" in raw)
 
     def found(self, name: str, folder: Path, key: str, file: str | None, trail: tuple[Path, ...]) -> Path:
-        """Return the file that a default names: beside the file that names it, or in one of the places."""
+        """Return the file of an entry of ``defaults``: beside the file that has it, or in one of the places."""
         exact = name.endswith((".yaml", ".yml"))
         places = [folder / name] if exact else [place / f"{name}.yaml" for place in (folder, *self.places)]
         for place in places:
@@ -195,7 +195,7 @@ def _names(value: Any, file: str | None) -> list[str]:
 
 
 def _shown(path: Path) -> str:
-    """Return a path as errors show it: from the current folder where it lies below that."""
+    """Return a path for errors: relative to the current folder if below it."""
     try:
         return str(path.relative_to(Path.cwd()))
     except (ValueError, OSError):
@@ -203,7 +203,7 @@ def _shown(path: Path) -> str:
 
 
 def placed(value: Any, folder: Path) -> Any:
-    """Return nested mappings whose relative paths start at a folder."""
+    """Return nested mappings with relative paths joined to a folder."""
     if isinstance(value, dict):
         return {key: path_in(item, folder) if key in PATHS else placed(item, folder) for key, item in value.items()}
     if isinstance(value, list) and any(isinstance(item, dict | list) for item in value):
@@ -212,7 +212,7 @@ def placed(value: Any, folder: Path) -> Any:
 
 
 def path_in(value: Any, folder: Path) -> Any:
-    """Return a path, or each of several, from a folder; one that begins with a variable stays."""
+    """Return a path, or a list of them, joined to a folder; one that begins with a variable is unchanged."""
     if isinstance(value, list):
         return [path_in(item, folder) for item in value]
     if not isinstance(value, str) or value.startswith("$") or not value.strip():
@@ -220,20 +220,20 @@ def path_in(value: Any, folder: Path) -> Any:
     return os.path.normpath(folder / value)
 
 
-# ---- One layer over another
+# ---- Merging of two layers
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any], file: str | None, *, strict: bool) -> dict[str, Any]:
-    """Return a layer over another; neither is changed.
+    """Return two layers merged; neither is changed.
 
     Args:
         below: the earlier layer, by block.
         above: the later one.
-        file: of the later one, for errors.
-        strict: whether what a null removes has to be there; else the null stays, for a layer below.
+        file: file of the later one, for errors.
+        strict: True where a name that a null removes must exist; else the null is kept for a lower layer.
 
     Raises:
-        SceneError: a thing to remove that is not there.
+        SceneError: a removal of a name that does not exist.
     """
     below = with_size(below, above)
     result = dict(below)
@@ -246,7 +246,7 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any], file: str | None
 
 
 def things(block: str, below: Any, above: Mapping[str, Any], file: str | None, strict: bool) -> dict[str, Any]:
-    """Return a block of things over another, see :func:`_merged`."""
+    """Merge two blocks of :data:`NAMED`; see :func:`_merged`."""
     result = dict(below) if isinstance(below, Mapping) else {}
     for name, value in above.items():
         if value is not None:
@@ -259,7 +259,7 @@ def things(block: str, below: Any, above: Mapping[str, Any], file: str | None, s
 
 
 def over(below: Any, above: Any, where: Parts) -> Any:
-    """Return a value of a later layer over that of an earlier one, ``where`` they stand."""
+    """Merge the values of two layers at the key ``where``."""
     if where in KEEPING:
         below, above = (({"type": item} if isinstance(item, str) else item) for item in (below, above))
     if not isinstance(above, Mapping) or not isinstance(below, Mapping):
@@ -278,14 +278,14 @@ def over(below: Any, above: Any, where: Parts) -> Any:
 
 
 def _identity(thing: Mapping[str, Any]) -> Any:
-    """Return what says of a mapping what it is: its type, or that it names a texture."""
+    """Return the type of a mapping, or ``texture`` for a reference to a texture."""
     if "type" in thing:
         return thing["type"] or "null"  # a material that YAML reads as nothing
     return "texture" if "texture" in thing else None
 
 
 def kept(below: Mapping[str, Any], name: Any, table: Mapping[str, Any], default: str) -> dict[str, Any]:
-    """Return the keys of a mapping that another type reads too."""
+    """Return the keys of a block that stay when its type changes to ``name``: those that both types read."""
     if name == below.get("type", default) or not isinstance(name, str) or name not in table:
         return dict(below)
     own = parameters_of(table[name])
@@ -297,7 +297,7 @@ def _all_keys(table: Mapping[str, Any]) -> set[str]:
 
 
 def with_size(below: Mapping[str, Any], above: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a layer whose camera says the size that its ``K`` in pixels is of, where a later layer has another film."""
+    """Return a layer with the film's size added to a camera with ``K`` in pixels, where a later layer changes the film."""
     camera, film = below.get("camera"), below.get("film")
     if not isinstance(camera, Mapping) or camera.get("K") is None or camera.get("size") is not None:
         return below
@@ -308,7 +308,7 @@ def with_size(below: Mapping[str, Any], above: Mapping[str, Any]) -> Mapping[str
 
 
 def one_of(block: str, name: str, known: Sequence[str]) -> str:
-    """Return what is accepted in place of a name that is not there."""
+    """Return the phrase of what is accepted in place of an unknown name."""
     close = difflib.get_close_matches(name, known, 1)
     hint = f" (did you mean {close[0]}?)" if close else ""
     shown = [*known[:20], "..."] if len(known) > 20 else known

@@ -1,4 +1,4 @@
-"""A scene file as it was written, checked: names, files and numbers, nothing built yet."""
+"""Read and validate scene files: names, paths and numbers; nothing is built yet."""
 
 from __future__ import annotations
 
@@ -38,34 +38,34 @@ __all__ = [
 ]
 
 ASSETS = "$TORCHPT_ASSETS"
-#: Textures, materials, shapes (instances are some) and lights that a scene may name, of each.
+#: Most textures, materials, shapes (instances included) and lights of a scene, of each.
 MAX_ENTRIES = 100_000
 
 T = TypeVar("T")
-#: What a scene is read from.
+#: Types of the first argument of `load`.
 Source = str | os.PathLike[str] | IO[str] | IO[bytes] | Mapping[str, Any]
 SOURCES = "a scene's name, a path ending in .yaml, YAML text, an open file, or a mapping"
 
 
 @dataclass(frozen=True)
 class Description:
-    """A checked scene description.
+    """A validated scene file.
 
     Attributes:
         file: the scene file, or None for a scene given as a dict.
         base: the folder that relative paths start from.
         camera: the camera.
-        version: 1 where the file states it, else None.
-        film: the film settings that the file really sets, as written.
-        integrator: the same for the integrator.
-        sampler: the same for the sampler.
-        render: the same for the run.
-        textures: by name.
-        materials: by name.
-        shapes: by name, in file order.
-        lights: by name.
-        overrides: of its keys, as words of the command line.
-        layers: which file of several its keys come from.
+        version: 1 where the file has it, else None.
+        film: keys of the film block that are not null, as written.
+        integrator: keys of the integrator block.
+        sampler: keys of the sampler block.
+        render: keys of the render block.
+        textures: textures by name.
+        materials: materials by name.
+        shapes: shapes by name, in the order of the file.
+        lights: lights by name.
+        overrides: overrides of its keys, in the form of the command line.
+        layers: the file that each key comes from.
     """
 
     file: str | None
@@ -84,13 +84,13 @@ class Description:
     layers: Layers = field(default=Layers(), repr=False, compare=False)
 
     def blame(self, error: SceneError) -> SceneError:
-        """Return an error of one of its keys with the file that the key comes from."""
+        """Return an error with the file that its key comes from."""
         return error if error.file is None else self.layers.blame(error)
 
     def resolve(self, path: str | tuple[str, ...], key: str) -> Path:
-        """The file that a scene names, or the first existing one of several.
+        """Return the file that a path of the scene refers to, or the first that exists of several.
 
-        A relative path starts at the scene file's folder; a leading ``$TORCHPT_ASSETS`` is expanded, no other variable.
+        A relative path starts at the scene file's folder; only a leading ``$TORCHPT_ASSETS`` is expanded.
 
         Args:
             path: as written in the scene.
@@ -133,7 +133,7 @@ class Description:
 
 
 def scene_names() -> list[str]:
-    """The scenes that ship, by name."""
+    """Return the names of the scenes that ship."""
     return sorted(path.stem for path in (configs() / "scene").glob("*.yaml"))
 
 
@@ -144,20 +144,20 @@ def read_description(
     overrides: Mapping[str, Any] | None = None,
     places: Sequence[Path] = (),
 ) -> Description:
-    """A checked scene description.
+    """Read and validate a scene.
 
     Args:
         source: the name of a scene in ``configs/scene/``, a path ending in ``.yaml``, an open file, YAML text of more than
             one line, or a mapping of the same schema. Relative paths start at the file's folder; where there is no file, at
             the current one.
         bsdfs: material types of the caller's own: type name to model instance.
-        change: of what was written, merged with what it names in ``defaults``, before it is checked.
-        overrides: values of its keys by dotted key, see :func:`torchpt.scene.formats.overrides.overridden_by`.
-        places: folders where scenes are looked for by name, those that ``defaults`` name too, before those that ship.
+        change: called with the raw scene after ``defaults`` and overrides are merged; returns the one to validate.
+        overrides: values by dotted key, see :func:`torchpt.scene.formats.overrides.overridden_by`.
+        places: folders where scenes are looked up by name, also those in ``defaults``, before those that ship.
 
     Raises:
-        SceneError: what is wrong first, with file, dotted key, value and what is accepted.
-        NotBuiltError: something that the format knows and this version does not build.
+        SceneError: the first wrong key or value, with file, dotted key, value and what is accepted.
+        NotBuiltError: a key or type that the format knows and this version does not support.
 
     Warns:
         EnergyWarning: a material may reflect more light than it receives.
@@ -199,7 +199,7 @@ def _named_scene(name: str, places: Sequence[Path]) -> Path:
     """Return the file of a scene in one of the places, or of one that ships.
 
     Raises:
-        SceneError: there is none of this name.
+        SceneError: no scene has this name.
     """
     files = {
         path.stem: path for place in (configs() / "scene", *reversed(places)) for path in sorted(place.glob("*.yaml"))
@@ -212,11 +212,11 @@ def _named_scene(name: str, places: Sequence[Path]) -> Path:
 
 
 def settings(description: Description, overrides: Mapping[str, Any] | None = None) -> Settings:
-    """The complete run settings: built-in default < scene file < override.
+    """Return the complete settings: built-in default < scene file < override.
 
     Args:
-        description: whose blocks film, integrator, sampler and render count as the scene's wishes.
-        overrides: by block, e.g. ``{"render": {"spp": 16}}``; None means unset.
+        description: has the scene's blocks film, integrator, sampler and render.
+        overrides: keys by block, e.g. ``{"render": {"spp": 16}}``; None means unset.
 
     Raises:
         SceneError: key such as ``render.spp``.
@@ -229,14 +229,14 @@ def settings(description: Description, overrides: Mapping[str, Any] | None = Non
 
 
 def overridden(description: Description, overrides: Mapping[str, Mapping[str, Any]]) -> tuple[Description, Settings]:
-    """The description and the complete settings where a null among the overrides unsets the scene's own wish.
+    """Return the complete settings where a null among the overrides removes the scene's own key.
 
     Args:
-        description: of the scene.
-        overrides: by block, as `settings` takes them.
+        description: the scene's.
+        overrides: keys by block, as `settings` takes them.
 
     Returns:
-        The description without the wishes that were unset, and the settings.
+        The description without the removed keys, and the settings.
 
     Raises:
         SceneError: key such as ``render.spp``.

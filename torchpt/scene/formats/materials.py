@@ -1,4 +1,4 @@
-"""The materials of a scene file, and what can be said of them only once all are known: names, and blends of blends."""
+"""Read the materials of a scene file, and check references between materials and to textures once all are read."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ __all__ = [
     "read_material",
 ]  # fmt: skip
 
-#: A type of material: a class of :data:`torchpt.physics.bsdfs.KINDS`, or the one instance that a caller handed over.
+#: A type of material: a class of :data:`torchpt.physics.bsdfs.KINDS`, or an instance from the caller.
 Kind = type[Bsdf] | Bsdf
 
-#: How deep blends may be nested: every level can double the models that a lane evaluates.
+#: Greatest depth of nested blends: every level can double the BSDFs that a lane evaluates.
 MAX_BLENDS = 8
 
-#: Slots that the colours of vertices cannot give.
+#: Slots that cannot read vertex colours.
 _IMAGED = ("opacity", "emission", "normal_map", "bump_map")
-#: What is read at points, without regard to how large a pixel is: light and cut-outs are the same for every ray.
+#: Slots whose textures are not filtered by the footprint: emission and opacity must be the same for every ray.
 POINTS = ("opacity", "emission")
 
 
 def material_types(models: Mapping[str, Bsdf] | None) -> Mapping[str, Kind]:
-    """The table of types: those of the package and a caller's own.
+    """Return the table of material types: those of the package and the caller's.
 
     Args:
-        models: type name to model instance.
+        models: the caller's BSDF instances by type name.
 
     Raises:
-        SceneError: key ``bsdfs.NAME``: no model, the name of a type that exists, or parameters that cannot be read.
+        SceneError: key ``bsdfs.NAME``: no BSDF, a name that is taken, or wrong declarations of parameters.
     """
     if models is not None and not isinstance(models, Mapping):
         raise SceneError("bsdfs", models, "a mapping from type names to instances of torchpt.Bsdf")
@@ -56,7 +56,7 @@ def material_types(models: Mapping[str, Bsdf] | None) -> Mapping[str, Kind]:
 
 
 def _check_own(model: Bsdf, key: str) -> None:
-    """Refuse parameters that cannot be read."""
+    """Check the names and defaults of the parameters that a BSDF declares."""
     if not isinstance(model.parameters, Mapping):
         raise SceneError(f"{key}.parameters", model.parameters, "a mapping from names to defaults")
     own = {} if model.parameters is Bsdf.parameters else model.parameters
@@ -75,18 +75,18 @@ def _check_own(model: Bsdf, key: str) -> None:
 
 
 def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | None, depth: int = 0) -> ParsedParams:
-    """The material of a mapping, with those in place inside it.
+    """Read a material, including materials written in place inside a blend.
 
     Args:
         raw: the mapping as written.
         key: its dotted key.
-        types: the table, of :func:`material_types`.
-        file: scene file for errors.
-        depth: how many blends it lies in.
+        types: the table from :func:`material_types`.
+        file: scene file, for errors.
+        depth: number of enclosing blends.
 
     Raises:
-        SceneError: what is wrong with it.
-        NotBuiltError: a key that the format knows and this version does not build.
+        SceneError: a wrong key or value.
+        NotBuiltError: a key that the format knows and this version does not support.
     """
     if isinstance(raw, Mapping) and "type" in raw and raw["type"] is None:
         raw = {**raw, "type": "null"}  # YAML reads the bare word as nothing
@@ -102,7 +102,7 @@ def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | Non
 
 
 def plain_material() -> ParsedParams:
-    """That of shapes which are given none: grey, diffuse."""
+    """Return the default material of shapes: grey and diffuse."""
     return read_params(KINDS["diffuse"], {}, "", None, texture=texture_of)
 
 
@@ -111,12 +111,12 @@ def _inner_keys(kind: Kind) -> tuple[str, ...]:
 
 
 def inner_of(material: ParsedParams) -> dict[str, str | ParsedParams]:
-    """The materials that a blend is made of, by key: names, or materials in place. Of others none."""
+    """Return the materials inside a blend by key, as names or in place; an empty dict for other materials."""
     return {key: material[key] for key in _inner_keys(material.kind)}
 
 
 def model_of(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> tuple[Bsdf, dict[str, Any]]:
-    """A material's model, in the variant that it needs, and what that is given.
+    """Return the BSDF of a material and the values of its parameters.
 
     Args:
         material: the material.
@@ -136,22 +136,22 @@ def check_material(
     textures: Mapping[str, ParsedParams],
     file: str | None,
 ) -> None:
-    """What can be said of a material only once all are known.
+    """Check a material's references to other materials and to textures, once all are read.
 
     Args:
         material: the material.
         key: its dotted key.
         materials: all materials by name.
         textures: all textures by name.
-        file: scene file for errors.
+        file: scene file, for errors.
 
     Raises:
-        SceneError: a texture that does not exist; a blend of what does not exist, of itself or of what cannot be
-            blended; ``two_sided`` where light passes through.
-        NotBuiltError: a texture where none is built yet.
+        SceneError: an unknown texture; a blend of an unknown material, of itself or of one that cannot be blended;
+            ``two_sided`` for a material that transmits light.
+        NotBuiltError: a texture where textures are not supported yet.
 
     Warns:
-        EnergyWarning: it may reflect more light than it receives.
+        EnergyWarning: the material may reflect more light than it receives.
     """
     inner = inner_of(material)
     if inner:
@@ -219,7 +219,7 @@ def _check_maps(
     materials: Mapping[str, ParsedParams],
     file: str | None,
 ) -> None:
-    """Refuse textures that would have to be known before a blend can be: of normals and of how much is there at all."""
+    """Raise for normal maps, bump maps and opacity textures inside a blend, which the blend itself must have."""
     for key, advice in (("normal_map", "give it to the blend itself"), ("bump_map", "give it to the blend itself")):
         if inner[key] is not None:
             where = at if isinstance(item, str) else f"{at}.{key}"
@@ -234,7 +234,7 @@ def _check_maps(
 
 
 def _sides(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> Iterator[ParsedParams]:
-    """The materials that a blend is made of, those that exist."""
+    """Yield the existing materials inside a blend."""
     for item in inner_of(material).values():
         if not isinstance(item, str):
             yield item
@@ -243,7 +243,7 @@ def _sides(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> Ite
 
 
 def _sheer(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> bool:
-    """Whether rays may pass a material as if it were not there."""
+    """Return True where a material may have an opacity below 1."""
     if material.kind.sheer or material["opacity"] != 1.0:
         return True
     return any(_sheer(side, materials) for side in _sides(material, materials))

@@ -1,6 +1,6 @@
-"""Overrides of a scene's keys by dotted key, of the command line or of ``torchpt.load(overrides=...)``.
+"""Apply overrides of a scene's keys by dotted key, from the command line or ``torchpt.load(overrides=...)``.
 
-They are the uppermost layer of a scene, and are merged as :mod:`torchpt.scene.formats.compose` says.
+They are the top layer of a scene, merged by the rules of :mod:`torchpt.scene.formats.compose`.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ __all__ = ["overridden_by", "told", "words_of"]
 def overridden_by(
     raw: dict[str, Any], overrides: Mapping[str, Any], layers: Layers, file: str | None, base: Path
 ) -> tuple[dict[str, Any], Layers]:
-    """Return a scene with some of its values replaced, and where its keys come from then.
+    """Apply overrides to a scene; return it with the files of its keys.
 
-    Things are added and removed first, then types change, then all other values: in which order they are given makes
-    no difference otherwise.
+    Named blocks are added and removed first, then types change, then all other values; apart from that the order of
+    overrides has no effect.
 
     Args:
         raw: the scene, as :func:`compose` returns it; it is not changed.
-        overrides: values by dotted key. ``KEY`` sets what is there or may be there, ``+KEY`` adds what is not, ``++KEY`` does
-            either, ``~KEY`` removes what is there (whose value must be the one given, unless that is None).
-        layers: where the scene's keys come from.
+        overrides: values by dotted key. ``KEY`` sets a key of the scene or of its kinds, ``+KEY`` adds a new one, ``++KEY``
+            does either, ``~KEY`` removes one (whose value must equal the given one, unless that is None).
+        layers: the files of the scene's keys.
         file: the scene file.
         base: the folder that its relative paths start from.
 
     Raises:
-        SceneError: a key that leads nowhere, with a suggestion where there is one.
+        SceneError: an unknown key, with the closest known one.
     """
     if not isinstance(overrides, Mapping):
         raise SceneError("overrides", overrides, "a mapping from dotted keys such as camera.fov to values")
@@ -93,13 +93,13 @@ def overridden_by(
 
 @dataclass
 class _Change:
-    """An override, taken apart.
+    """A parsed override.
 
     Attributes:
         sign: "", "+", "++" or "~".
-        key: dotted, without it.
-        value: what it sets.
-        parts: where in the scene that is, once it is applied.
+        key: dotted key without the sign.
+        value: the new value.
+        parts: the key's names in the scene; set when it is applied.
     """
 
     sign: str
@@ -109,7 +109,7 @@ class _Change:
 
     @property
     def turn(self) -> int:
-        """Return when it is applied: things first, then types, then all else."""
+        """Return its place in the order of application: named blocks first, then types, then all others."""
         block, *inner = self.key.split(".")
         if not inner or (block in NAMED and len(inner) == 1):
             return 0
@@ -185,7 +185,7 @@ def _apply(raw: dict[str, Any], change: _Change) -> None:
 
 
 def _next_part(place: Any, rest: str) -> str:
-    """Return the next part of what is left of a key: names that are there may hold dots."""
+    """Return the next name of the rest of a dotted key: existing names may hold dots."""
     if isinstance(place, dict):
         for name in prefixes(rest):
             if name in place:
@@ -194,7 +194,7 @@ def _next_part(place: Any, rest: str) -> str:
 
 
 def _entered(place: Any, name: str, parts: Parts, change: _Change) -> Any:
-    """Return what lies under a part of a key that is not its last, as a copy in its place that may be changed."""
+    """Replace an inner mapping or list of the scene by a copy, which may be changed, and return it."""
     if isinstance(place, list):
         index = _index(place, name, change)
         place[index] = _checked(place[index], parts, change)
@@ -257,7 +257,7 @@ def _absent(place: Mapping[str, Any], parts: Parts, expected: str) -> str:
 
 
 def _retype(place: dict[str, Any], change: _Change) -> None:
-    """Change a type; keys that the new type does not read go."""
+    """Change a type, and drop keys that the new type does not read."""
     above = change.parts[:-1]
     if change.value is None and above[0] == "materials":
         change.value = "null"  # a material that YAML reads as nothing
@@ -270,7 +270,7 @@ def _retype(place: dict[str, Any], change: _Change) -> None:
 
 
 def _table_of(block: str, before: Any, after: Any) -> Mapping[str, Any] | None:
-    """Return the kinds that two types belong to, those of the block first."""
+    """Return the table of kinds that has both types; that of the block is tried first."""
     tables = [TABLES[block]] if block in TABLES else []
     for table in (*tables, TEXTURES, MATERIALS):
         if isinstance(after, str) and isinstance(before, str) and before in table and after in table:
@@ -292,7 +292,7 @@ _SPECIAL = ("true", "false", "null", "inf", "nan")
 
 
 def words_of(value: Any) -> str:
-    """Return a value as the command line writes it; of tensors and arrays their shape."""
+    """Return a value in the form of the command line; for tensors and arrays their shape."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, str):
@@ -312,7 +312,7 @@ def words_of(value: Any) -> str:
 
 
 def told(overrides: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return overrides as words of the command line."""
+    """Return overrides in the form of the command line."""
     return tuple(
         key if key.startswith("~") and value is None else f"{key}={words_of(value)}" for key, value in overrides.items()
     )

@@ -1,7 +1,7 @@
-"""Tensors and arrays in a scene given as a dict: the numbers that are read, and where tensors that want gradients stood.
+"""Replace tensors in a scene dict by plain numbers, and remember the keys of those that require gradients.
 
-Whatever reads a scene sees plain numbers, lists and arrays, so that ranges and errors are those of a file. What was written is
-kept beside them; :mod:`torchpt.scene.dict_tensors` makes the scene's parameters of it once more, on torch's tape.
+Readers see plain numbers, lists and arrays, so that ranges and errors are those of a file. The dict itself is kept;
+:mod:`torchpt.scene.dict_tensors` computes the scene's parameters from its tensors again, with gradients.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from torchpt.core.errors import SceneError
 
 __all__ = ["DictTensors", "Key"]
 
-#: Where something stands: keys of mappings, and indices of lists.
+#: A position in nested mappings and lists: keys and indices.
 Key = tuple[str | int, ...]
 
-#: One-dimensional arrays up to this length are read as lists, as the vectors and pairs of a file are.
+#: One-dimensional arrays up to this length become lists, like the vectors and pairs of a file.
 _LISTED = 64
 _PLAIN = frozenset({int, float, str, bool, type(None)})
 
 
 class DictTensors:
-    """What of one scene was written as tensors that require gradients.
+    """The tensors of a scene dict that require gradients.
 
     Attributes:
-        raw: the scene as written, tensors included.
-        keys: where in it such tensors stand, in order.
+        raw: the scene dict, tensors included.
+        keys: keys of such tensors, in order.
     """
 
     def __init__(self) -> None:
@@ -39,16 +39,16 @@ class DictTensors:
         self.keys: list[Key] = []
 
     def extract(self, raw: dict[str, Any]) -> dict[str, Any]:
-        """The scene with numbers in place of tensors, once :func:`torchpt.scene.formats.yaml.plain` has bounded it.
+        """Return the scene with numbers in place of tensors; ``raw`` was bounded by :func:`torchpt.scene.formats.yaml.plain`.
 
         Raises:
-            SceneError: a tensor that holds no numbers that can be read.
+            SceneError: a tensor whose numbers cannot be read.
         """
         self.raw, self.keys = raw, []
         return self._read(raw, ())
 
     def at(self, key: Key) -> Any:
-        """What was written at a key; None where nothing was."""
+        """Return the value of the dict at a key; None where there is none."""
         found: Any = self.raw
         for part in key:
             if isinstance(found, dict):
@@ -60,7 +60,7 @@ class DictTensors:
         return found
 
     def under(self, *prefix: str) -> Iterator[Key]:
-        """The keys that begin with a prefix, without it."""
+        """Return the keys of tensors that begin with a prefix, without the prefix."""
         return (key[len(prefix) :] for key in self.keys if key[: len(prefix)] == prefix)
 
     def _read(self, item: Any, key: Key) -> Any:
@@ -78,7 +78,7 @@ class DictTensors:
 
 
 def _numbers(tensor: Tensor, key: Key) -> np.ndarray:
-    """A tensor's values, apart from it: what is done to the tensor later does not change them."""
+    """Return a copy of a tensor's values."""
     if is_transformed(tensor):
         expected = "plain numbers: hand tensors under torch.func to render(params=...)"
         raise SceneError(".".join(map(str, key)), "a tensor under a transform of torch.func", expected)
@@ -93,5 +93,5 @@ def _numbers(tensor: Tensor, key: Key) -> np.ndarray:
 
 
 def _listed(array: np.ndarray) -> Any:
-    """A number of an array without dimensions, a list of a short one with one."""
+    """Convert a scalar array to a number and a short vector to a list."""
     return array.tolist() if array.ndim == 0 or (array.ndim == 1 and len(array) <= _LISTED) else array

@@ -1,6 +1,6 @@
-"""The grammar of textures in a scene file: what stands where a number or a colour could.
+"""Read textures in a scene file, which may stand in place of a number or a colour.
 
-A texture is read when its slot is: a *colour* slot takes three channels, a *number* slot one of them. No file is opened here.
+A texture is read for a slot: a *colour* slot takes three channels, a *number* slot one. No file is opened here.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ __all__ = ["Named", "TextureInput", "check_texture", "read_texture", "texture_of
 
 
 def read_texture(raw: Any, key: str, file: str | None) -> ParsedParams | Named:
-    """The texture of a mapping: ``{texture: NAME}``, or one written out.
+    """Read a reference ``{texture: NAME}``, or a texture written in place.
 
     Raises:
-        SceneError: what is wrong with it.
+        SceneError: a wrong key or value.
     """
     if isinstance(raw, Mapping) and "texture" in raw and "type" not in raw:
         check_keys(raw, ("texture", "channel"), key, "a reference to a texture", file)
@@ -35,14 +35,14 @@ def read_texture(raw: Any, key: str, file: str | None) -> ParsedParams | Named:
 
 
 def texture_of(raw: Mapping[str, Any], spec: Spec) -> TextureInput:
-    """What stands in place of a number or a colour; :func:`torchpt.spec.schema.read_typed` takes it as ``texture``.
+    """Read the texture of a slot; :func:`torchpt.spec.schema.read_typed` takes this function as ``texture``.
 
     Args:
         raw: the mapping as written.
-        spec: of the slot.
+        spec: spec of the slot.
 
     Raises:
-        Refused: what is wrong with it.
+        Refused: a wrong key or value.
     """
     low, high = getattr(spec, "bounds")  # noqa: B009  (of numbers and colours)
     return _input(raw, spec.coloured, low, high, getattr(spec, "linear", True), spec.moves)
@@ -70,18 +70,19 @@ def check_texture(
     coordinates: bool = False,
     points: bool = False,
 ) -> None:
-    """What can be said of a slot's texture only once all are known.
+    """Check the texture of a slot, once all textures are read.
 
     Args:
-        slot: what was read.
+        slot: the slot's texture.
         key: its dotted key.
-        textures: the named ones.
-        file: scene file for errors.
-        coordinates: whether it must be read by texture coordinates, as maps and what is read at points are.
-        points: whether the slot is read at points: then a texture of its own must not filter (a named one does not, here).
+        textures: all textures by name.
+        file: scene file, for errors.
+        coordinates: True where the texture must be a function of texture coordinates.
+        points: True where look-ups are not filtered; then a texture in place must not set a filter (that of a named one is
+            ignored).
 
     Raises:
-        SceneError: a texture that does not exist, or that the slot cannot read.
+        SceneError: an unknown texture, or one that the slot cannot read.
     """
     texture = slot.texture
     if isinstance(texture, Named):

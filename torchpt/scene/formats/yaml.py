@@ -1,4 +1,4 @@
-"""YAML text to plain dicts and lists: iterative, bounded, and strict about duplicate keys.
+"""Parse YAML to plain dicts and lists: iterative, bounded, and strict about duplicate keys.
 
 The parser is libyaml's (``CSafeLoader``), read event by event: nesting cannot exhaust the stack, keys stay text as
 written, ``1e-3`` is a number (YAML 1.2), and every error knows its line. Anchors, aliases and ``<<`` merges work;
@@ -36,7 +36,7 @@ _CORE_TAGS = {f"tag:yaml.org,2002:{name}" for name in ("str", "int", "float", "b
 
 
 def read_yaml(path: Path, file: str) -> Any:
-    """The document in a YAML file.
+    """Parse a YAML file.
 
     Raises:
         SceneError: the file is missing, too large, or no valid YAML.
@@ -53,7 +53,7 @@ def read_yaml(path: Path, file: str) -> Any:
 
 
 def read_open(source: Any, file: str | None) -> Any:
-    """The document in what is left of an open file, or of anything with a ``read``.
+    """Parse the rest of an open file, or of any object with ``read``.
 
     Raises:
         SceneError: it cannot be read, is too large, or is no valid YAML.
@@ -72,7 +72,7 @@ def read_open(source: Any, file: str | None) -> Any:
 
 
 def parse_yaml(data: bytes | str, file: str | None = None) -> Any:
-    """The single document in YAML text, as dicts, lists, text, numbers, booleans and None.
+    """Parse YAML text of a single document to dicts, lists, text, numbers, booleans and None.
 
     Raises:
         SceneError: invalid YAML, a duplicate key, a tag that names an object, or nesting beyond ``MAX_DEPTH``.
@@ -110,7 +110,7 @@ class _Frame:
 
 
 class _Builder:
-    """Turns parser events into plain objects."""
+    """Builder of plain objects from parser events."""
 
     def __init__(self, file: str | None) -> None:
         self.file = file
@@ -155,7 +155,7 @@ class _Builder:
         return SceneError(f"line {event.start_mark.line + 1}", value, expected, self.file)
 
     def path(self, name: str = "") -> str:
-        """The dotted key of what is being read."""
+        """Return the dotted key of the present event."""
         parts = [str(len(f.value)) if isinstance(f.value, list) else f.key for f in self.stack]
         return ".".join([part for part in parts if part is not None] + [name] * bool(name))
 
@@ -204,7 +204,7 @@ class _Builder:
         self.add(event, frame.value, None)
 
     def count(self, event: Any) -> None:
-        """One value more, wherever it stands."""
+        """Count a value."""
         self.values += 1
         if self.values > MAX_VALUES:
             raise self.error(event, self.values, f"at most {MAX_VALUES} values")
@@ -233,7 +233,7 @@ class _Builder:
 
 
 def _resolve(text: str) -> Any:
-    """A plain scalar's value: the YAML 1.2 core numbers, YAML 1.1 booleans, else text."""
+    """Return the value of a plain scalar: a number (YAML 1.2), a boolean (YAML 1.1), else text."""
     if text in _WORDS:
         return _WORDS[text]
     if text[0] not in "+-.0123456789":
@@ -250,7 +250,7 @@ def _resolve(text: str) -> Any:
 
 
 def plain(source: Any, file: str | None = None) -> Any:
-    """A copy of nested mappings and sequences as dicts and lists, bounded and safe to validate.
+    """Copy nested mappings and sequences to dicts and lists, bounded and safe to validate.
 
     Raises:
         SceneError: a ``_target_`` key, a key that is not printable text, a structure that contains itself, nesting

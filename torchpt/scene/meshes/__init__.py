@@ -1,6 +1,6 @@
-"""Mesh files to plain arrays: OBJ with MTL, PLY, STL, glTF by our own readers, others through trimesh.
+"""Read mesh files as plain arrays: OBJ with MTL, PLY, STL and glTF by readers of this package, other formats by trimesh.
 
-One table of formats; a scene imports those that it reads.
+:data:`FORMATS` is the table of formats; a reader is imported when a scene has a file for it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = [
     "FORMATS", "PARSERS", "FileCamera", "FileLight", "FileMaterial", "MeshPart", "load_mesh", "smooth_normals",
 ]  # fmt: skip
 
-#: Endings that trimesh reads, and the packages beside it that each of them takes (all in the extra ``formats``).
+#: Endings that trimesh reads, and the further packages that each of them needs (all in the extra ``formats``).
 PARSERS: dict[str, tuple[str, ...]] = {
     ".off": (),
     ".3mf": ("lxml", "networkx"),
@@ -27,7 +27,7 @@ PARSERS: dict[str, tuple[str, ...]] = {
     ".xaml": ("lxml",),
     ".3dxml": ("lxml", "networkx"),
 }
-#: File ending -> module here, whose ``load_<module>(path, data, materials)`` gives the parts.
+#: File ending -> module of this package, whose ``load_<module>(path, data, materials)`` returns the parts.
 FORMATS = {
     **{".obj": "obj", ".ply": "ply", ".stl": "stl", ".glb": "gltf", ".gltf": "gltf"},
     **dict.fromkeys(PARSERS, "trimesh_formats"),
@@ -35,11 +35,11 @@ FORMATS = {
 
 
 def load_mesh(path: Path, *, materials: bool = True) -> list[MeshPart]:
-    """The parts of a mesh file, one per material.
+    """Return the parts of a mesh file, one per material.
 
     Args:
         path: a file ending in one of ``FORMATS``.
-        materials: whether to read the file's own materials (MTL files, glTF materials); without, none is looked for.
+        materials: True to read the file's own materials (MTL files, glTF materials).
 
     Raises:
         AssetError: the file cannot be read or is malformed; the message names the element.
@@ -53,5 +53,5 @@ def load_mesh(path: Path, *, materials: bool = True) -> list[MeshPart]:
     except OSError as error:
         raise AssetError(path, f"cannot be read ({error.strerror})") from None
     reader = getattr(import_module(f"{__name__}.{kind}"), f"load_{kind}")
-    with np.errstate(all="ignore"):  # what is not finite is found by the checks
+    with np.errstate(all="ignore"):  # `checked` finds numbers that are not finite
         return checked(reader(path, data, materials), path)

@@ -1,4 +1,4 @@
-"""Texture entries of the materials that loaders make: as a user would have written them, defaults left out."""
+"""Texture blocks for the materials of mesh files, in the form of a scene file, without default values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Rgb = tuple[float, float, float]
 
 
 def plain_scale(color: Rgb) -> float | list[float]:
-    """A colour as the scene file has it: one number where it is grey."""
+    """Return a colour in the form of a scene file: one number where it is grey."""
     return color[0] if color[0] == color[1] == color[2] else list(color)
 
 
@@ -25,15 +25,15 @@ def image_texture(
     nearest: bool = False,
     uv_transform: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """An entry ``{type: image, path: ..., ...}``.
+    """Return the block ``{type: image, path: ..., ...}``.
 
     Args:
         path: absolute, or an image in memory.
         scale: factor of the values.
-        channel: what a number reads; None for colours.
+        channel: the channel that a number reads; None for colours.
         wrap: ``repeat``, ``clamp`` or ``mirror``.
-        nearest: whether texels are not interpolated.
-        uv_transform: as the scene file has it.
+        nearest: True where texels are not interpolated.
+        uv_transform: the block of a scene file; empty for none.
     """
     entry: dict[str, Any] = {"type": "image", "path": path}
     if wrap != "repeat":

@@ -1,6 +1,7 @@
-"""glTF 2.0, `.glb` and `.gltf`: triangles and lights of every node, moved by the node's world matrix, with their materials.
+"""Read glTF 2.0, `.glb` and `.gltf`: triangles, materials, lights and cameras of all nodes, in world space.
 
-Khronos glTF 2.0 specification. What is left out is named; a file that requires an extension which is not read is refused.
+Khronos glTF 2.0 specification. Unsupported features are listed by name in ``MeshPart.ignored``; a file that requires an
+unsupported extension is an error.
 """
 
 from __future__ import annotations
@@ -24,25 +25,25 @@ __all__ = ["load_gltf"]
 _READ = {*MATERIAL_EXTENSIONS, "KHR_texture_transform", "KHR_mesh_quantization", PUNCTUAL}
 _ATTRIBUTES = ("POSITION", "NORMAL", "TEXCOORD_0", "COLOR_0")
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-#: Vertices or faces, whichever are more, that the nodes of a file may come to (a larger file may hold as many as bytes).
+#: Limit of the vertices or faces, whichever are more, over all nodes of a file (or the file's bytes, where those are more).
 MOST_PLACED = 20_000_000
 
 
 def load_gltf(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
-    """The primitives of a glTF file, one part each, in world space.
+    """Return the primitives of a glTF file, one part each, in world space.
 
     Raises:
-        AssetError: truncated or malformed, a missing buffer or picture, or an extension that is required and not read.
+        AssetError: a truncated or malformed file, a missing buffer or image, or a required extension that is not supported.
     """
     return _Scene(Document(path, data), len(data)).parts(materials)
 
 
 class _Scene:
-    """The nodes of one document."""
+    """Reader of the nodes of one document."""
 
     def __init__(self, document: Document, size: int) -> None:
         self.document, self.json, self.path = document, document.json, document.path
-        # Nodes may place one mesh many times: a small file must not ask for any amount of memory.
+        # Many nodes may refer to one mesh: a small file must not take unlimited memory.
         self.most = max(MOST_PLACED, size)
         self.materials = Materials(document)
 
@@ -55,7 +56,7 @@ class _Scene:
         cameras = tuple(camera for camera in cameras if camera is not None)
         left_out = [name for name in ("animations", "skins") if self.json.get(name)]
         left_out += ["cameras"] * (bool(self.json.get("cameras")) and not cameras)
-        # Extensions of materials and textures are named where they are met.
+        # The readers of materials and textures list their own extensions.
         elsewhere = ("KHR_materials_", "KHR_texture_", "EXT_texture_")
         used = [str(name) for name in (*self.json.get("extensionsUsed", []), *self.json.get("extensions", {}))]
         left_out += [name for name in used if name not in _READ and not name.startswith(elsewhere)]
@@ -80,21 +81,21 @@ class _Scene:
                 part = self.primitive(mesh, node, number, primitive, materials, left_out)
                 if part is not None:
                     parts.append(transformed(part, matrix))
-        # With a part that is kept: those without a face are not.
+        # `checked` drops parts without faces, so lights and cameras go with the first other one.
         holder = next((number for number, part in enumerate(parts) if len(part.faces)), None)
         if holder is not None:
             parts[holder] = replace(parts[holder], lights=lights, cameras=cameras)
         return parts
 
     def size(self, primitive: dict[str, Any]) -> int:
-        """Vertices or faces of a primitive, whichever are more, as declared; what is alone too much its accessor refuses."""
+        """Return a primitive's declared number of vertices or faces, whichever is larger; 0 where its accessor will raise."""
         named = [primitive["attributes"]["POSITION"]] + [primitive[key] for key in ("indices",) if key in primitive]
         counts = [self.document.item("accessors", number).get("count") for number in named]
         counts = [count if type(count) is int and 0 < count <= self.most else 0 for count in counts]
         return max(counts[0], counts[-1] // (3 if primitive.get("mode", _TRIANGLES) == _TRIANGLES else 1))
 
     def nodes(self) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
-        """Every node of the scene with its world matrix."""
+        """Yield every node of the scene with its world matrix."""
         nodes = self.json.get("nodes", [])
         if "scenes" in self.json:
             roots = self.document.item("scenes", self.json.get("scene", 0)).get("nodes", [])
@@ -139,7 +140,7 @@ class _Scene:
         self, mesh: dict[str, Any], node: dict[str, Any], number: int, primitive: dict[str, Any],
         materials: bool, left_out: list[str],
     ) -> MeshPart | None:  # fmt: skip
-        """One primitive as a part in its mesh's space; None for points and lines."""
+        """Return a primitive as a part in its mesh's space; None for points and lines."""
         mode = primitive.get("mode", _TRIANGLES)
         if mode not in (_TRIANGLES, _STRIP, _FAN):
             left_out.append("points and lines")
@@ -171,7 +172,7 @@ class _Scene:
 
 
 def _triangles(index: NDArray[np.int64], mode: int, path: Path) -> NDArray[np.int64]:
-    """Index triples of a triangle list, strip or fan (glTF 2.0, 3.7.2.1)."""
+    """Return the index triples of a triangle list, strip or fan (glTF 2.0, 3.7.2.1)."""
     if mode == _TRIANGLES:
         if len(index) % 3:
             raise AssetError(path, f"{len(index)} indices are no whole number of triangles")

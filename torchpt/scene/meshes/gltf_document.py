@@ -1,4 +1,4 @@
-"""A glTF file as a checked document: its schema, buffers, accessors, nodes."""
+"""Validate the JSON of a glTF file against a schema, and read its buffers and accessors."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from torchpt.core.files import is_regular, read_regular
 __all__ = ["BLOCKS", "ROOT", "Document", "NumberReader", "SchemaError", "check"]
 
 
-# ---- What each part of a glTF document must be for the reader to follow it: objects, lists, texts, numbers, by key
+# ---- Schema of glTF documents: the types of all elements that are read
 #
-# Khronos glTF 2.0 specification, 5 (properties reference). Ranges of numbers are their readers' matter; only what is read is
-# checked, when it is first asked for. Errors name the element, as ``meshes[0].primitives[1].attributes.POSITION``.
+# Khronos glTF 2.0 specification, 5 (properties reference). Elements are checked when they are first read; the code that reads
+# a number checks its range. Errors name the element, as ``meshes[0].primitives[1].attributes.POSITION``.
 
 
 class SchemaError(ValueError):
-    """An element that is not what it must be; its text names it and says what is accepted."""
+    """An element of the wrong type; the text names it and says what is accepted."""
 
 
 @dataclass(frozen=True)
 class _Object:
-    """An object: what its keys hold, those that must be there, and what all others hold."""
+    """Schema of an object: by key, the required keys, and that of all other keys (None: not checked)."""
 
     keys: Mapping[str, Any] = field(default_factory=dict)
     required: tuple[str, ...] = ()
@@ -41,22 +41,22 @@ class _Object:
 
 @dataclass(frozen=True)
 class _List:
-    """A list: what its items are, and how many there are where that is fixed."""
+    """Schema of a list: that of its items, and its length where that is fixed."""
 
     items: Any
     length: int | None = None
 
 
-# Leaves: what a value must be, in words, and its types.
+# Schemas of single values: the phrase that errors print; and the types of each.
 _NUMBER, _WHOLE, _TEXT, _ANY = "a number", "a whole number", "text", "anything"
 _TYPES: dict[str, tuple[type, ...]] = {_NUMBER: (int, float), _WHOLE: (int,), _TEXT: (str,)}
-_LARGEST = 1e300  # of numbers that are only converted; those that count are held to narrower ranges where they are read
+_LARGEST = 1e300  # so that conversion to float cannot fail; the code that reads a number has its range
 
 _OBJECT = _Object()
 _INFO = _Object(
     {"extensions": _Object({"KHR_texture_transform": _OBJECT}), "texCoord": _ANY, "index": _WHOLE}, ("index",)
 )
-_LOOK = _Object(  # textures of the core material and of its extensions, whatever extension they stand in
+_LOOK = _Object(  # textures of the core material and of all its extensions
     {
         name: _INFO
         for name in (
@@ -73,7 +73,7 @@ _SPARSE = _Object(
     ("count", "indices", "values"),
 )
 
-#: Items of the document's lists, by the key of the list.
+#: Schema of the items of each list of the document, by the list's key.
 BLOCKS: dict[str, _Object] = {
     "scenes": _Object({"nodes": _List(_WHOLE)}),
     "nodes": _Object(
@@ -119,7 +119,7 @@ BLOCKS: dict[str, _Object] = {
     "textures": _Object({"extensions": _OBJECT}),
     "samplers": _Object({"wrapS": _WHOLE, "wrapT": _WHOLE}),
 }
-#: The document itself; the items of its lists are checked one by one.
+#: Schema of the document; :data:`BLOCKS` has the items of its lists.
 ROOT = _Object(
     {
         "extensionsRequired": _List(_TEXT),
@@ -131,15 +131,15 @@ ROOT = _Object(
 
 
 def check(value: Any, kind: Any, where: str) -> None:
-    """Hold a value against what it must be.
+    """Check a value of JSON against a schema.
 
     Args:
-        value: as JSON has it.
-        kind: one of :data:`BLOCKS`, or :data:`ROOT`.
-        where: the element's name; empty for the document itself.
+        value: the parsed JSON.
+        kind: the schema: one of :data:`BLOCKS`, or :data:`ROOT`.
+        where: the element's name for errors; empty for the document itself.
 
     Raises:
-        SchemaError: the first thing in it that is something else, or missing.
+        SchemaError: names the first element that is missing or of another type.
     """
     if isinstance(kind, _Object):
         if not isinstance(value, dict):
@@ -165,7 +165,7 @@ def check(value: Any, kind: Any, where: str) -> None:
 
 
 def _brief(value: Any) -> str:
-    """A value of JSON in a few words."""
+    """Return a short description of a value of JSON."""
     if isinstance(value, dict | list):
         return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)}"
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) > 10**40:
@@ -173,23 +173,23 @@ def _brief(value: Any) -> str:
     return repr(value)[:60] if value is not None else "null"
 
 
-# ---- A glTF 2.0 document and its bytes: GLB chunks, buffers, data: URIs, accessors
+# ---- Documents and their bytes: GLB chunks, buffers, data: URIs, accessors
 #
-# Khronos glTF 2.0 specification, 3.6 (binary data), 4.4 (GLB). Every declared size is held against what is there.
+# Khronos glTF 2.0 specification, 3.6 (binary data), 4.4 (GLB). Every declared size is checked against the bytes that exist.
 
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-#: Most rows of an accessor that has nothing but sparse ones: the others are zeros for which no byte is there.
+#: Largest count of an accessor with sparse rows only: its zeros are not in the file, so the file's size is no limit.
 _MOST_ZEROS = 2**20
 
 
 class Document:
-    """The JSON of a file, and what it points to.
+    """The JSON of a file, and the binary data that it refers to.
 
     Attributes:
         path: the file.
-        json: its object.
+        json: the top-level object.
     """
 
     def __init__(self, path: Path, data: bytes) -> None:
@@ -214,7 +214,7 @@ class Document:
                 self._buffers[0] = binary
 
     def item(self, block: str, index: Any) -> dict[str, Any]:
-        """An object of one of the document's lists, of which all that is read is of the right kind."""
+        """Return entry `index` of list `block`, checked against the schema on first use."""
         items = self.json.get(block, [])
         if type(index) is not int or not isinstance(items, list) or not 0 <= index < len(items):
             count = len(items) if isinstance(items, list) else 0
@@ -231,7 +231,7 @@ class Document:
             raise AssetError(self.path, f"malformed glTF: {wrong}") from None
 
     def resource(self, uri: Any, where: str) -> bytes:
-        """The bytes of a data: URI, or of a file beside the document."""
+        """Return the bytes of a data: URI, or of a file beside the document."""
         if not isinstance(uri, str):
             raise AssetError(self.path, f"{where}: the uri is no text")
         if uri.startswith("data:"):
@@ -247,7 +247,7 @@ class Document:
             raise AssetError(file, f"cannot be read ({error.strerror}), {where} of {self.path}") from None
 
     def file(self, uri: str, where: str) -> Path:
-        """The file that a relative URI names."""
+        """Return the path of the file that a relative URI names."""
         if "://" in uri:
             raise AssetError(self.path, f"{where}: only files and data: URIs are read, got {uri[:60]!r}")
         for name in dict.fromkeys((unquote(uri), uri)):
@@ -257,7 +257,7 @@ class Document:
         raise AssetError(self.path, f"{where}: the file {uri[:80]!r} is missing")
 
     def view(self, number: Any) -> tuple[memoryview, int | None]:
-        """The bytes of a bufferView, and its stride where it has one."""
+        """Return the bytes of a bufferView, and its stride or None."""
         view = self.item("bufferViews", number)
         index = view.get("buffer")
         begin, length = view.get("byteOffset", 0), view.get("byteLength")
@@ -278,7 +278,7 @@ class Document:
         return self._buffers[index]
 
     def accessor(self, number: Any, *kinds: str) -> NDArray[np.float64]:
-        """The rows of an accessor of one of some types, ``(n, width)`` float64; normalized integers become 0..1 or -1..1."""
+        """Return an accessor's rows ``(n, width)`` float64; its type must be in `kinds`; normalized integers become floats."""
         accessor = self.item("accessors", number)
         where = f"accessors {number}"
         kind, code, count = accessor.get("type"), accessor.get("componentType"), accessor.get("count")
@@ -321,7 +321,7 @@ class Document:
         return np.ascontiguousarray(rows).view(component)
 
     def _displace(self, values: NDArray[np.float64], sparse: Any, component: np.dtype, width: int, where: str) -> None:
-        """Puts the rows of a sparse accessor over those of its base (specification 3.6.2.3)."""
+        """Overwrite rows by those of a sparse accessor (specification 3.6.2.3)."""
         where = f"{where}.sparse"
         count, indices, rows = sparse["count"], sparse["indices"], sparse["values"]
         if (
@@ -339,11 +339,11 @@ class Document:
 
 
 class NumberReader:
-    """What objects of a document come to: reads their numbers.
+    """Reader of the numbers of a document's object, with range checks.
 
     Args:
-        document: whose they are.
-        what: what errors call the one that is read.
+        document: the document.
+        what: name of the object in errors.
     """
 
     def __init__(self, document: Document, what: str) -> None:
@@ -353,7 +353,7 @@ class NumberReader:
         """Return a number of the file, in a range.
 
         Raises:
-            AssetError: it is none, or lies outside.
+            AssetError: not a number, or out of range.
         """
         value = block.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
@@ -375,7 +375,7 @@ class NumberReader:
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
-    """The JSON and the binary chunk of a GLB file."""
+    """Return the JSON chunk and the binary chunk of a GLB file."""
     if len(data) < 20:
         raise AssetError(path, f"truncated: {len(data)} bytes")
     version, length = (int.from_bytes(data[at : at + 4], "little") for at in (4, 8))

@@ -1,4 +1,4 @@
-"""Lights and cameras of a glTF file's nodes: the rules, which ``docs/reference/assets.md`` tells users.
+"""Convert the lights and cameras of glTF nodes; ``docs/reference/assets.md`` has the rules.
 
 Khronos glTF 2.0 extension ``KHR_lights_punctual`` and specification 3.10 (cameras). Both look along their node's -z.
 """
@@ -21,25 +21,25 @@ __all__ = ["PUNCTUAL", "camera_at", "light_at"]
 
 PUNCTUAL = "KHR_lights_punctual"
 _KEYS = ("name", "type", "color", "intensity", "spot", "extras")
-#: The extension's kinds of lights, which are called as ours.
+#: Types of lights in the extension, which have the same names here.
 _TYPES = ("point", "spot", "directional")
-#: Amounts and lengths beyond it are taken for mistakes.
+#: Larger intensities and lengths are errors.
 _MOST = 1e30
-#: Degrees that a beam has at least: light that is whole on the axis alone.
+#: Smallest `beam_width` in degrees: stands for an innerConeAngle of 0.
 _NARROWEST = 1e-3
 
 
 def light_at(document: Document, node: dict[str, Any], matrix: NDArray[np.float64], left_out: list[str]) -> FileLight:
-    """The light of a node that has the extension.
+    """Return the light of a node that has the extension.
 
     Args:
         document: the file.
-        node: of the document.
+        node: the node's object.
         matrix: ``(4, 4)`` from the node to the file's space.
-        left_out: where the names of what is not used go.
+        left_out: gets the names of unsupported keys.
 
     Raises:
-        AssetError: a light that does not exist, or numbers that none can have.
+        AssetError: a light that does not exist, or numbers out of range.
     """
     index = node["extensions"][PUNCTUAL].get("light")
     lights = document.json.get("extensions", {}).get(PUNCTUAL, {}).get("lights", [])
@@ -60,7 +60,7 @@ def light_at(document: Document, node: dict[str, Any], matrix: NDArray[np.float6
 
 
 class _Rules(NumberReader):
-    """One light."""
+    """Reader of one light."""
 
     def __init__(self, document: Document, index: int, block: dict[str, Any]) -> None:
         super().__init__(document, f"{PUNCTUAL}: light {index}")
@@ -71,7 +71,7 @@ class _Rules(NumberReader):
         self.parameters = parameters_of(LIGHTS[self.kind])
 
     def values(self) -> dict[str, float | tuple[float, ...]]:
-        """Return what a scene file's light of its type has beside its place."""
+        """Return the light's parameters in a scene file, without position and direction."""
         color = self.numbers(self.block, "color", (1.0, 1.0, 1.0), _MOST)
         intensity = self.number(self.block, "intensity", 1.0, _MOST)
         amount = tuple(value * intensity for value in color)
@@ -94,7 +94,7 @@ class _Rules(NumberReader):
 
 
 def camera_at(document: Document, node: dict[str, Any], matrix: NDArray[np.float64]) -> FileCamera | None:
-    """The camera of a node that has one; None where its numbers make no picture (no picture is made with it here)."""
+    """Return the camera of a node; None for an invalid one, which is no error, since cameras of files are only reported."""
     index, cameras = node["camera"], document.json.get("cameras")
     if type(index) is not int or not isinstance(cameras, list) or not 0 <= index < len(cameras):
         return None

@@ -1,7 +1,7 @@
-"""What the materials of a glTF file come to: the rules, which ``docs/reference/assets.md`` tells users.
+"""Convert the materials of glTF files; ``docs/reference/assets.md`` has the rules.
 
 Khronos glTF 2.0 specification, 3.9 and appendix B, and the extensions ``KHR_materials_*``. The metallic-roughness model is
-close to Burley's principled one (roughness^2 is alpha in both, F0 of 0.04 is ``specular: 0.5``), so that is what it becomes.
+close to Burley's principled one (roughness^2 is alpha in both, F0 of 0.04 is ``specular: 0.5``), and is converted to it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torchpt.scene.meshes.mtl_material import coat_gloss
 
 __all__ = ["MATERIAL_EXTENSIONS", "Materials"]
 
-#: Extensions of materials that are read, at least in part; what of them is not is named.
+#: Extensions of materials that are read, at least in part; their unsupported keys are listed in ``FileMaterial.ignored``.
 MATERIAL_EXTENSIONS = (
     "KHR_materials_emissive_strength", "KHR_materials_transmission", "KHR_materials_ior", "KHR_materials_clearcoat",
     "KHR_materials_sheen", "KHR_materials_specular", "KHR_materials_unlit",
@@ -34,7 +34,7 @@ _WHITE = (1.0, 1.0, 1.0)
 
 
 class Materials:
-    """The materials of one document, by number."""
+    """Converter of one document's materials; each is converted once."""
 
     def __init__(self, document: Document) -> None:
         self.document = document
@@ -44,10 +44,10 @@ class Materials:
     def of(
         self, number: Any, colors: NDArray[np.float64] | None
     ) -> tuple[FileMaterial | None, NDArray[np.float64] | None]:
-        """A material, and the colours of the vertices with its base colour multiplied in where they stand for it.
+        """Return a material, and the vertex colours, multiplied by the base colour where they take its place.
 
         Args:
-            number: of the material; None where a primitive has none.
+            number: index of the material; None where a primitive has none.
             colors: the primitive's ``COLOR_0``, ``(V, 3)``, or None.
         """
         if number is None:
@@ -66,7 +66,7 @@ class Materials:
         return found, colors if colors is None or tint is None else colors * np.array(tint)
 
     def image(self, number: Any) -> str | EncodedImage:
-        """An image of the document: a path, or the bytes that lie in the document."""
+        """Return an image of the document: its path, or its bytes where they are embedded."""
         image = self.document.item("images", number)
         if number not in self.images:
             label = f"{self.document.path}: images {number}"
@@ -84,7 +84,7 @@ class Materials:
 
 
 class _Rules(NumberReader):
-    """One material, and the names of what was left out."""
+    """Converter of one material; ``ignored`` has the names of unsupported features."""
 
     def __init__(self, materials: Materials, block: dict[str, Any], number: Any) -> None:
         super().__init__(materials.document, f"materials {number}")
@@ -95,7 +95,7 @@ class _Rules(NumberReader):
         self.tinted = False
 
     def material(self, colored: bool) -> dict[str, Any]:
-        """The material as a scene file would have it; ``colored``: the vertices have colours."""
+        """Return the material as a block of a scene file; ``colored``: the vertices have colours."""
         pbr = self.block.get("pbrMetallicRoughness", {})
         factor = self.numbers(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0))
         self.base = (factor[0], factor[1], factor[2])
@@ -117,7 +117,7 @@ class _Rules(NumberReader):
         return material
 
     def microfacets(self, pbr: dict[str, Any]) -> dict[str, Any]:
-        """Roughness (G) and metallic (B) of one picture, and the strength of a dielectric's highlight."""
+        """Return roughness (channel G), metallic (B) and the specular strength or index of a dielectric."""
         rough = self.number(pbr, "roughnessFactor", 1.0, 1.0)
         metal = self.number(pbr, "metallicFactor", 1.0, 1.0)
         found: dict[str, Any] = {"roughness": self.scaled(pbr, "metallicRoughnessTexture", rough, "g")}
@@ -147,7 +147,7 @@ class _Rules(NumberReader):
         return found
 
     def layers(self) -> dict[str, Any]:
-        """Transmission, clearcoat and sheen."""
+        """Return the parameters of transmission, clearcoat and sheen."""
         found: dict[str, Any] = {}
         block = self.extension("transmission", ("transmissionFactor", "transmissionTexture"))
         through = self.number(block, "transmissionFactor", 0.0, 1.0)
@@ -168,7 +168,7 @@ class _Rules(NumberReader):
         return found
 
     def set_opacity(self, material: dict[str, Any], pbr: dict[str, Any], factor: float) -> None:
-        """alphaMode: the base colour's alpha is the opacity, above a threshold or as it is."""
+        """Set the opacity by alphaMode: the base colour's alpha, with a cut-off for MASK."""
         mode = self.block.get("alphaMode", "OPAQUE")
         if mode not in ("OPAQUE", "MASK", "BLEND"):
             raise self.wrong(f"alphaMode {str(mode)[:40]!r}, expected OPAQUE, MASK or BLEND")
@@ -184,7 +184,7 @@ class _Rules(NumberReader):
             material["opacity"] = alpha
 
     def set_normals(self, material: dict[str, Any]) -> None:
-        """The normal map."""
+        """Set the normal map."""
         normals = self.texture(self.block, "normalTexture", 1.0, None)
         if normals is None:
             return
@@ -196,7 +196,7 @@ class _Rules(NumberReader):
             material["normal_strength"] = strength
 
     def set_emission(self, material: dict[str, Any]) -> None:
-        """EmissiveFactor times its picture times KHR_materials_emissive_strength."""
+        """Set the emission: emissiveFactor, its texture, KHR_materials_emissive_strength."""
         color = self.numbers(self.block, "emissiveFactor", (0.0, 0.0, 0.0), 1e30)
         block = self.extension("emissive_strength", ("emissiveStrength",))
         strength = self.number(block, "emissiveStrength", 1.0, 1e30)
@@ -208,19 +208,19 @@ class _Rules(NumberReader):
             material["emission_strength"] = strength
 
     def extension(self, name: str, read: tuple[str, ...]) -> dict[str, Any]:
-        """The block of ``KHR_materials_NAME``; keys beside those that are read are named."""
+        """Return the block of ``KHR_materials_NAME``, and list its unsupported keys."""
         name = f"KHR_materials_{name}"
         block = self.extensions.get(name, {})
         self.ignored += [f"{name}.{str(key)[:40]}" for key in block if key not in (*read, "extras")]
         return block
 
     def scaled(self, block: dict[str, Any], key: str, factor: float, channel: str) -> Any:
-        """A number, times a channel of its picture where it has one."""
+        """Return a number, or a texture of a channel scaled by it where the file has one."""
         found = self.texture(block, key, factor, channel) if factor != 0 else None
         return factor if found is None else found
 
     def texture(self, block: dict[str, Any], key: str, scale: float | list[float], channel: str | None) -> Any:
-        """The picture that a textureInfo names; None where there is none, or none that is read."""
+        """Return the texture that a textureInfo refers to; None where it is missing or unsupported."""
         info = block.get(key)
         if info is None:
             return None

@@ -1,4 +1,4 @@
-"""A part of a mesh file: vertices, faces, smooth normals, displacement."""
+"""Records of what mesh files hold, their validation, and smooth normals, polygon fans and displacement of meshes."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ __all__ = [
 
 
 def smooth_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return unit vertex normals ``(V, 3)``, as :func:`torchpt.physics.shapes.normals.smooth_normals` has them.
+    """Return unit vertex normals ``(V, 3)``, computed by :func:`torchpt.physics.shapes.normals.smooth_normals`.
 
-    A vertex without a face of positive area gets (0, 0, 1), so nothing is NaN; so does one whose faces face each other.
+    A vertex whose normals sum to zero (no face with an area, or faces of opposite normals) gets (0, 0, 1).
 
     Args:
         vertices: ``(V, 3)``.
@@ -48,10 +48,10 @@ def smooth_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> N
     return found
 
 
-# ---- What a mesh loader hands over, and the checks that every format shares
+# ---- Records that mesh readers return, and the checks that all formats share
 
 
-#: Parts that one file may come to: groups of an OBJ file, placed primitives of a glTF file.
+#: Most parts of one file: groups of an OBJ file, primitives of all nodes of a glTF file.
 MOST_PARTS = 100_000
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -61,13 +61,13 @@ Rgb = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class FileMaterial:
-    """A mesh file's own material.
+    """A material of a mesh file.
 
     Attributes:
         name: as in the file.
-        material: what a scene file would have: ``type``, parameters, textures inline with absolute paths or
+        material: the block of a scene file: ``type``, parameters, textures inline with absolute paths or
             `EncodedImage`.
-        ignored: what the file says about the look and torchpt does not read, by the file's names.
+        ignored: unsupported features of the material, by the file's names.
     """
 
     name: str
@@ -77,14 +77,14 @@ class FileMaterial:
 
 @dataclass(frozen=True)
 class FileLight:
-    """A light of a mesh file that is no surface.
+    """A light of a mesh file other than an emissive surface.
 
     Attributes:
         name: as in the file.
         kind: ``type`` of a scene file's light: ``point``, ``spot`` or ``directional``.
         position: ``(3,)`` float64 in the file's space.
-        direction: ``(3,)`` of unit length, where it shines.
-        numbers: what a scene file's light of that type has beside its place.
+        direction: ``(3,)`` unit vector away from the light.
+        numbers: its parameters in a scene file, without position and direction.
     """
 
     name: str
@@ -96,13 +96,13 @@ class FileLight:
 
 @dataclass(frozen=True)
 class FileCamera:
-    """A camera of a mesh file, for users to copy: a scene has its own.
+    """A camera of a mesh file. It is only reported, for users to copy into their scene.
 
     Attributes:
         name: as in the file.
         kind: ``type`` of a scene file's camera.
         matrix: ``(4, 4)`` from its own space, where it looks along -z with +y up, to the file's.
-        film: what it sees, as keys of a scene file's camera.
+        film: its field of view or width, as text of a scene file's camera block.
     """
 
     name: str
@@ -113,19 +113,19 @@ class FileCamera:
 
 @dataclass(frozen=True)
 class MeshPart:
-    """Triangles that share a material.
+    """Triangles of a mesh file that share a material.
 
     Attributes:
-        name: the group's name in the file, may be empty.
+        name: the group's name in the file; may be empty.
         vertices: ``(V, 3)`` float64.
         faces: ``(F, 3)`` int64, front side counter-clockwise.
         normals: ``(V, 3)`` float64 of unit length where the file has them, else None.
         uvs: ``(V, 2)`` float64, row 0 of an image at v = 0, or None.
         colors: ``(V, 3)`` float64, linear RGB >= 0, or None.
         material: the file's own, or None.
-        ignored: what else of the file was left out, by name.
-        lights: of the whole file; one of its parts has them.
-        cameras: the same.
+        ignored: further unsupported features of the file, by name.
+        lights: lights of the whole file; only one of its parts has them.
+        cameras: cameras of the whole file; only one of its parts has them.
     """
 
     name: str
@@ -141,7 +141,7 @@ class MeshPart:
 
 
 def checked(parts: list[MeshPart], path: Path) -> list[MeshPart]:
-    """The parts, with indices and numbers checked, normals made unit and odd ones replaced.
+    """Return the parts that have faces, with indices and numbers checked and normals normalized.
 
     A zero normal becomes the smooth one of its vertex; a texture coordinate that is not finite becomes 0.
 
@@ -157,7 +157,7 @@ def checked(parts: list[MeshPart], path: Path) -> list[MeshPart]:
 
 
 def too_many_parts(path: Path) -> AssetError:
-    """What is said of a file of more than :data:`MOST_PARTS`."""
+    """Return the error for a file of more than :data:`MOST_PARTS` parts."""
     return AssetError(path, f"has more than {MOST_PARTS} parts; at most so many are read")
 
 
@@ -192,11 +192,11 @@ def _checked(part: MeshPart, path: Path) -> MeshPart:
 
 
 def polygon_fans(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Fans over polygons: ``(F, 3)`` positions into a flat list of corners, in polygon order.
+    """Split polygons into fans of triangles: ``(F, 3)`` indices into the flat list of corners, in the order of polygons.
 
     Args:
-        starts: position of each polygon's first corner.
-        counts: corners of each polygon, at least 3 (right for convex ones, as in most loaders).
+        starts: index of each polygon's first corner.
+        counts: number of corners of each polygon, at least 3. Fans are right for convex polygons, as in most loaders.
     """
     fans = counts - 2
     owner = np.repeat(np.arange(len(counts)), fans)
@@ -206,7 +206,7 @@ def polygon_fans(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArra
 
 
 def transformed(part: MeshPart, matrix: NDArray[np.float64]) -> MeshPart:
-    """A part moved by an affine ``(4, 4)`` matrix; a mirroring one flips the winding, the front stays outside."""
+    """Return a part transformed by an affine ``(4, 4)`` matrix; a mirroring one flips the winding, so fronts stay fronts."""
     linear = matrix[:3, :3]
     normals, faces = part.normals, part.faces
     if normals is not None:
@@ -220,24 +220,21 @@ def transformed(part: MeshPart, matrix: NDArray[np.float64]) -> MeshPart:
     )
 
 
-# ---- Displacement maps: a mesh is subdivided when the scene is built, and its vertices move along their normals
+# ---- Displacement maps: subdivide a mesh when the scene is built, and move its vertices along their normals
 #
-# Vertices that lie at one place (on both sides of a seam of the texture, say) move together, so that no crack opens.
+# Vertices of the same position (on both sides of a texture seam, say) move together, so that no crack opens.
 
 
 Rows = NDArray[np.float64]
 
 
 def displaced(piece: MeshPart, heights: Callable[[Rows], Rows], subdivisions: int) -> MeshPart:
-    """A mesh with its vertices moved along their normals.
+    """Return a mesh with its vertices moved along their normals, and the normals of its new shape.
 
     Args:
         piece: the mesh, with texture coordinates.
-        heights: from texture coordinates ``(V, 2)`` to how far each vertex goes ``(V,)``, in the mesh's own space.
-        subdivisions: how often every triangle is first cut into four.
-
-    Returns:
-        The mesh; its normals are those of its new shape, to be computed.
+        heights: returns displacements ``(V,)`` in the mesh's own space for texture coordinates ``(V, 2)``.
+        subdivisions: number of times that every triangle is first split into four.
     """
     assert piece.uvs is not None
     normals = piece.normals if piece.normals is not None else smooth_normals(piece.vertices, piece.faces)
@@ -249,17 +246,17 @@ def displaced(piece: MeshPart, heights: Callable[[Rows], Rows], subdivisions: in
     direction = _averaged(_unit(mesh.normals), group, len(place))
     height = _averaged(heights(mesh.uvs)[:, None], group, len(place))
     vertices = place + _unit(direction) * height
-    # One vertex a place, so that the new normals are smooth across seams; texture coordinates stay with their own.
+    # One vertex per position, so that the new normals are smooth across texture seams.
     joined = replace(mesh, vertices=vertices, faces=group[mesh.faces], normals=None, uvs=None, colors=None)
     smooth = smooth_normals(joined.vertices, joined.faces)
     return replace(mesh, vertices=vertices[group], normals=smooth[group])
 
 
 def subdivided(mesh: MeshPart) -> MeshPart:
-    """A mesh with every triangle cut into four at the middles of its edges; whatever the vertices have is interpolated."""
+    """Return a mesh with every triangle split into four at its edges' midpoints; vertex attributes are interpolated."""
     a, b, c = mesh.faces.T
     ends = np.sort(np.concatenate([np.stack([a, b], 1), np.stack([b, c], 1), np.stack([c, a], 1)]), axis=1)
-    # As one number each, which sorts many times faster than pairs.
+    # Edges as single numbers sort many times faster than pairs.
     keys, which = np.unique(ends[:, 0] * len(mesh.vertices) + ends[:, 1], return_inverse=True)
     edges = np.stack(np.divmod(keys, len(mesh.vertices)), 1)
     ab, bc, ca = which.reshape(3, -1) + len(mesh.vertices)
@@ -282,21 +279,21 @@ def subdivided(mesh: MeshPart) -> MeshPart:
 
 
 def _unique_positions(vertices: Rows) -> tuple[Rows, NDArray[np.int64]]:
-    """Distinct positions, and which of them each vertex has."""
+    """Return the distinct positions, and the index of each vertex's position."""
     bits = (np.ascontiguousarray(vertices) + 0.0).view(np.uint64)  # + 0 makes -0 and 0 one
     mixed = bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
     mixed ^= mixed >> np.uint64(29)
-    # Any vertex of a place will do for it: asked for the first ones, `unique` would have to sort stably, which is far slower.
+    # No `return_index`: `unique` would sort stably for it, which is far slower.
     keys, group = np.unique(mixed.sum(1) * np.uint64(0xBF58476D1CE4E5B9), return_inverse=True)
     place, group = np.empty((len(keys), 3)), group.reshape(-1)
     place[group] = vertices
-    if not np.array_equal(place[group], vertices):  # two places of one hash: once in 2^64 / V^2 meshes
+    if not np.array_equal(place[group], vertices):  # a hash collision: one in 2^64 / V^2 meshes
         place, group = np.unique(vertices, axis=0, return_inverse=True)
     return place, group.reshape(-1)
 
 
 def _averaged(rows: Rows, group: NDArray[np.int64], count: int) -> Rows:
-    """Means ``(count, C)`` over groups."""
+    """Return the means ``(count, C)`` of rows by group."""
     total = np.stack([np.bincount(group, column, minlength=count) for column in rows.T], 1)
     return total / np.bincount(group, minlength=count)[:, None]
 

@@ -1,4 +1,4 @@
-"""MTL material files: their statements, checked. What these come to as materials is in :mod:`mtl_material`."""
+"""Parse MTL material files; :mod:`mtl_material` converts their statements to materials."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchpt.scene.meshes.mtl_material import COLORS, MAPS, NUMBERS, Map, Statem
 
 __all__ = ["decoded_lines", "find_file", "read_mtl"]
 
-# options of a map statement -> how many words follow, at most; numbers only where the option takes one to three
+# Options of a map statement -> most words that follow; options of up to three take numbers only.
 _OPTIONS = {
     **{"-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, "-texres": 1, "-bm": 1, "-boost": 1, "-imfchan": 1},
     **{"-type": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-colorspace": 1},
@@ -22,9 +22,9 @@ _VECTORS = ("-o", "-s", "-t")
 
 
 def decoded_lines(data: bytes) -> list[str]:
-    """The lines of a text file, with continuations (a backslash at the end of a line) joined by blanks of equal count.
+    """Return the lines of a text file; lines that end in a backslash are joined with the next.
 
-    A continued line keeps the line numbers right: what was joined leaves empty lines behind.
+    Empty lines stand in for joined ones, so that line numbers stay right.
     """
     try:
         text = data.decode("utf-8-sig")
@@ -47,7 +47,7 @@ def decoded_lines(data: bytes) -> list[str]:
 
 
 def find_file(path: Path, name: str) -> Path | None:
-    """The file that a statement of ``path`` names, or None: with backslashes too, and by its last part alone."""
+    """Return the file that a statement in ``path`` names, or None; backslashes, and a match of the last component, will do."""
     forward = name.replace("\\", "/")
     for form in dict.fromkeys((name, forward, forward.rpartition("/")[2])):
         candidate = path.parent / form
@@ -57,14 +57,14 @@ def find_file(path: Path, name: str) -> Path | None:
 
 
 def read_mtl(path: Path, wanted: set[str]) -> dict[str, FileMaterial]:
-    """The materials of an MTL file by name.
+    """Return the materials of an MTL file by name.
 
     Args:
         path: the file.
-        wanted: names of those that are used; the others' pictures need not exist.
+        wanted: names of the materials that are used; images of the others need not exist.
 
     Raises:
-        AssetError: a file that cannot be read, a statement that is malformed, a picture that is missing.
+        AssetError: a file that cannot be read, a malformed statement, a missing image.
     """
     try:
         lines = decoded_lines(read_regular(path))
@@ -96,7 +96,7 @@ class _Line:
 
 
 def _add(statements: Statements, key: str, text: str, line: _Line) -> None:
-    """Files one statement under its kind."""
+    """Parse a statement and add it to those of its material."""
     lower = key.lower()
     kind = lower.replace("map_bump", "bump").replace("map_norm", "norm").replace("map_opacity", "map_d")
     if lower in COLORS:
@@ -135,7 +135,7 @@ def _color(text: str, key: str, line: _Line) -> Rgb:
 
 
 def _map(key: str, text: str, line: _Line) -> Map:
-    """A map statement: options, then a file name that may hold blanks."""
+    """Parse a map statement: options, then a file name that may hold blanks."""
     found = list(re.finditer(r"\S+", text))
     words, starts, at = [word[0] for word in found], [word.start() for word in found], 0
     options: dict[str, list[str]] = {}
@@ -192,7 +192,7 @@ def _is_number(word: str) -> bool:
 
 
 def _finished(name: str, statements: Statements, path: Path) -> FileMaterial:
-    """The material of its statements; every picture has been found."""
+    """Convert the statements of a material, once all its images are found."""
     files: dict[str, str] = {}
     for kind, found in statements.maps.items():
         file = find_file(path, found.name) or find_file(path, found.name.partition("#")[0].strip())

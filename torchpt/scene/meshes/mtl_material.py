@@ -1,4 +1,4 @@
-"""What the statements of an MTL file come to: the rules, which ``docs/reference/assets.md`` tells users.
+"""Convert the materials of MTL files; ``docs/reference/assets.md`` has the rules.
 
 The format was made for Phong's model (Alias Wavefront, *Object Files*, appendix B: MTL 3.0); ``Pr Pm Ps Pc Pcr aniso
 anisor norm`` are the extension of Clara.io's and Blender's exporters, whose meaning is Burley's principled model.
@@ -32,15 +32,15 @@ class Map:
     """A map statement.
 
     Attributes:
-        key: as written.
-        name: the file's, as written.
-        line: where it stands.
+        key: the statement's key as written.
+        name: the image file's name as written.
+        line: line number.
         bump: ``-bm``.
         offset: ``-o``.
         scale: ``-s``.
         clamp: ``-clamp on``.
-        channel: of ``-imfchan``, or None.
-        ignored: options that are not read.
+        channel: channel of ``-imfchan``, or None.
+        ignored: unsupported options.
     """
 
     key: str
@@ -56,7 +56,7 @@ class Map:
 
 @dataclass
 class Statements:
-    """What a file says of one material, by lower-case key; the last statement of a key holds."""
+    """The statements of one material by lower-case key; the last one of a key holds."""
 
     colors: dict[str, Rgb] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
@@ -65,15 +65,15 @@ class Statements:
 
 
 def coat_gloss(roughness: float) -> float:
-    """The ``clearcoat_gloss`` whose alpha is ``roughness^2``: alpha runs from 0.1 at gloss 0 to 0.001 at gloss 1."""
+    """Return the ``clearcoat_gloss`` of a roughness (alpha = roughness²; alpha is 0.1 at gloss 0 and 0.001 at gloss 1)."""
     return min(max((0.1 - roughness * roughness) / 0.099, 0.0), 1.0)
 
 
 def material_of(statements: Statements, files: dict[str, str]) -> tuple[dict[str, Any], list[str]]:
-    """A material as a scene file would have it, and what of the statements it does not say.
+    """Return a material as a block of a scene file, and the names of unsupported statements.
 
     Args:
-        statements: those of one material.
+        statements: the statements of one material.
         files: absolute path of each map.
     """
     rules = _Rules(statements, files)
@@ -85,7 +85,7 @@ def material_of(statements: Statements, files: dict[str, str]) -> tuple[dict[str
 
 
 class _Rules:
-    """One material's statements, and the names of those that were left out."""
+    """Converter of one material; ``ignored`` has the names of unsupported statements."""
 
     def __init__(self, statements: Statements, files: dict[str, str]) -> None:
         self.colors, self.numbers, self.maps = statements.colors, statements.numbers, statements.maps
@@ -95,7 +95,7 @@ class _Rules:
         self.opacity = self._opacity()
 
     def surface(self) -> dict[str, Any]:
-        """The model and its own parameters."""
+        """Return the type and its parameters, without opacity, normals and emission."""
         if self._is_glass():
             return self._glass()
         if _PBR & (self.numbers.keys() | self.maps.keys()):
@@ -115,7 +115,7 @@ class _Rules:
         }
 
     def _opacity(self) -> float:
-        """`d`, else 1 - `Tr`; but a `Tr` of 1 is taken for the `d` that some exporters write under that name."""
+        """Return `d`, else 1 - `Tr`; a `Tr` of 1 counts as opaque, since some exporters write `d` under that name."""
         if "d" in self.numbers:
             return self._bounded(self.numbers["d"], "d")
         through = self._bounded(self.numbers.get("tr", 0.0), "Tr")
@@ -142,7 +142,7 @@ class _Rules:
         self.ignored += [
             found.key for kind, found in self.maps.items() if kind in ("map_kd", "map_ks", "map_pr", "map_pm")
         ]
-        self.opacity = 1.0  # it says how much light passes, which the glass knows
+        self.opacity = 1.0  # the dielectric has its own transmission
         return material
 
     def _principled(self) -> dict[str, Any]:
@@ -172,12 +172,12 @@ class _Rules:
         return material
 
     def _amount(self, key: str, kind: str) -> float:
-        """A feature's number: where a map is given, 0 counts as absent."""
+        """Return a feature's number; beside a map 0 counts as absent."""
         value = self._bounded(self.numbers.get(key, 0.0), _NAMES[key])
         return 1.0 if kind in self.maps and value == 0.0 else value
 
     def _specular(self, ks: Rgb) -> Any:
-        """How strong a dielectric highlight is: the mean of `Ks`."""
+        """Return the specular strength of a dielectric: the mean of `Ks`."""
         if max(ks) == 0:
             ks = _WHITE  # beside its map
         if min(ks) != max(ks):
@@ -185,17 +185,17 @@ class _Rules:
         return self._number(self._bounded(sum(ks) / 3.0, "Ks"), "map_ks")
 
     def _phong_roughness(self) -> float:
-        """Of the microfacets whose highlight is about as wide as that of the exponent `Ns`.
+        """Return the roughness whose highlight is about as wide as that of the Phong exponent `Ns`.
 
         alpha = sqrt(2 / (Ns + 2)) (Walter et al., *Microfacet Models for Refraction through Rough Surfaces*, 2007,
-        section 5.2, for Beckmann's), and roughness = sqrt(alpha).
+        section 5.2, for Beckmann's distribution), and roughness = sqrt(alpha).
         """
         if "ns" not in self.numbers:
             return 0.5
         return math.sqrt(math.sqrt(2.0 / (max(self.numbers["ns"], 0.0) + 2.0)))
 
     def set_opacity(self, material: dict[str, Any]) -> None:
-        """How much of the surface is there at all: `d`, `Tr`, `map_d`."""
+        """Set the opacity: `d`, `Tr`, `map_d`."""
         found = self.maps.get("map_d")
         if found is not None:
             channel = found.channel
@@ -210,7 +210,7 @@ class _Rules:
             self.ignored.append("Tf")
 
     def set_normals(self, material: dict[str, Any]) -> None:
-        """`norm`, `bump`: where the latter's file is called a normal map, it is one."""
+        """Set the normal or bump map: `norm`, `bump`; a `bump` whose file name says normal map is one."""
         kind = "norm" if "norm" in self.maps else "bump"
         if kind not in self.maps:
             return
@@ -228,7 +228,7 @@ class _Rules:
             material["bump_map"] = self._image(kind, found.bump, found.channel or "luminance")
 
     def set_emission(self, material: dict[str, Any]) -> None:
-        """`Ke` times `map_Ke`."""
+        """Set the emission: `Ke` times `map_Ke`."""
         light = self.colors.get("ke", (0.0, 0.0, 0.0))
         if "map_ke" in self.maps:
             material["emission"] = self._image("map_ke", plain_scale(light if max(light) > 0 else _WHITE), None)
@@ -236,14 +236,14 @@ class _Rules:
             material["emission"] = list(light)
 
     def _color(self, key: str, default: Rgb, kind: str) -> Any:
-        """A colour of at most 1, times its map; beside one, black counts as white, as exporters write it for absent."""
+        """Return a colour clamped to 1, times its map. Beside a map black counts as white: exporters write it for absent."""
         color = self._unit(key, _WHITE if kind in self.maps else default)
         if kind not in self.maps:
             return list(color)
         return self._image(kind, plain_scale(color if max(color) > 0 else _WHITE), None)
 
     def _number(self, value: float, kind: str) -> Any:
-        """A number times its map."""
+        """Return a number times its map."""
         if kind not in self.maps:
             return value
         return self._image(kind, value, self.maps[kind].channel or "luminance")
@@ -273,7 +273,7 @@ class _Rules:
         return color
 
     def _bounded(self, value: float, name: str) -> float:
-        """A number in 0..1."""
+        """Return a number clamped to 0..1."""
         inside = min(max(value, 0.0), 1.0)
         if inside != value and f"{name} outside 0..1" not in self.ignored:
             self.ignored.append(f"{name} outside 0..1")

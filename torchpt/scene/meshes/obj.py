@@ -1,7 +1,7 @@
-"""Wavefront OBJ: polygons with their own indices for position, texture and normal, in groups of one material each.
+"""Read Wavefront OBJ: polygons with separate indices for position, texture and normal, grouped by material.
 
-Corners ``v/vt/vn`` become vertices, one for each different combination, as in Mitsuba. Polygons are split into fans
-(right for convex ones). Texture v is flipped: the format counts it from the bottom row.
+Each distinct corner ``v/vt/vn`` becomes a vertex, as in Mitsuba. Polygons are split into fans (right for convex ones).
+Texture v is flipped: the format counts it from the bottom row.
 """
 
 from __future__ import annotations
@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
-from torchpt.scene.meshes.mesh import MOST_PARTS, FileMaterial, MeshPart, polygon_fans, smooth_normals, too_many_parts
+from torchpt.scene.meshes.mesh import (
+    MOST_PARTS,
+    FileMaterial,
+    MeshPart,
+    polygon_fans,
+    smooth_normals,
+    too_many_parts,
+)
 from torchpt.scene.meshes.mtl import decoded_lines, find_file, read_mtl
 
 __all__ = ["load_obj"]
@@ -23,7 +30,7 @@ _CURVES = ("curv", "curv2", "surf", "l", "p")
 
 @dataclass
 class _Text:
-    """The file's statements as written, sorted by kind, with the line numbers for errors."""
+    """The statements of a file by key, as written, with line numbers for errors."""
 
     v: list[str] = field(default_factory=list)
     vt: list[str] = field(default_factory=list)
@@ -37,7 +44,7 @@ class _Text:
 
 
 def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
-    """The parts of an OBJ file, one per `usemtl` name.
+    """Return the parts of an OBJ file, one per `usemtl` name.
 
     Raises:
         AssetError: a malformed line, an index out of range, a malformed MTL file.
@@ -107,7 +114,7 @@ def _split(lines: list[str], path: Path) -> _Text:
 
 
 def _absolute(words: list[str], counts: tuple[int, int, int], path: Path, number: int) -> list[str]:
-    """A face with its negative indices (counted back from the statement) made positive."""
+    """Replace negative indices of a face, which count back from its statement, by positive ones."""
     result = [words[0]]
     for word in words[1:]:
         indices = word.split("/")
@@ -129,7 +136,7 @@ def _libraries(text: _Text, path: Path) -> dict[str, FileMaterial]:
     for name in text.libraries:
         whole = find_file(path, name)  # a name may hold blanks; else blanks separate several names
         files = [whole] if whole is not None else [find_file(path, word) for word in name.split()]
-        if not files or None in files:  # often so with files that were sent around; the shape is there all the same
+        if not files or None in files:  # MTL files are often missing; the shape can be rendered without
             text.ignored.append(f"mtllib {name} (no such file)")
         for file in files:
             if file is not None:
@@ -138,7 +145,7 @@ def _libraries(text: _Text, path: Path) -> dict[str, FileMaterial]:
 
 
 def _numbers(text: _Text, key: str, columns: int, path: Path) -> NDArray[np.float64]:
-    """``(n, columns)``: the first numbers of each statement; a one-number `vt` gets v = 0."""
+    """Return the first numbers of each statement ``(n, columns)``; a one-number `vt` gets v = 0."""
     rows: list[str] = getattr(text, key)
     words = " ".join(rows).split()
     width = columns + 1
@@ -166,11 +173,11 @@ def _numbers(text: _Text, key: str, columns: int, path: Path) -> NDArray[np.floa
 def _corners(
     text: _Text, path: Path, sizes: tuple[int, int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Corners of all faces.
+    """Parse the corners of all faces.
 
     Returns:
-        the different corners ``(V, 3)`` as zero-based v, vt, vn (-1: absent); which of them each corner is ``(C,)``;
-        how many corners each face has.
+        The distinct corners ``(V, 3)`` as zero-based v, vt, vn (-1: absent); the row of each corner of each face ``(C,)``;
+        the number of corners of each face.
     """
     words = " ".join(text.f).split()
     heads = np.array([at for at, word in enumerate(words) if word == "f"])
@@ -205,7 +212,7 @@ def _corners(
 
 
 def _looked_up(indices: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Rows of ``values``, zeros where the index is -1; None where all are."""
+    """Return rows of ``values`` by index, zeros for index -1; None where all indices are -1."""
     if not len(values) or (indices < 0).all():
         return None
     return np.where((indices >= 0)[:, None], values[np.maximum(indices, 0)], 0.0)

@@ -1,6 +1,6 @@
-"""PLY, ASCII and binary: the elements `vertex` and `face`; anything else in the file is stepped over.
+"""Read PLY, ASCII and binary: the elements `vertex` and `face`; other elements are skipped.
 
-Declared sizes are held against the file's before anything is allocated.
+Declared sizes are checked against the file's before memory is allocated.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _TYPES = {
 _INDICES = ("vertex_indices", "vertex_index")
 _COLORS = ("red", "green", "blue")
 _COLORED = {"type": "diffuse", "reflectance": {"type": "vertex_color"}}
-#: Bytes of the longest header.
+#: Most bytes of a header.
 _MOST_HEADER = 2**20
 _END = re.compile(rb"(?:^|\r)end_header[ \t]*(?:\r\n|\n|\r(?!\n))", re.MULTILINE)
 _UVS = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))
@@ -51,10 +51,10 @@ Columns = dict[str, Any]  # scalar property: (n,); list property: (lengths (n,),
 
 
 def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
-    """The faces of a PLY file as one part; the format has no materials, but vertices may have colours.
+    """Return the faces of a PLY file as one part; the format has no materials, but vertices may have colours.
 
     Raises:
-        AssetError: truncated, malformed, or without vertices and faces.
+        AssetError: a truncated or malformed file, or one without vertices and faces.
     """
     layout, elements, start = _header(path, data)
     reader = _Ascii(path, data, start, elements) if layout == "ascii" else _Binary(path, data, start, layout)
@@ -110,7 +110,7 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], 
 
 
 def _colors(vertex: Columns, elements: list[_Element]) -> NDArray[np.float64] | None:
-    """Linear RGB: floats as stored, integers over the largest of their declared type."""
+    """Return linear RGB: floats as stored, integers over the largest of their declared type."""
     kinds = {p.name: p.kind for element in elements if element.name == "vertex" for p in element.properties}
     if not all(isinstance(vertex.get(name), np.ndarray) for name in _COLORS):
         return None
@@ -166,7 +166,7 @@ def _truncated(path: Path, element: _Element, row: int | None = None) -> AssetEr
 
 
 class _Binary:
-    """Reads element after element from the bytes behind the header."""
+    """Reader of the elements of a binary file."""
 
     def __init__(self, path: Path, data: bytes, start: int, layout: str) -> None:
         self.path, self.data, self.at = path, data, start
@@ -185,7 +185,7 @@ class _Binary:
         return self.ragged(element) if uniform is None else uniform
 
     def uniform(self, element: _Element) -> Columns | None:
-        """All records at once where every list has the length it has in the first record."""
+        """Read all records at once; None where a list's length differs from that in the first record."""
         lengths, at = [], self.at
         for p in element.properties:
             length = 1
@@ -216,7 +216,7 @@ class _Binary:
         return columns
 
     def ragged(self, element: _Element) -> Columns:
-        """Record by record, for lists of different lengths."""
+        """Read record by record, for lists of different lengths."""
         chunks: list[list[Any]] = [[] for _ in element.properties]
         counts: list[list[int]] = [[] for _ in element.properties]
         at = self.at
@@ -250,7 +250,7 @@ class _Binary:
 
 
 class _Ascii:
-    """The same from words of text."""
+    """Reader of the elements of an ASCII file."""
 
     def __init__(self, path: Path, data: bytes, start: int, elements: list[_Element]) -> None:
         self.path, self.data, self.start, self.elements = path, data, start, elements
@@ -298,11 +298,11 @@ class _Ascii:
             raise self.wrong(f"element {element.name} holds {found}, expected {expected}") from None
 
     def wrong(self, problem: str) -> AssetError:
-        """The first row that is another than the header says; where all are as it says, the problem that was met."""
+        """Return the error about the first row that does not match the header, else about ``problem``."""
         return AssetError(self.path, find_mismatch(self.data, self.start, self.elements) or problem)
 
     def end(self) -> None:
-        """Refuse rows that came out even by chance: what is left over is not what the header says."""
+        """Raise where words remain: rows do not match the header, though their total happened to suffice."""
         read = [element for element in self.elements if element.size and element.properties]
         last = next((number for number, element in enumerate(read) if element.name == "face"), len(read))
         if last >= len(read) - 1 and self.at < len(self.words):

@@ -1,4 +1,4 @@
-"""Where the rows of an ASCII PLY file are others than its header declares: the format has one row a line."""
+"""Find the first row of an ASCII PLY file that its header does not describe (the format has one row per line)."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class _Element(Protocol):
 
 
 def find_mismatch(data: bytes, start: int, elements: Iterable[_Element]) -> str | None:
-    """What is wrong with the first row that its header does not describe; None where there is none.
+    """Return a description of the first row that does not match the header; None where all match.
 
     Args:
         data: the file.
-        start: where the header ends.
-        elements: of the header, in order.
+        start: offset of the header's end.
+        elements: elements of the header, in order.
     """
     lines = iter(enumerate(_lines(data[start:]), len(_lines(data[:start]))))
     for element in elements:

@@ -1,4 +1,4 @@
-"""STL, binary and ASCII: loose triangles, welded where corners are equal so that smooth normals can be computed."""
+"""Read STL, binary and ASCII: separate triangles, welded at equal corners so that smooth normals can be computed."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _HEADER = 84
 
 
 def load_stl(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
-    """The triangles of an STL file as one part; its facet normals are not used.
+    """Return the triangles of an STL file as one part; its facet normals are not used.
 
     Raises:
-        AssetError: truncated or malformed.
+        AssetError: a truncated or malformed file.
     """
     del materials  # the format has none
     declared = int.from_bytes(data[80:84], "little") if len(data) >= _HEADER else -1

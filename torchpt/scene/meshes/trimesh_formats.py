@@ -1,7 +1,7 @@
-"""The long tail of mesh formats, through trimesh: OFF, 3MF, COLLADA, XAML, 3DXML. What is read of them is what it gives.
+"""Read further mesh formats by trimesh: OFF, 3MF, COLLADA, XAML, 3DXML.
 
-Nothing is run and nothing fetched: archives are refused above a size, document types in COLLADA as well, and pictures lie
-beside the file or below.
+Files are untrusted: archives are limited in size, COLLADA may not declare a document type, and images are read only from the
+file's folder and below; nothing is executed or fetched.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ _ENCODINGS = (
     b"windows-1252",
 )
 
-#: Bytes that an archive may unfold to.
+#: Most bytes that an archive may decompress to.
 MAX_UNPACKED = 2**30
 
 
 def load_trimesh_formats(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
-    """The meshes of a file as trimesh reads it, moved by its nodes.
+    """Return the meshes of a file as trimesh reads it, in world space.
 
     Raises:
-        AssetError: a package that is not installed, a malformed file, a picture that is missing.
+        AssetError: a package that is not installed, a malformed file, a missing image.
     """
     kind = path.suffix.lower()
     missing = [name for name in PARSERS[kind] if find_spec(name) is None]
@@ -57,26 +57,26 @@ def load_trimesh_formats(path: Path, data: bytes, materials: bool) -> list[MeshP
     try:
         _check_safe(path, data)
         with Notes() as notes, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of NumPy and of readers about themselves
-            scene, lost = _read(path, data)
+            warnings.simplefilter("ignore")  # NumPy's, and deprecations of the parsers
+            scene, missing_files = _read(path, data)
     except (AssetError, MemoryError):
         raise
     except Exception as error:
         reason = (str(error).strip().splitlines() or [""])[0][:120]
         raise AssetError(path, f"malformed {kind} ({type(error).__name__}: {reason})") from None
-    if lost and materials:
-        raise AssetError(path, f"the file {lost[0][:80]!r} is missing")
+    if missing_files and materials:
+        raise AssetError(path, f"the file {missing_files[0][:80]!r} is missing")
     parts = mesh_parts_of(scene, str(path), materials=materials, most=max(MOST_PLACED, len(data)))
     ignored = tuple(dict.fromkeys((*parts[0].ignored, *notes.texts)))
     return [replace(parts[0], ignored=ignored), *parts[1:]]
 
 
 def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
-    """The scene, and names of files that it asks for and that are not there."""
+    """Return the ``trimesh.Scene`` of a file, and the names of missing files that it refers to."""
     import trimesh
     from trimesh.resolvers import FilePathResolver
 
-    lost: list[str] = []
+    missing_files: list[str] = []
 
     class Beside(FilePathResolver):
         def absolute(self, name: str) -> Path:
@@ -89,16 +89,16 @@ def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
             try:
                 return super().get(name)
             except Exception:
-                lost.append(name)
+                missing_files.append(name)
                 raise
 
     kind = path.suffix.lower().removeprefix(".")
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=Beside(str(path)), process=False)
-    return scene, lost
+    return scene, missing_files
 
 
 def _check_safe(path: Path, data: bytes) -> None:
-    """Refuse archives that unfold to too much, and XML that declares entities."""
+    """Raise for archives that decompress to too many bytes, and for XML that declares entities."""
     texts = [data] if path.suffix.lower() == ".dae" else []
     if data.startswith(b"PK"):
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -110,6 +110,8 @@ def _check_safe(path: Path, data: bytes) -> None:
         plain = text.replace(b"\0", b"")  # of UTF-16
         declared = _ENCODING.search(plain[:200])
         if not _BEGINS.match(plain) or (declared and declared[1].lower() not in _ENCODINGS):
-            raise AssetError(path, "is no XML in UTF-8, UTF-16, ASCII or Latin-1")  # in which what follows would hide
+            raise AssetError(
+                path, "is no XML in UTF-8, UTF-16, ASCII or Latin-1"
+            )  # other encodings could hide a DOCTYPE
         if b"<!DOCTYPE" in plain or b"<!ENTITY" in plain:
             raise AssetError(path, "declares a document type, which is not read")

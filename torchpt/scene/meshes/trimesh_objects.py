@@ -1,4 +1,4 @@
-"""Objects of trimesh as parts of a mesh, with their materials, lights and cameras."""
+"""Convert trimesh objects to mesh parts, with their materials, lights and cameras."""
 
 from __future__ import annotations
 
@@ -36,40 +36,40 @@ from torchpt.scene.meshes.mtl_material import Map, Statements, material_of
 __all__ = ["MaterialConverter", "Placed", "lights_of", "mesh_parts_of", "parts_of", "placed_in"]
 
 
-# ---- Materials of trimesh objects: by the rules of glTF (``PBRMaterial``) and MTL (``SimpleMaterial``), which they come from
+# ---- Materials of trimesh objects: converted as those of glTF (``PBRMaterial``) and MTL (``SimpleMaterial``)
 
 
 _FACTORS = ("metallicFactor", "roughnessFactor")
 _PICTURES = ("baseColorTexture", "metallicRoughnessTexture", "normalTexture", "occlusionTexture", "emissiveTexture")
-#: Keys of a glTF material that stand in its block ``pbrMetallicRoughness``.
+#: Keys of the block ``pbrMetallicRoughness`` of a glTF material.
 _INNER = (*_FACTORS, "baseColorFactor", "baseColorTexture", "metallicRoughnessTexture")
 #: Pillow's modes that a PNG file holds.
 _MODES = ("1", "L", "LA", "RGB", "RGBA", "I;16", "I")
-#: What trimesh says where a file says nothing: of ``SimpleMaterial``, the grey of its colours and its exponent.
+#: Trimesh's defaults of ``SimpleMaterial``: the grey of its colours, and its exponent.
 _DEFAULT_GREY, _DEFAULT_EXPONENT = (102, 102, 102, 255), 1.0
 
 
 class MaterialConverter:
-    """The materials of trimesh objects, each made once, and their pictures.
+    """Converter of the materials of trimesh objects and their images; each is converted once.
 
     Args:
-        label: what errors call their owner.
-        wanted: whether there are to be any.
+        label: name of the object in errors.
+        wanted: False to leave out all materials.
     """
 
     def __init__(self, label: str, wanted: bool = True) -> None:
         self.label, self.wanted = label, wanted
-        # What an id belongs to is kept, so that it stays its own.
+        # The objects are stored too: an id is unique only while its object lives.
         self._materials: dict[tuple[int, bool], tuple[Any, FileMaterial | None, NDArray[np.float64] | None]] = {}
         self._pictures: dict[int, tuple[Any, EncodedImage]] = {}
 
     def of(
         self, material: Any, colors: NDArray[np.float64] | None
     ) -> tuple[FileMaterial | None, NDArray[np.float64] | None]:
-        """A material, and the colours ``(V, 3)`` of the vertices with its own multiplied in where they stand for it.
+        """Return a material, and the vertex colours ``(V, 3)``, multiplied by the base colour where they take its place.
 
         Raises:
-            AssetError: a picture that cannot be used, numbers that no material has.
+            AssetError: an unsupported image, or numbers out of range.
         """
         if not self.wanted:
             return None, colors
@@ -84,7 +84,7 @@ class MaterialConverter:
     def _physical(
         self, material: Any, one: NDArray[np.float64] | None
     ) -> tuple[FileMaterial | None, NDArray[np.float64] | None]:
-        """A ``PBRMaterial``, or None: the block that a glTF file would have for it."""
+        """Convert a ``PBRMaterial`` or None by way of a glTF material."""
         block: dict[str, Any] = {}
         images: dict[int, str | EncodedImage] = {}
         if material is not None:
@@ -109,9 +109,9 @@ class MaterialConverter:
         return rules.of(None if material is None else 0, one)
 
     def _simple(self, material: Any) -> tuple[FileMaterial, None]:
-        """A ``SimpleMaterial``: the statements that an MTL file would have for it.
+        """Convert a ``SimpleMaterial`` by way of the statements of an MTL file.
 
-        Trimesh fills in a grey for colours that a file does not give, which cannot be told from the same grey given.
+        Trimesh fills in a grey for missing colours; the same grey from a file cannot be told from it and counts as missing too.
         """
         statements = Statements()
         files: dict[str, Any] = {}
@@ -132,10 +132,10 @@ class MaterialConverter:
         return FileMaterial(name, made, tuple(dict.fromkeys([*ignored, *extra]))), None
 
     def picture(self, image: Any, what: str) -> EncodedImage:
-        """A picture of Pillow's (or an array) as a PNG file in memory. It is called after its content: equal ones are one.
+        """Encode a Pillow image (or an array) as a PNG file in memory, named by a hash of its content.
 
         Raises:
-            AssetError: too large, broken, or of colours that are not read.
+            AssetError: an image that is too large, broken, or of an unsupported mode.
         """
         if id(image) not in self._pictures:
             self._pictures[id(image)] = image, self._encoded(image, what)
@@ -166,30 +166,30 @@ class MaterialConverter:
         return EncodedImage(f"{what} {digest}", data.getvalue(), "png")
 
 
-# ---- Objects of trimesh (https://trimesh.org) as the parts that mesh files come to: meshes, scenes, their lights and cameras
+# ---- Meshes, scenes, lights and cameras of trimesh (https://trimesh.org)
 
 
 Matrix = NDArray[np.float64]
-#: A node of a scene: its name, the name of what it places, and its ``(4, 4)`` to the scene's space.
+#: A node of a scene: its name, the name of its geometry, and its ``(4, 4)`` to world space.
 Placed = tuple[str, str, Matrix]
 
 
 def mesh_parts_of(
     source: Any, label: str = "trimesh", *, materials: bool = True, most: int = MOST_PLACED
 ) -> list[MeshPart]:
-    """What a ``trimesh.Trimesh`` or ``trimesh.Scene`` holds, one part for each node and material, in the scene's space.
+    """Return the parts of a ``trimesh.Trimesh`` or ``trimesh.Scene``, one for each node and material, in world space.
 
-    Normals are those that the mesh has (given to it, or asked of it before), as when trimesh writes a file. Nothing of the
-    object is changed or kept.
+    Normals are used where the mesh has them (set by the caller, or computed by trimesh before), as in trimesh's exporters. The
+    object is neither changed nor kept.
 
     Args:
         source: the object.
-        label: what errors call it.
-        materials: whether to read its own materials.
-        most: vertices or faces that the nodes may come to.
+        label: name of the object in errors.
+        materials: True to read the object's own materials.
+        most: limit of the vertices or faces over all nodes.
 
     Raises:
-        AssetError: no triangle, numbers that are not finite, an index out of range, a picture that cannot be used.
+        AssetError: no triangle, numbers that are not finite, an index out of range, an unsupported image.
     """
     import trimesh
 
@@ -224,7 +224,7 @@ def mesh_parts_of(
 
 
 def placed_in(scene: Any) -> Iterator[Placed]:
-    """The nodes of a ``trimesh.Scene`` that place meshes, in the order of its graph."""
+    """Yield the nodes of a ``trimesh.Scene`` that have a mesh, in the order of its graph."""
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         if name in scene.geometry and _solid(scene.geometry[name]):
@@ -232,26 +232,28 @@ def placed_in(scene: Any) -> Iterator[Placed]:
 
 
 def _solid(geometry: Any) -> bool:
-    """Whether it has faces, unlike points and paths."""
+    """Return True for a geometry with faces, unlike points and paths."""
     return len(getattr(geometry, "faces", ())) > 0
 
 
 def parts_of(mesh: Any, name: str, converter: MaterialConverter) -> list[MeshPart]:
-    """A ``trimesh.Trimesh`` in its own space, one part for each material; unchecked.
+    """Return the parts of a ``trimesh.Trimesh`` in its own space, one for each material; unchecked.
 
     Raises:
-        AssetError: an index out of range, a picture that cannot be used.
+        AssetError: an index out of range, an unsupported image.
     """
     vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
     if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):  # before anything is looked up by them
         raise AssetError(converter.label, f"a face has an index outside 0..{len(vertices) - 1}")
     visual = mesh.visual
     normals: Matrix | None = None
-    if "vertex_normals" in mesh._cache.cache:  # as trimesh's exporters tell: else they are made up from the faces
+    if (
+        "vertex_normals" in mesh._cache.cache
+    ):  # as in trimesh's exporters: else trimesh would compute them from the faces
         normals = np.array(mesh.vertex_normals, np.float64)
         normals = normals if normals.shape == vertices.shape else None
     if visual.kind == "face":
-        # Every corner of its own, so that colours end at edges; the shading stays that of the mesh.
+        # Split vertices, so that colours end at edges; normals stay those of the mesh.
         normals = smooth_normals(vertices, faces) if normals is None else normals
         corners = faces.reshape(-1)
         colors = np.repeat(_linear(visual.face_colors), 3, axis=0)
@@ -282,16 +284,16 @@ def parts_of(mesh: Any, name: str, converter: MaterialConverter) -> list[MeshPar
 
 
 def _linear(colors: Any) -> Matrix:
-    """Colours ``(n, 3)`` of 0..1, of trimesh's bytes (or floats); they are linear, as in glTF."""
+    """Return trimesh's colours, bytes or floats, as ``(n, 3)`` of 0..1; they are linear, as in glTF."""
     values = np.asarray(colors)[:, :3]
     return values / 255.0 if values.dtype.kind in "ui" else values.astype(np.float64)
 
 
 def lights_of(scene: Any, label: str) -> tuple[list[FileLight], list[str]]:
-    """The lights that a ``trimesh.Scene`` was given (it makes up others where it is asked), and what of them is not used.
+    """Return the lights that were set on a ``trimesh.Scene`` (not those that trimesh makes up), and unsupported features.
 
     Raises:
-        AssetError: a light that has no place in the graph, or numbers that none can have.
+        AssetError: a light without a transform in the graph, or numbers out of range.
     """
     lights: list[FileLight] = []
     left_out: list[str] = []
@@ -316,7 +318,7 @@ def lights_of(scene: Any, label: str) -> tuple[list[FileLight], list[str]]:
 
 
 def _cameras(scene: Any) -> Iterator[FileCamera]:
-    """The camera of a scene that has one, for users to copy."""
+    """Yield the camera of a scene, if any, for users to copy."""
     if scene.has_camera:
         matrix = np.array(scene.camera_transform, np.float64)
         fov = float(scene.camera.fov[0])
@@ -324,21 +326,21 @@ def _cameras(scene: Any) -> Iterator[FileCamera]:
 
 
 class Notes(logging.Handler):
-    """What trimesh warns of, as a list rather than on stderr. A context."""
+    """Context manager that collects trimesh's warnings in ``texts`` in place of stderr."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self.texts: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep one."""
+        """Append the message of a record."""
         self.texts.append(" ".join(record.getMessage().split())[:80])
 
     def __enter__(self) -> Notes:
-        """Listen."""
+        """Attach to trimesh's logger."""
         logging.getLogger("trimesh").addHandler(self)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop listening."""
+        """Detach from trimesh's logger."""
         logging.getLogger("trimesh").removeHandler(self)

@@ -1,4 +1,4 @@
-"""From parts and parameters to a :class:`~torchpt.physics.world.World`: one differentiable function of the parameters."""
+"""Build a :class:`~torchpt.physics.world.World` of parts and parameters: one differentiable function of the parameters."""
 
 from __future__ import annotations
 

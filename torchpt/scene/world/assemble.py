@@ -1,6 +1,6 @@
-"""From parts and parameters to a :class:`~torchpt.physics.world.World`: one differentiable function of the parameters.
+"""Build a :class:`~torchpt.physics.world.World` of parts and parameters: one differentiable function of the parameters.
 
-Whatever the scene does not hold is left out here: no smooth normals, no lights, no spheres, no second BSDF, then no tensor.
+Features that the scene does not use have no tensors: smooth normals, lights, quadrics, textures and so on are None.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ def assemble(
     uv: bool = False,
     choice: str = "auto",
 ) -> tuple[World, Geometry]:
-    """The world of ``parts`` under ``parameters``, and what the search sees of it.
+    """Build the world and the geometry for the search.
 
     Args:
-        parts: ordered by kind as ``records.KINDS``.
+        parts: the parts, ordered by kind as ``records.KINDS``.
         parameters: every tensor by dotted name.
-        sources: lights that are no surfaces, ordered as ``lights.order`` says.
-        space: the lanes' coordinates.
-        dtype: of the lanes.
+        sources: delta lights and environments, in the order of ``lights.order``.
+        space: the coordinates of lanes.
+        dtype: dtype of the lanes.
         copies: instances of parts.
-        uv: whether texture coordinates are wanted even if no texture reads them.
-        choice: how a light is chosen, from ``lights.WAYS``.
+        uv: True for texture coordinates even where no texture reads them.
+        choice: the light sampler, from ``lights.WAYS``.
 
     Raises:
-        SceneError: parameters that put something further away than float32 can follow.
+        SceneError: parameters with positions or sizes beyond the range of float32.
     """
     device = space.centre.device
     corners = corners_of_all(parts, parameters, space, dtype)
@@ -120,7 +120,7 @@ def assemble(
 
 
 def _emitter_primitives(parts: Sequence[Part], corners: Sequence[Corners], primitives: Primitives) -> Primitives:
-    """The primitives, without derivatives where no part that emits has any: what is cut out of the whole would seem to."""
+    """Return the primitives, detached where no emissive part has derivatives: slices of the whole would require gradients."""
     moving = any(
         part.emission is not None and any(x.requires_grad for x in leaves(own))
         for part, own in zip(parts, corners, strict=True)
@@ -131,7 +131,7 @@ def _emitter_primitives(parts: Sequence[Part], corners: Sequence[Corners], primi
 def _materials(
     owners: Sequence[Part | Copy], primitives: Primitives, groups: Groups, dark: Tensor, opacity: Tensor | None
 ) -> LaneMaterials:
-    """Who is made of what; ``dark``: ``(P + I,)`` 0 where a surface emits, else 1."""
+    """Return the material of each primitive; ``dark``: ``(P + I,)`` 0 where a surface emits, else 1."""
     count = len(groups.models)
     group, row = zip(*(groups.place[owner.material.name] for owner in owners), strict=True) if owners else ((), ())
     keys = dark * count + primitives.spread(group)
@@ -148,14 +148,14 @@ def _materials(
 
 
 def _with_scaled_bump(material: ResolvedMaterial, unit: float) -> ResolvedMaterial:
-    """A material where lengths are counted in ``unit``: the heights of a bump map are lengths."""
+    """Return a material with the heights of its bump map, which are lengths, divided by ``unit``."""
     if unit == 1.0 or material.bump_map is None:
         return material
     return replace(material, bump_map=material.bump_map.divided(unit))
 
 
 def _check_reach(parts: Sequence[Part], primitives: Primitives, space: Space) -> None:
-    """Refuse parameters that make a part too large, or lay it too far off."""
+    """Raise for parameters that make a part too large or move it too far from the origin."""
     reach = torch.stack([x.detach().abs().amax(0) for x in (primitives.p0, primitives.e1, primitives.e2)]).amax(0)
     if len(reach) and not bool(reach.max() <= MAX_COORDINATE):
         farthest = int(torch.nan_to_num(reach, nan=torch.inf).argmax())

@@ -1,4 +1,4 @@
-"""The table of lights: a row for each emissive primitive, then one for each light that is no surface."""
+"""Build the light table: a row for each emissive primitive, then one for each delta light and environment."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ __all__ = ["lights_of"]
 
 
 def _emission(part: Part, parameters: Mapping[str, Tensor], dtype: torch.dtype) -> Tensor:
-    """Radiance ``(3,)`` of a part that emits."""
+    """Return the radiance ``(3,)`` of an emissive part."""
     radiance, *strength = (parameters[name].to(dtype) for name in part.emission_names)
     if part.emission_texture is not None:
-        return radiance.expand(3)  # the strength alone: the texture's share is looked up
+        return radiance.expand(3)  # the strength alone: stages look up the texture
     return radiance if not strength else radiance * strength[0]
 
 
 def _mean_emission(part: Part, parameters: Mapping[str, Tensor]) -> float:
-    """Mean luminance of the texture that a part shines by; 1 without."""
+    """Return the mean luminance of a part's emission texture; 1 without one."""
     if part.emission_texture is None:
         return 1.0
     return float(luminance(part.emission_texture.mean(parameters).abs()))
@@ -43,7 +43,7 @@ def _mean_emission(part: Part, parameters: Mapping[str, Tensor]) -> float:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Columns of :class:`~torchpt.physics.lights.records.Lights` for some of its rows, and their power."""
+    """Columns of :class:`~torchpt.physics.lights.records.Lights` for some rows, and their power."""
 
     kind: list[str]  # of each row
     p0: Tensor
@@ -69,19 +69,19 @@ def lights_of(
     opacity_mapped: bool,
     choice: str = "auto",
 ) -> Lights | None:
-    """The lights; None where nothing emits.
+    """Build the light table; None where nothing emits.
 
     Args:
-        parts: ordered by kind.
-        sources: lights that are no surfaces, in the order of ``lights.order``.
-        primitives: of ``parts``.
-        geometry: of them, as the search sees it.
+        parts: the parts, ordered by kind.
+        sources: delta lights and environments, in the order of ``lights.order``.
+        primitives: primitives of ``parts``.
+        geometry: their geometry for the search.
         parameters: every tensor by dotted name.
-        space: the lanes' coordinates.
-        opacity: ``(P + I,)``, or None.
-        emissive: ``(P + I,)`` bool, which primitives emit.
-        opacity_mapped: whether opacity textures opacity_texture any of them.
-        choice: how one of them is chosen, from ``lights.WAYS``.
+        space: the coordinates of lanes.
+        opacity: opacity of primitives ``(P + I,)``, or None.
+        emissive: ``(P + I,)`` bool, True for primitives that emit.
+        opacity_mapped: True where an emissive part has an opacity texture.
+        choice: the light sampler, from ``lights.WAYS``.
     """
     prim = emissive.nonzero().squeeze(1)
     if not len(prim) and not sources:
@@ -132,7 +132,7 @@ def lights_of(
 
 
 def _reach(geometry: Geometry) -> Tensor:
-    """Radius of the scene: half the diagonal of its box, float64."""
+    """Return the radius of the scene: half the diagonal of its bounding box, float64."""
     low, high = (box.double() for box in primitive_bounds(geometry))
     return (high.amax(1) - low.amin(1)).norm() * 0.5 if low.shape[1] else torch.ones((), device=low.device)
 
@@ -140,7 +140,7 @@ def _reach(geometry: Geometry) -> Tensor:
 def _surfaces(
     emitting: Sequence[tuple[Part, int]], primitives: Primitives, parameters: Mapping[str, Tensor], prim: Tensor
 ) -> tuple[_Rows, Tensor | None]:
-    """Rows of emissive primitives ``prim``, and where any is a quadric their columns among the quadrics."""
+    """Return the rows of emissive primitives ``prim``, and their columns in the table of quadrics (None without quadrics)."""
     dtype, device = primitives.p0.dtype, primitives.p0.device
     counts = torch.tensor([n for _, n in emitting], dtype=torch.int64, device=device)
     names = [part.kind for part, n in emitting for _ in range(n)]
@@ -149,7 +149,7 @@ def _surfaces(
         for x in (primitives.p0, primitives.e1, primitives.e2, primitives.face, primitives.normal)
     )
     areas, wholes, columns, tabled, start = [], [], [], False, 0
-    for number, name in enumerate(KINDS):  # in whose order the primitives are
+    for number, name in enumerate(KINDS):  # the order of primitives
         stop = start + names.count(name)
         if start == stop:
             continue
@@ -173,14 +173,14 @@ def _surfaces(
 def _source(
     source: Source, parameters: Mapping[str, Tensor], space: Space, reach: Tensor, dtype: torch.dtype
 ) -> tuple[_Rows, Any]:
-    """The row of a light that is no surface, and what it has of an environment.
+    """Return the row of a delta light or environment, and the environment's data or None.
 
     Args:
         source: the light.
         parameters: every tensor by dotted name.
-        space: the lanes' coordinates.
+        space: the coordinates of lanes.
         reach: radius of the scene, float64.
-        dtype: of the lanes.
+        dtype: dtype of the lanes.
     """
 
     def given(key: str) -> Tensor:

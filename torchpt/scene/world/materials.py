@@ -1,4 +1,4 @@
-"""Materials of the world: their values as lanes gather them, texture charts, rows by slot."""
+"""Build the materials of the world: parameters stacked by BSDF, vertex attributes, textures and opacity by primitive."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 
-# ---- Where a point lies on its surface: texture coordinates, tangents, vertex colours; each only where something reads it
+# ---- Vertex attributes: texture coordinates, tangents, vertex colours; each only where something reads it
 
 
 def vertex_attributes_of(
@@ -42,9 +42,9 @@ def vertex_attributes_of(
     models: Sequence[Bsdf],
     uv: bool,
 ) -> dict[str, Any]:
-    """What of :class:`World` says where a point lies on its surface, each thing only where something reads it."""
+    """Return the vertex attributes of :class:`World` by name; None for those that nothing reads."""
     readings = [reading for material in materials.values() for reading in material.readings()]
-    # Filtered look-ups ask how large a surface's texels are.
+    # Filtered look-ups need the size of texels on the surface.
     bumpy = any(material.bump_map is not None for material in materials.values())
     bumpy = bumpy or any(reading.filtered for reading in readings)
     framed = (
@@ -82,7 +82,7 @@ def vertex_attributes_of(
 
 
 def _colors(part: Part, c: Corners) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours ``(3, P)`` at the corners; 1 where a shape has none."""
+    """Return the colours ``(3, P)`` at the three corners; 1 where a shape has none."""
     if part.colors is None:
         white = torch.ones_like(c.p0)
         return white, white, white
@@ -92,14 +92,14 @@ def _colors(part: Part, c: Corners) -> tuple[Tensor, Tensor, Tensor]:
     return first, second, third
 
 
-# ---- What materials come to on the lanes: a model, its parameters, and the chance that a ray meets the surface
+# ---- Materials on lanes: a BSDF, its parameters, and its opacity
 #
-# Differentiable in the parameters, and done once a material. A blend with ``null`` is its other half, met more rarely.
+# Differentiable in the parameters, and computed once per material. A blend with ``null`` is its other half with an opacity.
 
 
 @dataclass(frozen=True)
 class OpacityTexture:
-    """A texture of opacity: ``bias + factor * value`` is a factor of the chance that a ray meets the surface."""
+    """A texture of opacity: the surface's opacity is multiplied by ``bias + factor * value``."""
 
     node: Node
     bias: float = 0.0
@@ -108,14 +108,14 @@ class OpacityTexture:
 
 @dataclass(frozen=True)
 class LaneMaterial:
-    """A material on the lanes.
+    """A material on lanes.
 
     Attributes:
-        model: in the variant it needs.
-        values: what the model is given, ``(3, 1)`` or ``(1,)``; of a blend nested. Without those that textures give.
-        readings: the textures, nested alike.
-        opacity: ``(1,)``, or None where it is 1.
-        opacity_texture: the texture that opacity is multiplied by, or None.
+        model: the BSDF.
+        values: its parameters without textured ones, ``(3, 1)`` or ``(1,)``; nested for a blend.
+        readings: the textures of the others, nested alike.
+        opacity: ``(1,)``; None for 1.
+        opacity_texture: the texture by which the opacity is multiplied, or None.
     """
 
     model: Bsdf
@@ -126,7 +126,7 @@ class LaneMaterial:
 
 
 def lane_material(material: ResolvedMaterial, parameters: Mapping[str, Tensor], dtype: torch.dtype) -> LaneMaterial:
-    """Resolve a material under ``parameters`` (every tensor by dotted name)."""
+    """Return a material on lanes; ``parameters``: every tensor by dotted name."""
     readings = {key: value for key, value in material.values.items() if isinstance(value, Node)}
     values: Parameters = {
         key: parameters[f"{material.name}.{key}"].to(dtype)[..., None] for key in material.values if key not in readings
@@ -152,9 +152,9 @@ def lane_material(material: ResolvedMaterial, parameters: Mapping[str, Tensor], 
 def _blended(
     kind: Callable[[Bsdf, Bsdf], Bsdf], weight: Tensor | None, reading: Node | None, a: LaneMaterial, b: LaneMaterial
 ) -> LaneMaterial:
-    """The blend of two materials, ``weight (1,)`` of the second: what is met of each, and how often either is."""
+    """Return the blend of two materials; ``weight (1,)``: that of the second. Their opacities go into weight and opacity."""
     opacity = None
-    if weight is None:  # a texture, beside which nothing but null lets rays pass
+    if weight is None:  # a texture: only null may have an opacity below 1 beside it
         assert reading is not None
         if a.model.sheer:
             return LaneMaterial(b.model, b.values, None, b.readings, OpacityTexture(reading))
@@ -178,27 +178,27 @@ def _blended(
     return LaneMaterial(kind(a.model, b.model), values, opacity, readings)
 
 
-# ---- Materials: grouped by model and by what textures give; opacity by primitive
+# ---- Groups of materials of the same BSDF and textures; opacity by primitive
 
 
-#: Lanes are sorted by keys of 8 bits, two for each model.
+#: Lanes are sorted by 8-bit keys, two for each model.
 MOST_MODELS = 120
 
 
-#: What the lanes of a group have in common: a model, and which of its parameters are read from what.
+#: Key of a group: the BSDF, and the structure of its textures.
 Kind = tuple[Bsdf, Any]
 
 
 @dataclass(frozen=True)
 class Groups:
-    """Materials grouped by model and by what textures give.
+    """Materials grouped by BSDF and structure of textures.
 
     Attributes:
         place: group and row of each material, by name.
-        models: of each group.
-        parameters: of each group, stacked.
-        textures: of each group; None where it reads none.
-        two_sided: of each group ``(rows,)`` bool; None where all are.
+        models: BSDF of each group.
+        parameters: stacked parameters of each group.
+        textures: textures of each group; None without.
+        two_sided: ``(rows,)`` bool of each group; None where all materials are two-sided.
     """
 
     place: dict[str, tuple[int, int]]
@@ -216,10 +216,10 @@ def groups_of(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Groups:
-    """The groups of materials, by name as resolved and as ``made`` for the lanes.
+    """Group materials; ``made``: the same materials on lanes, by name.
 
     Raises:
-        SceneError: more groups than lanes can be sorted by.
+        SceneError: more than :data:`MOST_MODELS` groups.
     """
     members: dict[Kind, list[str]] = {}
     for name, material in made.items():
@@ -250,7 +250,7 @@ def groups_of(
 
 
 def _tabulated(model: Bsdf, values: Parameters) -> Parameters:
-    """Values with what the model tabulates of them."""
+    """Return values merged with the tables that the BSDF computes from them."""
 
     def merged(a: Parameters, b: Parameters) -> Parameters:
         inner = {key: merged(a[key], value) for key, value in b.items() if isinstance(value, dict)}
@@ -260,7 +260,7 @@ def _tabulated(model: Bsdf, values: Parameters) -> Parameters:
 
 
 def _group_key(material: ResolvedMaterial, made: LaneMaterial) -> Kind:
-    """The group of a material; materials without textures share that of their model."""
+    """Return the key of a material's group; materials without textures share that of their BSDF."""
     if not made.readings and material.normal_map is None and material.bump_map is None:
         return made.model, None
 
@@ -279,7 +279,7 @@ def _textures(
     places: Mapping[Node, Place],
     device: torch.device,
 ) -> MaterialTextures:
-    """The textures of materials of one form."""
+    """Return the stacked textures of the materials of one group."""
 
     def binding(column: Sequence[Node]) -> TextureBinding:
         rows = torch.tensor([places[node].row for node in column], device=device)
@@ -310,7 +310,7 @@ def _textures(
 def node_map_of(
     nodes: Sequence[Node | None], places: Mapping[Node, Place], sizes: list[int], device: torch.device
 ) -> NodeMap | None:
-    """Textures by primitive, from those of parts of ``sizes``; None where there are none."""
+    """Return textures by primitive, for parts with ``sizes`` primitives; None where no part has one."""
     if all(node is None for node in nodes):
         return None
     size = torch.tensor(sizes, dtype=torch.int64, device=device)
@@ -333,7 +333,7 @@ def opacity_maps_of(
     dtype: torch.dtype,
     device: torch.device,
 ) -> OpacityMaps | None:
-    """Textures of opacity by primitive; None where there are none."""
+    """Return opacity textures by primitive; None where there are none."""
     textures = [made[part.material.name].opacity_texture for part in parts]
     maps = node_map_of([None if texture is None else texture.node for texture in textures], places, sizes, device)
     if maps is None:
@@ -364,7 +364,7 @@ def opacity_of(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tensor | None:
-    """The chance ``(P,)`` that a ray meets a primitive; None where it always does."""
+    """Return the opacity ``(P,)`` of primitives without textures; None where all are opaque."""
     if all(one.opacity is None and one.opacity_texture is None for one in made.values()):
         return None
     whole = torch.ones(1, dtype=dtype, device=device)

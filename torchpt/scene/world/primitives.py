@@ -1,4 +1,4 @@
-"""Primitives of the world from parts: corners of triangles, copies of instances, tables by kind."""
+"""Build the primitives of the world: corners of triangles, instances, tables by kind."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 
-# ---- Where the primitives of one part lie: corners and normals in the world, differentiable in vertices and pose
+# ---- Primitives of one part: corners and normals in the world, differentiable in vertices and pose
 
 
 #: Arrays of a mesh that may be parameters.
@@ -37,7 +37,7 @@ _OWN = ("vertices", "normals", "uvs")
 
 
 def corners_of(part: Part, parameters: Mapping[str, Tensor], space: Space, dtype: torch.dtype) -> Corners:
-    """Place a part in the lanes' coordinates."""
+    """Return the corners of a part in the coordinates of lanes."""
     pose = space.pose(_pose_of(part, parameters))
     own = {key: parameters[f"{part.name}.{key}"] for key in _OWN if f"{part.name}.{key}" in parameters}
     return PRIMITIVES[part.kind].corners(part, pose, dtype, own)
@@ -46,7 +46,7 @@ def corners_of(part: Part, parameters: Mapping[str, Tensor], space: Space, dtype
 def corners_of_all(
     parts: Sequence[Part], parameters: Mapping[str, Tensor], space: Space, dtype: torch.dtype
 ) -> list[Corners]:
-    """Place parts, which are in the order of their kinds: those of a kind at once where that can be."""
+    """Return the corners of parts, which are ordered by kind; parts of a kind are computed at once where possible."""
     found: list[Corners] = []
     for kind, group in groupby(parts, lambda part: part.kind):
         own = list(group)
@@ -59,22 +59,22 @@ def corners_of_all(
 
 
 def _pose_of(part: Part, parameters: Mapping[str, Tensor]) -> Tensor:
-    """From a part's own space to the scene's, in float64: all is folded in before anything is rounded to the lanes' dtype."""
+    """Return the pose of a part to the scene in float64, so that only the final product is rounded to the lanes' dtype."""
     pose = parameters[f"{part.name}.to_world"].double()
     return pose if part.local is None else pose @ torch.from_numpy(part.local).to(pose.device)
 
 
-# ---- Instances: the maps that copy meshes, for the search and for the lanes
+# ---- Instances: transforms of copied meshes, for the search and for lanes
 
 
-#: Ids of primitives are int32 in the searches.
+#: Searches have int32 ids of primitives.
 MOST_PRIMITIVES = 2**31 - 1
 
 
 def copy_maps(
     parts: Sequence[Part], sizes: list[int], copies: Sequence[Copy], parameters: Mapping[str, Tensor], space: Space
 ) -> Tensor:
-    """Return where copies lie relative to their meshes: ``(15, I)`` float64, see :class:`Geometry`."""
+    """Return the transforms of copies relative to their meshes: ``(15, I)`` float64, see :class:`Geometry`."""
     first, at = {}, 0
     for part, n in zip(parts, sizes, strict=True):
         first[part.name], at = (at, n), at + n
@@ -95,7 +95,7 @@ def copy_maps(
 
 
 def copies_of(maps: Tensor, copies: Sequence[Copy], dtype: torch.dtype) -> Copies:
-    """What lanes need of copies, the identity first."""
+    """Return the transforms of copies for lanes, the identity first."""
     same = torch.eye(3, 4, dtype=torch.float64, device=maps.device).reshape(-1)
     maps = torch.cat((torch.cat((same, same.new_zeros(3)))[:, None], maps), 1)
     x, y, z, move = (maps[k:12:4] for k in range(4))
@@ -108,15 +108,15 @@ def copies_of(maps: Tensor, copies: Sequence[Copy], dtype: torch.dtype) -> Copie
     return Copies(start, first, x.to(dtype), y.to(dtype), z.to(dtype), move.to(dtype), nx, ny, nz)
 
 
-# ---- All primitives of a scene in one table, from the corners of its parts
+# ---- Table of all primitives of a scene, from the corners of its parts
 
 
 @dataclass(frozen=True)
 class Primitives:
-    """The P primitives, ordered by kind; see :class:`~torchpt.physics.world.World` for what has no comment."""
+    """The P primitives of a scene, ordered by kind; see :class:`~torchpt.physics.world.World` for fields without a comment."""
 
-    kinds: tuple[type[Primitive], ...]  # those that there are
-    sizes: list[int]  # how many each part has
+    kinds: tuple[type[Primitive], ...]  # those that occur
+    sizes: list[int]  # number of primitives of each part
     counts: tuple[int, int, int, int, int]
     p0: Tensor
     p1: Tensor
@@ -124,7 +124,7 @@ class Primitives:
     e1: Tensor
     e2: Tensor
     face: Tensor  # (3, P) cross product of the edges
-    sign: Tensor  # (P,) -1 where a shape's normals are turned around
+    sign: Tensor  # (P,) -1 where a shape's normals are flipped
     normal: Tensor
     normals: tuple[Tensor, Tensor, Tensor] | None
     bound: Tensor
@@ -132,12 +132,12 @@ class Primitives:
     quadrics: Quadrics | None
 
     def detached(self) -> Primitives:
-        """The same without derivatives."""
+        """Return detached primitives."""
         own = {name: getattr(self, name) for name in ("p0", "p1", "p2", "e1", "e2", "face", "sign", "normal", "bound")}
         return replace(self, **{name: value.detach() for name, value in own.items()})
 
     def spread(self, values: Sequence[int]) -> Tensor:
-        """One value a part, and where given one a copy, as rows ``(P,)`` or ``(P + I,)`` by primitive and copy."""
+        """Repeat one value per part, and optionally one per copy, to ``(P,)`` or ``(P + I,)`` by primitive and copy."""
         device = self.p0.device
         spans = self.sizes + [1] * (len(values) - len(self.sizes))
         return torch.repeat_interleave(
@@ -146,8 +146,8 @@ class Primitives:
         )
 
     def geometry(self, copies: Tensor | None) -> Geometry:
-        """What the search sees."""
-        # The corners themselves: rebuilt from edges, neighbours would no longer share them to the bit.
+        """Return the geometry for the search."""
+        # The corners themselves: recomputed from edges, neighbours would not share them to the bit.
         q0, q1, q2 = (x.detach().to(torch.float32).contiguous() for x in (self.p0, self.p1, self.p2))
         table = None
         if self.quadrics is not None and self.frame is not None:
@@ -158,7 +158,7 @@ class Primitives:
 def primitives_of(
     parts: Sequence[Part], corners: Sequence[Corners], dtype: torch.dtype, device: torch.device
 ) -> Primitives:
-    """The primitives of ``parts``, which are ordered by kind as ``records.KINDS``."""
+    """Build the primitives of ``parts``, which are ordered by kind as ``records.KINDS``."""
     sizes = [c.p0.shape[1] for c in corners]
     numbers = [sum(n for n, part in zip(sizes, parts, strict=True) if part.kind == kind) for kind in KINDS]
     counts = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
@@ -185,10 +185,10 @@ def primitives_of(
             joined([t[k] if f == 1.0 else t[k] * f for t, f in zip(triples, flips, strict=True)]) for k in range(3)
         )
         normals = (n0, n1, n2)
-        # The outside is where the shading normals point, whatever way a file winds its faces.
+        # The outside is the side of the shading normals, whatever the winding of faces.
         against = dot(normal, n0 + n1 + n2).detach() < 0
         normal = torch.where(against, -normal, normal)
-    # Largest coordinate magnitudes over each primitive, its whole parallelogram or ellipse included.
+    # Largest coordinate magnitudes over each primitive, including its whole parallelogram or ellipse.
     largest = (p0.abs() + e1.abs() + e2.abs()).detach()
     bound = dot(normal.detach().abs(), largest)
     if planar is not None:
