@@ -20,7 +20,7 @@ from torchpt.core.errors import AssetError, OutputError, SceneError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpt.images.comparison import Comparison, Shown
+    from torchpt.images.comparison import Comparison, DisplayTransform
 
 __all__ = ["HELP", "run"]
 
@@ -149,13 +149,13 @@ def run(words: list[str], interrupt: Interrupt) -> int:
     return 0
 
 
-def _shown(given: dict[str, str]) -> Shown:
+def _shown(given: dict[str, str]) -> DisplayTransform:
     """How a screen shows the pictures; the values are those of ``film``.
 
     Raises:
         SceneError: a value that is not accepted.
     """
-    from torchpt.images.comparison import Shown
+    from torchpt.images.comparison import DisplayTransform
     from torchpt.scene.settings import Film
     from torchpt.spec.reading import Refused
 
@@ -167,7 +167,7 @@ def _shown(given: dict[str, str]) -> Shown:
                 values[key] = Film.parameters[key].read(given[key] if math.isnan(number) else number)
             except Refused as refused:
                 raise SceneError(key, given[key], refused.expected) from None
-    return Shown(**values)
+    return DisplayTransform(**values)
 
 
 def _number(text: str) -> float:
@@ -262,7 +262,7 @@ def _apart(picture: Tensor, colours: bool) -> tuple[Tensor, Tensor | None]:
     return picture, None
 
 
-def _write_map(chart: _Map, image: Tensor, reference: Tensor, shown: Shown) -> dict[str, Any]:
+def _write_map(chart: _Map, image: Tensor, reference: Tensor, shown: DisplayTransform) -> dict[str, Any]:
     """Write the map whole or not at all; returns what it shows.
 
     Raises:
@@ -271,11 +271,11 @@ def _write_map(chart: _Map, image: Tensor, reference: Tensor, shown: Shown) -> d
     import torch
 
     from torchpt.images import write_image
-    from torchpt.images.comparison import map_of
+    from torchpt.images.comparison import comparison_map
     from torchpt.images.false_colour import false_colour
 
     try:
-        errors = map_of(chart.metric, image, reference, shown)
+        errors = comparison_map(chart.metric, image, reference, shown)
     except (ImportError, ValueError) as problem:
         raise OutputError(chart.file, f"there is no such map: {problem}") from None
     finite = errors[torch.isfinite(errors)]

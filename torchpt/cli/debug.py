@@ -17,7 +17,7 @@ from torchpt.cli.render import Job, described
 from torchpt.cli.streams import speaking
 
 if TYPE_CHECKING:
-    from torchpt.rendering.one_path import Chosen, Emission, Path, Scattered, Vertex
+    from torchpt.rendering.one_path import BsdfSampleRecord, EmissionRecord, LightSampleRecord, Path, Vertex
 
 __all__ = ["Wish", "debug", "lines"]
 
@@ -117,12 +117,12 @@ def _vertex(vertex: Vertex) -> Iterator[str]:
     yield _row("radiance", _three(vertex.radiance))
 
 
-def _emission(found: Emission) -> str:
+def _emission(found: EmissionRecord) -> str:
     parts = f"radiance {_three(found.radiance)}, pdf {_number(found.pdf)}, MIS weight {_number(found.mis_weight)}"
     return f"{found.light}: {parts}, contribution {_three(found.contribution)}"
 
 
-def _light(light: Chosen) -> str:
+def _light(light: LightSampleRecord) -> str:
     seen = "not asked" if light.visible is None else _number(light.visible)
     return (
         f"{light.light}: wi {_three(light.wi)}, {_density(light.pdf)}, radiance/pdf {_three(light.arriving)}, "
@@ -131,7 +131,7 @@ def _light(light: Chosen) -> str:
     )
 
 
-def _scattered(found: Scattered) -> Iterator[str]:
+def _scattered(found: BsdfSampleRecord) -> Iterator[str]:
     eta = "" if found.eta is None else f", eta {_number(found.eta)}"
     yield _row("scattered", f"wi {_three(found.wi)}, {_density(found.pdf)}, weight {_three(found.weight)}{eta}")
     if found.survival is not None:

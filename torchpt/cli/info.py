@@ -41,7 +41,7 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
         TorchptError: bad input.
         Interrupted: a signal came.
     """
-    from torchpt.rendering import loop_facts
+    from torchpt.rendering import describe_engine
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
 
@@ -50,7 +50,7 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
         description, wishes = described(job)
         scene = Scene(description, device_of(wishes.render.device))
         facts = scene.info(wishes)
-        facts["built"]["loop"] = loop_facts(scene, wishes)
+        facts["built"]["loop"] = describe_engine(scene, wishes)
         facts = {**job.facts(), **facts}
         if wishes.render.max_memory is not None:
             facts["memory"] = _memory(scene, wishes)

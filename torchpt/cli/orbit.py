@@ -116,7 +116,7 @@ def poses(scene: Scene, turn: Turn) -> Iterator[NDArray[np.float64]]:
         centre = np.asarray(told["target"], np.float64)
     else:
         nearest = int(np.abs(start[:3, 1]).argmax())
-        axis, centre = np.sign(start[nearest, 1]) * np.eye(3)[nearest], scene.middle()
+        axis, centre = np.sign(start[nearest, 1]) * np.eye(3)[nearest], scene.center()
     for frame in range(turn.frames):
         if frame * turn.degrees % (360.0 * turn.frames) == 0.0:
             yield start
@@ -325,11 +325,11 @@ class Frames:
 def _facts(scene: Scene, wishes: Settings, turn: Turn) -> dict[str, Any]:
     """Return what frames depend on, by dotted name: the turn, the settings, and a hash of the scene."""
     from torchpt.scene.fingerprint import fingerprint
-    from torchpt.scene.settings import having
+    from torchpt.scene.settings import settings_with
     from torchpt.spec import Role
 
     facts = {"torchpt": __version__, "frames": turn.frames, "degrees": turn.degrees}
-    free = {"render": having(Role.FREE, but=Role.ENDS)["render"]}  # which leave a frame as it is
+    free = {"render": settings_with(Role.FREE, but=Role.ENDS)["render"]}  # which leave a frame as it is
     return {**facts, **dict(_dotted(wishes.plain(free))), "scene": fingerprint(scene)}
 
 

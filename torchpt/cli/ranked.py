@@ -18,14 +18,14 @@ from torchpt.core.errors import LostRankError, OtherRankError, TorchptError
 
 if TYPE_CHECKING:
     from torchpt.ranks import Group
-    from torchpt.ranks.launch import Started
+    from torchpt.ranks.launch import LaunchedProcess
 
 __all__ = ["group", "main_of_ranks", "say", "several"]
 
 #: Words that ask for more than one render, or for something else.
 _SWEEPS, _SHOWN = ("-m", "--multirun"), ("-h", "--help", "help", "--version")
 
-_started: Started | None = None
+_started: LaunchedProcess | None = None
 _stderr: Any = None
 
 
@@ -64,10 +64,10 @@ def main_of_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
     first = os.environ.get("RANK", "0") == "0"
     try:
         with Interrupt() as interrupt:
-            from torchpt.ranks.launch import Started
+            from torchpt.ranks.launch import LaunchedProcess
 
-            _started = Started()
-            _started.meet(interrupt.check)
+            _started = LaunchedProcess()
+            _started.connect(interrupt.check)
     except LostRankError as error:
         _leave(parted(error))
     except TorchptError as error:  # of the environment, which is the same for all
@@ -98,7 +98,7 @@ def _ended(main: Callable[[list[str]], int], words: list[str]) -> int:
     if not own.over:
         try:
             code = own.end(code)
-            _started.leave()
+            _started.disconnect()
             return code
         except LostRankError as error:  # while it wrote the picture, say
             code = parted(error)

@@ -110,7 +110,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     """
     from torchpt.images import check_writable
     from torchpt.rendering.api import first_hit, render_scene
-    from torchpt.rendering.checkpoint import Keeper
+    from torchpt.rendering.checkpoint import CheckpointFile
     from torchpt.rendering.result import write_rendered
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
@@ -140,7 +140,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
         if kept is not None:
             wishes = replace(wishes, render=wishes.render.but(checkpoint=kept))
             if first:
-                Keeper(kept).check(wishes.render.resume)
+                CheckpointFile(kept).check(wishes.render.resume)
         scene = Scene(description, device_of(wishes.render.device))
     scene.load_seconds = time.perf_counter() - start
     if first:
@@ -161,7 +161,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
 
         rendering = _keeping(interrupt, lambda: render_scene(scene, wishes, on_progress=on_progress, **shared))
     if group is not None:  # a signal that any of them heard
-        interrupt.signum = int(max(group.agree("signals", interrupt.signum or 0))[0]) or None
+        interrupt.signum = int(max(group.all_gather_numbers("signals", interrupt.signum or 0))[0]) or None
     if not first:
         return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
     facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, wishes)

@@ -17,7 +17,7 @@ from torchpt.cli.streams import speaking
 from torchpt.core.errors import OutputError, SceneError
 
 if TYPE_CHECKING:
-    from torchpt.stress import Bench, Case, Outcome
+    from torchpt.stress import Case, Harness, Outcome
 
 __all__ = ["HELP", "run"]
 
@@ -124,13 +124,13 @@ def run(words: list[str], interrupt: Interrupt) -> int:
     topics, benches, folder = _topics(wishes), _benches(wishes), _folder(wishes)
     quick, begun = wishes.given.get("quick") == "true", time.perf_counter()
     found: dict[str, dict[str, list[Outcome]]] = {}
-    for number, (label, bench) in enumerate(benches.items()):
+    for number, (label, harness) in enumerate(benches.items()):
         _tell(wishes, f"{label}\n{heading()}")
         for topic, cases in topics.items():
             for case in cases:
                 if number and not case.backend:
                     continue  # the first run tells for all
-                outcome = outcome_of(case, bench, quick)
+                outcome = outcome_of(case, harness, quick)
                 found.setdefault(label, {}).setdefault(topic, []).append(outcome)
                 _tell(wishes, line(outcome))
     every = [one for by_topic in found.values() for row in by_topic.values() for one in row]
@@ -158,12 +158,12 @@ def _tell(wishes: Wishes, text: str) -> None:
             print(text)
 
 
-def _benches(wishes: Wishes) -> dict[str, Bench]:
+def _benches(wishes: Wishes) -> dict[str, Harness]:
     """One for each combination of what is asked for, by what it is called."""
     import torch
 
     from torchpt.scene.devices import device_of
-    from torchpt.stress import Bench
+    from torchpt.stress import Harness
 
     device, dtype = wishes.given.get("device", "cpu"), wishes.given.get("dtype", "float32")
     if not (device in ("cpu", "cuda") or (device.startswith("cuda:") and device[5:].isdigit())):
@@ -172,7 +172,9 @@ def _benches(wishes: Wishes) -> dict[str, Bench]:
     if "on" in wishes.list("compile", "auto") and (device, dtype) != ("cpu", "float32"):
         raise SceneError("compile", "on", f"auto or off (there are no kernels for {dtype} on {device})")
     return {
-        f"accel {accel}, compile {compiled}, {dtype} on {device}": Bench(device, accel, compiled, getattr(torch, dtype))
+        f"accel {accel}, compile {compiled}, {dtype} on {device}": Harness(
+            device, accel, compiled, getattr(torch, dtype)
+        )
         for accel, compiled in product(wishes.list("accel", "auto"), wishes.list("compile", "auto"))
     }
 
@@ -180,7 +182,7 @@ def _benches(wishes: Wishes) -> dict[str, Bench]:
 def _topics(wishes: Wishes) -> dict[str, tuple[Case, ...]]:
     """The cases that are asked for."""
     from torchpt.stress.cases import all_cases
-    from torchpt.stress.own_scene import cases_of
+    from torchpt.stress.scene_cases import cases_of
 
     scene = wishes.given.get("scene")
     every = all_cases() if scene is None else {"scene": cases_of(scene, wishes.settings, wishes.changes)}
