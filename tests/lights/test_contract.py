@@ -183,7 +183,7 @@ def test_every_kind_has_a_case():
 
 def test_rows_are_in_order():
     """Near lights, those infinitely far, the environment last."""
-    ordered = sorted(lights.KINDS, key=lights.order)
+    ordered = sorted(lights.KINDS, key=lights.sort_key)
     assert ordered[:2] == ["point", "spot"] and lights.KINDS[ordered[-1]].environment
     many = {name: {"type": name, **CASES[name].keys} for name in reversed(ordered) if name != "constant"}
     scene = torchpt.load({**block("disk"), "lights": many}, device="cpu")

@@ -19,7 +19,7 @@ from torchpt.paths.nonfinite import SampleId
 from torchpt.paths.state import Emission, PathState, VertexOutput
 from torchpt.paths.walk import Observer, Population
 from torchpt.paths.wave import Wave
-from torchpt.physics.samplers import Streams
+from torchpt.physics.samplers import Randomizations
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.physics.world import World
 
@@ -232,12 +232,12 @@ def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[SampleId]) -> l
     found: dict[SampleId, NonFiniteCause] = {}
     for streams in sorted({(place.first, place.streams) for place in places}):
         own = [place for place in places if (place.first, place.streams) == streams]
-        found |= zip(own, _find_causes(trace, wave, own, Streams(*streams)), strict=True)
+        found |= zip(own, _find_causes(trace, wave, own, Randomizations(*streams)), strict=True)
     return [found[place] for place in places]
 
 
 @torch.no_grad()
-def _find_causes(trace: Trace, wave: Wave, places: Sequence[SampleId], streams: Streams) -> list[NonFiniteCause]:
+def _find_causes(trace: Trace, wave: Wave, places: Sequence[SampleId], streams: Randomizations) -> list[NonFiniteCause]:
     """Return the causes for samples that belong to the same randomizations."""
     finder = _CauseFinder(wave.context.world, len(places))
     x, y, sample = (

@@ -13,16 +13,16 @@ from torchpt.physics.film import ErrorEstimate, Film, Pilots, pilots_of
 from torchpt.physics.film.error import (
     BLOCK,
     STREAMS,
-    Again,
-    again_counts,
+    Resampled,
+    allocate_samples,
     error_by_pilots,
-    foreseen,
-    known_error,
-    pilots_alone,
-    shared_out,
-    to_look_at,
+    error_estimate,
+    expected_errors,
+    pixels_to_resample,
+    probe_estimate,
+    resample_counts,
 )
-from torchpt.physics.samplers import Streams
+from torchpt.physics.samplers import Randomizations
 from torchpt.scene.settings import Settings
 
 __all__ = ["FIRST_ROUND", "ErrorProbes", "SampleAllocation", "error_probes"]
@@ -80,15 +80,15 @@ class ErrorProbes:
             pixel_set, suspects = self.resampled
             values = torch.stack(pixel_set.film.streams()).cpu()
             assert pixel_set.places is not None
-            again = Again(pixel_set.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
+            again = Resampled(pixel_set.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
         first = self._first(film)
-        return known_error(
+        return error_estimate(
             picture.cpu(), self.pilots, first, self._second(), self._second_variance(), self.counted, again
         )
 
     def resampling_share(self, pixels: int) -> float:
         """Return the samples that third values take, as a share of the samples of a picture of ``pixels`` pixels."""
-        return STREAMS * sum(again_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
+        return STREAMS * sum(resample_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
 
     def resample_outliers(
         self, film: Film, from_first_rank: Callable[[Tensor], Tensor] | None = None
@@ -100,11 +100,11 @@ class ErrorProbes:
         if not len(self.pilots):
             return []
         picture, first = self.picture(film).cpu(), self._first(film)
-        suspects, doubtful = to_look_at(picture, self.pilots, first, self._second())
+        suspects, doubtful = pixels_to_resample(picture, self.pilots, first, self._second())
         if from_first_rank is not None:
             suspects, doubtful = from_first_rank(suspects), from_first_rank(doubtful)
         places = torch.cat((suspects, doubtful)).to(film.sums.device)
-        streams = Streams(self.pixel_set.streams.first + self.pixel_set.streams.count, STREAMS)
+        streams = Randomizations(self.pixel_set.streams.first + self.pixel_set.streams.count, STREAMS)
         pixel_set = PixelSet(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
         self.resampled = pixel_set, len(suspects)
         self.resampled_at = float(film.counts.double().mean())
@@ -115,7 +115,7 @@ class ErrorProbes:
         """Return the error estimate that the probes give without third values; None without probes."""
         if not len(self.pilots):
             return None
-        return pilots_alone(self.pilots, self._first(film), self._second(), self._second_variance(), self.counted)
+        return probe_estimate(self.pilots, self._first(film), self._second(), self._second_variance(), self.counted)
 
     def _first(self, film: Film) -> Tensor:
         assert self.pixel_set.places is not None
@@ -136,7 +136,7 @@ def error_probes(wave: Wave, settings: Settings, device: torch.device) -> ErrorP
     """Return the error probes of a render, before any sample."""
     film = settings.film
     pilots = pilots_of(settings.render.seed, (film.width, film.height), wave.crop)
-    streams = Streams(wave.sampler.randomizations, 2 if settings.adaptive else 1)
+    streams = Randomizations(wave.sampler.randomizations, 2 if settings.adaptive else 1)
     sums = Film(len(pilots), 1, streams.count, device)
     return ErrorProbes(pilots, PixelSet(sums, {}, streams, pilots.places.to(device)), not settings.adaptive)
 
@@ -170,11 +170,11 @@ class SampleAllocation:
         """Return the next round's spans (pixels, first sample, count), after which the picture has ``mean`` samples a pixel.
 
         Pixels of one span have the same number of samples. ``last``: no round follows, see
-        :func:`torchpt.physics.film.error.shared_out`.
+        :func:`torchpt.physics.film.error.allocate_samples`.
         """
         device = picture.film.sums.device
         counts = self._of_blocks(picture.film.counts.cpu())
-        aims = shared_out(self._errors(probes), counts, self.pixels, mean, last)
+        aims = allocate_samples(self._errors(probes), counts, self.pixels, mean, last)
         spans: list[tuple[PixelSet, int, int]] = []
         if self._from_first_rank is not None:
             aims = self._from_first_rank(aims)
@@ -217,4 +217,4 @@ class SampleAllocation:
         errors, probed = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
         at = tuple(self.pilots.block)
         errors[at], probed[at] = error_by_pilots(self.pilots, a, b), True
-        return foreseen(errors, probed).reshape(-1)
+        return expected_errors(errors, probed).reshape(-1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchpt.core.errors import SceneError
-from torchpt.physics.lights import order
+from torchpt.physics.lights import sort_key
 from torchpt.physics.parts import Copy, Parameters, Part, Source
 from torchpt.physics.shapes.geometry import KINDS
 from torchpt.scene.formats.description import Description
@@ -31,7 +31,7 @@ class SceneBuild:
         parameters: arrays by dotted name.
         centre: ``(3,)`` float64, subtracted from all positions (:mod:`torchpt.scene.space`).
         unit: divisor of all lengths.
-        sources: delta lights and environments, in the order of ``lights.order``.
+        sources: delta lights and environments, in the order of ``lights.sort_key``.
         copies: instances of parts.
     """
 
@@ -73,7 +73,7 @@ def _built(description: Description, vertex_params: Collection[str]) -> SceneBui
     for name, material in description.materials.items():
         declare(resolved(material, f"materials.{name}", description.materials, texture_loader), parameters)
     sources = build_lights(description, parameters)
-    sources = sorted([*sources, *builder.sources], key=lambda source: order(source.kind))
+    sources = sorted([*sources, *builder.sources], key=lambda source: sort_key(source.kind))
     parameters.declare_all("camera", description.camera.kind, description.camera.values)
     declare_vertex_attributes(parts, vertex_params, parameters)
     check_coordinates(parts, parameters.stated, description.file)

@@ -32,7 +32,7 @@ _REQUIRED = {
 }
 
 
-class _Told(Point):
+class _UntracedPoint(Point):
     """Three numbers that say where the camera stands: no tensor of the scene, the pose made of them is."""
 
     differentiable: ClassVar[bool] = False
@@ -41,9 +41,11 @@ class _Told(Point):
 
 #: What every camera declares.
 POSES: Mapping[str, Spec] = {
-    "origin": _Told(None, doc="where it stands"),
-    "target": _Told(None, doc="a point that it looks at"),
-    "up": _Told(None, doc="what is up in the picture, any direction but the viewing direction; [0, 1, 0] by default"),
+    "origin": _UntracedPoint(None, doc="where it stands"),
+    "target": _UntracedPoint(None, doc="a point that it looks at"),
+    "up": _UntracedPoint(
+        None, doc="what is up in the picture, any direction but the viewing direction; [0, 1, 0] by default"
+    ),
     "to_world": Pose(
         None,
         rigid=True,

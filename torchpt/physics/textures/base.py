@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CHANNELS", "SAME", "Mapped", "Matrix", "Named", "Node", "Opening", "Table", "Texture", "TextureInput", "TexturePoint",
-    "UvTransform", "moved",
+    "UvTransform", "transform_uv",
 ]  # fmt: skip
 
 #: What a number may be read from.
@@ -346,7 +346,7 @@ class Mapped(Texture):
         return (values["uv_transform"] or UvTransform()).matrix(repeats)
 
 
-def moved(maps: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+def transform_uv(maps: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Coordinates ``(N,)`` under affine maps: rows of ``maps (6 or more, N)`` are those of the transform."""
     u, v = uv[0], uv[1]
     return (

@@ -52,12 +52,12 @@ def assemble(
     Args:
         parts: the parts, ordered by kind as ``records.KINDS``.
         parameters: every tensor by dotted name.
-        sources: delta lights and environments, in the order of ``lights.order``.
+        sources: delta lights and environments, in the order of ``lights.sort_key``.
         space: the coordinates of lanes.
         dtype: dtype of the lanes.
         copies: instances of parts.
         uv: True for texture coordinates even where no texture reads them.
-        choice: the light sampler, from ``lights.WAYS``.
+        choice: the light sampler, from ``lights.LIGHT_SAMPLERS``.
 
     Raises:
         SceneError: parameters with positions or sizes beyond the range of float32.

@@ -54,7 +54,7 @@ class Preview(FirstSurface):
     @staticmethod
     def of(world: World) -> Preview:
         """Return the shading for a world; differentiable in its environment."""
-        around = lights.surroundings(world.lights)
+        around = lights.environment_image(world.lights)
         if around is None:
             return Preview(None)
         if around.even:

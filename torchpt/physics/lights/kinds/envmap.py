@@ -34,7 +34,7 @@ from torchpt.images.texels import TEXELS, check_source, read_texels, texels_from
 from torchpt.math.sampling import Distribution2D, invert_linear
 from torchpt.math.vectors import azimuth, dot, luminance, safe_reciprocal, take
 from torchpt.physics.ibl.equirect import Cell, angles
-from torchpt.physics.lights.base import Environment, Row, Setting, Surroundings, bright
+from torchpt.physics.lights.base import Environment, EnvironmentImage, Row, Setting, bright
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.spec import Custom, Moves, Path, Pose, Scalar, Spec, Texels
 
@@ -315,15 +315,15 @@ class Envmap(Environment):
         return LightSample(wi, wi, None, light, density, weight)
 
     @classmethod
-    def arriving(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
+    def radiance_pdf(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
         """See :class:`Environment`."""
         return environment(around, d, mis)
 
     @classmethod
-    def surroundings(cls, around: EnvironmentMap) -> Surroundings:
+    def environment_image(cls, around: EnvironmentMap) -> EnvironmentImage:
         """See :class:`Environment`."""
         texels = (around.texels * around.scale).T.reshape(around.height, around.width, 3)
-        return Surroundings(texels, around.turn)
+        return EnvironmentImage(texels, around.turn)
 
     @classmethod
     def info(cls, around: EnvironmentMap) -> dict[str, Any]:
