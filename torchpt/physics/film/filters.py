@@ -109,16 +109,16 @@ class Tabulated(Filter):
         self.signed = negative > 0
 
     def kind(self) -> tuple[object, ...]:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.kind`."""
         return *super().kind(), len(self._moves)
 
     def tensors(self) -> dict[str, Tensor]:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.tensors`."""
         moves = {f"{name}{k}": pair[i] for k, pair in enumerate(self._moves) for i, name in enumerate(("end", "by"))}
         return {**super().tensors(), "inverse": self._inverse, "negative": self._negative, **moves}
 
     def offset(self, u: Tensor) -> Tensor:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.offset`."""
         if self._moves:
             *others, (_, last) = self._moves
             moved = u + last
@@ -131,7 +131,7 @@ class Tabulated(Filter):
         return low + (torch.take(self._inverse, cell + 1) - low) * (place - cell)
 
     def weight(self, u: Tensor) -> Tensor:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.weight`."""
         negative = u < self._negative
         norm = 1.0 / (1.0 - 2.0 * self._negative)
         return norm * norm * (1.0 - 2.0 * (negative[0] ^ negative[1]).to(u.dtype))

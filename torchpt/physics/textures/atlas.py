@@ -55,11 +55,11 @@ class ImageNode(Node):
 
     @property
     def variant(self) -> Hashable:
-        """See :class:`Node`."""
+        """See :attr:`Node.variant`."""
         return Atlas
 
     def divided(self, unit: float) -> ImageNode:
-        """See :class:`Node`."""
+        """See :meth:`Node.divided`."""
         x, y, z = self.scale
         return replace(self, scale=(x / unit, y / unit, z / unit))
 
@@ -70,7 +70,7 @@ class ImageNode(Node):
     def table(
         self, nodes: Sequence[Any], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
     ) -> Table:
-        """See :class:`Node`."""
+        """See :meth:`Node.table`."""
         first = {node.texels: node for node in reversed(nodes)}
         return atlas_of(nodes, {name: node.image(parameters) for name, node in first.items()}, dtype, device)
 
@@ -125,16 +125,16 @@ class Atlas(Table):
 
     @property
     def filtered(self) -> bool:
-        """See :class:`Table`."""
+        """See :attr:`Table.filtered`."""
         return self.pyramids is not None
 
     def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
-        """See :class:`Table`."""
+        """See :meth:`Table.look_up`."""
         assert point.uv is not None
         return look_up(self, nodes, point.uv, coloured, point.footprint)
 
     def slope(self, nodes: Tensor, point: TexturePoint) -> tuple[Tensor, Tensor]:
-        """See :class:`Table`."""
+        """See :meth:`Table.slope`."""
         assert point.uv is not None
         return slope(self, nodes, point.uv, point.footprint)
 

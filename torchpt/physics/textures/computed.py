@@ -70,7 +70,7 @@ class Computed(Mapped):
 
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.open`."""
         channel = opening.number(CHANNELS[:4], f"{cls.name} has no alpha")
         opening.declare_all(cls, values)
         made = cls.of(values)
@@ -108,11 +108,11 @@ class ComputedNode(Node):
 
     @property
     def variant(self) -> Hashable:
-        """See :class:`Node`."""
+        """See :attr:`Node.variant`."""
         return self.texture
 
     def divided(self, unit: float) -> ComputedNode:
-        """See :class:`Node`."""
+        """See :meth:`Node.divided`."""
         return replace(self, unit=self.unit * unit)
 
     def values(self, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -130,7 +130,7 @@ class ComputedNode(Node):
     def table(
         self, nodes: Sequence[Any], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
     ) -> Table:
-        """See :class:`Node`."""
+        """See :meth:`Node.table`."""
 
         def column(rows: list[Any]) -> Tensor:
             made = torch.tensor(rows, dtype=dtype, device=device)
@@ -180,12 +180,12 @@ class ComputedTable(Table):
 
     @property
     def count(self) -> int:
-        """See :class:`Table`."""
+        """See :attr:`Table.count`."""
         return self.rows
 
     @property
     def filtered(self) -> bool:
-        """See :class:`Table`."""
+        """See :attr:`Table.filtered`."""
         return self.areas is not None
 
     def _at(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> tuple[Values, Tensor, Tensor, Tensor | None]:
@@ -204,12 +204,12 @@ class ComputedTable(Table):
         return p, x, y, area
 
     def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
-        """See :class:`Table`."""
+        """See :meth:`Table.look_up`."""
         value = self.texture.value(*self._at(nodes, point, coloured))
         return value if self.factor is None else value * take(self.factor, nodes)
 
     def slope(self, nodes: Tensor, point: TexturePoint) -> tuple[Tensor, Tensor]:
-        """See :class:`Table`."""
+        """See :meth:`Table.slope`."""
         across, along = self.texture.slope(*self._at(nodes, point, False))
         if self.factor is not None:
             factor = take(self.factor, nodes)

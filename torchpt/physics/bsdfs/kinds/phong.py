@@ -27,11 +27,11 @@ class Phong(Power):
     name = "phong"
 
     def prepare(self, values: Parameters) -> Parameters:
-        """Adds how often the diffuse lobe is drawn."""
+        """Add ``share``, the probability of the diffuse lobe."""
         return {**values, "share": share(mean(values["diffuse"]), mean(values["specular"]))}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.eval_pdf`."""
         exponent, often = parameters["exponent"], parameters["share"]
         seen = above(wo, wi)
         cosine = wi[2] * seen
@@ -44,7 +44,7 @@ class Phong(Power):
         return value, pdf
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """One of the lobes by their mean reflectances; what falls below the surface fails."""
+        """Choose a lobe by mean reflectance; a ``wi`` below the surface fails."""
         assert lobe is not None
         drop = drop_of_power(u[0], parameters["exponent"])
         r = (drop * (2.0 - drop)).clamp_min(0.0).sqrt()
@@ -55,9 +55,9 @@ class Phong(Power):
         return weighed(self, parameters, wo, wi)
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """Both reflectances."""
+        """Return the sum of both reflectances."""
         return parameters["diffuse"] + parameters["specular"]
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """The lobe about the mirror direction is as narrow as one about half vectors of four times the exponent."""
+        """Return facets of exponent ``4 n``: about the half vector they are as wide as a lobe about the mirror direction."""
         return added(parameters, 2.0 / (4.0 * parameters["exponent"] + 2.0), 1.0)

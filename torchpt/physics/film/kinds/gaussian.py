@@ -25,10 +25,10 @@ class Gaussian(Tabulated):
     }
 
     def half_width(self) -> float:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.half_width`."""
         return self.values["radius"]
 
     def profile(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.profile`."""
         stddev, radius = self.values["stddev"], self.values["radius"]
         return np.maximum(np.exp(-0.5 * (x / stddev) ** 2) - np.exp(-0.5 * (radius / stddev) ** 2), 0.0)

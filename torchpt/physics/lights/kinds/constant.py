@@ -32,17 +32,17 @@ class Constant(Environment):
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
-        """See :class:`Light`."""
+        """See :meth:`Light.sample`."""
         wi = uniform_sphere(u).to(at.radiance.dtype)
         pdf, weight = (torch.full_like(wi[0], value) for value in (1.0 / _INVERSE_PDF, _INVERSE_PDF))
         return LightSample(wi, wi, None, at.radiance.expand_as(wi), pdf, weight)
 
     @classmethod
     def arriving(cls, around: Tensor, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
-        """See :class:`Environment`."""
+        """See :meth:`Environment.arriving`."""
         return around[:, None].expand_as(d), torch.full_like(d[0], 1.0 / _INVERSE_PDF)
 
     @classmethod
     def surroundings(cls, around: Tensor) -> Surroundings:
-        """See :class:`Environment`."""
+        """See :meth:`Environment.surroundings`."""
         return Surroundings(around.expand(2, 1, 3), even=True)

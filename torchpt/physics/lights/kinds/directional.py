@@ -28,14 +28,14 @@ class Directional(Light):
 
     @classmethod
     def row(cls, scene: Setting) -> Row:
-        """See :class:`Light`."""
+        """See :meth:`Light.row`."""
         color = scene["irradiance"]
         axis = normalize(scene["direction"][:, None])[:, 0]
         return Row(color, math.pi * scene.reach**2 * bright(color), normal=axis)
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
-        """See :class:`Light`."""
+        """See :meth:`Light.sample`."""
         one = torch.ones_like(u[0], dtype=at.radiance.dtype)
         wi = (-at.normal).expand(3, u.shape[1])
         return LightSample(wi, wi, None, at.radiance.expand_as(wi), one * torch.inf, one)

@@ -290,7 +290,7 @@ class Envmap(Environment):
     def files(
         cls, values: Mapping[str, Any], find: Callable[[str], FilePath]
     ) -> dict[str, tuple[NDArray[np.float32], Spec]]:
-        """See :class:`Light`."""
+        """See :meth:`Light.files`."""
         spec = Texels(doc="radiance `(H, W, 3)`, before `scale`")
         if values["data"] is not None:
             return {"texels": (radiance_of(values["data"], "data", "data"), spec)}
@@ -309,23 +309,23 @@ class Envmap(Environment):
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
-        """See :class:`Light`."""
+        """See :meth:`Light.sample`."""
         wi, density, light = sample(at.environment, u, mis)
         weight = torch.where(density > 0, safe_reciprocal(density), 0.0)
         return LightSample(wi, wi, None, light, density, weight)
 
     @classmethod
     def arriving(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
-        """See :class:`Environment`."""
+        """See :meth:`Environment.arriving`."""
         return environment(around, d, mis)
 
     @classmethod
     def surroundings(cls, around: EnvironmentMap) -> Surroundings:
-        """See :class:`Environment`."""
+        """See :meth:`Environment.surroundings`."""
         texels = (around.texels * around.scale).T.reshape(around.height, around.width, 3)
         return Surroundings(texels, around.turn)
 
     @classmethod
     def info(cls, around: EnvironmentMap) -> dict[str, Any]:
-        """See :class:`Environment`."""
+        """See :meth:`Environment.info`."""
         return {"texels": [around.width, around.height], "mis_compensation": around.compensated is not None}

@@ -36,13 +36,13 @@ class Point(Light):
 
     @classmethod
     def row(cls, scene: Setting) -> Row:
-        """See :class:`Light`."""
+        """See :meth:`Light.row`."""
         color = scene.intensity("intensity")
         return Row(color, (4.0 * math.pi) * bright(color), scene.point("position"))
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
-        """See :class:`Light`."""
+        """See :meth:`Light.sample`."""
         wi, weight = toward(x, at.p0)
         infinite = torch.full_like(weight, torch.inf)
         return LightSample(wi, at.p0.expand_as(wi), None, at.radiance.expand_as(wi), infinite, weight)

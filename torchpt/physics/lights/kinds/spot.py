@@ -61,7 +61,7 @@ class Spot(Light):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Light`."""
+        """See :meth:`Light.check`."""
         if values["position"] == values["target"]:
             raise Refused("a point other than the position", list(values["target"]), ("target",))
         if values["beam_width"] > values["cutoff_angle"]:
@@ -70,7 +70,7 @@ class Spot(Light):
 
     @classmethod
     def row(cls, scene: Setting) -> Row:
-        """See :class:`Light`."""
+        """See :meth:`Light.row`."""
         color = scene.intensity("intensity")
         axis = normalize((scene["target"] - scene["position"])[:, None])[:, 0]
         cutoff, beam = (scene[key] * (math.pi / 180.0) for key in ("cutoff_angle", "beam_width"))
@@ -91,7 +91,7 @@ class Spot(Light):
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
-        """See :class:`Light`."""
+        """See :meth:`Light.sample`."""
         drawn = point.Point.sample(at, x, u, mis)
         share = falloff(drawn.wi, at.normal, at.e1[0], at.e1[1])
         return replace(drawn, radiance=drawn.radiance * share)

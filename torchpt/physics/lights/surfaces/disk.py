@@ -21,6 +21,6 @@ class Disk(Surface):
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.sample`."""
         place = concentric_disk(u)
         return OnSurface(flat_point(at.p0, at.e1, at.e2, place), at.normal, place)

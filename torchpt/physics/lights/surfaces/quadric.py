@@ -48,7 +48,7 @@ class Quadric(Surface):
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.sample`."""
         assert at.quadrics is not None
         own = quadrics.sample(at.quadrics, u)
         p = affine(at.p0 + at.e1 * own[0], at.e2, own[1], at.quadrics.e3, own[2])
@@ -56,12 +56,12 @@ class Quadric(Surface):
 
     @classmethod
     def size(cls, at: Lights, normal: Tensor) -> Tensor | None:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.size`."""
         assert at.quadrics is not None
         return world_area(at.area, at.e1, at.e2, at.quadrics.e3, normal)
 
     @classmethod
     def bound(cls, at: Lights, normal: Tensor) -> Tensor | None:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.bound`."""
         assert at.quadrics is not None
         return dot(normal.detach().abs(), at.quadrics.reach)

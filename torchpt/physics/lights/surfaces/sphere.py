@@ -58,13 +58,13 @@ class Sphere(Surface):
 
     @classmethod
     def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.areas`."""
         area = (4.0 * math.pi) * faces.e1[0].double() ** 2
         return area, area.detach()
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.sample`."""
         # Detached: from a moving reference point the same spot on the light is held, as on planar lights.
         radius = at.e1[0]
         p, normal = sample(x.detach(), at.p0.detach(), radius.detach(), at.flip, u)
@@ -75,7 +75,7 @@ class Sphere(Surface):
     def inverse_pdf(
         cls, at: Lights, x: Tensor, normal: Tensor, wi: Tensor, square: Tensor, by_area: Tensor
     ) -> Tensor | None:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.inverse_pdf`."""
         found = inverse_pdf(x.detach(), at.p0.detach(), at.e1[0].detach(), normal, wi.detach(), square.detach())
         if not by_area.requires_grad:
             return found

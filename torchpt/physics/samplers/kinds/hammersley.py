@@ -29,11 +29,11 @@ class Hammersley(Points):
     rows = 3
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_1d`."""
         return jittered(key, salt)
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_2d`."""
         seed = mix(key[0] ^ salt)
         index = shuffle(key[1], key[2], seed)
         x = place(index.double(), to_unit(mix(mix(seed ^ X) ^ index)).double(), key[2].double())

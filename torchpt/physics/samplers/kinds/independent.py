@@ -29,10 +29,10 @@ class Independent(Points):
     parameters = ADAPTIVE
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_1d`."""
         return to_unit(_word(key, salt))
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_2d`."""
         word = _word(key, salt)
         return torch.stack((to_unit(word), to_unit(mix(word ^ _SECOND))))

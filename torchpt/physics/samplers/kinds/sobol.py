@@ -37,14 +37,14 @@ class Sobol(Points):
     joint = True
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_1d`."""
         # Shuffled before it is scrambled: scrambled alone, all 1D sets would share their order and move together.
         seed = mix(key[0] ^ salt)
         index = reverse_bits(scramble(reverse_bits(key[1]), seed))
         return to_unit(reverse_bits(scramble(index, mix(seed ^ X))))
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_2d`."""
         seed = mix(key[0] ^ salt)
         index = reverse_bits(scramble(reverse_bits(key[1]), seed))
         x = scramble(index, mix(seed ^ X))
@@ -52,7 +52,7 @@ class Sobol(Points):
         return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))
 
     def draw_further(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_further`."""
         seed = mix(key[0] ^ salt)
         index = reverse_bits(scramble(reverse_bits(key[1]), seed))
         x = scramble(third_dimension(index), mix(seed ^ Z))

@@ -27,11 +27,11 @@ class Stratified(Points):
     rows = 3
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_1d`."""
         return jittered(key, salt)
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_2d`."""
         seed = mix(key[0] ^ salt)
         stratum = shuffle(key[1], key[2], seed)
         jitter = to_unit(mix(mix(seed ^ X) ^ stratum)).double(), to_unit(mix(mix(seed ^ Y) ^ stratum)).double()

@@ -73,12 +73,12 @@ class ZSobol(Points):
         return torch.stack((mix(block ^ seed), (place | -(odd << 31)).to(torch.int32)))
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_1d`."""
         seed = mix(key[0] ^ salt)
         return to_unit(reverse_bits(scramble(_index(key[1], seed), mix(seed ^ X))))
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_2d`."""
         seed = mix(key[0] ^ salt)
         index = _index(key[1], seed)
         x = scramble(index, mix(seed ^ X))

@@ -40,13 +40,13 @@ class Cone(Shape, Quadric):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.check`."""
         if values["height"] == 0:
             raise Refused("a finite number other than 0", values["height"], ("height",))
 
     @classmethod
     def own(cls, values: Mapping[str, Any]) -> Any:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.own`."""
         height, slope = values["height"], values["slope"]
         turn = UPRIGHT if height < 0 else UPRIGHT * [[1.0], [-1.0], [-1.0]]
         (x, y, z), length = values["apex"], abs(height)
@@ -54,14 +54,14 @@ class Cone(Shape, Quadric):
 
     @classmethod
     def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.surfaces`."""
         if not values["capped"]:
             return [Surface("quadric", quadric=cls)]
         return [Surface("quadric", "side", quadric=cls), Surface("disk", "bottom", BOTTOM)]
 
     @classmethod
     def place(cls, u: Tensor, v: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.place`."""
         around, height = ring(u), v.clamp(0.0, 1.0)
         radius = 1.0 - height
         return torch.stack((around[0] * radius, around[1] * radius, height))
@@ -76,13 +76,13 @@ class Cone(Shape, Quadric):
 
     @classmethod
     def climb(cls, q: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.climb`."""
         one = torch.ones_like(radius)
         return -one, one
 
     @classmethod
     def sample(cls, u: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.sample`."""
         phi = (2.0 * math.pi) * u[0]
         # The area between the apex and a distance from it grows with the square of that distance.
         radius = u[1].sqrt()

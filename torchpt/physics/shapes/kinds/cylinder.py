@@ -32,14 +32,14 @@ class Cylinder(Shape, Quadric):
 
     @classmethod
     def own(cls, values: Mapping[str, Any]) -> Any:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.own`."""
         radius, height = values["radius"], values["height"]
         x, y, z = values["center"]
         return placed((x, y - 0.5 * height, z), (radius, radius, height), UPRIGHT)
 
     @classmethod
     def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.surfaces`."""
         if not values["capped"]:
             return [Surface("quadric", quadric=cls)]
         side = Surface("quadric", "side", quadric=cls)
@@ -47,18 +47,18 @@ class Cylinder(Shape, Quadric):
 
     @classmethod
     def place(cls, u: Tensor, v: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.place`."""
         around = ring(u)
         return torch.stack((around[0], around[1], v.clamp(0.0, 1.0)))
 
     @classmethod
     def normal(cls, q: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.normal`."""
         return torch.stack((q[0], q[1], torch.zeros_like(q[2])))
 
     @classmethod
     def sample(cls, u: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.sample`."""
         phi = (2.0 * math.pi) * u[0]
         return torch.stack((torch.cos(phi), torch.sin(phi), u[1]))
 

@@ -33,6 +33,6 @@ class Instance(Shape):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.check`."""
         if values["emission"] is not None:
             raise Refused("no emission on an instance (a mesh of its own can shine)", values["emission"], ("emission",))

@@ -70,7 +70,7 @@ class Mesh(Shape):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.check`."""
         inline = {name: values[name] for name in ("vertices", "faces", "normals", "uvs")}
         vertices, faces = values["vertices"], values["faces"]
         if values["path"] is not None and values["mesh"] is not None:
@@ -97,7 +97,7 @@ class Mesh(Shape):
 
     @classmethod
     def triangles(cls, values: Mapping[str, Any]) -> Triangles:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.triangles`."""
         arrays = (values[name] for name in ("path", "vertices", "faces", "normals", "uvs"))
         return Triangles(
             *arrays, flat=values["face_normals"], displacement=values["displacement"], object=values["mesh"]

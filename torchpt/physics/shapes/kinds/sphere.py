@@ -27,12 +27,12 @@ class Ellipsoid(Quadric):
 
     @classmethod
     def place(cls, u: Tensor, v: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.place`."""
         return octahedral(u, v)
 
     @classmethod
     def normal(cls, q: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.normal`."""
         return q
 
     @classmethod
@@ -47,12 +47,12 @@ class Ellipsoid(Quadric):
 
     @classmethod
     def sample(cls, u: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.sample`."""
         return uniform_sphere(u)
 
     @classmethod
     def box(cls, e1: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.box`."""
         reach = (e1.square() + e2.square() + e3.square()).sqrt()
         return -reach, reach
 
@@ -74,7 +74,7 @@ class Sphere(Shape):
 
     @classmethod
     def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.surfaces`."""
         if similarity_scale(pose) is not None:
             return [Surface("sphere")]
         return [Surface("quadric", quadric=Ellipsoid)]

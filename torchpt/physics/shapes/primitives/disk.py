@@ -30,7 +30,7 @@ class Disk(Primitive):
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.corners`."""
         move, x, y, mirrored = axes_of(pose)
         p1, p2 = move + x, move + y
         return Corners(move.to(dtype), p1.to(dtype), p2.to(dtype), mirrored=mirrored)
@@ -52,7 +52,7 @@ class Disk(Primitive):
 
     @classmethod
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.uv`."""
         x, y = at.u, at.v
         if world.geometry.mirrored is not None:
             turned = take(world.geometry.mirrored, at.prim)

@@ -29,7 +29,7 @@ class Quadric(Primitive):
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.corners`."""
         linear, move = pose.split((3, 1), 1)
         x, y = linear[:, 0:1], linear[:, 1:2]
         frame = torch.cat((move, x, y, linear[:, 2:3]))
@@ -37,7 +37,7 @@ class Quadric(Primitive):
 
     @classmethod
     def meet(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Met:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.meet`."""
         table = quadrics.rows(world, place.prim)
         own = _told(table, rays, mine)
         if rays.follow_shape:
@@ -56,7 +56,7 @@ class Quadric(Primitive):
 
     @classmethod
     def tangents(cls, world: World, place: Place, at: Interaction, mine: Tensor) -> tuple[Tensor, Tensor | None]:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.tangents`."""
         assert at.own is not None
         tangent = quadrics.tangent(place.e1, place.e2, at.own)
         if at.bitangent is None:
@@ -65,7 +65,7 @@ class Quadric(Primitive):
 
     @classmethod
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.uv`."""
         if at.own is None:  # a point on lights of other kinds
             return None
         return quadrics.surface_uv(quadrics.rows(world, at.prim), at.own)

@@ -29,7 +29,7 @@ class Rectangle(Primitive):
 
     @classmethod
     def corners_of_many(cls, poses: Tensor, dtype: torch.dtype) -> list[Corners]:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.corners_of_many`."""
         move, x, y, mirrored = axes_of_all(poses)
         x, y = 2.0 * x, 2.0 * y
         p0 = move - 0.5 * (x + y)
@@ -38,10 +38,10 @@ class Rectangle(Primitive):
 
     @classmethod
     def uvs(cls, part: Part, corners: Corners) -> Triple:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.uvs`."""
         return unit_uvs(corners)
 
     @classmethod
     def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.moves`."""
         return corner_moves(corners, uvs)

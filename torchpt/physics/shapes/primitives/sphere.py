@@ -31,7 +31,7 @@ class Sphere(Primitive):
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.corners`."""
         linear, move = pose.split((3, 1), 1)
         radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)
         zero = torch.zeros_like(radius)
@@ -50,7 +50,7 @@ class Sphere(Primitive):
 
     @classmethod
     def meet(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Met:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.meet`."""
         assert world.geometry.flip is not None
         o, d, p0 = rays.o, rays.d, place.p0
         radius = torch.where(mine, place.e1[0], 1.0)
@@ -77,7 +77,7 @@ class Sphere(Primitive):
 
     @classmethod
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.uv`."""
         assert world.geometry.axes is not None
         first, end = world.geometry.ends[2], world.geometry.ends[3]
         row = torch.minimum((at.prim - first).clamp_min(0), end - first - 1)

@@ -26,7 +26,7 @@ class Triangle(Primitive):
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.corners`."""
         linear, move = pose.split((3, 1), 1)
         assert part.faces is not None
         points = linear @ own["vertices"].T.double() + move
@@ -61,5 +61,5 @@ class Triangle(Primitive):
 
     @classmethod
     def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.moves`."""
         return super().moves(part, corners, uvs, linear) if part.uvs is None else corner_moves(corners, uvs)

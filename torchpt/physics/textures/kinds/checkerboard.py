@@ -33,7 +33,7 @@ class Checkerboard(Mapped):
 
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.open`."""
         channel = opening.number(CHANNELS[:4], "squares have no alpha")
         opening.declare_all(cls, values)
         matrix = cls.matrix(values, values["scale"])

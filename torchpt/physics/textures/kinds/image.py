@@ -66,7 +66,7 @@ class Image(Mapped):
 
     @classmethod
     def label(cls, values: Mapping[str, Any]) -> str | None:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.label`."""
         path = values["path"]
         return path.label if isinstance(path, EncodedImage) else path[0] if path else None
 
@@ -79,13 +79,13 @@ class Image(Mapped):
 
     @classmethod
     def film_space_applies(cls, values: Mapping[str, Any], coloured: bool) -> None:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.film_space_applies`."""
         if not coloured and len(set(values["scale"])) > 1:
             raise Refused("one number as scale where a number is wanted", list(values["scale"]), ("scale",))
 
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.open`."""
         slot, scale = opening.slot, values["scale"]
         label, picture = _picture(values, opening)
         channel = opening.channel or values["channel"] or "luminance"

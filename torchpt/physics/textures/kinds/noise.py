@@ -61,7 +61,7 @@ class Noise(Computed):
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Noise:
-        """See :class:`Computed`."""
+        """See :meth:`Computed.of`."""
         return cls(values["octaves"])
 
     def constants(self, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -71,7 +71,7 @@ class Noise(Computed):
         return {"keys": tuple(keys), "shifts": (0.0, 0.0, *shifts)}
 
     def value(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> Tensor:
-        """See :class:`Computed`."""
+        """See :meth:`Computed.value`."""
         height, whole = torch.zeros_like(x), torch.zeros_like(x)
         for weight, _, kept, at, key in self._octaves(p, x, y, area):
             whole = whole + weight
@@ -79,7 +79,7 @@ class Noise(Computed):
         return p["color0"] + (p["color1"] - p["color0"]) * (0.5 + _GAIN * (height / whole))
 
     def slope(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> tuple[Tensor, Tensor]:
-        """See :class:`Computed`."""
+        """See :meth:`Computed.slope`."""
         across, along, whole = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x)
         for weight, cells, kept, at, key in self._octaves(p, x, y, area):
             whole = whole + weight

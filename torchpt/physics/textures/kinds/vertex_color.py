@@ -54,5 +54,5 @@ class VertexColor(Texture):
 
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.open`."""
         return _Node(opening.number(CHANNELS[:4], "vertices have no alpha"))
