@@ -22,11 +22,11 @@ class Constant(Environment):
     """An environment of one radiance from all directions."""
 
     name = "constant"
-    parameters: ClassVar = {"radiance": Color((1.0, 1.0, 1.0), doc="from every direction")}
+    parameters: ClassVar = {"radiance": Color((1.0, 1.0, 1.0), doc="radiance from every direction")}
 
     @classmethod
     def row(cls, scene: Setting) -> Row:
-        """See :class:`Light`; what its functions are given is the radiance ``(3,)``."""
+        """See :meth:`Light.row`; :attr:`Row.environment` is the radiance ``(3,)``."""
         color, around = scene["radiance"], scene.given("radiance").to(scene.dtype)
         return Row(color, 4.0 * math.pi**2 * scene.reach**2 * bright(color), environment=around)
 

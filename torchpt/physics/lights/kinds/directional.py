@@ -1,4 +1,4 @@
-"""Parallel light from infinitely far: where it goes in ``Lights.normal``, an irradiance in ``Lights.radiance``."""
+"""Directional light: ``Lights.normal`` is the direction of the light, ``Lights.radiance`` the irradiance."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Directional(Light):
 
     name = "directional"
     parameters: ClassVar = {
-        "direction": Direction(moves=Moves.SHADOWS, doc="where the light goes"),
-        "irradiance": Color((1.0, 1.0, 1.0), doc="on a surface that faces it"),
+        "direction": Direction(moves=Moves.SHADOWS, doc="direction in which the light travels"),
+        "irradiance": Color((1.0, 1.0, 1.0), doc="irradiance on a surface perpendicular to it"),
     }
     distant = True
 

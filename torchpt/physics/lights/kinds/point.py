@@ -1,4 +1,4 @@
-"""Points that shine alike in all directions: a position in ``Lights.p0``, an intensity in ``Lights.radiance``."""
+"""Point lights: ``Lights.p0`` is the position, ``Lights.radiance`` the radiant intensity."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ __all__ = ["Point", "toward"]
 
 
 def toward(x: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit directions ``(3, N)`` from ``x (3, N)`` to points, and one over the squared distances ``(N,)``; 0 at the point."""
+    """Return unit directions ``(3, N)`` from ``x (3, N)`` to points, and inverse squared distances ``(N,)``, 0 at the point."""
     to = position - x
     square = dot(to, to)
     return to / square.clamp_min(torch.finfo(square.dtype).tiny).sqrt(), safe_reciprocal(square)
 
 
 class Point(Light):
-    """A point that shines alike in all directions."""
+    """A point that emits alike in all directions."""
 
     name = "point"
     parameters: ClassVar = {
-        "position": spec.Point(moves=Moves.SHADOWS, doc="where it is"),
-        "intensity": Color((1.0, 1.0, 1.0), doc="power per solid angle"),
+        "position": spec.Point(moves=Moves.SHADOWS, doc="position"),
+        "intensity": Color((1.0, 1.0, 1.0), doc="radiant intensity: power per solid angle"),
     }
     places = ("position",)
 

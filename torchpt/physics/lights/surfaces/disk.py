@@ -1,4 +1,4 @@
-"""Disks and ellipses, drawn by area."""
+"""Disks and ellipses, sampled by area."""
 
 from __future__ import annotations
 

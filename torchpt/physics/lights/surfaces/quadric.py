@@ -1,7 +1,7 @@
-"""Emitters that are quadrics under affine maps, sampled uniformly by area in the surface's own space.
+"""Emissive quadrics under affine maps, sampled uniformly by area in object space.
 
-Under a map M with cofactor matrix C the area element at own normal n grows by ``|C n| = |det M| / |M^T N|``, N the world's
-unit normal: what was sampled and what was hit by chance agree on the density from N alone.
+Under a map M with cofactor matrix C the area element at the object-space normal n grows by ``|C n| = |det M| / |M^T N|``,
+where N is the unit normal in the world: N alone gives the density, of sampled and of hit points.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ __all__ = ["Quadric", "world_area"]
 
 
 def world_area(area: Tensor, e1: Tensor, e2: Tensor, e3: Tensor, normal: Tensor) -> Tensor:
-    """One over the density by area where the normal is ``normal (3, N)``.
+    """Return one over the density by area at unit normals ``normal``.
 
     Args:
-        area: area in the own space times ``|det|`` ``(N,)``.
+        area: area in object space times ``|det|`` ``(N,)``.
         e1: ``(3, N)``.
         e2: ``(3, N)``.
         e3: ``(3, N)``.
-        normal: unit, of the world ``(3, N)``.
+        normal: unit normal in the world ``(3, N)``.
     """
     a, b, c = dot(e1, normal), dot(e2, normal), dot(e3, normal)
     square = a * a + b * b + c * c
@@ -41,7 +41,7 @@ class Quadric(Surface):
 
     @classmethod
     def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
-        """See :class:`Surface`: its own space's times ``|det|``; the world's by quadrature."""
+        """See :meth:`Surface.areas`: the area in object space times ``|det|``; the area in the world by quadrature."""
         assert faces.quadrics is not None and faces.frame is not None
         area, whole = quadrics.areas(faces.quadrics, faces.frame)
         return area.index_select(0, faces.column), whole.index_select(0, faces.column)
