@@ -1,4 +1,4 @@
-"""Disks, which transforms make ellipses of; texture coordinates are the distance from the centre and the azimuth (Mitsuba)."""
+"""Disks and, under affine maps, ellipses. As in Mitsuba ``u`` is the distance from the centre, ``v`` the azimuth over 2 pi."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Disk(Primitive):
 
     @classmethod
     def tangents(cls, world: World, place: Place, at: Interaction, mine: Tensor) -> tuple[Tensor, Tensor | None]:
-        """See :class:`Primitive`: outward, and around."""
+        """See :meth:`Primitive.tangents`; ``u`` grows outward, ``v`` around the centre."""
         u, v, e1, e2 = at.u, at.v, place.e1, place.e2
         away = torch.addcmul(e1 * u, e2, v)
         square = torch.where(mine, u * u + v * v, 1.0)

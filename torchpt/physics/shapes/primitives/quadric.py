@@ -21,7 +21,7 @@ __all__ = ["Quadric"]
 
 
 class Quadric(Primitive):
-    """A quadric; ``p0``, ``e1`` and ``e2`` of its map lie where those of flat primitives do."""
+    """A quadric; ``p0``, ``e1`` and ``e2`` of its map are stored as for flat primitives."""
 
     name = "quadric"
     flat = False
@@ -44,12 +44,12 @@ class Quadric(Primitive):
             moved = quadrics.follow_shape(table, place.p0, place.e1, rays.o, rays.d, rays.hit.t, own)
             own = torch.where(mine, moved, own)
         ng = quadrics.outward(table, own)
-        # At the point itself: a needle is far thinner than it is long.
+        # The bound at the point, not of the whole primitive: a needle is far thinner than it is long.
         return Met(_point(table, place, own), ng, dot(ng.detach().abs(), table.reach), own)
 
     @classmethod
     def hold(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Held:
-        """See :class:`Primitive`: at its place in its own space."""
+        """See :meth:`Primitive.hold`; points stay fixed in object space."""
         table = quadrics.rows(world, place.prim)
         own = _told(table, rays, mine)
         return Held(_point(table, place, own), quadrics.direction(table, quadrics.normal(table, own)))
@@ -66,13 +66,13 @@ class Quadric(Primitive):
     @classmethod
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
         """See :meth:`Primitive.uv`."""
-        if at.own is None:  # a point on lights of other kinds
+        if at.own is None:  # points on lights of other kinds
             return None
         return quadrics.surface_uv(quadrics.rows(world, at.prim), at.own)
 
 
 def _told(table: Quadrics, rays: Rays, mine: Tensor) -> Tensor:
-    """Points ``(3, N)`` in their own space as the search tells them."""
+    """Return hit points ``(3, N)`` in object space."""
     return quadrics.place(table, torch.where(mine, rays.hit.u, 0.0), torch.where(mine, rays.hit.v, 0.0))
 
 

@@ -1,4 +1,4 @@
-"""Rectangles, which transforms make parallelograms of."""
+"""Rectangles and, under affine maps, parallelograms."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ __all__ = ["Rectangle"]
 
 
 class Rectangle(Primitive):
-    """A parallelogram; texture coordinates run over [0, 1]^2."""
+    """A parallelogram; texture coordinates cover [0, 1]^2."""
 
     name = "rectangle"
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
-        """See :class:`Primitive`: Mitsuba's unit shape [-1, 1]^2 from its lower corner."""
+        """See :meth:`Primitive.corners`; the shape is [-1, 1]^2 as in Mitsuba, ``p0`` its lower corner."""
         return cls.corners_of_many(pose[None], dtype)[0]
 
     @classmethod

@@ -40,10 +40,10 @@ class Sphere(Primitive):
 
     @classmethod
     def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Primitive`: the vector whose cross product with the normal the tangent is, and ``(pi r, 0, 0)``."""
+        """Return the vector whose cross product with the normal is the tangent, and ``(pi r, 0, 0)``."""
         linear = linear.to(corners.p0)
         radius, zero = corners.p1[0].abs(), torch.zeros_like(corners.p1[0])
-        turned = -1.0 if part.flip else 1.0  # the normal is
+        turned = -1.0 if part.flip else 1.0  # sign of the normal
         handed = torch.sign(torch.linalg.det(linear.detach().double())).to(corners.p0) * turned
         around = normalize(linear[:, 2:3]) * (2.0 * math.pi * radius * handed)
         return around, torch.stack((math.pi * radius * handed, zero, zero))
@@ -62,14 +62,14 @@ class Sphere(Primitive):
 
     @classmethod
     def hold(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Held:
-        """See :class:`Primitive`: at its normal."""
+        """See :meth:`Primitive.hold`; points keep their normal."""
         radius = torch.where(mine, place.e1[0], 1.0)
         outward = normalize((rays.o + rays.d * rays.hit.t - place.p0).detach())
         return Held(place.p0 + outward * radius, outward * (radius * radius))
 
     @classmethod
     def tangents(cls, world: World, place: Place, at: Interaction, mine: Tensor) -> tuple[Tensor, Tensor | None]:
-        """See :class:`Primitive`: around, and down."""
+        """See :meth:`Primitive.tangents`; ``u`` grows around the axis, ``v`` downward."""
         assert at.tangent is not None
         around = cross(at.tangent, at.ng)
         down = None if at.bitangent is None else cross(normalize(around), at.ng) * at.bitangent[0]
@@ -88,16 +88,16 @@ class Sphere(Primitive):
 
 
 def axes(poses: list[Tensor], dtype: torch.dtype) -> Triple:
-    """Unit x, y, z ``(3, S)`` of spheres with these poses ``(4, 4)``."""
+    """Return unit axes x, y, z ``(3, S)`` of spheres with these poses ``(4, 4)``."""
     linear = [pose[:3, :3] for pose in poses]
     x, y, z = (normalize(torch.stack([m[:, k] for m in linear], 1).to(dtype)) for k in range(3))
     return x, y, z
 
 
 def _distance(o: Tensor, d: Tensor, centre: Tensor, radius: Tensor, near: Tensor) -> Tensor:
-    """The root next to the search's ``near``, with the derivative of the sphere's implicit equation at it."""
+    """Return the ray parameter of the hit next to ``near``, with the derivative of the sphere's implicit equation."""
     t = near.detach()
     f = o + d * t - centre
-    # One Newton step on |f|^2 = r^2; the slope is a constant of it, so the value is polished and the derivative right.
+    # One Newton step on |f|^2 = r^2 with a detached slope: it refines the value and gives the exact derivative.
     slope = (2.0 * dot(f, d)).detach()
     return t - (dot(f, f) - radius * radius) / torch.where(slope == 0, 1.0, slope)
