@@ -14,15 +14,15 @@ __all__ = ["Mitchell"]
 
 
 class Mitchell(Tabulated):
-    """Mitchell and Netravali's cubic, two pixels wide, with Mitsuba's names; its lobes are negative where ``C`` > 0.
+    """Mitchell and Netravali's cubic of radius 2, with Mitsuba's names; its outer lobes are negative for ``C`` > 0.
 
-    *Reconstruction Filters in Computer Graphics*, SIGGRAPH 1988, equation 8; its integral is 1.
+    *Reconstruction Filters in Computer Graphics*, SIGGRAPH 1988, equation 8. The integral is 1.
     """
 
     name = "mitchell"
     parameters: ClassVar = {
-        "B": Scalar(1 / 3, high=1.0, doc="how much it blurs"),
-        "C": Scalar(1 / 3, high=1.0, doc="how much it rings at edges"),
+        "B": Scalar(1 / 3, high=1.0, doc="amount of blur"),
+        "C": Scalar(1 / 3, high=1.0, doc="amount of ringing at edges"),
     }
 
     def half_width(self) -> float:

@@ -16,10 +16,10 @@ __all__ = ["Tent"]
 
 
 class Tent(Filter):
-    """A triangle, as Mitsuba's."""
+    """A triangle, as in Mitsuba."""
 
     name = "tent"
-    parameters: ClassVar = {"radius": Scalar(1.0, above=0.0, doc="where it has fallen to zero, in pixels")}
+    parameters: ClassVar = {"radius": Scalar(1.0, above=0.0, doc="half width in pixels")}
 
     def half_width(self) -> float:
         """See :meth:`Filter.half_width`."""
