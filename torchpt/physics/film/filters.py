@@ -56,7 +56,7 @@ class Filter(ABC):
 
     @abstractmethod
     def profile(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the filter along one axis at distances ``x`` from the centre in pixels, at any scale; zero beyond the radius."""
+        """Return the filter along one axis at distances ``x`` from the centre, in pixels and at any scale."""
 
     @abstractmethod
     def offset(self, u: Tensor) -> Tensor:
