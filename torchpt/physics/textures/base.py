@@ -347,7 +347,7 @@ class Mapped(Texture):
 
 
 def moved(maps: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Transform ``uv (2, N)`` by affine maps, given by the first six rows of ``maps (., N)``; return ``u, v``, each ``(N,)``."""
+    """Transform ``uv (2, N)`` by affine maps, the first six rows of ``maps (., N)``; return ``u, v``, each ``(N,)``."""
     u, v = uv[0], uv[1]
     return (
         torch.addcmul(torch.addcmul(maps[2], u, maps[0]), v, maps[1]),

@@ -16,14 +16,14 @@ _SECOND = as_int32(0x9E3779B9)
 
 
 def _word(key: Tensor, salt: Tensor | int) -> Tensor:
-    # Two rounds: the first spreads the sample index under this dimension's salt, the second brings in the pixel, so
-    # that two lanes share a number only if both rounds collide, and then in this one dimension alone.
+    # Two rounds: the first hashes the sample index with the salt, the second adds the pixel. So two lanes share a number only
+    # if both rounds collide, and then in this dimension alone.
     return mix(mix(key[1] ^ salt) + key[0])
 
 
 @dataclass(frozen=True)
 class Independent(Points):
-    """Random numbers, for comparisons and for tests that need independent samples."""
+    """Independent random numbers, for comparisons and for tests."""
 
     name = "independent"
     parameters = ADAPTIVE

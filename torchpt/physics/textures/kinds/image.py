@@ -43,7 +43,7 @@ class Image(Mapped):
             None,
             reader=texels_of,
             words=TEXELS,
-            doc="array, tensor or rows of numbers in place of a file, the top row first; linear, except uint8 (see `colorspace`)",
+            doc="array, tensor or rows of numbers in place of a file, the top row first; linear, except uint8: `colorspace`",
         ),
         "wrap": Choice("repeat", names=WRAPS, doc="how the image continues beyond its edges"),
         "filter": Choice(
