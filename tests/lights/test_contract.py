@@ -160,7 +160,7 @@ def shining(name: str, scene: torchpt.Scene, x: Tensor, d: Tensor, mis: bool) ->
     if name in lights.KINDS:
         kind = lights.KINDS[name]
         assert issubclass(kind, lights.Environment)
-        return kind.arriving(world.lights.environment, d.float(), mis)
+        return kind.radiance_pdf(world.lights.environment, d.float(), mis)
     o, d = x.float().expand_as(d).contiguous(), d.float().contiguous()
     t, prim, u, v = scene.accel("auto", None).intersect(o, d, torch.full((d.shape[1],), torch.inf))
     hit = prim >= 0
@@ -183,7 +183,7 @@ def test_every_kind_has_a_case():
 
 def test_rows_are_in_order():
     """Near lights, those infinitely far, the environment last."""
-    ordered = sorted(lights.KINDS, key=lights.order)
+    ordered = sorted(lights.KINDS, key=lights.sort_key)
     assert ordered[:2] == ["point", "spot"] and lights.KINDS[ordered[-1]].environment
     many = {name: {"type": name, **CASES[name].keys} for name in reversed(ordered) if name != "constant"}
     scene = torchpt.load({**block("disk"), "lights": many}, device="cpu")

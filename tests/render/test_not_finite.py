@@ -17,7 +17,7 @@ from torchpt.paths.nonfinite import KEPT, NonFinite, Place
 from torchpt.paths.wave import PixelSet
 from torchpt.physics.bsdfs.kinds.diffuse import Diffuse
 from torchpt.physics.bsdfs.records import BsdfSample
-from torchpt.physics.samplers import Streams
+from torchpt.physics.samplers import Randomizations
 from torchpt.rendering.api import Rendering, render_scene
 from torchpt.scene.formats.description import settings
 
@@ -275,7 +275,7 @@ def test_the_first_ones_are_kept_in_order():
     assert lost.places == [Place(6, 2, 15, nan=False), Place(8, 4, 10, nan=True)]
     assert str(lost.places[0]) == "sample 6 of pixel (15, 2)"
     chosen = PixelSet(
-        torchpt.physics.film.Film(30, 1, 1, torch.device("cpu")), {}, Streams(2, 3), torch.arange(100, 140)
+        torchpt.physics.film.Film(30, 1, 1, torch.device("cpu")), {}, Randomizations(2, 3), torch.arange(100, 140)
     )
     (first, _) = NonFinite.of(values, 10, 5, (3, 2, 16, 12), chosen).places
     assert (first.x, first.y, first.first, first.streams) == (112 % 16 + 3, 112 // 16 + 2, 2, 3)
@@ -288,7 +288,7 @@ def test_no_more_are_kept_than_are_traced():
         lost.add(NonFinite.of(torch.full((3, 1, 50), torch.nan), 0, sample, (0, 0, 50, 1)))
     assert lost.count == 100 and len(lost.places) == KEPT
     assert [place.sample for place in lost.places] == [3] * 50 + [9] * (KEPT - 50)
-    pilots = PixelSet(torchpt.physics.film.Film(50, 1, 1, torch.device("cpu")), {}, Streams(1, 1))
+    pilots = PixelSet(torchpt.physics.film.Film(50, 1, 1, torch.device("cpu")), {}, Randomizations(1, 1))
     lost.add(NonFinite.of(torch.full((3, 1, 50), torch.nan), 0, 0, (0, 0, 50, 1), pilots))
     assert lost.count == 150 and {place.first for place in lost.places} == {0}, "paths of the picture can be looked at"
 

@@ -20,7 +20,7 @@ from torchpt.paths.nonfinite import Place
 from torchpt.paths.state import Emission, PathState, VertexOutput
 from torchpt.paths.walk import Observer, Population
 from torchpt.paths.wave import Wave
-from torchpt.physics.samplers import Streams
+from torchpt.physics.samplers import Randomizations
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.physics.world import World
 
@@ -233,12 +233,12 @@ def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[Place]) -> list
     found: dict[Place, NonFiniteCause] = {}
     for streams in sorted({(place.first, place.streams) for place in places}):
         own = [place for place in places if (place.first, place.streams) == streams]
-        found |= zip(own, _again(trace, wave, own, Streams(*streams)), strict=True)
+        found |= zip(own, _again(trace, wave, own, Randomizations(*streams)), strict=True)
     return [found[place] for place in places]
 
 
 @torch.no_grad()
-def _again(trace: Trace, wave: Wave, places: Sequence[Place], streams: Streams) -> list[NonFiniteCause]:
+def _again(trace: Trace, wave: Wave, places: Sequence[Place], streams: Randomizations) -> list[NonFiniteCause]:
     """The same for samples of the same streams."""
     watch = _Watch(wave.context.world, len(places))
     x, y, sample = (

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchpt.paths.wave import PixelSet
-from torchpt.physics.samplers import Streams
+from torchpt.physics.samplers import Randomizations
 
 __all__ = ["KEPT", "NonFinite", "Place"]
 
@@ -28,7 +28,7 @@ class Place:
     Attributes:
         sample: its number in the pixel.
         y, x: the pixel on the whole film.
-        first, streams: which streams share the pixel's samples, see :class:`torchpt.physics.samplers.Streams`.
+        first, streams: which streams share the pixel's samples, see :class:`torchpt.physics.samplers.Randomizations`.
         nan: whether it was NaN; else it was infinite.
     """
 
@@ -115,7 +115,7 @@ class NonFinite:
         bad = ~torch.isfinite(radiance).all(0)
         nan = torch.isnan(radiance).any(0)
         count, nans = int(bad.sum()), int(nan.sum())
-        streams = Streams() if pixel_set is None else pixel_set.streams
+        streams = Randomizations() if pixel_set is None else pixel_set.streams
         places = []
         for s, p in bad.nonzero()[:KEPT].tolist():
             pixel = first_pixel + p

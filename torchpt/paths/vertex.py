@@ -131,13 +131,13 @@ def sample_light(context: StageContext, model: int, state: PathState, at: Intera
     draws = Draws(plan.sampler, state.key, context.salts)
     # The density of a light that a ray meets is asked for from where the ray left. That is where a reflected one will leave,
     # unless paths keep the vertex itself, or nothing that can be met shines.
-    kept = lights.local(table) or table.row_of_prim is None
+    kept = lights.depends_on_point(table) or table.row_of_prim is None
     x = at.p if kept else offset_origin(world, at, -state.d)
     n = None if world.materials.models[model].transmits else surface.frame.n
     numbers, which = draws.two(Dimension.LIGHT), None
     if table.choice is not None:
         # One number chooses the light and goes on to the place on it, so that both are stratified together.
-        which = lights.fine(torch.stack((numbers[0], draws.one(Dimension.LIGHT_DIGITS))))
+        which = lights.from_digits(torch.stack((numbers[0], draws.one(Dimension.LIGHT_DIGITS))))
     return lights.sample(table, x, which, numbers.to(plan.dtype), OFFSET, n, plan.strategy == "mis")
 
 

@@ -13,16 +13,16 @@ from torchpt.physics.film import ErrorEstimate, Film, Pilots, pilots_of
 from torchpt.physics.film.error import (
     BLOCK,
     STREAMS,
-    Again,
-    again_counts,
+    Resampled,
+    allocate_samples,
     error_by_pilots,
-    foreseen,
-    known_error,
-    pilots_alone,
-    shared_out,
-    to_look_at,
+    error_estimate,
+    expected_errors,
+    pixels_to_resample,
+    probe_estimate,
+    resample_counts,
 )
-from torchpt.physics.samplers import Streams
+from torchpt.physics.samplers import Randomizations
 from torchpt.scene.settings import Settings
 
 __all__ = ["FIRST_ROUND", "ErrorProbes", "Shares", "error_probes"]
@@ -79,13 +79,13 @@ class ErrorProbes:
             pixel_set, suspects = self.third
             values = torch.stack(pixel_set.film.streams()).cpu()
             assert pixel_set.places is not None
-            again = Again(pixel_set.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
+            again = Resampled(pixel_set.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
         first = self._first(film)
-        return known_error(picture.cpu(), self.pilots, first, self._second(), self._spare(), self.counted, again)
+        return error_estimate(picture.cpu(), self.pilots, first, self._second(), self._spare(), self.counted, again)
 
     def looks(self, pixels: int) -> float:
         """Return what looking again takes, as a share of the samples of a picture of so many pixels."""
-        return STREAMS * sum(again_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
+        return STREAMS * sum(resample_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
 
     def resample_outliers(
         self, film: Film, agreed: Callable[[Tensor], Tensor] | None = None
@@ -97,11 +97,11 @@ class ErrorProbes:
         if not len(self.pilots):
             return []
         picture, first = self.picture(film).cpu(), self._first(film)
-        suspects, doubtful = to_look_at(picture, self.pilots, first, self._second())
+        suspects, doubtful = pixels_to_resample(picture, self.pilots, first, self._second())
         if agreed is not None:
             suspects, doubtful = agreed(suspects), agreed(doubtful)
         places = torch.cat((suspects, doubtful)).to(film.sums.device)
-        streams = Streams(self.pixel_set.streams.first + self.pixel_set.streams.count, STREAMS)
+        streams = Randomizations(self.pixel_set.streams.first + self.pixel_set.streams.count, STREAMS)
         pixel_set = PixelSet(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
         self.third = pixel_set, len(suspects)
         self.looked = float(film.counts.double().mean())
@@ -112,7 +112,7 @@ class ErrorProbes:
         """RelMSE as the pilots alone tell it."""
         if not len(self.pilots):
             return None
-        return pilots_alone(self.pilots, self._first(film), self._second(), self._spare(), self.counted)
+        return probe_estimate(self.pilots, self._first(film), self._second(), self._spare(), self.counted)
 
     def _first(self, film: Film) -> Tensor:
         assert self.pixel_set.places is not None
@@ -133,7 +133,7 @@ def error_probes(wave: Wave, settings: Settings, device: torch.device) -> ErrorP
     """Pilots of a render, nothing sampled yet."""
     film = settings.film
     pilots = pilots_of(settings.render.seed, (film.width, film.height), wave.crop)
-    streams = Streams(wave.sampler.randomizations, 2 if settings.adaptive else 1)
+    streams = Randomizations(wave.sampler.randomizations, 2 if settings.adaptive else 1)
     sums = Film(len(pilots), 1, streams.count, device)
     return ErrorProbes(pilots, PixelSet(sums, {}, streams, pilots.places.to(device)), not settings.adaptive)
 
@@ -166,11 +166,11 @@ class Shares:
     def spans(self, picture: PixelSet, twice: ErrorProbes, mean: float, last: bool) -> list[tuple[PixelSet, int, int]]:
         """What is to be sampled for the picture to have ``mean`` samples a pixel: plates of pixels with as many samples.
 
-        ``last``: whether no round follows, see :func:`torchpt.physics.film.error.shared_out`.
+        ``last``: whether no round follows, see :func:`torchpt.physics.film.error.allocate_samples`.
         """
         device = picture.film.sums.device
         counts = self._of_blocks(picture.film.counts.cpu())
-        aims = shared_out(self._errors(twice), counts, self.pixels, mean, last)
+        aims = allocate_samples(self._errors(twice), counts, self.pixels, mean, last)
         spans: list[tuple[PixelSet, int, int]] = []
         if self._agreed is not None:
             aims = self._agreed(aims)
@@ -213,4 +213,4 @@ class Shares:
         errors, known = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
         at = tuple(self.pilots.block)
         errors[at], known[at] = error_by_pilots(self.pilots, a, b), True
-        return foreseen(errors, known).reshape(-1)
+        return expected_errors(errors, known).reshape(-1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchpt.core.errors import SceneError
-from torchpt.physics.lights import order
+from torchpt.physics.lights import sort_key
 from torchpt.physics.parts import Copy, Parameters, Part, Source
 from torchpt.physics.shapes.geometry import KINDS
 from torchpt.scene.formats.description import Description
@@ -31,7 +31,7 @@ class Built:
         parameters: arrays by dotted name.
         centre: ``(3,)`` float64, subtracted from all positions.
         unit: what all lengths are divided by.
-        sources: lights that are no surfaces, in the order of ``lights.order``.
+        sources: lights that are no surfaces, in the order of ``lights.sort_key``.
         copies: instances of parts.
     """
 
@@ -73,7 +73,7 @@ def _built(description: Description, traced: Collection[str]) -> Built:
     for name, material in description.materials.items():
         declare(resolved(material, f"materials.{name}", description.materials, opener), parameters)
     sources = sources_of(description, parameters)
-    sources = sorted([*sources, *builder.sources], key=lambda source: order(source.kind))
+    sources = sorted([*sources, *builder.sources], key=lambda source: sort_key(source.kind))
     parameters.declare_all("camera", description.camera.kind, description.camera.values)
     declare_corners(parts, traced, parameters)
     check_coordinates(parts, parameters.stated, description.file)

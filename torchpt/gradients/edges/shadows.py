@@ -29,7 +29,7 @@ from torchpt.math.sampling import Discrete, concentric_disk, uniform_sphere, uni
 from torchpt.math.vectors import cross, dot, largest, luminance, rows, take
 from torchpt.paths.roulette import chance_of, survived
 from torchpt.paths.vertex import light_radiance
-from torchpt.physics.lights import KINDS, SURFACES, fine
+from torchpt.physics.lights import KINDS, SURFACES, from_digits
 from torchpt.physics.lights.base import Environment, taken
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.samplers import Dimension, Draws
@@ -87,7 +87,7 @@ class Sources:
         lights = self.world.lights
         assert lights is not None
         u = draws.two(Dimension.LIGHT)
-        row, rest = self.choice.draw(fine(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS)))))
+        row, rest = self.choice.draw(from_digits(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS)))))
         chance, u = take(self.choice.pmf, row), torch.stack((rest, u[1].double()))
         a, e, w = torch.zeros(3, len(row), dtype=torch.float64, device=row.device), None, (row < self.surfaces).double()
         prim = take(self.prim, row)

@@ -14,7 +14,7 @@ from torchpt.paths import vertex as stages
 from torchpt.paths.roulette import DEEP, DEEP_CAP
 from torchpt.paths.state import Emission, Field, StageContext, Transmission, VertexInput, VertexOutput
 from torchpt.paths.vertex import STRATEGIES, Plan
-from torchpt.physics.lights import WAYS
+from torchpt.physics.lights import LIGHT_SAMPLERS
 from torchpt.spec import Choice, Flag, Scalar, Spec, Valued, parameters_of
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ STRATEGY: dict[str, Spec] = {
 LIGHT_CHOICE: dict[str, Spec] = {
     "light_choice": Choice(
         "auto",
-        names=WAYS,
+        names=LIGHT_SAMPLERS,
         doc="which of many lights is sampled",
     ),
 }

@@ -21,7 +21,7 @@ from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.specs import Heights, Normals, fraction
 from torchpt.spec import Color, Flag, Refused, Scalar, Spec, parameters_of
 
-__all__ = ["Bsdf", "Parameters", "Table", "Values", "gather", "made", "matte", "stacked"]
+__all__ = ["Bsdf", "Parameters", "Table", "Values", "diffuse_split_sum", "gather", "made", "stacked"]
 
 #: Values by parameter name: a tensor ``(3, N)`` or ``(N,)``, a :class:`Table`, a nested mapping, or None if absent.
 Parameters = dict[str, Any]
@@ -180,7 +180,7 @@ class Bsdf:
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Return the material for split-sum shading; by default diffuse with the colour of :meth:`albedo`."""
-        return matte(self.albedo(parameters))
+        return diffuse_split_sum(self.albedo(parameters))
 
     def preview(self, parameters: Parameters, shade: Callable[[SplitSumMaterial], Tensor]) -> Tensor:
         """Return radiance ``(3, N)`` in the preview; ``shade`` computes it for one split-sum material."""
@@ -207,7 +207,7 @@ def made(kind: Any, values: Values) -> tuple[Bsdf, dict[str, Any]]:
     return kind.of(values) if isinstance(kind, type) else (kind, kind.given(values))
 
 
-def matte(color: Tensor) -> SplitSumMaterial:
+def diffuse_split_sum(color: Tensor) -> SplitSumMaterial:
     """Return a split-sum material that is diffuse only, of colour ``(3, N)``."""
     none = torch.zeros_like(color[0])
     return SplitSumMaterial(color, none, none, torch.ones_like(none), None)

@@ -22,22 +22,22 @@ __all__ = [
     "Coat",
     "Glass",
     "Glossy",
-    "Power",
-    "above",
-    "added",
+    "PhongBase",
     "choose",
-    "clear",
-    "coated",
+    "coat_parameters",
+    "coated_split_sum",
     "cosine_power",
-    "drop_of_power",
+    "dielectric_parameters",
+    "dielectric_split_sum",
+    "in_upper_hemisphere",
+    "lobe_probability",
     "mean",
-    "over_base",
-    "passing",
+    "mixture_sample",
+    "phong_split_sum",
     "polished",
     "reflectance_at_normal",
-    "share",
+    "sample_cosine_power",
     "tinted",
-    "weighed",
     "with_delta",
 ]
 
@@ -45,7 +45,7 @@ __all__ = [
 # ---- Models of several lobes: powers of cosines, the choice between two lobes, the weight of a sampled direction
 
 
-def above(*directions: Tensor) -> Tensor:
+def in_upper_hemisphere(*directions: Tensor) -> Tensor:
     """Return 1 where all directions ``(3, N)`` lie in the upper hemisphere, else 0: ``(N,)``."""
     least = directions[0][2]
     for w in directions[1:]:
@@ -53,16 +53,16 @@ def above(*directions: Tensor) -> Tensor:
     return (least > 0).to(least.dtype)
 
 
-def cosine_power(drop: Tensor, exponent: Tensor) -> Tensor:
-    """Return ``cos^exponent`` ``(N,)`` for ``drop = 1 - cos``; 0 from a right angle on, also for exponent 0.
+def cosine_power(one_minus_cos: Tensor, exponent: Tensor) -> Tensor:
+    """Return ``cos^exponent`` ``(N,)`` for ``one_minus_cos = 1 - cos``; 0 from a right angle on, also for exponent 0.
 
     Takes ``1 - cos`` because an exponent of 1e5 would amplify the rounding error of a cosine near 1 by as much.
     """
-    inside = drop < 1.0
-    return torch.exp(exponent * torch.log1p(-torch.where(inside, drop, 0.0))) * inside
+    inside = one_minus_cos < 1.0
+    return torch.exp(exponent * torch.log1p(-torch.where(inside, one_minus_cos, 0.0))) * inside
 
 
-def drop_of_power(u: Tensor, exponent: Tensor) -> Tensor:
+def sample_cosine_power(u: Tensor, exponent: Tensor) -> Tensor:
     """Sample ``1 - cos`` from ``u (N,)`` with density ``(exponent + 1) / (2 pi) cos^exponent`` per steradian."""
     return -torch.expm1(torch.log1p(-u) / (exponent + 1.0))
 
@@ -78,14 +78,16 @@ def reflectance_at_normal(eta: Tensor) -> Tensor:
     return root * root
 
 
-def share(a: Tensor, b: Tensor) -> Tensor:
+def lobe_probability(a: Tensor, b: Tensor) -> Tensor:
     """Return the detached probability ``a / (a + b)`` of choosing the first of two lobes; 1 where both are 0."""
     a, b = a.detach(), b.detach()
     total = a + b
     return torch.where(total > 0, a / torch.where(total > 0, total, 1.0), 1.0)
 
 
-def weighed(model: Bsdf, parameters: Parameters, wo: Tensor, wi: Tensor, valid: Tensor | None = None) -> BsdfSample:
+def mixture_sample(
+    model: Bsdf, parameters: Parameters, wo: Tensor, wi: Tensor, valid: Tensor | None = None
+) -> BsdfSample:
     """Return the BSDF sample with direction ``wi``, weighted by ``eval / pdf`` over all lobes.
 
     Direction and density are detached: only ``eval`` is differentiated.
@@ -128,7 +130,7 @@ class Glass(Bsdf, part=True):
     }
 
 
-def clear(values: Parameters) -> Parameters:
+def dielectric_parameters(values: Parameters) -> Parameters:
     """Return ``eta``, the index below over the one above, and the two factors, None where absent."""
     tints = {name: values.get(name) for name in ("specular_reflectance", "specular_transmittance")}
     return {"eta": values["int_ior"] / values["ext_ior"], **tints}
@@ -151,14 +153,14 @@ def choose(reflectance: Tensor, lobe: Tensor) -> tuple[Tensor, Tensor]:
 def polished(parameters: Parameters, wo: Tensor, lobe: Tensor) -> BsdfSample:
     """Sample reflection or refraction at a smooth dielectric interface."""
     side = fresnel_dielectric(wo[2], parameters["eta"], torch.addcmul(wo[0] * wo[0], wo[1], wo[1]))
-    reflects, share = choose(side.reflectance, lobe)
+    reflects, ratio = choose(side.reflectance, lobe)
     # Nothing is refracted under total internal reflection, where the reflectance is 1.
     sideways = torch.where(reflects, -1.0, -side.eta_ti)
     wi = torch.stack((wo[0] * sideways, wo[1] * sideways, torch.where(reflects, wo[2], side.cos_t)))
     weight = torch.where(
         reflects,
-        tinted(share, parameters["specular_reflectance"]),
-        tinted(share * side.eta_ti * side.eta_ti, parameters["specular_transmittance"]),
+        tinted(ratio, parameters["specular_reflectance"]),
+        tinted(ratio * side.eta_ti * side.eta_ti, parameters["specular_transmittance"]),
     )
     return BsdfSample(
         wi,
@@ -168,7 +170,7 @@ def polished(parameters: Parameters, wo: Tensor, lobe: Tensor) -> BsdfSample:
     )
 
 
-def passing(parameters: Parameters, roughness: Tensor, f0: Tensor, eta: Tensor | None) -> SplitSumMaterial:
+def dielectric_split_sum(parameters: Parameters, roughness: Tensor, f0: Tensor, eta: Tensor | None) -> SplitSumMaterial:
     """Return the split-sum material of a dielectric interface.
 
     Args:
@@ -205,7 +207,7 @@ class Coat(Bsdf, part=True):
     }
 
 
-def coated(values: Parameters, eta: Tensor, passed: Tensor, nonlinear: bool) -> Parameters:
+def coat_parameters(values: Parameters, eta: Tensor, passed: Tensor, nonlinear: bool) -> Parameters:
     """Return the lane parameters that both plastics read.
 
     Args:
@@ -215,17 +217,19 @@ def coated(values: Parameters, eta: Tensor, passed: Tensor, nonlinear: bool) -> 
         nonlinear: whether internally reflected light is multiplied by the base's colour again, which saturates it.
     """
     diffuse, specular = values["diffuse_reflectance"], values.get("specular_reflectance")
-    often, again = mean(diffuse), diffuse if nonlinear else 1.0
+    diffuse_mean, again = mean(diffuse), diffuse if nonlinear else 1.0
     return {
         "eta": eta,
         "base": diffuse / ((1.0 - again + again * passed) * eta * eta),
         "diffuse_reflectance": diffuse,
         "specular_reflectance": specular,
-        "specular_share": share(torch.ones_like(often) if specular is None else mean(specular), often),
+        "specular_share": lobe_probability(
+            torch.ones_like(diffuse_mean) if specular is None else mean(specular), diffuse_mean
+        ),
     }
 
 
-def over_base(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
+def coated_split_sum(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
     """Return the split-sum material of a coat over a base that gets the light which the coat transmits on average."""
     eta, factor = parameters["eta"], parameters["specular_reflectance"]
     one = torch.ones_like(eta)
@@ -237,11 +241,11 @@ def over_base(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
 # ---- Phong models: a Lambertian lobe and a power of a cosine
 
 
-class Power(Bsdf, part=True):
+class PhongBase(Bsdf, part=True):
     """Mixin of Phong models: a diffuse and a glossy reflectance, and the exponent.
 
     Attributes:
-        most: largest albedo of the glossy lobe for ``specular`` 1.
+        max_albedo: largest albedo of the glossy lobe for ``specular`` 1.
     """
 
     parameters: ClassVar = {
@@ -250,7 +254,7 @@ class Power(Bsdf, part=True):
         "exponent": Scalar(30.0, high=1e5, texture=True, doc="exponent of the glossy lobe's cosine"),
     }
     lobed = True
-    most: ClassVar[float] = 1.0
+    max_albedo: ClassVar[float] = 1.0
 
     @classmethod
     def energy(cls, values: Values) -> str:
@@ -258,14 +262,14 @@ class Power(Bsdf, part=True):
         diffuse, specular = values["diffuse"], values["specular"]
         if not isinstance(diffuse, tuple) or not isinstance(specular, tuple):
             return ""
-        most = max(kd + cls.most * ks for kd, ks in zip(diffuse, specular, strict=True))
-        if most <= 1.0 + 1e-6:
+        albedo = max(kd + cls.max_albedo * ks for kd, ks in zip(diffuse, specular, strict=True))
+        if albedo <= 1.0 + 1e-6:
             return ""
-        terms = "diffuse + specular" if cls.most == 1.0 else f"diffuse + {cls.most:g} specular"
-        return f"{terms} is {most:.4g}: above 1 it may reflect more light than it receives"
+        terms = "diffuse + specular" if cls.max_albedo == 1.0 else f"diffuse + {cls.max_albedo:g} specular"
+        return f"{terms} is {albedo:.4g}: above 1 it may reflect more light than it receives"
 
 
-def added(parameters: Parameters, alpha2: Tensor, peak: Tensor | float) -> SplitSumMaterial:
+def phong_split_sum(parameters: Parameters, alpha2: Tensor, peak: Tensor | float) -> SplitSumMaterial:
     """Return the split-sum material of a Phong model: both lobes added.
 
     Args:
@@ -289,7 +293,7 @@ class Glossy(Bsdf):
     lobed = True
     delta = True
 
-    def amounts(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
+    def lobe_factors(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
         """Return the diffuse and the specular factor for ``wo``, each ``(3, N)``."""
         raise NotImplementedError
 
@@ -313,8 +317,8 @@ class Glossy(Bsdf):
         """See :meth:`Bsdf.eval_pdf`."""
         alpha, k = parameters["alpha"], parameters["k"]
         rough = torch.logical_not(parameters["smooth"]).to(wo.dtype)
-        diffuse, specular = self.amounts(parameters, wo)
-        often = share(mean(diffuse), mean(specular))
+        diffuse, specular = self.lobe_factors(parameters, wo)
+        diffuse_probability = lobe_probability(mean(diffuse), mean(specular))
         cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].clamp_min(0.0)
         facets = microfacet.reflection(wo, wi, alpha, alpha, microfacet.BOUNDED)
         # Divides Smith's masking out, to put the approximation in its place.
@@ -322,20 +326,22 @@ class Glossy(Bsdf):
             cos_i + microfacet.stretched_length(wi, alpha, alpha)
         )
         peak = facets.value * rough * smith / (4.0 * (cos_o - cos_o * k + k) * (cos_i - cos_i * k + k))
-        cosine = cos_i * above(wo, wi) * (1.0 / math.pi)
-        return torch.addcmul(diffuse * cosine, specular, peak), often * cosine + (1.0 - often) * facets.pdf * rough
+        cosine = cos_i * in_upper_hemisphere(wo, wi) * (1.0 / math.pi)
+        return torch.addcmul(diffuse * cosine, specular, peak), diffuse_probability * cosine + (
+            1.0 - diffuse_probability
+        ) * facets.pdf * rough
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """Choose a lobe by the mean of its factor; sample the facets by visible normals."""
         assert lobe is not None
         alpha = parameters["alpha"]
-        diffuse, specular = self.amounts(parameters, wo)
-        often = share(mean(diffuse), mean(specular))
-        shiny = lobe >= often
+        diffuse, specular = self.lobe_factors(parameters, wo)
+        diffuse_probability = lobe_probability(mean(diffuse), mean(specular))
+        shiny = lobe >= diffuse_probability
         m = microfacet.sample_normal(wo, alpha, alpha, u, microfacet.BOUNDED)
         about = microfacet.reflect(wo, m, wo[0] * m[0] + wo[1] * m[1] + wo[2] * m[2])
-        drawn = weighed(self, parameters, wo, torch.where(shiny, about, cosine_hemisphere(u)))
+        drawn = mixture_sample(self, parameters, wo, torch.where(shiny, about, cosine_hemisphere(u)))
         mirror = torch.stack((-wo[0], -wo[1], wo[2]))
         masking = wo[2] / (wo[2] - wo[2] * parameters["k"] + parameters["k"])
-        weight = specular * (masking * masking / torch.where(shiny, 1.0 - often, 1.0))
+        weight = specular * (masking * masking / torch.where(shiny, 1.0 - diffuse_probability, 1.0))
         return with_delta(drawn, shiny & parameters["smooth"] & (wo[2] > 0), mirror, weight)

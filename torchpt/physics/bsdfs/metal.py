@@ -17,7 +17,7 @@ from torchpt.physics.bsdfs.records import SplitSumMaterial
 from torchpt.physics.bsdfs.specs import WHITE, reflectance
 from torchpt.spec import Color, Other, Refused
 
-__all__ = ["Metal", "by_reflectance", "metal", "metal_colour", "mirrored"]
+__all__ = ["Metal", "by_reflectance", "metal", "metal_colour", "metal_split_sum"]
 
 _MIRROR = "none"  # Mitsuba's name of the metal that reflects everything
 _NAMES = f"{_MIRROR} (a perfect mirror) or one of {', '.join(METALS)}"
@@ -91,7 +91,7 @@ def metal_colour(parameters: Parameters, cos: Tensor) -> Tensor:
     return fresnel_conductor(cos, parameters["eta"], parameters["k"])
 
 
-def mirrored(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
+def metal_split_sum(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
     """Return the split-sum material of a metal with roughness ``(N,)``."""
     factor, one = parameters["specular_reflectance"], torch.ones_like(roughness)
     f0 = metal_colour(parameters, one)

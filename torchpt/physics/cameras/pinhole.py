@@ -133,9 +133,9 @@ class Pinhole(Camera):
 
     def film_of(self, p: Tensor) -> Tensor | None:
         """See :meth:`Camera.film_of`."""
-        return None if self.lens else self.placed(p - self.origin())
+        return None if self.lens else self.project_homogeneous(p - self.origin())
 
-    def placed(self, away: Tensor) -> Tensor:
+    def project_homogeneous(self, away: Tensor) -> Tensor:
         """Return :meth:`film_of` for points at offsets ``away (3, N)`` from the camera's origin."""
         right, up, depth = self.covectors() @ away
         half, (width, height) = self.half_width(), self.film

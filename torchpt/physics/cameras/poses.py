@@ -32,7 +32,7 @@ _REQUIRED = {
 }
 
 
-class _Told(Point):
+class _UntracedPoint(Point):
     """Spec of a vector from which the pose is computed. It is no parameter tensor; ``to_world`` is."""
 
     traced: ClassVar[bool] = False
@@ -41,9 +41,9 @@ class _Told(Point):
 
 #: Specs of the pose, which every camera has.
 POSES: Mapping[str, Spec] = {
-    "origin": _Told(None, doc="position"),
-    "target": _Told(None, doc="point at which the camera is aimed"),
-    "up": _Told(
+    "origin": _UntracedPoint(None, doc="position"),
+    "target": _UntracedPoint(None, doc="point at which the camera is aimed"),
+    "up": _UntracedPoint(
         None, doc="upward direction of the picture, not parallel to the viewing direction; [0, 1, 0] by default"
     ),
     "to_world": Pose(

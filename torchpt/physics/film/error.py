@@ -16,22 +16,22 @@ from torchpt.math.hashing import as_int32, mix, mix_int, to_unit
 
 __all__ = [
     "BLOCK",
-    "FEWEST_OF_TAIL",
+    "MIN_TAIL_VALUES",
     "STREAMS",
-    "Again",
     "ErrorEstimate",
     "Pilots",
-    "again_counts",
+    "Resampled",
+    "allocate_samples",
     "around",
     "error_at",
     "error_by_pilots",
-    "foreseen",
+    "error_estimate",
+    "expected_errors",
     "heavy_tail",
-    "known_error",
-    "pilots_alone",
     "pilots_of",
-    "shared_out",
-    "to_look_at",
+    "pixels_to_resample",
+    "probe_estimate",
+    "resample_counts",
 ]
 
 
@@ -44,13 +44,13 @@ __all__ = [
 
 
 #: Least number of values for :func:`heavy_tail`.
-FEWEST_OF_TAIL = 25
+MIN_TAIL_VALUES = 25
 #: Weight of the prior of the shape, and its mean.
 _PRIOR, _EXPECTED = 10.0, 0.5
 
 
 def heavy_tail(values: Tensor) -> bool:
-    """Return True if the upper tail of ``values (n,)`` is too heavy for their mean to be trusted; n >= ``FEWEST_OF_TAIL``.
+    """Return True if the upper tail of ``values (n,)`` is too heavy for their mean to be trusted; n >= ``MIN_TAIL_VALUES``.
 
     The shape has to exceed the threshold by two standard errors ``(1 + k) / sqrt(m)`` of a fit to m values.
     """
@@ -223,18 +223,18 @@ def error_by_pilots(pilots: Pilots, a: Tensor, b: Tensor) -> Tensor:
     return error_at(a, b, around(grid, known)[at]).mean(1)
 
 
-def pilots_alone(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> ErrorEstimate:
+def probe_estimate(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> ErrorEstimate:
     """Return the estimate from pilots alone, independent of all other pixels: stop rules use it."""
     share = error_by_pilots(pilots, a, b) * _first_part(a, b, spare)
     pixels = float(sum_all(pilots.weight))
     part = 1.0 - 0.5 * len(pilots) / pixels if counted else 1.0
     mean = float(sum_all(share * pilots.weight)) / pixels
     parts = pilots.weight / pixels * (share - mean) * part
-    return _with_interval(mean * part, parts, 0.0, False, share)
+    return _estimate(mean * part, parts, 0.0, False, share)
 
 
 @dataclass(frozen=True)
-class Again:
+class Resampled:
     """Resampled pixels: suspects and doubtful pilots.
 
     Attributes:
@@ -250,12 +250,12 @@ class Again:
     spare: Tensor
 
 
-def again_counts(pixels: int, pilots: int) -> tuple[int, int]:
+def resample_counts(pixels: int, pilots: int) -> tuple[int, int]:
     """Return the largest numbers of suspects and of doubtful pilots to resample."""
     return max(pixels // SUSPECTS, 1), max(pilots // DOUBTFUL, 4)
 
 
-def to_look_at(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+def pixels_to_resample(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Return the indices of pixels to resample: suspects and doubtful pilots, each ``(m,)``.
 
     Args:
@@ -268,7 +268,7 @@ def to_look_at(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[T
     rest = ~torch.isin(pilots.places, suspects)
     low = torch.minimum(a, b).clamp_min(0.0)
     doubt = relative((a - b).square(), low).mean(1) * rest
-    count = min(again_counts(len(rest), len(pilots))[1], int(rest.sum()))
+    count = min(resample_counts(len(rest), len(pilots))[1], int(rest.sum()))
     return suspects, pilots.places[doubt.topk(count).indices.sort().values]
 
 
@@ -282,13 +282,13 @@ def _suspects(picture: Tensor) -> Tensor:
         for dx in range(3):
             brighter += padded[dy : dy + height, dx : dx + width] > bright
     few = (brighter.reshape(-1) <= 1).nonzero()[:, 0]
-    standing = _standing_out(picture.reshape(-1, picture.shape[2])[few], _neighbours(picture, few))
-    count, _ = again_counts(bright.numel(), 0)
+    standing = _excess(picture.reshape(-1, picture.shape[2])[few], _neighbours(picture, few))
+    count, _ = resample_counts(bright.numel(), 0)
     return few[standing.topk(min(count, len(few))).indices].sort().values
 
 
-def known_error(
-    picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool, again: Again | None
+def error_estimate(
+    picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool, again: Resampled | None
 ) -> ErrorEstimate | None:
     """Return the error estimate of a picture.
 
@@ -314,11 +314,11 @@ def known_error(
     suspects = places[:0]
     if again is not None:
         suspects = again.places[: again.suspects]
-        sure, unsure = _really(flat[suspects], again.mean[: again.suspects], again.spare[: again.suspects])
+        sure, unsure = _actual_error(flat[suspects], again.mean[: again.suspects], again.spare[: again.suspects])
         rest = ~torch.isin(places, suspects)
         # A second value that would be a suspect itself stands for other suspects, which are counted already.
-        least = _standing_out(flat[suspects], _neighbours(picture, suspects)).min() if len(suspects) else math.inf
-        b = torch.where((_standing_out(b, others) > least)[:, None], near, b)
+        least = _excess(flat[suspects], _neighbours(picture, suspects)).min() if len(suspects) else math.inf
+        b = torch.where((_excess(b, others) > least)[:, None], near, b)
     share = error_at(a, b, near)
     if again is not None:
         at = torch.isin(places, again.places[again.suspects :])  # in the order of the pilots, both
@@ -333,7 +333,7 @@ def known_error(
     mean = float(sum_all(weight * share))
     parts = weight * (share - mean) * part
     total = sure / pixels + mean * part
-    return _with_interval(total, parts, unsure / pixels**2, sure / pixels > FEW * total, share)
+    return _estimate(total, parts, unsure / pixels**2, sure / pixels > FEW * total, share)
 
 
 def _first_part(a: Tensor, b: Tensor, spare: Tensor | None) -> float:
@@ -358,13 +358,13 @@ def _neighbours(picture: Tensor, places: Tensor) -> Tensor:
     return picture.reshape(-1, channels)[torch.stack(at)]
 
 
-def _standing_out(values: Tensor, others: Tensor) -> Tensor:
+def _excess(values: Tensor, others: Tensor) -> Tensor:
     """Return the relative squared excess ``(n,)`` of ``values (n, C)`` over the second brightest of ``others (8, n, C)``."""
     second = others.topk(2, 0).values[1]
     return relative((values - second).clamp_min(0.0).square(), others.mean(0)).mean(1)
 
 
-def _really(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
+def _actual_error(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
     """Return the summed squared error of resampled pixels over ``r² + 0.01``, and its variance.
 
     Args:
@@ -379,7 +379,7 @@ def _really(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
     return float(sum_all(share.mean(1))), float(sum_all((slope * spare.sqrt()).mean(1).square()))
 
 
-def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool, share: Tensor) -> ErrorEstimate:
+def _estimate(mean: float, parts: Tensor, unsure: float, few: bool, share: Tensor) -> ErrorEstimate:
     """Return the estimate with its interval.
 
     Args:
@@ -395,7 +395,7 @@ def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool, share: 
     if count < FEWEST:
         return ErrorEstimate(mean, None, True)
     deviation = math.sqrt(float(sum_all(parts.square())) + unsure)
-    heavy = few or deviation > VAGUE * mean or (count >= FEWEST_OF_TAIL and heavy_tail(share))
+    heavy = few or deviation > VAGUE * mean or (count >= MIN_TAIL_VALUES and heavy_tail(share))
     factor = math.exp(min(_quantile(count - 1) * deviation / mean, 300.0))
     return ErrorEstimate(mean, (mean / factor, mean * factor), heavy)
 
@@ -409,9 +409,9 @@ def _quantile(freedom: int) -> float:
 # ---- Sample allocation for adaptive sampling, by blocks of pixels
 #
 # A pixel of n samples and relative variance ``e`` has the standard deviation ``s = sqrt(e n)`` a sample. For a given total the
-# sum of ``s² / n`` over pixels is least for n in proportion to s. Pilots estimate ``e``, one a block (:func:`foreseen`). Other
-# pixels are not used, so that no pixel's number of samples depends on its own value, which would bias it. Numbers are powers of
-# two times the first one, the best for Sobol' points.
+# sum of ``s² / n`` over pixels is least for n in proportion to s. Pilots estimate ``e``, one a block: :func:`expected_errors`.
+# Other pixels are not used, so that no pixel's number of samples depends on its own value, which would bias it. Numbers are
+# powers of two times the first one, the best for Sobol' points.
 
 
 #: Largest growth of the samples of a block in one round, as few pilots estimate its error.
@@ -422,7 +422,7 @@ FLOOR = 0.05
 ORDINARY = 0.95
 
 
-def foreseen(errors: Tensor, known: Tensor) -> Tensor:
+def expected_errors(errors: Tensor, known: Tensor) -> Tensor:
     """Return the expected error of each block ``(R, C)``, from the errors of single pilots in blocks that are ``known (R, C)``.
 
     Most pilots tell the noise of their neighbourhood. A few large errors may be due to an edge, or to rare samples that are as
@@ -466,7 +466,7 @@ def _smoothed(values: Tensor, known: Tensor, own: bool = True) -> Tensor:
     return torch.where(weight > 0, total / weight.clamp_min(1e-30), mean)
 
 
-def shared_out(error: Tensor, counts: Tensor, pixels: Tensor, mean: float, last: bool = False) -> Tensor:
+def allocate_samples(error: Tensor, counts: Tensor, pixels: Tensor, mean: float, last: bool = False) -> Tensor:
     """Return new numbers of samples a pixel of each block ``(B,)`` int64: the present ones times 1, 2 or 4.
 
     In the ``last`` round the remaining samples are given out as halves, quarters, ... of present numbers, until they do not

@@ -41,7 +41,7 @@ class SplatSums:
 
     Args:
         pixels: number of pixels of the picture.
-        streams: number of randomizations, see :class:`torchpt.physics.samplers.Streams`.
+        streams: number of randomizations, see :class:`torchpt.physics.samplers.Randomizations`.
         device: device of the sums.
     """
 

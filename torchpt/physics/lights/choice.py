@@ -18,15 +18,15 @@ from torchpt.physics.lights.surface import emitter
 from torchpt.physics.lights.tree import LightTree
 
 __all__ = [
+    "LIGHT_SAMPLERS",
     "MANY",
-    "WAYS",
     "Bounds",
-    "ByTree",
+    "TreeSampler",
     "bounds_of",
-    "choice_of",
+    "depends_on_point",
     "draw",
     "environment",
-    "local",
+    "light_sampler",
     "probability",
     "without_last",
 ]
@@ -78,7 +78,7 @@ def bounds_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor]) -> Bo
 
 
 #: Values of `light_choice`; auto is `power` below MANY local lights, else `tree`.
-WAYS = ("auto", "uniform", "power", "tree")
+LIGHT_SAMPLERS = ("auto", "uniform", "power", "tree")
 MANY = 3
 #: Probability of a uniform choice instead of the tree: at most EVEN, EACH / K among K lights, 0 beyond FEW lights. The tree
 #: ignores the BSDF and may nearly always choose the wrong light for a glossy surface. At 64 samples a pixel the uniform share
@@ -87,7 +87,7 @@ EVEN, EACH, FEW = 0.25, 2.0, 64
 
 
 @dataclass(frozen=True)
-class ByTree:
+class TreeSampler:
     """Light sampler of a light tree over local lights, and a choice by power between it and each distant light."""
 
     tree: LightTree
@@ -96,14 +96,16 @@ class ByTree:
     share: Tensor  # () float64 probability of `even` among choices of local lights
 
 
-def choice_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: str) -> Discrete | ByTree | None:
+def light_sampler(
+    lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: str
+) -> Discrete | TreeSampler | None:
     """Return the light sampler of a table, None for a single light.
 
     Args:
         lights: the table; its field ``choice`` is not read.
         power: power of the rows ``(K,)``, float64.
         boxes: lower and upper corners ``(3, E)`` of the boxes of the E emissive primitives, which are the first rows.
-        way: one of :data:`WAYS`.
+        way: one of :data:`LIGHT_SAMPLERS`.
     """
     dtype = lights.area.dtype
     if len(power) == 1:
@@ -121,22 +123,22 @@ def choice_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: 
     few = count <= FEW
     share = min(EVEN, EACH / max(float(shining.sum()), 1.0)) if few else 0.0
     part = torch.tensor(share, dtype=torch.float64, device=power.device)
-    return ByTree(tree.build(*astuple(bounds)), beside, Discrete.of(shining, dtype) if few else None, part)
+    return TreeSampler(tree.build(*astuple(bounds)), beside, Discrete.of(shining, dtype) if few else None, part)
 
 
-def local(lights: Lights | None) -> bool:
+def depends_on_point(lights: Lights | None) -> bool:
     """Return True if the choice depends on the reference point, which paths then have to keep for MIS."""
-    return lights is not None and isinstance(lights.choice, ByTree)
+    return lights is not None and isinstance(lights.choice, TreeSampler)
 
 
-def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def draw(choice: Discrete | TreeSampler, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Choose lights; return rows ``(N,)``, probabilities ``(N,)``, and remapped numbers ``(N,)`` float64 in [0, 1].
 
     The remapped ``u`` is uniform given the choice. Reusing it keeps light and point stratified together.
 
     Args:
         choice: the light sampler.
-        u: ``(N,)`` float64 in [0, 1) of 48 bits, see :func:`torchpt.physics.lights.tree.fine`.
+        u: ``(N,)`` float64 in [0, 1) of 48 bits, see :func:`torchpt.physics.lights.tree.from_digits`.
         x: reference points ``(3, N)``.
         n: normals ``(3, N)``, or None, as for :func:`torchpt.physics.lights.tree.sample`.
     """
@@ -154,7 +156,7 @@ def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> t
     return torch.where(near, row, outcome + (first - 1)), p, rest
 
 
-def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _near(choice: TreeSampler, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Choose among local lights; see :func:`draw`."""
     if choice.even is None:
         return tree.sample(choice.tree, x, n, u)
@@ -166,7 +168,7 @@ def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tenso
     return row, _chance(choice, row, x, n), rest
 
 
-def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
+def _chance(choice: TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """Return the probability among local lights; see :func:`probability`."""
     p = tree.probability(choice.tree, row, x, n)
     if choice.even is None:
@@ -175,7 +177,7 @@ def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     return p * (1.0 - share) + take(choice.even.pmf, row) * share
 
 
-def probability(choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
+def probability(choice: Discrete | TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """Return the probability ``(N,)`` with which :func:`draw` chooses ``row (N,)`` at ``x`` and ``n``."""
     if isinstance(choice, Discrete):
         return take(choice.pmf, row)
@@ -186,7 +188,7 @@ def probability(choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | N
     return torch.where(row < first, p, 1.0) * take(choice.beside.pmf, (row - (first - 1)).clamp_min(0))
 
 
-def environment(choice: Discrete | ByTree | None) -> Tensor | float:
+def environment(choice: Discrete | TreeSampler | None) -> Tensor | float:
     """Return the probability of the last row, the environment's if the scene has one."""
     if choice is None:
         return 1.0
@@ -195,9 +197,9 @@ def environment(choice: Discrete | ByTree | None) -> Tensor | float:
     return chosen.pmf[-1]
 
 
-def without_last(choice: Discrete | ByTree) -> Discrete | ByTree:
+def without_last(choice: Discrete | TreeSampler) -> Discrete | TreeSampler:
     """Return the light sampler without the last row, a distant light; at least one row has to be left."""
-    if isinstance(choice, ByTree):
+    if isinstance(choice, TreeSampler):
         beside = choice.beside
         assert beside is not None  # distant lights are not in the tree
         return replace(choice, beside=None if len(beside.pmf) == 2 else _fewer(beside))

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpt.math.sampling import Discrete
-    from torchpt.physics.lights.choice import ByTree
+    from torchpt.physics.lights.choice import TreeSampler
     from torchpt.physics.shapes.geometry import Interaction, Quadrics
 
 __all__ = ["LightSample", "Lights"]
@@ -17,12 +17,12 @@ __all__ = ["LightSample", "Lights"]
 
 @dataclass(frozen=True)
 class Lights:
-    """The light table: a row for each emissive primitive, then one for each other light, sorted by ``lights.order``.
+    """The light table: a row for each emissive primitive, then one for each other light, sorted by ``lights.sort_key``.
 
     Columns are those of primitives; the files of :mod:`torchpt.physics.lights.kinds` say what other lights keep in them.
     """
 
-    choice: Discrete | ByTree | None  # the light sampler; None for a single row
+    choice: Discrete | TreeSampler | None  # the light sampler; None for a single row
     kinds: tuple[str, ...]  # kinds of the rows, in their order: of SURFACES, then of KINDS
     kind: Tensor | None  # (K,) index into `kinds`; None for a single kind
     p0: Tensor  # (3, K)

@@ -15,11 +15,11 @@ from torchpt.physics.shapes.geometry import KINDS as PRIMITIVES
 from torchpt.physics.shapes.geometry import Quadrics
 from torchpt.spec import Kinds
 
-__all__ = ["SURFACES", "Faces", "OnSurface", "Surface", "emitter", "flat_inverse_pdf", "flat_point"]
+__all__ = ["SURFACES", "Faces", "Surface", "SurfaceSample", "emitter", "flat_inverse_pdf", "flat_point"]
 
 
 @dataclass(frozen=True)
-class OnSurface:
+class SurfaceSample:
     """Points sampled on emissive surfaces."""
 
     p: Tensor  # (3, N)
@@ -64,12 +64,12 @@ class Surface(Emitter):
         name: kind of primitive, from :data:`torchpt.physics.shapes.geometry.KINDS`.
         convex: whether it emits to all sides.
         share: area over the length of the cross product of the edges.
-        tabled: whether sampling reads :class:`~torchpt.physics.shapes.geometry.Quadrics`.
+        needs_quadrics: whether sampling reads :class:`~torchpt.physics.shapes.geometry.Quadrics`.
     """
 
     convex: ClassVar[bool] = False
     share: ClassVar[float] = 1.0
-    tabled: ClassVar[bool] = False
+    needs_quadrics: ClassVar[bool] = False
 
     @classmethod
     def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
@@ -85,7 +85,7 @@ class Surface(Emitter):
         return super().bounds(at, intensity) if cls.convex else Cone(1.0, 0.0, intensity)
 
     @classmethod
-    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
+    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
         """Sample points as seen from ``x``. Not called for kinds that :mod:`torchpt.physics.lights.solid_angle` samples.
 
         Args:

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from torchpt.math.vectors import dot, safe_reciprocal, take
 from torchpt.physics.lights import choice, solid_angle
-from torchpt.physics.lights.base import COLUMNS, KINDS, Environment, Surroundings, taken
+from torchpt.physics.lights.base import COLUMNS, KINDS, Environment, EnvironmentImage, taken
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.lights.surface import SURFACES, Surface, emitter, flat_inverse_pdf, flat_point
 from torchpt.physics.shapes.geometry import Interaction
 
-__all__ = ["emitted", "environment", "sample", "surroundings", "without_environment"]
+__all__ = ["emitted", "environment", "environment_image", "sample", "without_environment"]
 
 
 def _surfaces(lights: Lights) -> list[tuple[int, type[Surface]]]:
@@ -59,7 +59,7 @@ def sample(
         u: ``(2, N)`` in [0, 1), chooses the point.
         offset: distance of the end of shadow rays from the light's surface, in units of ``Lights.bound``.
         n: normals ``(3, N)`` of opaque surfaces, zero for others; None: no such surface. Needed if
-            :func:`torchpt.physics.lights.choice.local` is True.
+            :func:`torchpt.physics.lights.choice.depends_on_point` is True.
         mis: whether the sample is combined with BSDF sampling by MIS: environment maps then leave dim directions to it.
     """
     row: Tensor | None = None
@@ -205,15 +205,15 @@ def _environment(lights: Lights) -> type[Environment]:
 
 def environment(lights: Lights, d: Tensor) -> tuple[Tensor, Tensor]:
     """Return radiance ``(3, N)`` of the environment along ``d (3, N)``, and the pdf ``(N,)`` of ``d`` under :func:`sample`."""
-    radiance, pdf = _environment(lights).arriving(lights.environment, d, mis=True)
+    radiance, pdf = _environment(lights).radiance_pdf(lights.environment, d, mis=True)
     return radiance, pdf * choice.environment(lights.choice)
 
 
-def surroundings(lights: Lights | None) -> Surroundings | None:
+def environment_image(lights: Lights | None) -> EnvironmentImage | None:
     """Return the environment as an image of all directions, differentiable; None without an environment."""
     if lights is None or lights.environment is None:
         return None
-    return _environment(lights).surroundings(lights.environment)
+    return _environment(lights).environment_image(lights.environment)
 
 
 def without_environment(lights: Lights | None) -> Lights | None:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchpt.core.dispatch import dispatched
 
-__all__ = ["FIELDS", "WIDTH", "LightTree", "build", "fine", "probability", "sample"]
+__all__ = ["FIELDS", "WIDTH", "LightTree", "build", "from_digits", "probability", "sample"]
 
 #: Children of a node.
 WIDTH = 8
@@ -106,7 +106,7 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
     return LightTree(*parts, count=number, levels=levels)
 
 
-def fine(u: Tensor) -> Tensor:
+def from_digits(u: Tensor) -> Tensor:
     """Return ``u (2, N)`` in [0, 1) as one number ``(N,)`` float64 of 48 bits: the second continues the digits of the first.
 
     Numbers of samplers have 24 bits, too few for lights of lower probability.
@@ -124,7 +124,7 @@ def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Ten
         x: ``(3, N)``.
         n: unit normals ``(3, N)`` of surfaces lit on their front only; zero where light counts from both sides. None: zero
             everywhere.
-        u: ``(N,)`` in [0, 1), float64, see :func:`fine`.
+        u: ``(N,)`` in [0, 1), float64, see :func:`from_digits`.
 
     Returns:
         Rows ``(N,)`` int64, their probabilities ``(N,)``, always positive, and the remapped ``u``: ``(N,)`` float64 in [0, 1],

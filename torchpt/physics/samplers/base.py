@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpt.math.hashing import mix
 from torchpt.spec import Flag, Spec
 
-__all__ = ["ADAPTIVE", "Numbers", "Points"]
+__all__ = ["ADAPTIVE", "Points", "SamplerTensors"]
 
 #: Parameters of kinds with any number of points, so that numbers may differ by pixel.
 ADAPTIVE: dict[str, Spec] = {
@@ -24,7 +24,7 @@ ADAPTIVE: dict[str, Spec] = {
 
 
 @dataclass(frozen=True)
-class Numbers:
+class SamplerTensors:
     """Tensors of a sampler, so that a compiled kernel serves all samplers of a kind."""
 
     seeds: Tensor  # (R,) int32 seeds of the randomizations
@@ -57,7 +57,7 @@ class Points(ABC):
     of_film: ClassVar[bool] = False
     joint: ClassVar[bool] = False
 
-    def key(self, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
+    def key(self, numbers: SamplerTensors, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
         """Return the keys of samples ``(rows, N)`` int32: seed of the pixel, index of the point, number of points (if 3 rows).
 
         For each seed and randomization the pixel's seed is a bijection of its index, so no two pixels share a sequence.

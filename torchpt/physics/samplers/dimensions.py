@@ -20,7 +20,7 @@ class Dimension(IntEnum):
     BSDF = 5  # 2D, direction
     ROULETTE = 6  # 1D
     OPACITY = 7  # 1D, hit or pass through
-    LED_HERE = 8  # an alias of the dimension that led to the vertex: BSDF of the previous vertex, or PIXEL
+    PREVIOUS_DIRECTION = 8  # an alias of the dimension that led to the vertex: BSDF of the previous vertex, or PIXEL
     DISTANCE = 9  # 1D, free-flight distance in a medium
     PHASE = 10  # 2D, direction from a phase function
     EDGE = 11  # 2D, choice of an edge of the scene and point on it; choice of its line if it has two
@@ -42,6 +42,6 @@ def salt(dimension: Dimension, depth: int, step: int = 0) -> int:
         depth: depth of the path vertex; 0 is the camera.
         step: index of the surface that the ray passes on its way to the vertex.
     """
-    if dimension is Dimension.LED_HERE:
+    if dimension is Dimension.PREVIOUS_DIRECTION:
         dimension, depth = (Dimension.BSDF, depth - 1) if depth > 1 else (Dimension.PIXEL, 0)
     return mix_int(0x9E3779B9 * (1 + (depth + step * STEPS) * STREAMS + int(dimension)))

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from torchpt.physics.shapes.primitive import Primitive
     from torchpt.physics.shapes.quadrics import Quadric
 
-__all__ = ["KINDS", "Copies", "Geometry", "Hit", "Interaction", "LaneGeometry", "QuadricTable", "Quadrics"]
+__all__ = ["KINDS", "Geometry", "Hit", "Instances", "Interaction", "LaneGeometry", "QuadricTable", "Quadrics"]
 
 
 #: Primitive kinds in the order in which a :class:`Geometry` stores them; each is a file in ``physics/shapes/primitives/``.
@@ -75,7 +75,7 @@ class Quadrics:
 
 
 @dataclass(frozen=True)
-class Copies:
+class Instances:
     """Instances of meshes. Column 0 is the identity, for all that is not instanced; column k belongs to instance k - 1.
 
     :attr:`Interaction.prim` indexes what instances share with the mesh (geometry); :attr:`Interaction.slot` indexes what each
@@ -95,7 +95,7 @@ class Copies:
 
 @dataclass(frozen=True)
 class LaneGeometry:
-    """The geometry for stages: P primitives, and I instances (see :class:`Copies`)."""
+    """The geometry for stages: P primitives, and I instances (see :class:`Instances`)."""
 
     kinds: tuple[type[Primitive], ...]  # the kinds present, in the order of KINDS; static
     counts: tuple[int, int, int, int, int]  # as in Geometry; static: stages read `ends`
@@ -117,7 +117,7 @@ class LaneGeometry:
     colors: tuple[Tensor, Tensor, Tensor] | None  # (3, P) vertex colours at the corners; None if not read
     object_id: Tensor  # (P + I,) int64, order of the shape in the scene
     quadrics: Quadrics | None = None  # None without quadrics
-    copies: Copies | None = None  # None without instances
+    copies: Instances | None = None  # None without instances
 
     def slot(self, prim: Tensor) -> Tensor:
         """Return :attr:`Interaction.slot` ``(N,)`` for primitive ids of the search; -1 stays."""

@@ -10,14 +10,23 @@ import torch
 from torch import Tensor
 
 from torchpt.math.vectors import affine, normalize, rows, take
-from torchpt.physics.shapes.geometry import KINDS, Copies, Hit, Interaction
+from torchpt.physics.shapes.geometry import KINDS, Hit, Instances, Interaction
 from torchpt.physics.world import World
 from torchpt.spec import Kinds
 
 if TYPE_CHECKING:
     from torchpt.physics.parts import Part
 
-__all__ = ["PRIMITIVES", "Corners", "Held", "Met", "Place", "Primitive", "Rays", "place_of"]
+__all__ = [
+    "PRIMITIVES",
+    "Corners",
+    "FixedPoints",
+    "HitPoints",
+    "LanePrimitives",
+    "Primitive",
+    "Rays",
+    "lane_primitives",
+]
 
 Triple = tuple[Tensor, Tensor, Tensor]
 
@@ -45,14 +54,14 @@ class Corners:
 
 
 @dataclass(frozen=True)
-class Place:
+class LanePrimitives:
     """Geometry of the primitives of N lanes, with their instances."""
 
     prim: Tensor  # (N,) below P
     p0: Tensor  # (3, N)
     e1: Tensor  # (3, N)
     e2: Tensor  # (3, N)
-    copies: Copies | None = None  # columns (., N); None without instances
+    copies: Instances | None = None  # columns (., N); None without instances
     copied: Tensor | None = None  # (N,) bool: primitives of instances
     reach: Tensor | None = None  # (3, N) sums of coordinate magnitudes, for rounding bounds; None without instances
 
@@ -68,15 +77,15 @@ class Place:
         return torch.where(self.copied, normalize(turned), n)
 
 
-def _linear(copies: Copies, w: Tensor) -> Tensor:
+def _linear(copies: Instances, w: Tensor) -> Tensor:
     return affine(copies.x * w[0], copies.y, w[1], copies.z, w[2])
 
 
-def place_of(world: World, prim: Tensor) -> Place:
+def lane_primitives(world: World, prim: Tensor) -> LanePrimitives:
     """Return the geometry of primitives by their ids in the search, none of them a miss."""
     geometry = world.geometry
     if geometry.copies is None:
-        return Place(prim, take(geometry.p0, prim), take(geometry.e1, prim), take(geometry.e2, prim))
+        return LanePrimitives(prim, take(geometry.p0, prim), take(geometry.e1, prim), take(geometry.e2, prim))
     column = geometry.copy(prim)
     table = rows(geometry.copies, column)
     prim = prim - table.start + table.first
@@ -84,7 +93,7 @@ def place_of(world: World, prim: Tensor) -> Place:
     size = (p0.abs() + e1.abs() + e2.abs()).detach()
     reach = affine(table.x.abs() * size[0], table.y.abs(), size[1], table.z.abs(), size[2]) + table.move.abs()
     p0, e1, e2 = _linear(table, p0) + table.move, _linear(table, e1), _linear(table, e2)
-    return Place(prim, p0, e1, e2, table, column > 0, reach.detach())
+    return LanePrimitives(prim, p0, e1, e2, table, column > 0, reach.detach())
 
 
 @dataclass(frozen=True)
@@ -105,7 +114,7 @@ class Rays:
 
 
 @dataclass(frozen=True)
-class Met:
+class HitPoints:
     """Hit points on primitives of one kind that is not flat; values in lanes of other kinds are arbitrary.
 
     Attributes:
@@ -122,7 +131,7 @@ class Met:
 
 
 @dataclass(frozen=True)
-class Held:
+class FixedPoints:
     """Hit points that stay fixed on their surfaces under differentiation."""
 
     p: Tensor  # (3, N)
@@ -137,13 +146,13 @@ class Primitive:
     Attributes:
         name: one of :data:`torchpt.physics.shapes.geometry.KINDS`.
         flat: whether points lie in the plane ``p0 + u e1 + v e2``. Flat kinds come first in the order of kinds.
-        charted: whether texture coordinates are not affine: then :meth:`tangents` and :meth:`uv` compute them.
+        has_own_uv: whether texture coordinates are not affine: then :meth:`tangents` and :meth:`uv` compute them.
         angles: whether only similarity transforms keep the kind, as for spheres.
     """
 
     name: ClassVar[str] = ""
     flat: ClassVar[bool] = True
-    charted: ClassVar[bool] = False
+    has_own_uv: ClassVar[bool] = False
     angles: ClassVar[bool] = False
 
     # -- when a world is built
@@ -187,17 +196,19 @@ class Primitive:
     # -- on lanes; results in lanes of other kinds are arbitrary
 
     @classmethod
-    def meet(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Met:
+    def hit_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> HitPoints:
         """Return the hit points, for kinds that are not flat; ``mine (N,)`` masks lanes of this kind."""
         raise NotImplementedError
 
     @classmethod
-    def hold(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Held:
+    def fixed_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> FixedPoints:
         """Return the hit points fixed on their surfaces under differentiation, for kinds that are not flat."""
         raise NotImplementedError
 
     @classmethod
-    def tangents(cls, world: World, place: Place, at: Interaction, mine: Tensor) -> tuple[Tensor, Tensor | None]:
+    def tangents(
+        cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
         """Return derivatives of points by texture coordinates, ``(3, N)`` each, the second if ``at`` has a bitangent.
 
         Called for charted kinds.

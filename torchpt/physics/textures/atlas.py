@@ -19,9 +19,9 @@ from torch import Tensor
 
 from torchpt.core.threads import mean_all
 from torchpt.math.vectors import luminance, take
-from torchpt.physics.textures.base import SAME, Matrix, Node, Table, TexturePoint, moved
+from torchpt.physics.textures.base import SAME, Matrix, Node, Table, TexturePoint, transform_uv
 
-__all__ = ["WRAPS", "Atlas", "ImageNode", "Pyramids", "atlas_of", "look_up", "slope"]
+__all__ = ["WRAPS", "Atlas", "ImageNode", "Mipmaps", "atlas_of", "look_up", "slope"]
 
 #: Wrap modes beyond the edges of an image, in the order of their codes in :class:`Atlas`.
 WRAPS = ("repeat", "clamp", "mirror")
@@ -82,7 +82,7 @@ class ImageNode(Node):
 
 
 @dataclass(frozen=True)
-class Pyramids:
+class Mipmaps:
     """The mipmaps of filtered nodes; their levels above 0 are nodes after the given ones, from large to small.
 
     Attributes:
@@ -106,7 +106,7 @@ class Atlas(Table):
         maps: ``(9, M)``: rows of the transform of texture coordinates, then ``scale``.
         wraps: wrap modes in use; static.
         scaled: whether any node scales; static.
-        moved: whether any node transforms its coordinates; static.
+        transformed: whether any node transforms texture coordinates; static.
         pyramids: mipmaps; None if no node is filtered.
     """
 
@@ -115,8 +115,8 @@ class Atlas(Table):
     maps: Tensor
     wraps: tuple[str, ...]
     scaled: bool
-    moved: bool
-    pyramids: Pyramids | None = None
+    transformed: bool
+    pyramids: Mipmaps | None = None
 
     @property
     def count(self) -> int:
@@ -171,7 +171,7 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
     pyramids = None
     if filtered:
         counts = torch.tensor([len(sizes) for sizes in smaller], dtype=torch.int64)
-        pyramids = Pyramids(
+        pyramids = Mipmaps(
             (len(nodes) - 1 + torch.cumsum(counts, 0) - counts).to(device),
             counts.to(device=device, dtype=dtype),
             torch.tensor(
@@ -284,12 +284,12 @@ def _slope(atlas: Atlas, node: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     along = (left + (right - left) * c.x) * (c.height * c.blend)
     if atlas.scaled:
         across, along = across * c.maps[6], along * c.maps[6]
-    if not atlas.moved:
+    if not atlas.transformed:
         return across, along
     return across * c.maps[0] + along * c.maps[3], across * c.maps[1] + along * c.maps[4]
 
 
-def _sizes(pyramids: Pyramids, node: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _sizes(pyramids: Mipmaps, node: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the two mipmap levels for footprints, as nodes, and the fraction between them: 0 up to one texel."""
     texels = take(pyramids.density, node) * footprint
     top = take(pyramids.top, node)
@@ -305,7 +305,7 @@ def _sizes(pyramids: Pyramids, node: Tensor, footprint: Tensor) -> tuple[Tensor,
 def _corners(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool) -> _Corners:
     place, maps = take(atlas.places, node), take(atlas.maps, node)
     first, stride, width, height, wrap, linear = (place[k] for k in range(6))
-    u, v = moved(maps, uv) if atlas.moved else (uv[0], uv[1])
+    u, v = transform_uv(maps, uv) if atlas.transformed else (uv[0], uv[1])
     blend = linear.to(uv.dtype)
     wide, tall = width.to(uv.dtype), height.to(uv.dtype)
     x = (u * wide - 0.5 * blend).clamp(-_FAR, _FAR)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CHANNELS", "SAME", "Mapped", "Matrix", "Named", "Node", "Opening", "Table", "Texture", "TextureInput", "TexturePoint",
-    "UvTransform", "moved",
+    "UvTransform", "transform_uv",
 ]  # fmt: skip
 
 #: Channels from which a number may be read.
@@ -276,7 +276,7 @@ class Texture:
         """
 
     @classmethod
-    def film_space_applies(cls, values: Mapping[str, Any], coloured: bool) -> None:
+    def check_slot(cls, values: Mapping[str, Any], coloured: bool) -> None:
         """Refuse values that do not fit the slot in which the texture is written: a colour if ``coloured``, else a number.
 
         Raises:
@@ -346,7 +346,7 @@ class Mapped(Texture):
         return (values["uv_transform"] or UvTransform()).matrix(repeats)
 
 
-def moved(maps: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+def transform_uv(maps: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Transform ``uv (2, N)`` by affine maps, the first six rows of ``maps (., N)``; return ``u, v``, each ``(N,)``."""
     u, v = uv[0], uv[1]
     return (

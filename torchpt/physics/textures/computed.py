@@ -23,7 +23,7 @@ from torchpt.physics.textures.base import (
     Opening,
     Table,
     TexturePoint,
-    moved,
+    transform_uv,
 )
 from torchpt.spec import Color, parameters_of
 
@@ -197,7 +197,7 @@ class ComputedTable(Table):
         }
         x, y = point.uv[0], point.uv[1]
         if self.transform is not None:
-            x, y = moved(take(self.transform, nodes), point.uv)
+            x, y = transform_uv(take(self.transform, nodes), point.uv)
         area = None
         if self.areas is not None and point.footprint is not None:
             area = take(self.areas, nodes) * point.footprint.clamp_max(_WIDE)

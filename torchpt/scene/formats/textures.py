@@ -57,7 +57,7 @@ def _input(raw: Any, coloured: bool, low: float, high: float, linear: bool, move
     if coloured and channel is not None:
         raise Refused("no channel where a colour is wanted", channel, ("channel",))
     if isinstance(texture, ParsedParams):
-        texture.kind.film_space_applies(texture.values, coloured)
+        texture.kind.check_slot(texture.values, coloured)
     return TextureInput(texture, coloured, linear, low, high, moves)
 
 

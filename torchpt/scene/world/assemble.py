@@ -52,12 +52,12 @@ def assemble(
     Args:
         parts: ordered by kind as ``records.KINDS``.
         parameters: every tensor by dotted name.
-        sources: lights that are no surfaces, ordered as ``lights.order`` says.
+        sources: lights that are no surfaces, ordered as ``lights.sort_key`` says.
         space: the lanes' coordinates.
         dtype: of the lanes.
         copies: instances of parts.
         uv: whether texture coordinates are wanted even if no texture reads them.
-        choice: how a light is chosen, from ``lights.WAYS``.
+        choice: how a light is chosen, from ``lights.LIGHT_SAMPLERS``.
 
     Raises:
         SceneError: parameters that put something further away than float32 can follow.

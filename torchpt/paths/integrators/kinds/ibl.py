@@ -54,7 +54,7 @@ class Preview(FirstSurface):
     @staticmethod
     def of(world: World) -> Preview:
         """Of a scene's environment; differentiable in it."""
-        around = lights.surroundings(world.lights)
+        around = lights.environment_image(world.lights)
         if around is None:
             return Preview(None)
         if around.even:

@@ -35,8 +35,8 @@ class Microfacet(Glossy):
     }
     reciprocal = False
 
-    def amounts(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
-        """See :meth:`Glossy.amounts`."""
+    def lobe_factors(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
+        """See :meth:`Glossy.lobe_factors`."""
         f = fresnel_dielectric(wo[2].clamp_min(0.0), parameters["ior"]).reflectance
         return (1.0 - f) * parameters["diffuse"], f * parameters["specular"]
 

@@ -34,7 +34,7 @@ from torchpt.images.texels import TEXELS, check_source, radiance_of, read_texels
 from torchpt.math.sampling import Cells, invert_linear
 from torchpt.math.vectors import azimuth, dot, luminance, safe_reciprocal, take
 from torchpt.physics.ibl.equirect import Cell, angles
-from torchpt.physics.lights.base import Environment, Row, Setting, Surroundings, bright
+from torchpt.physics.lights.base import Environment, EnvironmentImage, Row, Setting, bright
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.spec import Moves, Other, Path, Pose, Scalar, Spec, Texels
 
@@ -315,15 +315,15 @@ class Envmap(Environment):
         return LightSample(wi, wi, None, light, density, weight)
 
     @classmethod
-    def arriving(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
-        """See :meth:`Environment.arriving`."""
+    def radiance_pdf(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
+        """See :meth:`Environment.radiance_pdf`."""
         return environment(around, d, mis)
 
     @classmethod
-    def surroundings(cls, around: EnvironmentMap) -> Surroundings:
-        """See :meth:`Environment.surroundings`."""
+    def environment_image(cls, around: EnvironmentMap) -> EnvironmentImage:
+        """See :meth:`Environment.environment_image`."""
         texels = (around.texels * around.scale).T.reshape(around.height, around.width, 3)
-        return Surroundings(texels, around.turn)
+        return EnvironmentImage(texels, around.turn)
 
     @classmethod
     def info(cls, around: EnvironmentMap) -> dict[str, Any]:

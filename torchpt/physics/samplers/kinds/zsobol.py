@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.hashing import logical_shift, mix, to_unit
-from torchpt.physics.samplers.base import Numbers, Points
+from torchpt.physics.samplers.base import Points, SamplerTensors
 from torchpt.physics.samplers.bits import X, Y, reverse_bits, scramble, second_dimension
 
 __all__ = ["ZSobol"]
@@ -41,8 +41,8 @@ def _index(word: Tensor, state: Tensor) -> Tensor:
         one = 1 + ((logical_shift(state, 16) * 3) >> 16)
         other = 1 + one - 3 * ((one + 1) >> 2)
         other = other ^ (one & -((state >> 4) & 1))
-        moved = (one & -(digit & 1)) ^ (other & -(digit >> 1)) ^ ((state >> 2) & 3)
-        index = index | (moved << shift)
+        permuted = (one & -(digit & 1)) ^ (other & -(digit >> 1)) ^ ((state >> 2) & 3)
+        index = index | (permuted << shift)
         state = mix(state + digit + 1)
     odd = logical_shift(word, 31)
     return (index | (((word ^ state) & 1) & odd)) >> (1 - odd)
@@ -56,7 +56,7 @@ class ZSobol(Points):
     needs_count = True
     of_film = True
 
-    def key(self, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
+    def key(self, numbers: SamplerTensors, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
         """Return ``(2, N)`` int32: the seed of the block, and the position of the point on the curve within it.
 
         The position has ``DIGITS`` digits of two bits above a single bit. If ``numbers.bits`` is odd, the single bit is the

@@ -78,8 +78,8 @@ class Image(Mapped):
             raise Refused("no max_pixels beside data: it is of files", values["max_pixels"], ("max_pixels",))
 
     @classmethod
-    def film_space_applies(cls, values: Mapping[str, Any], coloured: bool) -> None:
-        """See :meth:`Texture.film_space_applies`."""
+    def check_slot(cls, values: Mapping[str, Any], coloured: bool) -> None:
+        """See :meth:`Texture.check_slot`."""
         if not coloured and len(set(values["scale"])) > 1:
             raise Refused("one number as scale where a number is wanted", list(values["scale"]), ("scale",))
 
