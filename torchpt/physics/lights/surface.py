@@ -24,7 +24,7 @@ class SurfaceSample:
 
     p: Tensor  # (3, N)
     normal: Tensor  # (3, N) unit, on the side that emits
-    place: Tensor | None = None  # (2, N) the primitive's u, v; None for primitives without
+    uv: Tensor | None = None  # (2, N) the primitive's u, v; None for primitives without
     own: Tensor | None = None  # (3, N) in the quadric's object space
 
 

@@ -104,16 +104,16 @@ def _on_surfaces(
     target: Tensor | None = None
     normal: Tensor | None = None
     inside: Tensor | None = None
-    place, angle, kinds = torch.zeros_like(u), None, _surfaces(lights)
+    uv, angle, kinds = torch.zeros_like(u), None, _surfaces(lights)
     if lights.solid is not None:
-        place, angle = solid_angle.sample(lights.solid, row, x, u, lights.shapes)
-        target, normal = flat_point(at.p0, at.e1, at.e2, place), at.normal.expand_as(x)
+        uv, angle = solid_angle.sample(lights.solid, row, x, u, lights.shapes)
+        target, normal = flat_point(at.p0, at.e1, at.e2, uv), at.normal.expand_as(x)
     for k, kind in kinds:
         if kind.code != solid_angle.OTHER:
             continue
         own = kind.sample(at, x, u)
         target, normal = _pick(number, k, own.p, target), _pick(number, k, own.normal, normal)
-        place = place if own.place is None else _pick(number, k, own.place, place)
+        uv = uv if own.uv is None else _pick(number, k, own.uv, uv)
         inside = inside if own.own is None else own.own
     assert target is not None and normal is not None
     to = target - x
@@ -128,7 +128,7 @@ def _on_surfaces(
         inverse = inverse / probability
     # Where the light is not visible the weight is 0, and the pdf does not matter.
     pdf = safe_reciprocal(inverse.detach())
-    point = None if lights.prim is None else _textured(lights, row, target, normal, place, inside)
+    point = None if lights.prim is None else _textured(lights, row, target, normal, uv, inside)
     target = torch.addcmul(target, normal, bound * offset)
     radiance = at.radiance if at.opacity is None else at.radiance * at.opacity
     return LightSample(wi, target, None, radiance.expand_as(wi), pdf, inverse, point)
@@ -159,12 +159,12 @@ def _inverse_pdf(
 
 
 def _textured(
-    lights: Lights, row: Tensor | None, p: Tensor, normal: Tensor, place: Tensor, own: Tensor | None
+    lights: Lights, row: Tensor | None, p: Tensor, normal: Tensor, uv: Tensor, own: Tensor | None
 ) -> Interaction:
     """Return the point on the light as an interaction, for textured emission."""
     assert lights.prim is not None
     prim = lights.prim.expand(p.shape[1]) if row is None else take(lights.prim, row)
-    return Interaction(p, normal, normal, None, None, prim, prim, None, place[0], place[1], own)
+    return Interaction(p, normal, normal, None, None, prim, prim, None, uv[0], uv[1], own)
 
 
 def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -104,15 +104,15 @@ class Shape:
             None,
             reader=_material,
             words="the name of a material, or a material",
-            doc="what it is made of; none: what its file says, else diffuse 0.5",
+            doc="material; by default the one in the shape's file, else diffuse with reflectance 0.5",
         ),
         "transform": Pose(
             None,
             words="a list of translate, scale, rotate, matrix, look_at, applied in order",
-            doc="from its own space to the world; none: the two are the same",
+            doc="from object space to the world; the identity by default",
         ),
-        "emission": Color(None, doc="radiance that leaves the front; none: it does not shine"),
-        "flip_normals": Flag(False, doc="turns the front around"),
+        "emission": Color(None, doc="radiance emitted on the front side; none by default"),
+        "flip_normals": Flag(False, doc="whether to swap front and back"),
     }
     meshed: ClassVar[bool] = False
     copies: ClassVar[bool] = False

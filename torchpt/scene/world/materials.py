@@ -14,7 +14,7 @@ from torchpt.physics.bsdfs import KINDS, Bsdf, Parameters, stacked
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Copy, Part
 from torchpt.physics.shapes.primitive import PRIMITIVES, Corners
-from torchpt.physics.textures import MaterialTextures, Node, NodeMap, OpacityMaps, Place, TextureBinding
+from torchpt.physics.textures import MaterialTextures, Node, NodeMap, NodePosition, OpacityMaps, TextureBinding
 
 __all__ = [
     "MOST_MODELS",
@@ -211,7 +211,7 @@ class Groups:
 def groups_of(
     materials: Mapping[str, ResolvedMaterial],
     made: Mapping[str, LaneMaterial],
-    places: Mapping[Node, Place],
+    places: Mapping[Node, NodePosition],
     parameters: Mapping[str, Tensor],
     dtype: torch.dtype,
     device: torch.device,
@@ -276,7 +276,7 @@ def _kind(material: ResolvedMaterial, made: LaneMaterial) -> Kind:
 def _textures(
     materials: Sequence[ResolvedMaterial],
     made: Sequence[LaneMaterial],
-    places: Mapping[Node, Place],
+    places: Mapping[Node, NodePosition],
     device: torch.device,
 ) -> MaterialTextures:
     """The textures of materials of one form."""
@@ -308,7 +308,7 @@ def _textures(
 
 
 def node_map_of(
-    nodes: Sequence[Node | None], places: Mapping[Node, Place], sizes: list[int], device: torch.device
+    nodes: Sequence[Node | None], places: Mapping[Node, NodePosition], sizes: list[int], device: torch.device
 ) -> NodeMap | None:
     """Textures by primitive, from those of parts of ``sizes``; None where there are none."""
     if all(node is None for node in nodes):
@@ -328,7 +328,7 @@ def node_map_of(
 def opacity_maps_of(
     parts: Sequence[Part | Copy],
     made: Mapping[str, LaneMaterial],
-    places: Mapping[Node, Place],
+    places: Mapping[Node, NodePosition],
     sizes: list[int],
     dtype: torch.dtype,
     device: torch.device,

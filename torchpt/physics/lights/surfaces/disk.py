@@ -22,5 +22,5 @@ class Disk(Surface):
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
         """See :meth:`Surface.sample`."""
-        place = concentric_disk(u)
-        return SurfaceSample(flat_point(at.p0, at.e1, at.e2, place), at.normal, place)
+        uv = concentric_disk(u)
+        return SurfaceSample(flat_point(at.p0, at.e1, at.e2, uv), at.normal, uv)
