@@ -87,7 +87,7 @@ FAULTS = (
         "physics/bsdfs/lobes.py",
         "bsdfs integrators",
         "polished",
-        "share * side.eta_ti * side.eta_ti",
+        "ratio * side.eta_ti * side.eta_ti",
         "share * side.eta_it * side.eta_it",
         "eta the wrong way round: what is seen from within glass or water is too bright by the fourth power of its index",
     ),

@@ -160,7 +160,7 @@ def shining(name: str, scene: torchpt.Scene, x: Tensor, d: Tensor, mis: bool) ->
     if name in lights.KINDS:
         kind = lights.KINDS[name]
         assert issubclass(kind, lights.Environment)
-        return kind.arriving(world.lights.environment, d.float(), mis)
+        return kind.radiance_pdf(world.lights.environment, d.float(), mis)
     o, d = x.float().expand_as(d).contiguous(), d.float().contiguous()
     t, prim, u, v = scene.accel("auto", None).intersect(o, d, torch.full((d.shape[1],), torch.inf))
     hit = prim >= 0

@@ -1,4 +1,4 @@
-"""The numbers of a scene by dotted name, and what each of them is."""
+"""Records of a scene before they become tensors: parameters, parts of shapes, instances, lights without a surface."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from torchpt.spec import Spec, parameters_of
 __all__ = ["Copy", "Parameters", "Part", "Source"]
 
 
-# ---- The numbers of a scene by dotted name, and what each of them is
+# ---- Parameters
 
 
 class Parameters(dict[str, np.ndarray]):
     """Arrays by dotted name, which become the tensors of ``scene.params``.
 
     Attributes:
-        specs: what each of them is.
-        stated: texels that the scene states itself, in no file.
+        specs: the spec of each parameter by name.
+        stated: names of texels that are given in the scene, not in an image file.
     """
 
     def __init__(self) -> None:
@@ -34,13 +34,13 @@ class Parameters(dict[str, np.ndarray]):
         self.stated: set[str] = set()
 
     def declare(self, name: str, value: Any, spec: Spec) -> None:
-        """Add one; texels stay as they are, all else is kept in float64."""
+        """Add a parameter, in float64 unless it is a float32 array (texels)."""
         keeps = isinstance(value, np.ndarray) and value.dtype == np.float32
         self[name] = value if keeps else np.asarray(value, np.float64)
         self.specs[name] = spec
 
     def declare_all(self, prefix: str, kind: Any, values: Mapping[str, Any]) -> None:
-        """Add those parameters of a kind that are traced and have a value; ``transform`` is called ``to_world``."""
+        """Add the traced parameters of a kind that have a value; ``transform`` becomes ``to_world``."""
         for key, spec in parameters_of(kind).items():
             if not spec.differentiable:
                 continue
@@ -50,7 +50,7 @@ class Parameters(dict[str, np.ndarray]):
                 self.declare(f"{prefix}.{key}", values[key], spec)
 
 
-# ---- Parts: what the shapes of a description come to before they are tensors of one world. Static, float64, in numpy
+# ---- Shapes and lights of a description, in numpy and float64
 
 
 @dataclass(frozen=True)
@@ -58,28 +58,28 @@ class Part:
     """Primitives of one kind that share a shape, a material and an emission.
 
     Attributes:
-        name: dotted prefix of its parameters, e.g. ``shapes.bunny``.
+        name: dotted prefix of the parameters, e.g. ``shapes.bunny``.
         shape: name of the shape in the scene.
-        object_id: order of the shape in the scene, from 1.
-        kind: one of ``records.KINDS``.
-        material: its material.
-        emission: radiance, or None where it does not emit; where a texture gives it, what that is multiplied by.
+        object_id: index of the shape in the scene, from 1.
+        kind: kind of primitive, one of :data:`torchpt.physics.shapes.geometry.KINDS`.
+        material: material of the part.
+        emission: radiance, or the factor of ``emission_texture``; None if it does not emit.
         emission_texture: the texture, or None.
-        emission_names: dotted names of that radiance and, where it has one, of its strength.
-        flip: whether the normals are turned around.
+        emission_names: dotted names of the parameters of radiance and, if it has one, strength.
+        flip: whether to flip the normals.
         to_world: ``(4, 4)`` float64.
-        local: ``(4, 4)`` float64 applied before the parameter ``to_world``, or None; where several parts share that.
-        quadric: its surface in its own space, where the kind is ``quadric``.
-        piece: its name within its shape, where the shape has several under one name.
+        local: ``(4, 4)`` float64 applied before the parameter ``to_world``, which several parts may share, or None.
+        quadric: the surface in object space, for the kind ``quadric``.
+        piece: name within the shape, if the shape has several parts of one name.
         vertices: ``(V, 3)`` float64 in the file's own space; None for analytic shapes.
         faces: ``(F, 3)`` int64.
         normals: ``(V, 3)`` from the file, or None.
         uvs: ``(V, 2)``, or None.
         colors: ``(V, 3)`` linear, or None.
         smooth: whether shading normals are interpolated.
-        dropped: faces without area, left out.
-        source: the file it was read from, or "".
-        ignored: what of the file is not used.
+        dropped: number of faces left out because they have no area.
+        source: the file from which the part was read, or "".
+        ignored: features of the file that are not used.
     """
 
     name: str
@@ -108,16 +108,16 @@ class Part:
 
 @dataclass(frozen=True)
 class Copy:
-    """An instance of one part of a mesh, whose triangles it shares.
+    """An instance of one part of a mesh; it shares the triangles.
 
     Attributes:
-        name: dotted prefix of its parameters, e.g. ``shapes.third_bunny``.
+        name: dotted prefix of the parameters, e.g. ``shapes.third_bunny``.
         shape: name of the instance in the scene.
-        object_id: order of the instance in the scene, from 1.
-        of: the part's name.
-        material: its material.
-        flip: whether the normals are turned around, compared with the part's.
-        to_world: ``(4, 4)`` float64, in place of the part's own.
+        object_id: index of the instance in the scene, from 1.
+        of: name of the part.
+        material: material of the instance.
+        flip: whether to flip the normals relative to the part.
+        to_world: ``(4, 4)`` float64, replaces the transform of the part.
     """
 
     name: str
@@ -131,12 +131,12 @@ class Copy:
 
 @dataclass(frozen=True)
 class Source:
-    """A light that is no surface.
+    """A light without a surface.
 
     Attributes:
-        name: dotted prefix of its parameters, e.g. ``lights.sky``.
+        name: dotted prefix of the parameters, e.g. ``lights.sky``.
         kind: one of ``lights.KINDS``.
-        values: of its parameters as it was loaded, those that are no tensors included.
+        values: values of all parameters as loaded, those that are no tensors included.
     """
 
     name: str

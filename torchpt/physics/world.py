@@ -16,9 +16,9 @@ __all__ = ["World"]
 
 @dataclass(frozen=True)
 class World:
-    """A scene as the lanes gather from it: everything on one device, floats in one dtype. Absent things are ``None``."""
+    """All tensors of a scene that stages read, on one device, floats in one dtype. Fields of absent features are ``None``."""
 
     geometry: LaneGeometry
     materials: LaneMaterials
     textures: LaneTextures
-    lights: Lights | None  # None where nothing emits
+    lights: Lights | None  # None if nothing emits

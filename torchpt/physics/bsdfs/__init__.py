@@ -1,4 +1,7 @@
-"""Materials: one model a file, in ``kinds/``. Lanes are grouped by model before they come here."""
+"""BSDF models, one a file, in ``kinds/``. Read ``base.py`` first: it states the conventions.
+
+Stages group lanes by model, so that each call of a model has lanes of this model alone.
+"""
 
 from __future__ import annotations
 
@@ -31,5 +34,5 @@ KINDS: Kinds[Bsdf] = Kinds(
 
 
 def variants() -> tuple[Bsdf, ...]:
-    """Every model in every variant that scenes can ask for: tests run over it. Imports all of them."""
+    """Return every model in each of its variants, for tests. Imports all of them."""
     return tuple(model for kind in KINDS.values() for model in kind.variants())

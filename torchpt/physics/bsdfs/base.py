@@ -1,10 +1,10 @@
-"""What a BSDF is, stated once: the conventions, the base class, and tables that a model may look up.
+"""The base class of BSDFs, their conventions of frames and densities, and 1-D tables for them.
 
 Directions are local: ``+z`` is the shading normal; ``wo`` points toward the previous vertex, ``wi`` is sampled. Both leave
-the surface. ``eval`` includes ``|cos(theta_i)|``, ``pdf`` is in solid angle, ``weight = eval / pdf``, and ``pdf = 0`` says
-that the sample failed. A lobe that is a delta is not seen by ``eval`` and ``pdf``; ``sample`` gives it ``pdf = inf``.
+the surface. ``eval`` includes ``|cos(theta_i)|``, ``pdf`` is in solid angle, ``weight = eval / pdf``, and ``pdf = 0`` means
+that the sample failed. ``eval`` and ``pdf`` leave out delta lobes; ``sample`` returns ``pdf = inf`` for them.
 
-Radiance is carried, so what is refracted scales by ``1 / eta^2`` (Veach, *Robust Monte Carlo Methods*, 1997, section 5.2).
+Paths carry radiance, so refracted light scales by ``1 / eta^2`` (Veach, *Robust Monte Carlo Methods*, 1997, section 5.2).
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from torchpt.spec import Color, Flag, Refused, Scalar, Spec, parameters_of
 
 __all__ = ["Bsdf", "Parameters", "Table", "Values", "diffuse_split_sum", "gather", "made", "stacked"]
 
-#: By name: a tensor, ``(3, N)`` or ``(N,)``; a :class:`Table`; such a mapping again; None where it asks for nothing.
+#: Values by parameter name: a tensor ``(3, N)`` or ``(N,)``, a :class:`Table`, a nested mapping, or None if absent.
 Parameters = dict[str, Any]
 
-#: By name, as a scene file has them: numbers, colours as three, textures, words.
+#: Values by parameter name, as in a scene file: numbers, colours as three numbers, textures, words.
 Values = Mapping[str, Any]
 
 
 class Bsdf:
-    """A material model: pure tensor functions on plain values. One instance is one group of lanes.
+    """A BSDF model: pure tensor functions of texture-free parameters.
 
-    A subclass defines :meth:`sample` and either :meth:`eval_pdf`, or :meth:`eval` and :meth:`pdf`. Its ``parameters`` are
-    added to those that every material has, which stand here.
+    One instance is called for one group of lanes. A subclass defines :meth:`sample` and either :meth:`eval_pdf`, or
+    :meth:`eval` and :meth:`pdf`. Its ``parameters`` are added to those of this class, which every material has.
 
     Attributes:
-        name: its ``type`` in a scene file.
-        parameters: what a material of this type takes: specs, or plain defaults (a number, or three for a colour).
-        factors: those that scale a lobe: where a material lacks one that others of its model have, it counts as 1.
-        tabulated: parameters that :meth:`tabulate` needs, so that no texture can give them.
-        sheer: whether nothing is there: rays pass, which is no bounce.
-        lobed: whether ``sample`` reads ``lobe``; the others are spared that number.
+        name: the ``type`` in a scene file.
+        parameters: parameters of this type: specs, or plain defaults (a number, or three for a colour).
+        factors: parameters that scale a lobe. A material without one counts as 1 beside materials that have it.
+        tabulated: parameters that :meth:`tabulate` reads; they cannot be textures.
+        sheer: whether rays pass as through a null surface, without counting a bounce.
+        lobed: whether ``sample`` reads ``lobe``; otherwise no number is drawn for it.
         delta: whether ``sample`` may give ``pdf = inf``.
-        smooth: whether it gives nothing else: then no light is sampled for it.
-        transmits: whether light passes through. Other models meet ``wo.z >= 0`` only: callers turn the frame around on the
-            back, or see to it that the back is black (``two_sided``).
+        smooth: whether all lobes are deltas: then no light is sampled.
+        transmits: whether light passes through. Other models get ``wo.z >= 0`` only: callers flip the frame on the back, or
+            make the back black (``two_sided``).
         refracts: whether ``sample`` returns ``eta``.
         anisotropic: whether the tangent matters.
         conserves: whether it reflects no more than it receives, for parameters in their ranges.
@@ -56,16 +56,16 @@ class Bsdf:
     name: ClassVar[str] = ""
     parameters: ClassVar[Mapping[str, Spec | float | tuple[float, float, float]]] = {
         "two_sided": Flag(
-            True, doc="whether the back of an opaque material reflects as the front does; else it is black"
+            True, doc="whether the back of an opaque material reflects as the front does; otherwise the back is black"
         ),
         "opacity": fraction(
             1.0, "fraction of the light that meets the surface; the rest passes as if it were not there"
         ),
-        "alpha_cutoff": Scalar(None, high=1.0, doc="an opacity below it counts as 0, else as 1"),
+        "alpha_cutoff": Scalar(None, high=1.0, doc="opacity below this value counts as 0, else as 1"),
         "emission": Color(None, texture=True, doc="radiance leaving the front side: an area light"),
         "emission_strength": Scalar(1.0, doc="factor of `emission`"),
         "normal_map": Normals(doc="shading normals in the surface's own frame, `2 c - 1` of the colours c"),
-        "normal_strength": Scalar(1.0, doc="factor of how far the map's normals lean"),
+        "normal_strength": Scalar(1.0, doc="factor of the tilt of the map's normals"),
         "bump_map": Heights(doc="heights along the normal, in the scene's units, whose slope tilts the shading normal"),
     }
     factors: tuple[str, ...] = ("specular_reflectance", "specular_transmittance")
@@ -81,26 +81,26 @@ class Bsdf:
     anisotropic: bool = False
 
     def __init_subclass__(cls, part: bool = False, **kwargs: Any) -> None:
-        """``part``: of models, and none by itself."""
+        """Check that the subclass can be evaluated; with ``part`` it is a mixin, not a model."""
         super().__init_subclass__(**kwargs)
         if not part and cls.eval_pdf is Bsdf.eval_pdf and (cls.eval is Bsdf.eval or cls.pdf is Bsdf.pdf):
             raise TypeError(f"{cls.__name__} has to define eval_pdf, or eval and pdf")
 
     def has(self, **traits: Any) -> None:
-        """Traits above that depend on a variant's own fields; to be called from ``__post_init__``."""
+        """Set class attributes that depend on fields of the variant. Called from ``__post_init__``."""
         for name, value in traits.items():
             object.__setattr__(self, name, value)
 
     @classmethod
     def check(cls, values: Values, given: frozenset[str]) -> None:
-        """Refuse values that do not go together.
+        """Refuse values that contradict each other.
 
         Args:
-            values: of all parameters, defaults filled in.
-            given: names of those that the file states.
+            values: values of all parameters, defaults filled in.
+            given: names of the parameters that the file sets.
 
         Raises:
-            Refused: says which, and what is accepted.
+            Refused: with the parameter and the accepted values.
         """
         if values["alpha_cutoff"] is not None and "opacity" not in given:
             raise Refused("an opacity beside alpha_cutoff", values["alpha_cutoff"], ("alpha_cutoff",))
@@ -112,16 +112,16 @@ class Bsdf:
 
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
-        """The model in the variant that a material needs, and what it is given: see :meth:`given`.
+        """Return the model in the variant for a material, and its values as from :meth:`given`.
 
         Args:
-            values: of all parameters; in place of other materials their models.
+            values: values of all parameters; models in place of inner materials.
         """
         return cls(), cls.given(values)
 
     @classmethod
     def given(cls, values: Values) -> dict[str, Any]:
-        """What the model is given of a material's values: its own numbers, colours and textures, None excepted."""
+        """Return the values that the model itself reads: its own numbers, colours and textures, without None."""
         specs = parameters_of(cls)
         return {
             key: value
@@ -131,23 +131,23 @@ class Bsdf:
 
     @classmethod
     def energy(cls, values: Values) -> str:
-        """Why a material reflects more than it receives, or ""; what textures give is not known yet."""
+        """Return why the material may reflect more than it receives, or "". Values from textures are not checked."""
         return ""
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
-        """The model in every variant that scenes can ask for: tests run over them."""
+        """Return the model in each variant that :meth:`of` can return, for tests."""
         return (cls(),)
 
     def tabulate(self, values: Parameters) -> Parameters:
-        """What :meth:`prepare` needs beside ``values`` and can be had once a material: integrals over directions."""
+        """Return tables that :meth:`prepare` reads, computed once a material: integrals over directions."""
         return {}
 
     def prepare(self, values: Parameters) -> Parameters:
-        """Lane parameters from those a material was given, differentiable.
+        """Return the parameters that :meth:`eval` and :meth:`sample` read, from those of a material. Differentiable.
 
-        Once a material (``(3, 1)`` or ``(1,)``); where textures give some of them at every lane (``(3, N)``, ``(N,)``),
-        with what :meth:`tabulate` gave.
+        Called once a material (``(3, 1)`` or ``(1,)``), or for all lanes (``(3, N)``, ``(N,)``) where textures give some of
+        the values; then ``values`` include the tables of :meth:`tabulate`.
         """
         return dict(values)
 
@@ -155,44 +155,44 @@ class Bsdf:
         """Draw ``wi``.
 
         Args:
-            parameters: lane values.
+            parameters: values from :meth:`prepare`, per lane.
             wo: ``(3, N)``.
-            lobe: ``(N,)`` in [0, 1), given where ``lobed``.
+            lobe: ``(N,)`` in [0, 1); None unless ``lobed``.
             u: ``(2, N)`` in [0, 1).
         """
         raise NotImplementedError
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """``f |cos(theta_i)|`` ``(3, N)`` and the density ``(N,)`` with which :meth:`sample` draws ``wi``."""
+        """Return ``f |cos(theta_i)|`` ``(3, N)`` and the probability density ``(N,)`` of ``wi``."""
         return self.eval(parameters, wo, wi), self.pdf(parameters, wo, wi)
 
     def eval(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> Tensor:
-        """``f |cos(theta_i)|``: ``(3, N), (3, N) -> (3, N)``."""
+        """Return ``f |cos(theta_i)|`` ``(3, N)``."""
         return self.eval_pdf(parameters, wo, wi)[0]
 
     def pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> Tensor:
-        """Density of :meth:`sample` in solid angle ``(N,)``."""
+        """Return the probability density ``(N,)`` of ``wi`` under :meth:`sample`, per steradian."""
         return self.eval_pdf(parameters, wo, wi)[1]
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """Colour ``(3, N)`` for the albedo layer."""
+        """Return the colour ``(3, N)`` for the albedo AOV."""
         raise NotImplementedError
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """What split-sum shading, the preview, takes the material for; by default diffuse, of the colour :meth:`albedo`."""
+        """Return the material for split-sum shading; by default diffuse with the colour of :meth:`albedo`."""
         return diffuse_split_sum(self.albedo(parameters))
 
     def preview(self, parameters: Parameters, shade: Callable[[SplitSumMaterial], Tensor]) -> Tensor:
-        """Radiance ``(3, N)`` in the preview, where ``shade`` gives that of one material."""
+        """Return radiance ``(3, N)`` in the preview; ``shade`` computes it for one split-sum material."""
         return shade(self.split_sum(parameters))
 
     def weights(self) -> Iterator[Tensor]:
-        """Trainable tensors of its own, those of modules it holds: gradients flow to them."""
+        """Yield the trainable tensors of the modules in :meth:`held`, which receive gradients."""
         for module in self.held():
             yield from torch.nn.Module.parameters(module)
 
     def held(self) -> list[torch.nn.Module]:
-        """The modules with such tensors: itself, where it is one."""
+        """Return the ``torch.nn`` modules of the model: itself if it is one, else those among its fields."""
         if isinstance(self, torch.nn.Module):
             return [self]
         return [value for value in vars(self).values() if isinstance(value, torch.nn.Module)]
@@ -203,24 +203,24 @@ class Bsdf:
 
 
 def made(kind: Any, values: Values) -> tuple[Bsdf, dict[str, Any]]:
-    """A kind's model and what it is given, see :meth:`Bsdf.of`; a caller's own kind is the one instance that they made."""
+    """Return model and values as from :meth:`Bsdf.of`; ``kind`` is a class, or an instance that the caller made."""
     return kind.of(values) if isinstance(kind, type) else (kind, kind.given(values))
 
 
 def diffuse_split_sum(color: Tensor) -> SplitSumMaterial:
-    """A diffuse surface ``(3, N)`` without a mirror."""
+    """Return a split-sum material that is diffuse only, of colour ``(3, N)``."""
     none = torch.zeros_like(color[0])
     return SplitSumMaterial(color, none, none, torch.ones_like(none), None)
 
 
 @dataclass(frozen=True)
 class Table:
-    """Functions on [0, 1], one a material, each by ``K`` values at equal distances; linear between them.
+    """Functions on [0, 1], one a material, tabulated at ``K`` equidistant points and interpolated linearly.
 
     Attributes:
-        values: ``(M K,)``, one function after the other: flat as it is looked up in, so that its derivatives go to this tensor.
+        values: ``(M K,)``, one function after the other. Flat, so that the gradients of look-ups go to this tensor.
         count: K.
-        row: ``(N,)`` which of them a lane reads; None before lanes are known.
+        row: ``(N,)`` the function that each lane reads; None before lanes are known.
     """
 
     values: Tensor
@@ -228,7 +228,7 @@ class Table:
     row: Tensor | None = None
 
     def at(self, x: Tensor) -> Tensor:
-        """Values ``(N,)`` at ``x (N,)``, clamped to [0, 1]."""
+        """Return the values ``(N,)`` at ``x (N,)``, clamped to [0, 1]."""
         last = self.count - 1
         place = x.clamp(0.0, 1.0) * last
         below = place.detach().to(torch.int64).clamp_max(last - 1)
@@ -238,7 +238,7 @@ class Table:
 
 
 def gather(rows: Parameters, row: Tensor) -> Parameters:
-    """Lane values of a model's stacked parameters at rows ``(N,)``: the one place where parameters are resolved."""
+    """Return a model's stacked parameters per lane, read at rows ``(N,)``."""
 
     def at(value: Any) -> Any:
         if value is None:
@@ -253,7 +253,7 @@ def gather(rows: Parameters, row: Tensor) -> Parameters:
 
 
 def stacked(prepared: Sequence[Parameters], factors: Sequence[str] = Bsdf.factors) -> Parameters:
-    """One mapping of rows from those of several materials of one model. Of what is None in some, they get 0, of a factor 1."""
+    """Return the parameters of several materials of one model as rows. Absent values become 0, absent factors 1."""
     out: Parameters = {}
     for name in dict.fromkeys(name for values in prepared for name in values):
         column = [values.get(name) for values in prepared]

@@ -1,4 +1,4 @@
-"""Lobes that several models are made of: diffuse, coats, glass, cosine powers, glossy reflection under a coat."""
+"""Lobes and parameters that several models share: dielectric interfaces, coats, cosine powers, GGX over a diffuse base."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ __all__ = [
 ]
 
 
-# ---- What models of several lobes share: cosines to a power, choice among two, and the weight of a drawn direction
+# ---- Models of several lobes: powers of cosines, the choice between two lobes, the weight of a sampled direction
 
 
 def in_upper_hemisphere(*directions: Tensor) -> Tensor:
-    """1 where all directions ``(3, N)`` are above the surface, else 0: ``(N,)``."""
+    """Return 1 where all directions ``(3, N)`` lie in the upper hemisphere, else 0: ``(N,)``."""
     least = directions[0][2]
     for w in directions[1:]:
         least = torch.minimum(least, w[2])
@@ -54,32 +54,32 @@ def in_upper_hemisphere(*directions: Tensor) -> Tensor:
 
 
 def cosine_power(one_minus_cos: Tensor, exponent: Tensor) -> Tensor:
-    """``cos^exponent`` of angles ``(N,)`` given as ``one_minus_cos = 1 - cos``; 0 from a right angle on, also for exponent 0.
+    """Return ``cos^exponent`` ``(N,)`` for ``one_minus_cos = 1 - cos``; 0 from a right angle on, also for exponent 0.
 
-    An exponent of 1e5 multiplies the rounding of a cosine near 1 by as much; that of its difference from 1 it leaves small.
+    Takes ``1 - cos`` because an exponent of 1e5 would amplify the rounding error of a cosine near 1 by as much.
     """
     inside = one_minus_cos < 1.0
     return torch.exp(exponent * torch.log1p(-torch.where(inside, one_minus_cos, 0.0))) * inside
 
 
 def sample_cosine_power(u: Tensor, exponent: Tensor) -> Tensor:
-    """``1 - cos`` of angles drawn from ``u (N,)`` with density ``(exponent + 1) / 2 pi cos^exponent`` in solid angle."""
+    """Sample ``1 - cos`` from ``u (N,)`` with density ``(exponent + 1) / (2 pi) cos^exponent`` per steradian."""
     return -torch.expm1(torch.log1p(-u) / (exponent + 1.0))
 
 
 def mean(rgb: Tensor) -> Tensor:
-    """Of the three channels: ``(3, N) -> (N,)``."""
+    """Return the mean of the three channels: ``(3, N) -> (N,)``."""
     return (rgb[0] + rgb[1] + rgb[2]) * (1.0 / 3.0)
 
 
 def reflectance_at_normal(eta: Tensor) -> Tensor:
-    """Of a dielectric of relative index ``eta (N,)``."""
+    """Return the Fresnel reflectance at normal incidence for a relative index ``eta (N,)``."""
     root = (eta - 1.0) / (eta + 1.0)
     return root * root
 
 
 def lobe_probability(a: Tensor, b: Tensor) -> Tensor:
-    """Detached ``a / (a + b)``: how often to choose the first of two lobes; always, where both are 0."""
+    """Return the detached probability ``a / (a + b)`` of choosing the first of two lobes; 1 where both are 0."""
     a, b = a.detach(), b.detach()
     total = a + b
     return torch.where(total > 0, a / torch.where(total > 0, total, 1.0), 1.0)
@@ -88,16 +88,16 @@ def lobe_probability(a: Tensor, b: Tensor) -> Tensor:
 def mixture_sample(
     model: Bsdf, parameters: Parameters, wo: Tensor, wi: Tensor, valid: Tensor | None = None
 ) -> BsdfSample:
-    """The sample that drew ``wi (3, N)``: weighed by all lobes over the mixture of their densities.
+    """Return the BSDF sample with direction ``wi``, weighted by ``eval / pdf`` over all lobes.
 
-    Direction and density are constants to derivatives: only what is reflected follows the parameters.
+    Direction and density are detached: only ``eval`` is differentiated.
 
     Args:
-        model: whose ``eval_pdf`` counts.
-        parameters: lane values.
+        model: the BSDF that evaluates the weight.
+        parameters: values per lane.
         wo: ``(3, N)``.
         wi: ``(3, N)``.
-        valid: ``(N,)`` 0 where the draw failed for reasons that the directions do not tell.
+        valid: ``(N,)`` 0 where sampling failed although the directions look valid.
     """
     wi = wi.detach()
     value, pdf = model.eval_pdf(parameters, wo, wi)
@@ -107,7 +107,7 @@ def mixture_sample(
 
 
 def with_delta(drawn: BsdfSample, chosen: Tensor, wi: Tensor, weight: Tensor) -> BsdfSample:
-    """Lanes that ``chosen (N,)`` marks have drawn a delta lobe instead: ``wi (3, N)`` with ``weight (3, N)``."""
+    """Replace samples by those of a delta lobe, ``wi (3, N)`` with ``weight (3, N)``, where ``chosen (N,)`` is True."""
     return replace(
         drawn,
         wi=torch.where(chosen, wi, drawn.wi),
@@ -116,33 +116,33 @@ def with_delta(drawn: BsdfSample, chosen: Tensor, wi: Tensor, weight: Tensor) ->
     )
 
 
-# ---- What boundaries between clear media share: their indices and tints, the choice of a side, a polished boundary
+# ---- Dielectric interfaces: parameters, the choice between reflection and refraction, the smooth interface
 
 
 class Glass(Bsdf, part=True):
-    """A part of a model: two media, and factors of what is reflected and of what passes."""
+    """Mixin of dielectrics: two indices of refraction, and factors of reflection and transmission."""
 
     parameters: ClassVar = {
         "int_ior": index(INDICES["bk7"], "index of refraction behind the normal"),
-        "ext_ior": index(INDICES["air"], "index of refraction in front of it"),
-        "specular_reflectance": reflectance(None, "a tint: a factor of what is reflected; 1 where it is not said"),
-        "specular_transmittance": reflectance(None, "the same of what passes"),
+        "ext_ior": index(INDICES["air"], "index of refraction in front of the surface"),
+        "specular_reflectance": reflectance(None, "factor of reflected light, 1 by default"),
+        "specular_transmittance": reflectance(None, "factor of transmitted light, 1 by default"),
     }
 
 
 def dielectric_parameters(values: Parameters) -> Parameters:
-    """What clear boundaries read: ``eta``, the index below over that above, and the factors, or None."""
+    """Return ``eta``, the index below over the one above, and the two factors, None where absent."""
     tints = {name: values.get(name) for name in ("specular_reflectance", "specular_transmittance")}
     return {"eta": values["int_ior"] / values["ext_ior"], **tints}
 
 
 def tinted(amount: Tensor, tint: Tensor | None) -> Tensor:
-    """An amount ``(N,)`` as a colour ``(3, N)``, by a factor that may be absent."""
+    """Return ``amount (N,)`` times the colour ``tint``, as ``(3, N)``; None counts as white."""
     return amount.expand(3, -1) if tint is None else amount * tint
 
 
 def choose(reflectance: Tensor, lobe: Tensor) -> tuple[Tensor, Tensor]:
-    """Whether to reflect, and the weight ``(N,)`` of what was chosen: 1, with the derivative of its amount."""
+    """Choose reflection or refraction; return a mask ``(N,)`` and a weight ``(N,)`` of 1 that carries the derivative."""
     r = reflectance.detach()
     reflects = lobe < r
     amount = torch.where(reflects, reflectance, 1.0 - reflectance)
@@ -151,16 +151,16 @@ def choose(reflectance: Tensor, lobe: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def polished(parameters: Parameters, wo: Tensor, lobe: Tensor) -> BsdfSample:
-    """The mirror image, or the refracted ray, at a smooth boundary."""
+    """Sample reflection or refraction at a smooth dielectric interface."""
     side = fresnel_dielectric(wo[2], parameters["eta"], torch.addcmul(wo[0] * wo[0], wo[1], wo[1]))
-    reflects, lobe_probability = choose(side.reflectance, lobe)
+    reflects, ratio = choose(side.reflectance, lobe)
     # Nothing is refracted under total internal reflection, where the reflectance is 1.
     sideways = torch.where(reflects, -1.0, -side.eta_ti)
     wi = torch.stack((wo[0] * sideways, wo[1] * sideways, torch.where(reflects, wo[2], side.cos_t)))
     weight = torch.where(
         reflects,
-        tinted(lobe_probability, parameters["specular_reflectance"]),
-        tinted(lobe_probability * side.eta_ti * side.eta_ti, parameters["specular_transmittance"]),
+        tinted(ratio, parameters["specular_reflectance"]),
+        tinted(ratio * side.eta_ti * side.eta_ti, parameters["specular_transmittance"]),
     )
     return BsdfSample(
         wi,
@@ -171,13 +171,13 @@ def polished(parameters: Parameters, wo: Tensor, lobe: Tensor) -> BsdfSample:
 
 
 def dielectric_split_sum(parameters: Parameters, roughness: Tensor, f0: Tensor, eta: Tensor | None) -> SplitSumMaterial:
-    """A clear boundary in the preview.
+    """Return the split-sum material of a dielectric interface.
 
     Args:
-        parameters: lane values.
+        parameters: values per lane.
         roughness: ``(N,)``.
         f0: reflectance at normal incidence ``(N,)``.
-        eta: index below over that above ``(N,)``; None where nothing is bent.
+        eta: index below over the one above ``(N,)``; None where light passes straight on.
     """
     one = torch.ones_like(f0)
     reflects, passes = parameters["specular_reflectance"], parameters["specular_transmittance"]
@@ -192,45 +192,45 @@ def dielectric_split_sum(parameters: Parameters, roughness: Tensor, f0: Tensor, 
     )
 
 
-# ---- What plastics share: a diffuse base under a clear coat
+# ---- Plastics: a diffuse base under a dielectric coat
 
 
 class Coat(Bsdf, part=True):
-    """A part of a model: the base's colour, the coat's media and tint."""
+    """Mixin of plastics: colour of the base, indices of refraction and tint of the coat."""
 
     parameters: ClassVar = {
         "diffuse_reflectance": reflectance(GREY, "colour of the base"),
         "int_ior": index(INDICES["polypropylene"], "index of refraction of the coat"),
-        "ext_ior": index(INDICES["air"], "index of refraction in front of it"),
-        "specular_reflectance": reflectance(None, "a tint: a factor of what the coat reflects; 1 where it is not said"),
-        "nonlinear": Flag(False, doc="whether light that the coat throws back takes the base's colour again"),
+        "ext_ior": index(INDICES["air"], "index of refraction in front of the surface"),
+        "specular_reflectance": reflectance(None, "factor of light that the coat reflects, 1 by default"),
+        "nonlinear": Flag(False, doc="whether internally reflected light is multiplied by the base's colour again"),
     }
 
 
 def coat_parameters(values: Parameters, eta: Tensor, passed: Tensor, nonlinear: bool) -> Parameters:
-    """What the coats have in common.
+    """Return the lane parameters that both plastics read.
 
     Args:
-        values: as given.
-        eta: ``(1,)`` index of the coat over that outside.
-        passed: ``(1,)`` part of diffuse light from within that the coat lets out.
-        nonlinear: whether light that the coat throws back takes the base's colour again, which saturates it.
+        values: values of the material.
+        eta: ``(1,)`` index of the coat over the one outside.
+        passed: ``(1,)`` fraction of diffuse light from the base that leaves through the coat.
+        nonlinear: whether internally reflected light is multiplied by the base's colour again, which saturates it.
     """
     diffuse, specular = values["diffuse_reflectance"], values.get("specular_reflectance")
-    diffuse_probability, again = mean(diffuse), diffuse if nonlinear else 1.0
+    diffuse_mean, again = mean(diffuse), diffuse if nonlinear else 1.0
     return {
         "eta": eta,
         "base": diffuse / ((1.0 - again + again * passed) * eta * eta),
         "diffuse_reflectance": diffuse,
         "specular_reflectance": specular,
         "specular_share": lobe_probability(
-            torch.ones_like(diffuse_probability) if specular is None else mean(specular), diffuse_probability
+            torch.ones_like(diffuse_mean) if specular is None else mean(specular), diffuse_mean
         ),
     }
 
 
 def coated_split_sum(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
-    """A coat in the preview, over a base which light enters by what the coat's mean reflectance leaves."""
+    """Return the split-sum material of a coat over a base that gets the light which the coat transmits on average."""
     eta, factor = parameters["eta"], parameters["specular_reflectance"]
     one = torch.ones_like(eta)
     base = parameters["base"] * diffuse_transmittance(eta)
@@ -238,71 +238,71 @@ def coated_split_sum(parameters: Parameters, roughness: Tensor) -> SplitSumMater
     return SplitSumMaterial(base, tinted(f0, factor), tinted(one, factor), roughness, f0)
 
 
-# ---- What models of Lambert and a lobe of a cosine's power share: their parameters, and how much energy they may make
+# ---- Phong models: a Lambertian lobe and a power of a cosine
 
 
 class PhongBase(Bsdf, part=True):
-    """A part of a model: a diffuse and a glossy reflectance, and how sharp the lobe is.
+    """Mixin of Phong models: a diffuse and a glossy reflectance, and the exponent.
 
     Attributes:
-        max_albedo: energy that a unit of ``specular`` reflects at most.
+        max_albedo: largest albedo of the glossy lobe for ``specular`` 1.
     """
 
     parameters: ClassVar = {
         "diffuse": reflectance(GREY, "reflectance of the diffuse lobe"),
-        "specular": reflectance((0.2, 0.2, 0.2), "reflectance of the glossy one"),
-        "exponent": Scalar(30.0, high=1e5, texture=True, doc="how sharp the glossy one is: the power of its cosine"),
+        "specular": reflectance((0.2, 0.2, 0.2), "reflectance of the glossy lobe"),
+        "exponent": Scalar(30.0, high=1e5, texture=True, doc="exponent of the glossy lobe's cosine"),
     }
     lobed = True
     max_albedo: ClassVar[float] = 1.0
 
     @classmethod
     def energy(cls, values: Values) -> str:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.energy`."""
         diffuse, specular = values["diffuse"], values["specular"]
         if not isinstance(diffuse, tuple) or not isinstance(specular, tuple):
             return ""
-        max_albedo = max(kd + cls.max_albedo * ks for kd, ks in zip(diffuse, specular, strict=True))
-        if max_albedo <= 1.0 + 1e-6:
+        albedo = max(kd + cls.max_albedo * ks for kd, ks in zip(diffuse, specular, strict=True))
+        if albedo <= 1.0 + 1e-6:
             return ""
         terms = "diffuse + specular" if cls.max_albedo == 1.0 else f"diffuse + {cls.max_albedo:g} specular"
-        return f"{terms} is {max_albedo:.4g}: above 1 it may reflect more light than it receives"
+        return f"{terms} is {albedo:.4g}: above 1 it may reflect more light than it receives"
 
 
 def phong_split_sum(parameters: Parameters, alpha2: Tensor, peak: Tensor | float) -> SplitSumMaterial:
-    """Both lobes in the preview, added.
+    """Return the split-sum material of a Phong model: both lobes added.
 
     Args:
-        parameters: lane values.
-        alpha2: square of the roughness of facets that would reflect as the lobe does ``(N,)``.
-        peak: what the lobe reflects of ``specular`` at normal incidence.
+        parameters: values per lane.
+        alpha2: square of the GGX alpha ``(N,)`` of a lobe as wide.
+        peak: albedo of the glossy lobe at normal incidence for ``specular`` 1.
     """
     specular = parameters["specular"] * peak
     roughness = alpha2.clamp(0.0, 1.0).sqrt().sqrt()
     return SplitSumMaterial(parameters["diffuse"], specular, specular, roughness, None)
 
 
-# ---- A diffuse base under GGX facets whose masking is the shortcut ``G1(v) = nv / (nv (1 - k) + k)``, ``k = (r + 1)^2 / 8``
+# ---- A diffuse base under GGX facets with the approximate masking ``G1(v) = nv / (nv (1 - k) + k)``, ``k = (r + 1)^2 / 8``
 #
-# Karis, *Real Shading in Unreal Engine 4*, 2013. Two models share it and differ in how much each lobe reflects.
+# Karis, *Real Shading in Unreal Engine 4*, 2013. Two models share it, with different factors of the lobes.
 
 
 class Glossy(Bsdf):
-    """``f = diffuse / pi + specular D G / (4 cos_o cos_i)``; a subclass says how much of each at ``wo``."""
+    """Base of ``f = diffuse / pi + specular D G / (4 cos_o cos_i)``; a subclass defines both factors."""
 
     lobed = True
     delta = True
 
     def lobe_factors(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
-        """Diffuse and specular factors ``(3, N)``."""
+        """Return the diffuse and the specular factor for ``wo``, each ``(3, N)``."""
         raise NotImplementedError
 
     def roughness(self, parameters: Parameters) -> Tensor:
-        """Roughness ``(N,)`` of the facets; 0 where they are a mirror."""
+        """Return the roughness ``(N,)`` of the facets; 0 where they form a mirror."""
         return torch.where(parameters["smooth"], 0.0, parameters["alpha"].sqrt())
 
     def prepare(self, values: Parameters) -> Parameters:
-        """Roughness becomes ``alpha`` and ``k``; below the least alpha the facets are a mirror."""
+        """Return the values with ``alpha``, ``k`` and ``smooth`` (a mirror, below the least alpha) for ``roughness``."""
         values = dict(values)
         roughness = values.pop("roughness")
         alpha = roughness * roughness
@@ -314,14 +314,14 @@ class Glossy(Bsdf):
         }
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.eval_pdf`."""
         alpha, k = parameters["alpha"], parameters["k"]
         rough = torch.logical_not(parameters["smooth"]).to(wo.dtype)
         diffuse, specular = self.lobe_factors(parameters, wo)
         diffuse_probability = lobe_probability(mean(diffuse), mean(specular))
         cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].clamp_min(0.0)
         facets = microfacet.reflection(wo, wi, alpha, alpha, microfacet.BOUNDED)
-        # The shortcut in place of Smith's masking.
+        # Divides Smith's masking out, to put the approximation in its place.
         smith = (cos_o + microfacet.stretched_length(wo, alpha, alpha)) * (
             cos_i + microfacet.stretched_length(wi, alpha, alpha)
         )
@@ -332,7 +332,7 @@ class Glossy(Bsdf):
         ) * facets.pdf * rough
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """One of the lobes by what they would reflect, the facets by visible normals."""
+        """Choose a lobe by the mean of its factor; sample the facets by visible normals."""
         assert lobe is not None
         alpha = parameters["alpha"]
         diffuse, specular = self.lobe_factors(parameters, wo)

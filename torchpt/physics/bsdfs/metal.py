@@ -1,4 +1,4 @@
-"""What smooth and rough metals share: which metal it is, by one of three ways to say it, and its colour."""
+"""Parameters and Fresnel reflectance that smooth and rough conductors share."""
 
 from __future__ import annotations
 
@@ -31,21 +31,23 @@ def _name(value: Any) -> str:
 
 
 class Metal(Bsdf, part=True):
-    """A part of a model: a metal by its name, by ``eta`` and ``k``, or by its reflectance at normal incidence."""
+    """Mixin of conductors: a metal by its name, by ``eta`` and ``k``, or by its reflectance at normal incidence."""
 
     parameters: ClassVar = {
         "material": Custom(
             None, reader=_name, words=f"{_MIRROR} (a perfect mirror), or a metal's name", doc="which metal"
         ),
-        "eta": Color(None, texture=True, doc="the real part of its index, with `k`"),
-        "k": Color(None, texture=True, doc="the imaginary part, with `eta`"),
-        "reflectance": reflectance(None, "at normal incidence, by Schlick; 1 where no metal is said"),
-        "specular_reflectance": reflectance(None, "a tint: a factor of what is reflected; 1 where it is not said"),
+        "eta": Color(None, texture=True, doc="real part of the index of refraction, with `k`"),
+        "k": Color(None, texture=True, doc="imaginary part of the index of refraction, with `eta`"),
+        "reflectance": reflectance(
+            None, "reflectance at normal incidence, with Schlick's approximation; 1 without a metal"
+        ),
+        "specular_reflectance": reflectance(None, "factor of reflected light, 1 by default"),
     }
 
     @classmethod
     def check(cls, values: Values, given: frozenset[str]) -> None:
-        """One metal only."""
+        """Refuse more than one of the three ways to specify the metal."""
         super().check(values, given)
         ways = {"material": ("material",), "eta and k": ("eta", "k"), "reflectance": ("reflectance",)}
         said = {way: [key for key in keys if values[key] is not None] for way, keys in ways.items()}
@@ -58,7 +60,7 @@ class Metal(Bsdf, part=True):
 
     @classmethod
     def given(cls, values: Values) -> dict[str, Any]:
-        """``reflectance``, or ``eta`` and ``k``."""
+        """Return the values with ``reflectance``, or with ``eta`` and ``k``, in place of the metal's name."""
         found = super().given(values)
         if by_reflectance(values):
             return {"reflectance": WHITE, **found}
@@ -67,12 +69,12 @@ class Metal(Bsdf, part=True):
 
 
 def by_reflectance(values: Values) -> bool:
-    """Whether a metal is given by its reflectance at normal incidence."""
+    """Return True if a metal is specified by its reflectance at normal incidence."""
     return values["eta"] is None and values["material"] in (None, _MIRROR)
 
 
 def metal(values: Parameters) -> Parameters:
-    """What :func:`metal_colour` reads: ``eta`` and ``k``, or ``reflectance``; the others are None."""
+    """Return the parameters of :func:`metal_colour`: ``eta`` and ``k``, or ``reflectance``; the others None."""
     names = ("reflectance",) if "reflectance" in values else ("eta", "k")
     absent = dict.fromkeys(("eta", "k", "reflectance", "specular_reflectance"))
     return {
@@ -83,14 +85,14 @@ def metal(values: Parameters) -> Parameters:
 
 
 def metal_colour(parameters: Parameters, cos: Tensor) -> Tensor:
-    """Reflectance ``(3, N)`` at a cosine ``(N,)``, without the factor ``specular_reflectance``."""
+    """Return the Fresnel reflectance ``(3, N)`` at a cosine ``(N,)``, without the factor ``specular_reflectance``."""
     if parameters["reflectance"] is not None:
         return schlick(cos, parameters["reflectance"])
     return fresnel_conductor(cos, parameters["eta"], parameters["k"])
 
 
 def metal_split_sum(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
-    """A metal in the preview, of some roughness ``(N,)``."""
+    """Return the split-sum material of a metal with roughness ``(N,)``."""
     factor, one = parameters["specular_reflectance"], torch.ones_like(roughness)
     f0 = metal_colour(parameters, one)
     black = torch.zeros_like(f0)

@@ -1,11 +1,11 @@
-"""Named metals and named media: complex and real indices of refraction.
+"""Complex indices of refraction of metals and real ones of dielectrics, by name.
 
-Metals are three numbers a curve, red green blue, as Mitsuba 3's RGB mode resolves its measured spectra (``data/ior/*.spd``,
+The values of a metal are linear RGB, computed as in Mitsuba 3's RGB mode from its measured spectra (``data/ior/*.spd``,
 from luxpop.com and Palik's *Handbook of Optical Constants of Solids*): integrated against the CIE 1931 observer, converted
 to linear sRGB, negative components set to 0. Iron, which Mitsuba does not have, comes from Johnson and Christy, *Optical
 constants of transition metals*, Physical Review B 9 (1974), converted in the same way.
 
-Media are Mitsuba 3's list: measured at 589 nm and 0 to 20 degrees Celsius, many from Hecht, *Optics*, fourth edition.
+The list of media is Mitsuba 3's: measured at 589 nm and 0 to 20 degrees Celsius, many from Hecht, *Optics*, fourth edition.
 """
 
 from __future__ import annotations
@@ -89,5 +89,5 @@ INDICES: dict[str, float] = {
 
 
 def metal(name: str) -> tuple[Rgb, Rgb] | None:
-    """``(eta, k)`` of a metal, or None where it is not known. Mitsuba's ``_palik`` may be left out or added."""
+    """Return ``(eta, k)`` of a metal, or None if the name is unknown. Mitsuba's suffix ``_palik`` is optional."""
     return METALS.get(name) or METALS.get(name.removesuffix("_palik"))

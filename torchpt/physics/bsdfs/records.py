@@ -1,4 +1,4 @@
-"""The records of materials: what lanes read of them, sampled directions, and what the preview shades with."""
+"""Records of materials: BSDF samples, tables of materials for lanes, split-sum materials."""
 
 from __future__ import annotations
 
@@ -16,39 +16,40 @@ __all__ = ["BsdfSample", "LaneMaterials", "SplitSumMaterial"]
 
 @dataclass(frozen=True)
 class BsdfSample:
-    """A direction drawn from a BSDF."""
+    """A sampled direction; the conventions stand in :mod:`torchpt.physics.bsdfs.base`."""
 
     wi: Tensor  # (3, N) local
-    pdf: Tensor  # (N,) in solid angle; 0 where the draw failed, inf where the lobe is a delta
+    pdf: Tensor  # (N,) per steradian; 0 where sampling failed, inf for a delta lobe
     weight: Tensor  # (3, N) = eval / pdf
-    eta: Tensor | None = None  # (N,) index of the side of wi over that of wo, 1 for reflection; None: never refracts
+    eta: Tensor | None = None  # (N,) index on the side of wi over the one of wo, 1 for reflection; None: never refracts
 
 
 @dataclass(frozen=True)
 class LaneMaterials:
-    """Materials of surfaces: M models, and for each its materials as rows of its parameters."""
+    """Materials of all primitives and instances: M models, each with a row of parameters for every material of it."""
 
-    row: Tensor  # (P + I,) int64 row in the parameters of its model
-    key: Tensor  # (P + I + 1,) uint8, shifted by one so that a miss reads the first: how lanes are sorted, see path.partition
-    models: tuple[Bsdf, ...]  # the BSDFs present
-    parameters: tuple[Parameters, ...]  # stacked, of each model; where it reads textures, as its materials were given
-    textures: tuple[MaterialTextures | None, ...]  # of each model; None where it reads none
-    two_sided: tuple[Tensor | None, ...]  # (M,) bool for the rows of each model; None where all are
-    opacity: Tensor | None  # (P + I,) chance that a ray meets the surface; None where it always does
+    row: Tensor  # (P + I,) int64 row in the parameters of the model
+    key: Tensor  # (P + I + 1,) uint8 sort key of lanes, shifted by one so that a miss reads the first entry
+    models: tuple[Bsdf, ...]
+    parameters: tuple[Parameters, ...]  # stacked, by model; before Bsdf.prepare where the model reads textures
+    textures: tuple[MaterialTextures | None, ...]  # by model; None without textures
+    two_sided: tuple[Tensor | None, ...]  # by model, (rows,) bool; None where all rows are
+    opacity: Tensor | None  # (P + I,) probability that a ray meets the surface; None where it is 1 everywhere
 
 
 @dataclass(frozen=True)
 class SplitSumMaterial:
-    """Properties of surfaces for split-sum shading, see :mod:`torchpt.ibl`.
+    """Parameters of split-sum shading, see :mod:`torchpt.physics.ibl`.
 
     Attributes:
-        diffuse: colour of the diffuse part ``(3, N)``: base colour by ``1 - metallic``.
-        f0: reflectance of the mirror at normal incidence, ``(3, N)`` or ``(N,)``.
-        f90: at grazing incidence, likewise.
+        diffuse: albedo of the diffuse lobe ``(3, N)``: base colour times ``1 - metallic``.
+        f0: reflectance of the specular lobe at normal incidence, ``(3, N)`` or ``(N,)``.
+        f90: reflectance at grazing incidence, shaped as ``f0``.
         roughness: ``(N,)`` from 0 to 1.
-        over: F0 of the mirror over the diffuse part, whose light is missing there, as ``f0``; None where the two are added.
-        through: colour of what is not mirrored but passes ``(3, N)``; None where nothing does. It needs ``over``.
-        eta: index of refraction ``(N,)`` of what lies below; None: light passes straight on.
+        over: reflectance at normal incidence, shaped as ``f0``, of a specular layer above the diffuse lobe, which loses
+            that light; None: the lobes are added.
+        through: colour of transmitted light ``(3, N)``; None if opaque. Needs ``over``.
+        eta: index of refraction ``(N,)`` below the surface; None: light passes straight on.
     """
 
     diffuse: Tensor

@@ -1,4 +1,4 @@
-"""A material as it is resolved: a model, and what it is given."""
+"""A material after its scene file was read: a BSDF model and the values of its parameters."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ Value = float | tuple[float, float, float] | Node
 
 @dataclass(frozen=True)
 class ResolvedMaterial:
-    """One material: one row of one BSDF model.
+    """One material: a BSDF model and one row of its parameters.
 
     Attributes:
-        model: its model, in the variant that it needs.
-        name: dotted prefix of its parameters, e.g. ``materials.red``.
-        values: what the model is given, by parameter name: colours as three floats, numbers as one, textures.
+        model: the BSDF, in the variant for this material.
+        name: dotted prefix of the parameters, e.g. ``materials.red``.
+        values: values of the model by parameter name: three floats for a colour, one for a number, or a texture.
         two_sided: whether the back of an opaque model reflects as the front does.
-        opacity: fraction of the light that meets the surface at all.
+        opacity: fraction of the light that meets the surface.
         alpha_cutoff: where set, opacity below it counts as 0, else as 1.
-        emission: radiance, or None where it does not emit.
-        emission_strength: factor of it.
-        normal_map: a colour texture, or None.
-        normal_strength: factor of how far its normals lean.
-        bump_map: a number texture, or None.
-        inner: the two materials of a blend, whose own ``values`` hold but the weight.
+        emission: radiance, or None if it does not emit.
+        emission_strength: factor of ``emission``.
+        normal_map: a texture of three channels, or None.
+        normal_strength: factor of the tilt of its normals.
+        bump_map: a texture of one channel, or None.
+        inner: the two materials of a blend; then ``values`` hold the weight alone.
     """
 
     model: Bsdf
@@ -45,11 +45,11 @@ class ResolvedMaterial:
     inner: tuple[ResolvedMaterial, ...] = ()
 
     def all(self) -> list[ResolvedMaterial]:
-        """Itself and the materials that it blends."""
+        """Return this material and all materials that it blends."""
         return [self, *(slot for inner in self.inner for slot in inner.all())]
 
     def own(self) -> dict[str, Value | None]:
-        """What it has by parameter name, that of inner materials excepted: numbers that say nothing are None."""
+        """Return the values by parameter name, without those of inner materials; None for numbers without effect."""
         return {
             **self.values,
             "opacity": None if self.opacity == 1.0 else self.opacity,
@@ -61,11 +61,11 @@ class ResolvedMaterial:
         }
 
     def readings(self) -> list[Node]:
-        """Its textures, those of inner materials included."""
+        """Return all textures, those of inner materials included."""
         own = [value for value in self.own().values() if isinstance(value, Node)]
         return [*own, *(reading for inner in self.inner for reading in inner.readings())]
 
     @property
     def bends(self) -> bool:
-        """Whether its deltas send rays on in directions that follow its indices of refraction."""
+        """True if directions of delta lobes depend on indices of refraction."""
         return self.model.refracts and self.model.delta

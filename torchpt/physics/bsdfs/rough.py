@@ -1,4 +1,4 @@
-"""What GGX facets have in common: their roughness, by one of three ways to say it, and the energy that they lose."""
+"""Roughness parameters of GGX microfacets, and tables of the energy lost between facets."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from torchpt.spec import Flag, Refused
 
 __all__ = ["Anisotropic", "Rough", "alphas", "energy_at", "energy_table", "mean_roughness", "rough"]
 
-_ALPHA = 0.1  # where none is said
+_ALPHA = 0.1  # the default
 
-#: Entries of an energy table: cosines, at squares of equal steps, and azimuths where the surface is anisotropic.
+#: Entries of an energy table: cosines, equidistant in their square roots, and azimuths for anisotropic surfaces.
 _COSINES, _COSINES_ANISOTROPIC, _AZIMUTHS = 64, 32, 17
 
 
 class Rough(Bsdf, part=True):
-    """A part of a model: the roughness of its facets, the same along u and v."""
+    """Mixin of isotropic microfacet models: roughness."""
 
     parameters: ClassVar = {
-        "alpha": fraction(None, f"roughness of the facets; {_ALPHA:g} where none is said"),
-        "roughness": fraction(None, "the same as `alpha = roughness^2`"),
+        "alpha": fraction(None, f"GGX alpha of the facets; {_ALPHA:g} by default"),
+        "roughness": fraction(None, "square root of `alpha`, in its place"),
     }
 
     @classmethod
     def check(cls, values: Values, given: frozenset[str]) -> None:
-        """One roughness only."""
+        """Refuse more than one of the three ways to specify roughness."""
         super().check(values, given)
         said = [key for key in ("alpha", "roughness", "alpha_u", "alpha_v") if values.get(key) is not None]
         if len(said) > 1 and said != ["alpha_u", "alpha_v"]:
@@ -41,18 +41,18 @@ class Rough(Bsdf, part=True):
 
     @classmethod
     def given(cls, values: Values) -> dict[str, Any]:
-        """With a roughness, whether or not one is said."""
+        """Return the values, with the default ``alpha`` if no roughness is set."""
         found = super().given(values)
         return found if found.keys() & {"alpha", "roughness", "alpha_u"} else {**found, "alpha": _ALPHA}
 
 
 class Anisotropic(Rough, part=True):
-    """The same, with another roughness along u and v, and the energy that facets lose given back if wanted."""
+    """Mixin of anisotropic microfacet models: roughness along u and v, and optional energy compensation."""
 
     parameters: ClassVar = {
         "alpha_u": fraction(None, "`alpha` along the surface's u, with `alpha_v`"),
-        "alpha_v": fraction(None, "`alpha` along its v, with `alpha_u`"),
-        "energy_compensation": Flag(False, doc="whether light that facets pass on among each other is given back"),
+        "alpha_v": fraction(None, "`alpha` along the surface's v, with `alpha_u`"),
+        "energy_compensation": Flag(False, doc="whether the energy of multiple scattering between facets is added"),
     }
 
     energy_compensation: bool
@@ -63,11 +63,11 @@ class Anisotropic(Rough, part=True):
 
 
 def rough(values: Parameters, anisotropic: bool) -> Parameters:
-    """Roughnesses of a material: ``alpha_u``, ``alpha_v`` (None where isotropic), and whether it is ``smooth``.
+    """Return ``alpha_u``, ``alpha_v`` (None if isotropic), and the mask ``smooth``.
 
     Args:
         values: ``alpha``, or ``roughness`` (its square root), or ``alpha_u`` and ``alpha_v``.
-        anisotropic: whether the two may differ.
+        anisotropic: whether ``alpha_u`` and ``alpha_v`` may differ.
     """
     alpha = values["roughness"].square() if "roughness" in values else values.get("alpha")
     u, v = values.get("alpha_u", alpha), values.get("alpha_v", alpha)
@@ -81,17 +81,17 @@ def rough(values: Parameters, anisotropic: bool) -> Parameters:
 
 
 def alphas(parameters: Parameters) -> tuple[Tensor, Tensor]:
-    """Both roughnesses, from what :func:`rough` gave."""
+    """Return ``alpha_u`` and ``alpha_v`` from the parameters of :func:`rough`."""
     u, v = parameters["alpha_u"], parameters["alpha_v"]
     return u, u if v is None else v
 
 
 def energy_table(parameters: Parameters, etas: Sequence[Tensor | None]) -> Table:
-    """What a lossless surface with these roughnesses gives back, as one row: see :func:`energy_at`.
+    """Return the directional albedo of a lossless microfacet surface as one row of a table, for :func:`energy_at`.
 
     Args:
-        parameters: those of :func:`rough`, of one material.
-        etas: relative index, or None for mirrors; one block of the table for each.
+        parameters: from :func:`rough`, for one material.
+        etas: relative indices, or None for a mirror; each gives one block of the table.
     """
     u, v = alphas(parameters)
     au, av = u.double(), v.double()
@@ -107,7 +107,7 @@ def energy_table(parameters: Parameters, etas: Sequence[Tensor | None]) -> Table
     wo = torch.stack((r, torch.zeros_like(r), z)) if isotropic else torch.stack((r * x, r * y, z))
     blocks = []
     for eta in etas:
-        # The edge of total internal reflection asks for more nodes, which many azimuths would make too many.
+        # Total internal reflection has an edge that needs more nodes; with many azimuths they would be too many.
         nodes = 64 if isotropic and eta is not None else 32
         index = None if eta is None else eta.double()
         blocks.append(microfacet.directional_albedo(wo, au, None if isotropic else av, index, nodes, nodes))
@@ -116,13 +116,13 @@ def energy_table(parameters: Parameters, etas: Sequence[Tensor | None]) -> Table
 
 
 def energy_at(table: Table, parameters: Parameters, wo: Tensor, block: Tensor | None = None) -> Tensor:
-    """The energy ``(N,)`` that a lossless surface gives back of light along ``wo``.
+    """Return the directional albedo ``(N,)`` of a lossless microfacet surface for ``wo``.
 
     Args:
-        table: as of :func:`energy_table`.
-        parameters: lane values.
+        table: from :func:`energy_table`.
+        parameters: values per lane.
         wo: ``(3, N)``.
-        block: ``(N,)`` 0 or 1, which of two relative indices; None where there is one.
+        block: ``(N,)`` 0 or 1, index into the two relative indices; None for one.
     """
     isotropic = parameters["alpha_v"] is None
     cosines, azimuths = (_COSINES, 1) if isotropic else (_COSINES_ANISOTROPIC, _AZIMUTHS)
@@ -144,6 +144,6 @@ def energy_at(table: Table, parameters: Parameters, wo: Tensor, block: Tensor | 
 
 
 def mean_roughness(parameters: Parameters) -> Tensor:
-    """``sqrt(alpha)``, of the mean of both where they differ; 0 where the surface is smooth."""
+    """Return ``(alpha_u alpha_v)^(1/4)`` ``(N,)``: ``sqrt(alpha)`` if isotropic; 0 where the surface is smooth."""
     u, v = alphas(parameters)
     return torch.where(parameters["smooth"], 0.0, (u * v).sqrt().sqrt())

@@ -1,4 +1,4 @@
-"""What parameters of materials are, beyond numbers and colours: fractions, indices, maps, other materials."""
+"""Specs of material parameters: fractions, indices of refraction, normal and bump maps, inner materials."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ GREY, WHITE = (0.5, 0.5, 0.5), (1.0, 1.0, 1.0)
 
 
 def fraction(default: Any, doc: str) -> Scalar:
-    """A number in 0..1, or a texture."""
+    """Return the spec of a number in 0..1, or a texture."""
     return Scalar(default, high=1.0, texture=True, doc=doc)
 
 
 def reflectance(default: Any, doc: str) -> Color:
-    """A colour in 0..1, or a texture."""
+    """Return the spec of a colour in 0..1, or a texture."""
     return Color(default, high=1.0, texture=True, doc=doc)
 
 
 def index(default: float, doc: str) -> Index:
-    """An index of refraction: a number, a medium's name, or a texture."""
+    """Return the spec of an index of refraction: a number, the name of a medium, or a texture."""
     return Index(default, texture=True, media=INDICES, doc=doc)
 
 
 def smooth(rough: str) -> Custom:
-    """The roughness of a type that has none: 0, which says nothing; ``rough`` is the type to use instead."""
+    """Return the spec of roughness for a smooth type: 0 without effect, else an error that suggests the type ``rough``."""
     words = f"0, as this type is smooth (use {rough})"
 
     def read(value: Any) -> None:
         if isinstance(value, bool | Mapping) or value != 0:
             raise Refused(words)
 
-    return Custom(None, reader=read, words=words, doc="nothing: there so that rough and smooth types can be exchanged")
+    return Custom(None, reader=read, words=words, doc="no effect: allows a rough type to be replaced by a smooth one")
 
 
 @dataclass(frozen=True)
 class Normals(Color):
-    """Normals in the surface's own frame, which a texture alone can give: ``2 c - 1`` of its colours c."""
+    """Spec of a normal map: a texture whose colours ``c`` are normals ``2 c - 1`` in the tangent frame."""
 
     default: Any = None
     high: float | None = field(default=1.0, kw_only=True)
@@ -54,17 +54,17 @@ class Normals(Color):
 
     @property
     def expected(self) -> str:
-        """See :class:`Spec`."""
+        """See :attr:`Spec.expected`."""
         return "a texture whose colours hold normals: {type: image, path: FILE} or {texture: NAME}"
 
     def read(self, value: Any) -> Any:
-        """Refuse what is no texture."""
+        """Refuse everything: textures are read before this is called."""
         raise Refused(self.expected)
 
 
 @dataclass(frozen=True)
 class Heights(Scalar):
-    """Heights along the normal, which a texture alone can give."""
+    """Spec of a bump map: a texture of heights along the normal."""
 
     default: Any = None
     low: float | None = field(default=None, kw_only=True)
@@ -74,27 +74,27 @@ class Heights(Scalar):
 
     @property
     def expected(self) -> str:
-        """See :class:`Spec`."""
+        """See :attr:`Spec.expected`."""
         return "a texture of heights in the scene's units: {type: image, path: FILE, scale: UNITS} or {texture: NAME}"
 
     def read(self, value: Any) -> Any:
-        """Refuse what is no texture."""
+        """Refuse everything: textures are read before this is called."""
         raise Refused(self.expected)
 
 
 @dataclass(frozen=True)
 class Inner(Spec):
-    """Another material: its name, or one in its place, which has been read before."""
+    """Spec of an inner material: a name, or a material that was already read."""
 
     default: Any = REQUIRED
 
     @property
     def accepted(self) -> str:
-        """See :class:`Spec`."""
+        """See :attr:`Spec.accepted`."""
         return "the name of a material, or a material"
 
     def read(self, value: Any) -> Any:
-        """See :class:`Spec`."""
+        """See :meth:`Spec.read`."""
         if isinstance(value, ParsedParams) or (isinstance(value, str) and value):
             return value
         raise Refused(self.expected)

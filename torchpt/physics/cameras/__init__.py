@@ -1,4 +1,4 @@
-"""Cameras: from film positions to rays, one kind a file.
+"""Cameras: rays through film positions and projections to the film, one kind a file in ``kinds/``.
 
 A pose is Mitsuba's ``to_world``: the camera looks along its own ``+z``, ``+y`` is up and ``+x`` points to the image's left,
 so that image right is ``(target - origin) x up``.

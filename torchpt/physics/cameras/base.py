@@ -1,4 +1,4 @@
-"""What every camera has, and what a kind of camera must say."""
+"""The base class of cameras."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ __all__ = ["Camera"]
 
 @dataclass(frozen=True, kw_only=True)
 class Camera(ABC):
-    """A camera on a film. Fields of a kind are the values of its parameters: tensors of the lanes' dtype, or plain values.
+    """A camera and its film. A subclass has its parameters as fields: tensors of the world's dtype, or plain values.
 
     Attributes:
-        name: its ``type`` in a scene file.
-        parameters: what it declares; those that are traced are differentiable.
-        lens: whether rays also depend on a place on a lens.
-        reaches: parameters that say how far from its origin a camera's rays may start.
-        projects: whether :meth:`project` says where a point is seen.
-        sized_by: what errors say instead, where a pose has a scale.
+        name: the ``type`` in a scene file.
+        parameters: specs of the parameters; traced ones are differentiable.
+        lens: whether rays also depend on a point on a lens.
+        reaches: parameters that bound the distance of ray origins from the camera's origin.
+        projects: whether :meth:`project` is implemented.
+        sized_by: hint for the error about a pose with a scale.
         to_world: pose ``(4, 4)``; its scale is ignored, as only the axes' directions and the origin matter.
         resolution: width and height of the whole film in pixels.
-        film: the same two as ``(2,)`` numbers of the lanes' dtype.
+        film: the resolution as a tensor ``(2,)`` of the world's dtype.
     """
 
     to_world: Tensor
@@ -46,93 +46,94 @@ class Camera(ABC):
 
     @classmethod
     def check(cls, values: dict[str, Any], given: frozenset[str]) -> None:
-        """Fill in the pose, from what the file states of it, and refuse values that do not go together.
+        """Set ``to_world`` from the parameters of the pose, and refuse values that contradict each other.
 
         Raises:
-            Refused: says which, and what is accepted.
+            Refused: with the parameter and the accepted values.
         """
         values["to_world"] = pose_of(values, given, cls.sized_by)
 
     @classmethod
     def on(cls, to_world: Tensor, resolution: tuple[int, int], values: Mapping[str, Any]) -> Self:
-        """A camera of this kind on a film of ``resolution`` pixels, from the values of its parameters."""
+        """Return a camera of this kind for a film of ``resolution`` pixels, from the values of its parameters."""
         own = {field.name: values[field.name] for field in fields(cls) if field.name in values}
         film = to_world.new_tensor(resolution)
         return cls(**{**own, "to_world": to_world, "resolution": resolution, "film": film})
 
     @abstractmethod
     def rays(self, x: Tensor, y: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Rays through film positions.
+        """Return rays through film positions.
 
         Args:
             x: ``(N,)`` in pixels from the left edge of the whole film.
-            y: ``(N,)`` in pixels from its upper edge.
-            u: ``(2, N)`` in [0, 1), the place on the lens; None where the camera has none.
+            y: ``(N,)`` in pixels from the upper edge.
+            u: ``(2, N)`` in [0, 1), samples the lens; None without a lens.
 
         Returns:
-            Origins, ``(3, 1)`` where all rays share one, else ``(3, N)``, and unit directions ``(3, N)``.
+            Origins, ``(3, 1)`` if all rays share one, else ``(3, N)``, and unit directions ``(3, N)``.
         """
 
     @abstractmethod
     def pixel(self) -> Tensor:
-        """How large a pixel is in the world, ``(5,)``: ``e``, ``w``, ``spread``.
+        """Return the footprint of a pixel in the world as ``(5,)``: ``e (3)``, ``w``, ``spread``.
 
-        From a point ``p`` the camera lies toward ``e - w p``, and a pixel's footprint there, across the line of sight, is
-        ``spread`` times that vector's length on a side. Of rays from one place ``e`` is that place, ``w`` is 1, and
-        ``spread`` a pixel's side at distance 1 where the camera looks; of parallel rays ``e`` is the unit direction
-        against them, ``w`` is 0, and ``spread`` a pixel's side. Of a pixel that is no square, the root of its area.
+        From a point ``p`` the camera lies in direction ``e - w p``, and the side of a pixel's footprint there, perpendicular
+        to this direction, is ``spread`` times its length. If all rays start at one point, ``e`` is this point, ``w`` is 1, and
+        ``spread`` is the side of a pixel at distance 1 along the viewing direction. If they are parallel, ``e`` is the unit
+        direction against them, ``w`` is 0, and ``spread`` is the side of a pixel. The side of a pixel that is not square is
+        the root of its area.
         """
 
     def project(self, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where points are seen, differentiable in them and in the camera; asked for only where it ``projects``.
+        """Project points to the film, differentiable in points and camera; called only if ``projects``.
 
         Args:
-            offset: from the camera's origin to points before it ``(3, N)``, or directions, of any length.
+            offset: vectors ``(3, N)`` of any length from the camera's origin to points in front of it.
 
         Returns:
-            The film position ``x, y`` in pixels, each ``(N,)``, as :meth:`rays` takes it, and the scale ``(N,)`` of areas: a
-            surface element ``dA`` with the unit normal ``n`` covers ``scale |n . offset| dA`` square pixels, and a solid
-            angle ``dw`` about unit directions ``scale dw``.
+            Film positions ``x, y`` in pixels, each ``(N,)``, as for :meth:`rays`, and the scale ``(N,)`` of areas: a surface
+            element ``dA`` with unit normal ``n`` covers ``scale |n . offset| dA`` square pixels; for unit ``offset`` a solid
+            angle ``dw`` covers ``scale dw``.
         """
         raise NotImplementedError
 
     def film_of(self, p: Tensor) -> Tensor | None:
-        """Where points ``(3, N)`` of the world lie on the film: ``x h``, ``y h``, ``h`` and their depth, ``(4, N)``.
+        """Return homogeneous film coordinates ``x h``, ``y h``, ``h`` and the depth of points ``p (3, N)``, as ``(4, N)``.
 
-        Affine in ``p``: a line of the world is one on the film. ``x, y`` are pixels as :meth:`rays` takes them; with
-        ``h`` or the depth not positive a point lies behind the camera. None: a picture that no such map makes (a lens that
-        blurs it), so that edges on it are not differentiated.
+        They are affine in ``p``, so lines stay lines. ``x, y`` are in pixels as for :meth:`rays`; points with ``h`` or depth
+        not positive lie behind the camera. None: the camera has no such map (a lens blurs), and edges in its picture are not
+        differentiated.
         """
         return None
 
     def intrinsics(self) -> Tensor | None:
-        """OpenCV's ``K (3, 3)`` in pixels, see :mod:`torchpt.physics.cameras.opencv`; None where no such matrix says it."""
+        """Return OpenCV's ``K (3, 3)`` in pixels, see :mod:`torchpt.physics.cameras.opencv`; None for cameras without one."""
         return None
 
     def kind(self) -> tuple[object, ...]:
-        """What is not a tensor: the stages are compiled anew where it differs."""
+        """Return all fields that are no tensors, as part of the cache key of compiled stages."""
         own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "resolution"}
         return (self.name, *((key, value) for key, value in own.items() if not isinstance(value, Tensor)))
 
     def place(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Film positions in pixels as ``right`` and ``up`` of the film's middle, in half widths of the film."""
+        """Return film positions as distances right of and above the film's centre, in half widths of the film."""
         width, height = self.film[0], self.film[1]
         right = x * (2.0 / width) - 1.0
         return right, (1.0 - y * (2.0 / height)) * (height / width)
 
     def axes(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Unit vectors ``(3, 1)`` in the world: right in the picture, up, and where the camera looks."""
+        """Return unit vectors ``(3, 1)`` in the world: right and up in the picture, and the viewing direction."""
         axes = normalize(self.to_world[:3, :3])
         return -axes[:, 0:1], axes[:, 1:2], axes[:, 2:3]
 
     def covectors(self) -> Tensor:
-        """Rows ``(3, 3)`` that tell how far a vector of the world goes along each of the :meth:`axes`.
+        """Return the inverse ``(3, 3)`` of the matrix of :meth:`axes`: its rows give the components of a vector along them.
 
-        Those are the axes themselves where they are at right angles, as poses are up to a thousandth. So far, and where
-        derivatives are taken by single entries, rays follow the axes as they are.
+        For orthogonal axes the rows are the axes. Poses are orthogonal to a thousandth only, and derivatives by single entries
+        of a pose leave orthogonality, so the exact inverse is needed to match :meth:`rays`.
         """
         return torch.linalg.inv(torch.cat(self.axes(), 1))
 
     def origin(self) -> Tensor:
-        """Where the camera stands ``(3, 1)``."""
+        """Return the position of the camera ``(3, 1)``."""
         return self.to_world[:3, 3:4]

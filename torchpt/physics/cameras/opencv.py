@@ -1,9 +1,9 @@
-"""A pinhole camera as OpenCV's matrices: ``K`` in pixels, and ``R``, ``t`` from the world to the camera.
+"""Conversion of pinhole cameras from and to OpenCV's matrices: ``K`` in pixels, ``R`` and ``t`` from world to camera.
 
 A point ``X`` of the world lies at ``x = R X + t`` in the camera's space, where +x is right in the picture, +y down and +z
-ahead, and at ``(fx x / z + cx, fy y / z + cy)`` on the film, in pixels from its upper left *corner*: the middle of the first
-pixel is (0.5, 0.5), and the middle of the film (width / 2, height / 2). So count COLMAP and its like. ``cv2`` itself and
-kornia put (0, 0) in the middle of the first pixel: 0.5 is to be added to ``cx`` and ``cy`` of their calibrations, which
+ahead, and at ``(fx x / z + cx, fy y / z + cy)`` on the film, in pixels from its upper left *corner*: the centre of the first
+pixel is (0.5, 0.5), the centre of the film (width / 2, height / 2). This is the convention of COLMAP. ``cv2`` and kornia put
+(0, 0) at the centre of the first pixel: add 0.5 to ``cx`` and ``cy`` of their calibrations, as
 :mod:`torchpt.scene.conventions` does.
 """
 
@@ -35,16 +35,16 @@ __all__ = [
     "translation",
 ]
 
-#: OpenCV's axes in ours, which are left, up, ahead.
+#: From OpenCV's axes (right, down, ahead) to those of cameras here (left, up, ahead).
 _TURN = np.diag([-1.0, -1.0, 1.0])
-#: A number of a pinhole that ``K`` says is left out where it is this one.
+#: Default values of parameters that ``K`` determines; :func:`angles` leaves them out.
 USUAL = {"principal_point_offset_x": 0.0, "principal_point_offset_y": 0.0, "pixel_aspect": 1.0}
-#: What is accepted of ``K``.
+#: Accepted form of ``K``, for errors.
 K_WORDS = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy > 0"
 
 
 class PinholeMatrices(NamedTuple):
-    """A pinhole camera as OpenCV has it; lengths in the scene's units."""
+    """The matrices of a pinhole camera in OpenCV's convention; lengths in scene units."""
 
     K: Tensor  # (3, 3) in pixels
     R: Tensor  # (3, 3) from the world to the camera
@@ -52,12 +52,12 @@ class PinholeMatrices(NamedTuple):
 
 
 def _listed(value: Any) -> Any:
-    """Numbers of an array or a tensor as lists."""
+    """Convert an array or a tensor to nested lists; return anything else as it is."""
     return value.tolist() if isinstance(value, np.ndarray | Tensor) else value
 
 
 def _square(value: Any, expected: str) -> NDArray[np.float64]:
-    """Three rows of three finite numbers."""
+    """Read three rows of three finite numbers."""
     value = _listed(value)
     if not isinstance(value, list | tuple) or len(value) != 3:
         raise Refused(expected)
@@ -65,7 +65,7 @@ def _square(value: Any, expected: str) -> NDArray[np.float64]:
 
 
 def rotation(value: Any) -> NDArray[np.float64]:
-    """A rotation matrix ``(3, 3)`` as written."""
+    """Read a rotation matrix ``(3, 3)`` from a scene file."""
     expected = "three rows of a rotation: orthogonal, and of determinant 1"
     found = _square(value, expected)
     if np.abs(found @ found.T - np.eye(3)).max() > 1e-3 or np.linalg.det(found) < 0.0:
@@ -74,12 +74,12 @@ def rotation(value: Any) -> NDArray[np.float64]:
 
 
 def translation(value: Any) -> NDArray[np.float64]:
-    """A translation ``(3,)`` as written."""
+    """Read a translation ``(3,)`` from a scene file."""
     return np.array(reading.vector(_listed(value)))
 
 
 def size(value: Any) -> tuple[int, int]:
-    """Width and height of a picture in pixels."""
+    """Read width and height of a picture in pixels from a scene file."""
     expected = "[width, height] in pixels, whole numbers >= 1"
     if not isinstance(value, list | tuple) or len(value) != 2 or not all(type(x) is int and x >= 1 for x in value):
         raise Refused(expected)
@@ -87,7 +87,7 @@ def size(value: Any) -> tuple[int, int]:
 
 
 def calibration(value: Any) -> NDArray[np.float64]:
-    """``K (3, 3)`` as written; such as a camera here can be."""
+    """Read ``K (3, 3)`` from a scene file; refuse skew and negative focal lengths."""
     found = _square(value, K_WORDS)
     if found[0, 1] != 0.0:
         raise Refused(f"{K_WORDS} (there is no skew)", float(found[0, 1]), (0, 1))
@@ -100,19 +100,19 @@ def calibration(value: Any) -> NDArray[np.float64]:
 
 
 def pose(turn: Any, move: Any) -> Any:
-    """Return camera to world ``(4, 4)`` in our axes, from OpenCV's ``R (3, 3)`` and ``t (3,)``: arrays, or tensors."""
+    """Return the pose ``(4, 4)`` from camera to world for OpenCV's ``R (3, 3)`` and ``t (3,)``, arrays or tensors."""
     return affine(turn.T @ constant(_TURN, turn), -turn.T @ move)
 
 
 def extrinsics(to_world: Tensor) -> tuple[Tensor, Tensor]:
-    """``R (3, 3)`` and ``t (3,)`` of a pose ``(4, 4)`` in our axes."""
+    """Return OpenCV's ``R (3, 3)`` and ``t (3,)`` of a pose ``(4, 4)``."""
     axes = normalize(to_world[:3, :3])
     turn = torch.stack((-axes[:, 0], -axes[:, 1], axes[:, 2]))
     return turn, -(turn @ to_world[:3, 3])
 
 
 def numbers_of(matrix: Any, picture: tuple[int, int]) -> dict[str, Any]:
-    """Return ``K (3, 3)`` of a ``picture (width, height)`` as a pinhole's numbers: of an array, or a tensor on its tape."""
+    """Return a pinhole's numeric parameters for ``K (3, 3)``, an array or a tensor, of a ``picture (width, height)``."""
     (width, height), fx, fy = picture, matrix[0, 0], matrix[1, 1]
     taped = isinstance(fx, Tensor)
     half = torch.atan2(fx.new_tensor(0.5 * width), fx) if taped else math.atan2(0.5 * width, fx)
@@ -125,7 +125,7 @@ def numbers_of(matrix: Any, picture: tuple[int, int]) -> dict[str, Any]:
 
 
 def angles(matrix: NDArray[np.float64], picture: tuple[int, int]) -> dict[str, float | str]:
-    """Return ``K`` of a ``picture (width, height)`` as a pinhole's parameters; those that are as usual are left out."""
+    """Return a pinhole's parameters for ``K`` of a ``picture (width, height)``, without those at their defaults."""
     found = {key: float(value) for key, value in numbers_of(matrix, picture).items()}
     rest = {key: found[key] for key, usual in USUAL.items() if found[key] != usual}
     return {"fov": found["fov"], "fov_axis": "x", **rest}

@@ -1,4 +1,4 @@
-"""What cameras with an angle of view share."""
+"""The base class of perspective cameras: angle of view, principal point, pixel aspect ratio."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from torchpt.spec import Angle, Choice, Custom, Moves, Refused, Scalar
 
 __all__ = ["FOV_AXES", "Pinhole"]
 
-#: What ``fov`` spans: the film's width, height, its smaller or larger side, or its diagonal.
+#: Values of ``fov_axis``: ``fov`` spans the film's width, height, smaller or larger side, or diagonal.
 FOV_AXES = ("x", "y", "smaller", "larger", "diagonal")
 _FROM_K = ("fov", "fov_axis", "principal_point_offset_x", "principal_point_offset_y", "pixel_aspect")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pinhole(Camera):
-    """A camera whose picture is what a pinhole's is, or blurs it.
+    """A camera with the perspective of a pinhole, possibly blurred by a lens.
 
     Attributes:
         fov: full angle of view in degrees, a 0-d tensor.
         fov_axis: one of :data:`FOV_AXES`.
-        principal_point_offset_x: how far the film's middle lies to the right of where the camera looks, in widths of the
-            film, a 0-d tensor; None: not at all, and no instruction for it. Mitsuba's name and sign.
-        principal_point_offset_y: the same downwards, in heights.
-        pixel_aspect: a pixel's width over its height, a 0-d tensor; None: squares.
+        principal_point_offset_x: offset of the film's centre to the right of the viewing direction, in film widths, a 0-d
+            tensor; None: 0, without any computation. Mitsuba's name and sign.
+        principal_point_offset_y: offset downward, in heights of the film, as above.
+        pixel_aspect: width of a pixel over its height, a 0-d tensor; None: 1.
     """
 
     parameters: ClassVar = {
@@ -41,30 +41,33 @@ class Pinhole(Camera):
             moves=Moves.SURFACES,
             doc="full angle of view along `fov_axis` of the whole film",
         ),
-        "fov_axis": Choice("x", names=FOV_AXES, doc="what `fov` spans: a side of the film, or its diagonal"),
+        "fov_axis": Choice("x", names=FOV_AXES, doc="side or diagonal of the film that `fov` spans"),
         "principal_point_offset_x": Scalar(
             None,
             low=None,
             moves=Moves.SURFACES,
-            doc="how far the film's middle lies right of where the camera looks, in widths of the film; 0 by default",
+            doc="offset of the film's centre to the right of the viewing direction, in widths of the film; 0 by default",
         ),
         "principal_point_offset_y": Scalar(
-            None, low=None, moves=Moves.SURFACES, doc="the same downwards, in heights of the film; 0 by default"
+            None,
+            low=None,
+            moves=Moves.SURFACES,
+            doc="offset of the film's centre downward, in heights of the film; 0 by default",
         ),
         "pixel_aspect": Scalar(
-            None, above=0.0, moves=Moves.SURFACES, doc="a pixel's width over its height, `fy / fx`; 1 by default"
+            None, above=0.0, moves=Moves.SURFACES, doc="width of a pixel over its height, `fy / fx`; 1 by default"
         ),
         "K": Custom(
             None,
             reader=opencv.calibration,
             words=opencv.K_WORDS,
-            doc="in place of these: OpenCV's calibration matrix of a picture of `size`",
+            doc="OpenCV's calibration matrix for a picture of `size`, in place of the parameters above",
         ),
         "size": Custom(
             None,
             reader=opencv.size,
             words="[width, height] in pixels",
-            doc="of the picture that `K` belongs to; by default the scene's own `film.width` and `film.height`",
+            doc="size of the picture that `K` belongs to; `film.width` and `film.height` of the scene by default",
         ),
     }
 
@@ -76,7 +79,7 @@ class Pinhole(Camera):
 
     @classmethod
     def check(cls, values: dict[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Camera`; ``K`` becomes the other parameters."""
+        """See :meth:`Camera.check`; ``K`` is converted to the other parameters."""
         super().check(values, given)
         if values["K"] is None:
             if "size" in given:
@@ -99,12 +102,12 @@ class Pinhole(Camera):
             raise Refused(expected, values["K"].tolist(), ("K",)) from None
 
     def sides(self) -> tuple[Tensor, Tensor]:
-        """Width and height of the film, in widths of a pixel."""
+        """Return width and height of the film in units of a pixel's width."""
         width, height = self.film[0], self.film[1]
         return width, height if self.pixel_aspect is None else height / self.pixel_aspect
 
     def half_width(self) -> Tensor:
-        """Tangent of half the horizontal angle of view, of a film in the middle."""
+        """Return the tangent of half the horizontal angle of view, for a centred film."""
         half = torch.tan(self.fov * (math.pi / 360.0))
         w, h = self.sides()
         if self.fov_axis == "x":
@@ -117,7 +120,7 @@ class Pinhole(Camera):
         return torch.where(other, half * (w / h), half)
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """How far ``right`` and ``up`` a ray through the film goes for each unit of depth, each ``(N,)``."""
+        """Return the slopes of rays through film positions: right and up per unit of depth, each ``(N,)``."""
         if self.principal_point_offset_x is not None:
             x = x + self.principal_point_offset_x * self.film[0]
         if self.principal_point_offset_y is not None:
@@ -133,7 +136,7 @@ class Pinhole(Camera):
         return None if self.lens else self.project_homogeneous(p - self.origin())
 
     def project_homogeneous(self, away: Tensor) -> Tensor:
-        """:meth:`film_of` of points that lie ``away (3, N)`` from the origin."""
+        """Return :meth:`film_of` for points at offsets ``away (3, N)`` from the camera's origin."""
         right, up, depth = self.covectors() @ away
         half, (width, height) = self.half_width(), self.film
         across, along = right / half, up / half

@@ -1,4 +1,4 @@
-"""Where a camera stands: by a point that it looks at, by a matrix, or by OpenCV's world-to-camera rotation and translation."""
+"""Poses of cameras: by origin and target, by a matrix, or by OpenCV's rotation and translation."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from torchpt.spec import Custom, Point, Pose, Refused, Spec
 
 __all__ = ["POSES", "UP", "pose_of", "posed"]
 
-#: What is up where a camera does not say.
+#: The default of ``up``.
 UP = (0.0, 1.0, 0.0)
-#: The keys that together say a pose.
+#: The ways to give a pose, with their keys.
 _WAYS = {"to_world": ("to_world",), "origin, target and up": ("origin", "target", "up"), "R and t": ("R", "t")}
 _POINT = "a point [x, y, z] (a camera needs origin and target, or to_world, or R and t)"
-#: Those without which a way says none, and what is said then.
+#: Required keys of each way, with the expectation for errors.
 _REQUIRED = {
     "to_world": {},
     "origin, target and up": {"origin": _POINT, "target": _POINT},
@@ -33,46 +33,46 @@ _REQUIRED = {
 
 
 class _UntracedPoint(Point):
-    """Three numbers that say where the camera stands: no tensor of the scene, the pose made of them is."""
+    """Spec of a vector from which the pose is computed. It is no parameter tensor; ``to_world`` is."""
 
     differentiable: ClassVar[bool] = False
     place: ClassVar[bool] = False
 
 
-#: What every camera declares.
+#: Specs of the pose, which every camera has.
 POSES: Mapping[str, Spec] = {
-    "origin": _UntracedPoint(None, doc="where it stands"),
-    "target": _UntracedPoint(None, doc="a point that it looks at"),
+    "origin": _UntracedPoint(None, doc="position"),
+    "target": _UntracedPoint(None, doc="point at which the camera is aimed"),
     "up": _UntracedPoint(
-        None, doc="what is up in the picture, any direction but the viewing direction; [0, 1, 0] by default"
+        None, doc="upward direction of the picture, not parallel to the viewing direction; [0, 1, 0] by default"
     ),
     "to_world": Pose(
         None,
         rigid=True,
         operations=False,
-        doc="in place of these: from its own space (it looks along +z, +y is up, +x left in the picture) to the world",
+        doc="in place of the above: from camera space (viewing direction +z, up +y, left in the picture +x) to the world",
     ),
     "R": Custom(
         None,
         reader=opencv.rotation,
         words="three rows of a rotation",
-        doc="in place of these, with `t`: OpenCV's rotation from the world to the camera (+x right, +y down, +z ahead)",
+        doc="in place of the above, with `t`: OpenCV's rotation from world to camera (+x right, +y down, +z ahead)",
     ),
     "t": Custom(
         None,
         reader=opencv.translation,
         words="three finite numbers [x, y, z]",
-        doc="where the world's origin lies in the camera's space, a point `X` of the world at `R X + t`",
+        doc="translation: a point `X` of the world is `R X + t` in camera space",
     ),
 }
 
 
 def posed(values: Mapping[str, Any], device: torch.device | None = None) -> Any:
-    """Return camera to world ``(4, 4)`` of a block that says one pose, and a right one.
+    """Return the pose ``(4, 4)`` from camera to world of parameters that are known to be valid.
 
     Args:
-        values: of the parameters by name, as read; with a device as written, tensors among them.
-        device: None: an array; else a float64 tensor there, on their tape.
+        values: values of the parameters by name, as read; with a device as written, which may be tensors.
+        device: None for an array; else the result is a float64 tensor on it, differentiable in tensors among the values.
     """
     known = {name: value for name, value in values.items() if name in POSES and value is not None}
     if "to_world" not in known and "R" not in known:
@@ -85,15 +85,15 @@ def posed(values: Mapping[str, Any], device: torch.device | None = None) -> Any:
 
 
 def pose_of(values: Mapping[str, Any], given: frozenset[str], sized_by: str = "") -> NDArray[np.float64]:
-    """Camera to world ``(4, 4)``, from what a file states.
+    """Return the pose ``(4, 4)`` from camera to world, from the parameters of a scene file.
 
     Args:
-        values: of the parameters by name.
-        given: names of those that the file states.
-        sized_by: what an error says where the pose has a scale.
+        values: values of the parameters by name.
+        given: names of the parameters that the file sets.
+        sized_by: hint for the error about a pose with a scale.
 
     Raises:
-        Refused: no pose, two of them, or one that is no rotation and translation.
+        Refused: no pose, two poses, or a pose that is no rotation and translation.
     """
     ways = [words for words, keys in _WAYS.items() if given.intersection(keys)]
     if len(ways) > 1:

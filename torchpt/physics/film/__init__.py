@@ -1,9 +1,9 @@
-"""The film: reconstruction filters by importance sampling, and sums that lose nothing.
+"""The film: filter importance sampling, sums of samples, and the error estimate.
 
-A sample belongs to one pixel: its place is drawn from the filter (Ernst, Stamminger, Greiner, *Filter Importance Sampling*,
-2006), so chunks of pixels are independent. Sums are float64, added sample by sample in order, one sum for each stream of the
-sampler (``sums.py``). Light that integrators send to other pixels is summed in integers, the same in any order (``splats.py``).
-What a picture knows of its own error, and where adaptive sampling spends samples, is in ``error.py``.
+A sample counts for one pixel: its film position is sampled from the filter (Ernst, Stamminger, Greiner, *Filter Importance
+Sampling*, 2006), so chunks of pixels are independent. ``sums.py`` adds samples in float64 and in order, one sum for each
+randomization of the sampler; ``splats.py`` adds splats to other pixels in fixed point, exact in any order; ``error.py``
+estimates the error and allocates samples for adaptive sampling.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ FILTERS: Kinds[Filter] = Kinds("torchpt.physics.film.kinds", ("gaussian", "box",
 
 
 def filter_of(kind: str, device: torch.device, **given: Any) -> Filter:
-    """A filter by name; parameters that are not ``given`` have their defaults.
+    """Return a filter by name; parameters that are not ``given`` have their defaults.
 
     Raises:
-        SceneError: a parameter that it does not have, or a bad value.
+        SceneError: an unknown parameter, or a bad value.
     """
     return FILTERS[kind](read_params(FILTERS[kind], given, "film.filter", None).values, device)

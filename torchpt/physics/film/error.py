@@ -1,4 +1,4 @@
-"""What a picture knows of its own error: pilots, tails, intervals, and where adaptive sampling spends samples."""
+"""Error estimates of pictures by error probes, their confidence intervals, and sample allocation for adaptive sampling."""
 
 from __future__ import annotations
 
@@ -35,32 +35,31 @@ __all__ = [
 ]
 
 
-# ---- The tail of a distribution: how far a mean of so many values can be trusted
+# ---- Heavy tails: whether a sample mean can be trusted
 #
-# The largest values are fitted by a generalized Pareto distribution, whose moments below 1 / k exist: from a shape k of 1/2 on
-# it has no variance, from 1 on no mean. The fit is that of Zhang and Stephens (2009), *A New and Efficient Estimation Method
-# for the Generalized Pareto Distribution*, Technometrics 51(3). How many values count as the tail, the weak prior and the
-# threshold are those of Vehtari, Simpson, Gelman, Yao and Gabry (2024), *Pareto Smoothed Importance Sampling*, JMLR 25(72).
+# A generalized Pareto distribution of shape k is fitted to the largest values. Its moments of order below 1 / k exist: it has
+# no variance for k >= 1/2 and no mean for k >= 1. The fit is that of Zhang and Stephens (2009), *A New and Efficient Estimation
+# Method for the Generalized Pareto Distribution*, Technometrics 51(3). The length of the tail, the weak prior and the threshold
+# are those of Vehtari, Simpson, Gelman, Yao and Gabry (2024), *Pareto Smoothed Importance Sampling*, JMLR 25(72).
 
 
-#: Fewest values whose tail a shape is fitted to.
+#: Least number of values for :func:`heavy_tail`.
 MIN_TAIL_VALUES = 25
-#: Weight of the prior, and the shape that it expects.
+#: Weight of the prior of the shape, and its mean.
 _PRIOR, _EXPECTED = 10.0, 0.5
 
 
 def heavy_tail(values: Tensor) -> bool:
-    """Return True where the upper tail of ``values (n,)``, n >= ``MIN_TAIL_VALUES``, is too heavy for their mean to be trusted.
+    """Return True if the upper tail of ``values (n,)`` is too heavy for their mean to be trusted; n >= ``MIN_TAIL_VALUES``.
 
-    That is, whether its shape exceeds the threshold by more than chance explains: by two standard errors ``(1 + k) / sqrt(m)``
-    of a shape fitted to m values.
+    The shape has to exceed the threshold by two standard errors ``(1 + k) / sqrt(m)`` of a fit to m values.
     """
     ordered = np.sort(values.detach().cpu().double().numpy())
     count = int(min(0.2 * len(ordered), 3.0 * math.sqrt(len(ordered))))
     excess = ordered[-count:] - ordered[-count - 1]
     if not excess[-1] > 0.0:
         return False
-    # Values alike have no logarithms of their differences; below this they weigh nothing.
+    # The logarithm of 0 does not exist; values this small have no weight.
     shape = _fitted(np.maximum(excess, 1e-30 * excess[-1]))
     shape = (count * shape + _PRIOR * _EXPECTED) / (count + _PRIOR)
     least = shape - 2.0 * (1.0 + abs(shape)) / math.sqrt(count + _PRIOR)
@@ -68,7 +67,7 @@ def heavy_tail(values: Tensor) -> bool:
 
 
 def _fitted(x: NDArray[np.float64]) -> float:
-    """Return the posterior mean of the shape of a generalized Pareto distribution of ``x (n,)``, positive and rising."""
+    """Return the posterior mean of the shape of a generalized Pareto distribution, from ``x (n,)``, positive and ascending."""
     n = len(x)
     m = 30 + math.isqrt(n)
     quartile = x[int(n / 4 + 0.5) - 1]
@@ -80,10 +79,10 @@ def _fitted(x: NDArray[np.float64]) -> float:
     return float(np.log1p(-mean * x).mean())
 
 
-# ---- Pilots: one pixel of each block of 4 x 4 that is sampled a second time, by other random numbers
+# ---- Error probes (pilots): one pixel of each block of 4 x 4 is sampled a second time, with other random numbers
 #
-# The difference of two independent values of a pixel is its error, whatever sampler made them. Where the pilots lie depends on
-# the seed and on the film alone: a crop has those of the whole film that lie in it.
+# The difference of two independent values of a pixel tells its error, for any sampler. The positions of pilots depend on the
+# seed and on the whole film alone: a crop has the same pilots.
 
 
 #: Side of a block in pixels.
@@ -93,14 +92,14 @@ _NAME = 0x50494C4F
 
 @dataclass(frozen=True)
 class Pilots:
-    """The pilots of a picture; n of them, one for each block of which it holds the pilot.
+    """The n error probes of a picture, one for each block whose probe lies in the picture.
 
     Attributes:
-        places: which pixels they are ``(n,)`` int64, row by row.
-        weight: pixels that each stands for ``(n,)`` float64.
-        block: row and column of their blocks ``(2, n)`` int64.
-        blocks: rows and columns of blocks that the picture touches.
-        corner: of the picture within its first block, ``(x, y)`` in pixels.
+        places: pixel indices ``(n,)`` int64, ascending by block.
+        weight: number of pixels of each block ``(n,)`` float64.
+        block: row and column of each block ``(2, n)`` int64.
+        blocks: number of rows and columns of blocks that overlap the picture.
+        corner: position ``(x, y)`` of the picture's corner in its first block, in pixels.
     """
 
     places: Tensor
@@ -114,7 +113,7 @@ class Pilots:
 
 
 def pilots_of(seed: int, film: tuple[int, int], crop: tuple[int, int, int, int]) -> Pilots:
-    """The pilots of a crop ``(x, y, width, height)`` of a film ``(width, height)``."""
+    """Return the error probes of a crop ``(x, y, width, height)`` of a film ``(width, height)``."""
     x0, y0, width, height = crop
     first = x0 // BLOCK, y0 // BLOCK
     columns, rows = -(-(x0 + width) // BLOCK) - first[0], -(-(y0 + height) // BLOCK) - first[1]
@@ -122,7 +121,7 @@ def pilots_of(seed: int, film: tuple[int, int], crop: tuple[int, int, int, int])
         grid.reshape(-1)
         for grid in torch.meshgrid(torch.arange(rows) + first[1], torch.arange(columns) + first[0], indexing="ij")
     )
-    # Blocks at the film's edge hold fewer pixels.
+    # Blocks at the film's edge have fewer pixels.
     wide, high = (film[0] - BLOCK * column).clamp_max(BLOCK), (film[1] - BLOCK * row).clamp_max(BLOCK)
     number = (row * -(-film[0] // BLOCK) + column).to(torch.int32)
     named = as_int32(mix_int(mix_int(seed) ^ as_int32(seed >> 32)) ^ _NAME)
@@ -139,33 +138,33 @@ def pilots_of(seed: int, film: tuple[int, int], crop: tuple[int, int, int, int])
     )
 
 
-# ---- What a picture knows of its own error, from pilots: pixels with two independent values
+# ---- The error estimate, from error probes with two independent values
 #
-# A pilot's first value A is sampled as every pixel is, its second value B by other random numbers. ``(A - B)² / 2`` has the
-# mean of A's variance, whatever sampler made them. relMSE divides it by ``r² + 0.01`` with the true radiance r; the median of
-# A, B and the mean of the eight pixels around stands for it.
+# The first value A of a pilot is sampled like every pixel, the second value B with other random numbers. The expectation of
+# ``(A - B)² / 2`` is the variance of A, for any sampler. relMSE divides it by ``r² + 0.01`` with the true radiance r, which is
+# estimated by the median of A, B and the mean of the eight neighbours.
 #
-# Where few pixels carry the error (caustics, edges of bright lights) pilots say little: they meet few such pixels or none, and
-# two values do not tell r. So some pixels are looked at again, by several more streams that are no part of the picture:
+# Where few pixels carry the error (caustics, edges of bright lights) pilots miss most of them, and two values do not estimate
+# r. So some pixels are resampled by several more randomizations, which do not count for the picture:
 #
-# - *suspects*: the pixels that stand out most from their second brightest neighbour, wherever they are. Of each the error that
-#   the picture really has is then known, so what sparkles in the picture is counted and not guessed.
-# - *doubtful pilots*: those whose two values differ most, for the r that theirs is divided by.
+# - *suspects*: the pixels that exceed their second brightest neighbour most. Their actual errors are then known, so fireflies
+#   are counted, not estimated.
+# - *doubtful pilots*: the pilots whose two values differ most, for a better r.
 #
-# The interval is that of the mean over pilots, symmetric in its logarithm, as errors are squares and lean to the right. It is
-# called heavy-tailed, and is not to be trusted, where suspects have most of the error, where the standard error is half of the
-# estimate, or where the largest errors of pilots have a tail too heavy for a mean (:mod:`torchpt.physics.film.error`).
+# The interval is that of the mean over pilots, symmetric in the logarithm, as squared errors are skewed. It is called
+# heavy-tailed, and cannot be trusted, if suspects have most of the error, if the standard error is more than half of the
+# estimate, or if the errors of pilots have a heavy tail (:func:`heavy_tail`).
 
 
-#: Pilots from which on an interval is given.
+#: Least number of pilots for an interval.
 FEWEST = 8
-#: Part of the error that suspects may have, and that its standard error may be, before the interval is called heavy-tailed.
+#: The interval is heavy-tailed if suspects have more than this fraction of the error, or if its standard error is larger.
 FEW, VAGUE = 0.5, 0.5
-#: One of so many pixels is a suspect, one of so many pilots doubtful.
+#: One of this many pixels is a suspect, one of this many pilots is doubtful.
 SUSPECTS, DOUBTFUL = 1024, 64
-#: Streams that they are looked at again by.
+#: Number of randomizations that resample them.
 STREAMS = 8
-#: Further values may all miss a light that few samples meet: r is taken for no less than this part of a pilot's mean, or of a
+#: The new values may all miss a light that few samples hit: r is at least one over this factor of a pilot's mean, or of a
 #: suspect's value.
 BRIGHTER, BRIGHTEST = 4.0, 32.0
 
@@ -175,9 +174,9 @@ class ErrorEstimate:
     """An estimate of relMSE, the mean of ``(x - r)² / (r² + 0.01)`` over pixels and channels.
 
     Attributes:
-        relmse: of the picture.
-        interval: of 95 % for it; None for a handful of pilots.
-        heavy_tailed: whether so few pixels carry the error that the interval is not to be trusted.
+        relmse: estimated relMSE of the picture.
+        interval: 95 % confidence interval; None for fewer than ``FEWEST`` pilots.
+        heavy_tailed: whether so few pixels carry the error that the interval cannot be trusted.
     """
 
     relmse: float
@@ -186,9 +185,9 @@ class ErrorEstimate:
 
 
 def around(values: Tensor, known: Tensor) -> Tensor:
-    """The mean of the eight neighbours of each place ``(H, W, C)``, of those that are ``known (H, W)``.
+    """Return the mean over the ``known (H, W)`` ones of the eight neighbours of each element of ``values (H, W, C)``.
 
-    Where one has none its own value stands.
+    An element without known neighbours keeps its own value.
     """
     height, width, _ = values.shape
     there = known.to(values.dtype)
@@ -204,19 +203,19 @@ def around(values: Tensor, known: Tensor) -> Tensor:
 
 
 def error_at(a: Tensor, b: Tensor, near: Tensor) -> Tensor:
-    """Squared error of each pilot's first value ``(n, C)`` over ``r² + 0.01``, as two values tell it.
+    """Return the squared error of each pilot's first value ``(n, C)`` over ``r² + 0.01``, estimated from two values.
 
     Args:
         a: first values ``(n, C)``.
-        b: second values.
-        near: what lies around.
+        b: second values ``(n, C)``.
+        near: means of the neighbours ``(n, C)``.
     """
     radiance = torch.stack((a, b, near)).median(0).values
     return relative((a - b).square() / 2, radiance)
 
 
 def error_by_pilots(pilots: Pilots, a: Tensor, b: Tensor) -> Tensor:
-    """:func:`error_at` with the mean of the pilots around for what lies around, mean of the channels ``(n,)``."""
+    """Return :func:`error_at` with neighbouring pilots as neighbours, averaged over channels ``(n,)``."""
     grid = a.new_zeros(*pilots.blocks, a.shape[1])
     known = torch.zeros(pilots.blocks, dtype=torch.bool)
     at = tuple(pilots.block)
@@ -225,7 +224,7 @@ def error_by_pilots(pilots: Pilots, a: Tensor, b: Tensor) -> Tensor:
 
 
 def probe_estimate(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> ErrorEstimate:
-    """By the pilots alone, so that no other pixel has a say: the relMSE that decisions are made by."""
+    """Return the estimate from pilots alone, independent of all other pixels: stop rules use it."""
     share = error_by_pilots(pilots, a, b) * _first_part(a, b, spare)
     pixels = float(sum_all(pilots.weight))
     part = 1.0 - 0.5 * len(pilots) / pixels if counted else 1.0
@@ -236,13 +235,13 @@ def probe_estimate(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, c
 
 @dataclass(frozen=True)
 class Resampled:
-    """Pixels that were looked at again.
+    """Resampled pixels: suspects and doubtful pilots.
 
     Attributes:
-        places: which pixels of the picture ``(m,)`` int64; suspects first, then pilots in their order.
-        suspects: how many of them are suspects; the others are pilots.
-        mean: of their further values ``(m, C)``.
-        spare: the variance of that mean.
+        places: pixel indices ``(m,)`` int64; suspects first, then pilots in their order.
+        suspects: number of suspects; the others are pilots.
+        mean: mean of the new values ``(m, C)``.
+        spare: variance of ``mean`` ``(m, C)``.
     """
 
     places: Tensor
@@ -252,18 +251,18 @@ class Resampled:
 
 
 def resample_counts(pixels: int, pilots: int) -> tuple[int, int]:
-    """Return how many suspects and how many doubtful pilots are looked at again, at most."""
+    """Return the largest numbers of suspects and of doubtful pilots to resample."""
     return max(pixels // SUSPECTS, 1), max(pilots // DOUBTFUL, 4)
 
 
 def pixels_to_resample(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Which pixels are to be looked at again: suspects, and doubtful pilots; places ``(m,)`` on the picture.
+    """Return the indices of pixels to resample: suspects and doubtful pilots, each ``(m,)``.
 
     Args:
         picture: ``(H, W, C)`` float64.
-        pilots: n of them.
-        a: their first values ``(n, C)``.
-        b: their second values.
+        pilots: the n pilots.
+        a: first values ``(n, C)``.
+        b: second values ``(n, C)``.
     """
     suspects = _suspects(picture)
     rest = ~torch.isin(pilots.places, suspects)
@@ -274,7 +273,7 @@ def pixels_to_resample(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) ->
 
 
 def _suspects(picture: Tensor) -> Tensor:
-    """The pixels that stand out most, of those that are brighter than seven of their neighbours."""
+    """Return the pixels that stand out most, among those brighter than at least seven of their neighbours."""
     bright = picture.sum(2)
     padded = torch.nn.functional.pad(bright, (1, 1, 1, 1), value=-math.inf)
     height, width = bright.shape
@@ -291,19 +290,19 @@ def _suspects(picture: Tensor) -> Tensor:
 def error_estimate(
     picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool, again: Resampled | None
 ) -> ErrorEstimate | None:
-    """The error that a picture knows.
+    """Return the error estimate of a picture.
 
     Args:
         picture: ``(H, W, C)`` float64, on the CPU.
-        pilots: n of them.
-        a: their first values ``(n, C)``.
-        b: their second values.
-        spare: an estimate of the variance of ``b`` where it is not that of first values.
+        pilots: the n pilots.
+        a: first values ``(n, C)``.
+        b: second values ``(n, C)``.
+        spare: estimated variance of ``b`` ``(n, C)`` if it differs from that of ``a``, else None.
         counted: whether second values are part of the picture, as half of each pilot.
-        again: what was looked at again; None: nothing yet.
+        again: the resampled pixels; None before resampling.
 
     Returns:
-        The estimate; None where there is no pilot.
+        The estimate; None without pilots.
     """
     if not len(pilots):
         return None
@@ -317,7 +316,7 @@ def error_estimate(
         suspects = again.places[: again.suspects]
         sure, unsure = _actual_error(flat[suspects], again.mean[: again.suspects], again.spare[: again.suspects])
         rest = ~torch.isin(places, suspects)
-        # A second value that would be a suspect itself tells of others like it, which are counted already.
+        # A second value that would be a suspect itself stands for other suspects, which are counted already.
         least = _excess(flat[suspects], _neighbours(picture, suspects)).min() if len(suspects) else math.inf
         b = torch.where((_excess(b, others) > least)[:, None], near, b)
     share = error_at(a, b, near)
@@ -338,10 +337,10 @@ def error_estimate(
 
 
 def _first_part(a: Tensor, b: Tensor, spare: Tensor | None) -> float:
-    """Twice the part that first values have in the variance of differences; 1 where second values are like them.
+    """Return twice the fraction of first values in the variance of differences; 1 if both values have the same variance.
 
-    Second values made of two streams of half the length vary more, as Sobol' points gain by being more. How much is told by all
-    pilots together, and it is no less than a half and no more than double.
+    Second values made of two randomizations of half the length vary more, as the error of Sobol' points falls faster than that
+    of random ones. The ratio is estimated over all pilots and clamped.
     """
     if spare is None:
         return 1.0
@@ -351,7 +350,7 @@ def _first_part(a: Tensor, b: Tensor, spare: Tensor | None) -> float:
 
 
 def _neighbours(picture: Tensor, places: Tensor) -> Tensor:
-    """The eight neighbours ``(8, n, C)`` of pixels; beyond the edge the nearest pixel stands for them."""
+    """Return the eight neighbours ``(8, n, C)`` of pixels, with the nearest pixel beyond the edge."""
     height, width, channels = picture.shape
     x, y = places % width, torch.div(places, width, rounding_mode="floor")
     steps = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy]
@@ -360,35 +359,35 @@ def _neighbours(picture: Tensor, places: Tensor) -> Tensor:
 
 
 def _excess(values: Tensor, others: Tensor) -> Tensor:
-    """By how much ``values (n, C)`` exceed the second brightest of ``others (8, n, C)``, relative to their mean ``(n,)``."""
+    """Return the relative squared excess ``(n,)`` of ``values (n, C)`` over the second brightest of ``others (8, n, C)``."""
     second = others.topk(2, 0).values[1]
     return relative((values - second).clamp_min(0.0).square(), others.mean(0)).mean(1)
 
 
 def _actual_error(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
-    """The squared error that pixels have, over ``r² + 0.01``, in all, and the variance of that.
+    """Return the summed squared error of resampled pixels over ``r² + 0.01``, and its variance.
 
     Args:
-        values: of the picture ``(m, C)``.
-        mean: of further values.
-        spare: its variance.
+        values: values of the picture ``(m, C)``.
+        mean: mean of the new values ``(m, C)``.
+        spare: variance of ``mean`` ``(m, C)``.
     """
     radiance, apart = torch.maximum(mean.abs(), values.abs() / BRIGHTEST), values - mean
     share = relative(apart.square() - spare, radiance)
-    # To the first order in the mean: channels move together, so their deviations add up.
+    # To first order in the mean. Channels are correlated, so their standard deviations are added.
     slope = relative(2 * apart.abs() + 2 * radiance * share.abs(), radiance)
     return float(sum_all(share.mean(1))), float(sum_all((slope * spare.sqrt()).mean(1).square()))
 
 
 def _estimate(mean: float, parts: Tensor, unsure: float, few: bool, share: Tensor) -> ErrorEstimate:
-    """The estimate with its interval.
+    """Return the estimate with its interval.
 
     Args:
         mean: the estimate.
-        parts: the pilots' deviations, whose sum of squares is their variance.
-        unsure: variance from suspects.
-        few: whether suspects carry most of the error.
-        share: the pilots' errors.
+        parts: deviations of the pilots; the sum of their squares is the variance of the mean.
+        unsure: variance due to suspects.
+        few: whether suspects have most of the error.
+        share: errors of the pilots.
     """
     count = len(parts)
     if not mean > 0.0 or not math.isfinite(mean):
@@ -402,34 +401,34 @@ def _estimate(mean: float, parts: Tensor, unsure: float, few: bool, share: Tenso
 
 
 def _quantile(freedom: int) -> float:
-    """Student's t at 97.5 % (Abramowitz and Stegun 26.7.5, to the second term)."""
+    """Return the 97.5 % quantile of Student's t (Abramowitz and Stegun 26.7.5, to the second term)."""
     z = 1.959964
     return z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom**2)
 
 
-# ---- How adaptive sampling shares samples out: more for blocks of pixels whose error falls most by them
+# ---- Sample allocation for adaptive sampling, by blocks of pixels
 #
-# A pixel of n samples whose relative variance is ``e`` has ``s = sqrt(e n)`` a sample; for so many samples in all the sum of
-# ``s² / n`` over pixels is least where n goes with s. What ``e`` is, pilots say, one a block (:func:`expected_errors`).
-# Other pixels are not asked, so none of them owes its number of samples to its own value. Numbers are powers of two times the
-# first one, as Sobol' points are at their best there.
+# A pixel of n samples and relative variance ``e`` has the standard deviation ``s = sqrt(e n)`` a sample. For a given total the
+# sum of ``s² / n`` over pixels is least for n in proportion to s. Pilots estimate ``e``, one a block: :func:`expected_errors`.
+# Other pixels are not used, so that no pixel's number of samples depends on its own value, which would bias it. Numbers are
+# powers of two times the first one, the best for Sobol' points.
 
 
-#: No block of pixels takes more than this many times its samples at once: it is known by few pilots.
+#: Largest growth of the samples of a block in one round, as few pilots estimate its error.
 GROWTH = 4
-#: Errors below this part of the mean count as much: what no pilot has met yet may be there all the same.
+#: Errors count as at least this fraction of the mean, as pilots may have missed rare contributions.
 FLOOR = 0.05
-#: Errors up to this quantile are taken as what pilots around have, too.
+#: Errors up to this quantile are smoothed over neighbouring blocks as they are.
 ORDINARY = 0.95
 
 
 def expected_errors(errors: Tensor, known: Tensor) -> Tensor:
-    """What blocks are expected to have of an error ``(R, C)`` that single pilots tell, where blocks are ``known (R, C)``.
+    """Return the expected error of each block ``(R, C)``, from the errors of single pilots in blocks that are ``known (R, C)``.
 
-    Most pilots tell of the noise around them. The few large ones may be an edge, or rare samples that are as likely elsewhere:
-    where they gathered by chance, samples would be taken from where the next ones will be. So what errors have above the 95th
-    percentile is believed only as far as the pilots around foretell it, by regression; the rest of it all blocks share. Where
-    no block is known nothing is expected of any.
+    Most pilots tell the noise of their neighbourhood. A few large errors may be due to an edge, or to rare samples that are as
+    likely elsewhere: following these would take samples from where the next ones will occur. So the part of errors above the
+    95th percentile is used only as far as neighbouring pilots predict it, by regression; the rest is spread over all blocks.
+    Without known blocks the result is 0.
     """
     if not bool(known.any()):
         return torch.zeros_like(errors)
@@ -444,9 +443,9 @@ def expected_errors(errors: Tensor, known: Tensor) -> Tensor:
 
 
 def _smoothed(values: Tensor, known: Tensor, own: bool = True) -> Tensor:
-    """Means ``(R, C)`` over 5 x 5 blocks with binomial weights, of the blocks that are ``known``; the mean of all elsewhere.
+    """Return means ``(R, C)`` of known blocks over 5 x 5 neighbourhoods with binomial weights; the overall mean elsewhere.
 
-    Without ``own`` a block has no part in its own mean.
+    Without ``own`` a block is left out of its own mean.
     """
     kernel = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0], dtype=values.dtype)
 
@@ -468,16 +467,16 @@ def _smoothed(values: Tensor, known: Tensor, own: bool = True) -> Tensor:
 
 
 def allocate_samples(error: Tensor, counts: Tensor, pixels: Tensor, mean: float, last: bool = False) -> Tensor:
-    """Samples a pixel that blocks are to have ``(B,)`` int64: those they have, twice or four times as many.
+    """Return new numbers of samples a pixel of each block ``(B,)`` int64: the present ones times 1, 2 or 4.
 
-    In the ``last`` round what cannot double any more is filled up by halves, quarters, ... of what blocks have, so that less is
-    left over than a sample of the smallest block's pixels.
+    In the ``last`` round the remaining samples are given out as halves, quarters, ... of present numbers, until they do not
+    suffice for one more sample of the pixels of any block.
 
     Args:
         error: relative variance of the pixels of each block ``(B,)`` float64, at its present number of samples.
-        counts: that number ``(B,)`` int64.
-        pixels: of each block ``(B,)``.
-        mean: samples a pixel over the picture that there are to be, at most.
+        counts: present numbers of samples a pixel ``(B,)`` int64.
+        pixels: number of pixels of each block ``(B,)``.
+        mean: largest mean number of samples a pixel over the picture.
         last: whether no round follows.
     """
     positive = error.clamp_min(0.0)
@@ -488,7 +487,7 @@ def allocate_samples(error: Tensor, counts: Tensor, pixels: Tensor, mean: float,
     if not bool((need > 0).any()):
         need = torch.ones_like(need)
     low, high = 0.0, float((most / need.clamp_min(1e-30)).max())
-    for _ in range(60):  # the number of samples a unit of need at which they come to the total
+    for _ in range(60):  # bisect the samples per unit of need for the total
         middle = 0.5 * (low + high)
         if float(sum_all(torch.minimum(torch.maximum(have, middle * need), most) * pixels)) < total:
             low = middle
@@ -497,7 +496,7 @@ def allocate_samples(error: Tensor, counts: Tensor, pixels: Tensor, mean: float,
     wanted = torch.minimum(torch.maximum(have, low * need), most) / have
     doubled = wanted.log2().add(1e-9).floor().clamp(0, 2).long()
     aims = counts << doubled
-    # What is left goes to those that are furthest below what they want, as far as it reaches.
+    # Remaining samples go to the blocks that are furthest below the wanted numbers.
     order = (wanted / (1 << doubled)).argsort(descending=True, stable=True)
     order = order[doubled[order] < 2]
     spent = ((aims * pixels)[order]).cumsum(0)
@@ -507,13 +506,13 @@ def allocate_samples(error: Tensor, counts: Tensor, pixels: Tensor, mean: float,
 
 
 def _filled_up(aims: Tensor, wanted: Tensor, pixels: Tensor, total: float) -> Tensor:
-    """Numbers of samples ``(B,)`` that come to ``total`` over all pixels, as nearly as whole samples of blocks do.
+    """Return numbers of samples ``(B,)`` whose total over all pixels comes as near to ``total`` as possible from below.
 
     Args:
-        aims: to begin with.
-        wanted: what blocks would have if that need not be whole: those that are furthest below it come first.
-        pixels: of each block.
-        total: samples in all.
+        aims: numbers to start with ``(B,)``.
+        wanted: ideal, fractional numbers ``(B,)``: blocks furthest below them come first.
+        pixels: number of pixels of each block ``(B,)``.
+        total: total number of samples.
     """
     order, halvings = (wanted / aims).argsort(descending=True, stable=True), 0
     while True:

@@ -1,4 +1,4 @@
-"""Reconstruction filters by importance sampling; those that come as a table of their inverse."""
+"""Reconstruction filters for filter importance sampling: the base class, and filters sampled by tabulated inversion."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from torchpt.spec import Spec
 __all__ = ["Filter", "Tabulated"]
 
 
-# ---- What a kind of reconstruction filter must say
+# ---- The base class
 
 
 class Filter(ABC):
-    """A separable, symmetric reconstruction filter that is sampled: a sample's place is drawn from it.
+    """A separable, symmetric reconstruction filter, from which film positions are sampled.
 
     Args:
-        values: of its parameters by name, all of them.
-        device: where the lanes live.
+        values: values of all parameters by name.
+        device: device of the lanes.
 
     Attributes:
-        name: its ``type`` in a scene file.
-        parameters: what it declares.
-        values: of its parameters.
-        radius: half width in pixels, beyond which it is zero.
-        signed: whether it is negative anywhere, so that samples have weights; else every weight is 1.
-        tabulated: whether lanes read its inverse from a table.
-        jumps: whether it ends at its radius by a jump.
+        name: the ``type`` in a scene file.
+        parameters: specs of the parameters.
+        values: values of the parameters by name.
+        radius: half width in pixels, beyond which the filter is zero.
+        signed: whether the filter is negative anywhere, so that samples have weights; else every weight is 1.
+        tabulated: whether :meth:`offset` reads a table of the inverse CDF.
+        jumps: whether the filter is discontinuous at its radius.
     """
 
     name: ClassVar[str] = ""
@@ -52,46 +52,46 @@ class Filter(ABC):
 
     @abstractmethod
     def half_width(self) -> float:
-        """In pixels."""
+        """Return the radius in pixels."""
 
     @abstractmethod
     def profile(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The filter along one axis at distances ``x`` from the middle, in pixels; any scale, zero beyond its radius."""
+        """Return the filter along one axis at distances ``x`` from the centre, in pixels and at any scale."""
 
     @abstractmethod
     def offset(self, u: Tensor) -> Tensor:
-        """Places in pixels from the pixel's centre for ``u`` in [0, 1), any shape, as dense as the profile's magnitude."""
+        """Sample offsets from the pixel centre, in pixels, by the magnitude of the profile; ``u`` in [0, 1) has any shape."""
 
     def weight(self, u: Tensor) -> Tensor:
-        """Weights ``(N,)`` of the samples at the offsets of ``u (2, N)``; asked for only where it is ``signed``."""
+        """Return weights ``(N,)`` of samples at the offsets of ``u (2, N)``; called only if ``signed``."""
         return torch.ones_like(u[0])
 
     def kind(self) -> tuple[object, ...]:
-        """What is not a tensor: kernels are made anew where it differs."""
+        """Return what is no tensor, as part of the cache key of kernels."""
         return self.name, self.signed
 
     def tensors(self) -> dict[str, Tensor]:
-        """What lanes read."""
+        """Return the tensors that :meth:`offset` and :meth:`weight` read, by name."""
         return {"radius": self._radius}
 
 
-# ---- Filters drawn from by a table of the inverse of their cumulative profile, negative lobes included
+# ---- Filters sampled by tabulated inversion, negative lobes included
 #
-# Where a filter is negative, places are drawn from its magnitude and a sample is weighted by the filter's sign times the
-# integral of the magnitude over that of the filter. The weight's expectation is 1: constants are kept without bias, and no
-# sample depends on another as it would where sums are divided by sums of weights.
+# Where a filter is negative, offsets are sampled by its magnitude, and a sample's weight is the sign of the filter times the
+# integral of the magnitude over that of the filter. The expected weight is 1: the estimate is unbiased, and samples do not
+# depend on each other, as they would by division by the sum of weights.
 
 
 _CELLS = 4096
-#: Numbers in [0, 1) are multiples of one over this.
+#: Numbers of samplers are multiples of one over this.
 _STEPS = 1 << 24
 
 
 class Tabulated(Filter):
-    """A filter of which only the profile is said.
+    """A filter defined by its profile alone.
 
-    Its runs of negative values are drawn by the lowest numbers, whole steps of them: the fewer ends of intervals, the more
-    evenly stratified points share them out. So numbers are moved about, a run at a time, before the table is read.
+    Intervals of negative values are sampled by the lowest numbers: fewer interval ends keep stratified points better
+    distributed. So numbers are shifted, interval by interval, before the table is read.
     """
 
     tabulated: ClassVar[bool] = True
@@ -109,16 +109,16 @@ class Tabulated(Filter):
         self.signed = negative > 0
 
     def kind(self) -> tuple[object, ...]:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.kind`."""
         return *super().kind(), len(self._moves)
 
     def tensors(self) -> dict[str, Tensor]:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.tensors`."""
         moves = {f"{name}{k}": pair[i] for k, pair in enumerate(self._moves) for i, name in enumerate(("end", "by"))}
         return {**super().tensors(), "inverse": self._inverse, "negative": self._negative, **moves}
 
     def offset(self, u: Tensor) -> Tensor:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.offset`."""
         if self._moves:
             *others, (_, last) = self._moves
             moved = u + last
@@ -131,7 +131,7 @@ class Tabulated(Filter):
         return low + (torch.take(self._inverse, cell + 1) - low) * (place - cell)
 
     def weight(self, u: Tensor) -> Tensor:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.weight`."""
         negative = u < self._negative
         norm = 1.0 / (1.0 - 2.0 * self._negative)
         return norm * norm * (1.0 - 2.0 * (negative[0] ^ negative[1]).to(u.dtype))
@@ -143,26 +143,26 @@ Tables = tuple[NDArray[np.float32], float, Moves]
 
 @dataclass(frozen=True)
 class _Profile:
-    """A profile as a key: filters of one kind with the same values have the same."""
+    """A profile as a cache key: equal for filters of one kind with the same values."""
 
     kind: type[Tabulated]
     values: tuple[tuple[str, Any], ...]
     filter: Tabulated = field(compare=False)
 
 
-@lru_cache(maxsize=16)  # takes milliseconds, which small renders repeated in a loop would notice
+@lru_cache(maxsize=16)  # takes milliseconds, which count in loops over small renders
 def _tables(profile: _Profile) -> Tables:
-    """The inverse of the cumulative magnitude, the share of it that is negative, and moves of numbers.
+    """Return the inverse CDF of the magnitude, the fraction of it that is negative, and shifts of numbers.
 
-    The inverse is made in float64 to be read linearly. Of the moves ``(end, by)``, the first whose end lies beyond a number
-    says what is added to it, so that the lowest numbers come to lie in the negative runs.
+    The inverse is computed in float64 and read with linear interpolation. The first shift ``(end, by)`` whose end lies above a
+    number is added to it, so that the lowest numbers fall into the negative intervals.
     """
     radius = profile.filter.radius
     x = np.linspace(-radius, radius, (1 << 16) + 1)
     weight = profile.filter.profile(0.5 * (x[1:] + x[:-1]))
     cdf = np.concatenate(([0.0], np.cumsum(np.abs(weight))))
     inverse = np.interp(np.linspace(0.0, 1.0, _CELLS + 1), cdf / cdf[-1], x).astype(np.float32)
-    # Where the sign changes on the left, in whole steps; on the right mirrored.
+    # Sign changes on the left half, in whole steps; mirrored on the right.
     below = weight < 0
     half = len(weight) // 2
     left = [round(float(cdf[k + 1] / cdf[-1]) * _STEPS) for k in np.flatnonzero(below[1:half] != below[: half - 1])]

@@ -1,4 +1,4 @@
-"""Light that samples bring to other pixels than their own, summed the same in whatever order it comes."""
+"""Sums of splats, which do not depend on the order of addition."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch import Tensor
 
 __all__ = ["LARGEST", "SplatSums", "Splats"]
 
-#: A sum is three integers of 64 bits: whole numbers, and two times 36 bits behind the point.
+#: A sum is three 64-bit integers: the whole part, and twice 36 bits of the fraction.
 BITS = 36
-#: From this number on a splat counts as infinite: a sum has room for 256 of them.
+#: Splats from this value on count as infinite: a sum holds 256 of them.
 LARGEST = 2.0**55
-#: Splats after which carries are taken: the lower integers have room for twice as many at one pixel.
+#: Number of splats after which carries are propagated: the lower integers hold twice as many at one pixel.
 CARRY = 1 << 26
 
 
@@ -24,8 +24,8 @@ class Splats:
     """Splats of a wave or of a chunk.
 
     Attributes:
-        lane: ``(k,)`` int64: the samples that bring them.
-        pixel: ``(k,)`` int64: pixels of the picture that they go to, counted row by row.
+        lane: ``(k,)`` int64 lanes of the samples.
+        pixel: ``(k,)`` int64 indices of the target pixels, row by row.
         value: ``(3, k)`` radiance.
     """
 
@@ -35,14 +35,14 @@ class Splats:
 
 
 class SplatSums:
-    """Sums of splats by pixel and stream, in fixed point: integers add up to the same in any order.
+    """Sums of splats by pixel and randomization, in fixed point: the same in any order of addition.
 
-    The sums are exact: only what lies below ``2**-72`` of a splat is cut off.
+    The sums are exact, but for truncation of each splat below ``2**-72``.
 
     Args:
-        pixels: of the picture.
-        streams: that share the samples, see :class:`torchpt.physics.samplers.Randomizations`.
-        device: where the sums live.
+        pixels: number of pixels of the picture.
+        streams: number of randomizations, see :class:`torchpt.physics.samplers.Randomizations`.
+        device: device of the sums.
     """
 
     def __init__(self, pixels: int, streams: int, device: torch.device) -> None:
@@ -52,14 +52,14 @@ class SplatSums:
 
     @staticmethod
     def bytes_of(pixels: int, streams: int) -> int:
-        """Return what sums of so many pixels take."""
+        """Return the size in bytes of the sums of this many pixels."""
         return 72 * pixels * streams
 
     def add(self, stream: Tensor, pixel: Tensor, value: Tensor) -> None:
-        """Add splats on a CPU; several threads may.
+        """Add splats on a CPU; thread-safe.
 
         Args:
-            stream: ``(k,)`` of the samples that bring them.
+            stream: ``(k,)`` int64 randomizations of the samples.
             pixel: ``(k,)`` int64.
             value: ``(3, k)``, each less than :data:`LARGEST`.
         """
@@ -73,9 +73,9 @@ class SplatSums:
                     np.add.at(row, place, values)
 
     def after(self, stream: Tensor, pixel: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what :meth:`add` would change, on any device: sums, places ``(n,)`` in their last axis, and values there.
+        """Return what :meth:`add` would change, on any device: sums, indices ``(n,)`` into their last axis, and new values.
 
-        Writing these twice does no harm; see :meth:`torchpt.physics.film.Film.after`.
+        Writing the values twice has no further effect; see :meth:`torchpt.physics.film.Film.after`.
         """
         place, where = torch.unique(stream * self._pixels + pixel, return_inverse=True)
         with self._lock:
@@ -86,27 +86,27 @@ class SplatSums:
         return self._sums, place, total
 
     def join(self, sums: Tensor) -> None:
-        """Add the sums of another one, see :meth:`state`."""
+        """Add sums from :meth:`state` of another object."""
         with self._lock:
             self._sums += sums
             self._added += 1
             self._carry()
 
     def state(self) -> Tensor:
-        """Return the sums ``(3, 3, streams * pixels)`` int64, in the one form in which carries are taken."""
+        """Return the sums ``(3, 3, streams * pixels)`` int64, with all carries propagated, so that they are unique."""
         with self._lock:
             self._carry()
         return self._sums
 
     def values(self, stream: int) -> Tensor:
-        """Return the sums of a stream ``(3, pixels)`` float64."""
-        with self._lock:  # a picture that is looked at on the way: others may be adding
+        """Return the sums of one randomization ``(3, pixels)`` float64."""
+        with self._lock:  # other threads may be adding while a preview is read
             self._carry()
             high, middle, low = (part.double() for part in self._sums.view(3, 3, -1, self._pixels)[:, :, stream])
         return high + (middle + low * 2.0**-BITS) * 2.0**-BITS
 
     def _count(self, splats: int) -> None:
-        """Make room for so many splats."""
+        """Count splats that are about to be added, after propagating carries if there are too many."""
         if self._added + splats > CARRY:
             self._carry()
         self._added += splats
@@ -123,7 +123,7 @@ class SplatSums:
 
 
 def _parts(value, whole):
-    """Yield whole numbers in units of 1, 2**-36 and 2**-72 that add up to values in float64; ``whole`` cuts off fractions."""
+    """Yield integers in units of 1, 2**-36 and 2**-72 that add up to ``value``, in float64; ``whole`` truncates."""
     for _ in range(3):
         part = whole(value)
         yield part

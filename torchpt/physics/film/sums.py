@@ -17,16 +17,16 @@ class Film:
     """Sums of radiance per pixel and randomization.
 
     Args:
-        width: of the picture (after a crop) in pixels.
-        height: of the picture in pixels.
-        randomizations: independent sequences that share the samples, see :mod:`torchpt.physics.samplers`.
-        device: where the lanes live.
+        width: width of the picture (after a crop) in pixels.
+        height: height of the picture in pixels.
+        randomizations: number of independent sequences that share the samples, see :mod:`torchpt.physics.samplers`.
+        device: device of the lanes.
         channels: C, three for radiance.
-        splats: whether samples also bring light to other pixels than their own. A pixel's mean is that of its own samples then,
-            and what came from elsewhere over the mean number of samples of all pixels.
+        splats: whether integrators splat to other pixels. The value of a pixel is then the mean of its own samples plus its
+            splats over the mean number of samples of all pixels.
 
     Attributes:
-        splats: sums of that light; None where there is none.
+        splats: sums of splats; None without splats.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Film:
 
     @staticmethod
     def bytes_of(pixels: int, randomizations: int, channels: int = 3, splats: bool = False) -> int:
-        """Return what a film of so many pixels takes."""
+        """Return the size in bytes of a film of this many pixels."""
         own = 8 * pixels * (channels + randomizations * (channels + 1))
         return own + (SplatSums.bytes_of(pixels, randomizations) if splats else 0)
 
@@ -57,9 +57,9 @@ class Film:
             place.copy_(value)
 
     def after(self, radiance: Tensor, first_pixel: int, first_sample: int) -> list[tuple[Tensor, Tensor]]:
-        """What :meth:`add` would change: places in this film, and what they would hold.
+        """Return what :meth:`add` would change: pairs of a view of this film and its new values.
 
-        It changes nothing, and copying the values allocates nothing: who runs out of memory has added all or nothing.
+        The film is not changed. Copying the values allocates nothing, so that on lack of memory all or nothing is added.
         """
         count, n = radiance.shape[1], radiance.shape[2]
         pixels = slice(first_pixel, first_pixel + n)
@@ -83,33 +83,33 @@ class Film:
         return part
 
     def stream(self, sample: Tensor) -> Tensor:
-        """Return which stream samples ``(k,)`` of a pixel, by their numbers, belong to."""
+        """Return the randomization of each sample ``(k,)`` of a pixel, by its index."""
         return sample % self.randomizations
 
     def taken(self, places: Tensor) -> Film:
-        """Return some of its pixels as a film of their own, with no splats yet."""
+        """Return some of the pixels as a separate film, without splats."""
         part = self.part(len(places))
         part._first, part._sums = self._first[:, places].contiguous(), self._sums[:, :, places].contiguous()
         part._counts = self._counts[:, places].contiguous()
         return part
 
     def put(self, places: Tensor, part: Film) -> None:
-        """Hold what :meth:`taken` took, after more samples, and add their splats."""
+        """Write back pixels from :meth:`taken` after more samples, and add their splats."""
         self._first[:, places], self._sums[:, :, places] = part._first, part._sums
         self._counts[:, places] = part._counts
         if self.splats is not None and part.splats is not None:
             self.splats.join(part.splats.state())
 
     def state(self) -> dict[str, Tensor]:
-        """Return all that it holds, by name."""
+        """Return the tensors of the film by name, for a checkpoint."""
         own = {"sums": self._sums, "counts": self._counts, "first": self._first}
         return own if self.splats is None else {**own, "splats": self.splats.state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Hold what another film of this size held, as :meth:`state` said.
+        """Load the :meth:`state` of another film of the same size.
 
         Raises:
-            ValueError: a film of another size.
+            ValueError: the state of a film of another size.
         """
         for name, value in self.state().items():
             if state[name].shape != value.shape or state[name].dtype != value.dtype:
@@ -130,7 +130,7 @@ class Film:
         return mean
 
     def _stream(self, k: int) -> Tensor:
-        """Return means of the pixels by one stream ``(C, pixels)``."""
+        """Return means of the pixels by one randomization ``(C, pixels)``."""
         mean = self._sums[k] / self._counts[k].clamp_min(1)
         if self.splats is not None:
             mean += self.splats.values(k) / _samples(self._counts[k])
@@ -141,19 +141,19 @@ class Film:
         return self._mean().T.contiguous()
 
     def streams(self) -> list[Tensor]:
-        """Return means of each stream ``(pixels, C)`` float64."""
+        """Return the means by each randomization ``(pixels, C)`` float64."""
         return [self._stream(k).T.contiguous() for k in range(self.randomizations)]
 
     @property
     def sums(self) -> Tensor:
-        """``(randomizations, C, pixels)`` float64."""
+        """Sums of samples ``(randomizations, C, pixels)`` float64."""
         return self._sums
 
     def counted(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> None:
-        """Say that consecutive samples were added to the sums of consecutive pixels."""
+        """Count consecutive samples that were added to :attr:`sums` of consecutive pixels."""
         counts = self._counts.numpy()
         for group in range(self.randomizations):
-            # Of the numbers from `first_sample` on those that are `group` modulo the randomizations.
+            # Number of sample indices that are `group` modulo the randomizations.
             number = len(range((group - first_sample) % self.randomizations, samples, self.randomizations))
             counts[group, first_pixel : first_pixel + pixels] += number
 
@@ -163,25 +163,25 @@ class Film:
         self._first.numpy()[:, first_pixel : first_pixel + values.shape[1]] = values
 
     def mean(self) -> Tensor:
-        """The picture ``(H, W, C)`` in float64; pixels without samples are black."""
+        """Return the picture ``(H, W, C)`` in float64; pixels without samples are black."""
         return self._picture(self._mean())
 
     def first(self) -> Tensor:
-        """The first sample of each pixel ``(H, W, C)``: for what has no average."""
+        """Return the first sample of each pixel ``(H, W, C)``, for AOVs that cannot be averaged."""
         return self._picture(self._first)
 
     def _picture(self, values: Tensor) -> Tensor:
         return values.T.reshape(self.height, self.width, -1)
 
     def variance(self) -> Tensor | None:
-        """Variance of :meth:`mean` ``(H, W, C)``, from the spread of the randomizations; None where one is all there is.
+        """Return the variance of :meth:`mean` ``(H, W, C)`` from the spread of randomizations; None for fewer than two.
 
-        Randomizations with a sample more than the others weigh as much: the estimate is exact for equal counts.
+        Randomizations have equal weights, also if some have one sample more: the estimate is exact for equal counts.
         """
         filled = [k for k in range(self.randomizations) if int(self._counts[k].min()) > 0]
         if len(filled) < 2:
             return None
-        # One randomization at a time: a large film has room for no more.
+        # One randomization at a time, to save memory on large films.
         mean = torch.zeros_like(self._first)
         for k in filled:
             mean += self._stream(k)
@@ -193,7 +193,7 @@ class Film:
         return self._picture(spread / len(filled))
 
     def relmse(self) -> float | None:
-        """The picture's estimate of its own relMSE."""
+        """Return the relMSE estimated from :meth:`variance`; None without it."""
         variance = self.variance()
         if variance is None:
             return None
@@ -201,6 +201,6 @@ class Film:
 
 
 def _samples(counts: Tensor) -> Tensor:
-    """Return the mean number of samples of pixels, 1 where there are none."""
+    """Return the mean number of samples a pixel, 1 without samples."""
     mean = counts.double().mean()
     return torch.where(mean > 0, mean, 1.0)

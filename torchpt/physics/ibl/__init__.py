@@ -1,5 +1,5 @@
-"""Image-based lighting by split sum: maps of a sky as tensors, differentiable in the sky, and shading with them.
+"""Image-based lighting by split-sum approximation: prefiltered environment maps and shading, differentiable in the map.
 
-``convolve.py`` and ``pyramid.py`` make the maps, ``table.py`` the BRDF's, ``shading.py`` looks them up: start there. What users
-import is :mod:`torchpt.ibl`.
+``convolve.py`` and ``pyramid.py`` prefilter maps, ``table.py`` integrates the BRDF, ``shading.py`` does look-ups: start there.
+The public module is :mod:`torchpt.ibl`.
 """

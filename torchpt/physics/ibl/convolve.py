@@ -1,4 +1,4 @@
-"""Maps convolved with a lobe about each direction: diffuse irradiance, and radiance prefiltered by GGX."""
+"""Convolution of environment maps: diffuse irradiance, and radiance prefiltered by GGX."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from torchpt.physics.ibl.pyramid import Pyramid, resampled
 __all__ = ["METHODS", "irradiance_map", "prefiltered", "roughnesses"]
 
 METHODS = ("grid", "importance")
-#: Step of the regular grid in both angles.
+#: Step of the regular grid in both angles, in radians.
 STEP = 0.025
-#: Samples read at once, so that memory does not grow with the maps.
+#: Number of samples read at once, which bounds memory.
 LANES = 1 << 19
-#: How many points of light stand for the brightest texels.
+#: Number of directional lights that replace the brightest texels.
 SUNS = 1024
-#: Largest lattice of points for a texel as wide as a lobe, or wider.
+#: Largest lattice of points for a texel that is not narrow compared to the lobe.
 LATTICE = 8
-#: Texels across the width of a lobe that it can tell apart: more are averaged first.
+#: Number of texels across the width of a lobe; finer maps are downsampled first.
 FINE = 8
 
 
 @dataclass(frozen=True)
 class Lobe:
-    """Weighted directions about +z, and the density that they stand for."""
+    """Weighted sample directions about +z, and the density that they represent."""
 
     d: Tensor  # (3, S) float64, unit
     weight: Tensor  # (S,), of sum 1
-    spacing: Tensor  # (S,) angle from a direction to its neighbours
-    density: Callable[[Tensor], Tensor]  # of the cosine with +z, in solid angle
-    width: float  # the angle over which the density falls: as -1/width^2 is its second derivative at the peak, over the peak
+    spacing: Tensor  # (S,) angle between neighbouring directions
+    density: Callable[[Tensor], Tensor]  # function of the cosine with +z, per steradian
+    width: float  # angular width: the second derivative of the density at the peak is -1/width^2 times the peak
 
 
 def irradiance_map(map: Tensor, height: int = 32, width: int = 64, method: str = "importance") -> Tensor:
-    """``E(n) / pi`` of a map: what a white diffuse surface sends back, by its normal.
+    """Return ``E(n) / pi`` of a map: the radiance of a white diffuse surface by its normal.
 
     Args:
         map: radiance ``(H, W, 3)``, see :mod:`torchpt.physics.ibl.equirect`.
@@ -66,18 +66,18 @@ def irradiance_map(map: Tensor, height: int = 32, width: int = 64, method: str =
 def prefiltered(
     map: Tensor, levels: int = 6, sizes: Sequence[tuple[int, int]] | None = None, samples: int = 1024
 ) -> list[Tensor]:
-    """The map seen in rough mirrors, ``sum L (n l) / sum (n l)`` over directions ``l`` mirrored about GGX normals.
+    """Prefilter a map for rough mirrors: ``sum L (n l) / sum (n l)`` over directions ``l`` mirrored about GGX normals.
 
-    One map for each of ``levels`` roughnesses from 0 to 1, ``alpha = roughness^2``, with ``n = v = r`` (Karis, *Real Shading in
-    Unreal Engine 4*, 2013). Directions are Hammersley's points; each reads a level of a pyramid by the solid angle that
-    it stands for (Colbert and Krivanek, GPU Gems 3, chapter 20), so that no sun falls between them.
+    There is one map for each of ``levels`` roughnesses from 0 to 1, ``alpha = roughness^2``, with ``n = v = r`` (Karis, *Real
+    Shading in Unreal Engine 4*, 2013). Directions are Hammersley's points; each reads a level of a pyramid by the solid angle
+    of the sample (Colbert and Krivanek, GPU Gems 3, chapter 20), so that small bright lights are not missed.
 
     Args:
         map: radiance ``(H, W, 3)``.
-        levels: how many; the first is the map itself.
-        sizes: ``(rows, columns)`` of the levels after the first; by default as many columns as the map for the
-            second, from 16 to 256, halved down to 64.
-        samples: directions for each texel.
+        levels: number of levels; the first is the map itself.
+        sizes: ``(rows, columns)`` of the levels after the first; by default the second has as many columns as the map, from 16
+            to 256, and each further one half of them, down to 64.
+        samples: number of directions for each texel.
 
     Returns:
         ``levels`` tensors ``(H_l, W_l, 3)``, differentiable in the map.
@@ -99,7 +99,7 @@ def prefiltered(
 
 
 def roughnesses(levels: int) -> list[float]:
-    """The roughness of each level of a chain."""
+    """Return the roughness of each level of a prefiltered map."""
     return [k / (levels - 1) for k in range(levels)]
 
 
@@ -127,11 +127,11 @@ def _cosine(n: int) -> Lobe:
 
 
 def _facets(alpha: float, n: int) -> Lobe:
-    """Mirror directions of ``n`` for normals with density ``D cos``; those below the horizon are left out."""
+    """Return mirror directions for ``n`` normals of density ``D cos``, without those below the horizon."""
     a2 = alpha * alpha
 
     def distribution(cos: Tensor, scale: float = 1.0) -> Tensor:
-        """D of the normal halfway to a direction with this cosine: ``a2 / (pi (sin^2 + a2 cos^2)^2)`` of the half angle."""
+        """Return D of the half vector of +z and a direction with this cosine: ``a2 / (pi (sin^2 + a2 cos^2)^2)``."""
         bracket = 0.5 * (1.0 + a2) - 0.5 * (1.0 - a2) * cos
         return (scale * a2 / math.pi) / bracket.square()
 
@@ -150,16 +150,16 @@ def _facets(alpha: float, n: int) -> Lobe:
 
 @dataclass(frozen=True)
 class _Convolve:
-    """How a result of ``height x width`` is made of the texels of a pyramid and of suns, by a lobe."""
+    """The convolution of a pyramid and of suns with a lobe, to a map of ``height x width``."""
 
     pyramid: Pyramid
-    suns: Tensor  # (3, K) float64 directions, on the host
+    suns: Tensor  # (3, K) float64 directions, on the CPU
     height: int
     width: int
     lobe: Lobe
 
     def taps(self) -> Iterator[tuple[Tensor, Tensor]]:
-        """Indices and weights ``(n, 4 S)`` of texels for consecutive texels of the result, row by row."""
+        """Yield indices and weights ``(n, 4 S)`` of texels for n consecutive texels of the result, row by row."""
         columns = max(1, min(self.width, LANES // len(self.lobe.weight)))
         for row in range(self.height):
             place = self._places(math.pi * row / (self.height - 1))
@@ -167,14 +167,14 @@ class _Convolve:
                 yield self._taps(place, torch.arange(start, min(start + columns, self.width), device=place[0].device))
 
     def _places(self, theta: float) -> tuple[Tensor, ...]:
-        """Where the lobe about a direction at longitude 0 reads: column, columns there are, first texel, two weights."""
+        """Return for a lobe at longitude 0 the columns it reads, numbers of columns, first texels of rows, and two weights."""
         p, lobe, texels = self.pyramid, self.lobe, self.pyramid.texels
         sine, cosine = math.sin(theta), math.cos(theta)
         x, y, z = lobe.d
         up, away = z * cosine - y * sine, z * sine + y * cosine
         across = torch.addcmul(x * x, away, away).sqrt()
         u, v = azimuth(away, x) * (0.5 / math.pi), azimuth(up, across) * (1.0 / math.pi)
-        # Levels whose texels are as large as what a direction stands for.
+        # Levels whose texels are as large as the spacing of samples.
         tall = lobe.spacing * ((p.heights[0] - 1) / math.pi)
         wide = lobe.spacing * (p.widths[0] / (2.0 * math.pi)) / across.clamp_min(1e-12)
         a, b = (
@@ -205,7 +205,7 @@ class _Convolve:
         return torch.cat((left, right, left + width, right + width), 1), torch.cat((low - a, a, high - b, b), 1)
 
     def sun_weights(self) -> Iterator[Tensor]:
-        """Densities ``(n, K)`` of the suns for consecutive texels of the result."""
+        """Yield the densities ``(n, K)`` of the suns for n consecutive texels of the result."""
         n = directions(self.height, self.width).reshape(3, -1)
         for start in range(0, n.shape[1], max(1, LANES // self.suns.shape[1])):
             cos = n[:, start : start + max(1, LANES // self.suns.shape[1])].T @ self.suns
@@ -213,7 +213,7 @@ class _Convolve:
 
 
 class _Gather(torch.autograd.Function):
-    """Weighted sums of texels and suns. Weights are made anew for the backward pass rather than kept."""
+    """Weighted sums of texels and suns. The backward pass recomputes the weights instead of keeping them."""
 
     @staticmethod
     def forward(ctx: Any, texels: Tensor, light: Tensor, rule: _Convolve) -> Tensor:
@@ -249,10 +249,10 @@ class _Gather(torch.autograd.Function):
 
 
 class _Convolution:
-    """A map ready to be convolved with any lobe.
+    """A map prepared for convolution with any lobe.
 
-    Its brightest texels are taken out and shine on each texel of the result by the lobe's density itself: a sun between two
-    of a thousand directions would be missed, and one that a coarse level of the pyramid spreads out is not where it was.
+    The excess of the brightest texels is removed and becomes suns, which are convolved exactly by the lobe's density: a sun
+    between sample directions would be missed, and a coarse level of the pyramid would spread it out.
     """
 
     def __init__(self, map: Tensor) -> None:
@@ -260,7 +260,7 @@ class _Convolution:
         self.parts: dict[tuple[int, int], tuple[Pyramid, Tensor, Tensor]] = {}
 
     def __call__(self, height: int, width: int, lobe: Lobe) -> Tensor:
-        """The result ``(height, width, 3)``."""
+        """Return the convolution with a lobe, as a map ``(height, width, 3)``."""
         for key, value, least in (("height", height, 2), ("width", width, 1)):
             if not isinstance(value, int) or value < least:
                 raise SceneError(key, value, f"an integer, at least {least}")
@@ -270,10 +270,10 @@ class _Convolution:
         return out
 
     def _ready(self, width: float) -> tuple[Pyramid, Tensor, Tensor]:
-        """The map for lobes as wide as this: no finer than they can tell, the rest and the suns."""
+        """Return pyramid, suns and their light for lobes of this width, at the resolution that they need."""
         most = math.ceil(FINE * math.pi / width)
         rows, columns = min(self.map.shape[0] - 1, most) + 1, min(self.map.shape[1], 2 * most)
-        # A texel is a point to a lobe five times as wide, else a lattice of points; still wider ones are read as they are.
+        # A texel counts as a point for a lobe five times as wide, else as a lattice of points; wider ones stay in the map.
         points = math.ceil(5.0 * math.pi / (rows - 1) / width)
         points = points if points <= LATTICE else 0
         if (rows, points) not in self.parts:
@@ -283,15 +283,15 @@ class _Convolution:
 
 
 def _extract_suns(map: Tensor, points: int) -> tuple[Tensor, Tensor, Tensor]:
-    """A map without what its brightest texels have above the others, and that as suns.
+    """Split off the excess radiance of the brightest texels as suns.
 
     Args:
         map: ``(H, W, 3)``.
-        points: each texel's hat becomes ``(2 points - 1)^2`` suns; 0: none at all.
+        points: the hat function of each texel becomes ``(2 points - 1)^2`` suns; 0: no suns.
 
     Returns:
-        The rest ``(H, W, 3)``, directions of suns ``(3, K)`` float64 on the host, and their light ``(K, 3)``, radiance by solid
-        angle.
+        The remaining map ``(H, W, 3)``, directions of suns ``(3, K)`` float64 on the CPU, and their light ``(K, 3)``: radiance
+        times solid angle.
     """
     height, width, _ = map.shape
     each = max(2 * points - 1, 0) ** 2
@@ -302,7 +302,7 @@ def _extract_suns(map: Tensor, points: int) -> tuple[Tensor, Tensor, Tensor]:
         return map, torch.zeros(3, 1, dtype=torch.float64), map.new_zeros(1, 3)
     excess = (flat[brightest.indices] - brightest.values[-1]).clamp_min(0.0)
     rest = flat.index_add(0, brightest.indices, -excess).view_as(map)
-    # The lattice of each hat: offsets in texels, and shares of its solid angle.
+    # The lattice of each hat: offsets in texels, and fractions of its solid angle.
     offset = torch.arange(1 - points, points, dtype=torch.float64) / points
     hat = 1.0 - offset.abs()
     row, column = brightest.indices.cpu() // width, brightest.indices.cpu() % width

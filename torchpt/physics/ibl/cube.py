@@ -24,7 +24,7 @@ FACES = (
 
 
 def cube_directions(size: int, border: int = 0) -> Tensor:
-    """Unit directions ``(6, S, S, 3)`` float64 of the texel centres; ``border`` more texels around each face."""
+    """Return unit directions ``(6, S, S, 3)`` float64 of the texel centres, with a border of ``border`` texels around faces."""
     s = (torch.arange(-border, size + border, dtype=torch.float64) + 0.5) * (2.0 / size) - 1.0
     forward, up, right = _axes(torch.float64, s.device)
     d = (
@@ -36,9 +36,9 @@ def cube_directions(size: int, border: int = 0) -> Tensor:
 
 
 def equirect_to_cube(map: Tensor, size: int) -> Tensor:
-    """The faces ``(6, size, size, 3)`` of a map ``(H, W, 3)``, differentiable in it.
+    """Convert a map ``(H, W, 3)`` to faces ``(6, size, size, 3)``; differentiable.
 
-    Where texels of a face are larger than the map's, each is the mean of several look-ups.
+    Where texels of a face are larger than those of the map, each is the mean of several look-ups.
     """
     checked(map)
     if not isinstance(size, int) or size < 1:
@@ -52,7 +52,7 @@ def equirect_to_cube(map: Tensor, size: int) -> Tensor:
 
 
 def cube_to_equirect(cube: Tensor, height: int, width: int) -> Tensor:
-    """The map ``(height, width, 3)`` of faces ``(6, S, S, 3)``, differentiable in them; interpolated across edges too."""
+    """Convert faces ``(6, S, S, 3)`` to a map ``(height, width, 3)``, interpolating across edges too; differentiable."""
     if not isinstance(cube, Tensor) or not cube.is_floating_point():
         raise SceneError("cube", type(cube).__name__, "a tensor of floats")
     if cube.dim() != 4 or cube.shape[0] != 6 or cube.shape[1] != cube.shape[2] or cube.shape[3] != 3:
@@ -64,7 +64,7 @@ def cube_to_equirect(cube: Tensor, height: int, width: int) -> Tensor:
     times = max(1, math.ceil(min(math.pi / (height - 1), 2.0 * math.pi / width) * 0.5 * size))
     if times == 1:
         return look_up_cube(cube, directions(height, width).permute(1, 2, 0).to(cube))
-    # Texels larger than those of the faces: means over a lattice under their hats.
+    # Texels larger than those of the faces: means over a lattice, weighted by their hat functions.
     offset = (torch.arange(1 - times, times, dtype=torch.float64)) / times
     hat = (1.0 - offset.abs()).to(cube)
     theta = (torch.arange(height)[:, None] + offset) * (math.pi / (height - 1))
@@ -82,7 +82,7 @@ def cube_to_equirect(cube: Tensor, height: int, width: int) -> Tensor:
 
 
 def look_up_cube(cube: Tensor, d: Tensor) -> Tensor:
-    """Radiance ``(..., 3)`` of faces ``(6, S, S, 3)`` in directions ``(..., 3)``, bilinear."""
+    """Return radiance ``(..., 3)`` of faces ``(6, S, S, 3)`` in directions ``(..., 3)``, bilinear."""
     return _bilinear(_bordered(cube), d.reshape(-1, 3), 1).view(d.shape)
 
 
@@ -93,7 +93,7 @@ def _axes(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Ten
 
 
 def _bordered(cube: Tensor) -> Tensor:
-    """The faces with one more texel around, of what the neighbours show in that direction; corners are shared by three."""
+    """Return the faces with a border of one texel, read from the neighbouring faces."""
     size = cube.shape[1]
     d = cube_directions(size, 1).to(cube)
     inner = torch.zeros(size + 2, size + 2, dtype=torch.bool, device=cube.device)
@@ -105,7 +105,7 @@ def _bordered(cube: Tensor) -> Tensor:
 
 
 def _bilinear(faces: Tensor, d: Tensor, border: int) -> Tensor:
-    """Values ``(N, 3)`` of faces with a border, clamped at their edges, in directions ``(N, 3)``."""
+    """Return values ``(N, 3)`` in directions ``(N, 3)`` of faces with a border, clamped at their edges."""
     rows = faces.shape[1]
     size = rows - 2 * border
     forward, up, right = _axes(d.dtype, d.device)

@@ -1,4 +1,4 @@
-"""Pictures of all directions: latitude by rows, longitude by columns, as an ``envmap`` light has them.
+"""Equirectangular environment maps: latitude by rows, longitude by columns, as in the light ``envmap``.
 
 ``u = atan2(x, -z) / 2 pi`` (wrapped), ``v = acos(y) / pi``. Texel centres lie at ``u = (j + 1/2) / W`` and ``v = i / (H - 1)``:
 the first row is the pole +y, the last one -y. Between them a map is interpolated bilinearly.
@@ -20,7 +20,11 @@ __all__ = ["Cell", "angles", "checked", "coordinates", "corners", "directions", 
 
 
 def checked(map: Tensor, key: str = "map") -> Tensor:
-    """A map that can be worked with: ``(H, W, 3)`` floats, finite, not negative, at least two rows."""
+    """Return the map after checking it: ``(H, W, 3)`` floats, finite, not negative, at least two rows.
+
+    Raises:
+        SceneError: any other map; ``key`` names it.
+    """
     if not isinstance(map, Tensor) or not map.is_floating_point():
         raise SceneError(key, type(map).__name__ if not isinstance(map, Tensor) else map.dtype, "a tensor of floats")
     if map.dim() != 3 or map.shape[2] != 3 or map.shape[0] < 2 or map.shape[1] < 1:
@@ -34,19 +38,19 @@ def checked(map: Tensor, key: str = "map") -> Tensor:
 
 
 def directions(height: int, width: int) -> Tensor:
-    """Unit directions ``(3, H, W)`` float64 of the texel centres."""
+    """Return unit directions ``(3, H, W)`` float64 of the texel centres."""
     theta = torch.linspace(0.0, math.pi, height, dtype=torch.float64)[:, None]
     phi = ((torch.arange(width, dtype=torch.float64) + 0.5) * (2.0 * math.pi / width))[None]
     sine = theta.sin()
-    sine[-1] = 0.0  # rather than sin(pi) in floating point
+    sine[-1] = 0.0  # sin(pi) is not quite 0 in floating point
     return torch.stack((sine * phi.sin(), theta.cos().expand(height, width), -sine * phi.cos()))
 
 
 def solid_angles(height: int, width: int) -> Tensor:
-    """``(H,)`` float64: the integral over the sphere of one texel's share of the bilinear map, the same along a row.
+    """Return the solid angle ``(H,)`` float64 of one texel of each row: the integral of its hat function over the sphere.
 
-    Of hats of half-width h about ``theta``: ``2 sin(theta) (1 - cos h) / h``, and ``1 - sin(h) / h`` for the half hats at the
-    poles. They sum to 4 pi exactly.
+    A hat of half-width h about ``theta`` has ``2 sin(theta) (1 - cos h) / h``, a half hat at a pole ``1 - sin(h) / h``, both
+    times the width of a column. All texels sum to 4 pi exactly.
     """
     h = math.pi / (height - 1)
     theta = torch.linspace(0.0, math.pi, height, dtype=torch.float64)
@@ -56,23 +60,23 @@ def solid_angles(height: int, width: int) -> Tensor:
 
 
 def angles(d: Tensor | Sequence[Tensor], least: float) -> tuple[Tensor, Tensor]:
-    """Return longitude in ``[0, 2 pi]`` and angle from +y, each ``(N,)``, of unit directions: three of ``(N,)``.
+    """Return longitude in ``[0, 2 pi]`` and angle from +y, each ``(N,)``, of unit directions ``(3, N)`` or three ``(N,)``.
 
-    Not by acos, which near the poles knows an angle only to a square root of the rounding. ``least`` above 0 is what the
-    square of the sine of the second counts at least: derivatives are finite at the poles too.
+    Not by acos, which near the poles is accurate only to the square root of rounding. ``least``: lower bound of the squared
+    sine of the angle from +y; above 0, derivatives are finite at the poles too.
     """
     across = torch.addcmul(d[0] * d[0], d[2], d[2]).clamp_min(least).sqrt()
     return azimuth(-d[2], d[0]), azimuth(d[1], across)
 
 
 def coordinates(d: Tensor) -> tuple[Tensor, Tensor]:
-    """``(u, v)``, each ``(N,)`` in ``[0, 1]``, of unit directions ``(3, N)``; finite derivatives at the poles too."""
+    """Return ``u, v``, each ``(N,)`` in ``[0, 1]``, of unit directions ``(3, N)``; derivatives are finite at the poles too."""
     around, down = angles(d, 1e-14)
     return around * (0.5 / math.pi), down * (1.0 / math.pi)
 
 
 class Cell(NamedTuple):
-    """Where points fall on maps, each ``(N,)``: the upper left one of four texels, and how far from it to the others."""
+    """Cells of a map in which points lie, each ``(N,)``: row and column of the upper left texel, and fractions ``x, y``."""
 
     row: Tensor
     column: Tensor
@@ -81,9 +85,9 @@ class Cell(NamedTuple):
 
     @staticmethod
     def of(x: Tensor, y: Tensor, height: int | Tensor, width: int | Tensor) -> Cell:
-        """Return the cells of points ``x, y (N,)`` in texels from the first one's centre; sizes may differ by lane.
+        """Return the cells of points ``x, y (N,)``, in texels from the centre of the first one; sizes may differ by lane.
 
-        The first column follows the last one. The last row has none below it: what lies there is at the lower end of a cell.
+        Columns wrap around. A point in the last row has ``y`` 1 in the cells above it.
         """
         column, row = x.detach().floor(), y.detach().floor().clamp_min(0.0)
         row = row.clamp_max(height - 2) if isinstance(height, int) else torch.minimum(row, (height - 2).to(row.dtype))
@@ -91,7 +95,7 @@ class Cell(NamedTuple):
         return Cell(row.to(torch.int64), torch.where(column < 0, width - 1, column), x, y)
 
     def texels(self, width: int | Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the indices ``(N,)`` of the four in rows one after another: two of the upper row, two of the lower one."""
+        """Return indices ``(N,)`` of the four texels in a flat map: two of the upper row, two of the lower one."""
         left, right = self.column, torch.where(self.column == width - 1, 0, self.column + 1)
         top = self.row * width
         return top + left, top + right, top + width + left, top + width + right
@@ -100,10 +104,10 @@ class Cell(NamedTuple):
 def corners(
     u: Tensor, v: Tensor, height: int | Tensor, width: int | Tensor
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """The four texels about points ``(N,)`` and their shares; sizes may differ from lane to lane.
+    """Return the four texels around points ``(N,)`` with bilinear weights; sizes may differ by lane.
 
     Returns:
-        Indices ``(N,)`` int64 into the rows one after another, and weights ``(N,)`` that sum to 1.
+        Four indices ``(N,)`` int64 into the flat map, and four weights ``(N,)`` that sum to 1.
     """
     at = Cell.of(u * width - 0.5, (v * (height - 1)).clamp_min(0.0), height, width)
     x, y = 1.0 - at.x, 1.0 - at.y
@@ -111,7 +115,7 @@ def corners(
 
 
 def look_up(map: Tensor, d: Tensor) -> Tensor:
-    """Radiance ``(..., 3)`` of a map ``(H, W, 3)`` in unit directions ``(..., 3)``, with gradients to both."""
+    """Return radiance ``(..., 3)`` of a map ``(H, W, 3)`` in unit directions ``(..., 3)``; differentiable in both."""
     height, width, _ = map.shape
     flat = map.reshape(-1, 3)
     index, weight = corners(*coordinates(d.reshape(-1, 3).T), height, width)

@@ -1,4 +1,4 @@
-"""Hammersley's points: a plane set of a known size whose points keep clear of one another."""
+"""Hammersley's points: a two-dimensional low-discrepancy set of fixed size."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ __all__ = ["hammersley", "van_der_corput"]
 
 
 def van_der_corput(index: Tensor) -> Tensor:
-    """Radical inverse in base 2 of ``index (N,)`` in ``[0, 2^32)``: its bits mirrored at the point; float64 in ``[0, 1)``."""
+    """Return the radical inverse in base 2 ``(N,)`` of ``index (N,)`` in ``[0, 2^32)``; float64 in ``[0, 1)``."""
     return reverse_bits(index.to(torch.int64)).double() * 2.0**-32
 
 
 def hammersley(n: int) -> Tensor:
-    """``(2, n)`` float64 in ``[0, 1)``: ``(i / n, van_der_corput(i))`` (Hammersley 1960)."""
+    """Return the points ``(i / n, van_der_corput(i))`` (Hammersley 1960): ``(2, n)`` float64 in ``[0, 1)``."""
     i = torch.arange(n)
     return torch.stack((i.double() / n, van_der_corput(i)))

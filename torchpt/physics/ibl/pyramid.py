@@ -1,7 +1,8 @@
-"""A map at every pair of resolutions, coarser by rows, by columns, or both; so that a sample can stand for its solid angle.
+"""Pyramids of environment maps, coarser by rows, by columns, or both, so that samples average over their solid angle.
 
-A texel of a coarse level is the mean of the fine map under the coarse texel's own hat, in solid angle: no level loses light,
-a constant stays the constant. Rows and columns are told apart because a texel of the poles is far narrower than high.
+A texel of a coarse level is the mean of the fine map, weighted by the coarse texel's hat function and solid angle: levels
+conserve energy, and constants stay constant. Rows and columns are separate because texels near the poles are far narrower
+than high.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ __all__ = ["Pyramid", "resampled"]
 
 @dataclass(frozen=True)
 class Pyramid:
-    """All levels in one table.
+    """All levels of a pyramid in one table.
 
     Attributes:
         texels: ``(T, 3)``.
-        heights: rows of the levels 0..A-1.
-        widths: columns of the levels 0..B-1.
-        first: ``(A, B)`` int64 on the host: where level ``(a, b)`` begins.
+        heights: numbers of rows of the levels 0..A-1.
+        widths: numbers of columns of the levels 0..B-1.
+        first: ``(A, B)`` int64 on the CPU: index of the first texel of level ``(a, b)``.
     """
 
     texels: Tensor
@@ -35,7 +36,7 @@ class Pyramid:
 
     @staticmethod
     def of(map: Tensor) -> Pyramid:
-        """From a map ``(H, W, 3)``; differentiable, linear."""
+        """Build the pyramid of a map ``(H, W, 3)``; differentiable, linear."""
         height, width, _ = map.shape
         heights = tuple(intervals + 1 for intervals in _halved(height - 1))
         widths = _halved(width)
@@ -51,7 +52,7 @@ class Pyramid:
 
 
 def resampled(map: Tensor, height: int, width: int) -> Tensor:
-    """A map ``(height, width, 3)`` of means of a finer one; differentiable, linear."""
+    """Downsample a map to ``(height, width, 3)`` by means; differentiable, linear."""
     return _means(_means(map, height, True).transpose(0, 1), width, False).transpose(0, 1)
 
 
@@ -63,7 +64,7 @@ def _halved(size: int) -> tuple[int, ...]:
 
 
 def _means(x: Tensor, size: int, latitude: bool) -> Tensor:
-    """A map ``(n, m, 3)`` with ``size`` rows instead of ``n``."""
+    """Downsample a map ``(n, m, 3)`` to ``size`` rows."""
     n, m, _ = x.shape
     if n == size:
         return x
@@ -80,9 +81,10 @@ def _means(x: Tensor, size: int, latitude: bool) -> Tensor:
 
 @lru_cache(maxsize=64)
 def _matrix(fine: int, coarse: int, latitude: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The matrix ``(coarse, fine)`` of means under the coarse hats: indices ``(2, K)`` sorted by rows, values ``(K,)``.
+    """Return the sparse matrix ``(coarse, fine)`` of means: indices ``(2, K)`` sorted by rows, and values ``(K,)``.
 
-    Integrals over products of two hats (and the sine of the latitude) between their kinks, by three Gauss-Legendre nodes.
+    Integrates products of two hat functions (and the sine of the polar angle) between their kinks by three-point
+    Gauss-Legendre quadrature.
     """
     if latitude:
         kinks = np.union1d(np.arange(fine) / (fine - 1), np.arange(coarse) / (coarse - 1))

@@ -1,7 +1,7 @@
-"""Shading by split sum: what a sky sends back off a surface, as two look-ups and a table, without shadows.
+"""Split-sum shading: radiance of surfaces under an environment map by three look-ups, without shadows.
 
-Karis, *Real Shading in Unreal Engine 4*, 2013. The sky's part of the reflection integral is taken apart: a mean of the sky
-(prefiltered about the mirror direction) by what the surface would reflect of a white sky.
+Karis, *Real Shading in Unreal Engine 4*, 2013. The reflection integral is approximated by a product: the map prefiltered about
+the mirror direction, times the reflectance of the surface under a white sky.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from torchpt.physics.ibl.table import brdf_table
 
 __all__ = ["F0", "IblMaps", "Sky", "SplitSumMaterial", "fresnel", "maps", "shade"]
 
-#: Reflectance at normal incidence of what is no metal.
+#: Reflectance at normal incidence of dielectrics.
 F0 = 0.04
 
 
 @dataclass(frozen=True)
 class IblMaps:
-    """What split-sum shading looks up.
+    """The maps of split-sum shading.
 
     Attributes:
-        irradiance: ``(H, W, 3)``, ``E(n) / pi``, by normals.
-        specular: ``(H_l, W_l, 3)`` each, by mirror directions; level l of L is for roughness ``l / (L - 1)``.
-        brdf: ``(R, R, 2)``, scale and bias, by roughness and ``n . v``.
+        irradiance: ``(H, W, 3)``, ``E(n) / pi`` by normal.
+        specular: ``(H_l, W_l, 3)`` each, radiance by mirror direction; level l of L is for roughness ``l / (L - 1)``.
+        brdf: ``(R, R, 2)``, scale and bias by roughness and ``n . v``.
     """
 
     irradiance: Tensor
@@ -47,14 +47,14 @@ def maps(
     method: str = "importance",
     sizes: Sequence[tuple[int, int]] | None = None,
 ) -> IblMaps:
-    """The maps of a sky ``(H, W, 3)``, differentiable in it; see :mod:`torchpt.physics.ibl.equirect` for where directions lie.
+    """Compute the maps of split-sum shading for an environment map; differentiable in it.
 
     Args:
-        map: radiance, at least 0 and finite.
-        levels: roughnesses of the specular chain.
-        samples: directions for each of its texels.
-        method: of :func:`torchpt.ibl.irradiance_map`.
-        sizes: of :func:`torchpt.ibl.prefiltered`.
+        map: radiance ``(H, W, 3)``, finite, at least 0, in the layout of :mod:`torchpt.physics.ibl.equirect`.
+        levels: number of roughnesses of the prefiltered map.
+        samples: number of directions for each of its texels.
+        method: see :func:`torchpt.ibl.irradiance_map`.
+        sizes: see :func:`torchpt.ibl.prefiltered`.
     """
     return IblMaps(
         irradiance_map(map, method=method),
@@ -72,22 +72,22 @@ def shade(
     metallic: Tensor | float = 0.0,
     f0: Tensor | float = F0,
 ) -> Tensor:
-    """Radiance toward the eye of surfaces under the sky, nothing in its way.
+    """Return the radiance of surfaces under an environment map, without shadows.
 
     ``kD = (1 - F_r)(1 - metallic)`` with ``F_r = F0 + (max(1 - roughness, F0) - F0)(1 - n . v)^5``; diffuse ``kD base_color
     E / pi``, specular ``prefiltered(r, roughness) (F0 scale + bias)``. Differentiable in all of its arguments.
 
     Args:
-        maps: of :func:`maps`.
+        maps: from :func:`maps`.
         n: unit normals ``(..., 3)``.
-        v: unit directions toward the eye ``(..., 3)``; what lies behind a surface counts as grazing.
+        v: unit directions toward the viewer ``(..., 3)``; below the surface they count as grazing.
         base_color: ``(..., 3)``.
         roughness: ``(...)``, from 0 (a mirror) to 1.
         metallic: ``(...)``, from 0 to 1.
         f0: reflectance at normal incidence where metallic is 0, ``(...)`` or ``(..., 3)``.
 
     Returns:
-        ``(..., 3)``.
+        Radiance ``(..., 3)``.
     """
     for key, value in (("n", n), ("v", v), ("base_color", base_color)):
         if not isinstance(value, Tensor) or value.dim() < 1 or value.shape[-1] != 3:
@@ -115,7 +115,7 @@ def shade(
 
 
 def fresnel(cosine: Tensor, f0: Tensor, surface: SplitSumMaterial) -> Tensor:
-    """Schlick's ``F0 + (max((1 - roughness) F90, F0) - F0)(1 - cosine)^5``: rough surfaces rise less toward grazing."""
+    """Return Schlick's reflectance with roughness: ``F0 + (max((1 - roughness) F90, F0) - F0)(1 - cosine)^5``."""
     grazing = 1.0 - cosine
     weight = (grazing * grazing) * (grazing * grazing) * grazing
     end = torch.maximum(*torch.broadcast_tensors((1.0 - surface.roughness) * surface.f90, f0))
@@ -124,13 +124,13 @@ def fresnel(cosine: Tensor, f0: Tensor, surface: SplitSumMaterial) -> Tensor:
 
 @dataclass(frozen=True)
 class Sky:
-    """The maps as lanes read them: all texels of one kind in one table.
+    """The maps of split-sum shading as flat tables, for look-ups on lanes.
 
     Attributes:
         irradiance: ``(3, H W)``.
-        size: H and W of it.
-        specular: ``(3, T)``, the levels one after another.
-        levels: ``(3, L)`` int64: first texel, rows, columns.
+        size: H and W of ``irradiance``.
+        specular: ``(3, T)``, all levels.
+        levels: ``(3, L)`` int64: first texel, number of rows, number of columns of each level.
         brdf: ``(2, R R)``.
         entries: R.
     """
@@ -144,7 +144,7 @@ class Sky:
 
     @staticmethod
     def of(maps: IblMaps) -> Sky:
-        """The tables of ``maps``."""
+        """Return the tables of ``maps``."""
         places, first = [], 0
         for level in maps.specular:
             places.append((first, *level.shape[:2]))
@@ -160,7 +160,7 @@ class Sky:
         )
 
     def reflected(self, n: Tensor, v: Tensor, surface: SplitSumMaterial) -> Tensor:
-        """Radiance ``(3, N)`` toward unit ``v (3, N)`` off surfaces with unit normals ``n (3, N)``."""
+        """Return radiance ``(3, N)`` toward unit ``v (3, N)`` from surfaces with unit normals ``n (3, N)``."""
         cosine = dot(n, v)
         mirrored = torch.addcmul(-v, n, 2.0 * cosine)
         cosine = cosine.clamp(0.0, 1.0)
@@ -173,7 +173,7 @@ class Sky:
         return torch.addcmul(base, self.prefiltered(mirrored, roughness), color)
 
     def diffuse(self, n: Tensor) -> Tensor:
-        """``E / pi (3, N)`` of normals ``(3, N)``."""
+        """Return ``E / pi`` ``(3, N)`` for normals ``(3, N)``."""
         height, width = self.size
         index, weight = corners(*coordinates(n), height, width)
         value = take(self.irradiance, index[0]) * weight[0]
@@ -182,7 +182,7 @@ class Sky:
         return value
 
     def prefiltered(self, d: Tensor, roughness: Tensor) -> Tensor:
-        """The sky ``(3, N)`` seen in mirrors of some roughness ``(N,)``, along unit ``d (3, N)``; linear between levels."""
+        """Return prefiltered radiance ``(3, N)`` along unit ``d (3, N)`` for ``roughness (N,)``; linear between levels."""
         last = self.levels.shape[1] - 1
         place = roughness * last
         low = place.detach().floor().clamp_max(last - 1)
@@ -200,7 +200,7 @@ class Sky:
         return value
 
     def reflectance(self, cosine: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
-        """Scale and bias ``(N,)`` of the table at cosines and roughnesses ``(N,)`` in ``[0, 1]``."""
+        """Return scale and bias ``(N,)`` of the BRDF table at cosines and roughnesses ``(N,)`` in ``[0, 1]``."""
         last = self.entries - 1
         x, y = cosine * last, roughness * last
         j, i = (a.detach().floor().clamp_max(last - 1) for a in (x, y))

@@ -1,4 +1,4 @@
-"""How much a rough mirror with Schlick's Fresnel term reflects of a white sky: ``F0 scale + bias``."""
+"""The BRDF table of split-sum shading: reflectance of a rough mirror with Schlick's Fresnel, ``F0 scale + bias``."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["brdf_table"]
 
 
 def brdf_table(size: int = 64, samples: int = 1024) -> Tensor:
-    """``(scale, bias)`` of ``integral f cos = F0 scale + bias``, with GGX and the separable masking of ``roughconductor``.
+    """Return ``(scale, bias)`` of ``integral f cos = F0 scale + bias``, with the GGX and masking of ``roughconductor``.
 
     Args:
-        size: entries along both axes.
-        samples: visible normals for each entry, at Hammersley's points.
+        size: number of entries along both axes.
+        samples: number of visible normals for each entry, at Hammersley's points.
 
     Returns:
         ``(size, size, 2)`` float64: entry ``[i, j]`` is for roughness ``i / (size - 1)`` and ``n . v = j / (size - 1)``.
@@ -41,7 +41,7 @@ def _table(size: int, samples: int) -> Tensor:
 
 
 def _row(wo: Tensor, u: Tensor, alpha: Tensor, samples: int) -> Tensor:
-    """``(size, 2)``: over visible normals ``f cos / pdf`` is the Fresnel term by the masking of ``wi``."""
+    """Return a row ``(size, 2)``; with visible normals ``f cos / pdf`` is the Fresnel term times the masking of ``wi``."""
     alphas = alpha.expand(wo.shape[1])
     m = microfacet.sample_normal(wo, alphas, alphas, u)
     cos = dot(wo, m).clamp(0.0, 1.0)

@@ -1,11 +1,11 @@
-"""Lights: emissive primitives, points, the environment; the table that chooses among them.
+"""Lights: emissive surfaces, delta lights, the environment, and how one of them is sampled.
 
     sample(lights, x, which, u) -> LightSample     a point on the lights seen from x
-    emitted(lights, prim, ...) -> radiance, pdf     what a ray that hit an emitter by chance brings
+    emitted(lights, x, ...) -> radiance, pdf        emission of a surface that a ray hit
 
-One kind a file: lights that are no surfaces in ``kinds/`` (:class:`Light`), surfaces that emit in ``surfaces/``
-(:class:`Surface`). ``table`` puts together what they say of their rows; which row is drawn is said in ``choice``: by power, or
-by the light ``tree``.
+One kind a file: lights without a surface in ``kinds/`` (:class:`Light`), emissive primitives in ``surfaces/``
+(:class:`Surface`). ``table`` samples the table of all lights; ``choice`` chooses its row: uniformly, by power, or by the light
+``tree``.
 """
 
 from __future__ import annotations

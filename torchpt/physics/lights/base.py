@@ -1,4 +1,4 @@
-"""What a light is: whatever emits, and the lights that are no surfaces."""
+"""Base classes of lights: all emitters, lights without a surface, environments."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ COLUMNS = ("p0", "e1", "e2", "normal", "flip", "area", "bound", "radiance")
 
 
 def taken(lights: Lights, row: Tensor | None) -> Lights:
-    """Lane values of the table at ``row``; with a single row (None) the table itself, which broadcasts."""
+    """Return the rows ``row (N,)`` of the table, one a lane; for None the table itself, whose single row broadcasts."""
     bent = lights.quadrics
     if bent is not None:
         assert lights.quadric is not None
@@ -54,7 +54,7 @@ def taken(lights: Lights, row: Tensor | None) -> Lights:
 
 @dataclass(frozen=True)
 class Cone:
-    """Where K lights shine to, about ``Lights.normal``, and how brightly; see :func:`torchpt.physics.lights.tree.build`."""
+    """Cones of emission of K lights about ``Lights.normal``, and intensities: see :func:`torchpt.physics.lights.tree.build`."""
 
     cos_o: Tensor | float  # (K,)
     cos_e: Tensor | float  # (K,)
@@ -62,13 +62,13 @@ class Cone:
 
 
 class Emitter:
-    """Whatever has rows in the table of lights.
+    """Anything with rows in the table of lights.
 
     Attributes:
-        name: of the kind.
-        distant: whether it is infinitely far.
-        environment: whether it surrounds the scene, of which there may be one.
-        code: of the shape that :mod:`torchpt.physics.lights.solid_angle` draws by its solid angle; else ``OTHER``.
+        name: name of the kind.
+        distant: whether the light is infinitely far away.
+        environment: whether the light is the environment. A scene has at most one.
+        code: shape code of :mod:`torchpt.physics.lights.solid_angle` if points are sampled by solid angle; else ``OTHER``.
     """
 
     name: ClassVar[str] = ""
@@ -78,27 +78,27 @@ class Emitter:
 
     @classmethod
     def bounds(cls, at: Lights, intensity: Tensor) -> Cone:
-        """Where rows of the kind shine to: no light leaves them outside. Of distant kinds nothing asks.
+        """Return cones that bound the emission of K rows of this kind. Not called for distant kinds.
 
         Args:
             at: K rows of the table, float64, detached.
-            intensity: power over pi ``(K,)``: what a flat face sends straight ahead.
+            intensity: power over pi ``(K,)``: the intensity of a flat emitter along its normal.
         """
-        # All directions; what is convex shows a quarter of its area on average.
+        # All directions; the mean projected area of a convex surface is a quarter of its area.
         return Cone(-1.0, 0.0, intensity * 0.25)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a light is told of its scene when its row is made.
+    """Parameters of a light and properties of its scene, from which :meth:`Light.row` makes a row.
 
     Attributes:
-        given: its own parameters by key, as the scene holds them.
-        values: of its parameters as it was loaded: flags, choices and whole numbers, which are no tensors.
-        place: from a point ``(3,)`` of the scene to the lanes' coordinates, float64.
-        unit: how long the lanes' unit is in the scene's.
-        reach: ``()`` float64 radius of the scene in the lanes' unit.
-        dtype: of the lanes.
+        given: returns a parameter of the light by its key, in the scene's coordinates.
+        values: parameters as loaded, for those that are no tensors: flags, choices, integers.
+        place: maps a point ``(3,)`` of the scene to world coordinates, float64.
+        unit: length of the world unit in scene units.
+        reach: ``()`` float64 radius of the scene in world units.
+        dtype: dtype of the world.
     """
 
     given: Callable[[str], Tensor]
@@ -109,18 +109,18 @@ class Setting:
     dtype: torch.dtype
 
     def __getitem__(self, key: str) -> Tensor:
-        """A parameter in float64."""
+        """Return a parameter in float64."""
         return self.given(key).double()
 
     def point(self, key: str) -> Tensor:
-        """A parameter that is a point, in the lanes' coordinates."""
+        """Return a parameter that is a point, in world coordinates."""
         return self.place(self[key])
 
     def intensity(self, key: str) -> Tensor:
-        """A parameter that is a power per solid angle, in the lanes' unit: what arrives at a distance is the same.
+        """Return a parameter that is a radiant intensity, in world units: its irradiance at a distance is unchanged.
 
         Raises:
-            Refused: more than float32 holds.
+            Refused: the value is beyond float32.
         """
         scaled = self[key] / self.unit**2
         if not bool(torch.isfinite(scaled.float()).all()):
@@ -132,16 +132,16 @@ class Setting:
 
 @dataclass(frozen=True)
 class Row:
-    """A light's columns of the table, float64; what is None is zero.
+    """The row of one light in the table, float64; None counts as zero.
 
     Attributes:
-        radiance: ``(3,)`` or whatever else its :meth:`Light.sample` reads there.
-        power: ``()`` that it sends out, in luminance, detached: lights are chosen by it.
-        p0: ``(3,)`` where it is, unless it is distant.
-        e1: ``(3,)`` free for the kind's own numbers.
-        e2: ``(3,)`` the same.
-        normal: unit ``(3,)``, the axis that :meth:`Emitter.bounds` is about.
-        environment: record of tensors that its :class:`Environment` methods are given.
+        radiance: ``(3,)`` radiance, or the quantity that :meth:`Light.sample` of the kind reads in this column.
+        power: ``()`` emitted power as luminance, detached. Lights are chosen by it.
+        p0: ``(3,)`` position, unless distant.
+        e1: ``(3,)`` free for numbers of the kind.
+        e2: ``(3,)`` free for numbers of the kind.
+        normal: unit ``(3,)``, the axis of the cone of :meth:`Emitter.bounds`.
+        environment: record of tensors, the first argument of the methods of :class:`Environment`.
     """
 
     radiance: Tensor
@@ -154,15 +154,15 @@ class Row:
 
 
 class Light(Emitter):
-    """A kind of light that is no surface.
+    """A kind of light without a surface.
 
-    Rays do not meet such lights, unless they are the :class:`Environment`; a light that no ray meets has an infinite
-    density, whatever it is drawn by, so that light sampling counts whole.
+    Rays hit none of them but the :class:`Environment`. The others return an infinite density, so that MIS gives light
+    sampling the whole weight.
 
     Attributes:
-        name: its ``type`` in a scene file.
-        parameters: what it declares.
-        places: names of those of them that are points which the lanes hold; so are their distances from the scene.
+        name: the ``type`` in a scene file.
+        parameters: specs of the parameters.
+        places: names of parameters that are points within the world; its unit covers their distances too.
     """
 
     parameters: ClassVar[Mapping[str, Spec]] = {}
@@ -170,62 +170,62 @@ class Light(Emitter):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """Refuse values that do not go together.
+        """Refuse values that contradict each other.
 
         Raises:
-            Refused: says which, and what is accepted.
+            Refused: with the parameter and the accepted values.
         """
 
     @classmethod
     def files(
         cls, values: Mapping[str, Any], find: Callable[[str], Path]
     ) -> dict[str, tuple[NDArray[np.float32], Spec]]:
-        """Arrays that its files hold, and their specs, by the names under which they become parameters.
+        """Return arrays read from files, with their specs, by the names of the parameters that they become.
 
         Args:
-            values: of its parameters.
-            find: the file that a parameter, by its key, names.
+            values: values of the parameters.
+            find: returns the path of the file that a parameter names, by its key.
 
         Raises:
-            Refused: numbers that the light cannot have.
-            AssetError: a file that is missing or malformed.
+            Refused: numbers that the light does not accept.
+            AssetError: a missing or malformed file.
         """
         return {}
 
     @classmethod
     def row(cls, scene: Setting) -> Row:
-        """Its row of the table; differentiable in the parameters.
+        """Return the row of the table; differentiable in the parameters.
 
         Raises:
-            Refused: numbers that the lanes cannot hold.
+            Refused: numbers beyond the world's dtype.
         """
         raise NotImplementedError
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
-        """A point on the light, or a direction toward it, for lanes that drew it.
+        """Sample a point on the light or a direction toward it.
 
         Args:
-            at: the lanes' rows of the table.
+            at: rows of the table, one a lane.
             x: reference points ``(3, N)``.
             u: ``(2, N)`` in [0, 1).
-            mis: whether BSDF sampling shares the work.
+            mis: whether the sample is combined with BSDF sampling by MIS.
 
         Returns:
-            ``wi``, ``target`` (``wi`` where it is distant), ``radiance``, ``pdf`` and ``weight``, without the choice of the
-            light. Of a light that no ray meets ``weight`` is what ``radiance`` is to be multiplied by.
+            ``wi``, ``target`` (``wi`` if distant), ``radiance``, ``pdf`` and ``weight``, without the probability of the light.
+            For a delta light ``weight`` is the factor of ``radiance``.
         """
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class EnvironmentImage:
-    """An environment as a picture of all directions, laid out as :mod:`torchpt.physics.lights.kinds.envmap` says.
+    """An environment as an image of all directions, in the layout of :mod:`torchpt.physics.lights.kinds.envmap`.
 
     Attributes:
         texels: ``(H, W, 3)`` radiance.
-        turn: ``(3, 3)`` from the world to the picture's own space; None where they are the same.
-        even: whether all texels are one.
+        turn: ``(3, 3)`` from the world to the image's own space; None for the identity.
+        even: whether all texels are equal.
     """
 
     texels: Tensor
@@ -234,37 +234,37 @@ class EnvironmentImage:
 
 
 class Environment(Light):
-    """A light that surrounds the scene. Its functions are given what its :attr:`Row.environment` was."""
+    """A light that surrounds the scene. Its methods take the :attr:`Row.environment` that its :meth:`row` returned."""
 
     distant = True
     environment = True
 
     @classmethod
     def radiance_pdf(cls, around: Any, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
-        """Radiance ``(3, N)`` from unit directions ``d (3, N)``, and the density ``(N,)`` with which they are drawn."""
+        """Return radiance ``(3, N)`` from unit directions ``d (3, N)``, and their density ``(N,)`` under :meth:`sample`."""
         raise NotImplementedError
 
     @classmethod
     def environment_image(cls, around: Any) -> EnvironmentImage:
-        """The same as a picture; differentiable."""
+        """Return the environment as an image; differentiable."""
         raise NotImplementedError
 
     @classmethod
     def info(cls, around: Any) -> dict[str, Any]:
-        """What ``torchpt info`` tells of it."""
+        """Return entries for ``torchpt info``."""
         return {}
 
 
 def bright(color: Tensor) -> Tensor:
-    """Luminance of colours ``(3, ...)`` of either sign, float64, detached: what powers are made of."""
+    """Return the luminance of the magnitude of colours ``(3, ...)``, float64, detached."""
     return luminance(color.detach().double().abs())
 
 
-#: The kinds of lights that are no surfaces.
+#: The kinds of lights without a surface.
 KINDS: Kinds[Light] = Kinds("torchpt.physics.lights.kinds", ("point", "spot", "directional", "constant", "envmap"))
 
 
 def sort_key(name: str) -> tuple[bool, bool, str]:
-    """By which the rows of lights are sorted: those somewhere, those infinitely far, the environment last."""
+    """Return the sort key of rows of lights: local lights first, then distant ones, the environment last."""
     kind = KINDS[name]
     return kind.environment, kind.distant, name

@@ -1,4 +1,4 @@
-"""Which of many lights is sampled: by power, by a light tree, or one; the bounds of lights that the tree is built of."""
+"""Light samplers: the choice of a light uniformly, by power, or by the light tree, and the bounds for the tree."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ __all__ = [
 ]
 
 
-# ---- Where lights lie and where they shine: what the light tree asks of the table's rows
+# ---- Bounds of lights for the light tree
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Of K lights, see :func:`torchpt.physics.lights.tree.build`; float64, detached."""
+    """Bounds of K lights, arguments of :func:`torchpt.physics.lights.tree.build`; float64, detached."""
 
     low: Tensor  # (3, K)
     high: Tensor  # (3, K)
@@ -48,12 +48,12 @@ class Bounds:
 
 
 def bounds_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor]) -> Bounds:
-    """The bounds of all rows that lie somewhere, which come before those infinitely far.
+    """Return the bounds of all local lights, which are the first rows.
 
     Args:
         lights: the table.
-        power: of all rows ``(K,)``.
-        boxes: lower and upper corners ``(3, E)`` of boxes about the E primitives that emit, which come first.
+        power: power of all rows ``(K,)``.
+        boxes: lower and upper corners ``(3, E)`` of the boxes of the E emissive primitives, which are the first rows.
     """
     near = [kind for kind in map(emitter, lights.kinds) if not kind.distant]
     number = torch.zeros_like(lights.area, dtype=torch.int64) if lights.kind is None else lights.kind
@@ -72,42 +72,40 @@ def bounds_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor]) -> Bo
     return Bounds(low, high, columns["normal"], cos_o, cos_e, intensity)
 
 
-# ---- Which light: by power where there are few, by the light tree where there are many
+# ---- Choice of a light
 #
-# Made with the table (:func:`light_sampler`); :func:`draw` gives rows and their probabilities, and :func:`probability` tells the
-# same to rays that meet a light by chance.
+# :func:`draw` returns rows and their probabilities, :func:`probability` the probability of a row whose light a ray hit.
 
 
-#: Ways to choose: all lights alike, by power, by the tree, or by power below MANY lights that lie somewhere, by the tree from
-#: there on.
+#: Values of `light_choice`; auto is `power` below MANY local lights, else `tree`.
 LIGHT_SAMPLERS = ("auto", "uniform", "power", "tree")
 MANY = 3
-#: Share of the draws near by that is even among the lights, at most; among K of them EACH / K, and none beyond FEW. The tree
-#: knows of no lobe, and of a glossy surface may draw the wrong light nearly always. At 64 samples a pixel it halves the error
-#: of four plates under five lights; among many it would help none of them, and cost where one outshines the others.
+#: Probability of a uniform choice instead of the tree: at most EVEN, EACH / K among K lights, 0 beyond FEW lights. The tree
+#: ignores the BSDF and may nearly always choose the wrong light for a glossy surface. At 64 samples a pixel the uniform share
+#: halves the error of four plates under five lights; among many lights it would not help, and cost where one outshines all.
 EVEN, EACH, FEW = 0.25, 2.0, 64
 
 
 @dataclass(frozen=True)
 class TreeSampler:
-    """A tree over the rows that lie somewhere; beside it those infinitely far, by power."""
+    """Light sampler of a light tree over local lights, and a choice by power between it and each distant light."""
 
     tree: LightTree
-    beside: Distribution1D | None  # over the tree and the rows after its own; None where there are none
-    even: Distribution1D | None  # over the rows of the tree; None where all draws are the tree's own
-    share: Tensor  # () float64, of the draws of a row of the tree that are taken from `even`
+    beside: Distribution1D | None  # over the tree (0) and the distant rows; None without distant lights
+    even: Distribution1D | None  # uniform over the rows of the tree; None if it is never used
+    share: Tensor  # () float64 probability of `even` among choices of local lights
 
 
 def light_sampler(
     lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: str
 ) -> Distribution1D | TreeSampler | None:
-    """How to choose among the rows of a table.
+    """Return the light sampler of a table, None for a single light.
 
     Args:
-        lights: the table; its own choice is not read.
-        power: of its rows ``(K,)``, float64.
-        boxes: lower and upper corners ``(3, E)`` of boxes about the E primitives that emit, which come first.
-        way: from :data:`LIGHT_SAMPLERS`.
+        lights: the table; its field ``choice`` is not read.
+        power: power of the rows ``(K,)``, float64.
+        boxes: lower and upper corners ``(3, E)`` of the boxes of the E emissive primitives, which are the first rows.
+        way: one of :data:`LIGHT_SAMPLERS`.
     """
     dtype = lights.area.dtype
     if len(power) == 1:
@@ -129,20 +127,20 @@ def light_sampler(
 
 
 def depends_on_point(lights: Lights | None) -> bool:
-    """Whether the choice asks where it is made, so that paths must keep that."""
+    """Return True if the choice depends on the reference point, which paths then have to keep for MIS."""
     return lights is not None and isinstance(lights.choice, TreeSampler)
 
 
 def draw(choice: Distribution1D | TreeSampler, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows ``(N,)``, their probabilities ``(N,)``, and what the choice leaves of ``u``: ``(N,)`` float64 in [0, 1].
+    """Choose lights; return rows ``(N,)``, probabilities ``(N,)``, and remapped numbers ``(N,)`` float64 in [0, 1].
 
-    The rest is uniform whatever was chosen. Who goes on with it keeps the stratification of light and place together.
+    The remapped ``u`` is uniform given the choice. Reusing it keeps light and point stratified together.
 
     Args:
-        choice: the choice.
+        choice: the light sampler.
         u: ``(N,)`` float64 in [0, 1) of 48 bits, see :func:`torchpt.physics.lights.tree.from_digits`.
         x: reference points ``(3, N)``.
-        n: normals ``(3, N)`` as :func:`torchpt.physics.lights.tree.sample` takes them, or None.
+        n: normals ``(3, N)``, or None, as for :func:`torchpt.physics.lights.tree.sample`.
     """
     if isinstance(choice, Distribution1D):
         row, rest = choice.draw(u)
@@ -159,7 +157,7 @@ def draw(choice: Distribution1D | TreeSampler, u: Tensor, x: Tensor, n: Tensor |
 
 
 def _near(choice: TreeSampler, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """:func:`draw` among the rows of the tree."""
+    """Choose among local lights; see :func:`draw`."""
     if choice.even is None:
         return tree.sample(choice.tree, x, n, u)
     share = choice.share
@@ -171,7 +169,7 @@ def _near(choice: TreeSampler, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[
 
 
 def _chance(choice: TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
-    """:func:`probability` among the rows of the tree."""
+    """Return the probability among local lights; see :func:`probability`."""
     p = tree.probability(choice.tree, row, x, n)
     if choice.even is None:
         return p
@@ -180,7 +178,7 @@ def _chance(choice: TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Te
 
 
 def probability(choice: Distribution1D | TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
-    """``(N,)`` with which :func:`draw` gives ``row (N,)`` at ``x, n``."""
+    """Return the probability ``(N,)`` with which :func:`draw` chooses ``row (N,)`` at ``x`` and ``n``."""
     if isinstance(choice, Distribution1D):
         return take(choice.pmf, row)
     if choice.beside is None:
@@ -191,7 +189,7 @@ def probability(choice: Distribution1D | TreeSampler, row: Tensor, x: Tensor, n:
 
 
 def environment(choice: Distribution1D | TreeSampler | None) -> Tensor | float:
-    """The probability of the last row, which is the environment's where there is one."""
+    """Return the probability of the last row, the environment's if the scene has one."""
     if choice is None:
         return 1.0
     chosen = choice if isinstance(choice, Distribution1D) else choice.beside
@@ -200,10 +198,10 @@ def environment(choice: Distribution1D | TreeSampler | None) -> Tensor | float:
 
 
 def without_last(choice: Distribution1D | TreeSampler) -> Distribution1D | TreeSampler:
-    """The choice among all rows but the last, which is infinitely far and not the only one left."""
+    """Return the light sampler without the last row, a distant light; at least one row has to be left."""
     if isinstance(choice, TreeSampler):
         beside = choice.beside
-        assert beside is not None  # what is infinitely far is not of the tree
+        assert beside is not None  # distant lights are not in the tree
         return replace(choice, beside=None if len(beside.pmf) == 2 else _fewer(beside))
     return _fewer(choice)
 

@@ -1,4 +1,4 @@
-"""The records of lights: the table of them, and a point sampled on one."""
+"""Records of lights: the light table and light samples."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ __all__ = ["LightSample", "Lights"]
 
 @dataclass(frozen=True)
 class Lights:
-    """The emitters: a row for each emissive primitive, then one for each other light, sorted as ``lights.sort_key`` says.
+    """The light table: a row for each emissive primitive, then one for each other light, sorted by ``lights.sort_key``.
 
-    Columns are a primitive's own; what the others put there is said in their files in :mod:`torchpt.physics.lights.kinds`.
+    Columns are those of primitives; the files of :mod:`torchpt.physics.lights.kinds` say what other lights keep in them.
     """
 
-    choice: Distribution1D | TreeSampler | None  # over the rows; None where there is but one
-    kinds: tuple[str, ...]  # kinds among the rows, in their order: of KINDS, then lights
-    kind: Tensor | None  # (K,) index into `kinds`; None where there is but one
+    choice: Distribution1D | TreeSampler | None  # the light sampler; None for a single row
+    kinds: tuple[str, ...]  # kinds of the rows, in their order: of SURFACES, then of KINDS
+    kind: Tensor | None  # (K,) index into `kinds`; None for a single kind
     p0: Tensor  # (3, K)
     e1: Tensor  # (3, K)
     e2: Tensor  # (3, K)
     normal: Tensor  # (3, K) unit, the side that emits
     flip: Tensor  # (K,) -1 where a sphere emits inward
-    area: Tensor  # (K,); of a quadric its own space's area times |det|, see torchpt.physics.lights.surfaces.quadric
-    bound: Tensor  # (K,) see LaneGeometry.bound
-    radiance: Tensor  # (3, K); of a point or spot its intensity, of a directional light its irradiance
-    opacity: Tensor | None  # (K,) of the surface that emits; None where all are opaque
-    environment: Any  # what comes from outside, as the class of the last row made it; None where nothing does
-    row_of_prim: Tensor | None  # (P + I,) int64, -1 where a primitive does not emit; None where none does
-    quadric: (
-        Tensor | None
-    )  # (K,) int64 column of LaneGeometry.quadrics, 0 for the other kinds; None where no quadric emits
-    quadrics: Quadrics | None  # LaneGeometry.quadrics where a quadric emits
-    prim: Tensor | None  # (K,) int64 the primitive; None where no texture says how much it emits
+    area: (
+        Tensor  # (K,); for a quadric the area in object space times |det|, see torchpt.physics.lights.surfaces.quadric
+    )
+    bound: Tensor  # (K,) rounding bound, see LaneGeometry.bound
+    radiance: Tensor  # (3, K); intensity of a point or spot light, irradiance of a directional light
+    opacity: Tensor | None  # (K,) opacity of the emissive surface; None if all are opaque
+    environment: Any  # Row.environment of the last row; None without an environment
+    row_of_prim: Tensor | None  # (P + I,) int64, -1 for a primitive that does not emit; None if none emits
+    quadric: Tensor | None  # (K,) int64 column of LaneGeometry.quadrics, 0 for other kinds; None if no quadric emits
+    quadrics: Quadrics | None  # LaneGeometry.quadrics if a quadric emits
+    prim: Tensor | None  # (K,) int64 primitive; None without textured emission
     solid: (
         Tensor | None
     )  # (K, 14) float64, see torchpt.physics.lights.solid_angle.table_of; None without triangles and rectangles
@@ -49,14 +49,14 @@ class Lights:
 
 @dataclass(frozen=True)
 class LightSample:
-    """A point drawn on the lights, seen from a reference point."""
+    """A light sample: a point on a light, seen from a reference point."""
 
     wi: Tensor  # (3, N) unit, toward the light
     target: Tensor  # (3, N) end of the shadow ray, moved off the light's surface; a direction where `distant`
-    distant: Tensor | None  # (N,) bool: lights infinitely far; None where there are none
-    radiance: Tensor  # (3, N), zero where the draw failed; of a delta light what `weight` is to be multiplied by
-    pdf: Tensor  # (N,) in solid angle, with the choice of the light, detached; inf where it is a delta
+    distant: Tensor | None  # (N,) bool; None without distant lights
+    radiance: Tensor  # (3, N), zero where sampling failed; for a delta light the intensity or irradiance
+    pdf: Tensor  # (N,) per steradian, times the probability of the light, detached; inf for a delta light
     weight: Tensor  # (N,) = 1 / pdf, differentiable in the geometry
-    at: Interaction | None = None  # the point itself, without tangents; None where no texture asks for it
-    bare: Tensor | None = None  # (N,) bool: where `at` has no meaning, as the light is no surface; None: nowhere
-    row: Tensor | None = None  # (N,) int64 of the light in the table; None: there is but one
+    at: Interaction | None = None  # the point, without tangents; None without textured emission
+    bare: Tensor | None = None  # (N,) bool: the light has no surface, so `at` is meaningless; None: nowhere
+    row: Tensor | None = None  # (N,) int64 row in the light table; None for a single row

@@ -1,17 +1,17 @@
-"""Planar lights sampled uniformly by the solid angle that they fill, seen from each reference point.
+"""Sample triangles and parallelograms uniformly by solid angle, as seen from each reference point.
 
-Triangles: Arvo, *Stratified Sampling of Spherical Triangles*, 1995. His map is made of vectors here instead of angles: a
+Triangles: Arvo, *Stratified Sampling of Spherical Triangles*, 1995. The map is written with vectors instead of angles: a
 subtriangle of the share ``u`` of the area ends where the reflection of a corner falls (van Oosterom and Strackee's
 ``tan(E / 2)``, *The Solid Angle of a Plane Triangle*, 1983, solved for the corner), so that nothing cancels in slivers, and
 the point comes out as its own barycentric coordinates, inside the triangle whatever the rounding.
 Rectangles: Urena, Fajardo, King, *An Area-Preserving Parametrization for Spherical Rectangles*, 2013. A parallelogram that
 is no rectangle is two triangles, which share a corner and hence one continuous map.
 
-Where the angle is below :data:`LEAST` a light is sampled by area, which is then as good; above :data:`MOST` the point lies
-in the light up to rounding. The switch is part of :func:`angles`, and so the same for :func:`sample` and for the density of
-a direction that was found otherwise. Everything is float64 inside: the angle of a light near or edge-on cancels.
+Below the solid angle :data:`LEAST` a light is sampled by area, which is then as good; above :data:`MOST` the reference point
+lies in the light up to rounding. :func:`angles` makes the switch, so :func:`sample` and the pdf of a direction from BSDF
+sampling agree on it. Computed in float64, since the solid angle of a near or edge-on light cancels.
 
-Nothing of it is differentiable, and engines may take it over.
+Nothing here is differentiable. Engines may replace :func:`sample` and :func:`angles` by kernels.
 """
 
 from __future__ import annotations
@@ -42,32 +42,32 @@ __all__ = [
     "table_of",
 ]
 
-#: Codes of shapes: a triangle, a rectangle, a parallelogram that is no rectangle, anything else.
+#: Shape codes: triangle, rectangle, parallelogram that is no rectangle, anything else.
 TRIANGLE, RECTANGLE, SKEW, OTHER = 0, 1, 2, 3
-#: Solid angles, in steradians, beyond which lights are sampled by area.
+#: Range of solid angles, in steradians, outside of which lights are sampled by area.
 LEAST, MOST = 3e-4, 2.0 * math.pi - 1e-5
 #: One plus the cosine between two corners of a triangle below which float64 loses the angle: seen from a millionth of an
 #: edge's length away, its ends lie in opposite directions. Then the triangle is sampled by area.
 OPPOSITE = 1e-12
-#: Farther than this from its centre, in units of the radius about it, a light is sampled by area.
+#: Distance from the centre of a light, over its radius, beyond which it is sampled by area.
 NEAR = 2.0
 #: Cosine of the edges below which a parallelogram is a rectangle: rounding of its corners in float32.
 SQUARE = 1e-6
 
 
 def table_of(codes: Sequence[int], p0: Tensor, e1: Tensor, e2: Tensor, near: float = NEAR) -> Tensor | None:
-    """Return what :func:`sample` reads of lights.
+    """Return the table of lights for :func:`sample` and :func:`angles`.
 
     Args:
-        codes: of the rows' shapes: :data:`TRIANGLE`, :data:`RECTANGLE` (which may be sheared) or :data:`OTHER`.
+        codes: shape codes of the rows: :data:`TRIANGLE`, :data:`RECTANGLE` (which may be sheared) or :data:`OTHER`.
         p0: ``(3, K)``.
         e1: ``(3, K)``.
         e2: ``(3, K)``.
-        near: in place of :data:`NEAR`.
+        near: replaces :data:`NEAR`.
 
     Returns:
-        ``(K, 14)`` float64: the shape's code, the squared distance from which on it is sampled by area, the centre which
-        that is from, ``p0``, ``e1``, ``e2``. None where none of them is sampled by its solid angle.
+        ``(K, 14)`` float64: shape code, squared distance from the centre beyond which it is sampled by area, centre, ``p0``,
+        ``e1``, ``e2``. None if all codes are :data:`OTHER`.
     """
     if set(codes) <= {OTHER}:
         return None
@@ -84,7 +84,7 @@ def table_of(codes: Sequence[int], p0: Tensor, e1: Tensor, e2: Tensor, near: flo
 
 
 def shapes_of(table: Tensor | None) -> tuple[int, ...]:
-    """Codes of the shapes in a table that are sampled here."""
+    """Return the codes other than :data:`OTHER` that occur in a table."""
     if table is None:
         return ()
     return tuple(code for code in (TRIANGLE, RECTANGLE, SKEW) if bool((table[:, 0] == code).any()))
@@ -95,18 +95,18 @@ def shapes_of(table: Tensor | None) -> tuple[int, ...]:
 def sample(
     table: Tensor, row: Tensor | None, x: Tensor, u: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)
 ) -> tuple[Tensor, Tensor]:
-    """Points on lights, seen from ``x``; nothing of it is differentiable.
+    """Sample points on lights as seen from ``x``; not differentiable.
 
     Args:
         table: from :func:`table_of`.
-        row: of each lane ``(N,)`` int64; None where the table has one row.
+        row: row of each lane ``(N,)`` int64; None for a table of one row.
         x: reference points ``(3, N)``.
         u: ``(2, N)`` in [0, 1).
-        shapes: codes of those in the table; the others cost nothing.
+        shapes: codes in the table, from :func:`shapes_of`. Other shapes are not computed.
 
     Returns:
-        The primitive's own ``(u, v)`` of the points ``(2, N)``, and as :func:`angles` the solid angles ``(N,)``: where they
-        are 0 the point was drawn by area. Rows of other shapes keep ``u``.
+        ``(u, v)`` of the points on their primitives ``(2, N)``, ``u`` itself for other shapes, and solid angles ``(N,)`` as
+        from :func:`angles`: 0 where the point was sampled by area.
     """
     shape, near, a, e, f = _seen(table, row, x)
     w = u.double()
@@ -119,9 +119,9 @@ def sample(
 @dispatched
 @torch.no_grad()
 def angles(table: Tensor, row: Tensor | None, x: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)) -> Tensor:
-    """Solid angles ``(N,)`` by which :func:`sample` draws from these lights at ``x``, 0 where it draws by area.
+    """Return solid angles ``(N,)`` of lights as seen from ``x``, 0 where :func:`sample` samples by area.
 
-    From behind a light fills the same angle; it is the caller who knows which side emits.
+    The angle is the same from behind: the caller has to check which side emits.
     """
     shape, near, a, e, f = _seen(table, row, x)
     angle = _of_shapes(shapes, shape, a, e, f, torch.zeros_like(a[:2]))[1]
@@ -129,12 +129,12 @@ def angles(table: Tensor, row: Tensor | None, x: Tensor, shapes: Sequence[int] =
 
 
 def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
-    """``1 / pdf`` in solid angle ``(N,)`` of points drawn by :func:`sample`, 0 behind the emitter.
+    """Return ``1 / pdf`` in steradians ``(N,)`` of points from :func:`sample`, 0 behind the emitter.
 
     Args:
         angle: from :func:`sample` or :func:`angles`.
-        by_area: ``area cos / r^2``, 0 behind the emitter. Its derivative is that of the result: the point on the light is
-            held, and the integrand over its area is what moves.
+        by_area: ``area cos / r^2``, 0 behind the emitter. Its relative derivative becomes that of the result, as the point
+            stays fixed on the light and the integrand over the area is differentiated.
     """
     if not by_area.requires_grad:
         return torch.where(angle > 0, angle * torch.sign(by_area), by_area)
@@ -145,7 +145,7 @@ def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
 
 
 def _seen(table: Tensor, row: Tensor | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Shape, whether it is near, first corner as seen from ``x``, and edges of each lane, in float64."""
+    """Return for each lane, in float64: shape code, mask of near lights, first corner relative to ``x``, both edges."""
     lanes = (table if row is None else table[row]).T.expand(14, x.shape[1])
     away = lanes[2:5] - x.double()
     near = (lanes[0] != OTHER) & (dot(away, away) < lanes[1])
@@ -155,7 +155,7 @@ def _seen(table: Tensor, row: Tensor | None, x: Tensor) -> tuple[Tensor, Tensor,
 def _of_shapes(
     shapes: Sequence[int], shape: Tensor, a: Tensor, e: Tensor, f: Tensor, u: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Points and solid angles, each lane by the form of its shape."""
+    """Return points ``(2, N)`` and solid angles ``(N,)``, each lane by the formulas of its shape."""
     forms = {TRIANGLE: _triangle, RECTANGLE: _rectangle, SKEW: _skew}
     if not shapes:
         return torch.zeros_like(a[:2]), torch.zeros_like(a[0])
@@ -175,13 +175,13 @@ def _within(angle: Tensor) -> Tensor:
 
 
 def _unit(a: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vectors and one over the length."""
+    """Return unit vectors and one over the lengths."""
     inverse = _reciprocal(dot(a, a).sqrt())
     return a * inverse, inverse
 
 
 def _excess(volume: Tensor, ab: Tensor, bc: Tensor, ca: Tensor) -> Tensor:
-    """Half the solid angle of three unit vectors; NaN where rounding is all there is of it."""
+    """Return half the solid angle of three unit vectors; NaN where it is lost to rounding."""
     half = azimuth(1.0 + ab + bc + ca, volume)
     told = 1.0 + torch.minimum(torch.minimum(ab, bc), ca) >= OPPOSITE
     return torch.where(told, torch.where(half <= math.pi, half, 0.0), math.nan)
@@ -190,7 +190,7 @@ def _excess(volume: Tensor, ab: Tensor, bc: Tensor, ca: Tensor) -> Tensor:
 def _arc(
     half: Tensor, volume: Tensor, ab: Tensor, bc: Tensor, ca: Tensor, u: Tensor, v: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights of the unit vectors A, B, C in a direction of their triangle."""
+    """Return a sampled direction of the spherical triangle A, B, C as weights of these unit vectors."""
     c, s = torch.cos(half * u), torch.sin(half * u)
     # C' on the arc from A to C cuts off the share u: along x A + y C, reflected.
     x, y = volume * c - (bc + ca) * s, (1.0 + ab) * s
@@ -204,7 +204,7 @@ def _arc(
 
 
 def _share(weights: tuple[Tensor, Tensor, Tensor], ia: Tensor, ib: Tensor, ic: Tensor) -> tuple[Tensor, Tensor]:
-    """Barycentric shares of A and C in the plane, from weights of unit vectors and one over their lengths."""
+    """Return the barycentric coordinates of A and C in the plane, from weights of unit vectors and inverse lengths."""
     a, b, c = (w.clamp_min(0.0) * i for w, i in zip(weights, (ia, ib, ic), strict=True))
     scale = _reciprocal(a + b + c)
     return a * scale, c * scale
@@ -235,7 +235,7 @@ def _skew(hub: Tensor, e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, Tensor]
     inner = (pick(at, at - one) * _reciprocal(half)).clamp_max(1.0)
     weights = _arc(half, pick(first, second), pick(oa, ob), pick(ob, oc), pick(ab, bc), inner, u[1])
     p, q = _share(weights, pick(ia, ib), io, pick(ib, ic))
-    # Of the first half A and C are the ends of e and of e + f, of the second those of e + f and of f.
+    # A and C end at e and e + f in the first triangle, at e + f and f in the second.
     return torch.stack((pick(p + q, p), pick(q, p + q))), _within(2.0 * (one + two))
 
 
@@ -244,14 +244,14 @@ def _rectangle(a: Tensor, e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, Tens
     ie, jf = _reciprocal(wide), _reciprocal(high)
     x0, y0, z = dot(a, e) * ie, dot(a, f) * jf, dot(a, cross(e, f)).abs() * ie * jf
     x1, y1 = x0 + wide, y0 + high
-    # The unit of length: eight of them are multiplied below.
+    # Normalize lengths, as eight of them are multiplied below.
     extent = torch.maximum(torch.maximum(x0.abs(), x1.abs()), torch.maximum(y0.abs(), y1.abs()))
     unit = _reciprocal(torch.maximum(extent, z))
     x0, x1, y0, y1, z = (w * unit for w in (x0, x1, y0, y1, z))
     zz = z * z
 
     def corner(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """A complex number that turns by the angle of the quadrant up to ``(x, y)``: tan F = x y / (z r)."""
+        """Return a complex number whose argument is the solid angle of the quadrant to ``(x, y)``: tan F = x y / (z r)."""
         return z * (x * x + y * y + zz).sqrt(), x * y
 
     def less(p: tuple[Tensor, Tensor], q: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
@@ -261,7 +261,7 @@ def _rectangle(a: Tensor, e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, Tens
     angle = azimuth(*less(end, begin))
     h = ((y0 * y0 + zz) * (y1 * y1 + zz)).sqrt()
     scale = _reciprocal((x0 * x0 + zz) * h)
-    # The share left of x is T = F(x, y1) - F(x, y0) = T0 + u S.
+    # The solid angle left of x is T = F(x, y1) - F(x, y0) = T0 + u S.
     c, s = torch.cos(angle * u[0]), torch.sin(angle * u[0])
     cos_t, sin_t = (c * begin[0] - s * begin[1]) * scale, (s * begin[0] + c * begin[1]) * scale
     p = h * cos_t - y0 * y1

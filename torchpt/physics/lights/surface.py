@@ -1,4 +1,4 @@
-"""What a surface that emits is: one kind for each kind of primitive. They shine from the side of their normal."""
+"""The base class of emissive surfaces, one kind for each kind of primitive. They emit on the side of the normal."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ __all__ = ["SURFACES", "Faces", "Surface", "SurfaceSample", "emitter", "flat_inv
 
 @dataclass(frozen=True)
 class SurfaceSample:
-    """Points drawn on surfaces."""
+    """Points sampled on emissive surfaces."""
 
     p: Tensor  # (3, N)
-    normal: Tensor  # (3, N) unit, of the side that emits
-    uv: Tensor | None = None  # (2, N) in the primitive's own parametrization; None where that has none
-    own: Tensor | None = None  # (3, N) in a quadric's own space
+    normal: Tensor  # (3, N) unit, on the side that emits
+    uv: Tensor | None = None  # (2, N) the primitive's u, v; None for primitives without
+    own: Tensor | None = None  # (3, N) in the quadric's object space
 
 
 @dataclass(frozen=True)
 class Faces:
-    """E primitives of one kind that emit."""
+    """E emissive primitives of one kind."""
 
     e1: Tensor  # (3, E)
     face: Tensor  # (3, E) cross product of the edges
     column: Tensor  # (E,) int64 among the scene's primitives of the kind
-    quadrics: Quadrics | None  # of the scene
-    frame: Tensor | None  # (12, Q) float64: p0 e1 e2 e3 of them
+    quadrics: Quadrics | None  # all quadrics of the scene
+    frame: Tensor | None  # (12, Q) float64: p0 e1 e2 e3 of all quadrics
 
 
 def flat_point(p0: Tensor, e1: Tensor, e2: Tensor, uv: Tensor) -> Tensor:
@@ -45,10 +45,10 @@ def flat_point(p0: Tensor, e1: Tensor, e2: Tensor, uv: Tensor) -> Tensor:
 
 
 def flat_inverse_pdf(normal: Tensor, area: Tensor, wi: Tensor, square: Tensor) -> Tensor:
-    """Return ``1 / pdf`` in solid angle of a point drawn by area, ``area cos / r^2``; 0 behind the emitter.
+    """Return ``1 / pdf`` in steradians of a point sampled by area, ``area cos / r^2``; 0 behind the emitter.
 
     Args:
-        normal: of the emitting side ``(3, N)``.
+        normal: unit normal on the emitting side ``(3, N)``.
         area: ``(N,)``.
         wi: unit direction toward the light ``(3, N)``.
         square: squared distance ``(N,)``.
@@ -58,13 +58,13 @@ def flat_inverse_pdf(normal: Tensor, area: Tensor, wi: Tensor, square: Tensor) -
 
 
 class Surface(Emitter):
-    """A kind of primitive as a light; as it stands a flat one. What a method gives as None is what flat ones share.
+    """A kind of emissive primitive. This class implements flat ones; a method returns None where a kind is like these.
 
     Attributes:
-        name: from :data:`torchpt.physics.shapes.geometry.KINDS`.
-        convex: whether it shines to all sides.
+        name: kind of primitive, from :data:`torchpt.physics.shapes.geometry.KINDS`.
+        convex: whether it emits to all sides.
         share: area over the length of the cross product of the edges.
-        needs_quadrics: whether lanes need columns of :class:`~torchpt.physics.shapes.geometry.Quadrics`.
+        needs_quadrics: whether sampling reads :class:`~torchpt.physics.shapes.geometry.Quadrics`.
     """
 
     convex: ClassVar[bool] = False
@@ -73,7 +73,7 @@ class Surface(Emitter):
 
     @classmethod
     def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
-        """``(E,)`` float64: the column ``Lights.area``, differentiable, and the surfaces' areas, detached."""
+        """Return the column ``Lights.area``, differentiable, and the areas in the world, detached; each ``(E,)`` float64."""
         # In float64: the fourth power of a length leaves float32 long before the length is extreme.
         wide = faces.face.double()
         area = dot(wide, wide).clamp_min(torch.finfo(torch.float64).tiny).sqrt() * faces.face.new_tensor(cls.share)
@@ -81,51 +81,51 @@ class Surface(Emitter):
 
     @classmethod
     def bounds(cls, at: Lights, intensity: Tensor) -> Cone:
-        """See :class:`Emitter`: seen face on a flat light is as bright as any of its power."""
+        """See :meth:`Emitter.bounds`. A flat light has its whole ``intensity`` along the normal."""
         return super().bounds(at, intensity) if cls.convex else Cone(1.0, 0.0, intensity)
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
-        """Points seen from ``x (3, N)``, for kinds that :mod:`torchpt.physics.lights.solid_angle` does not draw.
+        """Sample points as seen from ``x``. Not called for kinds that :mod:`torchpt.physics.lights.solid_angle` samples.
 
         Args:
-            at: the lanes' rows of the table.
-            x: reference points ``(3, N)``; the points on the light do not follow their derivative.
+            at: rows of the table, one a lane.
+            x: reference points ``(3, N)``; the sampled points are not differentiated in them.
             u: ``(2, N)`` in [0, 1).
         """
         raise NotImplementedError
 
     @classmethod
     def size(cls, at: Lights, normal: Tensor) -> Tensor | None:
-        """One over the density by area ``(N,)`` where the unit normal is ``normal (3, N)``; None: ``Lights.area``."""
+        """Return one over the density by area ``(N,)`` at unit normals ``normal (3, N)``; None: ``Lights.area``."""
         return None
 
     @classmethod
     def bound(cls, at: Lights, normal: Tensor) -> Tensor | None:
-        """``(N,)`` in place of ``Lights.bound`` where the unit normal is ``normal (3, N)``; None: that."""
+        """Return rounding bounds ``(N,)`` at unit normals ``normal (3, N)``; None: ``Lights.bound``."""
         return None
 
     @classmethod
     def inverse_pdf(
         cls, at: Lights, x: Tensor, normal: Tensor, wi: Tensor, square: Tensor, by_area: Tensor
     ) -> Tensor | None:
-        """``1 / pdf`` in solid angle ``(N,)`` of :meth:`sample`, 0 behind the emitting side; None: ``by_area``.
+        """Return ``1 / pdf`` in steradians ``(N,)`` of :meth:`sample`, 0 behind the emitting side; None: ``by_area``.
 
         Args:
-            at: the lanes' rows of the table.
+            at: rows of the table, one a lane.
             x: reference points ``(3, N)``.
-            normal: of the emitting side ``(3, N)``, at the point drawn or met.
-            wi: unit directions toward that ``(3, N)``.
+            normal: unit normal on the emitting side ``(3, N)``, at the sampled or hit point.
+            wi: unit directions toward the point ``(3, N)``.
             square: squared distance ``(N,)``.
-            by_area: ``area cos / r^2``, whose derivative is that of the result.
+            by_area: ``area cos / r^2``, whose relative derivative becomes that of the result.
         """
         return None
 
 
-#: The kinds of surfaces that emit.
+#: The kinds of emissive surfaces.
 SURFACES: Kinds[Surface] = Kinds("torchpt.physics.lights.surfaces", PRIMITIVES)
 
 
 def emitter(name: str) -> type[Emitter]:
-    """The class of a kind among ``Lights.kinds``."""
+    """Return the class of a kind of ``Lights.kinds``."""
     return SURFACES[name] if name in SURFACES else KINDS[name]

@@ -1,9 +1,9 @@
-"""The table of lights: sampling, and the densities that MIS asks for.
+"""Sample the light table, and evaluate emission and its pdf for MIS.
 
-Rows are emissive primitives, then lights that are no surfaces; the environment, where there is one, is the last row. What a row
-means is its class's to say (:mod:`torchpt.physics.lights.surface`, :mod:`torchpt.physics.lights.base`): here the kinds of the
-scene are gone through and put together. Kinds absent from it cost nothing: ``Lights.kinds`` is static, and a single row is
-neither chosen nor gathered.
+Rows are emissive primitives, then lights without a surface, the environment last. The class of a row's kind samples it
+(:mod:`torchpt.physics.lights.surface`, :mod:`torchpt.physics.lights.base`); the functions here loop over the kinds of the
+scene and merge the results. Absent kinds cost nothing, as ``Lights.kinds`` is static; a single row is neither chosen nor
+gathered.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ __all__ = ["emitted", "environment", "environment_image", "sample", "without_env
 
 
 def _surfaces(lights: Lights) -> list[tuple[int, type[Surface]]]:
-    """The kinds of surfaces among the rows, each with its number there."""
+    """Return the kinds of emissive surfaces in the table, each with its index in ``Lights.kinds``."""
     return [(number, SURFACES[name]) for number, name in enumerate(lights.kinds) if name in SURFACES]
 
 
 def _numbers(lights: Lights, row: Tensor | None) -> Tensor | None:
-    """Number of the lanes' kinds ``(N,)``; None where there is but one."""
+    """Return the index of each lane's kind ``(N,)``; None for a single kind."""
     if len(lights.kinds) == 1:
         return None
     assert lights.kind is not None and row is not None
@@ -37,7 +37,7 @@ def _numbers(lights: Lights, row: Tensor | None) -> Tensor | None:
 
 
 def _pick(number: Tensor | None, k: int, a: Tensor, b: Tensor | None) -> Tensor:
-    """``a`` in the lanes of kind ``k``, else ``b``; where there is no ``b``, ``a``."""
+    """Return ``a`` in the lanes of kind ``k``, else ``b``; ``a`` everywhere without ``b``."""
     return a if number is None or b is None else torch.where(number == k, a, b)
 
 
@@ -50,18 +50,17 @@ def sample(
     n: Tensor | None = None,
     mis: bool = True,
 ) -> LightSample:
-    """A point on the lights, seen from ``x (3, N)``.
+    """Choose a light and sample a point on it, as seen from ``x``.
 
     Args:
         lights: the table.
         x: reference points ``(3, N)``.
-        which: ``(N,)`` float64 in [0, 1), picks the light, and what that leaves of it takes the place of ``u[0]``; unused
-            (``None``) where there is but one.
-        u: ``(2, N)`` in [0, 1), picks the point.
-        offset: how far shadow rays stop off the light's surface, in units of ``Lights.bound``.
-        n: normals ``(3, N)`` of surfaces that nothing lights from behind, zero for others; None: no such surface. Asked for
-            where the choice is local, see :func:`torchpt.physics.lights.choice.depends_on_point`.
-        mis: whether BSDF sampling shares the work: an environment map then leaves it the dim directions.
+        which: ``(N,)`` float64 in [0, 1), chooses the light; remapped, it replaces ``u[0]``. None for a single light.
+        u: ``(2, N)`` in [0, 1), chooses the point.
+        offset: distance of the end of shadow rays from the light's surface, in units of ``Lights.bound``.
+        n: normals ``(3, N)`` of opaque surfaces, zero for others; None: no such surface. Needed if
+            :func:`torchpt.physics.lights.choice.depends_on_point` is True.
+        mis: whether the sample is combined with BSDF sampling by MIS: environment maps then leave dim directions to it.
     """
     row: Tensor | None = None
     probability: Tensor | float = 1.0
@@ -75,7 +74,7 @@ def sample(
     distant: Tensor | None = None
     for k, name in enumerate(lights.kinds[len(surfaces) :], len(surfaces)):
         kind = KINDS[name]
-        # Kinds follow each other: what comes from this one on.
+        # Rows are sorted by kind: this kind and all later ones; those overwrite it below.
         here = torch.ones_like(at.area, dtype=torch.bool) if number is None else number >= k
         bare = here if bare is None else bare
         distant = here if distant is None and kind.distant else distant
@@ -87,7 +86,7 @@ def sample(
 
 
 def _merged(mask: Tensor, a: LightSample, b: LightSample) -> LightSample:
-    """``a`` where the mask holds, else ``b``."""
+    """Return ``a`` where ``mask`` is True, else ``b``."""
     names = ("wi", "target", "radiance", "pdf", "weight")
     return replace(b, **{name: torch.where(mask, getattr(a, name), getattr(b, name)) for name in names})
 
@@ -127,7 +126,7 @@ def _on_surfaces(
     inverse = _inverse_pdf(at, kinds, number, x, normal, wi, square, angle)
     if lights.choice is not None:
         inverse = inverse / probability
-    # Where the light is not seen the weight is 0, and the density has no say.
+    # Where the light is not visible the weight is 0, and the pdf does not matter.
     pdf = safe_reciprocal(inverse.detach())
     point = None if lights.prim is None else _textured(lights, row, target, normal, uv, inside)
     target = torch.addcmul(target, normal, bound * offset)
@@ -145,7 +144,7 @@ def _inverse_pdf(
     square: Tensor,
     angle: Tensor | None,
 ) -> Tensor:
-    """``1 / pdf`` in solid angle ``(N,)`` of points drawn or met, the choice of the light left out; 0 from behind."""
+    """Return ``1 / pdf`` in steradians ``(N,)`` of sampled or hit points, without the choice of the light; 0 from behind."""
     size = at.area
     for k, kind in kinds:
         other = kind.size(at, normal)
@@ -162,24 +161,24 @@ def _inverse_pdf(
 def _textured(
     lights: Lights, row: Tensor | None, p: Tensor, normal: Tensor, uv: Tensor, own: Tensor | None
 ) -> Interaction:
-    """The point on the light as textures ask for it."""
+    """Return the point on the light as an interaction, for textured emission."""
     assert lights.prim is not None
     prim = lights.prim.expand(p.shape[1]) if row is None else take(lights.prim, row)
     return Interaction(p, normal, normal, None, None, prim, prim, None, uv[0], uv[1], own)
 
 
 def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return what emitters that were hit send back along ``wi``.
+    """Return radiance and pdf of emissive surfaces that rays hit.
 
     Args:
         lights: the table.
-        x: where the rays came from ``(3, N)``.
-        at: points on emissive primitives.
-        wi: unit directions from ``x`` to them ``(3, N)``.
-        n: normals ``(3, N)`` where they came from, as :func:`sample` was given them.
+        x: origins of the rays ``(3, N)``.
+        at: hit points on emissive primitives.
+        wi: unit directions from ``x`` to the hit points ``(3, N)``.
+        n: normals ``(3, N)`` at ``x``, as for :func:`sample`.
 
     Returns:
-        Radiance ``(3, N)``, zero from behind, and the density ``(N,)`` with which :func:`sample` would have drawn ``wi``.
+        Radiance ``(3, N)``, zero from behind, and the pdf ``(N,)`` of ``wi`` under :func:`sample`, per steradian.
     """
     assert lights.row_of_prim is not None
     row = take(lights.row_of_prim, at.slot) if len(lights.area) > 1 else None
@@ -198,27 +197,27 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | 
 
 
 def _environment(lights: Lights) -> type[Environment]:
-    """The class of the environment, which is the last row."""
+    """Return the class of the environment, the last row."""
     kind = emitter(lights.kinds[-1])
     assert issubclass(kind, Environment)
     return kind
 
 
 def environment(lights: Lights, d: Tensor) -> tuple[Tensor, Tensor]:
-    """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them for MIS."""
+    """Return radiance ``(3, N)`` of the environment along ``d (3, N)``, and the pdf ``(N,)`` of ``d`` under :func:`sample`."""
     radiance, pdf = _environment(lights).radiance_pdf(lights.environment, d, mis=True)
     return radiance, pdf * choice.environment(lights.choice)
 
 
 def environment_image(lights: Lights | None) -> EnvironmentImage | None:
-    """The environment as a picture of all directions, differentiable; None where there is none."""
+    """Return the environment as an image of all directions, differentiable; None without an environment."""
     if lights is None or lights.environment is None:
         return None
     return _environment(lights).environment_image(lights.environment)
 
 
 def without_environment(lights: Lights | None) -> Lights | None:
-    """The table without its last row, where that is the environment; None where nothing is left."""
+    """Return the table without the environment; None if no row is left."""
     if lights is None or lights.environment is None:
         return lights
     left = len(lights.area) - 1

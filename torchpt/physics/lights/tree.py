@@ -1,4 +1,4 @@
-"""Choice among many lights by a tree: what shines near a point, toward it and above its horizon, is drawn most often.
+"""Light tree: chooses lights near a point, aimed at it and above its horizon most often.
 
     build(low, high, axis, cos_o, cos_e, intensity) -> LightTree
     sample(tree, x, n, u) -> row, probability
@@ -6,10 +6,10 @@
 
 After Conty Estevez and Kulla, "Importance Sampling of Many Lights with Adaptive Tree Splitting" (2018), with the bounds of
 Pharr, Jakob, Humphreys, *Physically Based Rendering*, 4th ed., section 12.6.3. A node has eight children rather than two: they
-are weighed at once as one vector, and a choice made among finer groups is the better one.
+are weighted together as one vector, and a choice among finer groups has less variance.
 
-Lights that cannot bring anything (turned away, below the horizon) have probability 0; where that holds for a whole node its
-children share evenly, so that every draw has a probability, and the probabilities of all rows sum to one everywhere.
+Lights that cannot contribute (turned away, below the horizon) have probability 0. If that holds for a whole node, its
+children are chosen uniformly, so that the probabilities of all rows sum to 1 at every point.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from torchpt.core.dispatch import dispatched
 
 __all__ = ["FIELDS", "WIDTH", "LightTree", "build", "from_digits", "probability", "sample"]
 
-#: Children a node.
+#: Children of a node.
 WIDTH = 8
-#: What a node knows of each child: centre and radius of a ball about it, the cone of its axes, how far beyond that it still
-#: shines (all angles by their cosine), and its intensity, the brightest child's being 1.
+#: Fields of each child of a node: bounding sphere, cone of the axes, angle of emission beyond the cone (angles as cosines), and
+#: intensity relative to the brightest child.
 FIELDS = ("x", "y", "z", "radius", "axis x", "axis y", "axis z", "cos o", "sin o", "cos e", "intensity")
-#: Cosines within this of none are taken for some: what rounding might hide is drawn rarely, not never.
+#: Cosines are raised by this much, so that rounding does not give a contributing light probability 0.
 SLACK = 2.0**-20
-#: Squared distances count as no less than this part of the squared radius. With 1/4, and cosines as in `_weigh`, the choice
-#: among 1,000 lights of four kinds of scene had 1.4 to 6 times less variance than with 1 and with bounds alone.
+#: Squared distances are at least this fraction of the squared radius. With 1/4, and cosines as in `_weigh`, variance was 1.4
+#: to 6 times lower than with 1 and with bounds alone, for 1,000 lights in four kinds of scenes.
 NEAR = 0.25
-#: Steps of a way in one word of 32 bits.
+#: Levels of a path through the tree that one 32-bit word holds.
 STEPS = 10
-#: Lights dimmer than all together by this factor are taken for that bright: they stay in the range of float32.
+#: Least intensity of a light over the sum of all, so that it stays in the range of float32.
 _DIMMEST = 1e-30
 
 
@@ -45,24 +45,24 @@ class LightTree:
 
     nodes: Tensor  # (M, F, 8) float32, see FIELDS
     child: Tensor  # (M, 8) int32: a node, or ~row
-    full: Tensor  # (M,) int32 how many children there are
-    trail: Tensor  # (W, K) int32 the way from the root, three bits a step, ten steps a word, the first lowest
-    depth: Tensor  # (K,) int32 how many steps; 0 where a light is left out, since it does not shine
+    full: Tensor  # (M,) int32 number of children
+    trail: Tensor  # (W, K) int32 path from the root: three bits a level, ten levels a word, the first level lowest
+    depth: Tensor  # (K,) int32 number of levels; 0 for lights without intensity, which are not in the tree
     count: Tensor  # () int64 K
     levels: int  # the largest of `depth`
 
 
 def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor, intensity: Tensor) -> LightTree:
-    """The tree over lights that lie in boxes and shine about cones.
+    """Build the tree over lights, given by bounding boxes and cones of emission.
 
     Args:
         low: ``(3, K)``.
         high: ``(3, K)``.
         axis: unit ``(3, K)``.
-        cos_o: ``(K,)`` cosine of the cone about ``axis`` that the surface normals fill; -1: all directions.
-        cos_e: ``(K,)`` cosine of how far off its normal a surface shines: 0 for a surface that emits everywhere it faces.
-        intensity: ``(K,)`` radiant intensity where it is largest, up to a common factor. A light without any is never drawn,
-            but where no light has any all are drawn alike.
+        cos_o: ``(K,)`` cosine of the half angle of the cone about ``axis`` that holds all normals; -1: all directions.
+        cos_e: ``(K,)`` cosine of the largest angle between a normal and emitted light: 0 for the whole hemisphere.
+        intensity: ``(K,)`` maximum radiant intensity, up to a common factor. Lights of intensity 0 are never chosen, unless
+            all are 0: then all are chosen alike.
     """
     import numpy as np
 
@@ -107,9 +107,9 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
 
 
 def from_digits(u: Tensor) -> Tensor:
-    """``(2, N)`` in [0, 1) as ``(N,)`` float64: the second continues the digits of the first.
+    """Return ``u (2, N)`` in [0, 1) as one number ``(N,)`` float64 of 48 bits: the second continues the digits of the first.
 
-    A sampler's number has 24 bits; a light rarer than that would be drawn never, or too often.
+    Numbers of samplers have 24 bits, too few for lights of lower probability.
     """
     return torch.add(u[0].double(), u[1].double(), alpha=2.0**-24)
 
@@ -117,18 +117,18 @@ def from_digits(u: Tensor) -> Tensor:
 @dispatched
 @torch.no_grad()
 def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw lights for points.
+    """Choose a light for each point.
 
     Args:
         tree: the lights.
         x: ``(3, N)``.
-        n: unit normals ``(3, N)`` of surfaces that nothing lights from behind; zero where light comes from both sides. None:
-            such everywhere.
+        n: unit normals ``(3, N)`` of surfaces lit on their front only; zero where light counts from both sides. None: zero
+            everywhere.
         u: ``(N,)`` in [0, 1), float64, see :func:`from_digits`.
 
     Returns:
-        Rows ``(N,)`` int64, the probabilities ``(N,)`` with which they were drawn, always positive, and what is left of ``u``:
-        ``(N,)`` float64 in [0, 1], uniform whatever was drawn.
+        Rows ``(N,)`` int64, their probabilities ``(N,)``, always positive, and the remapped ``u``: ``(N,)`` float64 in [0, 1],
+        uniform given the choice.
     """
     row, p, rest = _walk(tree, x, n, u, None)
     assert rest is not None
@@ -138,17 +138,17 @@ def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Ten
 @dispatched
 @torch.no_grad()
 def probability(tree: LightTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
-    """``(N,)`` with which :func:`sample` draws ``row (N,)`` at ``x, n``."""
+    """Return the probability ``(N,)`` with which :func:`sample` chooses ``row (N,)`` at ``x`` and ``n``."""
     return _walk(tree, x, n, None, row)[1]
 
 
 def _weigh(nodes: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
-    """Weights ``(N, 8)`` of children of ``nodes (N, F, 8)`` in float32, zero only where none of their lights brings anything.
+    """Return weights ``(N, 8)`` of the children of ``nodes (N, F, 8)`` in float32, zero only where no light contributes.
 
-    Pharr et al., PBRT 4th ed., section 12.6.3: with theta_w the angle between a child's axis and the direction to p, theta_b
-    that which the child subtends, none of its lights sends light to p at less than theta_w - theta_o - theta_b off its normal;
-    the same holds for p's own normal. Bounds alone draw wide groups too often: each cosine is the mean of its bound and its
-    value at the centre.
+    Pharr et al., PBRT 4th ed., section 12.6.3: with theta_w the angle between a child's axis and the direction to p, and
+    theta_b the angle that the child subtends, its lights emit toward p at least theta_w - theta_o - theta_b off their normals;
+    likewise for p's own normal. Bounds alone would favour wide groups: each cosine is the mean of its bound and its value at
+    the centre.
     """
     p, tiny = x.float(), torch.finfo(torch.float32).tiny
     cx, cy, cz, radius, ax, ay, az, cos_o, sin_o, cos_e, intensity = nodes.unbind(1)
@@ -183,7 +183,7 @@ def _root(a: Tensor) -> Tensor:
 def _walk(
     tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor | None, row: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Ways through the tree, by ``u`` or to ``row``: where they end, their probabilities, and what is left of ``u``."""
+    """Descend the tree, by ``u`` or to ``row``; return the rows reached, their probabilities, and the remapped ``u``."""
     node = torch.zeros(x.shape[1], dtype=torch.int64, device=x.device)
     p = torch.ones(x.shape[1], dtype=torch.float64, device=x.device)
     places = torch.arange(tree.child.shape[1], device=x.device)
@@ -202,7 +202,7 @@ def _walk(
             assert way is not None
             chosen, way = (way & 7).long(), way >> 3
         else:
-            # The last child with any weight whose interval starts no later.
+            # The last child of positive weight whose interval starts at or before `aim`.
             chosen = torch.where((weight > 0) & (ends - weight <= aim[:, None]), places, 0).amax(1)
         share, end = (a.gather(1, chosen[:, None])[:, 0] for a in (weight, ends))
         deeper = node >= 0

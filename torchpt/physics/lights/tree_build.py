@@ -1,7 +1,7 @@
-"""Build of the light tree (numba, float64): nodes of eight children, top down, each opened where it costs most.
+"""Builder of the light tree (numba, float64): top down, nodes of eight children, splitting the child of highest cost.
 
 Conty Estevez and Kulla, "Importance Sampling of Many Lights with Adaptive Tree Splitting", Proc. ACM Comput. Graph. Interact.
-Tech. 1(2), 2018: a group of lights costs its intensity times the spread of its places and of its directions.
+Tech. 1(2), 2018: the cost of a group of lights is intensity times spread of positions times spread of directions.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from torchpt.physics.lights.tree import WIDTH
 
 __all__ = ["build"]
 
-#: A way takes three bits a level of an int64, which holds 21. From this level on children take equal numbers of lights, so that
-#: no input, however lopsided, goes deeper: eight to the tenth is more lights than memory holds.
+#: Paths take three bits a level of an int64, which holds 21 levels. From this level on children get equal numbers of lights, so
+#: that ten more levels suffice for any input: eight to the tenth is more lights than memory holds.
 _EVEN = 11
 _BINS = 12
 _UPPER, _LOWER = _BINS, _BINS + 1
@@ -56,10 +56,10 @@ def _angle(cosine):
 
 @jit()
 def _cost(groups, k):
-    """Intensity times directions times squared diagonal of a group.
+    """Return the cost of a group: intensity times measure of directions times squared diagonal.
 
-    Directions by equation 1 of the paper; their spread by how far the weighted axes cancel: axes even over a cone of half angle
-    theta have a mean of length ``(1 + cos theta) / 2``.
+    The measure of directions is equation 1 of the paper. The half angle theta follows from the mean of the weighted axes,
+    which has length ``(1 + cos theta) / 2`` for axes uniform over a cone.
     """
     if groups[k, 11] == 0.0:
         return 0.0
@@ -87,7 +87,7 @@ def _bin(lights, i, axis, low, scale):
 
 @jit()
 def _split(lights, ids, start, stop, bins, suffix):
-    """Reorder a range of lights so that its two parts cost least; return where the second starts."""
+    """Partition a range of lights into two groups of least cost; return the start of the second."""
     best, best_axis, best_cut, best_low, best_scale = _INF, -1, 0, 0.0, 0.0
     for axis in range(3):
         low, high = _INF, -_INF
@@ -110,7 +110,7 @@ def _split(lights, ids, start, stop, bins, suffix):
                 cost = _cost(bins, _LOWER) + suffix[k]
                 if cost < best:
                     best, best_axis, best_cut, best_low, best_scale = cost, axis, k, low, scale
-    if best_axis < 0:  # all in one place
+    if best_axis < 0:  # all centres coincide
         return (start + stop) // 2
     i, j = start, stop - 1
     while i <= j:
@@ -124,7 +124,7 @@ def _split(lights, ids, start, stop, bins, suffix):
 
 @jit()
 def _cone(lights, cos_o, ids, start, stop):
-    """Axis and half angle of a cone that holds the cones of a range of lights."""
+    """Return axis and half angle of a cone that contains the cones of a range of lights."""
     x, y, z = 0.0, 0.0, 0.0
     for i in range(start, stop):
         k = ids[i]
@@ -150,17 +150,17 @@ def build(lights, cos_o, ids, nodes, child, full, trail, depth):
     """Build the tree.
 
     Args:
-        lights: ``(K, 12)`` float64 groups of one; an axis is as long as the intensity times ``(1 + cos_o) / 2``.
+        lights: ``(K, 12)`` float64 groups of one light; axes have the length intensity times ``(1 + cos_o) / 2``.
         cos_o: ``(K,)`` cosine of the cone of axes.
-        ids: ``(L,)`` the lights that shine; reordered.
+        ids: ``(L,)`` lights of positive intensity; reordered.
         nodes: ``(max(L - 1, 1), F, 8)`` float32 zeros, filled: :data:`torchpt.physics.lights.tree.FIELDS`.
         child: ``(nodes, 8)`` int32, filled: a node, or ``~light``.
-        full: ``(nodes,)`` int32, filled: how many children.
-        trail: ``(K,)`` int64, filled: three bits for each step from the root, the first lowest.
-        depth: ``(K,)`` int32 zeros, filled: steps from the root.
+        full: ``(nodes,)`` int32, filled: number of children.
+        trail: ``(K,)`` int64, filled: path from the root, three bits a level, the first lowest.
+        depth: ``(K,)`` int32 zeros, filled: number of levels.
 
     Returns:
-        How many nodes there are; node 0 is the root.
+        The number of nodes; node 0 is the root.
     """
     spans = np.zeros((len(nodes), 2), np.int64)
     level = np.zeros(len(nodes), np.int64)
@@ -202,7 +202,7 @@ def build(lights, cos_o, ids, nodes, child, full, trail, depth):
                 half = 0.5 * (groups[k, 3 + c] - groups[k, c])
                 square += half * half
                 reach = max(reach, abs(groups[k, c]), abs(groups[k, 3 + c]))
-            # Wider by what float32 may round away.
+            # Enlarged by the rounding of float32.
             nodes[at, 3, k] = math.sqrt(square) * (1.0 + 2.0**-20) + reach * 2.0**-21
             x, y, z, theta = _cone(lights, cos_o, ids, cuts[k], cuts[k + 1])
             nodes[at, 4, k], nodes[at, 5, k], nodes[at, 6, k] = x, y, z

@@ -1,7 +1,7 @@
 """Stateless samplers: ``(seed, pixel, sample, dimension) -> u``.
 
-A pixel's samples are the points of one or more independent *randomizations* of a sequence, its streams: of R streams sample
-``i`` is point ``i // R`` of stream ``i % R``. The spread of streams tells an error; that of points within one Sobol' sequence
+The samples of a pixel are points of R independent *randomizations* of a sequence: sample ``i`` is point ``i // R`` of
+randomization ``i % R``. The spread between randomizations estimates the error; the spread of points of one Sobol' sequence
 would not.
 """
 
@@ -42,7 +42,7 @@ KINDS: Kinds[Points] = Kinds(
 
 
 def points_of(kind: str | Points) -> Points:
-    """A kind by name, all of its parameters at their defaults; or what is one already."""
+    """Return a kind of sampler by name, with default parameters; return an instance as it is."""
     return _plain(kind) if isinstance(kind, str) else kind
 
 
@@ -53,27 +53,27 @@ def _plain(kind: str) -> Points:
 
 @dataclass(frozen=True)
 class Randomizations:
-    """Randomizations that share samples: ``count`` of them from number ``first`` on."""
+    """The randomizations that share samples: ``count`` of them from index ``first`` on."""
 
     first: int = 0
     count: int = 1
 
 
-#: Streams beside those of the picture that a sampler has seeds for: two of second values, eight that look again.
+#: Number of randomizations beyond those of the picture that have seeds: two for error probes, eight for resampled pixels.
 SPARE = 10
 
 
 @dataclass(frozen=True)
 class Sampler:
-    """A sampler of one kind under one seed.
+    """A sampler: a kind of points and a seed.
 
     Attributes:
-        kind: where the points lie; or the name of a kind.
-        seed: any integer from 0 to 2^63 - 1.
-        randomizations: R, how many streams share the samples of a pixel: ``spp // R`` points each, and one more for the
-            first ``spp % R``. Those from R on are there for pixels that are sampled again.
-        spp: samples a pixel in all, for the kinds that must know it beforehand; 0 where nobody knows.
-        width: of the film in pixels, by which pixels are numbered; for kinds that ask where a pixel lies.
+        kind: an instance of :class:`Points`, or the name of a kind.
+        seed: an integer from 0 to 2^63 - 1.
+        randomizations: R, the number of randomizations that share the samples of a pixel: ``spp // R`` points each, and one
+            more for the first ``spp % R``. Those from index R on serve pixels that are sampled again.
+        spp: total samples a pixel, for kinds that need it beforehand; 0 if unknown.
+        width: width of the film in pixels, for kinds that depend on the position of a pixel.
     """
 
     kind: str | Points
@@ -88,22 +88,22 @@ class Sampler:
 
     @property
     def points(self) -> Points:
-        """Return where the points lie."""
+        """The kind of points."""
         return points_of(self.kind)
 
     @property
     def streams(self) -> Randomizations:
-        """Those of the picture."""
+        """The randomizations of the picture."""
         return Randomizations(0, self.randomizations)
 
     def key(self, pixel: Tensor, sample: Tensor, streams: Randomizations | None = None) -> Tensor:
-        """:meth:`Points.key` for int64 pixel and sample indices ``(N,)``, by the picture's streams or others."""
+        """Return :meth:`Points.key` for int64 pixel and sample indices ``(N,)``, by default in :attr:`streams`."""
         streams = streams or self.streams
         group, point = sample % streams.count + streams.first, sample // streams.count
         return self.points.key(self.numbers(pixel.device), pixel, group, point)
 
     def numbers(self, device: torch.device) -> SamplerTensors:
-        """Return what :meth:`Points.key` needs of the sampler."""
+        """Return the sampler's tensors for :meth:`Points.key`."""
         seeds = [
             mix_int(mix_int(mix_int(self.seed) ^ as_int32(self.seed >> 32)) + g)
             for g in range(self.randomizations + SPARE)
@@ -119,41 +119,40 @@ class Sampler:
 
 @dispatched
 def draw_1d(points: Points, key: Tensor, salt: Tensor) -> Tensor:
-    """Draw one number a lane, see :meth:`Points.draw_1d`."""
+    """Return one number for each lane; see :meth:`Points.draw_1d`."""
     return points.draw_1d(key, salt)
 
 
 @dispatched
 def draw_2d(points: Points, key: Tensor, salt: Tensor) -> Tensor:
-    """Draw two numbers a lane, see :meth:`Points.draw_2d`."""
+    """Return two numbers for each lane; see :meth:`Points.draw_2d`."""
     return points.draw_2d(key, salt)
 
 
 @dispatched
 def draw_further(points: Points, key: Tensor, salt: Tensor) -> Tensor:
-    """Draw the two numbers with which a set of two goes on, see :meth:`Points.draw_further`."""
+    """Return the third and fourth number of a set of four for each lane; see :meth:`Points.draw_further`."""
     return points.draw_further(key, salt)
 
 
 class Draws:
-    """The numbers of one path vertex for a batch of lanes: ``draws.one(Dimension.ROULETTE)``, ``draws.two(...)``.
+    """The random numbers of a path vertex for N lanes: ``draws.one(Dimension.ROULETTE)``, ``draws.two(...)``.
 
     Args:
-        kind: where the points lie; or the name of a kind.
-        key: ``(rows, N)`` int32 as given by :meth:`Sampler.key`.
-        salts: ``(len(Dimension),)`` int32, the dimensions' names at this depth; a tensor, so that a compiled stage does not
-            specialize on the depth.
+        kind: an instance of :class:`Points`, or the name of a kind.
+        key: ``(rows, N)`` int32 from :meth:`Sampler.key`.
+        salts: ``(len(Dimension),)`` int32 from :func:`salts`; a tensor, so that compiled stages do not specialize on the depth.
     """
 
     def __init__(self, kind: str | Points, key: Tensor, salts: Tensor) -> None:
         self._points, self._key, self._salts = points_of(kind), key, salts
 
     def one(self, dimension: Dimension) -> Tensor:
-        """``(N,)`` float32 in ``[0, 1)``."""
+        """Return ``(N,)`` float32 in ``[0, 1)``."""
         return draw_1d(self._points, self._key, self._salts[int(dimension)])
 
     def two(self, dimension: Dimension) -> Tensor:
-        """``(2, N)`` float32 in ``[0, 1)``."""
+        """Return ``(2, N)`` float32 in ``[0, 1)``."""
         if dimension is Dimension.LIGHT and self._points.joint:
             return draw_further(self._points, self._key, self._salts[int(Dimension.PREVIOUS_DIRECTION)])
         return draw_2d(self._points, self._key, self._salts[int(dimension)])
@@ -161,5 +160,5 @@ class Draws:
 
 @lru_cache(maxsize=4096)
 def salts(depth: int, device: torch.device, step: int = 0) -> Tensor:
-    """Return the names ``(len(Dimension),)`` int32 of all dimensions at a vertex, or at a step on the way (:func:`salt`)."""
+    """Return :func:`salt` of all dimensions ``(len(Dimension),)`` int32, at a vertex or a step on the way to it."""
     return torch.tensor([salt(d, depth, step) for d in Dimension], dtype=torch.int32, device=device)

@@ -1,4 +1,4 @@
-"""What a kind of sampler must say, and the numbers that its keys are made of."""
+"""The base class of kinds of samplers."""
 
 from __future__ import annotations
 
@@ -15,38 +15,39 @@ from torchpt.spec import Flag, Spec
 
 __all__ = ["ADAPTIVE", "Points", "SamplerTensors"]
 
-#: Of kinds whose points may be any number, so that pixels may have more or fewer.
+#: Parameters of kinds with any number of points, so that numbers may differ by pixel.
 ADAPTIVE: dict[str, Spec] = {
-    "adaptive": Flag(False, doc="whether samples go where the error is; `spp` is then their mean number"),
+    "adaptive": Flag(
+        False, doc="whether to take more samples where the error is larger; `spp` is then their mean number"
+    ),
 }
 
 
 @dataclass(frozen=True)
 class SamplerTensors:
-    """A sampler under one seed as tensors, so that a kernel made for one serves all of its kind."""
+    """Tensors of a sampler, so that a compiled kernel serves all samplers of a kind."""
 
-    seeds: Tensor  # (R,) int32 of the streams
-    every: Tensor  # () int64 points of each randomization
-    more: Tensor  # () int64 how many of them have one more
-    bits: Tensor  # () int64 of the largest index of a point
-    width: Tensor  # () int64 of the film
+    seeds: Tensor  # (R,) int32 seeds of the randomizations
+    every: Tensor  # () int64 number of points of each randomization
+    more: Tensor  # () int64 number of randomizations that have one more
+    bits: Tensor  # () int64 number of bits of the largest index of a point
+    width: Tensor  # () int64 width of the film
 
 
 @dataclass(frozen=True)
 class Points(ABC):
-    """A kind of sampler: where the points of a pixel lie. Its fields are the values of its parameters, ``ADAPTIVE`` apart.
+    """A kind of sampler. Its fields are the values of its parameters, except ``ADAPTIVE``.
 
-    Every number is a pure function of a key (which pixel, which point) and a salt (which dimension), the same for a lane
-    wherever it stands: integer operations, or such as round alike everywhere.
+    Every number is a pure function of a key (pixel and point) and a salt (dimension), bit for bit the same on all lanes and
+    engines: it uses integer operations, or those that round alike everywhere.
 
     Attributes:
-        name: its ``type`` in a scene file.
-        parameters: what it declares; a field each.
-        needs_count: whether the number of points must be known before the first is drawn, so that nothing but ``spp`` may
-            end a render.
-        rows: of a key.
-        of_film: whether points depend on where a pixel lies beside others; else on its number alone.
-        joint: whether sets of two dimensions go on: :meth:`draw_further` gives two more, stratified with them.
+        name: the ``type`` in a scene file.
+        parameters: specs of the parameters, a field each.
+        needs_count: whether the number of points must be known beforehand, so that ``spp`` is the only stop rule.
+        rows: number of rows of a key.
+        of_film: whether points depend on the position of a pixel, not on its index alone.
+        joint: whether :meth:`draw_further` continues sets of two dimensions to four, stratified together.
     """
 
     name: ClassVar[str] = ""
@@ -57,16 +58,15 @@ class Points(ABC):
     joint: ClassVar[bool] = False
 
     def key(self, numbers: SamplerTensors, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
-        """Return what tells a sample from all others, ``(rows, N)`` int32: a pixel's seed, a point's index, how many there are.
+        """Return the keys of samples ``(rows, N)`` int32: seed of the pixel, index of the point, number of points (if 3 rows).
 
-        The seed is a bijection of the pixel's index for each (seed, stream), so no two pixels share a sequence. The
-        third row is there only where ``rows`` says so.
+        For each seed and randomization the pixel's seed is a bijection of its index, so no two pixels share a sequence.
 
         Args:
-            numbers: of the sampler.
+            numbers: the sampler's tensors.
             pixel: index on the film ``(N,)`` int64, row by row.
-            group: stream ``(N,)`` int64.
-            point: index in its sequence ``(N,)`` int64.
+            group: randomization ``(N,)`` int64.
+            point: index in the sequence ``(N,)`` int64.
         """
         seed = torch.index_select(numbers.seeds, 0, group)
         key = [mix(mix(pixel.to(torch.int32)) ^ seed), point.to(torch.int32)]
@@ -76,17 +76,17 @@ class Points(ABC):
 
     @abstractmethod
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """``(N,)`` float32 in ``[0, 1)``, multiples of ``2^-24``.
+        """Return ``(N,)`` float32 in ``[0, 1)``, multiples of ``2^-24``.
 
         Args:
-            key: ``(rows, N)`` int32 as given by :meth:`key`.
-            salt: int32, the dimension's name.
+            key: ``(rows, N)`` int32 from :meth:`key`.
+            salt: int32 from :func:`~torchpt.physics.samplers.dimensions.salt`.
         """
 
     @abstractmethod
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """``(2, N)`` float32 in ``[0, 1)``; arguments as in :meth:`draw_1d`."""
+        """Return ``(2, N)`` float32 in ``[0, 1)``; arguments as for :meth:`draw_1d`."""
 
     def draw_further(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """The third and fourth dimension of the set whose first two :meth:`draw_2d` gives; where ``joint`` says so."""
+        """Return dimensions three and four ``(2, N)`` of the set that :meth:`draw_2d` begins; called only if ``joint``."""
         raise NotImplementedError(f"sets of {self.name} points end with two dimensions")

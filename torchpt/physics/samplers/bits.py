@@ -1,4 +1,4 @@
-"""Bits of sample points: Owen scrambling, shuffled indices, strata."""
+"""Integer arithmetic of samplers: Sobol' points, Owen scrambling, permutations, strata."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = [
 # Burley, *Practical Hash-based Owen Scrambling*, JCGT 10(4), 2020. The scrambling hash is Vegdahl's refinement
 # ("Owen scrambling based permutation hash", 2021) of the Laine-Karras permutation.
 #
-# Working with bit-reversed numbers throughout spares most reversals. The first coordinate of point ``i`` is the reversal of
+# Bit-reversed numbers throughout avoid most reversals. The first coordinate of point ``i`` is the reversal of
 # ``i``; the second is the reversal of ``p(x + 1)`` where ``p`` is the polynomial over GF(2) whose coefficients are the bits
 # of ``i`` (its direction numbers are the powers of ``x + 1``), and that shift takes five masked xor-shifts.
 #
@@ -42,16 +42,16 @@ __all__ = [
 # two are; a bit of each digit of the fourth is added to the other for that.
 
 
-#: What a seed is mixed with for the four coordinates.
+#: Constants that are mixed into a seed, for each of four coordinates.
 X, Y, Z, W = as_int32(0x68BC21EB), as_int32(0x02E5BE93), as_int32(0x967A889B), as_int32(0x368CC8B7)
 _K0, _K1, _K2 = 0x3D20ADEA, 0x05526C56, 0x53A22864
-#: Low bits of the digits of base 4 whose number is 0, 1 or 2 modulo 3.
+#: Low bits of the base-4 digits whose position is 0, 1 or 2 modulo 3.
 _FIRST, _SECOND, _THIRD = 0x41041041, 0x04104104, 0x10410410
 _STAYS = as_int32(3 * _FIRST)
 
 
 def scramble(x: Tensor, seed: Tensor) -> Tensor:
-    """Nested uniform scramble of bit-reversed numbers: each bit is flipped by a hash of the bits below it."""
+    """Apply Owen scrambling to bit-reversed numbers: each bit is flipped by a hash of the bits below it."""
     x = x ^ (x * _K0)
     x = x + seed
     x = x * (logical_shift(seed, 16) | 1)
@@ -60,44 +60,44 @@ def scramble(x: Tensor, seed: Tensor) -> Tensor:
 
 
 def second_dimension(index: Tensor) -> Tensor:
-    """Bit-reversed second Sobol' coordinate of point ``index``."""
+    """Return the bit-reversed second Sobol' coordinate of point ``index``."""
     for shift, mask in reversed(HALVES):
         index = index ^ ((index >> shift) & mask)
     return index
 
 
 def third_dimension(index: Tensor) -> Tensor:
-    """Bit-reversed third coordinate of point ``index``."""
+    """Return the bit-reversed third coordinate of point ``index``."""
     return _turned(_shifted(_turned(index, _SECOND, _THIRD)), _THIRD, _SECOND)
 
 
 def fourth_dimension(index: Tensor) -> Tensor:
-    """Bit-reversed fourth coordinate of point ``index``."""
+    """Return the bit-reversed fourth coordinate of point ``index``."""
     index = _turned(_shifted(_turned(index, _THIRD, _SECOND)), _SECOND, _THIRD)
     return index ^ ((index >> 1) & 0x55555555)
 
 
 def _shifted(index: Tensor) -> Tensor:
-    """``p(x + 1)`` with coefficients of two bits each."""
+    """Return ``p(x + 1)`` for coefficients of two bits each."""
     for shift, mask in reversed(HALVES[1:]):
         index = index ^ ((index >> shift) & mask)
     return index
 
 
 def _turned(index: Tensor, once: int, twice: int) -> Tensor:
-    """Digits of base 4 times w at the places ``once``, times w² at ``twice``; w times low and high bit: high, low + high."""
+    """Multiply base-4 digits by w at positions ``once``, by w² at ``twice``; w maps bits (low, high) to (high, low + high)."""
     low, high = index & 0x55555555, (index >> 1) & 0x55555555
     both = low ^ high
     return (index & _STAYS) | (high & once) | (both & twice) | (((both & once) | (low & twice)) << 1)
 
 
-# ---- Permutations of any length by hashing, a lane at a time and without a branch
+# ---- Permutations of any length by hashing, for each lane separately and without branches
 #
 # The swap-or-not shuffle (Hoang, Morris, Rogaway, *An Enciphering Scheme Based on a Card Shuffle*, CRYPTO 2012): a round
 # pairs ``x`` with ``pivot - x`` modulo the length and swaps the pair or not, by a hash of its larger member. It is a bijection
-# whatever the length, so nothing is drawn again as in a walk along the cycles of a larger permutation. A rotation comes first:
-# it makes the place of any one index uniform, so that padded dimensions are free of bias whatever the rounds; these part
-# neighbours, of whose order ``2^-r`` is left after ``r``.
+# for any length, without the rejections of a cycle walk. A rotation comes first: it makes the position of each single index
+# uniform, so that padded dimensions are unbiased for any number of rounds. Each round separates half of the neighbours that are
+# still in order.
 
 
 ROUNDS = 8
@@ -106,7 +106,7 @@ STRIDE, STEP = 0x2C9277B5, as_int32(0xAC564B05)
 
 
 def shuffle(index: Tensor, count: Tensor, seed: Tensor) -> Tensor:
-    """The place of ``index`` under a permutation of ``0 .. count - 1`` that ``seed`` names; int32 lanes ``(N,)``."""
+    """Return the image of ``index`` under the permutation of ``0 .. count - 1`` given by ``seed``; int32 ``(N,)``."""
     wide = count.to(torch.int64)
 
     def pivot(seed: Tensor) -> Tensor:
@@ -124,21 +124,21 @@ def shuffle(index: Tensor, count: Tensor, seed: Tensor) -> Tensor:
     return index
 
 
-# ---- Intervals of equal length, one point in each: what the samplers that know their number of points share
+# ---- Stratification into equal intervals, for samplers with a known number of points
 
 
 _LEVELS = float(1 << 24)
 
 
 def place(stratum: Tensor, jitter: Tensor, count: Tensor) -> Tensor:
-    """``(stratum + jitter) / count`` as float32 below one, for float64 lanes; cut to 24 bits as all of our numbers are."""
+    """Return ``(stratum + jitter) / count`` of float64 lanes as float32 below 1, truncated to 24 bits as all numbers are."""
     return ((stratum + jitter) / count * _LEVELS).floor().clamp_max(_LEVELS - 1.0).to(torch.float32) * (1.0 / _LEVELS)
 
 
 def jittered(key: Tensor, salt: Tensor | int) -> Tensor:
-    """``(N,)`` float32 in ``[0, 1)``, one in each of as many intervals as there are points, in an order by ``salt``.
+    """Return jittered numbers ``(N,)`` float32, one in each of ``count`` intervals of ``[0, 1)``, in an order by ``salt``.
 
-    ``key (3, N)`` int32: the pixel's seed, the point's index, and how many there are.
+    ``key (3, N)`` int32: seed of the pixel, index of the point, number ``count`` of points.
     """
     seed = mix(key[0] ^ salt)
     stratum = shuffle(key[1], key[2], seed)

@@ -1,4 +1,4 @@
-"""The dimensions of a path, named once. A random number is a pure function of (seed, pixel, sample, dimension)."""
+"""The dimensions of random numbers along a path, and their hashes."""
 
 from __future__ import annotations
 
@@ -12,36 +12,35 @@ __all__ = ["STREAMS", "Dimension", "salt"]
 class Dimension(IntEnum):
     """The use of a random number. ``PIXEL`` and ``LENS`` are drawn once a path, the others at every vertex."""
 
-    PIXEL = 0  # 2D, place within the pixel's filter
-    LENS = 1  # 2D, place on the aperture
-    LIGHT_DIGITS = 2  # 1D, further digits of the first number of LIGHT
-    LIGHT = 3  # 2D, which light, and the place on it
-    LOBE = 4  # 1D, which part of the BSDF
+    PIXEL = 0  # 2D, offset in the reconstruction filter
+    LENS = 1  # 2D, point on the lens
+    LIGHT_DIGITS = 2  # 1D, low digits of the first number of LIGHT
+    LIGHT = 3  # 2D, choice of the light, and point on it
+    LOBE = 4  # 1D, choice of the lobe
     BSDF = 5  # 2D, direction
     ROULETTE = 6  # 1D
-    OPACITY = 7  # 1D, whether a surface is met
-    PREVIOUS_DIRECTION = 8  # no number of its own: by which the vertex was reached, BSDF of the one before or PIXEL
-    DISTANCE = 9  # 1D, how far a ray comes in what lies between surfaces
-    PHASE = 10  # 2D, where that scatters it to
-    EDGE = 11  # 2D, which edge of the scene and the place on it; which of its two lines where it has two
+    OPACITY = 7  # 1D, hit or pass through
+    PREVIOUS_DIRECTION = 8  # an alias of the dimension that led to the vertex: BSDF of the previous vertex, or PIXEL
+    DISTANCE = 9  # 1D, free-flight distance in a medium
+    PHASE = 10  # 2D, direction from a phase function
+    EDGE = 11  # 2D, choice of an edge of the scene and point on it; choice of its line if it has two
 
 
-#: More than there are dimensions, so that a new one leaves the numbers of the others as they were.
+#: Stride between vertices, larger than the number of dimensions, so that a new dimension does not change the others.
 STREAMS = 16
 
 
-#: Vertices between the numbers of one step on the way to a vertex and those of the next: only the numbers of paths that are
-#: longer meet those of steps.
+#: Stride between steps on the way to a vertex, in vertices: numbers repeat only on paths with more vertices.
 STEPS = 1 << 13
 
 
 def salt(dimension: Dimension, depth: int, step: int = 0) -> int:
-    """Return a signed 32-bit constant that names a random number.
+    """Return the hash of a dimension at a path vertex, a signed 32-bit integer.
 
     Args:
-        dimension: its use.
-        depth: of the path vertex; 0 is the camera.
-        step: of the ray on its way to the vertex, through what lets rays pass.
+        dimension: the use of the number.
+        depth: depth of the path vertex; 0 is the camera.
+        step: index of the surface that the ray passes on its way to the vertex.
     """
     if dimension is Dimension.PREVIOUS_DIRECTION:
         dimension, depth = (Dimension.BSDF, depth - 1) if depth > 1 else (Dimension.PIXEL, 0)

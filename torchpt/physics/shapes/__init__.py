@@ -1,6 +1,7 @@
-"""Shapes: what they declare, and from what the search found to a surface point, its normals, and points sampled on it.
+"""Shapes and their primitives: scene parameters, surface points of hits, normals and texture coordinates.
 
-One kind a file in ``kinds/``. Planar primitives (triangle, rectangle, disk) share one affine form; spheres are their own.
+Shapes of scene files stand in ``kinds/``, primitives in ``primitives/``, one a file. ``interaction`` turns hits into surface
+points. Planar primitives (triangle, rectangle, disk) share one affine form.
 """
 
 from __future__ import annotations

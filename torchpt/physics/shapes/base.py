@@ -1,4 +1,4 @@
-"""What a shape is: what it declares, and the surfaces that it comes to."""
+"""The base class of shapes: parameters, and the primitives that they become."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Size(spec.Scalar):
-    """A length of a shape before its transform: part of its ``to_world``, no tensor of its own."""
+    """Spec of a length before the transform. It is part of ``to_world``, not a parameter tensor."""
 
     differentiable: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
 class Place(spec.Point):
-    """A point of a shape before its transform: part of its ``to_world``, no tensor of its own."""
+    """Spec of a point before the transform. It is part of ``to_world``, not a parameter tensor."""
 
     differentiable: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
 class Surface:
-    """One primitive that a shape comes to.
+    """One primitive of a shape, other than triangles.
 
     Attributes:
-        kind: of primitive, one of ``records.KINDS``.
-        label: its name within the shape, where that has several.
-        local: ``(4, 4)`` from the primitive's own space to the shape's; None: the same.
-        quadric: its surface in its own space, where the kind is ``quadric``.
+        kind: kind of primitive, one of :data:`torchpt.physics.shapes.geometry.KINDS`.
+        label: name within the shape, if it has several primitives.
+        local: ``(4, 4)`` from the primitive's space to the shape's; None for the identity.
+        quadric: the surface in object space, for the kind ``quadric``.
     """
 
     kind: str
@@ -56,18 +56,18 @@ class Surface:
 
 @dataclass(frozen=True)
 class Triangles:
-    """The triangles that a shape comes to, or the file that has them.
+    """The triangles of a shape, or the file that contains them.
 
     Attributes:
-        path: candidates, the first that is there is used; None: the arrays.
+        path: candidates, of which the first that exists is read; None: the arrays are used.
         vertices: ``(V, 3)`` float64.
         faces: ``(F, 3)`` int64.
         normals: ``(V, 3)``, or None.
         uvs: ``(V, 2)``, or None.
-        flat: shade flat, whatever normals there are.
+        flat: use face normals even if vertex normals are given.
         displacement: ``texture``, ``scale`` and ``subdivisions`` of :class:`~torchpt.physics.shapes.kinds.mesh.Displacement`,
             or None.
-        object: of trimesh, or parts of a mesh, in place of a file; None: no such thing.
+        object: an object of trimesh, or a tuple of meshes, in place of a file; None otherwise.
     """
 
     path: tuple[str, ...] | None = None
@@ -81,7 +81,7 @@ class Triangles:
 
 
 def _material(value: Any) -> Any:
-    """A material's name; whoever reads a scene has made one that is written out before the shape is read."""
+    """Return the name of a material, or a material that the scene reader has already made of an inline one."""
     plain = isinstance(value, str | bool | int | float | Mapping | Sequence | np.ndarray)
     if plain and not (isinstance(value, str) and value):
         raise Refused("the name of a material, or a material")
@@ -92,10 +92,10 @@ class Shape:
     """A kind of shape.
 
     Attributes:
-        name: its ``type`` in a scene file.
-        parameters: what it declares.
-        meshed: whether it is made of triangles, which instances may share.
-        copies: whether it is an instance of another shape: ``of``.
+        name: the ``type`` in a scene file.
+        parameters: specs of the parameters.
+        meshed: whether the shape consists of triangles, which instances may share.
+        copies: whether the shape is an instance of another one, its parameter ``of``.
     """
 
     name: ClassVar[str] = ""
@@ -104,65 +104,65 @@ class Shape:
             None,
             reader=_material,
             words="the name of a material, or a material",
-            doc="what it is made of; none: what its file says, else diffuse 0.5",
+            doc="material; by default the one in the shape's file, else diffuse with reflectance 0.5",
         ),
         "transform": Pose(
             None,
             words="a list of translate, scale, rotate, matrix, look_at, applied in order",
-            doc="from its own space to the world; none: the two are the same",
+            doc="from object space to the world; the identity by default",
         ),
-        "emission": Color(None, doc="radiance that leaves the front; none: it does not shine"),
-        "flip_normals": Flag(False, doc="turns the front around"),
+        "emission": Color(None, doc="radiance emitted on the front side; none by default"),
+        "flip_normals": Flag(False, doc="whether to swap front and back"),
     }
     meshed: ClassVar[bool] = False
     copies: ClassVar[bool] = False
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """Refuse values that do not go together.
+        """Refuse values that contradict each other.
 
         Raises:
-            Refused: says which, and what is accepted.
+            Refused: with the parameter and the accepted values.
         """
 
     @classmethod
     def own(cls, values: Mapping[str, Any]) -> Any:
-        """From the space of its surfaces to its own, ``(4, 4)``: its size and place before its transform; None: the same.
+        """Return the map ``(4, 4)`` from the space of the primitives to the shape's, by sizes and positions; None: identity.
 
-        A tensor of what are tensors among ``values``, a matrix of numbers.
+        The result is a tensor if any of ``values`` is one, else an array.
         """
         return None
 
     @classmethod
     def to_world(cls, values: Mapping[str, Any]) -> Matrix:
-        """Its transform, ``(4, 4)`` float64."""
+        """Return the transform from the shape's space to the world, ``(4, 4)`` float64."""
         return np.eye(4) if values["transform"] is None else values["transform"]
 
     @classmethod
     def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:
-        """The primitives that it comes to; none where it is made of triangles.
+        """Return the primitives of the shape; none if it consists of triangles.
 
         Args:
-            values: of its parameters.
-            pose: ``(4, 4)`` from the space of its surfaces to the world.
+            values: values of the parameters.
+            pose: ``(4, 4)`` from the space of the primitives to the world.
         """
         return []
 
     @classmethod
     def triangles(cls, values: Mapping[str, Any]) -> Triangles | None:
-        """The triangles that it comes to; None where it is made of primitives of other kinds."""
+        """Return the triangles of the shape; None if it consists of other primitives."""
         return None
 
 
 def placed(origin: Sequence[Any], size: Sequence[Any], turn: Matrix) -> Any:
-    """A scale, then a rotation ``(3, 3)``, then a move, as ``(4, 4)``: a tensor where any of the six numbers is one."""
+    """Return scale, then rotation ``turn (3, 3)``, then translation as ``(4, 4)``; a tensor if any number is one."""
     device = next((number.device for number in (*origin, *size) if isinstance(number, Tensor)), None)
     place, factors = (np.array(three) if device is None else tensor_of([*three], device) for three in (origin, size))
     return affine(constant(turn, factors) * factors, place)
 
 
-#: z to y, by a turn about x: the axis of what turns about one lies along its surfaces' z.
+#: Rotates z to y about x: in scene files axes of rotation lie along y, those of quadrics along z.
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-#: From the unit disk to the caps of a surface between z = 0 and z = 1, facing outward.
+#: From the unit disk to the caps of a quadric at z = 1 and z = 0, facing outward.
 TOP = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]])
 BOTTOM = np.diag([1.0, -1.0, -1.0, 1.0])

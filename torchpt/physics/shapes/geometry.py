@@ -1,4 +1,4 @@
-"""Geometry as the search and the lanes hold it, hits, and points on surfaces."""
+"""Records of geometry for the search and for stages, of hits, and of surface points."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ KINDS = ("triangle", "rectangle", "disk", "sphere", "quadric")
 
 @dataclass(frozen=True)
 class Geometry:
-    """The primitives as the search sees them: float32, detached, contiguous, on one device.
+    """The primitives for the search: float32, detached, contiguous, on one device.
 
     A planar primitive is the affine map ``p = p0 + u (p1 - p0) + v (p2 - p0)``: a triangle holds ``u, v >= 0, u + v <= 1``,
     a rectangle (parallelogram) ``0 <= u, v <= 1``, a disk (ellipse) ``u^2 + v^2 <= 1`` about its centre ``p0``.
-    A sphere has its centre in ``p0`` and its radius in ``p1[0]``. A quadric is a surface in its own space under the affine map
-    ``p = p0 + x e1 + y e2 + z e3``, kept in float64 beside the others.
+    A sphere has its centre in ``p0`` and its radius in ``p1[0]``. A quadric is a surface in object space under the affine map
+    ``p = p0 + x e1 + y e2 + z e3``; ``quadrics`` has it in float64.
 
     Attributes:
         p0: ``(3, P)``.
-        p1: ``(3, P)``; of a quadric its ``e1``.
-        p2: ``(3, P)``; of a quadric its ``e2``.
-        counts: how many primitives of each of :data:`KINDS`; stored in that order.
-        quadrics: None where there are none.
-        copies: ``(15, I)`` float64: three rows of the map from a mesh to its copy, the first triangle of that mesh, how many it
-            has, and the id of the copy's first primitive; None where there are no instances. A copy's primitives exist by
-            their ids alone, which follow those of all others.
+        p1: ``(3, P)``; ``e1`` for a quadric.
+        p2: ``(3, P)``; ``e2`` for a quadric.
+        counts: number of primitives of each of :data:`KINDS`, in the order of storage.
+        quadrics: None without quadrics.
+        copies: ``(15, I)`` float64: three rows of the map from a mesh to its instance, the mesh's first triangle, its number of
+            triangles, and the id of the instance's first primitive; None without instances. Primitives of instances are not
+            stored; they have ids after P.
     """
 
     p0: Tensor
@@ -47,28 +47,28 @@ class Geometry:
 
     @property
     def size(self) -> int:
-        """Number of primitives P, copies not counted."""
+        """Number of primitives P, without instances."""
         return sum(self.counts)
 
 
 @dataclass(frozen=True)
 class QuadricTable:
-    """The quadrics as the search sees them: numbers alone, whatever their surfaces are called; float64, detached."""
+    """The quadrics for the search: coefficients of their equations, float64, detached."""
 
     frame: Tensor  # (12, Q) p0 e1 e2 e3
-    form: Tensor  # (7, Q) the surface in its own space, see torchpt.physics.shapes.quadrics.Form
-    low: Tensor  # (3, Q) its box in the world
+    form: Tensor  # (7, Q) the surface in object space, see torchpt.physics.shapes.quadrics.Form
+    low: Tensor  # (3, Q) bounding box in the world
     high: Tensor  # (3, Q)
 
 
 @dataclass(frozen=True)
 class Quadrics:
-    """Numbers that lanes gather of a quadric beside ``LaneGeometry.p0, e1, e2``: one column a quadric."""
+    """Quadrics for stages, beside ``LaneGeometry.p0, e1, e2``: one column a quadric."""
 
-    kinds: tuple[type[Quadric], ...]  # the surfaces among them; static
-    code: Tensor | None  # (Q,) int64 index into `kinds`; None where there is but one
+    kinds: tuple[type[Quadric], ...]  # the kinds of surfaces; static
+    code: Tensor | None  # (Q,) int64 index into `kinds`; None for a single kind
     e3: Tensor  # (3, Q)
-    n1: Tensor  # (3, Q) columns of the cofactor matrix of (e1, e2, e3), turned to the front; their common scale is free
+    n1: Tensor  # (3, Q) columns of the cofactor matrix of (e1, e2, e3), toward the front, up to a common scale
     n2: Tensor  # (3, Q)
     n3: Tensor  # (3, Q)
     reach: Tensor  # (3, Q) largest coordinate magnitudes that enter a point's sum, see LaneGeometry.bound
@@ -76,51 +76,51 @@ class Quadrics:
 
 @dataclass(frozen=True)
 class Instances:
-    """Instances of meshes: column 0 is the identity, that of all that is no copy; column k belongs to copy k - 1.
+    """Instances of meshes. Column 0 is the identity, for all that is not instanced; column k belongs to instance k - 1.
 
-    What is kept by primitive splits in two: its place on a mesh, looked up by :attr:`Interaction.prim`, and what a copy has of
-    its own (material, opacity, object id), by :attr:`Interaction.slot`: rows after the P of the primitives, one a copy.
+    :attr:`Interaction.prim` indexes what instances share with the mesh (geometry); :attr:`Interaction.slot` indexes what each
+    has of its own (material, opacity, object id): one row an instance, after the P rows of the primitives.
     """
 
-    start: Tensor  # (I + 1,) int64 id of the copy's first primitive
-    first: Tensor  # (I + 1,) int64 first triangle of its mesh
+    start: Tensor  # (I + 1,) int64 id of the instance's first primitive
+    first: Tensor  # (I + 1,) int64 first triangle of the mesh
     x: Tensor  # (3, I + 1) columns of the linear map
     y: Tensor  # (3, I + 1)
     z: Tensor  # (3, I + 1)
     move: Tensor  # (3, I + 1)
-    nx: Tensor  # (3, I + 1) columns of its cofactor matrix, turned to the front; their scale is free
+    nx: Tensor  # (3, I + 1) columns of the cofactor matrix, toward the front, up to a common scale
     ny: Tensor  # (3, I + 1)
     nz: Tensor  # (3, I + 1)
 
 
 @dataclass(frozen=True)
 class LaneGeometry:
-    """Places of surfaces, as the lanes gather them: P primitives, and I copies (see :class:`Instances`)."""
+    """The geometry for stages: P primitives, and I instances (see :class:`Instances`)."""
 
-    kinds: tuple[type[Primitive], ...]  # those that there are, in the order of KINDS; static
-    counts: tuple[int, int, int, int, int]  # as in Geometry; static: lanes read `ends`
+    kinds: tuple[type[Primitive], ...]  # the kinds present, in the order of KINDS; static
+    counts: tuple[int, int, int, int, int]  # as in Geometry; static: stages read `ends`
     ends: Tensor  # (5,) int64 the id after the last primitive of each kind
     p0: Tensor  # (3, P)
     e1: Tensor  # (3, P)
     e2: Tensor  # (3, P)
     normal: Tensor  # (3, P) unit geometric normal; zero for spheres, without meaning for quadrics
-    bound: Tensor  # (P,) sum |n_i| max |p_i| over the primitive: scales the rounding of its plane
+    bound: Tensor  # (P,) rounding bound: sum |n_i| max |p_i| over the primitive, the scale of rounding of its plane
     flip: Tensor | None  # (P,) orientation of spheres
-    normals: tuple[Tensor, Tensor, Tensor] | None  # (3, P) shading normals at the corners, where any are smooth
-    #: (3, P) how p moves with texture coordinate u; zero: any direction will do. Of a sphere the vector whose cross product
-    #: with the normal it is. None where no frame needs it.
+    normals: tuple[Tensor, Tensor, Tensor] | None  # (3, P) shading normals at the corners; None if all are flat
+    #: (3, P) derivative of p by texture coordinate u; zero: any tangent will do. For a sphere the vector whose cross product
+    #: with the normal is this derivative. None if no shading frame needs it.
     tangents: Tensor | None
-    bitangents: Tensor | None  # (3, P) the same for v; of a sphere (pi r, 0, 0). None without bump maps
+    bitangents: Tensor | None  # (3, P) derivative of p by v; (pi r, 0, 0) for a sphere. None without bump maps
     uvs: tuple[Tensor, Tensor, Tensor] | None  # (2, P) texture coordinates at the corners; None without textures
     axes: tuple[Tensor, Tensor, Tensor] | None  # (3, S) unit x, y, z of the spheres; None without textures or spheres
-    mirrored: Tensor | None  # (P,) bool: disks whose u and v are swapped; None where none are, or none matter
-    colors: tuple[Tensor, Tensor, Tensor] | None  # (3, P) at the corners, where vertex colours are read
+    mirrored: Tensor | None  # (P,) bool: disks whose u and v are swapped; None if none are, or none has a texture
+    colors: tuple[Tensor, Tensor, Tensor] | None  # (3, P) vertex colours at the corners; None if not read
     object_id: Tensor  # (P + I,) int64, order of the shape in the scene
-    quadrics: Quadrics | None = None  # None where there are none
-    copies: Instances | None = None  # None where there are no instances
+    quadrics: Quadrics | None = None  # None without quadrics
+    copies: Instances | None = None  # None without instances
 
     def slot(self, prim: Tensor) -> Tensor:
-        """Rows ``(N,)`` of what copies have of their own, for ids of primitives as the search gives them; -1 stays."""
+        """Return :attr:`Interaction.slot` ``(N,)`` for primitive ids of the search; -1 stays."""
         if self.copies is None:
             return prim
         import torch
@@ -129,13 +129,13 @@ class LaneGeometry:
         return torch.where(copy > 0, copy + (self.ends[4] - 1), prim)
 
     def of(self, kind: type[Primitive], prim: Tensor) -> Tensor:
-        """Return which of ``prim (N,)`` are of a kind that the scene has: ``(N,)`` bool."""
+        """Return a mask ``(N,)`` of the primitives ``prim (N,)`` of a kind that the scene has."""
         number = KINDS.index(kind.name)
         after = prim >= self.ends[number - 1] if number else prim >= 0
         return after & (prim < self.ends[number]) if any(self.counts[number + 1 :]) else after
 
     def copy(self, prim: Tensor) -> Tensor:
-        """Columns ``(N,)`` of ``copies`` for ids of primitives as the search gives them."""
+        """Return columns ``(N,)`` of ``copies`` for primitive ids of the search."""
         import torch
 
         assert self.copies is not None
@@ -144,29 +144,29 @@ class LaneGeometry:
 
 @dataclass(frozen=True)
 class Hit:
-    """Hits of rays, as the search found them."""
+    """Hits of rays, as returned by the search."""
 
     t: Tensor  # (N,) in units of |d|
-    prim: Tensor  # (N,) int64, -1 for a miss; of a copy beyond P, see Copies
+    prim: Tensor  # (N,) int64, -1 for a miss; P and more for instances, see Copies
     u: Tensor  # (N,)
     v: Tensor  # (N,)
     chance: Tensor | None = (
-        None  # (N,) 1, with the derivative of the chance to get here; None: no derivative, or no chance
+        None  # (N,) 1, with the derivative of the probability to get here past opacity; None without derivative
     )
 
 
 @dataclass(frozen=True)
 class Interaction:
-    """A surface point, ready to be shaded."""
+    """A surface interaction: the point of a hit with its frame and parametrization."""
 
     p: Tensor  # (3, N)
     ng: Tensor  # (3, N) unit geometric normal, on the shape's own outside
     ns: Tensor  # (3, N) unit shading normal
-    tangent: Tensor | None  # (3, N) along u, neither unit nor orthogonal; None where no frame needs it
+    tangent: Tensor | None  # (3, N) along u, neither unit nor orthogonal; None if no shading frame needs it
     bitangent: Tensor | None  # (3, N) along v; None without bump maps
-    prim: Tensor  # (N,) below P: of a copy the triangle of its mesh
-    slot: Tensor  # (N,) row of what a copy has of its own; else prim
-    bound: Tensor | None  # (N,) in place of LaneGeometry.bound at prim; None where that holds everywhere
-    u: Tensor  # (N,) of the primitive's own parametrization
+    prim: Tensor  # (N,) below P: for an instance the triangle of its mesh
+    slot: Tensor  # (N,) row of the instance, see Copies; else prim
+    bound: Tensor | None  # (N,) rounding bounds; None: LaneGeometry.bound at prim
+    u: Tensor  # (N,) in the primitive's own parametrization
     v: Tensor  # (N,)
-    own: Tensor | None  # (3, N) point of a quadric in its own space; None where there are none
+    own: Tensor | None  # (3, N) point in the object space of a quadric; None without quadrics

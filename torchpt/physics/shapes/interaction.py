@@ -1,10 +1,10 @@
-"""The surface point under a hit, re-derived from ``prim, u, v`` with gradients.
+"""Surface interactions of hits, recomputed from ``prim, u, v`` with gradients.
 
-The search is free of gradients. Here the point comes from the primitive's own corners, which is more accurate than
-``o + t d`` and makes any search differentiable. Two parametrizations serve the derivative (the values are the same):
+The search has no gradients. Computing the point from the corners of its primitive is more accurate than ``o + t d`` and
+makes any search differentiable. The derivative can be taken in two parametrizations, with the same values:
 
 - a camera ray stays fixed in its pixel and the point slides along it: ``follow_shape``;
-- at later vertices the point stays fixed on its surface and the direction follows: :func:`reattach` (the material form of
+- at later vertices the point stays fixed on its surface and the direction follows it: :func:`reattach` (the material form of
   Zhang, Miller, Yan, Gkioulekas, Zhao, *Path-Space Differentiable Rendering*, 2020; its interior term).
 """
 
@@ -25,12 +25,12 @@ __all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
 #: Rays leave a surface ``OFFSET * LaneGeometry.bound`` off its plane. Re-deriving a point and evaluating its plane in the
 #: search each round by less than ``4 * 2^-24 * 2 bound``; this is two and a half times their sum, and free of world units.
 OFFSET = 2.0**-19
-#: Points nearer to each other than this share of their coordinates have no derivative by their distance.
+#: Distances below this fraction of the coordinates count as 0 and have no derivative.
 NEAR = 2.0**-15
 
 
 def _plane_uv(o: Tensor, d: Tensor, p0: Tensor, e1: Tensor, e2: Tensor) -> tuple[Tensor, Tensor]:
-    """``u, v`` of the ray with the primitive's plane (Moeller and Trumbore, 1997), differentiable in all arguments."""
+    """Return ``u, v`` of rays in the primitives' planes, differentiable in all arguments (Moeller and Trumbore, 1997)."""
     pvec = cross(d, e2)
     det = dot(e1, pvec)
     inverse = 1.0 / torch.where(det == 0, 1.0, det)
@@ -39,18 +39,18 @@ def _plane_uv(o: Tensor, d: Tensor, p0: Tensor, e1: Tensor, e2: Tensor) -> tuple
 
 
 def _round(world: World, prim: Tensor) -> list[tuple[type[Primitive], Tensor]]:
-    """The kinds that are not flat, and which of the primitives are of them."""
+    """Return the kinds present that are not flat, each with the mask of its primitives."""
     return [(kind, world.geometry.of(kind, prim)) for kind in world.geometry.kinds if not kind.flat]
 
 
 def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_shape: bool = False) -> Interaction:
-    """Surface points of hits ``(N,)``, none of them a miss.
+    """Return the surface interactions of hits ``(N,)``, none of them a miss.
 
     Args:
         world: the scene's tensors.
         o: ray origins ``(3, N)``.
         d: ray directions ``(3, N)``.
-        hit: from the search.
+        hit: hits of the search.
         follow_shape: re-intersect the ray with the plane, so that the point follows ``o``, ``d`` and the geometry.
     """
     geometry, place = world.geometry, lane_primitives(world, hit.prim)
@@ -83,7 +83,7 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_shape: bool = 
 
 
 def _framed(world: World, place: LanePrimitives, at: Interaction) -> Interaction:
-    """Points with how they move with their texture coordinates, where anything asks."""
+    """Add tangents and bitangents, if the world has them."""
     geometry = world.geometry
     if geometry.tangents is None:
         return at
@@ -102,18 +102,18 @@ def _framed(world: World, place: LanePrimitives, at: Interaction) -> Interaction
 
 
 def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Tensor]:
-    """Let a traced direction follow both of its ends.
+    """Make a traced direction differentiable in both of its end points.
 
     Args:
         world: the scene's tensors, with gradients.
-        x: where the ray left, differentiable ``(3, N)``.
-        hit: what it found; the point is held at ``u, v`` of its primitive (on a sphere: at its normal,
-            on a quadric: at its place in its own space).
-        wi: the traced direction ``(3, N)``; kept for misses.
+        x: origins, differentiable ``(3, N)``.
+        hit: hits of the rays. The points stay fixed at ``u, v`` of their primitives (on a sphere at their normal, on a quadric
+            at their position in object space).
+        wi: traced directions ``(3, N)``; unchanged for misses.
 
     Returns:
-        The direction ``(3, N)`` and the factor ``(N,)`` of value 1 whose derivative is that of the change of measure from
-        solid angle to the surface, ``|cos| dA / r^2``.
+        The direction ``(3, N)``, and a factor ``(N,)`` of value 1 with the relative derivative of ``|cos| dA / r^2``, the
+        change of measure from solid angle to area.
     """
     missed = hit.prim < 0
     place = lane_primitives(world, hit.prim.clamp_min(0))
@@ -127,8 +127,8 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
             y, area = torch.where(mine, held.p, y), torch.where(mine, held.area, area)
     offset = torch.where(missed, wi, y - x)
     square = dot(offset, offset)
-    # Where two surfaces touch, the derivative grows with one over the distance. Points as near as rounding leaves them are not
-    # told apart: a ray that leaves beside an edge may meet the other side of that edge.
+    # Where two surfaces touch, the derivative grows as one over the distance. Points within rounding of each other count as
+    # one: a ray that leaves beside an edge may hit the other face of that edge.
     least = largest(torch.maximum(x.detach().abs(), y.detach().abs())) * NEAR
     apart = missed | (square.detach() > least * least)
     square = torch.where(apart, square, 1.0)
@@ -137,14 +137,14 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
     value = measure.detach()
     usable = apart & ~missed & (value > 0)
     ratio = torch.where(usable, measure / torch.where(usable, value, 1.0), 1.0)
-    # The value stays the traced direction's own: only its derivative is new.
+    # The value stays the traced direction; only the derivative is added.
     return torch.where(apart, wi + (direction - direction.detach()), wi), ratio
 
 
 def offset_origin(world: World, at: Interaction, w: Tensor) -> Tensor:
-    """Origins ``(3, N)`` for rays that leave in directions ``w``, moved off the surface on the side they leave by.
+    """Return origins ``(3, N)`` of rays in directions ``w``, moved off the surface to the side of ``w``.
 
-    Waechter and Binder (*A Fast and Robust Method for Avoiding Self-Intersection*, Ray Tracing Gems, 2019) for the idea.
+    After Waechter and Binder, *A Fast and Robust Method for Avoiding Self-Intersection*, Ray Tracing Gems, 2019.
     """
     step = (take(world.geometry.bound, at.prim) if at.bound is None else at.bound) * OFFSET
     return torch.addcmul(at.p, at.ng, torch.copysign(step, dot(w, at.ng)))

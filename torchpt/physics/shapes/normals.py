@@ -1,7 +1,7 @@
 """Smooth vertex normals of a mesh, differentiable in its vertices.
 
 Weighted by the angle at each corner, as Mitsuba does (Thuermer and Wuethrich, *Computing Vertex Normals from Polygonal
-Facets*, 1998); the angle is taken by ``2 atan2(|a - b|, |a + b|)`` of unit edges, which is exact for slivers.
+Facets*, 1998); the angle between unit edges is ``2 atan2(|a - b|, |a + b|)``, which is accurate for slivers.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def _length(a: Tensor) -> Tensor:
 def smooth_normals(vertices: Tensor, faces: Tensor, least: float = 0.0) -> Tensor:
     """Return unit normals ``(3, V)`` for vertices ``(3, V)`` and faces ``(F, 3)``; zero where no face has area.
 
-    Zero too where faces face each other, so that the sum of their normals by angle is no longer than ``least``.
+    Also zero where opposite faces cancel: where the weighted sum of normals is no longer than ``least``.
     """
     corner = [vertices.index_select(1, faces[:, k]) for k in range(3)]
     normal = normalize(cross(corner[1] - corner[0], corner[2] - corner[0]))

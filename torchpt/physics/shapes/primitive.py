@@ -1,4 +1,4 @@
-"""What a primitive is: where it lies when a scene is assembled, and what lanes make of a hit on it."""
+"""The base class of primitives: their geometry when a world is built, and surface points of hits on them."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ Triple = tuple[Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Corners:
-    """The primitives of one part: ``(3, P)`` each, see :class:`~torchpt.physics.shapes.geometry.Geometry`.
+    """Geometry of the primitives of one part: ``(3, P)`` each, see :class:`~torchpt.physics.shapes.geometry.Geometry`.
 
     Attributes:
-        normals: at the corners, or None.
-        faces: ``(P, 3)`` vertices at the corners; of meshes only.
-        mirrored: whether a flat shape's two axes changed places.
+        normals: normals at the corners, or None.
+        faces: ``(P, 3)`` vertex indices of the corners; meshes only.
+        mirrored: whether the two axes of a flat shape were swapped.
         frame: ``(12, 1)`` float64 ``p0 e1 e2 e3`` of a quadric.
-        uvs: ``(V, 2)`` at the vertices, where they are a parameter of the scene; else the part has them.
+        uvs: ``(V, 2)`` texture coordinates at the vertices if they are a parameter of the scene; None: those of the part.
     """
 
     p0: Tensor
@@ -55,23 +55,23 @@ class Corners:
 
 @dataclass(frozen=True)
 class LanePrimitives:
-    """Where primitives lie: what interactions need of them before a point is chosen."""
+    """Geometry of the primitives of N lanes, with their instances."""
 
     prim: Tensor  # (N,) below P
     p0: Tensor  # (3, N)
     e1: Tensor  # (3, N)
     e2: Tensor  # (3, N)
-    copies: Instances | None = None  # columns (., N) where the scene has copies
-    copied: Tensor | None = None  # (N,) bool: which are copies
-    reach: Tensor | None = None  # (3, N) coordinate magnitudes that enter a point's sum, where the scene has copies
+    copies: Instances | None = None  # columns (., N); None without instances
+    copied: Tensor | None = None  # (N,) bool: primitives of instances
+    reach: Tensor | None = None  # (3, N) sums of coordinate magnitudes, for rounding bounds; None without instances
 
     def moved(self, w: Tensor) -> Tensor:
-        """Vectors ``(3, N)`` of a mesh as those of its copy."""
+        """Transform vectors ``(3, N)`` from the mesh to its instance."""
         assert self.copies is not None
         return _linear(self.copies, w)
 
     def turned(self, n: Tensor) -> Tensor:
-        """Unit normals ``(3, N)`` of a mesh as those of its copy."""
+        """Transform unit normals ``(3, N)`` from the mesh to its instance."""
         assert self.copies is not None and self.copied is not None
         turned = affine(self.copies.nx * n[0], self.copies.ny, n[1], self.copies.nz, n[2])
         return torch.where(self.copied, normalize(turned), n)
@@ -82,7 +82,7 @@ def _linear(copies: Instances, w: Tensor) -> Tensor:
 
 
 def lane_primitives(world: World, prim: Tensor) -> LanePrimitives:
-    """Places of primitives by ids as the search gives them, none of them a miss."""
+    """Return the geometry of primitives by their ids in the search, none of them a miss."""
     geometry = world.geometry
     if geometry.copies is None:
         return LanePrimitives(prim, take(geometry.p0, prim), take(geometry.e1, prim), take(geometry.e2, prim))
@@ -98,12 +98,12 @@ def lane_primitives(world: World, prim: Tensor) -> LanePrimitives:
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays and what they met.
+    """Rays and their hits.
 
     Attributes:
         o: origins ``(3, N)``.
         d: directions ``(3, N)``.
-        hit: from the search.
+        hit: hits of the search.
         follow_shape: whether points follow ``o``, ``d`` and the geometry.
     """
 
@@ -115,13 +115,13 @@ class Rays:
 
 @dataclass(frozen=True)
 class HitPoints:
-    """Points of surfaces that are not flat; lanes of other kinds hold anything.
+    """Hit points on primitives of one kind that is not flat; values in lanes of other kinds are arbitrary.
 
     Attributes:
         p: ``(3, N)``.
         ng: unit geometric normals ``(3, N)``.
-        bound: ``(N,)`` in place of ``LaneGeometry.bound``; None: that.
-        own: points ``(3, N)`` in the surface's own space, where it has one.
+        bound: rounding bounds ``(N,)``; None: ``LaneGeometry.bound``.
+        own: points ``(3, N)`` in object space, for quadrics.
     """
 
     p: Tensor
@@ -132,22 +132,22 @@ class HitPoints:
 
 @dataclass(frozen=True)
 class FixedPoints:
-    """Points that stay where they are on their surfaces."""
+    """Hit points that stay fixed on their surfaces under differentiation."""
 
     p: Tensor  # (3, N)
-    area: Tensor  # (3, N) along the normal, as long as what area becomes in the world
+    area: Tensor  # (3, N) along the normal; its length is the ratio of area in the world to area in the parametrization
 
 
 class Primitive:
-    """A kind of primitive; as it stands a flat one, whose point is ``p0 + u e1 + v e2``.
+    """A kind of primitive. This class implements flat ones, with points ``p0 + u e1 + v e2``.
 
-    The search meets it by kernels of its own (:mod:`torchpt.search`).
+    The search has kernels of its own to intersect primitives (:mod:`torchpt.search`).
 
     Attributes:
         name: one of :data:`torchpt.physics.shapes.geometry.KINDS`.
-        flat: whether its point is that of its plane; those that are come first.
-        has_own_uv: whether its texture coordinates are not affine: then :meth:`tangents` and :meth:`uv` say them.
-        angles: whether it stays what it is under maps that keep angles alone.
+        flat: whether points lie in the plane ``p0 + u e1 + v e2``. Flat kinds come first in the order of kinds.
+        has_own_uv: whether texture coordinates are not affine: then :meth:`tangents` and :meth:`uv` compute them.
+        angles: whether only similarity transforms keep the kind, as for spheres.
     """
 
     name: ClassVar[str] = ""
@@ -155,73 +155,75 @@ class Primitive:
     has_own_uv: ClassVar[bool] = False
     angles: ClassVar[bool] = False
 
-    # -- when a scene is assembled
+    # -- when a world is built
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
-        """Where the primitives of a part lie.
+        """Return the geometry of the primitives of a part.
 
         Args:
-            part: whose.
-            pose: ``(3, 4)`` float64 into the lanes' coordinates.
-            dtype: of the lanes.
-            own: arrays of the part that are parameters of the scene: ``vertices (V, 3)`` in its own space, of meshes always;
-                ``normals (V, 3)`` and ``uvs (V, 2)`` where gradients of them are wanted.
+            part: the part.
+            pose: ``(3, 4)`` float64, to world coordinates.
+            dtype: dtype of the world.
+            own: arrays of the part that are parameters of the scene: ``vertices (V, 3)`` in object space for all meshes;
+                ``normals (V, 3)`` and ``uvs (V, 2)`` if they are differentiated.
         """
         raise NotImplementedError
 
     @classmethod
     def corners_of_many(cls, poses: Tensor, dtype: torch.dtype) -> list[Corners] | None:
-        """The corners of parts that are no more than a pose each, ``(N, 3, 4)``, at once; None: one by one."""
+        """Return :meth:`corners` of N parts given by their poses ``(N, 3, 4)`` alone; None: not implemented."""
         return None
 
     @classmethod
     def uvs(cls, part: Part, corners: Corners) -> Triple:
-        """Texture coordinates ``(2, P)`` at the corners; zero where :meth:`uv` says them."""
+        """Return texture coordinates ``(2, P)`` at the corners; zero for charted kinds."""
         nothing = torch.zeros_like(corners.p0[:2])
         return nothing, nothing, nothing
 
     @classmethod
     def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
-        """What :meth:`tangents` needs of ``LaneGeometry.tangents`` and ``bitangents``: ``(3, P)`` each.
+        """Return the columns of ``LaneGeometry.tangents`` and ``bitangents`` of a part: ``(3, P)`` each.
 
         Args:
-            part: whose.
-            corners: of it.
-            uvs: of it.
-            linear: ``(3, 3)`` of its pose.
+            part: the part.
+            corners: the part's :meth:`corners`.
+            uvs: the part's :meth:`uvs`.
+            linear: linear part ``(3, 3)`` of the pose.
         """
         return torch.zeros_like(corners.p0), torch.zeros_like(corners.p0)
 
-    # -- on lanes; what is given back where a lane is of another kind means nothing
+    # -- on lanes; results in lanes of other kinds are arbitrary
 
     @classmethod
     def hit_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> HitPoints:
-        """Points of hits; not of flat kinds. ``mine (N,)``: which lanes are of this kind."""
+        """Return the hit points, for kinds that are not flat; ``mine (N,)`` masks lanes of this kind."""
         raise NotImplementedError
 
     @classmethod
     def fixed_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> FixedPoints:
-        """Points that stay on their surface where rays met it, as these and the surface move; not of flat kinds."""
+        """Return the hit points fixed on their surfaces under differentiation, for kinds that are not flat."""
         raise NotImplementedError
 
     @classmethod
     def tangents(
         cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """How points move with their texture coordinates, ``(3, N)`` each, the second where ``at`` has one; of charted kinds.
+        """Return derivatives of points by texture coordinates, ``(3, N)`` each, the second if ``at`` has a bitangent.
+
+        Called for charted kinds.
 
         Args:
             world: the scene's tensors.
-            place: where the primitives lie.
-            at: the points, with the primitives' columns of ``LaneGeometry.tangents`` and ``bitangents``.
-            mine: which lanes are of this kind.
+            place: geometry of the primitives.
+            at: the points, with columns of ``LaneGeometry.tangents`` and ``bitangents``.
+            mine: mask ``(N,)`` of lanes of this kind.
         """
         raise NotImplementedError
 
     @classmethod
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
-        """Texture coordinates ``(2, N)``, of charted kinds; None where none of the points is of this kind."""
+        """Return texture coordinates ``(2, N)``, for charted kinds; None if no point is of this kind."""
         raise NotImplementedError
 
 

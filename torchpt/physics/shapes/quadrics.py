@@ -1,8 +1,8 @@
-"""Quadrics under affine maps: points, normals, tangents, uv, area and sampling, in the surface's own space.
+"""Quadrics under affine maps: points, normals, tangents, uv, area and sampling, in object space.
 
-What a surface is in its own space is said by its class (:class:`Quadric`), in the file of the shape that has it. A primitive
-maps it by ``p = p0 + x e1 + y e2 + z e3``; normals follow by the cofactor matrix, which needs no inverse and keeps the outside
-outside when the map mirrors. The functions below take lanes of any of the surfaces that a scene has.
+A subclass of :class:`Quadric` defines the surface in object space, in the file of its shape. A primitive maps it by
+``p = p0 + x e1 + y e2 + z e3``; normals are mapped by the cofactor matrix, which needs no inverse and keeps them outward under
+mirroring maps. The functions below take lanes of all quadrics of a scene together.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Form:
-    """``x^2 + y^2 + bend w^2 + 2 half w = level`` with ``w = z - shift``, where ``low <= z <= high``.
+    """The equation ``x^2 + y^2 + bend w^2 + 2 half w = level`` with ``w = z - shift``, for ``low <= z <= high``.
 
     Attributes:
-        bend: of the square of w.
-        level: on the other side.
-        shift: of z.
+        bend: coefficient of ``w^2``.
+        level: right side of the equation.
+        shift: offset of z.
         low: least z.
         high: greatest z.
-        around: whether the search tells a point by its direction from the origin (two octahedral coordinates), as it must
-            where the surface closes smoothly at an end; else by its place on the ring and its height.
-        half: half of what w counts.
+        around: whether ``u, v`` of hits are octahedral coordinates of the direction from the origin, needed where the surface
+            closes smoothly at an end; else the position on the ring and the height.
+        half: half the coefficient of ``w``.
     """
 
     bend: float
@@ -67,12 +67,12 @@ class Form:
 
 
 class Quadric:
-    """A surface in its own space: round about z, within ``[-1, 1]^3``.
+    """A surface of revolution about z in object space, within ``[-1, 1]^3``.
 
     Attributes:
-        name: of the surface.
-        form: its equation.
-        area: of it.
+        name: name of the surface.
+        form: equation of the surface.
+        area: area in object space.
     """
 
     name: ClassVar[str] = ""
@@ -81,43 +81,43 @@ class Quadric:
 
     @classmethod
     def place(cls, u: Tensor, v: Tensor) -> Tensor:
-        """Points ``(3, N)`` from the ``u, v (N,)`` of a search (:func:`torchpt.search.leaf.quadric`), none of it derived."""
+        """Return points ``(3, N)`` by ``u, v (N,)`` of hits (:func:`torchpt.search.leaf.quadric`), without gradients."""
         raise NotImplementedError
 
     @classmethod
     def normal(cls, q: Tensor) -> Tensor:
-        """Outward normals ``(3, N)`` at its points, of any length; where there is none, along the axis."""
+        """Return outward normals ``(3, N)`` at points of the surface, of any length; along the axis where undefined."""
         raise NotImplementedError
 
     @classmethod
     def climb(cls, q: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
-        """How the distance from the axis, which is ``radius (N,)``, and z change with the texture coordinate ``v``."""
+        """Return derivatives of the distance from the axis (``radius (N,)``) and of z by the texture coordinate ``v``."""
         return torch.zeros_like(radius), torch.ones_like(radius)
 
     @classmethod
     def v(cls, q: Tensor, radius: Tensor) -> Tensor:
-        """The texture coordinate ``v (N,)`` at points whose distance from the axis is ``radius (N,)``."""
+        """Return the texture coordinate ``v (N,)`` at points with distance ``radius (N,)`` from the axis."""
         return q[2]
 
     @classmethod
     def sample(cls, u: Tensor) -> Tensor:
-        """Points ``(3, N)`` uniform by area, from ``u (2, N)`` in [0, 1)."""
+        """Sample points ``(3, N)`` uniformly by area, from ``u (2, N)`` in [0, 1)."""
         raise NotImplementedError
 
     @classmethod
     def box(cls, e1: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
-        """Its box ``(3, Q)`` under the map by ``e1, e2, e3 (3, Q)``, from ``p0``."""
+        """Return the corners ``(3, Q)`` of the bounding box under the map by ``e1, e2, e3 (3, Q)``, relative to ``p0``."""
         raise NotImplementedError
 
 
 def ring(u: Tensor) -> Tensor:
-    """Points ``(3, N)`` of the unit circle in the xy plane, by the way along the square ``|x| + |y| = 1`` in [-2, 2]."""
+    """Return points ``(3, N)`` of the unit circle in the xy plane, by the arc length u in [-2, 2] along ``|x| + |y| = 1``."""
     across, sign = u.abs(), torch.copysign(torch.ones_like(u), u)
     return normalize(torch.stack((1.0 - across, sign * torch.minimum(across, 2.0 - across), torch.zeros_like(u))))
 
 
 def octahedral(u: Tensor, v: Tensor) -> Tensor:
-    """Unit directions ``(3, N)`` by their octahedral coordinates."""
+    """Return unit directions ``(3, N)`` by octahedral coordinates."""
     z = 1.0 - u.abs() - v.abs()
     x = torch.where(z < 0, torch.copysign(1.0 - v.abs(), u), u)
     y = torch.where(z < 0, torch.copysign(1.0 - u.abs(), v), v)
@@ -125,24 +125,24 @@ def octahedral(u: Tensor, v: Tensor) -> Tensor:
 
 
 def polar(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance from the axis ``(N,)`` and azimuth in turns ``(N,)``, with derivatives that are finite on the axis."""
+    """Return distance from the axis ``(N,)`` and azimuth over 2 pi ``(N,)``, with finite derivatives on the axis."""
     square = torch.addcmul(x * x, y, y)
     some = square > 0
     across = torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)
     return across, azimuth(x, y) * (0.5 / math.pi)
 
 
-# -- when a scene is assembled
+# -- when a world is built
 
 
 def quadrics_of(kinds: Sequence[type[Quadric]], turned: Sequence[bool], frames: Tensor, dtype: torch.dtype) -> Quadrics:
-    """What lanes need of quadrics; in float64 until it is their normals' directions.
+    """Return the quadrics for stages; normals are computed in float64.
 
     Args:
-        kinds: of each.
-        turned: whether the normals of each are turned around.
+        kinds: surface of each quadric.
+        turned: whether to flip the normals of each quadric.
         frames: ``(12, Q)`` float64, ``p0 e1 e2 e3``.
-        dtype: of the lanes.
+        dtype: dtype of the world.
     """
     p0, e1, e2, e3 = frames[0:3], frames[3:6], frames[6:9], frames[9:12]
     faces = [cross(e2, e3), cross(e3, e1), cross(e1, e2)]
@@ -159,7 +159,7 @@ def quadrics_of(kinds: Sequence[type[Quadric]], turned: Sequence[bool], frames: 
 
 
 def table_of(table: Quadrics, frames: Tensor) -> QuadricTable:
-    """The quadrics as the search sees them, from frames ``(12, Q)``."""
+    """Return the quadrics for the search, from frames ``(12, Q)``."""
     frames = frames.detach()
     forms = torch.tensor([astuple(kind.form) for kind in table.kinds], dtype=torch.float64, device=frames.device).T
     p0, e1, e2, e3 = frames[0:3], frames[3:6], frames[6:9], frames[9:12]
@@ -169,7 +169,7 @@ def table_of(table: Quadrics, frames: Tensor) -> QuadricTable:
 
 
 def areas(table: Quadrics, frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Areas ``(Q,)`` float64 of quadrics: their own space's times ``|det|``, and (by quadrature, detached) the world's."""
+    """Return for quadrics the area in object space times ``|det|`` ``(Q,)`` float64, and the area in the world (detached)."""
     e1, e2, e3 = frames[3:6], frames[6:9], frames[9:12]
     own = torch.tensor([kind.area for kind in table.kinds], dtype=torch.float64, device=e1.device)
     own = own.expand(e1.shape[1]) if table.code is None else own[table.code]
@@ -189,14 +189,14 @@ def areas(table: Quadrics, frames: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def rows(world: World, prim: Tensor) -> Quadrics:
-    """The columns ``(., N)`` of primitives ``prim (N,)``; any where one is no quadric."""
+    """Return the columns ``(., N)`` of primitives ``prim (N,)``; arbitrary ones where a primitive is no quadric."""
     assert world.geometry.quadrics is not None
     index = (prim - world.geometry.ends[3]).clamp_min(0)
     return columns(world.geometry.quadrics, index)
 
 
 def _each(table: Quadrics, values: Iterable[Tensor]) -> Tensor:
-    """What each surface makes of lanes, where the lanes are its own; ``values`` in the order of ``table.kinds``."""
+    """Select in each lane the value of its surface; ``values`` are in the order of ``table.kinds``."""
     first, *others = values
     for number, value in enumerate(others, 1):
         assert table.code is not None
@@ -205,32 +205,32 @@ def _each(table: Quadrics, values: Iterable[Tensor]) -> Tensor:
 
 
 def place(table: Quadrics, u: Tensor, v: Tensor) -> Tensor:
-    """Points ``(3, N)`` in their own space from the ``u, v (N,)`` of a search."""
+    """Return points ``(3, N)`` in object space by ``u, v (N,)`` of hits."""
     return _each(table, (kind.place(u, v) for kind in table.kinds))
 
 
 def normal(table: Quadrics, q: Tensor) -> Tensor:
-    """Outward normals ``(3, N)`` at points of their own space, as long as :meth:`Quadric.normal` makes them."""
+    """Return outward normals ``(3, N)`` in object space, with the lengths of :meth:`Quadric.normal`."""
     return _each(table, (kind.normal(q) for kind in table.kinds))
 
 
 def direction(table: Quadrics, n: Tensor) -> Tensor:
-    """Own normals ``(3, N)`` as front-facing directions of the world, not of unit length."""
+    """Transform normals ``(3, N)`` from object space to the world, toward the front, not of unit length."""
     return affine(table.n1 * n[0], table.n2, n[1], table.n3, n[2])
 
 
 def outward(table: Quadrics, q: Tensor) -> Tensor:
-    """Unit normals ``(3, N)`` of the world, on the front."""
+    """Return unit normals ``(3, N)`` in the world, on the front."""
     return normalize(direction(table, normal(table, q)))
 
 
 def tangent(e1: Tensor, e2: Tensor, q: Tensor) -> Tensor:
-    """Derivatives ``(3, N)`` of the world's point with respect to ``u``, the azimuth in turns."""
+    """Return derivatives ``(3, N)`` of the point in the world by ``u``, the azimuth over 2 pi."""
     return (e2 * q[0] - e1 * q[1]) * (2.0 * math.pi)
 
 
 def bitangent(table: Quadrics, e1: Tensor, e2: Tensor, q: Tensor) -> Tensor:
-    """Derivatives ``(3, N)`` of the world's point with respect to ``v``."""
+    """Return derivatives ``(3, N)`` of the point in the world by ``v``."""
     across = (q[0] * q[0] + q[1] * q[1]).detach()
     radius = torch.where(across > 0, across, 1.0).sqrt()
     x, y = q[0] / radius, q[1] / radius
@@ -239,16 +239,16 @@ def bitangent(table: Quadrics, e1: Tensor, e2: Tensor, q: Tensor) -> Tensor:
 
 
 def surface_uv(table: Quadrics, q: Tensor) -> Tensor:
-    """Texture coordinates ``(2, N)``: the azimuth about z over 2 pi, and :meth:`Quadric.v`."""
+    """Return texture coordinates ``(2, N)``: the azimuth about z over 2 pi, and :meth:`Quadric.v`."""
     across, turn = polar(q[0], q[1])
     return torch.stack((turn, _each(table, (kind.v(q, across) for kind in table.kinds))))
 
 
 def follow_shape(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, t: Tensor, q: Tensor) -> Tensor:
-    """The points ``q (3, N)`` with the derivative of where the ray ``o + t d`` meets the surface, in all arguments but ``t``.
+    """Return the points ``q (3, N)`` with the derivative of the intersection of ``o + t d``, in all arguments but ``t``.
 
-    One Newton step on the surface's equation, whose slope is a constant of it. In float64 it is the value too, finer than the
-    search's float32; else the value stays ``q``, which knows nothing of how far away the ray began.
+    One Newton step on the surface's equation, with a detached slope. In float64 the value is its result too, more accurate than
+    the float32 of the search; else the value stays ``q``, whose rounding does not depend on the distance of the origin.
     """
     det = dot(e1, table.n1)
     inverse = 1.0 / torch.where(det == 0, 1.0, det)
@@ -265,7 +265,7 @@ def follow_shape(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, 
 
 
 def _residual(form: Form, q: Tensor) -> Tensor:
-    """By how much points ``(3, N)`` are off the equation of a surface: ``(N,)``."""
+    """Return left minus right side ``(N,)`` of a surface's equation at points ``(3, N)``."""
     value = q[0] * q[0] + q[1] * q[1]
     if form.bend or form.half:
         w = q[2] - form.shift if form.shift else q[2]
@@ -275,7 +275,7 @@ def _residual(form: Form, q: Tensor) -> Tensor:
 
 
 def _slope(form: Form, q: Tensor, e: Tensor) -> Tensor:
-    """How :func:`_residual` grows along ``e (3, N)``: ``(N,)``."""
+    """Return the derivative ``(N,)`` of :func:`_residual` along ``e (3, N)``."""
     half = q[0] * e[0] + q[1] * e[1]
     if form.bend or form.half:
         w = q[2] - form.shift if form.shift else q[2]
@@ -285,5 +285,5 @@ def _slope(form: Form, q: Tensor, e: Tensor) -> Tensor:
 
 
 def sample(table: Quadrics, u: Tensor) -> Tensor:
-    """Points ``(3, N)`` uniform by area in their own space, from ``u (2, N)`` in [0, 1)."""
+    """Sample points ``(3, N)`` uniformly by area in object space, from ``u (2, N)`` in [0, 1)."""
     return _each(table, (kind.sample(u) for kind in table.kinds))

@@ -1,7 +1,7 @@
-"""Texture coordinates of surface points, as Mitsuba has them for each shape, and vertex colours.
+"""Texture coordinates of surface points, as in Mitsuba, and vertex colours.
 
-A mesh without coordinates has those of its triangles' own ``(u, v)``. A rectangle's run over [0, 1]^2; those of other
-primitives are said in their files in ``primitives/``.
+On a mesh without texture coordinates they are the barycentric ``(u, v)`` of each triangle; on a rectangle they cover
+[0, 1]^2. The files in ``primitives/`` define the others.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["surface_uv", "vertex_colors"]
 
 
 def surface_uv(world: World, at: Interaction) -> Tensor:
-    """Texture coordinates ``(2, N)``."""
+    """Return texture coordinates ``(2, N)``."""
     geometry = world.geometry
     assert geometry.uvs is not None
     a, b, c = (take(x, at.prim) for x in geometry.uvs)
@@ -30,7 +30,7 @@ def surface_uv(world: World, at: Interaction) -> Tensor:
 
 
 def vertex_colors(world: World, at: Interaction) -> Tensor:
-    """Colours ``(3, N)`` interpolated from the vertices; those of surfaces without are 1."""
+    """Return colours ``(3, N)`` interpolated from the vertices; 1 on surfaces without vertex colours."""
     assert world.geometry.colors is not None
     a, b, c = (take(x, at.prim) for x in world.geometry.colors)
     return torch.addcmul(torch.addcmul(a * (1.0 - at.u - at.v), b, at.u), c, at.v)

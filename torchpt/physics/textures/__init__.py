@@ -1,7 +1,7 @@
-"""Textures on the lanes: images lie in one atlas, others are computed; look-ups are differentiable.
+"""Textures: images in one atlas, and computed ones; look-ups are differentiable.
 
-One kind a file in ``kinds/``. ``base.py`` says what a kind, a node and a table are, ``atlas.py`` reads images, ``computed.py``
-is for textures whose values are computed from coordinates, and ``bindings.py`` says which material reads what.
+One kind a file in ``kinds/``. Read ``base.py`` first: it defines kinds, nodes and tables. ``atlas.py`` looks up images,
+``computed.py`` is the base of textures computed from coordinates, and ``bindings.py`` connects materials to textures.
 """
 
 from __future__ import annotations

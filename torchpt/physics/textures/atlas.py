@@ -1,10 +1,10 @@
 """One atlas for all images of a scene, and look-ups into it that are differentiable in texels and coordinates.
 
-An image lies in the atlas as planes of floats, one a channel. A node says how it is read: which plane, how it
-repeats, how texture coordinates are transformed. Texel centres are at ``(i + 1/2) / size``; row 0 is ``v = 0`` (Mitsuba).
+An image is stored in the atlas as planes of floats, one a channel. A node defines how it is read: channel, wrap mode, filter,
+transform of texture coordinates. Texel centres are at ``(i + 1/2) / size``; row 0 is ``v = 0`` (Mitsuba).
 
-A node that filters has its image in smaller and smaller sizes too (Williams, *Pyramidal Parametrics*, 1983). Each is a further
-node that reads as the first one does, and a look-up lies between the two whose texels are about as large as the footprint.
+A filtered node has a mipmap (Williams, *Pyramidal Parametrics*, 1983). Each level is another node with the same settings, and
+a look-up interpolates between the two levels whose texels are about as large as the footprint.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from torchpt.physics.textures.base import SAME, Matrix, Node, Table, TexturePoin
 
 __all__ = ["WRAPS", "Atlas", "ImageNode", "Mipmaps", "atlas_of", "look_up", "slope"]
 
-#: How an image goes on beyond its edges, in the order of the codes in :class:`Atlas`.
+#: Wrap modes beyond the edges of an image, in the order of their codes in :class:`Atlas`.
 WRAPS = ("repeat", "clamp", "mirror")
-#: Texels from the origin beyond which a coordinate says nothing any more.
+#: Coordinates are clamped to this distance from the origin in texels, where float32 has no fraction anyway.
 _FAR = 2.0**30
 
 
 @dataclass(frozen=True)
 class ImageNode(Node):
-    """One way of reading an image.
+    """One use of an image.
 
     Attributes:
-        texels: which of the images: the parameter that holds it, or of which ``made`` makes it.
+        texels: name of the parameter with the texels, or the argument of ``made``.
         channel: see :class:`Node`.
         wrap: one of :data:`WRAPS`.
-        nearest: take the nearest texel; else bilinear.
+        nearest: whether to read the nearest texel; else bilinear.
         transform: rows of the affine map ``(2, 3)`` of texture coordinates.
-        scale: factors of the three channels (of a number: the first).
-        filtered: whether footprints larger than a texel read the image in smaller sizes.
-        made: makes the image ``(H, W, C)`` of the parameters and ``texels``; None: it is a parameter.
+        scale: factors of the three channels (the first for a number).
+        filtered: whether footprints larger than a texel read levels of a mipmap.
+        made: computes the image ``(H, W, C)`` from the parameters and ``texels``; None: it is a parameter.
     """
 
     texels: str
@@ -55,27 +55,27 @@ class ImageNode(Node):
 
     @property
     def variant(self) -> Hashable:
-        """See :class:`Node`."""
+        """See :attr:`Node.variant`."""
         return Atlas
 
     def divided(self, unit: float) -> ImageNode:
-        """See :class:`Node`."""
+        """See :meth:`Node.divided`."""
         x, y, z = self.scale
         return replace(self, scale=(x / unit, y / unit, z / unit))
 
     def image(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """What it reads ``(H, W, C)``, linear."""
+        """Return the image ``(H, W, C)``, linear."""
         return parameters[self.texels] if self.made is None else self.made(parameters, self.texels)
 
     def table(
         self, nodes: Sequence[Any], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
     ) -> Table:
-        """See :class:`Node`."""
+        """See :meth:`Node.table`."""
         first = {node.texels: node for node in reversed(nodes)}
         return atlas_of(nodes, {name: node.image(parameters) for name, node in first.items()}, dtype, device)
 
     def mean(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Of the whole image, however it is read; see :class:`Node`."""
+        """See :meth:`Node.mean`; the mean of the whole image, for any transform."""
         image = self.image(parameters).detach().double()
         color = image[..., :3].mean((0, 1)) if image.shape[2] >= 3 else mean_all(image[..., 0]).expand(3)
         return color * color.new_tensor(self.scale)
@@ -83,12 +83,12 @@ class ImageNode(Node):
 
 @dataclass(frozen=True)
 class Mipmaps:
-    """Which nodes read an image in smaller sizes; those sizes are nodes after the given ones, from large to small.
+    """The mipmaps of filtered nodes; their levels above 0 are nodes after the given ones, from large to small.
 
     Attributes:
-        first: ``(M,)`` int64 node of the first smaller size less one; any number where there is none.
-        top: ``(M,)`` how many smaller sizes there are.
-        density: ``(M,)`` texels in a unit square of texture coordinates.
+        first: ``(M,)`` int64 node of level 1, minus one; arbitrary without a mipmap.
+        top: ``(M,)`` the coarsest level.
+        density: ``(M,)`` number of texels in a unit square of texture coordinates.
     """
 
     first: Tensor
@@ -98,16 +98,16 @@ class Mipmaps:
 
 @dataclass(frozen=True)
 class Atlas(Table):
-    """All planes, and the nodes that read them.
+    """All planes of images, and the nodes that read them.
 
     Attributes:
-        texels: ``(T,)``.
-        places: ``(6, M)`` int64: first texel, texels from one channel to the next, width, height, wrap, 1 where bilinear.
-        maps: ``(9, M)``: transform of the coordinates by rows, scale.
-        wraps: the ways of wrapping in use; static.
+        texels: ``(T,)`` all planes.
+        places: ``(6, M)`` int64: first texel, stride between channels, width, height, code of the wrap mode, 1 if bilinear.
+        maps: ``(9, M)``: rows of the transform of texture coordinates, then ``scale``.
+        wraps: wrap modes in use; static.
         scaled: whether any node scales; static.
-        transform_uv: whether any node transforms its coordinates; static.
-        pyramids: of nodes that filter; None where none does.
+        transformed: whether any node transforms texture coordinates; static.
+        pyramids: mipmaps; None if no node is filtered.
     """
 
     texels: Tensor
@@ -115,38 +115,38 @@ class Atlas(Table):
     maps: Tensor
     wraps: tuple[str, ...]
     scaled: bool
-    transform_uv: bool
+    transformed: bool
     pyramids: Mipmaps | None = None
 
     @property
     def count(self) -> int:
-        """Nodes, smaller sizes included."""
+        """Number of nodes, levels of mipmaps included."""
         return self.places.shape[1]
 
     @property
     def filtered(self) -> bool:
-        """See :class:`Table`."""
+        """See :attr:`Table.filtered`."""
         return self.pyramids is not None
 
     def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
-        """See :class:`Table`."""
+        """See :meth:`Table.look_up`."""
         assert point.uv is not None
         return look_up(self, nodes, point.uv, coloured, point.footprint)
 
     def slope(self, nodes: Tensor, point: TexturePoint) -> tuple[Tensor, Tensor]:
-        """See :class:`Table`."""
+        """See :meth:`Table.slope`."""
         assert point.uv is not None
         return slope(self, nodes, point.uv, point.footprint)
 
 
 def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch.dtype, device: torch.device) -> Atlas:
-    """The atlas of ``nodes``, in their order; differentiable in the images.
+    """Build the atlas of ``nodes``, in their order; differentiable in the images.
 
     Args:
-        nodes: what is read.
-        images: ``(H, W, C)`` by name, linear; C is 1 (grey), 2 (grey, alpha), 3 or 4 (RGB, alpha).
-        dtype: of the lanes.
-        device: where it lies.
+        nodes: the nodes that the atlas serves.
+        images: ``(H, W, C)`` by name, linear; C is 1 (grey), 2 (grey, alpha), 3 (RGB) or 4 (RGB, alpha).
+        dtype: dtype of the world.
+        device: device of the atlas.
     """
     planes: list[Tensor] = []
     blocks: dict[tuple[str, int | None], list[list[int]]] = {}  # first texel, stride, width, height of each size
@@ -192,15 +192,15 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
 
 
 def _density(place: Sequence[int], node: ImageNode) -> float:
-    """Texels in a unit square of texture coordinates."""
+    """Return the number of texels in a unit square of texture coordinates."""
     (a, b, _), (c, d, _) = node.transform
     return abs(a * d - b * c) * place[2] * place[3]
 
 
 def _halved(planes: Tensor, dim: int) -> Tensor:
-    """Planes half as large along ``dim`` (rounded down): means over boxes, exact for odd sizes too.
+    """Downsample planes by 2 along ``dim`` (rounded down) with a box filter, exact for odd sizes too.
 
-    Of ``2 m + 1`` texels, new one ``i`` covers ``i (2 + 1/m) .. (i + 1) (2 + 1/m)``: parts of three.
+    For ``2 m + 1`` texels, output ``i`` covers ``i (2 + 1/m) .. (i + 1) (2 + 1/m)``: fractions of three texels.
     """
     n = planes.shape[dim]
     m = n // 2
@@ -220,7 +220,7 @@ def _evens(planes: Tensor, m: int) -> Tensor:
 
 
 def _planes(image: Tensor, channel: int | None) -> Tensor:
-    """The planes ``(1 or 3, H, W)`` that a node reads."""
+    """Return the planes ``(1 or 3, H, W)`` of an image that a node with this channel reads."""
     coloured = image.shape[2] >= 3
     if channel is None:
         return image[..., :3].permute(2, 0, 1) if coloured else image[..., :1].permute(2, 0, 1)
@@ -233,7 +233,7 @@ def _planes(image: Tensor, channel: int | None) -> Tensor:
 
 @dataclass(frozen=True)
 class _Corners:
-    """The four texels about a point: ``(C, N)`` each, and where the point lies between them."""
+    """The four texels around each point, ``(C, N)`` each, and the position between them."""
 
     low: tuple[Tensor, Tensor]
     high: tuple[Tensor, Tensor]
@@ -241,14 +241,14 @@ class _Corners:
     y: Tensor
     width: Tensor
     height: Tensor
-    blend: Tensor  # 1, or 0 where the nearest texel is taken
+    blend: Tensor  # 1 for bilinear, 0 for nearest
     maps: Tensor
 
 
 def look_up(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool, footprint: Tensor | None = None) -> Tensor:
-    """Values of nodes ``(N,)`` at texture coordinates ``(2, N)``: ``(3, N)`` where ``coloured``, else ``(N,)``.
+    """Return values of nodes ``(N,)`` at texture coordinates ``(2, N)``: ``(3, N)`` if ``coloured``, else ``(N,)``.
 
-    ``footprint``: areas ``(N,)`` in texture coordinates that nodes which filter average over; None: they read single points.
+    ``footprint``: areas ``(N,)`` in texture coordinates over which filtered nodes average; None: no filtering.
     """
     if footprint is None or atlas.pyramids is None:
         return _point(atlas, node, uv, coloured)
@@ -268,7 +268,7 @@ def _point(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool) -> Tensor:
 
 
 def slope(atlas: Atlas, node: Tensor, uv: Tensor, footprint: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Derivatives ``(N,)`` of number-valued nodes with respect to ``u`` and ``v``; ``footprint`` as of :func:`look_up`."""
+    """Return derivatives ``(N,)`` of number-valued nodes by ``u`` and ``v``; ``footprint`` as for :func:`look_up`."""
     if footprint is None or atlas.pyramids is None:
         return _slope(atlas, node, uv)
     low, high, share = _sizes(atlas.pyramids, node, footprint)
@@ -284,16 +284,16 @@ def _slope(atlas: Atlas, node: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     along = (left + (right - left) * c.x) * (c.height * c.blend)
     if atlas.scaled:
         across, along = across * c.maps[6], along * c.maps[6]
-    if not atlas.transform_uv:
+    if not atlas.transformed:
         return across, along
     return across * c.maps[0] + along * c.maps[3], across * c.maps[1] + along * c.maps[4]
 
 
 def _sizes(pyramids: Mipmaps, node: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The two sizes of images between which footprints lie, as nodes, and how far between them: 0 up to one texel."""
+    """Return the two mipmap levels for footprints, as nodes, and the fraction between them: 0 up to one texel."""
     texels = take(pyramids.density, node) * footprint
     top = take(pyramids.top, node)
-    # Half the logarithm of an area is that of its side. Beyond 2^60 texels no image has further sizes.
+    # Half the logarithm of an area is that of its side. No mipmap has levels beyond 2^60 texels.
     level = torch.minimum(texels.clamp(1.0, _FAR * _FAR).log() * (0.5 / math.log(2.0)), top)
     under = level.detach().floor()
     over = torch.minimum(under + 1.0, top)
@@ -305,7 +305,7 @@ def _sizes(pyramids: Mipmaps, node: Tensor, footprint: Tensor) -> tuple[Tensor, 
 def _corners(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool) -> _Corners:
     place, maps = take(atlas.places, node), take(atlas.maps, node)
     first, stride, width, height, wrap, linear = (place[k] for k in range(6))
-    u, v = transform_uv(maps, uv) if atlas.transform_uv else (uv[0], uv[1])
+    u, v = transform_uv(maps, uv) if atlas.transformed else (uv[0], uv[1])
     blend = linear.to(uv.dtype)
     wide, tall = width.to(uv.dtype), height.to(uv.dtype)
     x = (u * wide - 0.5 * blend).clamp(-_FAR, _FAR)
@@ -328,7 +328,7 @@ def _corners(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool) -> _Corners
 
 
 def _wrapped(wraps: tuple[str, ...], index: Tensor, size: Tensor, code: Tensor) -> Tensor:
-    """Indices folded into ``0..size - 1``."""
+    """Map indices into ``0..size - 1`` by the wrap mode."""
     folded: Tensor | None = None
     for wrap in wraps:
         if wrap == "repeat":

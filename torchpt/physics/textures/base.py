@@ -1,7 +1,7 @@
-"""What a texture is: what a scene file says of it, how it is opened, and what lanes read of it.
+"""Base classes of textures: kinds, nodes and tables.
 
-A *kind* of texture is a file in ``kinds/``. Opened for a slot (:class:`Opening`) it becomes a *node*, one way of reading it;
-nodes that lanes read by the same code are rows of one *table*.
+A *kind* of texture is a file in ``kinds/``. A *slot* is a parameter that a texture gives. Opened for a slot
+(:class:`Opening`) a texture becomes a *node*, one use of it; nodes that are looked up by the same code are rows of one *table*.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ __all__ = [
     "UvTransform", "transform_uv",
 ]  # fmt: skip
 
-#: What a number may be read from.
+#: Channels from which a number may be read.
 CHANNELS = ("luminance", "r", "g", "b", "a")
 
 Matrix = tuple[tuple[float, float, float], tuple[float, float, float]]
-#: Texture coordinates as they are.
+#: The identity transform of texture coordinates.
 SAME: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _ONE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Named:
-    """A texture of the block ``textures``; ``channel``: which of its channels a number takes."""
+    """A reference to a texture of the block ``textures``; ``channel``: the channel for a slot of a number."""
 
     texture: str
     channel: str | None = None
@@ -48,15 +48,15 @@ class Named:
 
 @dataclass(frozen=True)
 class TextureInput:
-    """A texture where a number or a colour could stand.
+    """A texture as the value of a parameter that takes a number or a colour.
 
     Attributes:
-        texture: as written.
-        coloured: whether three channels are wanted.
-        linear: whether the numbers are no colours: then ``colorspace: auto`` leaves them as they are.
-        low: least value that the slot accepts.
-        high: greatest.
-        moves: what changes place with the slot's values.
+        texture: the texture as written in the file.
+        coloured: whether the slot takes three channels.
+        linear: whether the values are not colours: then ``colorspace: auto`` means linear.
+        low: least accepted value.
+        high: greatest accepted value.
+        moves: geometry that moves with the values.
     """
 
     texture: ParsedParams | Named
@@ -69,47 +69,47 @@ class TextureInput:
 
 @dataclass(frozen=True)
 class TexturePoint:
-    """Where textures are read."""
+    """Points at which textures are looked up."""
 
-    uv: Tensor | None = None  # (2, N); None where nothing is read by coordinates
-    footprint: Tensor | None = None  # (N,) area in texture coordinates; None: they are read at points
-    colors: Tensor | None = None  # (3, N) of the mesh's vertices; None where nothing reads them
+    uv: Tensor | None = None  # (2, N) texture coordinates; None if not needed
+    footprint: Tensor | None = None  # (N,) area in texture coordinates; None: no filtering
+    colors: Tensor | None = None  # (3, N) interpolated vertex colours; None if not needed
 
     @property
     def bare(self) -> TexturePoint:
-        """The same, for what averages over no footprint."""
+        """The points without footprints."""
         return self if self.footprint is None else replace(self, footprint=None)
 
 
 class Table:
-    """The nodes that lanes read by the same code, one a row; a dataclass of tensors and of what is static."""
+    """Nodes that are looked up by the same code, one a row; a dataclass of tensors and static values."""
 
     @property
     def count(self) -> int:
-        """How many nodes it holds."""
+        """Number of nodes."""
         raise NotImplementedError
 
     @property
     def filtered(self) -> bool:
-        """Whether any of them averages over footprints; static."""
+        """True if any node averages over footprints; static."""
         return False
 
     def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
-        """Values of nodes ``(N,)`` at points: ``(3, N)`` where ``coloured``, else ``(N,)``; nodes are of that sort."""
+        """Return values of nodes ``(N,)`` at points: ``(3, N)`` if ``coloured``, as all these nodes are then, else ``(N,)``."""
         raise NotImplementedError
 
     def slope(self, nodes: Tensor, point: TexturePoint) -> tuple[Tensor, Tensor]:
-        """Derivatives ``(N,)`` of number-valued nodes with respect to ``u`` and ``v``."""
+        """Return derivatives ``(N,)`` of number-valued nodes by ``u`` and ``v``."""
         raise NotImplementedError
 
 
 class Node:
-    """One way of reading a texture: a frozen dataclass, static, equal where the same is read alike.
+    """One use of a texture: a frozen, static dataclass; equal nodes give equal values.
 
     Attributes:
-        channel: None for a colour, else the channel read as a number: its index, or -1 for luminance.
-        filtered: whether it averages over footprints.
-        reads: what of a surface it asks for: ``uv`` or ``colors``.
+        channel: None for a colour; for a number the index of the channel, or -1 for luminance.
+        filtered: whether look-ups average over footprints.
+        reads: input from the surface: ``uv`` or ``colors``.
     """
 
     channel: int | None
@@ -118,37 +118,37 @@ class Node:
 
     @property
     def variant(self) -> Hashable:
-        """What nodes of one table have in common."""
+        """Key that is equal for all nodes of one table."""
         raise NotImplementedError
 
     @property
     def form(self) -> Hashable:
-        """What the slots have in common that lanes of one group read it for."""
+        """Key of slots that can be looked up together: the variant, and whether the value is a colour."""
         return self.variant, self.channel is None
 
     def at_points(self) -> Any:
-        """The same node without filtering, for slots that are read at points."""
+        """Return the node without filtering, for slots without a footprint."""
         return replace(self, filtered=False) if self.filtered else self  # type: ignore[type-var]
 
     def divided(self, unit: float) -> Any:
-        """The same node with its values divided by a unit of length."""
+        """Return the node with its values divided by a unit of length."""
         raise NotImplementedError
 
     def table(
         self, nodes: Sequence[Any], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
     ) -> Table:
-        """The table of ``nodes``, all of this variant, in their order; differentiable in the parameters.
+        """Build the table of ``nodes``, all of this variant, in their order; differentiable in the parameters.
 
         Args:
             nodes: the rows.
-            parameters: every tensor by dotted name.
-            dtype: of the lanes.
-            device: where it lies.
+            parameters: all parameter tensors of the scene by dotted name.
+            dtype: dtype of the world.
+            device: device of the table.
         """
         raise NotImplementedError
 
     def mean(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Mean colour ``(3,)`` over a unit square of texture coordinates, float64, detached; of a colour's node."""
+        """Return the mean colour ``(3,)`` over a unit square of texture coordinates, float64, detached; for colours only."""
         side = (torch.arange(64, dtype=torch.float64) + 0.5) / 64
         uv = torch.stack(torch.meshgrid(side, side, indexing="xy")).reshape(2, -1)
         given = {name: value.detach().cpu() for name, value in parameters.items()}
@@ -159,17 +159,17 @@ class Node:
 
 @dataclass(frozen=True)
 class Opening:
-    """A texture's slot, and the scene that it is opened in.
+    """A slot for which a texture is opened, and the scene around it.
 
     Attributes:
-        slot: what is wanted.
-        key: the slot's dotted key, for errors.
-        name: dotted name of the texture, which its parameters begin with.
-        channel: what a number is read from, where the slot says so.
-        parameters: numbers of the scene, where the texture adds its own.
-        resolve: from a path as written and its dotted key to a file.
-        file: scene file for errors.
-        pictures: files that were read for other slots, for a kind's own use.
+        slot: the texture and the requirements of the slot.
+        key: dotted key of the slot, for errors.
+        name: dotted name of the texture, the prefix of its parameters.
+        channel: channel for a number, if the slot sets it.
+        parameters: parameters of the scene, to which the texture adds its own.
+        resolve: maps a path as written and its dotted key to a file.
+        file: the scene file, for errors.
+        pictures: images read for other slots, a cache for kinds.
     """
 
     slot: TextureInput
@@ -182,10 +182,10 @@ class Opening:
     pictures: dict[Any, Any] = field(default_factory=dict)
 
     def number(self, channels: Sequence[str], without: str) -> int | None:
-        """The channel of a node whose colours have no alpha; None where a colour is wanted.
+        """Return the channel of the node for a texture without alpha; None for a slot of a colour.
 
         Raises:
-            SceneError: none of ``channels`` is asked for; ``without`` says why it is not there.
+            SceneError: the slot's channel is not in ``channels``; ``without`` is the reason.
         """
         channel = self.channel or "luminance"
         if channel not in channels:
@@ -193,12 +193,12 @@ class Opening:
         return None if self.slot.coloured else CHANNELS.index(channel) - 1
 
     def declare(self, name: str, value: Any, spec: Spec) -> None:
-        """Add a parameter; where another slot did before, it must suit both."""
+        """Add a parameter; if another slot added it before, its spec becomes the intersection of both."""
         known = self.parameters.specs.get(name)
         self.parameters.declare(name, value, spec if known is None else _both(known, spec))
 
     def declare_all(self, kind: Any, values: Mapping[str, Any]) -> None:
-        """Add those parameters of a kind that are traced: colours are what the slot gets, and have its range.
+        """Add the traced parameters of a kind; colours are restricted to the range of the slot.
 
         Raises:
             SceneError: a colour that the slot does not accept.
@@ -216,7 +216,7 @@ class Opening:
         """Refuse values, times ``scale``, that the slot does not accept.
 
         Raises:
-            SceneError: says what is accepted; ``label``: of which file.
+            SceneError: with the accepted range; ``label`` names the file.
         """
         slot = self.slot
         ends = [float(end) * factor for end in (values.min(), values.max()) for factor in scale]
@@ -226,7 +226,7 @@ class Opening:
             raise SceneError(key, [low, high], f"numbers{_words(slot.low, slot.high)}{where}", self.file)
 
     def ranged(self, spec: Any, scale: tuple[float, float, float] = _ONE) -> Any:
-        """A spec of numbers narrowed to what the slot accepts once they are multiplied by ``scale``."""
+        """Return a spec restricted to values that the slot accepts after multiplication by ``scale``."""
         low, high = -LARGEST, LARGEST
         for factor in {factor for factor in scale if factor != 0.0}:
             a, b = sorted((self.slot.low / factor, self.slot.high / factor))
@@ -235,7 +235,7 @@ class Opening:
         return _both(spec, mine)
 
 
-#: What is taken for rounding in numbers that a slot gets.
+#: Tolerance for rounding in the range check of a slot.
 _CLOSE = 1e-6
 
 
@@ -244,7 +244,7 @@ def _words(low: float, high: float) -> str:
 
 
 def _both(a: Any, b: Any) -> Any:
-    """The spec of what must suit two slots."""
+    """Return the spec of a parameter that two slots share: the intersection of the ranges."""
     if not hasattr(a, "bounds") or not hasattr(b, "bounds"):
         return b
     lows, highs = ([low for low in (a.low, b.low) if low is not None], [h for h in (a.high, b.high) if h is not None])
@@ -256,10 +256,10 @@ class Texture:
     """A kind of texture.
 
     Attributes:
-        name: its ``type`` in a scene file.
-        parameters: what it declares. Of a scene's own are those that are traced; colours among them are what the slot gets.
-        reads: what of a surface it asks for: ``uv`` or ``colors``.
-        filters: values of its parameter ``filter`` with which it averages over footprints.
+        name: the ``type`` in a scene file.
+        parameters: specs of the parameters. Traced ones become parameters of the scene; traced colours are values of the slot.
+        reads: input from the surface: ``uv`` or ``colors``.
+        filters: values of the parameter ``filter`` for which look-ups average over footprints.
     """
 
     name: ClassVar[str] = ""
@@ -269,44 +269,44 @@ class Texture:
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """Refuse values that do not go together.
+        """Refuse values that contradict each other.
 
         Raises:
-            Refused: says which, and what is accepted.
+            Refused: with the parameter and the accepted values.
         """
 
     @classmethod
     def check_slot(cls, values: Mapping[str, Any], coloured: bool) -> None:
-        """Refuse what a slot of a colour, or of a number, cannot read of a texture that is written in it.
+        """Refuse values that do not fit the slot in which the texture is written: a colour if ``coloured``, else a number.
 
         Raises:
-            Refused: says what is accepted.
+            Refused: with the accepted values.
         """
 
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
-        """The node of a slot, its parameters declared.
+        """Declare the parameters of the texture, and return the node for a slot.
 
         Raises:
-            SceneError: what the slot cannot read.
-            AssetError: a file that is missing or malformed.
+            SceneError: values that the slot does not accept.
+            AssetError: a missing or malformed file.
         """
         raise NotImplementedError
 
     @classmethod
     def label(cls, values: Mapping[str, Any]) -> str | None:
-        """The file that it is named after where a mesh file brings it; None: it is named after its slot."""
+        """Return the file after which a texture of a mesh file is named; None: it is named after its slot."""
         return None
 
 
 @dataclass(frozen=True)
 class UvTransform:
-    """How texture coordinates are transformed: scaled, then turned, then moved."""
+    """An affine transform of texture coordinates: scale, then rotation, then translation."""
 
     parameters: ClassVar = {
         "scale": Pair((1.0, 1.0), single=True, doc="factors of u and v"),
-        "rotate": Angle(0.0, low=None, doc="turns from u to v, after the scale"),
-        "translate": Pair((0.0, 0.0), doc="is added last"),
+        "rotate": Angle(0.0, low=None, doc="rotation from u to v, after the scale"),
+        "translate": Pair((0.0, 0.0), doc="added last"),
     }
 
     scale: tuple[float, float] = (1.0, 1.0)
@@ -314,7 +314,7 @@ class UvTransform:
     translate: tuple[float, float] = (0.0, 0.0)
 
     def matrix(self, repeats: tuple[float, float] = (1.0, 1.0)) -> Matrix:
-        """Rows ``(2, 3)`` of the transform; with ``repeats`` as a scale after it."""
+        """Return the rows ``(2, 3)`` of the transform, followed by a scale by ``repeats``."""
         return uv_matrix(self.scale, self.rotate, self.translate, repeats)
 
 
@@ -328,7 +328,7 @@ def _uv_transform(value: Any) -> UvTransform:
 
 
 class Mapped(Texture):
-    """A texture that is read by texture coordinates."""
+    """A texture that is looked up by texture coordinates."""
 
     parameters: ClassVar = {
         "uv_transform": Custom(
@@ -342,12 +342,12 @@ class Mapped(Texture):
 
     @staticmethod
     def matrix(values: Mapping[str, Any], repeats: tuple[float, float] = (1.0, 1.0)) -> Matrix:
-        """Rows ``(2, 3)`` of what is done to texture coordinates; with ``repeats`` as a scale after it."""
+        """Return the rows ``(2, 3)`` of the transform of texture coordinates, followed by a scale by ``repeats``."""
         return (values["uv_transform"] or UvTransform()).matrix(repeats)
 
 
 def transform_uv(maps: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Coordinates ``(N,)`` under affine maps: rows of ``maps (6 or more, N)`` are those of the transform."""
+    """Transform ``uv (2, N)`` by affine maps, the first six rows of ``maps (., N)``; return ``u, v``, each ``(N,)``."""
     u, v = uv[0], uv[1]
     return (
         torch.addcmul(torch.addcmul(maps[2], u, maps[0]), v, maps[1]),

@@ -1,4 +1,4 @@
-"""What of textures a world holds: the tables, which node each material reads, which each surface."""
+"""Bindings of textures: the tables of a world, and the nodes that materials and surfaces read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["MaterialTextures", "NodeMap", "NodePosition", "OpacityMaps", "Textur
 
 
 class NodePosition(NamedTuple):
-    """Where a node lies: which table, and which of its rows."""
+    """The table and the row of a node."""
 
     table: int
     row: int
@@ -23,13 +23,13 @@ class NodePosition(NamedTuple):
 
 @dataclass(frozen=True)
 class TextureBinding:
-    """Which texture a material reads, for the rows of one model.
+    """The textures of one parameter, for the rows of one model.
 
     Attributes:
-        table: static; which of the world's tables.
-        nodes: ``(R,)`` int64 rows of it.
-        channel: static; None: a colour. Of numbers any: their nodes say which.
-        filtered: static; whether any of them filters.
+        table: index into the world's tables; static.
+        nodes: ``(R,)`` int64 rows of the table.
+        channel: None for a colour, any channel for a number, as nodes have their own; static.
+        filtered: whether any node is filtered; static.
     """
 
     table: int
@@ -40,15 +40,15 @@ class TextureBinding:
 
 @dataclass(frozen=True)
 class MaterialTextures:
-    """What the materials of one model read from textures.
+    """The textures of the materials of one model.
 
     Attributes:
         readings: :class:`TextureBinding` by parameter, nested as the parameters are.
-        normal: normals in the surface's own frame, or None.
-        bump: heights, or None.
-        strength: ``(R,)`` how far those normals lean, as a factor; None where it is 1.
-        filtered: static; whether any texture here filters.
-        reads: static; what of a surface they ask for, see :attr:`torchpt.physics.textures.Node.reads`.
+        normal: normal map, or None.
+        bump: bump map, or None.
+        strength: ``(R,)`` factor of the tilt of normals; None if 1 everywhere.
+        filtered: whether any texture is filtered; static.
+        reads: inputs from the surface, see :attr:`torchpt.physics.textures.Node.reads`; static.
     """
 
     readings: dict[str, Any]
@@ -61,12 +61,12 @@ class MaterialTextures:
 
 @dataclass(frozen=True)
 class NodeMap:
-    """Textures by primitive and copy.
+    """Textures by primitive and instance.
 
     Attributes:
-        nodes: ``(P + I,)`` int64 row in a table, -1 where there is none.
-        tables: static; the tables that any of them lies in.
-        table: ``(P + I,)`` int64 which of ``tables``; None where it is one.
+        nodes: ``(P + I,)`` int64 row in a table, -1 without a texture.
+        tables: indices of the tables in use; static.
+        table: ``(P + I,)`` int64 index into ``tables``; None for a single table.
     """
 
     nodes: Tensor
@@ -76,12 +76,12 @@ class NodeMap:
 
 @dataclass(frozen=True)
 class OpacityMaps(NodeMap):
-    """Textures of opacity: ``bias + factor * value``, and where that counts as 0 or 1.
+    """Textures of opacity: ``bias + factor * value``, optionally thresholded to 0 or 1.
 
     Attributes:
         bias: ``(P + I,)``.
         factor: ``(P + I,)``.
-        cutoff: ``(P + I,)``, -1 where there is none; None where there is none at all.
+        cutoff: ``(P + I,)`` threshold, -1 without; None if there is no threshold at all.
     """
 
     bias: Tensor
@@ -92,7 +92,7 @@ class OpacityMaps(NodeMap):
 def tables_of(
     nodes: Iterable[Node], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
 ) -> tuple[tuple[Table, ...], dict[Node, NodePosition]]:
-    """The tables of nodes, and where in them each lies; differentiable in the parameters."""
+    """Build the tables of nodes, differentiable in the parameters; return them and the position of each node."""
     groups: dict[Hashable, list[Node]] = {}
     places: dict[Node, NodePosition] = {}
     for node in dict.fromkeys(nodes):

@@ -1,7 +1,7 @@
-"""Textures that are no images: values computed on lanes from texture coordinates and from parameters gathered by node.
+"""Procedural textures: values computed from texture coordinates and parameters.
 
-A kind is one class with two functions, see :class:`Computed`. Whatever reads images reads it: colours, numbers, normal and bump
-maps, opacity, emission, displacement. Scenes without one hold nothing of it.
+A kind is one class with two functions, see :class:`Computed`. It can be used wherever images can: colours, numbers, normal and
+bump maps, opacity, emission, displacement. Scenes without one have no cost.
 """
 
 from __future__ import annotations
@@ -30,47 +30,47 @@ from torchpt.spec import Color, parameters_of
 __all__ = ["Computed", "ComputedNode", "ComputedTable"]
 
 Values = Mapping[str, Tensor]
-#: A footprint larger than this is all of a texture; its products stay far from the ends of float32.
+#: Footprints are clamped to this area, so that products stay in the range of float32.
 _WIDE = 1e12
 
 
 @dataclass(frozen=True)
 class Computed(Mapped):
-    """A kind whose values are computed. An instance is a variant: what is static of it, as fields.
+    """A kind of procedural texture. An instance is a variant, with its static values as fields.
 
-    Its functions get coordinates ``(N,)`` after ``uv_transform``, and ``p``: its traced parameters by name. Numbers are
-    ``(N,)``. A colour is ``(3, N)`` where the slot wants a colour and ``(N,)``, one channel of it, where it wants a number: so
-    the functions treat all channels alike, and are linear in colours, as luminance is. They use operations that round alike
-    on every lane (``tests/integrators/test_reproducible.py`` lists them) and that the lane compiler knows.
+    Its functions get coordinates ``(N,)`` after ``uv_transform``, and ``p``: the traced parameters by name. Numbers are
+    ``(N,)``. A colour is ``(3, N)`` for a slot of a colour and ``(N,)``, one channel, for a slot of a number: so the functions
+    must treat all channels alike, and be linear in colours, as luminance is. They may use operations that round alike on
+    every lane (``tests/integrators/test_reproducible.py`` lists them) and that the lane compiler supports.
     """
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Computed:
-        """The variant that the values of the parameters need."""
+        """Return the variant for the values of the parameters."""
         return cls()
 
     def constants(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Numbers that lanes get in ``p`` beside the parameters: by name, each a number or a tuple; integers become int32."""
+        """Return more entries of ``p`` by name, each a number or a tuple; integers become int32."""
         return {}
 
     def value(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> Tensor:
-        """Values ``(3, N)`` or ``(N,)``, as the colours are.
+        """Return values ``(3, N)`` or ``(N,)``, shaped as the colours.
 
         Args:
             p: parameters by name.
-            x: first coordinate.
-            y: second.
-            area: ``(N,)`` of the footprint in these coordinates, 0 for nodes that do not filter; None: none does.
+            x: first coordinate ``(N,)``.
+            y: second coordinate ``(N,)``.
+            area: area ``(N,)`` of the footprint in these coordinates, 0 for unfiltered nodes; None if all are unfiltered.
         """
         raise NotImplementedError
 
     def slope(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Derivatives ``(N,)`` of numbers with respect to ``x`` and ``y``."""
+        """Return derivatives ``(N,)`` of numbers by ``x`` and ``y``."""
         raise NotImplementedError
 
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.open`."""
         channel = opening.number(CHANNELS[:4], f"{cls.name} has no alpha")
         opening.declare_all(cls, values)
         made = cls.of(values)
@@ -86,16 +86,16 @@ class Computed(Mapped):
 
 @dataclass(frozen=True)
 class ComputedNode(Node):
-    """One way of reading a computed texture.
+    """One use of a procedural texture.
 
     Attributes:
-        texture: its variant.
-        name: dotted prefix of its parameters.
+        texture: the variant.
+        name: dotted prefix of the parameters.
         channel: see :class:`Node`.
         transform: rows of the affine map ``(2, 3)`` of texture coordinates.
         constants: see :meth:`Computed.constants`.
         filtered: see :class:`Node`.
-        unit: what values are divided by.
+        unit: divisor of the values.
     """
 
     texture: Computed
@@ -108,15 +108,15 @@ class ComputedNode(Node):
 
     @property
     def variant(self) -> Hashable:
-        """See :class:`Node`."""
+        """See :attr:`Node.variant`."""
         return self.texture
 
     def divided(self, unit: float) -> ComputedNode:
-        """See :class:`Node`."""
+        """See :meth:`Node.divided`."""
         return replace(self, unit=self.unit * unit)
 
     def values(self, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Its parameters ``()`` or ``(3,)`` by name, in float64; of a number's node colours as three times the channel."""
+        """Return the parameters ``()`` or ``(3,)`` by name, float64; for a number, colours repeat the node's channel."""
         found = {}
         for key, spec in parameters_of(type(self.texture)).items():
             value = parameters.get(f"{self.name}.{key}") if spec.differentiable else None
@@ -130,7 +130,7 @@ class ComputedNode(Node):
     def table(
         self, nodes: Sequence[Any], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
     ) -> Table:
-        """See :class:`Node`."""
+        """See :meth:`Node.table`."""
 
         def column(rows: list[Any]) -> Tensor:
             made = torch.tensor(rows, dtype=dtype, device=device)
@@ -161,13 +161,13 @@ class ComputedTable(Table):
 
     Attributes:
         texture: the variant; static.
-        rows: how many nodes; static.
-        values: what its functions get, by name ``(M,)`` or ``(C, M)``.
-        colors: which of those are colours ``(3, M)``; static.
-        transform: ``(6, M)`` of the coordinates by rows; None where none transforms.
-        areas: ``(M,)`` area in own coordinates of a unit square of texture coordinates, 0 where a node does not filter; None
-            where none does.
-        factor: ``(M,)`` of the values; None where it is 1.
+        rows: number of nodes; static.
+        values: entries of ``p`` by name, ``(M,)`` or ``(C, M)``.
+        colors: names of the values that are colours ``(3, M)``; static.
+        transform: ``(6, M)`` rows of the transforms of texture coordinates; None if all are the identity.
+        areas: ``(M,)`` area of a unit square of texture coordinates after the transform, 0 for unfiltered nodes; None if all
+            are unfiltered.
+        factor: ``(M,)`` factor of the values; None if 1 everywhere.
     """
 
     texture: Computed
@@ -180,16 +180,16 @@ class ComputedTable(Table):
 
     @property
     def count(self) -> int:
-        """See :class:`Table`."""
+        """See :attr:`Table.count`."""
         return self.rows
 
     @property
     def filtered(self) -> bool:
-        """See :class:`Table`."""
+        """See :attr:`Table.filtered`."""
         return self.areas is not None
 
     def _at(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> tuple[Values, Tensor, Tensor, Tensor | None]:
-        """What the texture's functions get."""
+        """Return the arguments of the texture's functions."""
         assert point.uv is not None
         p = {
             key: take(value[0] if key in self.colors and not coloured else value, nodes)
@@ -204,12 +204,12 @@ class ComputedTable(Table):
         return p, x, y, area
 
     def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
-        """See :class:`Table`."""
+        """See :meth:`Table.look_up`."""
         value = self.texture.value(*self._at(nodes, point, coloured))
         return value if self.factor is None else value * take(self.factor, nodes)
 
     def slope(self, nodes: Tensor, point: TexturePoint) -> tuple[Tensor, Tensor]:
-        """See :class:`Table`."""
+        """See :meth:`Table.slope`."""
         across, along = self.texture.slope(*self._at(nodes, point, False))
         if self.factor is not None:
             factor = take(self.factor, nodes)

@@ -1,4 +1,4 @@
-"""The textures of a scene as lanes read them."""
+"""The record of a world's textures."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ __all__ = ["LaneTextures"]
 
 @dataclass(frozen=True)
 class LaneTextures:
-    """The textures, and those that surfaces read whatever their model."""
+    """Tables of all textures, and the textures that surfaces read for any model."""
 
-    tables: tuple[Table, ...] = ()  # what is read, by the code that reads it
-    opacity: OpacityMaps | None = None  # None where there are none
-    emission: NodeMap | None = None  # None where there are none
+    tables: tuple[Table, ...] = ()
+    opacity: OpacityMaps | None = None  # None without textured opacity
+    emission: NodeMap | None = None  # None without textured emission
 
     @property
     def filtered(self) -> bool:
-        """Return True where any averages over a pixel's footprint."""
+        """True if any texture averages over footprints."""
         return any(table.filtered for table in self.tables)

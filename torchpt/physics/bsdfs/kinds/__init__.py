@@ -1,1 +1,1 @@
-"""Materials: one model a file."""
+"""BSDF models, one a file, named after its ``type`` in scene files."""

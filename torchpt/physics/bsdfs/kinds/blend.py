@@ -1,4 +1,4 @@
-"""A blend of two models: ``f = (1 - weight) a + weight b``, each of any kind, blends included."""
+"""The mixture of two BSDFs: ``f = (1 - weight) a + weight b``, either of any type, blends included."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["Blend"]
 class Blend(Bsdf):
     """A mixture: `1 - weight` of `a` and `weight` of `b`.
 
-    Where one lets light through and the other does not, the opaque one meets both sides alike.
+    Where one transmits light and the other is opaque, both sides of the opaque one reflect alike.
 
     Attributes:
         a: the model at weight 0.
@@ -42,12 +42,12 @@ class Blend(Bsdf):
 
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.of`."""
         return cls(values["a"], values["b"]), cls.given(values)
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
-        """Of one kind and of two, of what light passes and what it does not, and of a blend."""
+        """Return blends of two opaque models, of an opaque and a transmitting one, and of a blend with another model."""
         from torchpt.physics.bsdfs import KINDS
 
         made: dict[str, Any] = {name: KINDS[name] for name in KINDS}
@@ -69,27 +69,27 @@ class Blend(Bsdf):
         )
 
     def tabulate(self, values: Parameters) -> Parameters:
-        """Both, each by its own."""
+        """See :meth:`Bsdf.tabulate`."""
         return {"a": self.a.tabulate(values["a"]), "b": self.b.tabulate(values["b"])}
 
     def prepare(self, values: Parameters) -> Parameters:
-        """Both, each by its own."""
+        """See :meth:`Bsdf.prepare`."""
         return {"weight": values["weight"], "a": self.a.prepare(values["a"]), "b": self.b.prepare(values["b"])}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.eval_pdf`."""
         weight = parameters["weight"].clamp(0.0, 1.0)
         value_a, pdf_a = self._facing(self.a).eval_pdf(parameters["a"], wo, wi)
         value_b, pdf_b = self._facing(self.b).eval_pdf(parameters["b"], wo, wi)
         return value_a + weight * (value_b - value_a), pdf_a + weight * (pdf_b - pdf_a)
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """One of the two by the weight; the other counts too, but for deltas."""
+        """Choose a model by the weight; unless it draws a delta, both models evaluate the weight of the sample."""
         assert lobe is not None
         weight = parameters["weight"].clamp(0.0, 1.0)
         second_probability = weight.detach()
         second = lobe < second_probability
-        # What is left of the number after the choice is uniform again.
+        # Given the choice, the number rescaled to [0, 1) is uniform again.
         low, width = (
             torch.where(second, 0.0, second_probability),
             torch.where(second, second_probability, 1.0 - second_probability),
@@ -109,17 +109,17 @@ class Blend(Bsdf):
         return replace(drawn, eta=eta)
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """Blended likewise."""
+        """Return the blend of both."""
         a, b = self.a.albedo(parameters["a"]), self.b.albedo(parameters["b"])
         return a + parameters["weight"].clamp(0.0, 1.0) * (b - a)
 
     def preview(self, parameters: Parameters, shade: Callable[[SplitSumMaterial], Tensor]) -> Tensor:
-        """Blended likewise."""
+        """Return the blend of both."""
         a, b = self.a.preview(parameters["a"], shade), self.b.preview(parameters["b"], shade)
         return a + (b - a) * parameters["weight"].clamp(0.0, 1.0)
 
     def weights(self) -> Iterator[Tensor]:
-        """Those of both."""
+        """Yield those of both models."""
         yield from self.a.weights()
         yield from self.b.weights()
 
@@ -132,7 +132,7 @@ class Blend(Bsdf):
 
 @dataclass(frozen=True)
 class _Mirrored(Bsdf):
-    """An opaque model that meets both sides: what is below is turned up."""
+    """An opaque model made two-sided: directions are flipped where ``wo`` is below the surface."""
 
     inner: Bsdf
 

@@ -1,4 +1,4 @@
-"""Blinn's model in Phong's normalization, as published: ``f = kd / pi + ks (n + 2) / (2 pi) (h . n)^n``.
+"""Blinn's model with Phong's normalization, as published: ``f = kd / pi + ks (n + 2) / (2 pi) (h . n)^n``.
 
 Blinn, *Models of Light Reflection for Computer Synthesized Pictures*, 1977. It creates energy: at normal incidence the
 specular lobe alone reflects up to ``4 ks``.
@@ -38,13 +38,15 @@ class BlinnPhong(PhongBase):
 
     name = "blinn_phong"
     parameters: ClassVar = {
-        "specular": reflectance((0.1, 0.1, 0.1), "reflectance of the glossy one: where it is sharp, four times as much")
+        "specular": reflectance(
+            (0.1, 0.1, 0.1), "reflectance of the glossy lobe: it reflects up to four times as much where it is sharp"
+        )
     }
     max_albedo = 4.0
     conserves = False
 
     def prepare(self, values: Parameters) -> Parameters:
-        """Adds how often the diffuse lobe is drawn, by what each reflects at normal incidence.
+        """Add ``lobe_probability``: the probability of the diffuse lobe by albedos at normal incidence.
 
         There ``(n + 2) / (2 pi) (h . n)^n`` integrates to ``4 (n + 2^(-n/2)) / (n + 4)``: from 1 at ``n = 0`` to 4.
         """
@@ -56,7 +58,7 @@ class BlinnPhong(PhongBase):
         }
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.eval_pdf`."""
         exponent, diffuse_probability = parameters["exponent"], parameters["lobe_probability"]
         seen = in_upper_hemisphere(wo, wi)
         cosine = wi[2] * seen
@@ -75,7 +77,7 @@ class BlinnPhong(PhongBase):
         return value, pdf
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """One of the lobes; the half vector has density ``(n + 1) / (2 pi) (h . n)^n``. Below the surface it fails."""
+        """Choose a lobe; the half vector has density ``(n + 1) / (2 pi) (h . n)^n``. A ``wi`` below the surface fails."""
         assert lobe is not None
         one_minus_cos = sample_cosine_power(u[0], parameters["exponent"])
         r = (one_minus_cos * (2.0 - one_minus_cos)).clamp_min(0.0).sqrt()
@@ -85,10 +87,10 @@ class BlinnPhong(PhongBase):
         return mixture_sample(self, parameters, wo, wi)
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """Both reflectances; where they create energy, no more than 1."""
+        """Return the sum of both reflectances, at most 1."""
         return (parameters["diffuse"] + parameters["specular"]).clamp_max(1.0)
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """Facets as wide, and as bright as the lobe is at normal incidence."""
+        """Return facets of GGX alpha ``sqrt(2 / (n + 2))``, with the lobe's albedo at normal incidence."""
         n = parameters["exponent"]
         return phong_split_sum(parameters, 2.0 / (n + 2.0), 4.0 * (n + torch.exp(-0.34657359 * n)) / (n + 4.0))

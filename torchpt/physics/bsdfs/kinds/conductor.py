@@ -1,4 +1,4 @@
-"""A smooth metal: a mirror whose colour is Fresnel's for a complex index, or Schlick's for one at normal incidence."""
+"""A smooth conductor: a mirror with Fresnel's reflectance of a complex index, or with Schlick's approximation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Conductor(Metal):
     """A polished metal; without a metal, a perfect mirror.
 
     Attributes:
-        schlick: its colour is given as ``reflectance`` at normal incidence rather than as ``eta`` and ``k``.
+        schlick: the colour is ``reflectance`` at normal incidence, not ``eta`` and ``k``.
     """
 
     name = "conductor"
@@ -34,24 +34,24 @@ class Conductor(Metal):
 
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.of`."""
         return cls(by_reflectance(values)), cls.given(values)
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.variants`."""
         return cls(), cls(schlick=True)
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.prepare`."""
         return metal(values)
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """Nothing: a delta is not seen."""
+        """Return zeros: deltas are left out."""
         return torch.zeros_like(wi), torch.zeros_like(wi[2])
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """The mirror image."""
+        """Reflect ``wo`` at the surface."""
         wi = torch.stack((-wo[0], -wo[1], wo[2]))
         colour = metal_colour(parameters, wo[2].clamp_min(0.0))
         if parameters["specular_reflectance"] is not None:
@@ -59,12 +59,12 @@ class Conductor(Metal):
         return BsdfSample(wi, torch.where(wo[2] > 0, math.inf, 0.0).to(wo.dtype), colour)
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """The colour at normal incidence."""
+        """Return the reflectance at normal incidence."""
         some = parameters["eta"] if parameters["reflectance"] is None else parameters["reflectance"]
         colour = metal_colour(parameters, torch.ones_like(some[0]))
         return colour if parameters["specular_reflectance"] is None else colour * parameters["specular_reflectance"]
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """A mirror."""
+        """Return a mirror."""
         like = next(parameters[key] for key in ("reflectance", "eta") if parameters[key] is not None)
         return metal_split_sum(parameters, torch.zeros_like(like[0]))

@@ -35,23 +35,23 @@ class Dielectric(Glass):
     refracts = True
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.prepare`."""
         return dielectric_parameters(values)
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """Nothing: a delta is not seen."""
+        """Return zeros: deltas are left out."""
         return torch.zeros_like(wi), torch.zeros_like(wi[2])
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """The mirror image, or the refracted ray."""
+        """Reflect or refract, by the Fresnel reflectance."""
         assert lobe is not None
         return polished(parameters, wo, lobe)
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """White: what it takes is what it gives."""
+        """Return white, as nothing is absorbed."""
         return torch.ones_like(parameters["eta"]).expand(3, -1)
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """A smooth boundary."""
+        """Return a smooth interface."""
         eta = parameters["eta"]
         return dielectric_split_sum(parameters, torch.zeros_like(eta), reflectance_at_normal(eta), eta)

@@ -24,15 +24,15 @@ class Diffuse(Bsdf):
     parameters: ClassVar = {"reflectance": reflectance(GREY, "share of the light that is reflected")}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.eval_pdf`."""
         density = wi[2].clamp_min(0.0) * (1.0 / math.pi)
         return parameters["reflectance"] * density, density
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """Cosine-weighted."""
+        """Sample the cosine-weighted hemisphere."""
         wi = cosine_hemisphere(u)
         return BsdfSample(wi, wi[2] * (1.0 / math.pi), parameters["reflectance"])
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """The reflectance."""
+        """Return the reflectance."""
         return parameters["reflectance"]

@@ -1,6 +1,6 @@
 """The microfacet material of the GAMES101 course: ``f = ks D F G / (4 cos_o cos_i) + (1 - F) kd / pi``.
 
-``F`` is the dielectric Fresnel reflectance at the macroscopic normal, of the angle to ``wo``.
+``F`` is the dielectric Fresnel reflectance for the angle between ``wo`` and the surface normal, not the half vector.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ __all__ = ["Microfacet"]
 class Microfacet(Glossy):
     """Cook and Torrance's highlight over Lambert, as in the GAMES101 course.
 
-    Not reciprocal, as Fresnel knows of ``wo`` only.
+    Not reciprocal, as the Fresnel factor depends on ``wo`` only.
     """
 
     name = "microfacet"
     parameters: ClassVar = {
         "diffuse": reflectance(GREY, "colour of the diffuse base"),
-        "specular": reflectance(WHITE, "factor of what the facets reflect"),
-        "roughness": fraction(0.4, "of the facets: the square root of GGX's alpha"),
+        "specular": reflectance(WHITE, "factor of light that the facets reflect"),
+        "roughness": fraction(0.4, "roughness of the facets: the square root of GGX's alpha"),
         "ior": index(1.85, "index of refraction of the facets"),
     }
     reciprocal = False
 
     def lobe_factors(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Glossy`."""
+        """See :meth:`Glossy.lobe_factors`."""
         f = fresnel_dielectric(wo[2].clamp_min(0.0), parameters["ior"]).reflectance
         return (1.0 - f) * parameters["diffuse"], f * parameters["specular"]
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """Both lobes at normal incidence."""
+        """Return the sum of both lobes at normal incidence."""
         f0 = reflectance_at_normal(parameters["ior"])
         return (1.0 - f0) * parameters["diffuse"] + f0 * parameters["specular"]
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """Facets over the base."""
+        """Return facets over the diffuse base."""
         specular, f0 = parameters["specular"], reflectance_at_normal(parameters["ior"])
         return SplitSumMaterial(parameters["diffuse"], f0 * specular, specular, self.roughness(parameters), f0)

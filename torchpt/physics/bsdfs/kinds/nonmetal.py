@@ -22,21 +22,21 @@ class Nonmetal(Glossy):
     name = "nonmetal"
     parameters: ClassVar = {
         "base_color": reflectance(GREY, "colour of the diffuse base"),
-        "specular": fraction(0.04, "share of the highlight"),
-        "roughness": fraction(0.5, "of its facets: the square root of GGX's alpha"),
+        "specular": fraction(0.04, "reflectance of the highlight"),
+        "roughness": fraction(0.5, "roughness of the facets: the square root of GGX's alpha"),
     }
 
     def lobe_factors(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Glossy`."""
+        """See :meth:`Glossy.lobe_factors`."""
         s = parameters["specular"]
         return (1.0 - s) * parameters["base_color"], s.expand_as(parameters["base_color"])
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """Both lobes."""
+        """Return the sum of both lobes."""
         diffuse, specular = self.lobe_factors(parameters, parameters["base_color"])
         return diffuse + specular
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """Reflectance alike at every angle."""
+        """Return facets with the same reflectance at every angle, over the diffuse base."""
         s = parameters["specular"]
         return SplitSumMaterial(parameters["base_color"], s, s, self.roughness(parameters), s)

@@ -1,4 +1,4 @@
-"""No surface at all: light passes as if it were not there."""
+"""The null BSDF: light passes as if there were no surface."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Null(Bsdf):
 
     @classmethod
     def check(cls, values: Values, given: frozenset[str]) -> None:
-        """Nothing can cover it, and it does not shine."""
+        """Refuse opacity and emission."""
         super().check(values, given)
         for key in ("opacity", "alpha_cutoff", "emission"):
             if key in given:
@@ -35,22 +35,22 @@ class Null(Bsdf):
                 raise Refused(f"no {key}, as {why}", values[key], (key,))
 
     def prepare(self, values: Parameters) -> Parameters:
-        """One flag that stands for the row: it has no parameters."""
+        """Return one flag, so that the model has a row although it has no parameters."""
         return {"row": torch.ones(1, dtype=torch.bool)}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """Nothing: a delta is not seen."""
+        """Return zeros: deltas are left out."""
         return torch.zeros_like(wi), torch.zeros_like(wi[2])
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """Straight on."""
+        """Continue straight on."""
         return BsdfSample(-wo, torch.full_like(wo[2], math.inf), torch.ones_like(wo))
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """White: all light goes on."""
+        """Return white, as all light passes."""
         return torch.ones_like(parameters["row"], dtype=torch.float32).expand(3, -1)
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """All passes."""
+        """Return a material that transmits all light."""
         none = torch.zeros(3, len(parameters["row"]), device=parameters["row"].device)
         return SplitSumMaterial(none, none[0], none[0], none[0], none[0], none + 1.0)

@@ -36,11 +36,11 @@ class Phong(PhongBase):
     name = "phong"
 
     def prepare(self, values: Parameters) -> Parameters:
-        """Adds how often the diffuse lobe is drawn."""
+        """Add ``lobe_probability``, the probability of the diffuse lobe."""
         return {**values, "lobe_probability": lobe_probability(mean(values["diffuse"]), mean(values["specular"]))}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.eval_pdf`."""
         exponent, diffuse_probability = parameters["exponent"], parameters["lobe_probability"]
         seen = in_upper_hemisphere(wo, wi)
         cosine = wi[2] * seen
@@ -56,7 +56,7 @@ class Phong(PhongBase):
         return value, pdf
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """One of the lobes by their mean reflectances; what falls below the surface fails."""
+        """Choose a lobe by mean reflectance; a ``wi`` below the surface fails."""
         assert lobe is not None
         one_minus_cos = sample_cosine_power(u[0], parameters["exponent"])
         r = (one_minus_cos * (2.0 - one_minus_cos)).clamp_min(0.0).sqrt()
@@ -67,9 +67,9 @@ class Phong(PhongBase):
         return mixture_sample(self, parameters, wo, wi)
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """Both reflectances."""
+        """Return the sum of both reflectances."""
         return parameters["diffuse"] + parameters["specular"]
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """The lobe about the mirror direction is as narrow as one about half vectors of four times the exponent."""
+        """Return facets of exponent ``4 n``: about the half vector they are as wide as a lobe about the mirror direction."""
         return phong_split_sum(parameters, 2.0 / (4.0 * parameters["exponent"] + 2.0), 1.0)

@@ -1,8 +1,8 @@
-"""Burley's principled model with the numbers of Mitsuba 3's ``principled``: metal, dielectric, glass, coat, cloth in one.
+"""Burley's principled BSDF with the constants of Mitsuba 3's ``principled``: metal, dielectric, glass, clearcoat and sheen.
 
 Burley, *Physically Based Shading at Disney*, 2012, and *Extending the Disney BRDF to a BSDF with Integrated Subsurface
-Scattering*, 2015. It is no physical model: rough white creates energy at grazing angles, and sheen and coat are added to
-what is there.
+Scattering*, 2015. It does not conserve energy: rough white creates energy at grazing angles, and sheen and clearcoat are
+added without attenuating the lobes below.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ from torchpt.spec import Refused, Scalar
 
 __all__ = ["Principled"]
 
-#: Least alpha of the main lobes, as Mitsuba's.
+#: Least alpha of the main lobes, as in Mitsuba.
 ALPHA_MIN = 1e-3
-#: What every material of the model is given, and features that only shape another.
+#: Parameters that every material of the model has, and those without effect unless another one is above 0.
 _ALWAYS = ("base_color", "roughness", "specular", "eta")
 _PART_OF = {"sheen_tint": "sheen", "clearcoat_gloss": "clearcoat"}
 
 
 @dataclass(frozen=True)
 class Principled(Bsdf):
-    """Burley's principled model, but for thin surfaces; a feature whose amount is 0 is left out, not computed.
+    """Burley's principled BSDF, without its thin-surface form. A feature whose amount is 0 is not computed.
 
     Attributes:
-        transmissive: light passes through (``spec_trans``).
-        anisotropic: highlights may be longer across the tangent than along it.
+        transmissive: ``spec_trans`` may be above 0.
+        anisotropic: ``anisotropic`` may be above 0.
     """
 
     transmissive: bool = False
@@ -67,37 +67,37 @@ class Principled(Bsdf):
     name = "principled"
     parameters: ClassVar = {
         "base_color": reflectance(GREY, "colour of the surface"),
-        "roughness": fraction(0.5, "from a mirror to plaster"),
-        "metallic": fraction(0.0, "share that is metal"),
-        "specular": fraction(None, "how much a dielectric reflects: 0.08 of it at normal incidence; 0.5 without `eta`"),
-        "eta": Scalar(None, low=1e-3, high=1e3, texture=True, doc="its index of refraction, in place of `specular`"),
-        "spec_tint": fraction(0.0, "how much of the base's hue that reflection takes"),
-        "anisotropic": fraction(0.0, "how much longer highlights are across the tangent than along it"),
-        "sheen": fraction(0.0, "glow of cloth at grazing angles"),
-        "sheen_tint": fraction(0.0, "how much of the base's hue it takes"),
-        "clearcoat": fraction(0.0, "amount of a second, clear highlight"),
-        "clearcoat_gloss": fraction(0.0, "how sharp that is"),
-        "spec_trans": fraction(0.0, "share of what is no metal that is glass"),
-        "flatness": fraction(0.0, "from the diffuse lobe to one that stands in for scattering below the surface"),
+        "roughness": fraction(0.5, "roughness of the main lobes, from a mirror at 0 to plaster at 1"),
+        "metallic": fraction(0.0, "fraction of metal"),
+        "specular": fraction(None, "reflectance of a dielectric at normal incidence over 0.08; 0.5 without `eta`"),
+        "eta": Scalar(None, low=1e-3, high=1e3, texture=True, doc="index of refraction, in place of `specular`"),
+        "spec_tint": fraction(0.0, "how far the dielectric reflection takes the base's hue"),
+        "anisotropic": fraction(0.0, "how far highlights are stretched across the tangent"),
+        "sheen": fraction(0.0, "amount of sheen: reflection of cloth at grazing angles"),
+        "sheen_tint": fraction(0.0, "how far sheen takes the base's hue"),
+        "clearcoat": fraction(0.0, "amount of clearcoat: a second, uncoloured highlight"),
+        "clearcoat_gloss": fraction(0.0, "sharpness of the clearcoat's highlight"),
+        "spec_trans": fraction(0.0, "fraction of glass in the part that is not metal"),
+        "flatness": fraction(0.0, "from the diffuse lobe at 0 to the fake subsurface lobe at 1"),
     }
     lobed = True
     conserves = False
 
     @classmethod
     def check(cls, values: Values, given: frozenset[str]) -> None:
-        """One index only."""
+        """Refuse ``specular`` together with ``eta``."""
         super().check(values, given)
         if values["specular"] is not None and values["eta"] is not None:
             raise Refused("either specular or eta, not both", values["eta"], ("eta",))
 
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.of`."""
         return cls(values["spec_trans"] != 0.0, values["anisotropic"] != 0.0), cls.given(values)
 
     @classmethod
     def given(cls, values: Values) -> dict[str, Any]:
-        """Features whose amount is 0 are left out, with what would only shape them."""
+        """Return the values without features whose amount is 0 and without parameters of such features."""
         found = super().given(values)
         if "specular" not in found and "eta" not in found:
             found["specular"] = 0.5
@@ -111,14 +111,14 @@ class Principled(Bsdf):
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.variants`."""
         return tuple(cls(transmissive, anisotropic) for anisotropic in (False, True) for transmissive in (False, True))
 
     def prepare(self, values: Parameters) -> Parameters:
-        """Roughness becomes ``alpha_u`` and ``alpha_v``, ``specular`` becomes ``eta``. What is absent counts as 0.
+        """Return ``alpha_u`` and ``alpha_v`` for ``roughness``, ``eta`` for ``specular``, None for features that are absent.
 
         ``eta = 2 / (1 - sqrt(0.08 specular)) - 1`` gives a reflectance of ``0.08 specular`` at normal incidence. An index
-        that is 1 leaves a refracted lobe without extent: as Mitsuba does, it is moved a little.
+        of 1 would make the refraction lobe a delta: as in Mitsuba it becomes 1.001.
         """
         roughness = values["roughness"]
         if "eta" in values:
@@ -153,7 +153,7 @@ class Principled(Bsdf):
         }
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.eval_pdf`."""
         eta = parameters["eta"]
         front = None
         if self.transmissive:
@@ -185,7 +185,7 @@ class Principled(Bsdf):
         return value, pdf
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """One of the lobes by what each is expected to reflect."""
+        """Choose a lobe by :meth:`probabilities` and sample it."""
         assert lobe is not None
         eta, above, front, side = parameters["eta"], wo, None, None
         if self.transmissive:
@@ -208,17 +208,17 @@ class Principled(Bsdf):
             return mixture_sample(self, parameters, wo, wi)
         bent = (lobe >= threshold) & (lobe < threshold + probability.refract)
         wi = torch.where(bent, refract(above, m, cos, facet.interface), wi)
-        # A direction that fell on the wrong side of its own lobe may not pass for one of the other.
+        # A reflection that ends up below the surface must not count as a refraction, nor the other way round.
         valid = ((wi[2] < 0) == bent).to(wi.dtype)
         drawn = mixture_sample(self, parameters, wo, torch.stack((wi[0], wi[1], wi[2] * side)), valid)
         return BsdfSample(drawn.wi, drawn.pdf, drawn.weight, torch.where(bent, eta, 1.0).detach())
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """The base colour."""
+        """Return the base colour."""
         return parameters["base_color"]
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """Metal, dielectric and glass; sheen and coat are left out."""
+        """Return the metal, dielectric and glass lobes; sheen and clearcoat are left out."""
         base, eta = parameters["base_color"], parameters["eta"]
         f0 = reflectance_at_normal(eta).expand_as(base)
         if parameters["spec_tint"] is not None:
@@ -231,7 +231,7 @@ class Principled(Bsdf):
         u, v = alphas(parameters)
         through, passing = parameters.get("spec_trans"), None
         if through is not None:
-            # Colour is taken at the way in and the way out.
+            # Light takes the root of the base colour on entering and again on leaving.
             passing, rest = base.clamp_min(1e-12).sqrt() * (rest * through), rest * (1.0 - through)
         roughness, below = (u * v).sqrt().sqrt(), None if through is None else eta
         return SplitSumMaterial(base * rest, f0, torch.ones_like(eta), roughness, over, passing, below)
@@ -239,16 +239,16 @@ class Principled(Bsdf):
     def probabilities(
         self, parameters: Parameters, wo: Tensor, facet: Facet, front: Tensor | None = None
     ) -> Probabilities:
-        """How often to draw each lobe: by the luminance that each is expected to send on.
+        """Return the probabilities of the lobes, in proportion to the expected luminance of each.
 
-        Mean reflectances of lobes by their angle are fits. Rough facets face ``wo``: their Fresnel rises less toward
-        grazing, by about ``(1 - roughness)^2``, and they lose about ``0.7 roughness^3`` between one another.
+        The directional albedos are fits. Visible facets of rough surfaces face ``wo``, so their Fresnel reflectance rises
+        less toward grazing, by about ``(1 - roughness)^2``, and masking loses about ``0.7 roughness^3``.
 
         Args:
-            parameters: lane values.
+            parameters: values per lane.
             wo: ``(3, N)``, on the upper side.
-            facet: where the main lobes may reflect or refract.
-            front: ``(N,)`` 1 outside, 0 inside, where only the main lobes are; None: outside.
+            facet: the facet that the main lobes reflect or refract at.
+            front: ``(N,)`` 1 outside, 0 inside, where only the main lobes exist; None: outside.
         """
         with torch.no_grad():
             cos, roughness = wo[2].clamp_min(0.0), parameters["roughness"]
@@ -258,7 +258,7 @@ class Principled(Bsdf):
             smoothness = (1.0 - roughness).clamp_min(0.0)
             raised = weight * smoothness * smoothness
             rest = 1.0 if metallic is None else 1.0 - metallic
-            # Never quite 0: what is black may have a derivative.
+            # Above 0 also for black, whose derivative may not be 0.
             diffuse = rest * (0.01 + 0.99 * base)
             single = lerp(reflectance_at_normal(parameters["eta"]), 1.0, raised)
             main = rest * single
@@ -294,7 +294,7 @@ class Principled(Bsdf):
         return microfacet.BOUNDED and not (self.transmissive or self.anisotropic)
 
     def _main(self, parameters: Parameters, wo: Tensor, wi: Tensor, eta: Tensor) -> MainLobes:
-        """Both main lobes; with the half vector ``s = wo + wi`` or ``wo + eta wi``, ``s . m = |s|``: nothing cancels."""
+        """Return both main lobes. With ``s = wo + wi`` or ``wo + eta wi``, ``s . m = |s|`` avoids cancellation."""
         alpha_u, alpha_v = alphas(parameters)
         if not (self.transmissive or self.anisotropic):
             r = microfacet.reflection(wo, wi, alpha_u, alpha_v, self._bounded)
@@ -310,7 +310,7 @@ class Principled(Bsdf):
         reflects, refracts = meets & ~below & (far > 0), meets & below & (far < 0)
         cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].abs()
         s_o, s_i = (microfacet.stretched_length(w, alpha_u, alpha_v) for w in (wo, wi))
-        # Density of visible normals over their cosine with wo, and Smith's masking of wi.
+        # Density of visible normals over dot(wo, m), and Smith's masking of wi.
         d = microfacet.ggx(m, alpha_u, alpha_v) if not self.anisotropic else wide_ggx(m, alpha_u, alpha_v)
         d = 2.0 * d / (cos_o + s_o)
         g = 2.0 * cos_i / (cos_i + s_i)
@@ -327,10 +327,10 @@ class Principled(Bsdf):
     def _facet(
         self, parameters: Parameters, wo: Tensor, m: Tensor, cos: Tensor, eta: Tensor, front: Tensor | None
     ) -> Facet:
-        """Fresnel at a facet: of a dielectric, with tint and metal by Schlick's weight of the angle on the thinner side."""
+        """Return the Fresnel factors at a facet: exact for dielectrics, Schlick's from the thinner side for tint and metal."""
         base, metallic = parameters["base_color"], parameters["metallic"]
         sin2 = None
-        if self.transmissive:  # the refracted direction is as good as this sine
+        if self.transmissive:  # the refracted direction is as accurate as this sine
             across = torch.addcmul(wo, m, cos, value=-1)
             sin2 = dot(across, across)
         interface = fresnel_dielectric(cos, eta, sin2)
@@ -343,7 +343,7 @@ class Principled(Bsdf):
             reflected = lerp(reflected, rest * tinted, parameters["spec_tint"])
         if metallic is not None:
             reflected = torch.addcmul(reflected, metallic, lerp(base, 1.0, schlick))
-        # As in Mitsuba an index of 1 has no main reflection at all, not even a metal's.
+        # As in Mitsuba, an index of 1 has no main reflection, not even for metals.
         reflected = torch.where(eta == 1.0, 0.0, reflected)
         through = parameters.get("spec_trans")
         if through is None:
@@ -356,7 +356,7 @@ class Principled(Bsdf):
         return Facet(interface, cos, schlick, reflected, root * (through * (1.0 - f)))
 
     def _diffuse(self, parameters: Parameters, cos_o: Tensor, cos_i: Tensor, cos_d: Tensor) -> Tensor:
-        """Diffuse and sheen ``(3, N)`` without the cosine."""
+        """Return the diffuse and sheen lobes ``(3, N)`` without the cosine."""
         base, roughness = parameters["base_color"], parameters["roughness"]
         fresnel_o, fresnel_i = schlick_weight(cos_o), schlick_weight(cos_i)
         f = retro_diffuse(roughness, fresnel_o, fresnel_i, cos_d)

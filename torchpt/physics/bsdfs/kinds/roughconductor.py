@@ -1,4 +1,4 @@
-"""A rough metal: GGX microfacets of a conductor, reflected once, or with the energy of further reflections given back."""
+"""A rough conductor: GGX microfacets with single scattering, or with compensation of the energy of multiple scattering."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ __all__ = ["RoughConductor"]
 class RoughConductor(Anisotropic, Metal):
     """A metal with GGX microfacets.
 
-    A row with both roughnesses below ``1e-4`` is a smooth one: a delta lobe.
+    A row with both alphas below ``1e-4`` is smooth: a delta lobe.
 
-    Facets shade one another; light that meets more than one of them is lost, unless it is given back as Turquin does
-    (*Practical Multiple Scattering Compensation for Microfacet Models*, 2019, equation 16): each direction ``wo`` has its
-    lobe scaled by ``1 + F0 (1 - E) / E``, with ``E(wo)`` what facets of reflectance 1 give back.
+    Light that meets more than one facet is lost, unless it is compensated (Turquin, *Practical Multiple Scattering
+    Compensation for Microfacet Models*, 2019, equation 16): the lobe of ``wo`` is scaled by ``1 + F0 (1 - E) / E``, where
+    ``E(wo)`` is the directional albedo of facets with reflectance 1.
 
     Attributes:
-        schlick: its colour is given as ``reflectance`` at normal incidence rather than as ``eta`` and ``k``.
+        schlick: the colour is ``reflectance`` at normal incidence, not ``eta`` and ``k``.
         anisotropic: ``alpha_u`` and ``alpha_v`` may differ.
-        energy_compensation: scaled so, and with masking correlated by height; not reciprocal then.
+        energy_compensation: scale the lobe so, with height-correlated masking. Not reciprocal.
     """
 
     name = "roughconductor"
@@ -44,7 +44,7 @@ class RoughConductor(Anisotropic, Metal):
 
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.of`."""
         return (
             cls(by_reflectance(values), values["alpha_u"] is not None, values["energy_compensation"]),
             cls.given(values),
@@ -52,22 +52,22 @@ class RoughConductor(Anisotropic, Metal):
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
-        """See :class:`Bsdf`; either colour with lost energy given back."""
+        """Return all pairs of ``schlick`` and ``anisotropic``, and two variants with energy compensation."""
         plain = [cls(schlick, anisotropic) for anisotropic in (False, True) for schlick in (False, True)]
         return *plain, cls(energy_compensation=True), cls(anisotropic=True, energy_compensation=True)
 
     def tabulate(self, values: Parameters) -> Parameters:
-        """The energy that facets give back at once."""
+        """Return the table of directional albedo for energy compensation."""
         return {"energy": energy_table(rough(values, self.anisotropic), [None])} if self.energy_compensation else {}
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.prepare`."""
         tables = values if "energy" in values else self.tabulate(values)
         energy = {"energy": tables["energy"]} if self.energy_compensation else {}
         return {**metal(values), **rough(values, self.anisotropic), **energy}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.eval_pdf`."""
         at = microfacet.reflection(wo, wi, *alphas(parameters), microfacet.BOUNDED, self.energy_compensation)
         on = (~parameters["smooth"]).to(wo.dtype)
         value = self._colour(parameters, at.cos_m) * (at.value * on)
@@ -77,18 +77,18 @@ class RoughConductor(Anisotropic, Metal):
         return value, at.pdf * on
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """Reflect at a visible normal; at the surface's own where it is smooth."""
+        """Reflect at a visible normal, or at the surface normal where the surface is smooth."""
         m = microfacet.sample_normal(wo, *alphas(parameters), u, microfacet.BOUNDED)
         drawn = mixture_sample(self, parameters, wo, microfacet.reflect(wo, m, dot(wo, m)))
-        metal_split_sum = torch.stack((-wo[0], -wo[1], wo[2]))
-        return with_delta(drawn, parameters["smooth"] & (wo[2] > 0), metal_split_sum, self._colour(parameters, wo[2]))
+        mirror = torch.stack((-wo[0], -wo[1], wo[2]))
+        return with_delta(drawn, parameters["smooth"] & (wo[2] > 0), mirror, self._colour(parameters, wo[2]))
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """The colour at normal incidence."""
+        """Return the reflectance at normal incidence."""
         return self._colour(parameters, torch.ones_like(parameters["alpha_u"]))
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """A rough mirror."""
+        """Return a rough mirror."""
         return metal_split_sum(parameters, mean_roughness(parameters))
 
     def _colour(self, parameters: Parameters, cos: Tensor) -> Tensor:

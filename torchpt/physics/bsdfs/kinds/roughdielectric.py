@@ -1,4 +1,4 @@
-"""A rough boundary between two clear media: GGX microfacets that reflect and refract.
+"""A rough dielectric interface: GGX microfacets that reflect and refract.
 
 Walter, Marschner, Li, Torrance, *Microfacet Models for Refraction through Rough Surfaces*, 2007.
 """
@@ -34,12 +34,12 @@ __all__ = ["RoughDielectric"]
 class RoughDielectric(Anisotropic, Glass):
     """A boundary between two clear media with GGX microfacets: frosted glass.
 
-    A row with both roughnesses below ``1e-4`` is polished glass, one with equal indices is nothing.
+    A row with both alphas below ``1e-4`` is a smooth interface; with equal indices light passes straight on.
 
     Attributes:
         anisotropic: ``alpha_u`` and ``alpha_v`` may differ.
-        energy_compensation: what is lost between facets is given back: each direction ``wo`` has both its lobes scaled by
-            ``1 / E(wo)``, where E is what leaves at once (Turquin 2019). Masking is correlated by height. Not reciprocal.
+        energy_compensation: scale both lobes of ``wo`` by ``1 / E(wo)``, where E is the directional albedo of single
+            scattering (Turquin 2019), with height-correlated masking. Not reciprocal.
     """
 
     name = "roughdielectric"
@@ -53,36 +53,36 @@ class RoughDielectric(Anisotropic, Glass):
 
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.of`."""
         return cls(values["alpha_u"] is not None, values["energy_compensation"]), cls.given(values)
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.variants`."""
         return tuple(cls(anisotropic, compensated) for compensated in (False, True) for anisotropic in (False, True))
 
     def tabulate(self, values: Parameters) -> Parameters:
-        """The energy that facets give back at once, from either side."""
+        """Return the table of directional albedo for energy compensation, one block for each side."""
         if not self.energy_compensation:
             return {}
         surface = self._surface(values)
-        # Equal indices would refract nothing: such a row is smooth, and reads no energy.
+        # Rows with equal indices are smooth and do not read the table: any other index will do.
         eta = torch.where(surface["smooth"], 1.5, surface["eta"])
         return {"energy": energy_table(surface, [eta, 1.0 / eta])}
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.prepare`."""
         tables = values if "energy" in values else self.tabulate(values)
         return {**self._surface(values), **({"energy": tables["energy"]} if self.energy_compensation else {})}
 
     def _surface(self, values: Parameters) -> Parameters:
         out = {**dielectric_parameters(values), **rough(values, self.anisotropic)}
-        # Facets between equal indices bend nothing, however they lie.
+        # Facets between equal indices do not bend light.
         out["smooth"] = out["smooth"] | ((out["eta"] - 1.0).abs() < INDEX_MATCHED)
         return out
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """Equations 20 and 21 of Walter et al., and the densities of equations 14 and 17 for visible normals."""
+        """Return equations 20 and 21 of Walter et al., and the densities of equations 14 and 17 with visible normals."""
         au, av = alphas(parameters)
         eta = parameters["eta"]
         reflects = wo[2] * wi[2] > 0
@@ -92,13 +92,13 @@ class RoughDielectric(Anisotropic, Glass):
         m = m * torch.copysign(torch.ones_like(m[2]), m[2])
         o, i = dot(wo, m), dot(wi, m)
         cos_o, cos_i = wo[2].abs(), wi[2].abs()
-        # A facet is seen from the side of the surface on which the direction lies, or not at all.
+        # A facet is visible only from the side of the surface on which the direction lies.
         seen = torch.minimum(o * wo[2], i * wi[2]) > 0
         on = seen & ~parameters["smooth"]
         side = fresnel_dielectric(o, eta)
         s_o, s_i = microfacet.stretched_length(wo, au, av), microfacet.stretched_length(wi, au, av)
         h2 = dot(h, h)
-        # Solid angle of normals over that of wi: 1 / (4 i) and eta^2 i / |wo + eta wi|^2.
+        # Jacobian dm / dwi: 1 / (4 i), and eta^2 i / |wo + eta wi|^2.
         through = (o * i).abs() / torch.where(on, h2, 1.0)
         spread = torch.where(reflects, 0.25, through)
         visible = torch.where(on, microfacet.ggx(m, au, av) * 2.0 / (cos_o + s_o).clamp_min(_TINY) * spread, 0.0)
@@ -116,7 +116,7 @@ class RoughDielectric(Anisotropic, Glass):
         return colour, visible * torch.where(reflects, r, (1.0 - r) * (eta_it * eta_it))
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """A visible normal, then reflection or refraction as its reflectance has it."""
+        """Sample a visible normal, then reflect or refract by its Fresnel reflectance."""
         assert lobe is not None
         smooth = parameters["smooth"]
         up = torch.copysign(torch.ones_like(wo[2]), wo[2])
@@ -125,7 +125,7 @@ class RoughDielectric(Anisotropic, Glass):
         side = fresnel_dielectric(o, parameters["eta"])
         reflects = lobe < side.reflectance
         wi = torch.where(reflects, microfacet.reflect(wo, m, o), normalize(refract(wo, m, o, side)))
-        # A facet may send the ray to the other side of the surface than is meant: no pair of directions is drawn so.
+        # A reflected ray may end up below the surface, a refracted one above it: such samples fail.
         kept = ((wi[2] * wo[2] > 0) == reflects).to(wo.dtype)
         drawn = mixture_sample(self, parameters, wo, wi, kept)
         clean = polished(parameters, wo, lobe)
@@ -138,11 +138,11 @@ class RoughDielectric(Anisotropic, Glass):
         )
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """White: what it takes is what it gives."""
+        """Return white, as nothing is absorbed."""
         return torch.ones_like(parameters["eta"]).expand(3, -1)
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """A rough boundary."""
+        """Return a rough interface."""
         eta = parameters["eta"]
         return dielectric_split_sum(parameters, mean_roughness(parameters), reflectance_at_normal(eta), eta)
 

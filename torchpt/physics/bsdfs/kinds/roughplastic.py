@@ -28,18 +28,18 @@ from torchpt.physics.bsdfs.rough import Rough, mean_roughness, rough
 
 __all__ = ["RoughPlastic"]
 
-_ENTRIES = 64  # cosines of the tables, as Mitsuba has them
+_ENTRIES = 64  # cosines of the tables, as in Mitsuba
 
 
 @dataclass(frozen=True)
 class RoughPlastic(Rough, Coat):
     """A coat with GGX microfacets over a diffuse base.
 
-    A row with a roughness below ``1e-4`` has a mirror for a coat. What the coat lets through is tabulated for each material
-    over the cosine of a direction.
+    A row with alpha below ``1e-4`` has a smooth coat. The transmittance of the coat is tabulated for each material, over the
+    cosine of a direction.
 
     Attributes:
-        nonlinear: light that the coat throws back takes the base's colour again.
+        nonlinear: internally reflected light is multiplied by the base's colour again.
     """
 
     name = "roughplastic"
@@ -51,16 +51,16 @@ class RoughPlastic(Rough, Coat):
 
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.of`."""
         return cls(values["nonlinear"]), cls.given(values)
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.variants`."""
         return cls(), cls(nonlinear=True)
 
     def tabulate(self, values: Parameters) -> Parameters:
-        """How much the coat lets through by cosine, and how much of the base's light it sends back."""
+        """Return the coat's transmittance by cosine, and its mean reflectance for diffuse light from the base."""
         eta = values["int_ior"] / values["ext_ior"]
         surface = rough(values, False)
         cosines = torch.linspace(0, 1, _ENTRIES, dtype=torch.float64, device=eta.device).clamp_min(1e-6)
@@ -71,7 +71,7 @@ class RoughPlastic(Rough, Coat):
         return {"transmittance": Table(through.to(eta.dtype), _ENTRIES), "inner": diffuse}
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :class:`Bsdf`."""
+        """See :meth:`Bsdf.prepare`."""
         tables = values if "transmittance" in values else self.tabulate(values)
         return {
             **coat_parameters(values, values["int_ior"] / values["ext_ior"], 1.0 - tables["inner"], self.nonlinear),
@@ -80,7 +80,7 @@ class RoughPlastic(Rough, Coat):
         }
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """The coat, and the base seen through the coat both ways."""
+        """Return the coat, and the base attenuated by the coat on the way in and out."""
         alpha = parameters["alpha_u"]
         at = microfacet.reflection(wo, wi, alpha, alpha, bounded=microfacet.BOUNDED)
         f = fresnel_dielectric(at.cos_m, parameters["eta"]).reflectance
@@ -93,7 +93,7 @@ class RoughPlastic(Rough, Coat):
         return torch.addcmul(coat, parameters["base"], t_o * t_i * cosine), pdf
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """Reflect at a visible normal, or about the surface's."""
+        """Reflect at a visible normal of the coat, or sample the base by the cosine."""
         assert lobe is not None
         alpha, smooth = parameters["alpha_u"], parameters["smooth"]
         through = parameters["transmittance"].at(wo[2])
@@ -102,21 +102,21 @@ class RoughPlastic(Rough, Coat):
         m = microfacet.sample_normal(wo, alpha, alpha, u, microfacet.BOUNDED)
         wi = torch.where(chosen, microfacet.reflect(wo, m, dot(wo, m)), cosine_hemisphere(u))
         drawn = mixture_sample(self, parameters, wo, wi)
-        # Under a mirror, what the table says is let through is not reflected as well.
+        # Keeps reflectance and tabulated transmittance of a smooth coat from adding up to more than 1.
         f_o = torch.minimum(fresnel_dielectric(wo[2], parameters["eta"]).reflectance, 1.0 - through)
-        metal_split_sum = torch.stack((-wo[0], -wo[1], wo[2]))
+        mirror = torch.stack((-wo[0], -wo[1], wo[2]))
         weight = tinted(f_o / torch.where(specular > 0, specular, 1.0), parameters["specular_reflectance"])
-        return with_delta(drawn, chosen & smooth & (wo[2] > 0), metal_split_sum, weight)
+        return with_delta(drawn, chosen & smooth & (wo[2] > 0), mirror, weight)
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """That of the base."""
+        """Return the albedo of the base."""
         return parameters["diffuse_reflectance"]
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """A rough mirror over the base."""
+        """Return a rough mirror over the base."""
         return coated_split_sum(parameters, mean_roughness(parameters))
 
     def _specular(self, parameters: Parameters, t_o: Tensor) -> Tensor:
-        """How often the coat is chosen."""
+        """Return the probability of choosing the coat."""
         weight = parameters["specular_share"]
         return lobe_probability((1.0 - t_o) * weight, t_o * (1.0 - weight))

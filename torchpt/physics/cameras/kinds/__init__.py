@@ -1,1 +1,1 @@
-"""Cameras: one kind a file."""
+"""Kinds of cameras, one a file, named after its ``type`` in scene files."""

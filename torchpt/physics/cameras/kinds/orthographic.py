@@ -1,4 +1,4 @@
-"""The parallel projection."""
+"""The orthographic camera."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ __all__ = ["Orthographic"]
 
 @dataclass(frozen=True, kw_only=True)
 class Orthographic(Camera):
-    """A camera of parallel rays, which start on the plane through its origin: what lies behind it is not seen.
+    """A camera with parallel rays, which start on the plane through its origin: nothing behind it is visible.
 
     Attributes:
-        width: what the film's width shows, in world units, a 0-d tensor.
+        width: width of the film in world units, a 0-d tensor.
     """
 
     name = "orthographic"
     parameters: ClassVar = {
-        "width": Scalar(2.0, above=0.0, length=True, moves=Moves.SURFACES, doc="what the film's width shows"),
+        "width": Scalar(2.0, above=0.0, length=True, moves=Moves.SURFACES, doc="width of the film in the scene"),
     }
     reaches: ClassVar[tuple[str, ...]] = ("width",)
     sized_by: ClassVar[str] = "an orthographic camera is sized by width"

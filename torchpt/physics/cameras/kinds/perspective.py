@@ -22,7 +22,7 @@ class Perspective(Pinhole):
     projects: ClassVar[bool] = True
 
     def rays(self, x: Tensor, y: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
-        """See :meth:`Camera.rays`; one origin."""
+        """See :meth:`Camera.rays`; all rays share one origin."""
         right, up, ahead = self.axes()
         across, along = self.slopes(x, y)
         return self.origin(), normalize(ahead + up * along + right * across)

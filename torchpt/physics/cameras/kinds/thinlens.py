@@ -1,4 +1,4 @@
-"""The thin lens: depth of field."""
+"""The thin lens camera, with depth of field."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ __all__ = ["ThinLens"]
 
 @dataclass(frozen=True, kw_only=True)
 class ThinLens(Pinhole):
-    """A perspective camera whose rays start on a lens, and meet in the plane in focus.
+    """A perspective camera whose rays start on a lens and meet in the plane of focus.
 
-    What lies at depth ``z`` is spread over a disk of radius ``aperture_radius |1/focus_distance - 1/z|``, as slopes of the
-    film (Potmesil and Chakravarty, *A Lens and Aperture Camera Model*, 1981).
+    A point at depth ``z`` is blurred to a disk of radius ``aperture_radius |1/focus_distance - 1/z|``, in slopes as of
+    :meth:`slopes` (Potmesil and Chakravarty, *A Lens and Aperture Camera Model*, 1981).
 
     Attributes:
-        aperture_radius: of the lens in world units, a 0-d tensor.
-        focus_distance: depth of the plane in focus, along the viewing direction, a 0-d tensor.
+        aperture_radius: radius of the lens in world units, a 0-d tensor.
+        focus_distance: depth of the plane of focus, along the viewing direction, a 0-d tensor.
         blades: corners of the aperture, the first of them up; 0 is a disk.
     """
 
     name = "thinlens"
     parameters: ClassVar = {
-        "aperture_radius": Scalar(length=True, moves=Moves.SURFACES, doc="of the lens; 0 is a pinhole"),
+        "aperture_radius": Scalar(length=True, moves=Moves.SURFACES, doc="radius of the lens; 0 is a pinhole"),
         "focus_distance": Scalar(
-            above=0.0, length=True, moves=Moves.SURFACES, doc="depth of the plane in focus, along the viewing direction"
+            above=0.0, length=True, moves=Moves.SURFACES, doc="depth of the plane of focus, along the viewing direction"
         ),
         "blades": Integer(
             0, low=3, high=64, also=(0,), doc="corners of the aperture, the first of them up; 0 is a disk"
@@ -52,8 +52,8 @@ class ThinLens(Pinhole):
         left, high = concentric_disk(u) if self.blades == 0 else uniform_polygon(u, self.blades)
         right, up, ahead = self.axes()
         across, along = self.slopes(x, y)
-        # From the place on the lens to the point in focus, over the larger of their distances: no size overflows, and a
-        # lens without extent gives the very rays of a pinhole.
+        # From the point on the lens to the point in focus, divided by the larger of radius and distance: nothing overflows, and
+        # a lens of radius 0 gives exactly the rays of a pinhole.
         unit = torch.maximum(self.aperture_radius, self.focus_distance).detach()
         near, far = self.aperture_radius / unit, self.focus_distance / unit
         d = ahead * far + up * (along * far - high * near) + right * (across * far + left * near)

@@ -1,1 +1,1 @@
-"""Reconstruction filters: one kind a file."""
+"""Kinds of reconstruction filters, one a file, named after its ``type`` in scene files."""

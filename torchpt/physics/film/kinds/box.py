@@ -20,13 +20,13 @@ class Box(Filter):
     jumps: ClassVar[bool] = True
 
     def half_width(self) -> float:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.half_width`."""
         return 0.5
 
     def profile(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.profile`."""
         return (np.abs(x) <= self.radius).astype(np.float64)
 
     def offset(self, u: Tensor) -> Tensor:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.offset`."""
         return (u - 0.5) * (2.0 * self._radius)

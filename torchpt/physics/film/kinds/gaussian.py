@@ -14,21 +14,21 @@ __all__ = ["Gaussian"]
 
 
 class Gaussian(Tabulated):
-    """A truncated gaussian, as Mitsuba's: ``exp(-x^2 / 2 stddev^2)`` minus its value at ``radius``."""
+    """A truncated gaussian, as in Mitsuba: ``exp(-x^2 / 2 stddev^2)`` minus its value at ``radius``."""
 
     name = "gaussian"
     parameters: ClassVar = {
-        "stddev": Scalar(0.5, above=0.0, doc="its standard deviation in pixels"),
+        "stddev": Scalar(0.5, above=0.0, doc="standard deviation in pixels"),
         "radius": Scalar(
-            lambda values: 4.0 * values["stddev"], above=0.0, doc="where it ends, in pixels; by default 4 `stddev`"
+            lambda values: 4.0 * values["stddev"], above=0.0, doc="half width in pixels; 4 `stddev` by default"
         ),
     }
 
     def half_width(self) -> float:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.half_width`."""
         return self.values["radius"]
 
     def profile(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.profile`."""
         stddev, radius = self.values["stddev"], self.values["radius"]
         return np.maximum(np.exp(-0.5 * (x / stddev) ** 2) - np.exp(-0.5 * (radius / stddev) ** 2), 0.0)

@@ -14,23 +14,23 @@ __all__ = ["Mitchell"]
 
 
 class Mitchell(Tabulated):
-    """Mitchell and Netravali's cubic, two pixels wide, with Mitsuba's names; its lobes are negative where ``C`` > 0.
+    """Mitchell and Netravali's cubic of radius 2, with Mitsuba's names; its outer lobes are negative for ``C`` > 0.
 
-    *Reconstruction Filters in Computer Graphics*, SIGGRAPH 1988, equation 8; its integral is 1.
+    *Reconstruction Filters in Computer Graphics*, SIGGRAPH 1988, equation 8. The integral is 1.
     """
 
     name = "mitchell"
     parameters: ClassVar = {
-        "B": Scalar(1 / 3, high=1.0, doc="how much it blurs"),
-        "C": Scalar(1 / 3, high=1.0, doc="how much it rings at edges"),
+        "B": Scalar(1 / 3, high=1.0, doc="amount of blur"),
+        "C": Scalar(1 / 3, high=1.0, doc="amount of ringing at edges"),
     }
 
     def half_width(self) -> float:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.half_width`."""
         return 2.0
 
     def profile(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See :class:`Filter`."""
+        """See :meth:`Filter.profile`."""
         b, c = self.values["B"], self.values["C"]
         x = np.abs(x)
         inner = (12 - 9 * b - 6 * c) * x**3 + (-18 + 12 * b + 6 * c) * x**2 + (6 - 2 * b)

@@ -1,1 +1,1 @@
-"""Lights that are no surfaces: one kind a file."""
+"""Kinds of lights without a surface, one a file, named after its ``type`` in scene files."""

@@ -1,4 +1,4 @@
-"""Parallel light from infinitely far: where it goes in ``Lights.normal``, an irradiance in ``Lights.radiance``."""
+"""Directional light: ``Lights.normal`` is the direction of the light, ``Lights.radiance`` the irradiance."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ class Directional(Light):
 
     name = "directional"
     parameters: ClassVar = {
-        "direction": Direction(moves=Moves.SHADOWS, doc="where the light goes"),
-        "irradiance": Color((1.0, 1.0, 1.0), doc="on a surface that faces it"),
+        "direction": Direction(moves=Moves.SHADOWS, doc="direction in which the light travels"),
+        "irradiance": Color((1.0, 1.0, 1.0), doc="irradiance on a surface perpendicular to it"),
     }
     distant = True
 
     @classmethod
     def row(cls, scene: Setting) -> Row:
-        """See :class:`Light`."""
+        """See :meth:`Light.row`."""
         color = scene["irradiance"]
         axis = normalize(scene["direction"][:, None])[:, 0]
         return Row(color, math.pi * scene.reach**2 * bright(color), normal=axis)
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
-        """See :class:`Light`."""
+        """See :meth:`Light.sample`."""
         one = torch.ones_like(u[0], dtype=at.radiance.dtype)
         wi = (-at.normal).expand(3, u.shape[1])
         return LightSample(wi, wi, None, at.radiance.expand_as(wi), one * torch.inf, one)

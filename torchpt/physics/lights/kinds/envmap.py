@@ -1,4 +1,4 @@
-"""An environment given by a picture of all directions, sampled by its luminance.
+"""Environment maps: images of all directions, sampled by luminance.
 
 Coordinates are Mitsuba's: in the map's own space ``u = atan2(x, -z) / 2 pi`` (wrapped) and ``v = theta / pi`` with
 ``theta = acos(y)``. Texel ``(i, j)`` of H x W lies at ``u = (j + 1/2) / W``, ``v = i / (H - 1)``: the first and the last row
@@ -10,12 +10,12 @@ angles, so the density in solid angle *is* the bilinear value over a constant: n
 and positive wherever the look-up is. A cell's weight is the mean of its corners times its exact solid angle.
 
 **MIS compensation** (Karlík, Šik, Vévoda, Skřivan, Křivánek, *MIS Compensation: Optimizing Sampling Techniques in Multiple
-Importance Sampling*, 2019, section 5): sampled together with BSDFs, the map's own density is better made sharper, as BSDF
-sampling finds the dim rest. The mean luminance over the sphere is subtracted, and what is below it is never drawn. That is
-unbiased only while BSDF sampling covers those directions, so it holds for the strategy ``mis`` alone; ``light`` draws by
-the luminance itself. A near-constant map keeps its own density, as compensation would leave little but noise of it: one with
-less than a tenth of its light above the mean, spread over more than a tenth of the sphere (measured as
-``(int f)^2 / int f^2`` of what lies above; a small lamp before an even sky is worth the compensation however faint).
+Importance Sampling*, 2019, section 5): combined with BSDF sampling, a sharper density of the map has less variance, as BSDF
+sampling finds the dim directions. The mean luminance over the sphere is subtracted, and directions below it are never sampled.
+That is unbiased only if BSDF sampling covers those directions: only the strategy ``mis`` uses it; ``light`` samples by the
+luminance itself. Near-constant maps are not compensated, as little but their noise would remain: maps with less than a tenth
+of their light above the mean, spread over more than a tenth of the sphere (measured as ``(int f)^2 / int f^2`` of the part
+above the mean; a small lamp before an even sky is worth the compensation however faint).
 """
 
 from __future__ import annotations
@@ -44,18 +44,18 @@ if TYPE_CHECKING:
 
 __all__ = ["EVEN", "EnvironmentMap", "Envmap", "Grid", "build", "environment", "pdf", "radiance", "sample"]
 
-#: A map is near-constant with less than this share of its light above the mean, over more than this share of the sphere.
+#: A map is near-constant if less than this fraction of its light is above the mean, over more than this fraction of the sphere.
 EVEN = 0.1
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A density over a map's cells, made of ``max(luminance - floor, 0)`` at the texels.
+    """A density over the cells of a map, proportional to ``max(luminance - floor, 0)`` at the texels.
 
     Attributes:
-        cells: the choice of a cell, in float64.
-        floor: ``()`` what is subtracted; negative, for a black map, it makes the density uniform.
-        factor: ``()`` from the interpolated difference to the density in solid angle.
+        cells: distribution of the cells, in float64.
+        floor: ``()`` subtracted luminance; -1 for a black map, for a uniform density.
+        factor: ``()`` factor from the interpolated difference to the density per steradian.
     """
 
     cells: Distribution2D
@@ -69,17 +69,17 @@ class EnvironmentMap:
 
     Attributes:
         texels: ``(3, H W)`` linear RGB.
-        height: H, static; lanes read ``size``.
+        height: H, static; stages read ``size``.
         width: W.
         size: ``(2,)`` int64 H and W.
         turn: ``(3, 3)`` orthogonal, from the world to the map's own space.
         scale: ``()`` factor of the texels.
-        halves: ``(2, H)`` ``sin^2(theta / 2)`` and ``cos^2(theta / 2)`` of the rows: differences of either keep their
-            digits at its own pole.
-        steps: ``(H - 1,)`` one over the differences of the first.
-        mean: ``()`` mean luminance over the sphere, ``scale`` left out; detached.
-        plain: the density by luminance.
-        compensated: the density for MIS; None where it is ``plain``.
+        halves: ``(2, H)`` ``sin^2(theta / 2)`` and ``cos^2(theta / 2)`` of the rows: differences of the first are accurate at
+            the north pole, of the second at the south pole.
+        steps: ``(H - 1,)`` one over the differences of ``halves[0]``.
+        mean: ``()`` mean luminance over the sphere, without ``scale``; detached.
+        plain: density by luminance.
+        compensated: density for MIS; None if it is ``plain``.
     """
 
     texels: Tensor
@@ -95,18 +95,18 @@ class EnvironmentMap:
     compensated: Grid | None
 
     def grid(self, mis: bool) -> Grid:
-        """The density in use: for MIS with BSDF sampling, or alone."""
+        """Return the density for MIS with BSDF sampling, or for light sampling alone."""
         return self.compensated if mis and self.compensated is not None else self.plain
 
 
 def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None = None) -> EnvironmentMap:
-    """A map ready to be looked up and sampled; differentiable in all three, but for its densities.
+    """Build a map for look-ups and sampling; radiance is differentiable in all three tensors, densities are not.
 
     Args:
-        texels: ``(H, W, 3)`` linear RGB in the lanes' dtype; a single row is the same at every height.
+        texels: ``(H, W, 3)`` linear RGB in the world's dtype; a single row is repeated at every height.
         turn: ``(3, 3)`` orthogonal, from the world to the map's own space.
         scale: ``()`` factor of the texels.
-        compensation: whether MIS gets a density of its own; None: where the map is uneven enough.
+        compensation: whether to apply MIS compensation; None: unless the map is near-constant.
     """
     if texels.shape[0] == 1:
         texels = texels.expand(2, -1, -1)
@@ -148,26 +148,26 @@ def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None
 
 
 def _weights(values: Tensor, heights: Tensor) -> Tensor:
-    """Integrals ``(H - 1, W)`` float64 over the cells of values ``(H, W)`` at the texels; the whole sphere counts as 1."""
+    """Return integrals ``(H - 1, W)`` float64 over the cells of values ``(H, W)`` at the texels; the sphere has measure 1."""
     v = values.double()
     v = v + v.roll(-1, 1)
     return 0.25 * (v[:-1] + v[1:]) * (heights / values.shape[1])[:, None]
 
 
 def _uneven(weights: Tensor, mean: Tensor, heights: Tensor) -> bool:
-    """Whether compensation repays: see :data:`EVEN`. ``weights`` are those of what lies above the mean."""
+    """Return False for a near-constant map, see :data:`EVEN`; ``weights`` are integrals of the luminance above the mean."""
     above = sum_all(weights)
     spread = above * above / sum_all(weights * weights * (weights.shape[1] / heights[:, None]))
     return bool((above > EVEN * mean) | (spread < EVEN))
 
 
 def _grid(weights: Tensor, floor: Tensor) -> Grid:
-    """From integrals over the cells; the sphere counts as 1 in them, and as 4 pi in the density."""
+    """Return the density of integrals over the cells, in which the sphere has measure 1."""
     return Grid(Distribution2D.of(weights), floor, (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype))
 
 
 def _place(map: EnvironmentMap, d: Tensor) -> Cell:
-    """The cells of unit directions ``(3, N)`` of the world."""
+    """Return the cells of unit directions ``(3, N)`` of the world."""
     local = [dot(map.turn[k][:, None], d) for k in range(3)]
     around, down = angles(local, torch.finfo(d.dtype).tiny)
     tall, wide = map.size[0].to(d.dtype), map.size[1].to(d.dtype)
@@ -193,7 +193,7 @@ def _mix(corners: tuple[Tensor, Tensor, Tensor, Tensor], x: Tensor, y: Tensor) -
 
 
 def _values(grid: Grid, corners: _Corners) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What the density interpolates, ``(N,)`` a corner."""
+    """Return the values ``(N,)`` at the corners that the density interpolates."""
     a, b, c, d = ((luminance(colour.detach()).clamp_min(0.0) - grid.floor).clamp_min(0.0) for colour in corners)
     return a, b, c, d
 
@@ -201,41 +201,41 @@ def _values(grid: Grid, corners: _Corners) -> tuple[Tensor, Tensor, Tensor, Tens
 def _density(map: EnvironmentMap, grid: Grid, at: Cell, corners: _Corners) -> Tensor:
     step = math.pi / (map.size[0] - 1).to(at.y.dtype)
     y = at.y.detach()
-    # A difference of cosines as a product, which does not cancel.
+    # A difference of cosines, written as a product to avoid cancellation.
     down = torch.sin((0.5 * step) * y) * torch.sin(step * (at.row + 0.5 * y)) * take(map.steps, at.row)
     return _mix(_values(grid, corners), at.x.detach(), down.clamp_max(1.0)) * grid.factor
 
 
 def radiance(map: EnvironmentMap, d: Tensor) -> Tensor:
-    """Radiance ``(3, N)`` from unit directions ``d (3, N)``."""
+    """Return radiance ``(3, N)`` from unit directions ``d (3, N)``."""
     at = _place(map, d)
     return _mix(_corners(map, at), at.x, at.y) * map.scale
 
 
 def pdf(map: EnvironmentMap, d: Tensor, mis: bool) -> Tensor:
-    """Density ``(N,)`` in solid angle with which :func:`sample` draws unit directions ``d (3, N)``; detached."""
+    """Return the pdf ``(N,)`` of unit directions ``d (3, N)`` under :func:`sample`, per steradian; detached."""
     at = _place(map, d.detach())
     return _density(map, map.grid(mis), at, _corners(map, at))
 
 
 def environment(map: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
-    """:func:`radiance` and :func:`pdf` in one look-up."""
+    """Return :func:`radiance` and :func:`pdf`, with one look-up."""
     at = _place(map, d)
     corners = _corners(map, at)
     return _mix(corners, at.x, at.y) * map.scale, _density(map, map.grid(mis), at, corners)
 
 
 def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Directions drawn by luminance.
+    """Sample directions by luminance.
 
     Args:
         map: the map.
         u: ``(2, N)`` in ``[0, 1)``.
-        mis: whether BSDF sampling shares the work; without it the density leaves nothing out that shines.
+        mis: whether the samples are combined with BSDF sampling by MIS; else the density is positive wherever the map is.
 
     Returns:
-        Unit directions ``(3, N)`` and their densities ``(N,)`` in solid angle, both detached, and the radiance ``(3, N)`` from
-        there. A density of 0 means that the draw failed.
+        Unit directions ``(3, N)`` and their pdf ``(N,)`` per steradian, both detached, and the radiance ``(3, N)`` from these
+        directions. A pdf of 0 means that sampling failed.
     """
     grid = map.grid(mis)
     row, column, rest = grid.cells.sample(u)
@@ -251,46 +251,46 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
         phi = (x + (column + 0.5)) * (2.0 * math.pi / wide)
         radius = 2.0 * (half[0] * half[1]).sqrt()
         local = (radius * torch.sin(phi), half[1] - half[0], radius * -torch.cos(phi))
-        # The inverse of an orthogonal map is its transpose.
+        # The inverse of an orthogonal matrix is its transpose.
         turn = map.turn
         wi = torch.stack([local[0] * turn[0, k] + local[1] * turn[1, k] + local[2] * turn[2, k] for k in range(3)])
         y = (azimuth(local[1], radius) * ((tall - 1.0) * (1.0 / math.pi)) - row).clamp(0.0, 1.0)
     if map.turn.requires_grad:
-        return wi, density, radiance(map, wi)  # which follows the turn
+        return wi, density, radiance(map, wi)  # differentiable in the rotation
     return wi, density, _mix(corners, x, y) * map.scale
 
 
 class Envmap(Environment):
-    """An environment given by a picture of all directions."""
+    """An environment given by an image of all directions."""
 
     name = "envmap"
     parameters: ClassVar = {
-        "path": Path(None, doc="the picture: `.exr`, `.hdr` or 8-bit; of several the first that is there"),
+        "path": Path(None, doc="image file: `.exr`, `.hdr` or 8-bit; of several paths the first that exists"),
         "data": Custom(
             None,
             reader=texels_from_array,
             words=TEXELS,
-            doc="in place of a file: an array, a tensor or rows of numbers, the first at the top; linear, but for uint8",
+            doc="array, tensor or rows of numbers in place of a file, the top row first; linear, except uint8 (sRGB)",
         ),
-        "scale": Scalar(1.0, doc="factor of its radiance"),
+        "scale": Scalar(1.0, doc="factor of the radiance"),
         "transform": Pose(
             None,
             angles=True,
             moves=Moves.NOTHING,
-            doc="turns it, and may mirror it; where it is moved to, and how much it is enlarged, do not matter",
+            doc="rotation, may mirror; translation and scale have no effect",
         ),
     }
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Light`: of one source."""
+        """See :meth:`Light.check`; refuse other than one source of texels."""
         check_source(values)
 
     @classmethod
     def files(
         cls, values: Mapping[str, Any], find: Callable[[str], FilePath]
     ) -> dict[str, tuple[NDArray[np.float32], Spec]]:
-        """See :class:`Light`."""
+        """See :meth:`Light.files`."""
         spec = Texels(doc="radiance `(H, W, 3)`, before `scale`")
         if values["data"] is not None:
             return {"texels": (texels_to_radiance(values["data"], "data", "data"), spec)}
@@ -299,7 +299,7 @@ class Envmap(Environment):
 
     @classmethod
     def row(cls, scene: Setting) -> Row:
-        """See :class:`Light`; what its functions are given is an :class:`EnvironmentMap`."""
+        """See :meth:`Light.row`; :attr:`Row.environment` is an :class:`EnvironmentMap`."""
         texels, scale = (scene.given(key).to(scene.dtype) for key in ("texels", "scale"))
         linear = scene["to_world"][:3, :3]
         turn = torch.linalg.inv(linear) * torch.linalg.det(linear).abs() ** (1.0 / 3.0)
@@ -309,23 +309,23 @@ class Envmap(Environment):
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
-        """See :class:`Light`."""
+        """See :meth:`Light.sample`."""
         wi, density, light = sample(at.environment, u, mis)
         weight = torch.where(density > 0, safe_reciprocal(density), 0.0)
         return LightSample(wi, wi, None, light, density, weight)
 
     @classmethod
     def radiance_pdf(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
-        """See :class:`Environment`."""
+        """See :meth:`Environment.radiance_pdf`."""
         return environment(around, d, mis)
 
     @classmethod
     def environment_image(cls, around: EnvironmentMap) -> EnvironmentImage:
-        """See :class:`Environment`."""
+        """See :meth:`Environment.environment_image`."""
         texels = (around.texels * around.scale).T.reshape(around.height, around.width, 3)
         return EnvironmentImage(texels, around.turn)
 
     @classmethod
     def info(cls, around: EnvironmentMap) -> dict[str, Any]:
-        """See :class:`Environment`."""
+        """See :meth:`Environment.info`."""
         return {"texels": [around.width, around.height], "mis_compensation": around.compensated is not None}

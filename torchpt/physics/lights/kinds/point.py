@@ -1,4 +1,4 @@
-"""Points that shine alike in all directions: a position in ``Lights.p0``, an intensity in ``Lights.radiance``."""
+"""Point lights: ``Lights.p0`` is the position, ``Lights.radiance`` the radiant intensity."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ __all__ = ["Point", "toward"]
 
 
 def toward(x: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit directions ``(3, N)`` from ``x (3, N)`` to points, and one over the squared distances ``(N,)``; 0 at the point."""
+    """Return unit directions ``(3, N)`` from ``x (3, N)`` to points, and inverse squared distances ``(N,)``, 0 at the point."""
     to = position - x
     square = dot(to, to)
     return to / square.clamp_min(torch.finfo(square.dtype).tiny).sqrt(), safe_reciprocal(square)
 
 
 class Point(Light):
-    """A point that shines alike in all directions."""
+    """A point that emits alike in all directions."""
 
     name = "point"
     parameters: ClassVar = {
-        "position": spec.Point(moves=Moves.SHADOWS, doc="where it is"),
-        "intensity": Color((1.0, 1.0, 1.0), doc="power per solid angle"),
+        "position": spec.Point(moves=Moves.SHADOWS, doc="position"),
+        "intensity": Color((1.0, 1.0, 1.0), doc="radiant intensity: power per solid angle"),
     }
     places = ("position",)
 
     @classmethod
     def row(cls, scene: Setting) -> Row:
-        """See :class:`Light`."""
+        """See :meth:`Light.row`."""
         color = scene.intensity("intensity")
         return Row(color, (4.0 * math.pi) * bright(color), scene.point("position"))
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
-        """See :class:`Light`."""
+        """See :meth:`Light.sample`."""
         wi, weight = toward(x, at.p0)
         infinite = torch.full_like(weight, torch.inf)
         return LightSample(wi, at.p0.expand_as(wi), None, at.radiance.expand_as(wi), infinite, weight)

@@ -1,6 +1,6 @@
-"""Spots: points that shine within a cone about ``Lights.normal``; ``Lights.e1`` holds the cutoff angle and the slope.
+"""Spot lights: points that emit in a cone about ``Lights.normal``; ``Lights.e1`` holds the cutoff angle and the slope.
 
-Whole up to the beam's edge, from there falling linearly in the angle to zero at the cutoff, as Mitsuba's ``spot``.
+The intensity is constant up to the beam's edge and falls linearly in the angle to zero at the cutoff, as in Mitsuba's ``spot``.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ __all__ = ["Spot", "falloff"]
 
 
 def falloff(wi: Tensor, axis: Tensor, cutoff: Tensor, slope: Tensor) -> Tensor:
-    """Share ``(N,)`` of the intensity that goes along ``-wi``.
+    """Return the fraction ``(N,)`` of the intensity along ``-wi``.
 
     Args:
         wi: unit directions toward the light ``(3, N)``.
         axis: unit ``(3, N)``.
-        cutoff: in radians ``(N,)``.
+        cutoff: cutoff angle in radians ``(N,)``.
         slope: one over the angle from the beam's edge to the cutoff ``(N,)``.
     """
     aside = cross(axis.expand_as(wi), wi)
@@ -37,31 +37,31 @@ def falloff(wi: Tensor, axis: Tensor, cutoff: Tensor, slope: Tensor) -> Tensor:
 
 
 def _most_of_the_cone(values: Mapping[str, Any]) -> float:
-    """The beam's width where nobody says it, as Mitsuba has it."""
+    """Return the default beam width, as in Mitsuba."""
     return 0.75 * values["cutoff_angle"]
 
 
 class Spot(Light):
-    """A point that shines within a cone about the direction to ``target``."""
+    """A point that emits in a cone about the direction to ``target``."""
 
     name = "spot"
     parameters: ClassVar = {
-        "position": Point(moves=Moves.SHADOWS, doc="where it is"),
-        "target": Point(moves=Moves.SHADOWS, doc="a point that it aims at"),
-        "intensity": Color((1.0, 1.0, 1.0), doc="power per solid angle within the beam"),
-        "cutoff_angle": Angle(20.0, above=0.0, high=180.0, doc="from the axis; nothing shines beyond"),
+        "position": Point(moves=Moves.SHADOWS, doc="position"),
+        "target": Point(moves=Moves.SHADOWS, doc="point at which the light is aimed"),
+        "intensity": Color((1.0, 1.0, 1.0), doc="radiant intensity within the beam"),
+        "cutoff_angle": Angle(20.0, above=0.0, high=180.0, doc="angle from the axis beyond which nothing is emitted"),
         "beam_width": Angle(
             _most_of_the_cone,
             above=0.0,
             high=180.0,
-            doc="from the axis, up to which the intensity is whole; from there it falls linearly to 0 at the cutoff",
+            doc="angle from the axis up to which the intensity is constant; it falls linearly from there to 0 at the cutoff",
         ),
     }
     places = ("position",)
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Light`."""
+        """See :meth:`Light.check`."""
         if values["position"] == values["target"]:
             raise Refused("a point other than the position", list(values["target"]), ("target",))
         if values["beam_width"] > values["cutoff_angle"]:
@@ -70,13 +70,13 @@ class Spot(Light):
 
     @classmethod
     def row(cls, scene: Setting) -> Row:
-        """See :class:`Light`."""
+        """See :meth:`Light.row`."""
         color = scene.intensity("intensity")
         axis = normalize((scene["target"] - scene["position"])[:, None])[:, 0]
         cutoff, beam = (scene[key] * (math.pi / 180.0) for key in ("cutoff_angle", "beam_width"))
-        # How fast it falls from the beam's edge to the cutoff; finite where the two are one.
+        # Slope of the falloff from the beam's edge to the cutoff; finite where both are equal.
         slope = 1.0 / (cutoff - beam).clamp_min(1e-6)
-        # What falls linearly from a to b is on average as the mean of cosines between them, which is this product.
+        # The solid angle of a linear falloff from a to b depends on the mean cosine between them, which is this product.
         mean = torch.cos(0.5 * (cutoff + beam)) * torch.sinc((cutoff - beam) * (0.5 / math.pi))
         share = 2.0 * math.pi * (1.0 - mean).detach()
         numbers = torch.stack((cutoff, slope, torch.zeros_like(cutoff)))
@@ -84,14 +84,14 @@ class Spot(Light):
 
     @classmethod
     def bounds(cls, at: Lights, intensity: Tensor) -> Cone:
-        """See :class:`Emitter`: whole within the beam, and beyond its edge up to the cutoff."""
+        """See :meth:`Emitter.bounds`: the cone of the beam, extended by the angle from its edge to the cutoff."""
         cutoff, slope = at.e1[0], at.e1[1]
         edge = 1.0 / slope
         return Cone(torch.cos((cutoff - edge).clamp_min(0.0)), torch.cos(edge), luminance(at.radiance.abs()))
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
-        """See :class:`Light`."""
+        """See :meth:`Light.sample`."""
         drawn = point.Point.sample(at, x, u, mis)
         share = falloff(drawn.wi, at.normal, at.e1[0], at.e1[1])
         return replace(drawn, radiance=drawn.radiance * share)

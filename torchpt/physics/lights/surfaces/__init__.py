@@ -1,1 +1,1 @@
-"""Surfaces that emit: one kind of primitive a file."""
+"""Kinds of emissive surfaces, one kind of primitive a file."""

@@ -1,4 +1,4 @@
-"""Disks and ellipses, drawn by area."""
+"""Disks and ellipses, sampled by area."""
 
 from __future__ import annotations
 
@@ -21,6 +21,6 @@ class Disk(Surface):
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.sample`."""
         uv = concentric_disk(u)
         return SurfaceSample(flat_point(at.p0, at.e1, at.e2, uv), at.normal, uv)

@@ -1,7 +1,7 @@
-"""Emitters that are quadrics under affine maps, sampled uniformly by area in the surface's own space.
+"""Emissive quadrics under affine maps, sampled uniformly by area in object space.
 
-Under a map M with cofactor matrix C the area element at own normal n grows by ``|C n| = |det M| / |M^T N|``, N the world's
-unit normal: what was sampled and what was hit by chance agree on the density from N alone.
+Under a map M with cofactor matrix C the area element at the object-space normal n grows by ``|C n| = |det M| / |M^T N|``,
+where N is the unit normal in the world: N alone gives the density, of sampled and of hit points.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ __all__ = ["Quadric", "world_area"]
 
 
 def world_area(area: Tensor, e1: Tensor, e2: Tensor, e3: Tensor, normal: Tensor) -> Tensor:
-    """One over the density by area where the normal is ``normal (3, N)``.
+    """Return one over the density by area at unit normals ``normal``.
 
     Args:
-        area: area in the own space times ``|det|`` ``(N,)``.
+        area: area in object space times ``|det|`` ``(N,)``.
         e1: ``(3, N)``.
         e2: ``(3, N)``.
         e3: ``(3, N)``.
-        normal: unit, of the world ``(3, N)``.
+        normal: unit normal in the world ``(3, N)``.
     """
     a, b, c = dot(e1, normal), dot(e2, normal), dot(e3, normal)
     square = a * a + b * b + c * c
@@ -41,14 +41,14 @@ class Quadric(Surface):
 
     @classmethod
     def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
-        """See :class:`Surface`: its own space's times ``|det|``; the world's by quadrature."""
+        """See :meth:`Surface.areas`: the area in object space times ``|det|``; the area in the world by quadrature."""
         assert faces.quadrics is not None and faces.frame is not None
         area, whole = quadrics.areas(faces.quadrics, faces.frame)
         return area.index_select(0, faces.column), whole.index_select(0, faces.column)
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.sample`."""
         assert at.quadrics is not None
         own = quadrics.sample(at.quadrics, u)
         p = affine(at.p0 + at.e1 * own[0], at.e2, own[1], at.quadrics.e3, own[2])
@@ -56,12 +56,12 @@ class Quadric(Surface):
 
     @classmethod
     def size(cls, at: Lights, normal: Tensor) -> Tensor | None:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.size`."""
         assert at.quadrics is not None
         return world_area(at.area, at.e1, at.e2, at.quadrics.e3, normal)
 
     @classmethod
     def bound(cls, at: Lights, normal: Tensor) -> Tensor | None:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.bound`."""
         assert at.quadrics is not None
         return dot(normal.detach().abs(), at.quadrics.reach)

@@ -1,4 +1,4 @@
-"""Rectangles and parallelograms, drawn by :mod:`torchpt.physics.lights.solid_angle`."""
+"""Rectangles and parallelograms, sampled by :mod:`torchpt.physics.lights.solid_angle`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Spherical emitters: the visible cone sampled uniformly from outside, the whole sphere from within.
+"""Emissive spheres: from outside the visible cone is sampled uniformly, from inside the whole sphere.
 
-Pharr, Jakob, Humphreys, *Physically Based Rendering*, 4th ed., section 6.2.4; the series below ``sin^2 = 6.9e-4`` keeps far
-lights exact.
+Pharr, Jakob, Humphreys, *Physically Based Rendering*, 4th ed., section 6.2.4; a series below ``sin^2 = 6.9e-4`` keeps distant
+lights accurate.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["Sphere", "inverse_pdf", "sample"]
 
 
 def _cone(x: Tensor, centre: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Axis, distance, ``outside``, and ``1 - cos`` of the visible cone."""
+    """Return axis, distance, mask of points outside, and ``1 - cos`` of the half angle of the visible cone."""
     axis = centre - x
     square = dot(axis, axis)
     outside = square > radius * radius * (1.0 + 2.0**-18)  # nearer, the cone is a half space up to rounding
@@ -29,13 +29,13 @@ def _cone(x: Tensor, centre: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Te
 
 
 def sample(x: Tensor, centre: Tensor, radius: Tensor, flip: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Points ``(3, N)`` on the spheres seen from ``x (3, N)``, and the emitting side's unit normals there."""
+    """Sample points ``(3, N)`` on spheres as seen from ``x (3, N)``; return them and unit normals on the emitting side."""
     axis, distance, outside, width = _cone(x, centre, radius)
     local = uniform_cone(u, width)
     sin2 = local[0] * local[0] + local[1] * local[1]
     half = (radius * radius - sin2 * distance * distance).clamp_min(0.0).sqrt()
     depth = distance * local[2] - half
-    # From the centre to the point, in the cone's frame: its z is depth cos - distance, without that cancellation.
+    # From the centre to the point, in the cone's frame: z is depth cos - distance, written without cancellation.
     seen = torch.stack((local[0] * depth, local[1] * depth, -(sin2 * distance + local[2] * half)))
     seen = Frame.about(normalize(axis)).to_world(normalize(seen))
     normal = torch.where(outside, seen, uniform_sphere(u))
@@ -43,7 +43,7 @@ def sample(x: Tensor, centre: Tensor, radius: Tensor, flip: Tensor, u: Tensor) -
 
 
 def inverse_pdf(x: Tensor, centre: Tensor, radius: Tensor, normal: Tensor, wi: Tensor, square: Tensor) -> Tensor:
-    """``1 / pdf`` in solid angle of :func:`sample`, given what was hit; 0 behind the emitting side."""
+    """Return ``1 / pdf`` in steradians ``(N,)`` of :func:`sample` at a point with this normal; 0 behind the emitting side."""
     _, _, outside, width = _cone(x, centre, radius)
     cosine = -dot(wi, normal)
     whole = (4.0 * math.pi) * radius * radius * cosine * safe_reciprocal(square)
@@ -58,27 +58,27 @@ class Sphere(Surface):
 
     @classmethod
     def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.areas`."""
         area = (4.0 * math.pi) * faces.e1[0].double() ** 2
         return area, area.detach()
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
-        """See :class:`Surface`."""
-        # Detached: from a moving reference point the same spot on the light is held, as on planar lights.
+        """See :meth:`Surface.sample`."""
+        # Detached: as the reference point moves, the point stays fixed on the light, as on planar lights.
         radius = at.e1[0]
         p, normal = sample(x.detach(), at.p0.detach(), radius.detach(), at.flip, u)
-        grown = radius / torch.where(radius == 0, 1.0, radius).detach()  # 1; rows of other kinds may have a 0 there
+        grown = radius / torch.where(radius == 0, 1.0, radius).detach()  # 1; rows of other kinds may have radius 0
         return SurfaceSample(at.p0 + (p - at.p0).detach() * grown, normal)
 
     @classmethod
     def inverse_pdf(
         cls, at: Lights, x: Tensor, normal: Tensor, wi: Tensor, square: Tensor, by_area: Tensor
     ) -> Tensor | None:
-        """See :class:`Surface`."""
+        """See :meth:`Surface.inverse_pdf`."""
         found = inverse_pdf(x.detach(), at.p0.detach(), at.e1[0].detach(), normal, wi.detach(), square.detach())
         if not by_area.requires_grad:
             return found
-        # In area measure the derivative of a sphere's share is that of the planar form.
+        # In area measure the derivative is the one of planar lights.
         value = by_area.detach()
         return found * torch.where(value > 0, by_area / torch.where(value > 0, value, 1.0), 1.0)

@@ -1,4 +1,4 @@
-"""Triangles, drawn by :mod:`torchpt.physics.lights.solid_angle`."""
+"""Triangles, sampled by :mod:`torchpt.physics.lights.solid_angle`."""
 
 from __future__ import annotations
 

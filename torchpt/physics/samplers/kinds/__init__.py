@@ -1,1 +1,1 @@
-"""Samplers: one kind a file."""
+"""Kinds of samplers, one a file, named after its ``type`` in scene files."""

@@ -16,23 +16,23 @@ _SECOND = as_int32(0x9E3779B9)
 
 
 def _word(key: Tensor, salt: Tensor | int) -> Tensor:
-    # Two rounds: the first spreads the sample index under this dimension's salt, the second brings in the pixel, so
-    # that two lanes share a number only if both rounds collide, and then in this one dimension alone.
+    # Two rounds: the first hashes the sample index with the salt, the second adds the pixel. So two lanes share a number only
+    # if both rounds collide, and then in this dimension alone.
     return mix(mix(key[1] ^ salt) + key[0])
 
 
 @dataclass(frozen=True)
 class Independent(Points):
-    """Random numbers, for comparisons and for tests that need independent samples."""
+    """Independent random numbers, for comparisons and for tests."""
 
     name = "independent"
     parameters = ADAPTIVE
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_1d`."""
         return to_unit(_word(key, salt))
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_2d`."""
         word = _word(key, salt)
         return torch.stack((to_unit(word), to_unit(mix(word ^ _SECOND))))

@@ -1,7 +1,7 @@
-"""Jittered strata: as many as a pixel has points, each with one point in it, in an order of its own for each dimension.
+"""Jittered points: one in each of n strata, in an order of its own for each dimension.
 
-In two dimensions the strata stand in ``round(sqrt(count))`` columns that hold as equal a number of strata as can be and are
-as wide as that: all have the same area and are nearly square, whatever the count (a prime one included).
+In two dimensions the strata are arranged in ``round(sqrt(n))`` columns with nearly equal numbers of strata and widths in
+proportion: all strata have the same area and are nearly square, for any n (primes included).
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ class Stratified(Points):
     rows = 3
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_1d`."""
         return jittered(key, salt)
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_2d`."""
         seed = mix(key[0] ^ salt)
         stratum = shuffle(key[1], key[2], seed)
         jitter = to_unit(mix(mix(seed ^ X) ^ stratum)).double(), to_unit(mix(mix(seed ^ Y) ^ stratum)).double()
-        # Whole numbers below 2^53, so that quotients are floored rightly.
+        # Integers below 2^53, so that quotients are floored correctly.
         k, count = stratum.double(), key[2].double()
         columns = (count.sqrt() + 0.5).floor()
         column = (((k + 1.0) * columns - 1.0) / count).floor()

@@ -1,11 +1,11 @@
-"""One Sobol' sequence for the whole film, dealt out along a Z curve, so that errors of neighbours differ (blue noise).
+"""One Sobol' sequence for the whole film, distributed along a Z-order curve, for blue-noise error.
 
 Ahmed and Wonka, *Screen-Space Blue-Noise Diffusion of Monte Carlo Sampling Error via Hierarchical Ordering of Pixels*, ACM
-TOG 39(6), 2020; as in pbrt-4's ``ZSobolSampler``. Each square of 2x2, 4x4, ... pixels holds a run of the sequence, so the
-errors in it cancel. The digits (base 4) of a place on the curve are permuted by a hash of the digits above them, anew for
-each dimension.
+TOG 39(6), 2020; as in pbrt-4's ``ZSobolSampler``. Each square of 2x2, 4x4, ... pixels has a contiguous part of the sequence,
+so errors in it cancel. The base-4 digits of a position on the curve are permuted by a hash of the digits above them,
+differently for each dimension.
 
-A permutation of four things is an affine map of two bits, ``A d + b`` with an invertible ``A``: there are 6 * 4 = 24 of both.
+Every permutation of four digits is an affine map of two bits, ``A d + b`` with an invertible ``A``: there are 6 * 4 = 24.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from torchpt.physics.samplers.bits import X, Y, reverse_bits, scramble, second_d
 
 __all__ = ["ZSobol"]
 
-#: Of a place on the curve. Places that share all digits above are one block, 2^24 samples with a sequence of their own.
+#: Number of permuted base-4 digits. Positions that share all digits above are a block of 2^24 samples with its own sequence.
 DIGITS = 12
 
 
 def _spread(x: Tensor) -> Tensor:
-    """A zero between any two of the low 16 bits of int64 lanes."""
+    """Insert a zero between any two of the low 16 bits of int64 lanes."""
     for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
         x = (x | (x << shift)) & mask
     return x
 
 
 def _index(word: Tensor, state: Tensor) -> Tensor:
-    """The point of the Sobol' sequence that a place on the curve is given under the hash ``state`` of a dimension."""
+    """Return the index in the Sobol' sequence for a position on the curve, under the hash ``state`` of a dimension."""
     index = torch.zeros_like(word)
     for shift in range(2 * DIGITS - 1, 0, -2):
         digit = (word >> shift) & 3
-        # Columns of A: one of the three vectors, and one of the two others.
+        # Columns of A: one of three vectors, then one of the other two.
         one = 1 + ((logical_shift(state, 16) * 3) >> 16)
         other = 1 + one - 3 * ((one + 1) >> 2)
         other = other ^ (one & -((state >> 4) & 1))
-        moved = (one & -(digit & 1)) ^ (other & -(digit >> 1)) ^ ((state >> 2) & 3)
-        index = index | (moved << shift)
+        permuted = (one & -(digit & 1)) ^ (other & -(digit >> 1)) ^ ((state >> 2) & 3)
+        index = index | (permuted << shift)
         state = mix(state + digit + 1)
     odd = logical_shift(word, 31)
     return (index | (((word ^ state) & 1) & odd)) >> (1 - odd)
@@ -50,17 +50,17 @@ def _index(word: Tensor, state: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class ZSobol(Points):
-    """One Sobol' sequence for the film along a Z curve: of a few samples a pixel the error is blue noise."""
+    """One Sobol' sequence for the film along a Z-order curve: with few samples a pixel the error is blue noise."""
 
     name = "zsobol"
     needs_count = True
     of_film = True
 
     def key(self, numbers: SamplerTensors, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
-        """``(2, N)`` int32: the seed of the block, and the place of the point on the curve within it.
+        """Return ``(2, N)`` int32: the seed of the block, and the position of the point on the curve within it.
 
-        The place has ``DIGITS`` digits of two bits above one single bit. Where ``numbers.bits`` is odd, the single bit is the
-        last of the point's index and the sign bit is set; else it is none of the place.
+        The position has ``DIGITS`` digits of two bits above a single bit. If ``numbers.bits`` is odd, the single bit is the
+        last of the point's index and the sign bit is set; else it is unused.
         """
         seed = torch.index_select(numbers.seeds, 0, group)
         bits, width = numbers.bits, numbers.width
@@ -73,12 +73,12 @@ class ZSobol(Points):
         return torch.stack((mix(block ^ seed), (place | -(odd << 31)).to(torch.int32)))
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_1d`."""
         seed = mix(key[0] ^ salt)
         return to_unit(reverse_bits(scramble(_index(key[1], seed), mix(seed ^ X))))
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :class:`Points`."""
+        """See :meth:`Points.draw_2d`."""
         seed = mix(key[0] ^ salt)
         index = _index(key[1], seed)
         x = scramble(index, mix(seed ^ X))

@@ -1,1 +1,1 @@
-"""One kind of shape a file, see :mod:`torchpt.physics.shapes`."""
+"""Kinds of shapes, one a file, named after its ``type`` in scene files."""

@@ -1,4 +1,4 @@
-"""Cubes: triangles, four vertices a side, so that their normals are flat."""
+"""Cubes of triangles, with four vertices a side for flat normals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Cube(Shape):
 
     @classmethod
     def triangles(cls, values: Mapping[str, Any]) -> Triangles:
-        """See :class:`Shape`: 24 vertices, 12 triangles, outward normals and the uv of Mitsuba's ``cube``."""
+        """Return 24 vertices and 12 triangles, with outward normals and the uv of Mitsuba's ``cube``."""
         vertices, normals, faces = [], [], []
         for side, frame in enumerate(_SIDES):
             normal, along_u, along_v = np.array(frame, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Cylinders: a side, and two disks that close it."""
+"""Cylinders: the side, and two disks as caps."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ __all__ = ["Cylinder"]
 class Cylinder(Shape, Quadric):
     """An analytic cylinder about an axis along y."""
 
-    # Its side in its own space: x^2 + y^2 = 1, 0 <= z <= 1.
+    # The side in object space: x^2 + y^2 = 1, 0 <= z <= 1.
     name = "cylinder"
     form = Form(bend=0.0, level=1.0)
     area = 2.0 * math.pi
     parameters: ClassVar = {
-        "center": Place((0.0, 0.0, 0.0), doc="its middle, half-way up, before the transform"),
-        "radius": Size(1.0, above=0.0, length=True, doc="before the transform"),
-        "height": Size(1.0, above=0.0, length=True, doc="along y, before the transform"),
-        "capped": Flag(True, doc="closed by two disks that face outward"),
+        "center": Place((0.0, 0.0, 0.0), doc="centre, half-way up the axis, before the transform"),
+        "radius": Size(1.0, above=0.0, length=True, doc="radius before the transform"),
+        "height": Size(1.0, above=0.0, length=True, doc="height along y, before the transform"),
+        "capped": Flag(True, doc="whether two disks that face outward close the ends"),
     }
 
     @classmethod
     def own(cls, values: Mapping[str, Any]) -> Any:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.own`."""
         radius, height = values["radius"], values["height"]
         x, y, z = values["center"]
         return placed((x, y - 0.5 * height, z), (radius, radius, height), UPRIGHT)
 
     @classmethod
     def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.surfaces`."""
         if not values["capped"]:
             return [Surface("quadric", quadric=cls)]
         side = Surface("quadric", "side", quadric=cls)
@@ -47,23 +47,23 @@ class Cylinder(Shape, Quadric):
 
     @classmethod
     def place(cls, u: Tensor, v: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.place`."""
         around = ring(u)
         return torch.stack((around[0], around[1], v.clamp(0.0, 1.0)))
 
     @classmethod
     def normal(cls, q: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.normal`."""
         return torch.stack((q[0], q[1], torch.zeros_like(q[2])))
 
     @classmethod
     def sample(cls, u: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.sample`."""
         phi = (2.0 * math.pi) * u[0]
         return torch.stack((torch.cos(phi), torch.sin(phi), u[1]))
 
     @classmethod
     def box(cls, e1: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Quadric`: the hull of two ellipses."""
+        """See :meth:`Quadric.box`; the side is the hull of two ellipses."""
         reach = (e1.square() + e2.square()).sqrt()
         return torch.minimum(-reach, e3 - reach), torch.maximum(reach, e3 + reach)

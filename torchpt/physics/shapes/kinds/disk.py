@@ -17,5 +17,5 @@ class Disk(Shape):
 
     @classmethod
     def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.surfaces`."""
         return [Surface("disk")]

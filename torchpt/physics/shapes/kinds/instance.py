@@ -1,4 +1,4 @@
-"""Instances: other places of meshes."""
+"""Instances of meshes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def _of(value: Any) -> str:
 
 
 class Instance(Shape):
-    """Another place of a mesh, whose triangles it shares; the mesh's own transform does not count here."""
+    """A copy of a mesh with its own transform and material, which shares the triangles; the mesh's transform does not apply."""
 
     name = "instance"
     parameters: ClassVar = {
@@ -26,13 +26,13 @@ class Instance(Shape):
             REQUIRED,
             reader=_of,
             words="the name of a mesh among the shapes",
-            doc="whose triangles these are, and whose material where it has none of its own",
+            doc="the mesh: its triangles are used, and its material unless one is given",
         )
     }
     copies = True
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.check`."""
         if values["emission"] is not None:
             raise Refused("no emission on an instance (a mesh of its own can shine)", values["emission"], ("emission",))

@@ -1,4 +1,4 @@
-"""Meshes: triangles of a file, or written out."""
+"""Meshes: triangles from a file, from arrays, or from objects of trimesh."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ __all__ = ["Displacement", "Mesh"]
 
 
 class Displacement:
-    """How far vertices move along their normals, after cutting triangles in four."""
+    """Displacement of vertices along their normals, after subdivision of the triangles."""
 
     parameters: ClassVar = {
-        "texture": Map(REQUIRED, doc="a number texture, or the name of one: how far, in units of scale"),
+        "texture": Map(REQUIRED, doc="texture of one channel, or the name of one: the displacement over scale"),
         "scale": Scalar(1.0, low=None, length=True, doc="factor of the texture"),
-        "subdivisions": Integer(0, high=12, doc="how often each triangle is cut in four before"),
+        "subdivisions": Integer(0, high=12, doc="number of times that each triangle is first split in four"),
     }
 
 
 def _object(value: Any) -> Any:
-    """An object of trimesh; or parts, which Python code read itself. Whoever builds the scene takes it apart."""
+    """Return an object of trimesh, or a tuple of parts from Python code; the scene builder converts them."""
     if isinstance(value, tuple | list) and value and all(hasattr(part, "faces") for part in value):
         return tuple(value)
     if all(kind.__module__.partition(".")[0] != "trimesh" for kind in type(value).__mro__):
@@ -44,7 +44,7 @@ class Mesh(Shape):
             words="a trimesh.Trimesh or trimesh.Scene",
             doc="an object of Python, read when the scene is loaded",
         ),
-        "vertices": Vertices(None, doc="points in its own space"),
+        "vertices": Vertices(None, doc="points in object space"),
         "faces": Custom(
             None,
             reader=reading.faces,
@@ -55,22 +55,22 @@ class Mesh(Shape):
             None,
             reader=lambda value: reading.rows(value, 3, "[x, y, z]"),
             words="a list of [x, y, z], finite numbers each",
-            doc="one a vertex; none: computed, smooth",
+            doc="one for each vertex; computed as smooth normals by default",
         ),
         "uvs": Custom(
             None,
             reader=lambda value: reading.rows(value, 2, "[u, v]"),
             words="a list of [u, v], finite numbers each",
-            doc="texture coordinates, one a vertex",
+            doc="texture coordinates, one for each vertex",
         ),
-        "face_normals": Flag(False, doc="shade flat, whatever normals there are"),
+        "face_normals": Flag(False, doc="whether to shade with face normals even if vertex normals exist"),
         "displacement": Block(None, kind=Displacement, doc="moves the vertices when the scene is loaded"),
     }
     meshed = True
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.check`."""
         inline = {name: values[name] for name in ("vertices", "faces", "normals", "uvs")}
         vertices, faces = values["vertices"], values["faces"]
         if values["path"] is not None and values["mesh"] is not None:
@@ -97,7 +97,7 @@ class Mesh(Shape):
 
     @classmethod
     def triangles(cls, values: Mapping[str, Any]) -> Triangles:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.triangles`."""
         arrays = (values[name] for name in ("path", "vertices", "faces", "normals", "uvs"))
         return Triangles(
             *arrays, flat=values["face_normals"], displacement=values["displacement"], object=values["mesh"]

@@ -1,4 +1,4 @@
-"""Spheres, which uneven transforms make ellipsoids of."""
+"""Spheres; non-uniform scales turn them into ellipsoids."""
 
 from __future__ import annotations
 
@@ -27,54 +27,54 @@ class Ellipsoid(Quadric):
 
     @classmethod
     def place(cls, u: Tensor, v: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.place`."""
         return octahedral(u, v)
 
     @classmethod
     def normal(cls, q: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.normal`."""
         return q
 
     @classmethod
     def climb(cls, q: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Quadric`: from the pole down."""
+        """See :meth:`Quadric.climb`; ``v`` grows from the pole +z to -z."""
         return math.pi * q[2], -math.pi * radius
 
     @classmethod
     def v(cls, q: Tensor, radius: Tensor) -> Tensor:
-        """See :class:`Quadric`: the angle from z over pi."""
+        """Return the angle from +z over pi ``(N,)``."""
         return azimuth(q[2], radius) * (1.0 / math.pi)
 
     @classmethod
     def sample(cls, u: Tensor) -> Tensor:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.sample`."""
         return uniform_sphere(u)
 
     @classmethod
     def box(cls, e1: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Quadric`."""
+        """See :meth:`Quadric.box`."""
         reach = (e1.square() + e2.square() + e3.square()).sqrt()
         return -reach, reach
 
 
 class Sphere(Shape):
-    """An analytic sphere; under an uneven transform an ellipsoid."""
+    """An analytic sphere; an ellipsoid under a transform that does not preserve angles."""
 
     name = "sphere"
     parameters: ClassVar = {
-        "center": Place((0.0, 0.0, 0.0), doc="its middle, before the transform"),
-        "radius": Size(1.0, above=0.0, length=True, doc="before the transform"),
+        "center": Place((0.0, 0.0, 0.0), doc="centre before the transform"),
+        "radius": Size(1.0, above=0.0, length=True, doc="radius before the transform"),
     }
 
     @classmethod
     def own(cls, values: Mapping[str, Any]) -> Any:
-        """See :class:`Shape`; its surface is the unit sphere."""
+        """See :meth:`Shape.own`; the primitive is the unit sphere."""
         radius = values["radius"]
         return placed(values["center"], (radius, radius, radius), np.eye(3))
 
     @classmethod
     def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:
-        """See :class:`Shape`."""
+        """See :meth:`Shape.surfaces`."""
         if similarity_scale(pose) is not None:
             return [Surface("sphere")]
         return [Surface("quadric", quadric=Ellipsoid)]

@@ -1,1 +1,1 @@
-"""One kind of primitive a file, see :mod:`torchpt.physics.shapes.primitive`."""
+"""Kinds of primitives, one a file; see :mod:`torchpt.physics.shapes.primitive`."""

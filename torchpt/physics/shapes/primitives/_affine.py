@@ -1,4 +1,4 @@
-"""What flat primitives share: a pose's axes, and texture coordinates that are affine over the primitive."""
+"""Axes of poses and affine texture coordinates, for flat primitives."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ __all__ = ["axes_of", "axes_of_all", "corner_moves", "unit_uvs"]
 
 
 def axes_of(pose: Tensor) -> tuple[Tensor, Tensor, Tensor, bool]:
-    """Where a pose ``(3, 4)`` puts the origin, x and y ``(3, 1)`` each, and whether it mirrors.
+    """Return translation, x axis and y axis ``(3, 1)`` of a pose ``(3, 4)``, and True if it mirrors.
 
-    Then x and y are exchanged: the shape still faces where its own +z goes, as in Mitsuba.
+    A mirroring pose has x and y swapped, so that the shape faces along its transformed +z, as in Mitsuba.
     """
     move, x, y, mirrored = axes_of_all(pose[None])
     return move, x, y, mirrored[0]
 
 
 def axes_of_all(poses: Tensor) -> tuple[Tensor, Tensor, Tensor, list[bool]]:
-    """The same of N poses ``(N, 3, 4)``, side by side: ``(3, N)`` each."""
+    """Return the same as :func:`axes_of` for N poses ``(N, 3, 4)``: ``(3, N)`` each."""
     x, y, move = poses[:, :, 0].T, poses[:, :, 1].T, poses[:, :, 3].T
     mirrored = torch.linalg.det(poses[:, :, :3].detach()) < 0
     flags: list[bool] = mirrored.tolist()
@@ -30,7 +30,7 @@ def axes_of_all(poses: Tensor) -> tuple[Tensor, Tensor, Tensor, list[bool]]:
 
 
 def unit_uvs(corners: Corners) -> Triple:
-    """Texture coordinates ``(2, P)`` at the corners that are the primitive's own ``u, v``."""
+    """Return texture coordinates ``(2, P)`` at the corners equal to the primitive's own ``u, v``."""
     like = corners.p0[:2]
     origin, u, v = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
     if corners.mirrored:
@@ -40,7 +40,7 @@ def unit_uvs(corners: Corners) -> Triple:
 
 
 def corner_moves(corners: Corners, uvs: Triple) -> tuple[Tensor, Tensor]:
-    """How points move with ``u`` and with ``v``, ``(3, P)`` each, by texture coordinates at the corners."""
+    """Return derivatives ``(3, P)`` of points by the texture coordinates ``u`` and ``v``, from those at the corners."""
     e1, e2 = corners.p1 - corners.p0, corners.p2 - corners.p0
     a, b = uvs[1] - uvs[0], uvs[2] - uvs[0]
     det = a[0] * b[1] - a[1] * b[0]

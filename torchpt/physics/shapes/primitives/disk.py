@@ -1,4 +1,4 @@
-"""Disks, which transforms make ellipses of; texture coordinates are the distance from the centre and the azimuth (Mitsuba)."""
+"""Disks and, under affine maps, ellipses. As in Mitsuba ``u`` is the distance from the centre, ``v`` the azimuth over 2 pi."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Disk(Primitive):
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.corners`."""
         move, x, y, mirrored = axes_of(pose)
         p1, p2 = move + x, move + y
         return Corners(move.to(dtype), p1.to(dtype), p2.to(dtype), mirrored=mirrored)
@@ -39,7 +39,7 @@ class Disk(Primitive):
     def tangents(
         cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """See :class:`Primitive`: outward, and around."""
+        """See :meth:`Primitive.tangents`; ``u`` grows outward, ``v`` around the centre."""
         u, v, e1, e2 = at.u, at.v, place.e1, place.e2
         away = torch.addcmul(e1 * u, e2, v)
         square = torch.where(mine, u * u + v * v, 1.0)
@@ -54,7 +54,7 @@ class Disk(Primitive):
 
     @classmethod
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.uv`."""
         x, y = at.u, at.v
         if world.geometry.mirrored is not None:
             turned = take(world.geometry.mirrored, at.prim)

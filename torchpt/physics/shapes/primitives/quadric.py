@@ -21,7 +21,7 @@ __all__ = ["Quadric"]
 
 
 class Quadric(Primitive):
-    """A quadric; ``p0``, ``e1`` and ``e2`` of its map lie where those of flat primitives do."""
+    """A quadric; ``p0``, ``e1`` and ``e2`` of its map are stored as for flat primitives."""
 
     name = "quadric"
     flat = False
@@ -29,7 +29,7 @@ class Quadric(Primitive):
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.corners`."""
         linear, move = pose.split((3, 1), 1)
         x, y = linear[:, 0:1], linear[:, 1:2]
         frame = torch.cat((move, x, y, linear[:, 2:3]))
@@ -37,19 +37,19 @@ class Quadric(Primitive):
 
     @classmethod
     def hit_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> HitPoints:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.hit_points`."""
         table = quadrics.rows(world, place.prim)
         own = _object_point(table, rays, mine)
         if rays.follow_shape:
             moved = quadrics.follow_shape(table, place.p0, place.e1, rays.o, rays.d, rays.hit.t, own)
             own = torch.where(mine, moved, own)
         ng = quadrics.outward(table, own)
-        # At the point itself: a needle is far thinner than it is long.
+        # The bound at the point, not of the whole primitive: a needle is far thinner than it is long.
         return HitPoints(_point(table, place, own), ng, dot(ng.detach().abs(), table.reach), own)
 
     @classmethod
     def fixed_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> FixedPoints:
-        """See :class:`Primitive`: at its place in its own space."""
+        """See :meth:`Primitive.fixed_points`; points stay fixed in object space."""
         table = quadrics.rows(world, place.prim)
         own = _object_point(table, rays, mine)
         return FixedPoints(_point(table, place, own), quadrics.direction(table, quadrics.normal(table, own)))
@@ -58,7 +58,7 @@ class Quadric(Primitive):
     def tangents(
         cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.tangents`."""
         assert at.own is not None
         tangent = quadrics.tangent(place.e1, place.e2, at.own)
         if at.bitangent is None:
@@ -67,14 +67,14 @@ class Quadric(Primitive):
 
     @classmethod
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
-        """See :class:`Primitive`."""
-        if at.own is None:  # a point on lights of other kinds
+        """See :meth:`Primitive.uv`."""
+        if at.own is None:  # points on lights of other kinds
             return None
         return quadrics.surface_uv(quadrics.rows(world, at.prim), at.own)
 
 
 def _object_point(table: Quadrics, rays: Rays, mine: Tensor) -> Tensor:
-    """Points ``(3, N)`` in their own space as the search tells them."""
+    """Return hit points ``(3, N)`` in object space."""
     return quadrics.place(table, torch.where(mine, rays.hit.u, 0.0), torch.where(mine, rays.hit.v, 0.0))
 
 

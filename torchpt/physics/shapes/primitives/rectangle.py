@@ -1,4 +1,4 @@
-"""Rectangles, which transforms make parallelograms of."""
+"""Rectangles and, under affine maps, parallelograms."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ __all__ = ["Rectangle"]
 
 
 class Rectangle(Primitive):
-    """A parallelogram; texture coordinates run over [0, 1]^2."""
+    """A parallelogram; texture coordinates cover [0, 1]^2."""
 
     name = "rectangle"
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
-        """See :class:`Primitive`: Mitsuba's unit shape [-1, 1]^2 from its lower corner."""
+        """See :meth:`Primitive.corners`; the shape is [-1, 1]^2 as in Mitsuba, ``p0`` its lower corner."""
         return cls.corners_of_many(pose[None], dtype)[0]
 
     @classmethod
     def corners_of_many(cls, poses: Tensor, dtype: torch.dtype) -> list[Corners]:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.corners_of_many`."""
         move, x, y, mirrored = axes_of_all(poses)
         x, y = 2.0 * x, 2.0 * y
         p0 = move - 0.5 * (x + y)
@@ -38,10 +38,10 @@ class Rectangle(Primitive):
 
     @classmethod
     def uvs(cls, part: Part, corners: Corners) -> Triple:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.uvs`."""
         return unit_uvs(corners)
 
     @classmethod
     def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.moves`."""
         return corner_moves(corners, uvs)

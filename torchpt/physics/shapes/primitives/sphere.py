@@ -31,7 +31,7 @@ class Sphere(Primitive):
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.corners`."""
         linear, move = pose.split((3, 1), 1)
         radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)
         zero = torch.zeros_like(radius)
@@ -40,17 +40,17 @@ class Sphere(Primitive):
 
     @classmethod
     def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Primitive`: the vector whose cross product with the normal the tangent is, and ``(pi r, 0, 0)``."""
+        """Return the vector whose cross product with the normal is the tangent, and ``(pi r, 0, 0)``."""
         linear = linear.to(corners.p0)
         radius, zero = corners.p1[0].abs(), torch.zeros_like(corners.p1[0])
-        turned = -1.0 if part.flip else 1.0  # the normal is
+        turned = -1.0 if part.flip else 1.0  # sign of the normal
         handed = torch.sign(torch.linalg.det(linear.detach().double())).to(corners.p0) * turned
         around = normalize(linear[:, 2:3]) * (2.0 * math.pi * radius * handed)
         return around, torch.stack((math.pi * radius * handed, zero, zero))
 
     @classmethod
     def hit_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> HitPoints:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.hit_points`."""
         assert world.geometry.flip is not None
         o, d, p0 = rays.o, rays.d, place.p0
         radius = torch.where(mine, place.e1[0], 1.0)
@@ -62,7 +62,7 @@ class Sphere(Primitive):
 
     @classmethod
     def fixed_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> FixedPoints:
-        """See :class:`Primitive`: at its normal."""
+        """See :meth:`Primitive.fixed_points`; points keep their normal."""
         radius = torch.where(mine, place.e1[0], 1.0)
         outward = normalize((rays.o + rays.d * rays.hit.t - place.p0).detach())
         return FixedPoints(place.p0 + outward * radius, outward * (radius * radius))
@@ -71,7 +71,7 @@ class Sphere(Primitive):
     def tangents(
         cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """See :class:`Primitive`: around, and down."""
+        """See :meth:`Primitive.tangents`; ``u`` grows around the axis, ``v`` downward."""
         assert at.tangent is not None
         around = cross(at.tangent, at.ng)
         down = None if at.bitangent is None else cross(normalize(around), at.ng) * at.bitangent[0]
@@ -79,7 +79,7 @@ class Sphere(Primitive):
 
     @classmethod
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.uv`."""
         assert world.geometry.axes is not None
         first, end = world.geometry.ends[2], world.geometry.ends[3]
         row = torch.minimum((at.prim - first).clamp_min(0), end - first - 1)
@@ -90,16 +90,16 @@ class Sphere(Primitive):
 
 
 def axes(poses: list[Tensor], dtype: torch.dtype) -> Triple:
-    """Unit x, y, z ``(3, S)`` of spheres with these poses ``(4, 4)``."""
+    """Return unit axes x, y, z ``(3, S)`` of spheres with these poses ``(4, 4)``."""
     linear = [pose[:3, :3] for pose in poses]
     x, y, z = (normalize(torch.stack([m[:, k] for m in linear], 1).to(dtype)) for k in range(3))
     return x, y, z
 
 
 def _distance(o: Tensor, d: Tensor, centre: Tensor, radius: Tensor, near: Tensor) -> Tensor:
-    """The root next to the search's ``near``, with the derivative of the sphere's implicit equation at it."""
+    """Return the ray parameter of the hit next to ``near``, with the derivative of the sphere's implicit equation."""
     t = near.detach()
     f = o + d * t - centre
-    # One Newton step on |f|^2 = r^2; the slope is a constant of it, so the value is polished and the derivative right.
+    # One Newton step on |f|^2 = r^2 with a detached slope: it refines the value and gives the exact derivative.
     slope = (2.0 * dot(f, d)).detach()
     return t - (dot(f, f) - radius * radius) / torch.where(slope == 0, 1.0, slope)

@@ -26,13 +26,13 @@ class Triangle(Primitive):
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.corners`."""
         linear, move = pose.split((3, 1), 1)
         assert part.faces is not None
         points = linear @ own["vertices"].T.double() + move
         faces = torch.from_numpy(part.faces).to(points.device)
         if bool(torch.linalg.det(linear.detach()) < 0):
-            faces = faces[:, [0, 2, 1]]  # a mirrored mesh keeps its outside
+            faces = faces[:, [0, 2, 1]]  # the outside of a mirrored mesh stays outside
         points = points.to(dtype)
         p0, p1, p2 = (points.index_select(1, faces[:, k]) for k in range(3))
         if not part.smooth:
@@ -43,14 +43,14 @@ class Triangle(Primitive):
             given = own.get("normals", torch.from_numpy(part.normals)).to(linear)
             normals = normalize(torch.linalg.inv(linear).T @ given.T).to(dtype)
         n0, n1, n2 = (normals.index_select(1, faces[:, k]) for k in range(3))
-        if not bool((dot(normals, normals) > 0).all()):  # a corner without a normal takes its face's
+        if not bool((dot(normals, normals) > 0).all()):  # a corner without a normal gets that of its face
             flat = normalize(cross(p1 - p0, p2 - p0))
             n0, n1, n2 = (torch.where(dot(n, n) > 0, n, flat) for n in (n0, n1, n2))
         return Corners(p0, p1, p2, (n0, n1, n2), faces, uvs=own.get("uvs"))
 
     @classmethod
     def uvs(cls, part: Part, corners: Corners) -> Triple:
-        """See :class:`Primitive`: those of the file, else the triangle's own."""
+        """See :meth:`Primitive.uvs`; the mesh's texture coordinates, else the triangle's own ``u, v``."""
         if part.uvs is None:
             return unit_uvs(corners)
         assert corners.faces is not None
@@ -61,5 +61,5 @@ class Triangle(Primitive):
 
     @classmethod
     def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Primitive`."""
+        """See :meth:`Primitive.moves`."""
         return super().moves(part, corners, uvs, linear) if part.uvs is None else corner_moves(corners, uvs)

@@ -1,1 +1,1 @@
-"""Kinds of textures: one a file."""
+"""Kinds of textures, one a file, named after its ``type`` in scene files."""

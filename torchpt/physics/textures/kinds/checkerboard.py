@@ -1,4 +1,4 @@
-"""Checkerboards: two colours in turn, as an image of 2 x 2 texels that repeats."""
+"""Checkerboards of two colours, stored as a repeated image of 2 x 2 texels."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ __all__ = ["Checkerboard"]
 
 
 class Checkerboard(Mapped):
-    """Two colours in turn: a repeat holds two squares each way, as in Mitsuba."""
+    """Two alternating colours: a repeat has two squares each way, as in Mitsuba."""
 
     name = "checkerboard"
     parameters: ClassVar = {
-        "color0": Color((0.4, 0.4, 0.4), doc="of the square at the origin"),
-        "color1": Color((0.2, 0.2, 0.2), doc="of the squares beside it"),
-        "scale": Pair((1.0, 1.0), single=True, doc="repeats in a unit of u and of v"),
+        "color0": Color((0.4, 0.4, 0.4), doc="colour of the square at the origin"),
+        "color1": Color((0.2, 0.2, 0.2), doc="colour of its neighbours"),
+        "scale": Pair((1.0, 1.0), single=True, doc="number of repeats in a unit of u and of v"),
         "filter": Choice(
             "nearest",
             names=("nearest", "trilinear"),
-            doc="trilinear: the colours go over into their mean where a pixel covers several squares",
+            doc="trilinear: fades to the mean of both colours where a pixel covers several squares",
         ),
     }
     filters = ("trilinear",)
 
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.open`."""
         channel = opening.number(CHANNELS[:4], "squares have no alpha")
         opening.declare_all(cls, values)
         matrix = cls.matrix(values, values["scale"])
@@ -42,6 +42,6 @@ class Checkerboard(Mapped):
 
 
 def _squares(parameters: Mapping[str, Tensor], name: str) -> Tensor:
-    """The image ``(2, 2, 3)``."""
+    """Return the image ``(2, 2, 3)``."""
     a, b = parameters[f"{name}.color0"], parameters[f"{name}.color1"]
     return torch.stack((torch.stack((a, b)), torch.stack((b, a))))

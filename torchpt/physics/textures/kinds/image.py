@@ -1,4 +1,4 @@
-"""Images: files, or numbers of the scene, whose texels become one parameter ``(H, W, C)``. Every file is read once a scene."""
+"""Image textures from files or arrays. The texels become one parameter ``(H, W, C)``; a file is read once a scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchpt.spec import Texels as TexelsSpec
 
 __all__ = ["MOST_PIXELS", "Image"]
 
-#: Pixels up to which a texture may ask for a larger image to be read.
+#: Largest value of ``max_pixels``.
 MOST_PIXELS = 2**30
 
 
@@ -43,21 +43,21 @@ class Image(Mapped):
             None,
             reader=texels_from_array,
             words=TEXELS,
-            doc="in place of a file: an array, a tensor or rows of numbers, the first at the top; linear, but for uint8",
+            doc="array, tensor or rows of numbers in place of a file, the top row first; linear, except uint8: `colorspace`",
         ),
-        "wrap": Choice("repeat", names=WRAPS, doc="how it goes on beyond its edges"),
+        "wrap": Choice("repeat", names=WRAPS, doc="how the image continues beyond its edges"),
         "filter": Choice(
             "bilinear",
             names=("bilinear", "nearest", "trilinear"),
-            doc="how values between texels are found; trilinear: in smaller sizes too, where a pixel covers several texels",
+            doc="interpolation between texels; trilinear: with a mipmap, where a pixel covers several texels",
         ),
         "colorspace": Choice(
             "auto",
             names=("auto", "srgb", "linear"),
-            doc="of an image of 8 bits a value; auto: sRGB where it gives a colour, linear where a number",
+            doc="encoding of images of 8 bits a value; auto: sRGB for a colour, linear for a number",
         ),
-        "scale": Color((1.0, 1.0, 1.0), low=None, doc="multiplies the values"),
-        "channel": Choice(None, names=CHANNELS, doc="what a number takes: luminance where nothing is said"),
+        "scale": Color((1.0, 1.0, 1.0), low=None, doc="factor of the values"),
+        "channel": Choice(None, names=CHANNELS, doc="channel for a number; luminance by default"),
         "max_pixels": Integer(
             None, low=1, high=MOST_PIXELS, also=(None,), doc="larger images are refused; null: 64 Mpixel"
         ),
@@ -66,30 +66,30 @@ class Image(Mapped):
 
     @classmethod
     def label(cls, values: Mapping[str, Any]) -> str | None:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.label`."""
         path = values["path"]
         return path.label if isinstance(path, EncodedImage) else path[0] if path else None
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Texture`: of one source."""
+        """See :meth:`Texture.check`; refuse other than one source of texels."""
         check_source(values)
         if values["data"] is not None and values["max_pixels"] is not None:
             raise Refused("no max_pixels beside data: it is of files", values["max_pixels"], ("max_pixels",))
 
     @classmethod
     def check_slot(cls, values: Mapping[str, Any], coloured: bool) -> None:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.check_slot`."""
         if not coloured and len(set(values["scale"])) > 1:
             raise Refused("one number as scale where a number is wanted", list(values["scale"]), ("scale",))
 
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.open`."""
         slot, scale = opening.slot, values["scale"]
         label, picture = _picture(values, opening)
         channel = opening.channel or values["channel"] or "luminance"
-        alpha = not slot.coloured and channel == "a"  # which is never encoded
+        alpha = not slot.coloured and channel == "a"  # alpha is always linear
         space = values["colorspace"]
         decode = picture.eight_bit and (space == "srgb" or (space == "auto" and (alpha or not slot.linear)))
         channels = picture.values.shape[2]
@@ -114,7 +114,7 @@ class Image(Mapped):
 
 
 def _picture(values: Mapping[str, Any], opening: Opening) -> tuple[str, Texels]:
-    """An image's numbers as stored, and how errors name it."""
+    """Return the name of an image for errors, and its values as stored."""
     if values["data"] is not None:
         return f"{opening.name}.data", values["data"]
     if isinstance(values["path"], EncodedImage):
@@ -132,11 +132,11 @@ def _picture(values: Mapping[str, Any], opening: Opening) -> tuple[str, Texels]:
 def _declared(
     opening: Opening, label: str, picture: Texels, decode: bool, alpha: bool, scale: tuple[float, float, float]
 ) -> str:
-    """The name of the parameter that holds an image's texels, decoded or as stored (of alpha either will do)."""
+    """Declare an image's texels as a parameter, decoded or as stored, and return its name; alpha is the same in both."""
     texels = _decoded(opening, label, picture) if decode else picture.values
     name, others = opening.name, opening.parameters
     if name in others and others[name] is not texels and not alpha:
-        name += ".decoded" if decode else ".stored"  # one image for colours and for numbers: two sets of texels
+        name += ".decoded" if decode else ".stored"  # an image for both colours and numbers has two sets of texels
     if name in others:
         texels = others[name]
     opening.check(texels, opening.key, label, scale)
@@ -148,7 +148,7 @@ def _declared(
 
 
 def _decoded(opening: Opening, label: str, picture: Texels) -> np.ndarray:
-    """Texels whose colours are decoded from sRGB."""
+    """Return the texels with colours decoded from sRGB."""
     key = (label, "decoded")
     if key not in opening.pictures:
         values = picture.values.copy()

@@ -1,9 +1,9 @@
 """Noise: octaves of gradient noise (Perlin, *Improving Noise*, 2002) between two colours.
 
-A point lies among four points of a grid. Each has a direction drawn by hashing its place, and brings the product of that and
-the way to the point; between them fades ``6 t^5 - 15 t^4 + 10 t^3``, which leaves the slope and its own slope continuous. The
-eight directions are those that lie furthest from the axes and the diagonals, along which noise would show the grid. No
-table is needed, and nothing repeats but after 2^31 cells.
+Each of the four grid points around a point has a gradient, chosen by a hash of its position. The dot products of gradients and
+offsets are blended by ``6 t^5 - 15 t^4 + 10 t^3``, with continuous first and second derivatives. The eight gradients are
+farthest from the axes and the diagonals, along which the grid would be visible. No table is needed, and the noise repeats
+only after 2^31 cells.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from torchpt.spec import Choice, Color, Integer, Scalar
 
 __all__ = ["Noise"]
 
-#: Cells from the origin beyond which a coordinate says nothing any more.
+#: Coordinates are clamped to this distance from the origin in cells, where float32 has no fraction anyway.
 _FAR = 2.0**30
-#: The parts of a direction: the cosine and the sine of 22.5 degrees.
+#: Components of a gradient: cosine and sine of 22.5 degrees.
 _LONG, _SHORT = math.cos(math.pi / 8.0), math.sin(math.pi / 8.0)
-#: With these directions an octave lies within -0.661..0.661.
+#: With these gradients an octave lies within -0.661..0.661.
 _GAIN = 0.75
 _GOLDEN = 0x9E3779B9
 _COVERED = 64.0
@@ -36,23 +36,27 @@ Values = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class Noise(Computed):
-    """Octaves of gradient noise: smooth spots of two colours without repetition.
+    """Octaves of gradient noise: smooth blobs of two colours without repetition.
 
     Attributes:
-        octaves: how many are added.
+        octaves: number of octaves.
     """
 
     name = "noise"
     parameters: ClassVar = {
-        "color0": Color((0.0, 0.0, 0.0), low=None, doc="where the noise is least"),
-        "color1": Color((1.0, 1.0, 1.0), low=None, doc="where it is greatest; their mean is the mean of all"),
-        "scale": Scalar(8.0, low=1e-6, high=1e6, doc="cells of the first octave in a unit of u and of v"),
-        "octaves": Integer(4, low=1, high=16, doc="how many are added, each finer than the one before"),
-        "persistence": Scalar(0.5, low=0.0, high=1.0, doc="height of an octave over that of the one before"),
-        "lacunarity": Scalar(2.0, low=1.0, high=16.0, doc="cells of an octave over those of the one before"),
-        "seed": Integer(0, low=0, high=2**31 - 1, doc="another one gives another noise of the same look"),
+        "color0": Color((0.0, 0.0, 0.0), low=None, doc="colour where the noise is least"),
+        "color1": Color(
+            (1.0, 1.0, 1.0),
+            low=None,
+            doc="colour where the noise is greatest; the mean of both is the mean of the texture",
+        ),
+        "scale": Scalar(8.0, low=1e-6, high=1e6, doc="cells of the first octave per unit of u and of v"),
+        "octaves": Integer(4, low=1, high=16, doc="number of octaves"),
+        "persistence": Scalar(0.5, low=0.0, high=1.0, doc="amplitude of an octave over that of the previous one"),
+        "lacunarity": Scalar(2.0, low=1.0, high=16.0, doc="frequency of an octave over that of the previous one"),
+        "seed": Integer(0, low=0, high=2**31 - 1, doc="selects another pattern of the same look"),
         "filter": Choice(
-            "none", names=("none", "fade"), doc="fade: octaves whose cells a pixel covers go over into their mean"
+            "none", names=("none", "fade"), doc="fade: octaves fade to their mean where a pixel covers their cells"
         ),
     }
     filters = ("fade",)
@@ -61,17 +65,17 @@ class Noise(Computed):
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Noise:
-        """See :class:`Computed`."""
+        """See :meth:`Computed.of`."""
         return cls(values["octaves"])
 
     def constants(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Of each octave a key for its directions, and how far its grid is moved: else all would be 0 at the same points."""
+        """Return a hash key for the gradients of each octave and a shift of its grid, as unshifted octaves share zeros."""
         keys = [as_int32(mix_int(mix_int(values["seed"] + _GOLDEN) + k * _GOLDEN)) for k in range(self.octaves)]
         shifts = [(mix_int(key + axis) >> 8 & 0xFFFF) / 2**16 for key in keys[1:] for axis in (1, 2)]
         return {"keys": tuple(keys), "shifts": (0.0, 0.0, *shifts)}
 
     def value(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> Tensor:
-        """See :class:`Computed`."""
+        """See :meth:`Computed.value`."""
         height, whole = torch.zeros_like(x), torch.zeros_like(x)
         for weight, _, kept, at, key in self._octaves(p, x, y, area):
             whole = whole + weight
@@ -79,7 +83,7 @@ class Noise(Computed):
         return p["color0"] + (p["color1"] - p["color0"]) * (0.5 + _GAIN * (height / whole))
 
     def slope(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> tuple[Tensor, Tensor]:
-        """See :class:`Computed`."""
+        """See :meth:`Computed.slope`."""
         across, along, whole = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x)
         for weight, cells, kept, at, key in self._octaves(p, x, y, area):
             whole = whole + weight
@@ -92,21 +96,21 @@ class Noise(Computed):
     def _octaves(
         self, p: Values, x: Tensor, y: Tensor, area: Tensor | None
     ) -> Iterator[tuple[Tensor, Tensor, Tensor | None, tuple[Tensor, Tensor], Tensor]]:
-        """Of each octave its weight, its cells in a unit, how much a footprint leaves, where in it points lie, and its key."""
+        """Yield for each octave weight, frequency, attenuation by the footprint, coordinates in cells, and hash key."""
         weight, cells, shifts = torch.ones_like(x), p["scale"], p["shifts"]
-        if area is not None:  # in cells; of more than these nothing is left of any octave
+        if area is not None:  # in cells; footprints above this size attenuate every octave to nothing
             area = (area * cells * cells).clamp_max(_COVERED)
         for k in range(self.octaves):
             if k:
                 weight, cells = weight * p["persistence"], cells * p["lacunarity"]
                 area = None if area is None else area * p["lacunarity"] * p["lacunarity"]
-            # The mean over a square of area a is 2^-a of the noise in its middle, by least squares, for any a.
+            # The mean over a square of area a is about 2^-a times the noise at its centre (a least-squares fit).
             kept = None if area is None else (area * -math.log(2.0)).exp()
             yield weight, cells, kept, (x * cells + shifts[2 * k], y * cells + shifts[2 * k + 1]), p["keys"][k]
 
 
 def _noise(at: tuple[Tensor, Tensor], key: Tensor, slope: bool) -> tuple[Tensor, ...]:
-    """Gradient noise ``(N,)`` at two coordinates, or its derivatives by them; ``key``: int32 of the lane's noise."""
+    """Return gradient noise ``(N,)`` at coordinates ``at``, or with ``slope`` its derivatives; ``key``: int32 hash key."""
     x, y = (w.clamp(-_FAR, _FAR) for w in at)
     i, j = x.detach().floor(), y.detach().floor()
     x, y = x - i, y - j
@@ -133,7 +137,7 @@ def _between(a: Tensor, b: Tensor, t: Tensor) -> Tensor:
 
 
 def _direction(bits: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
-    """One of eight directions by three bits of a hash: which part is the long one, and the two signs."""
+    """Return one of eight gradients by three bits of a hash: which component is longer, and the two signs."""
     swap, x, y = (logical_shift(bits, 31 - k) & 1 for k in range(3))
     swap, x, y = (bit.to(like.dtype) for bit in (swap, x, y))
     return (

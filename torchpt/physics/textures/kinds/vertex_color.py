@@ -1,4 +1,4 @@
-"""The colours of a mesh's vertices, between them as points lie between the corners."""
+"""Vertex colours, interpolated over triangles."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class _Table(Table):
 
     @property
     def count(self) -> int:
-        return 0  # nothing of its own
+        return 0  # no values of its own
 
     def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
         assert point.colors is not None
@@ -47,12 +47,12 @@ class _Table(Table):
 
 
 class VertexColor(Texture):
-    """The colours of a mesh's vertices, taken as linear; white on surfaces that have none."""
+    """The vertex colours of a mesh, read as linear; white on surfaces without them."""
 
     name = "vertex_color"
     reads = "colors"
 
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
-        """See :class:`Texture`."""
+        """See :meth:`Texture.open`."""
         return _Node(opening.number(CHANNELS[:4], "vertices have no alpha"))
