@@ -2,7 +2,7 @@
 
 Run: ``python scripts/bench_refit.py [--rounds 5] [--json file]``; ``$TORCHPT_ASSETS/bunny.ply`` must be there. One thread, by
 its CPU time. Of each way of moving the bunny's vertices a line tells how often its tree's cost has multiplied since it was
-built (what ``torchpt.search.tree.REBUILD`` bounds), what it costs beside a tree built anew, and how much longer searches
+built (what ``torchpt.search.tree.REBUILD_THRESHOLD`` bounds), what it costs beside a tree built anew, and how much longer searches
 take than there.
 """
 
@@ -22,8 +22,8 @@ from bench_accel import bumpy_sphere
 from bench_search import built, bunny, camera, contenders, extent, measure, ray_sets
 
 from torchpt.physics.shapes.geometry import Geometry
-from torchpt.search import tree as topology
-from torchpt.search.tree import Wide
+from torchpt.search import tree as refit_state
+from torchpt.search.tree import WideBvh
 
 
 def noise(x: np.ndarray, amount: float) -> np.ndarray:
@@ -67,7 +67,7 @@ def moved(g: Geometry, how: Callable[[np.ndarray, float], np.ndarray], amount: f
     return Geometry(a, b, c, g.counts)
 
 
-def refit(accel: Wide, g: Geometry) -> Wide:
+def refit(accel: WideBvh, g: Geometry) -> WideBvh:
     """The refitted tree, whatever it costs."""
     tree = accel.refit(g)
     assert tree is not None
@@ -92,14 +92,14 @@ def seconds(rounds: int, rows: list[dict[str, Any]]) -> None:
 def slowdown(rounds: int, rows: list[dict[str, Any]]) -> None:
     """How much longer searches take in a refitted tree."""
     first = bunny()
-    accel = Wide(first, 1)
+    accel = WideBvh(first, 1)
     for name, (how, amounts) in MOVES.items():
         for amount in amounts:
             g = moved(first, how, amount)
-            old, new = refit(accel, g), Wide(g, 1)
-            work, least = (x.topology.growth * (x.topology.built or 1.0) for x in (old, refit(new, g)))
-            growth = old.topology.growth
-            row: dict[str, Any] = {"move": name, "amount": amount, "growth": growth, "beside": work / least}
+            old, new = refit(accel, g), WideBvh(g, 1)
+            work, least = (x.refit_state.sah_ratio * (x.refit_state.built or 1.0) for x in (old, refit(new, g)))
+            sah_ratio = old.refit_state.sah_ratio
+            row: dict[str, Any] = {"move": name, "amount": amount, "sah_ratio": sah_ratio, "beside": work / least}
             _, centre, size = extent(g)
             near, light = np.array([0.1, 0.15, 1.0]) * 0.95 * size, np.array([0.9, 1.6, 1.2]) * size
             for kind, ray in ray_sets(g, new, camera(centre + near, centre, 40.0), centre + light, size).items():
@@ -109,7 +109,9 @@ def slowdown(rounds: int, rows: list[dict[str, Any]]) -> None:
                 row[kind] = speed["new"] / speed["old"]
             rows.append(row)
             times = "  ".join(f"{k} {row[k]:.2f}" for k in ("camera", "shadow, area", "second"))
-            print(f"{name} {amount:5.3f}: cost x {growth:.2f}, {row['beside']:.2f} of anew; time {times}", flush=True)
+            print(
+                f"{name} {amount:5.3f}: cost x {sah_ratio:.2f}, {row['beside']:.2f} of anew; time {times}", flush=True
+            )
 
 
 def main() -> None:
@@ -119,7 +121,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    topology.REBUILD = float("inf")
+    refit_state.REBUILD_THRESHOLD = float("inf")
     rows: list[dict[str, Any]] = []
     seconds(args.rounds, rows)
     slowdown(args.rounds, rows)

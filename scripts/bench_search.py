@@ -23,7 +23,7 @@ import torch
 from bench_accel import bumpy_sphere, mesh_geometry
 
 from torchpt.physics.shapes.geometry import Geometry
-from torchpt.search.tree import Wide
+from torchpt.search.tree import WideBvh
 
 Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
 RAYS = 1 << 18
@@ -117,7 +117,7 @@ def cosine(n: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return d / np.maximum(np.linalg.norm(d, axis=0), 1e-9)
 
 
-def ray_sets(g: Geometry, accel: Wide, first: Rays, light: np.ndarray, size: float) -> dict[str, Rays]:
+def ray_sets(g: Geometry, accel: WideBvh, first: Rays, light: np.ndarray, size: float) -> dict[str, Rays]:
     """Camera rays, shadow rays from what they hit, and bounces."""
     sets, ray, rng = {"camera": first}, first, np.random.default_rng(1)
     for depth in range(2, 5):
@@ -154,7 +154,7 @@ def embree(g: Geometry) -> Any:
     return scene, vertices, mesh  # the scene reads the vertices where they are
 
 
-def contenders(accel: Wide, other: Any, ray: Rays, any_hit: bool) -> dict[str, Callable[[], object]]:
+def contenders(accel: WideBvh, other: Any, ray: Rays, any_hit: bool) -> dict[str, Callable[[], object]]:
     """What is measured: calls by name."""
     n = ray[0].shape[1]
     t, u, v = np.empty((3, n), np.float32)
@@ -185,12 +185,12 @@ def measure(calls: dict[str, Callable[[], object]], n: int, rounds: int) -> dict
     return {name: n / statistics.median(x) / 1e6 for name, x in times.items()}
 
 
-def built(g: Geometry) -> tuple[Wide, float]:
+def built(g: Geometry) -> tuple[WideBvh, float]:
     """The tree, and the least CPU time of three builds."""
-    accel, best = Wide(g, 1), np.inf
+    accel, best = WideBvh(g, 1), np.inf
     for _ in range(3):
         start = time.process_time()
-        accel = Wide(g, 1)
+        accel = WideBvh(g, 1)
         best = min(best, time.process_time() - start)
     return accel, best
 

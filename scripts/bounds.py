@@ -24,7 +24,7 @@ BOUNDS: list[tuple[str, str, str]] = [
     ("levels of blends within blends", "torchpt.scene.formats.materials:MAX_BLENDS", ""),
     ("models of materials, told apart by what they are made of", "torchpt.scene.world.materials:MOST_MODELS", ""),
     ("primitives, those of instances counted again", "torchpt.scene.world.primitives:MOST_PRIMITIVES", ""),
-    ("faces of a displaced mesh", "torchpt.scene.mesh_shapes:MOST_FACES", ""),
+    ("faces of a displaced mesh", "torchpt.scene.mesh_triangles:MOST_FACES", ""),
     ("a side of the film", "torchpt.scene.settings:MAX_SIDE", "pixels"),
     ("the film", "torchpt.scene.settings:MAX_PIXELS", "pixels"),
     ("a number", "torchpt.spec.reading:LARGEST", ""),
@@ -35,7 +35,7 @@ BOUNDS: list[tuple[str, str, str]] = [
         "torchpt.scene.meshes.gltf:MOST_PLACED",
         "",
     ),
-    ("what an archive of meshes unfolds to", "torchpt.scene.meshes.others:MOST_UNFOLDED", "bytes"),
+    ("what an archive of meshes unfolds to", "torchpt.scene.meshes.trimesh_formats:MOST_UNFOLDED", "bytes"),
     ("a picture", "torchpt.images.decode:MAX_PIXELS", "pixels"),
     ("a picture by the texture's `max_pixels`", "torchpt.physics.textures.kinds.image:MOST_PIXELS", "pixels"),
 ]

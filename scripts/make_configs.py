@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from torchpt.scene.settings import BLOCKS, RECORDS, TYPED
+from torchpt.scene.settings import BLOCKS, TYPED_BLOCKS, UNTYPED_BLOCKS
 from torchpt.spec import Choice, Spec, parameters_of, unsupported
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -41,7 +41,7 @@ def first_line(group: str, kind: str | None, specs: Mapping[str, Spec]) -> str:
     """The command that a file opens with."""
     chosen = {key: spec.default for key, spec in specs.items() if spec.default is not None}
     example = EXAMPLES.get(group) or {key: str(value).lower() for key, value in list(chosen.items())[:1]}
-    words = [f"{group}={kind}"] if kind else [f"{group}.type={TYPED[group][1]}"] if group in TYPED else []
+    words = [f"{group}={kind}"] if kind else [f"{group}.type={TYPED_BLOCKS[group][1]}"] if group in TYPED_BLOCKS else []
     words += [f"{group}.{key}={value}" for key, value in example.items()]
     return f"# {' '.join(['torchpt render scene=cornell_box', *words])}\n"
 
@@ -88,7 +88,7 @@ def later(group: str) -> Rows:
 
 def typed(group: str, kind: str | None) -> str:
     """The file of a type, or of all types of a group."""
-    table, default = TYPED[group]
+    table, default = TYPED_BLOCKS[group]
     head = first_line(group, kind, parameters_of(table[kind or default]))
     return head + block(rows_of(table, kind) + later(group))
 
@@ -99,8 +99,8 @@ def plain(group: str, record: Any) -> str:
     text = first_line(group, None, specs)
     rows: Rows = []
     for key, spec in specs.items():
-        if key in TYPED:
-            text += block(rows) + block([(key, "", comment(spec))]) + block(rows_of(TYPED[key][0], None), "  ")
+        if key in TYPED_BLOCKS:
+            text += block(rows) + block([(key, "", comment(spec))]) + block(rows_of(TYPED_BLOCKS[key][0], None), "  ")
             rows = []
         else:
             rows.append((key, "null", comment(spec)))
@@ -109,10 +109,12 @@ def plain(group: str, record: Any) -> str:
 
 def written() -> dict[str, str]:
     """The text of each file by its path below configs/."""
-    files = {f"{group}/default.yaml": plain(group, record) for group, record in RECORDS.items()}
+    files = {f"{group}/default.yaml": plain(group, record) for group, record in UNTYPED_BLOCKS.items()}
     for group in BLOCKS:
-        if group in TYPED:
-            files |= {f"{group}/{kind or 'default'}.yaml": typed(group, kind) for kind in (None, *TYPED[group][0])}
+        if group in TYPED_BLOCKS:
+            files |= {
+                f"{group}/{kind or 'default'}.yaml": typed(group, kind) for kind in (None, *TYPED_BLOCKS[group][0])
+            }
     return files
 
 

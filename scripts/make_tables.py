@@ -23,7 +23,7 @@ import bounds
 
 from torchpt.scene.settings import RenderOptions
 from torchpt.spec import REQUIRED, Color, Index, Scalar, Spec, parameters_of
-from torchpt.spec.arguments import declared
+from torchpt.spec.arguments import arguments_of
 
 DOCS = Path(__file__).parents[1] / "docs"
 MARKED = re.compile(r"(<!-- generated: ([\w.]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -35,9 +35,9 @@ TABLES = {
     "filters": ("torchpt.physics.film", "FILTERS"),
     "integrators": ("torchpt.paths.integrators", "KINDS"),
     "layers": ("torchpt.paths.layers", "LAYERS"),
-    "settings": ("torchpt.scene.settings", "RECORDS"),
+    "settings": ("torchpt.scene.settings", "UNTYPED_BLOCKS"),
     "shapes": ("torchpt.physics.shapes", "KINDS"),
-    "studies": ("torchpt.reports.study", "RECORDS"),
+    "studies": ("torchpt.reports.study", "UNTYPED_BLOCKS"),
     "textures": ("torchpt.physics.textures", "KINDS"),
 }
 
@@ -108,7 +108,7 @@ def rows(specs: Mapping[str, Spec]) -> str:
 def arguments(form: Any) -> str:
     """Keyword arguments as a table: what they are by default in Python, and what None stands for."""
     text = "| argument | what it is | accepted | default |\n|---|---|---|---|\n"
-    for name, item in declared(form).items():
+    for name, item in arguments_of(form).items():
         default = item.stands_for.replace("None", "`None`") or f"`{item.default}`"
         text += f"| `{name}` | {item.spec.doc} | {item.accepted} | {default} |\n"
     return text

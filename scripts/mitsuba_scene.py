@@ -38,7 +38,7 @@ from torchpt.scene.formats.textures import TextureInput
 from torchpt.scene.settings import Film, Settings
 from torchpt.scene.space import Space
 from torchpt.scene.world import corners_of
-from torchpt.spec.schema import ParsedParams, values_of
+from torchpt.spec.schema import ParsedParams, read_params
 
 __all__ = [
     "NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "lets_pass", "load_mitsuba", "nearest",
@@ -288,9 +288,9 @@ class _Nearest:
         return _with(material, material=None, reflectance=None, eta=(1.0, 1.0, 1.0), k=k)
 
 
-def _with(described: ParsedParams, /, **values: Any) -> ParsedParams:
+def _with(read_typed: ParsedParams, /, **values: Any) -> ParsedParams:
     """The same with other values."""
-    return replace(described, values={**described.values, **values})
+    return replace(read_typed, values={**read_typed.values, **values})
 
 
 def _coat(name: str, material: ParsedParams) -> tuple[Any, float, float, Any] | None:
@@ -341,7 +341,7 @@ def _cone(cone: ParsedParams) -> ParsedParams:
         "normals": (across / np.linalg.norm(across, axis=0)).T,
         "faces": np.concatenate(faces, 1).T,
     }
-    made = values_of(SHAPES["mesh"], mesh, "", None)
+    made = read_params(SHAPES["mesh"], mesh, "", None)
     return replace(made, values=made.values | {key: cone[key] for key in Shape.parameters})
 
 

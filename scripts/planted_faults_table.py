@@ -570,7 +570,7 @@ FAULTS = (
     # -- learning
     Fault(
         "stuck_at_its_end",
-        "nn/ranges.py",
+        "nn/parametrizations.py",
         "ml",
         "_Held.backward",
         "(x <= ctx.low) & (cotangent > 0)",

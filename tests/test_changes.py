@@ -23,7 +23,7 @@ import torchpt
 import torchpt.cli
 from torchpt.cli import main as cli
 from torchpt.core.memory import Budget
-from torchpt.engines.engine import Forward, Share, radiance
+from torchpt.engines.engine import Forward, TaskResult, radiance
 from torchpt.extend import Bsdf, BsdfSample, Color, cosine_hemisphere
 from torchpt.paths.wave import PixelSet, RayCounts, Wave
 from torchpt.rendering import run
@@ -102,7 +102,7 @@ class OneByOne:
     def rows(self, layers: Mapping[str, Any]) -> int:
         return 0
 
-    def run(self, spans: Sequence[tuple[PixelSet, int, int]], each: Callable[[Share | None], bool]) -> bool:
+    def run(self, spans: Sequence[tuple[PixelSet, int, int]], each: Callable[[TaskResult | None], bool]) -> bool:
         for pixel_set, first, count in spans:
             pixels = pixel_set.film.width * pixel_set.film.height
             for sample in range(first, first + count):
@@ -110,11 +110,11 @@ class OneByOne:
                 for place, value in pixel_set.film.after(values, 0, sample):
                     place.copy_(value)
                 self.taken += 1
-                if each(Share(RayCounts(pixels), pixels)):
+                if each(TaskResult(RayCounts(pixels), pixels)):
                     return False
         return True
 
-    def dismiss(self, keeps: bool) -> None:
+    def release_workers(self, keeps: bool) -> None:
         pass
 
 

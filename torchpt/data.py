@@ -28,7 +28,7 @@ __all__ = ["Made", "RenderDataset", "RenderStream"]
 Made = Scene | Mapping[str, Any] | tuple[Scene | Mapping[str, Any], Mapping[str, Any]]
 
 
-class _Items:
+class _ItemRenderer:
     """How an index becomes an item."""
 
     def __init__(
@@ -40,20 +40,20 @@ class _Items:
         layers: Sequence[str],
         seed: int,
         device: str | torch.device,
-        wishes: Mapping[str, Any],
+        options: Mapping[str, Any],
     ) -> None:
         if not callable(make):
             raise SceneError("make", make, "a function from a scene's index to the scene")
-        check_names(call, wishes, RenderOptions, ("cameras", "layers"))
+        check_names(call, options, RenderOptions, ("cameras", "layers"))
         for key in ("params", "spp", "seed"):
-            if key in wishes:
-                raise SceneError(key, wishes[key], "an argument of the data set, of `make` or none")
-        _check_wishes(wishes)
+            if key in options:
+                raise SceneError(key, options[key], "an argument of the data set, of `make` or none")
+        _check_options(options)
         if type(seed) is not int or seed < 0:
             raise SceneError("seed", seed, "a whole number >= 0")
         if isinstance(layers, str) or not isinstance(layers, Iterable):
             raise SceneError("layers", layers, "a sequence of names of layers")
-        self.make, self.layers, self.seed, self.device, self.wishes = make, tuple(layers), seed, device, dict(wishes)
+        self.make, self.layers, self.seed, self.device, self.options = make, tuple(layers), seed, device, dict(options)
         self.spp = spp
         self.cameras = _cameras(cameras)
         self.latest: tuple[int, Scene, dict[str, Any]] | None = None
@@ -62,21 +62,21 @@ class _Items:
         """See :class:`RenderDataset`."""
         number, view = divmod(index, max(len(self.cameras), 1))
         scene, own = self._scene(number)
-        wishes: dict[str, Any] = {**self.wishes, **own}
+        options: dict[str, Any] = {**self.options, **own}
         film = {
-            **(self.wishes.get("film") or {}),
+            **(self.options.get("film") or {}),
             **(own.get("film") or {}),
             "aovs": list(self.layers),
             "denoise": False,
         }
-        params = {**(self.cameras[view] if self.cameras else {}), **(wishes.pop("params", None) or {})}
+        params = {**(self.cameras[view] if self.cameras else {}), **(options.pop("params", None) or {})}
         own_types = {name: value.dtype for name, value in scene.params.items()}
         params = {n: _tensor(f"params.{n}", value, own_types.get(n, torch.float32)) for n, value in params.items()}
         if get_worker_info() is not None:
-            wishes.setdefault("threads", 1)  # workers share the cores
-        wishes = {"spp": self.spp, "seed": self.seed + index, **wishes, "film": film}
+            options.setdefault("threads", 1)  # workers share the cores
+        options = {"spp": self.spp, "seed": self.seed + index, **options, "film": film}
         with torch.no_grad():
-            found = render(scene, params=params, full=True, **wishes)
+            found = render(scene, params=params, full=True, **options)
             exact = own_types["camera.to_world"]  # float64 far from the origin
             world = scene.merged(params)["camera.to_world"].to(exact)
             item = {"image": found.image, **{name: found.layers[name] for name in self.layers}, "to_world": world}
@@ -97,7 +97,7 @@ class _Items:
                 )
                 raise SceneError(f"make({number})", made, expected)
             check_names("render", own, RenderOptions)
-            _check_wishes(own, f"make({number}).")
+            _check_options(own, f"make({number}).")
             scene = source if isinstance(source, Scene) else load(dict(source), self.device)
             self.latest = number, scene, dict(own)
         return self.latest[1], dict(self.latest[2])
@@ -127,7 +127,7 @@ class RenderDataset(Dataset):
         layers: names of layers (``film.aovs``).
         seed: of item 0; any integer from 0.
         device: where mappings are loaded.
-        wishes: further arguments of ``torchpt.render``.
+        options: further arguments of ``torchpt.render``.
 
     Raises:
         SceneError: arguments that are not accepted; on access, what ``load`` and ``render`` raise.
@@ -145,11 +145,14 @@ class RenderDataset(Dataset):
         layers: Sequence[str] = (),
         seed: int = 0,
         device: str | torch.device = "cpu",
-        **wishes: Any,
+        **options: Any,
     ) -> None:
         if type(scenes) is not int or scenes < 0:
             raise SceneError("scenes", scenes, "a whole number >= 0")
-        self._items, self.scenes = _Items("RenderDataset", make, cameras, spp, layers, seed, device, wishes), scenes
+        self._items, self.scenes = (
+            _ItemRenderer("RenderDataset", make, cameras, spp, layers, seed, device, options),
+            scenes,
+        )
 
     def __len__(self) -> int:
         return self.scenes * max(len(self._items.cameras), 1)
@@ -182,7 +185,7 @@ class RenderStream(IterableDataset):
         layers: see there.
         seed: see there.
         device: see there.
-        wishes: see there.
+        options: see there.
     """
 
     def __init__(
@@ -197,7 +200,7 @@ class RenderStream(IterableDataset):
         layers: Sequence[str] = (),
         seed: int = 0,
         device: str | torch.device = "cpu",
-        **wishes: Any,
+        **options: Any,
     ) -> None:
         if scenes is not None and (type(scenes) is not int or scenes < 0):
             raise SceneError("scenes", scenes, "a whole number >= 0, or None for no end")
@@ -205,7 +208,7 @@ class RenderStream(IterableDataset):
             raise SceneError("start", start, "a whole number >= 0")
         if shard is not None and not 0 <= shard[0] < shard[1]:
             raise SceneError("shard", shard, "(rank, world) with 0 <= rank < world")
-        self._items = _Items("RenderStream", make, cameras, spp, layers, seed, device, wishes)
+        self._items = _ItemRenderer("RenderStream", make, cameras, spp, layers, seed, device, options)
         self.scenes = scenes
         self.start, self.shard = start, shard
         self.seen: tuple[int, int] | None = None  # of the process that made this worker
@@ -228,11 +231,11 @@ class RenderStream(IterableDataset):
         return {**self.__dict__, "seen": self.seen or _ranks()}  # spawned workers know nothing of ranks
 
 
-def _check_wishes(wishes: Mapping[str, Any], where: str = "") -> None:
+def _check_options(options: Mapping[str, Any], where: str = "") -> None:
     """Refuse arguments of ``render`` that would change nothing here; ``where``: what their keys begin with."""
-    film, params = wishes.get("film"), wishes.get("params")
-    if "full" in wishes:
-        raise SceneError(f"{where}full", wishes["full"], "none: an item holds the picture and its layers")
+    film, params = options.get("film"), options.get("params")
+    if "full" in options:
+        raise SceneError(f"{where}full", options["full"], "none: an item holds the picture and its layers")
     if film is not None and not isinstance(film, Mapping):
         raise SceneError(f"{where}film", film, "a mapping of film settings such as width")
     if params is not None and not isinstance(params, Mapping):

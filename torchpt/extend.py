@@ -61,7 +61,7 @@ from torchpt.physics.shapes.geometry import Hit, Interaction
 from torchpt.physics.shapes.quadrics import Form, Quadric, octahedral
 from torchpt.physics.textures.computed import Computed
 from torchpt.physics.world import World
-from torchpt.spec import Angle, Choice, Color, Flag, Moves, Other, Refused, Scalar, Whole
+from torchpt.spec import Angle, Choice, Color, Custom, Flag, Integer, Moves, Refused, Scalar
 
 __all__ = [
     "BOTTOM",
@@ -78,6 +78,7 @@ __all__ = [
     "Color",
     "Computed",
     "Cone",
+    "Custom",
     "Dimension",
     "DirectLight",
     "Drawn",
@@ -92,6 +93,7 @@ __all__ = [
     "Form",
     "Frame",
     "Hit",
+    "Integer",
     "Interaction",
     "Light",
     "LightSample",
@@ -99,7 +101,6 @@ __all__ = [
     "Limits",
     "Matrix",
     "Moves",
-    "Other",
     "Parameters",
     "Path",
     "PathState",
@@ -123,7 +124,6 @@ __all__ = [
     "Transmission",
     "VertexInput",
     "VertexOutput",
-    "Whole",
     "World",
     "as_int32",
     "bright",

@@ -432,7 +432,11 @@ def _null(model: Bsdf) -> Iterator[Case]:
 def _numbers(model: Bsdf) -> dict[str, Scalar | Color]:
     """Parameters of a model's own that a material without further keys gives it, or has to."""
     specs = {key: spec for key, spec in parameters_of(model).items() if key not in Bsdf.parameters}
-    return {key: s for key, s in specs.items() if isinstance(s, Scalar | Color) and s.traced and s.default is not None}
+    return {
+        key: s
+        for key, s in specs.items()
+        if isinstance(s, Scalar | Color) and s.differentiable and s.default is not None
+    }
 
 
 def _between(spec: Scalar | Color, share: float) -> Any:

@@ -132,7 +132,7 @@ def their_passed(eta: Tensor) -> Tensor:
 @pytest.fixture
 def their_fits(monkeypatch):
     """All but the fit is compared."""
-    monkeypatch.setattr("torchpt.physics.bsdfs.kinds.plastic.diffuse_passed", their_passed)
+    monkeypatch.setattr("torchpt.physics.bsdfs.kinds.plastic.diffuse_transmittance", their_passed)
 
 
 @pytest.mark.mitsuba

@@ -48,17 +48,17 @@ def rows_of(kind: str) -> list[str]:
 
 def test_every_kind_and_every_tensor_of_it_has_a_row():
     for kind in KINDS:
-        traced = {key for key, spec in parameters_of(KINDS[kind]).items() if spec.traced} - {"to_world"}
-        assert traced <= {key for name in rows_of(kind) for key in CAMERAS[name]}
-        assert traced <= {field.name for field in fields(KINDS[kind])}
-        assert set(KINDS[kind].reaches) <= traced
+        differentiable = {key for key, spec in parameters_of(KINDS[kind]).items() if spec.differentiable} - {"to_world"}
+        assert differentiable <= {key for name in rows_of(kind) for key in CAMERAS[name]}
+        assert differentiable <= {field.name for field in fields(KINDS[kind])}
+        assert set(KINDS[kind].reaches) <= differentiable
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_what_is_declared(kind):
     for key, spec in parameters_of(KINDS[kind]).items():
         assert spec.doc, key
-        if spec.traced:
+        if spec.differentiable:
             assert spec.moves is Moves.SURFACES, key  # whatever it is, rays go elsewhere
 
 
@@ -142,7 +142,7 @@ def test_no_parameter_may_be_out_of_range(name, key):
             read_camera({**keys, key: value}, {}, None)
         assert caught.value.key.startswith(f"camera.{key}"), value
         assert "\n" not in str(caught.value)
-    if spec.traced and key not in PLACES:
+    if spec.differentiable and key not in PLACES:
         scene = loaded(name)
         for value in numbers_outside(spec):
             with pytest.raises(SceneError) as caught:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchpt.cli.main import main
 from torchpt.images import read_image, read_layers, write_image
-from torchpt.images.comparison import Shown
+from torchpt.images.comparison import DisplayTransform
 from torchpt.images.comparison import compare as measure
 from torchpt.images.false_colour import false_colour
 from torchpt.images.metrics import METRICS, error_map
@@ -90,7 +90,7 @@ def test_the_table_says_the_same(pair: Path, capfd: Captured) -> None:
 def test_how_a_screen_shows_it(pair: Path, capfd: Captured) -> None:
     told = facts(capfd, "a.exr", "b.exr", "exposure=-1", "tonemap=reinhard", "gamma=0.5")
     assert told["display"] == {"exposure": -1.0, "tonemap": "reinhard", "gamma": 0.5}
-    found = measure(A, B, Shown(-1.0, "reinhard", 0.5))
+    found = measure(A, B, DisplayTransform(-1.0, "reinhard", 0.5))
     assert told["metrics"]["psnr"] == pytest.approx(found.metrics["psnr"])
     assert found.metrics["psnr"] != pytest.approx(measure(A, B).metrics["psnr"], rel=1e-3)
 
@@ -116,7 +116,7 @@ def test_a_file_of_one_layer_needs_no_name(pair: Path, capfd: Captured) -> None:
 def test_a_map_of_numbers(pair: Path, capfd: Captured, metric: str) -> None:
     told = facts(capfd, "a.exr", "b.exr", "map=e.exr", f"metric={metric}")["map"]
     written = read_layers("e.exr")["image"]
-    seen = (Shown().of(A), Shown().of(B)) if metric == "ssim" else (A, B)
+    seen = (DisplayTransform().of(A), DisplayTransform().of(B)) if metric == "ssim" else (A, B)
     errors = error_map(metric, *seen)
     assert written.shape == (14, 18, 1) and torch.allclose(written[..., 0], errors.float(), rtol=1e-6)
     assert told == {"file": "e.exr", "metric": metric, "largest": pytest.approx(float(errors.max()))}

@@ -14,7 +14,7 @@ from torchpt.cli import render
 from torchpt.cli.main import GROUPS, main
 from torchpt.cli.render import Job
 from torchpt.core.files import configs
-from torchpt.scene.settings import TYPED
+from torchpt.scene.settings import TYPED_BLOCKS
 from torchpt.spec import parameters_of, unsupported
 
 from .conftest import Renderer
@@ -43,7 +43,7 @@ def test_group_files_are_made_of_what_kinds_declare(monkeypatch: pytest.MonkeyPa
 def test_a_types_file_holds_its_own_keys_and_no_values() -> None:
     """Said without the script: every key of a file is read by its type, and every key of its type is there."""
     for group in ("integrator", "sampler"):
-        table, _ = TYPED[group]
+        table, _ = TYPED_BLOCKS[group]
         later = set(unsupported.KEYS.get(group, ()))
         keys = {name: set(parameters_of(table[name])) | later for name in table}
         for name, own in {**keys, "default": set().union(*keys.values())}.items():

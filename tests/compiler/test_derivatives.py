@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.compiler.function import lanewise
+from torchpt.compiler.function import compile_lanewise
 from torchpt.compiler.graph import Graph, Unsupported
-from torchpt.compiler.operators.derivatives import summands
+from torchpt.compiler.operators.derivatives import summand_of
 from torchpt.math.vectors import cross, dot, normalize
 
 RNG = torch.Generator().manual_seed(0)
@@ -26,7 +26,7 @@ def gradients(p: Tensor, q: Tensor) -> list[Tensor]:
 
 def test_a_tape_inside_of_a_kernel():
     p, q = torch.randn(3, 1000, generator=RNG), torch.randn(3, 1000, generator=RNG)
-    for found, wanted in zip(lanewise(gradients, (p, q))(p, q), gradients(p, q), strict=True):
+    for found, wanted in zip(compile_lanewise(gradients, (p, q))(p, q), gradients(p, q), strict=True):
         assert float(wanted.abs().max()) > 1
         assert torch.allclose(found, wanted, rtol=1e-3, atol=1e-3)
 
@@ -37,11 +37,11 @@ def test_sums_over_lanes_are_taken_apart():
     x, y = (graph.node("arena", "f", extra=k) for k in range(2))
     a, b = (graph.node("total", "f", node) for node in (x, y))
     shared, zero = graph.node("element", "f", extra=(0, 0)), graph.constant("f", 0)
-    assert summands(graph, a) == x
-    assert summands(graph, zero) is None
-    assert summands(graph, graph.binary("add", "f", a, b)) == graph.binary("add", "f", x, y)
-    assert summands(graph, graph.binary("mul", "f", a, shared)) == graph.binary("mul", "f", x, shared)
-    assert summands(graph, graph.node("neg", "f", b)) == graph.node("neg", "f", y)
+    assert summand_of(graph, a) == x
+    assert summand_of(graph, zero) is None
+    assert summand_of(graph, graph.binary("add", "f", a, b)) == graph.binary("add", "f", x, y)
+    assert summand_of(graph, graph.binary("mul", "f", a, shared)) == graph.binary("mul", "f", x, shared)
+    assert summand_of(graph, graph.node("neg", "f", b)) == graph.node("neg", "f", y)
     for wrong in (shared, graph.binary("mul", "f", a, b), graph.node("sqrt", "f", a)):
         with pytest.raises(Unsupported, match="no sum over lanes"):
-            summands(graph, wrong)
+            summand_of(graph, wrong)

@@ -107,9 +107,9 @@ def test_targets_have_entries_of_their_own(here):
 
 
 def test_forms_have_programs_of_their_own(monkeypatch):
-    vectors = shelf.key_of(("stage",))
+    vectors = shelf.cache_key(("stage",))
     monkeypatch.setitem(cpu._state, "host", one_lane())
-    assert vectors is not None and shelf.key_of(("stage",)) not in (vectors, None)
+    assert vectors is not None and shelf.cache_key(("stage",)) not in (vectors, None)
 
 
 def test_switched_off(here, monkeypatch):

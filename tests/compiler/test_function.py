@@ -160,8 +160,8 @@ def test_what_the_lane_compiler_does_not_know():
 
 def test_a_trace_of_classes_that_are_not_the_packages_is_not_kept():
     """Their code is no part of an entry's name."""
-    assert cache.key_of(("a", torch.float32, points_of("sobol").__class__, 2)) is not None
-    assert cache.key_of(("a", torch.float32, Curve, 2)) is None
+    assert cache.cache_key(("a", torch.float32, points_of("sobol").__class__, 2)) is not None
+    assert cache.cache_key(("a", torch.float32, Curve, 2)) is None
 
 
 SCRIPT = """

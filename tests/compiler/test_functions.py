@@ -23,7 +23,7 @@ from forms import differing, one_lane
 from numpy.typing import NDArray
 
 from torchpt.compiler.cpu import Target
-from torchpt.compiler.function import lanewise
+from torchpt.compiler.function import compile_lanewise
 from torchpt.compiler.functions import FUNCTIONS
 
 DENSE = np.finfo(np.longdouble).nmant >= 63
@@ -135,7 +135,7 @@ def arguments(name: str, dtype: type, count: int) -> list[Array]:
 
 def run(name: str, *given: Array, target: Target | None = None) -> Array:
     x = [torch.from_numpy(np.ascontiguousarray(a)) for a in given]
-    return lanewise(lambda *x: [of_torch(name)(*x)], x, target)(*x)[0].numpy()
+    return compile_lanewise(lambda *x: [of_torch(name)(*x)], x, target)(*x)[0].numpy()
 
 
 def ulps(found: Array, exact: Array) -> Array:

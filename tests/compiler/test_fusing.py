@@ -9,8 +9,8 @@ import torch
 from forms import one_lane
 from torch import Tensor
 
-from torchpt.compiler.function import lanewise
-from torchpt.compiler.fusing import fused
+from torchpt.compiler.function import compile_lanewise
+from torchpt.compiler.fusing import fused_products
 from torchpt.compiler.graph import Graph
 
 #: (1 + STEP)^2 is 1 + 2 STEP + STEP^2, of which float32 keeps no STEP^2.
@@ -33,7 +33,7 @@ CASES: dict[str, tuple[Callable[[Tensor], list[Tensor]], list[float]]] = {
 @pytest.mark.parametrize("name", CASES)
 def test_rounded_once(name, form):
     function, wanted = CASES[name]
-    kernel = lanewise(function, [X], one_lane() if form == "one lane" else None)
+    kernel = compile_lanewise(function, [X], one_lane() if form == "one lane" else None)
     for found, value in zip(kernel(X), wanted, strict=True):
         assert (found == value).all(), (found[0].item(), value)
 
@@ -47,8 +47,8 @@ def test_what_counts_as_asking():
     twice = graph.node("add", "f", product, product)
     whole = graph.node("tensor", "i", extra=(1, 0))
     count = graph.node("add", "i", graph.node("mul", "i", whole, whole), whole)
-    assert fused(graph, graph.needed([total]), [total]) == {total: product}
-    assert fused(graph, graph.needed([total]), [total, product]) == {}
-    assert fused(graph, graph.needed([total, less]), [total, less]) == {}
-    assert fused(graph, graph.needed([twice]), [twice]) == {}
-    assert fused(graph, graph.needed([count]), [count]) == {}
+    assert fused_products(graph, graph.needed([total]), [total]) == {total: product}
+    assert fused_products(graph, graph.needed([total]), [total, product]) == {}
+    assert fused_products(graph, graph.needed([total, less]), [total, less]) == {}
+    assert fused_products(graph, graph.needed([twice]), [twice]) == {}
+    assert fused_products(graph, graph.needed([count]), [count]) == {}

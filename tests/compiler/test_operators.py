@@ -22,8 +22,8 @@ from few import few
 from forms import differing, one_lane
 from torch import Tensor, nn
 
-from torchpt.compiler.function import lanewise
-from torchpt.compiler.tracing import HANDLERS
+from torchpt.compiler.function import compile_lanewise
+from torchpt.compiler.tracing import LOWERINGS
 
 N = 1000
 LENGTHS = (N, 1, 15, 16, 17)
@@ -695,14 +695,14 @@ def test_operators(number, monkeypatch):
     case = CASES[number]
     called: set[str] = set()
     for name in case.operators.split():
-        monkeypatch.setitem(HANDLERS, name, _noted(name, called))
+        monkeypatch.setitem(LOWERINGS, name, _noted(name, called))
 
     def function(*arguments: Tensor) -> list[Tensor]:
         return [form(_namespace(arguments)) for form in case.forms]
 
     with torch.inference_mode(case.inference), torch.no_grad():
         wanted = function(*INPUTS.values())
-        kernel = lanewise(function, list(INPUTS.values()))
+        kernel = compile_lanewise(function, list(INPUTS.values()))
     assert called == set(case.operators.split())
     for n in LENGTHS:
         found = kernel(*(x[..., :n] for x in INPUTS.values()))
@@ -725,13 +725,13 @@ def test_one_lane_at_a_time(number):
 
     with torch.inference_mode(case.inference), torch.no_grad():
         given = list(INPUTS.values())
-        vectors, single = (lanewise(function, given, target)(*given) for target in (None, one_lane()))
+        vectors, single = (compile_lanewise(function, given, target)(*given) for target in (None, one_lane()))
     for k, (a, b) in enumerate(zip(vectors, single, strict=True)):
         assert not differing(a, b).any(), f"{case.operators}, result {k}"
 
 
 def _noted(name: str, called: set[str]) -> Any:
-    handler = HANDLERS[name]
+    handler = LOWERINGS[name]
 
     def noted(*args: Any, **kwargs: Any) -> None:
         called.add(name)
@@ -742,7 +742,7 @@ def _noted(name: str, called: set[str]) -> Any:
 
 def test_square_root_is_rounded_once():
     x = INPUTS["f"].abs()
-    found, inverse = lanewise(lambda x: [torch.sqrt(x), torch.rsqrt(x)], [x])(x)
+    found, inverse = compile_lanewise(lambda x: [torch.sqrt(x), torch.rsqrt(x)], [x])(x)
     wanted = torch.from_numpy(np.sqrt(x.numpy()))
     compare(found, wanted)
     compare(inverse, 1.0 / wanted)
@@ -750,4 +750,4 @@ def test_square_root_is_rounded_once():
 
 def test_every_operator_has_a_case():
     covered = {name for case in CASES for name in case.operators.split()}
-    assert covered == set(HANDLERS)
+    assert covered == set(LOWERINGS)

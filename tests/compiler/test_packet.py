@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchpt.compiler import cpu
 from torchpt.compiler.form import SCALAR, VECTORS, Form
-from torchpt.compiler.kernel import HEAD, text
+from torchpt.compiler.kernel import HEAD, kernel_ir
 from torchpt.compiler.packet import KINDS
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.sinks import Sinks, Store
@@ -40,7 +40,7 @@ def searches(accel: Brute, kinds: Sequence[str] | None = None, form: Form = VECT
     stores.append(Store((graph.node("occluded", "b", *ray),), "b"))
     if kinds is None:
         kinds = [kind for kind, count in zip(KINDS, accel.counts, strict=False) if count]
-    made = cpu.compiled(text(TracedStage(graph, Sinks(store=stores), tensors=3, searched=tuple(kinds)), form))
+    made = cpu.compiled(kernel_ir(TracedStage(graph, Sinks(store=stores), tensors=3, searched=tuple(kinds)), form))
 
     def run(o: Tensor, d: Tensor, t_max: Tensor) -> list[Tensor]:
         n = t_max.shape[0]

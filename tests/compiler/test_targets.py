@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchpt.compiler import cpu as engine
 from torchpt.compiler.cpu import Target
-from torchpt.compiler.function import lanewise
+from torchpt.compiler.function import compile_lanewise
 
 X86 = platform.machine().lower() in ("x86_64", "amd64")
 N = 333
@@ -79,7 +79,7 @@ def test_older_machines(cpu):
         pytest.skip("this machine has no AVX2")
     target = Target(cpu, "")  # of features only the CPU's own
     for function in (plain, fused):
-        there, here = (lanewise(function, GIVEN, t) for t in (target, None))
+        there, here = (compile_lanewise(function, GIVEN, t) for t in (target, None))
         for n in (1, 16, N):
             given = [x[..., :n] for x in GIVEN]
             for k, (a, b) in enumerate(zip(there(*given), here(*given), strict=True)):
@@ -103,7 +103,7 @@ def test_older_machines_have_no_newer_vectors():
 def test_aarch64():
     """The same functions as an object for another machine; nothing here runs it."""
     target = Target("generic", "+neon", "aarch64-linux-gnu")
-    run = lanewise(lambda *x: [*plain(*x), x[0].sin(), x[1].log()], GIVEN, target)
+    run = compile_lanewise(lambda *x: [*plain(*x), x[0].sin(), x[1].log()], GIVEN, target)
     assert callable(run)
     made = [f for f in engine._functions.values() if f.call is None]
     assert made

@@ -15,10 +15,10 @@ from torch import Tensor, nn
 
 from torchpt.compiler import cpu, function
 from torchpt.compiler.form import VECTORS
-from torchpt.compiler.function import lanewise
+from torchpt.compiler.function import compile_lanewise
 from torchpt.compiler.graph import Graph, Unsupported
 from torchpt.compiler.kernel import text
-from torchpt.compiler.program import Program, TracedStage, bound, holds, laid_out, replayed
+from torchpt.compiler.program import Program, TracedStage, bind_tables, guards_hold, lay_out_table, run_prologue
 from torchpt.compiler.sinks import Sinks, Store
 from torchpt.compiler.tracing import LANES, Tracer, tracing
 from torchpt.math import vectors
@@ -76,7 +76,7 @@ REFUSED: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
 def test_refused(name):
     says, stage = REFUSED[name]
     with pytest.raises(Unsupported, match=says):
-        lanewise(lambda x: [stage(x)], [X])
+        compile_lanewise(lambda x: [stage(x)], [X])
 
 
 def test_operator_of_another_library_is_refused():
@@ -84,13 +84,13 @@ def test_operator_of_another_library_is_refused():
     library.define("add(Tensor x, Tensor y) -> Tensor")
     library.impl("add", lambda x, y: x - y, "CPU")
     with pytest.raises(Unsupported, match="the operator add"):
-        lanewise(lambda x: [torch.ops.lanetest.add(x, x)], [X])
+        compile_lanewise(lambda x: [torch.ops.lanetest.add(x, x)], [X])
 
 
 def test_tracing_ends():
     seen = []
     with pytest.raises(Unsupported):
-        lanewise(lambda x: [seen.append(tracing()) or x.sort(0)[0]], [X])
+        compile_lanewise(lambda x: [seen.append(tracing()) or x.sort(0)[0]], [X])
     assert seen == [True] and not tracing()
 
 
@@ -106,12 +106,12 @@ def stage(x: Tensor, table: Tensor, gain: Tensor) -> list[Tensor]:
 
 def program(tracer: Tracer, ir: str) -> Program:
     made = cpu.compiled(ir)
-    parts = tuple(tracer.tables), tuple(tracer.steps), tuple(tracer.held), tuple(tracer.guards)
+    parts = tuple(tracer.tables), tuple(tracer.steps), tuple(tracer.constants), tuple(tracer.guards)
     return Program(made.call, made.key, *parts, (), 0, 0, 1, 2, 0, {})
 
 
 def call(made: Program, x: Tensor, results: int, leaves: dict[str, Tensor]) -> list[Tensor]:
-    tables = bound(made.tables, made.steps, made.held, leaves)
+    tables = bind_tables(made.tables, made.steps, made.constants, leaves)
     outputs = [torch.full((x.shape[1],), math.nan) for _ in range(results)]
     words = [0] * len(function.HEAD)
     words[function.HEAD.index("tables")] = tables.address
@@ -155,15 +155,15 @@ def test_guards():
     tracer, ir = trace(branching, X, table=torch.tensor([0.5, 2.0]))
     made = program(tracer, ir)
     assert len(made.guards) == 2
-    assert holds(made, {"table": torch.tensor([2.0, 0.1])})
-    assert not holds(made, {"table": torch.tensor([0.5, 3.0])})  # another number, on which the trace may rely
-    assert not holds(made, {"table": torch.tensor([2.0, math.nan])})
+    assert guards_hold(made, {"table": torch.tensor([2.0, 0.1])})
+    assert not guards_hold(made, {"table": torch.tensor([0.5, 3.0])})  # another number, on which the trace may rely
+    assert not guards_hold(made, {"table": torch.tensor([2.0, math.nan])})
 
 
 def test_numbers_of_the_program_are_read_not_frozen():
     """A network's weight without axes is memory like others: training may change it in place."""
     gain = torch.tensor(2.0)
-    kernel = lanewise(lambda x: [x * gain], [X])
+    kernel = compile_lanewise(lambda x: [x * gain], [X])
     assert torch.equal(kernel(X)[0], X * 2)
     gain.fill_(3.0)
     assert torch.equal(kernel(X)[0], X * 3)
@@ -182,15 +182,15 @@ def test_steps_are_replayed_in_order():
     x = torch.rand(3, 50)
     found = call(program(tracer, ir), x, 1, {"table": torch.tensor([8.0])})[0]
     assert torch.equal(found, writing(x, torch.tensor([8.0]))[0]) and found.max() == 9
-    tensor = replayed(tracer.steps, tracer.held, {"table": torch.tensor([8.0])})
+    tensor = run_prologue(tracer.steps, tracer.constants, {"table": torch.tensor([8.0])})
     assert tensor(tracer.tables[0].source).tolist() == [1, 9, 1, 1]
 
 
 def test_tables_beyond_32_bits_are_refused():
     with pytest.raises(Unsupported, match="beyond 32 bits"):
-        laid_out(torch.tensor([1 << 40]), None)
+        lay_out_table(torch.tensor([1 << 40]), None)
     with pytest.raises(Unsupported, match="2147483648 numbers"):
-        laid_out(torch.zeros(1).expand(1 << 31), None)
+        lay_out_table(torch.zeros(1).expand(1 << 31), None)
 
 
 # -- safety of look-ups
@@ -212,7 +212,7 @@ def test_indices_out_of_range_read_the_table(wrong):
         lambda x: torch.index_select(network.weight + 100, 0, x.long()).T,
     ]
     like = torch.zeros(50)
-    kernel = lanewise(lambda x: [form(x) for form in forms], [like])
+    kernel = compile_lanewise(lambda x: [form(x) for form in forms], [like])
     for n in (1, 16, 50):
         for k, found in enumerate(kernel(torch.full((n,), wrong))):
             if k == 6 and not math.isfinite(wrong):
@@ -224,7 +224,7 @@ def test_indices_out_of_range_read_the_table(wrong):
 def test_indices_in_range_beside_others():
     table = torch.arange(10.0)
     x = torch.tensor([0.0, 9.0, -5.0, 1e9, math.nan, 3.0] * 3)
-    found = lanewise(lambda x: [table[x.long()]], [x])(x)[0]
+    found = compile_lanewise(lambda x: [table[x.long()]], [x])(x)[0]
     assert found.tolist() == [0, 9, 9, 9, 9, 3] * 3
 
 
@@ -239,10 +239,10 @@ def test_networks():
         nn.Linear(8, 3), nn.Softplus(),
     )  # fmt: skip
     x = torch.randn(5, 333)
-    found = lanewise(lambda x: [net(x.T).T], [x])(x)[0]
+    found = compile_lanewise(lambda x: [net(x.T).T], [x])(x)[0]
     torch.testing.assert_close(found, net(x.T).T.detach(), rtol=1e-5, atol=1e-6)  # sums of 16 terms in another order
     double = net.double()
-    found = lanewise(lambda x: [double(x.T).T], [x.double()])(x.double())[0]
+    found = compile_lanewise(lambda x: [double(x.T).T], [x.double()])(x.double())[0]
     torch.testing.assert_close(found, double(x.T.double()).T.detach(), rtol=1e-13, atol=1e-14)
 
 

@@ -26,12 +26,12 @@ def test_the_first_implementation_that_takes_the_arguments_is_called() -> None:
 
 
 def test_the_lane_compiler_turns_bits_around_as_tensors_do() -> None:
-    from torchpt.compiler.function import lanewise
+    from torchpt.compiler.function import compile_lanewise
     from torchpt.engines.kernels import programs  # noqa: F401  (registers)
     from torchpt.physics.samplers.bits import reverse_bits
 
     numbers = torch.randint(-(2**31), 2**31, (1003,), generator=torch.Generator().manual_seed(1)).int()
-    (turned,) = lanewise(lambda x: [reverse_bits(x)], [numbers])(numbers)
+    (turned,) = compile_lanewise(lambda x: [reverse_bits(x)], [numbers])(numbers)
     expected = [int(f"{n & 0xFFFFFFFF:032b}"[::-1], 2) for n in numbers.tolist()]
     assert [n & 0xFFFFFFFF for n in turned.tolist()] == expected
     assert [n & 0xFFFFFFFF for n in reverse_bits(numbers).tolist()] == expected

@@ -7,7 +7,7 @@ import torch
 
 from torchpt.core import memory
 from torchpt.core.errors import RenderError, SceneError
-from torchpt.core.memory import Budget, Span, check_limit, fits_in_memory, retried
+from torchpt.core.memory import Budget, Span, check_limit, fits_in_memory, retry_out_of_memory
 
 CPU = torch.device("cpu")
 
@@ -66,9 +66,9 @@ def test_pieces_take_each_sample_once_and_those_of_a_pixel_in_their_order():
 
 def test_lanes_grow_to_what_was_measured(monkeypatch):
     held = {"now": 1000, "peak": 1000}
-    monkeypatch.setattr(memory.Meter, "base", lambda _: 0)
-    monkeypatch.setattr(memory.Meter, "now", lambda _: held["now"])
-    monkeypatch.setattr(memory.Meter, "peak", lambda _: held["peak"])
+    monkeypatch.setattr(memory.MemoryMeter, "base", lambda _: 0)
+    monkeypatch.setattr(memory.MemoryMeter, "now", lambda _: held["now"])
+    monkeypatch.setattr(memory.MemoryMeter, "peak", lambda _: held["peak"])
     monkeypatch.setattr(memory, "FEWEST", 16)
     found, lanes = budget(10_000, limit=101_000), []
     most = [0]
@@ -85,11 +85,11 @@ def test_lanes_grow_to_what_was_measured(monkeypatch):
 
 
 def test_a_limit_that_holds_all_lanes_is_forgotten(monkeypatch):
-    monkeypatch.setattr(memory.Meter, "base", lambda _: 0)
-    monkeypatch.setattr(memory.Meter, "now", lambda _: 0)
+    monkeypatch.setattr(memory.MemoryMeter, "base", lambda _: 0)
+    monkeypatch.setattr(memory.MemoryMeter, "now", lambda _: 0)
     for limit, lanes in ((11_500, 8000), (20_000, 8000), (80_000, 8000), (100_000, 8000)):
         found = Budget(CPU, lanes, what="a thing", limit=limit, per_lane=10)
-        found.steady()
+        found.drop_unneeded_limit()
         assert (found.limit is None and found.lanes == lanes) == (limit == 100_000)
 
 
@@ -104,15 +104,15 @@ def test_what_is_kept_goes_before_it_is_an_error(monkeypatch):
         return "done"
 
     assert not fits_in_memory(work) and kept
-    assert retried("a thing", work) == "done"
+    assert retry_out_of_memory("a thing", work) == "done"
 
     def never() -> None:
         raise RuntimeError("std::bad_alloc")
 
     with pytest.raises(RenderError, match=r"^not enough memory for a thing, with \d+MB held already$"):
-        retried("a thing", never)
+        retry_out_of_memory("a thing", never)
     with pytest.raises(KeyError):
-        retried("a thing", lambda: {}["other errors go on their way"])
+        retry_out_of_memory("a thing", lambda: {}["other errors go on their way"])
 
 
 def test_a_limit_is_told_in_its_unit():

@@ -15,7 +15,7 @@ import torch
 
 from torchpt.core import threads
 from torchpt.core.errors import RenderError
-from torchpt.core.threads import Crew, deal, share
+from torchpt.core.threads import TaskQueue, map_in_order, parallel_for
 
 
 def dealt(task: Callable[[int], Any], count: int, **wish: Any) -> list[Any]:
@@ -26,7 +26,7 @@ def dealt(task: Callable[[int], Any], count: int, **wish: Any) -> list[Any]:
             found.append(result)
         return False
 
-    deal(range(count), task, wish.pop("threads", 3), each, **wish)
+    map_in_order(range(count), task, wish.pop("threads", 3), each, **wish)
     return found
 
 
@@ -53,13 +53,13 @@ def test_no_task_is_begun_too_far_ahead():
             told.append(k)
         return False
 
-    deal(range(40), task, 2, each, ahead=4)
+    map_in_order(range(40), task, 2, each, ahead=4)
     assert told == list(range(40)) and max(far) <= 5  # one more between the end of a task and its result
 
 
 def test_signals_are_looked_after_while_tasks_run():
     calls = []
-    deal([0], lambda _: time.sleep(0.3), 1, lambda result: calls.append(result) or False)
+    map_in_order([0], lambda _: time.sleep(0.3), 1, lambda result: calls.append(result) or False)
     assert len(calls) >= 3
 
 
@@ -76,7 +76,7 @@ def test_whoever_is_told_ends_it():
         return k == 5
 
     halt = threading.Event()
-    deal(range(1000), task, 2, each, halt, ahead=4)
+    map_in_order(range(1000), task, 2, each, halt, ahead=4)
     assert halt.is_set() and told == sorted(begun) and len(begun) < 12
 
 
@@ -92,7 +92,7 @@ def test_the_first_error_in_order_is_raised_and_ends_the_others():
         return k
 
     with pytest.raises(KeyError):
-        deal(range(1000), task, 3, lambda _: False, halt, ahead=20)
+        map_in_order(range(1000), task, 3, lambda _: False, halt, ahead=20)
     assert halt.is_set()
 
 
@@ -112,7 +112,7 @@ def test_an_error_of_whoever_is_told_ends_the_tasks():
         return False
 
     with pytest.raises(KeyboardInterrupt):
-        deal(range(3), task, 3, each, halt)
+        map_in_order(range(3), task, 3, each, halt)
     assert sorted(ended) == [0, 1, 2]  # nobody works on behind the error's back
 
 
@@ -154,7 +154,7 @@ def test_tasks_that_use_threads_do_not_wait_for_each_other():
             sums[k] += last - first
 
         for _ in range(20):
-            share(work, 100, 3)
+            parallel_for(work, 100, 3)
         return k
 
     assert dealt(task, 8, threads=4) == list(range(8)) and sums == [2000] * 8
@@ -163,7 +163,7 @@ def test_tasks_that_use_threads_do_not_wait_for_each_other():
 def test_a_share_covers_its_range_once():
     for count in (1, 2, 5):
         found = SimpleQueue[tuple[int, int]]()
-        share(lambda a, b, found=found: found.put((a, b)), 17, count)
+        parallel_for(lambda a, b, found=found: found.put((a, b)), 17, count)
         parts = sorted(found.get() for _ in range(found.qsize()))
         assert len(parts) == count and parts[0][0] == 0 and parts[-1][1] == 17
         assert all(a[1] == b[0] for a, b in pairwise(parts))
@@ -173,7 +173,7 @@ def test_a_share_covers_its_range_once():
             if first:
                 raise IndexError("of the work")
 
-        share(work, 10, 3)
+        parallel_for(work, 10, 3)
 
 
 @pytest.fixture
@@ -200,7 +200,7 @@ def test_fewer_threads_where_there_is_no_memory_for_all(no_more_threads, left):
     no_more_threads(left)
     assert dealt(lambda k: k, 10, threads=4) == list(range(10))
     total = []
-    share(lambda a, b: total.append(b - a), 12, 4)
+    parallel_for(lambda a, b: total.append(b - a), 12, 4)
     assert sum(total) == 12
 
 
@@ -209,21 +209,21 @@ def test_without_memory_for_a_thread_it_is_one_line(no_more_threads):
     with pytest.raises(RenderError, match="^not enough memory for a thread that renders$"):
         dealt(lambda k: k, 10)
     total = []
-    share(lambda a, b: total.append(b - a), 12, 4)  # the calling thread does it all
+    parallel_for(lambda a, b: total.append(b - a), 12, 4)  # the calling thread does it all
     assert sum(total) == 12
 
 
 def test_a_crew_takes_more_while_it_works():
-    crew = Crew[str, int](2)
+    queue = TaskQueue[str, int](2)
     try:
-        crew.add("a", lambda: 1)
-        found = [crew.next(True)]
+        queue.add("a", lambda: 1)
+        found = [queue.next(True)]
         for k in range(5):
-            crew.add("b", lambda k=k: k)
-        while crew.pending:
-            found.append(crew.next(True))
+            queue.add("b", lambda k=k: k)
+        while queue.pending:
+            found.append(queue.next(True))
     finally:
-        crew.close()
+        queue.close()
     came = [one for one in found if one is not None]
     assert came[0] == ("a", 1) and sorted(came[1:]) == [("b", k) for k in range(5)]
 
@@ -249,7 +249,7 @@ def test_torch_uses_no_other_thread_in_those_of_the_pool() -> None:
     before, found = torch.get_num_threads(), []
     try:
         torch.set_num_threads(3)
-        deal(range(4), lambda _: torch.get_num_threads(), 2, lambda number: found.append(number) is not None)
+        map_in_order(range(4), lambda _: torch.get_num_threads(), 2, lambda number: found.append(number) is not None)
         assert set(found) - {None} == {1} and torch.get_num_threads() == 3
         own: list[int] = []
         thread = threading.Thread(target=lambda: own.append(torch.get_num_threads()))
@@ -279,5 +279,5 @@ def test_an_error_of_a_task_that_was_on_its_way_is_not_lost() -> None:
         return number == 0
 
     with pytest.raises(ValueError, match="half of a sum"):
-        deal([0, 1], task, 2, each)
+        map_in_order([0, 1], task, 2, each)
     assert seen == [0]

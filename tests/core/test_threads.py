@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.core.threads import PIECE, in_pieces, mean_all, sum_all
+from torchpt.core.threads import PIECE, map_in_pieces, mean_all, sum_all
 from torchpt.images.colour import display, linear_to_srgb, srgb_to_linear
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.physics.shapes.normals import smooth_normals
 
 THREADS = (2, 3)
@@ -49,11 +49,11 @@ def mesh() -> Tensor:
         lambda: srgb_to_linear(X[0]),
         lambda: linear_to_srgb(X[0]),
         lambda: display(X[:3].T, gamma=0.6),
-        lambda: Discrete.of(X[0], torch.float32).cdf,
-        lambda: Discrete.of(X[0].double() ** 8, torch.float64).pmf,
-        lambda: in_pieces(torch.atan2, X[0], X[1]),
-        lambda: in_pieces(torch.pow, X[:2], X[2:]),
-        lambda: in_pieces(torch.pow, X[0].double(), X[1].double()),
+        lambda: Distribution1D.of(X[0], torch.float32).cdf,
+        lambda: Distribution1D.of(X[0].double() ** 8, torch.float64).pmf,
+        lambda: map_in_pieces(torch.atan2, X[0], X[1]),
+        lambda: map_in_pieces(torch.pow, X[:2], X[2:]),
+        lambda: map_in_pieces(torch.pow, X[0].double(), X[1].double()),
         lambda: sum_all(X),
         lambda: sum_all(X[..., 1:].double()),
         lambda: mean_all(X[:, ::3]),
@@ -69,14 +69,14 @@ def test_the_number_of_threads_does_not_matter(function):
 def test_they_are_what_one_thread_gives_at_once(size):
     torch.set_num_threads(1)
     for x, y in ((X[0, :size], X[1, :size]), (X[2, :size].double(), X[3, :size].double())):
-        assert torch.equal(in_pieces(torch.atan2, x, y), torch.atan2(x, y))
-        assert torch.equal(in_pieces(torch.pow, x, y), x**y)
+        assert torch.equal(map_in_pieces(torch.atan2, x, y), torch.atan2(x, y))
+        assert torch.equal(map_in_pieces(torch.pow, x, y), x**y)
         assert torch.equal(sum_all(x), x.sum()) and torch.equal(mean_all(x), x.mean())
 
 
 def test_they_pass_gradients():
     x, y = (X[k].clone().requires_grad_() for k in range(2))
-    a = torch.autograd.grad(in_pieces(torch.atan2, x, y).sum(), (x, y))
+    a = torch.autograd.grad(map_in_pieces(torch.atan2, x, y).sum(), (x, y))
     b = torch.autograd.grad(torch.atan2(x, y).sum(), (x, y))
     assert all(torch.equal(one, other) for one, other in zip(a, b, strict=True))
     assert torch.equal(torch.autograd.grad(mean_all(x), x)[0], torch.autograd.grad(x.mean(), x)[0])

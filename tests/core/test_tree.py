@@ -18,7 +18,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.core.tree import UNPRINTED, fingerprint, leaves, map_leaves, named_leaves, rebuild, signature
+from torchpt.core.tree import NOT_FINGERPRINTED, fingerprint, leaves, map_leaves, named_leaves, rebuild, signature
 
 Pair = namedtuple("Pair", "x y")
 
@@ -27,7 +27,7 @@ Pair = namedtuple("Pair", "x y")
 class Inner:
     x: Tensor
     name: str = "a"
-    source: str = field(default="", metadata=UNPRINTED)
+    source: str = field(default="", metadata=NOT_FINGERPRINTED)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import torchpt
 from torchpt.core.errors import SceneError
 from torchpt.physics.film import FILTERS, Filter, filter_of
 from torchpt.spec import parameters_of
-from torchpt.spec.schema import described
+from torchpt.spec.schema import read_typed
 
 CPU = torch.device("cpu")
 #: Beside the defaults: parameters that make a filter of another shape.
@@ -53,7 +53,7 @@ def test_what_is_declared(kind):
         assert spec.doc, key
         for value in values_outside(spec):
             with pytest.raises(SceneError, match=rf"film\.filter\.{key}"):
-                described("filter", FILTERS, {"type": kind, key: value}, "film.filter", None)
+                read_typed("filter", FILTERS, {"type": kind, key: value}, "film.filter", None)
     with pytest.raises(SceneError):
         filter_of(kind, CPU, no_such_key=1)
 

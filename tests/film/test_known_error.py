@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchpt.physics.film import ErrorEstimate, pilots_of
-from torchpt.physics.film.error import STREAMS, Again, around, known_error, pilots_alone, to_look_at
+from torchpt.physics.film.error import STREAMS, Resampled, around, error_estimate, pixels_to_resample, probe_estimate
 
 SIDE = 96
 
@@ -40,11 +40,11 @@ def known(radiance: Tensor, sparkle: float, seed: int) -> tuple[ErrorEstimate, f
     flat = picture.view(-1, 3)
     a, b = flat[pilots.places].clone(), noisy(radiance, sparkle, g).reshape(-1, 3)[pilots.places]
     flat[pilots.places] = (a + b) / 2
-    suspects, doubtful = to_look_at(picture, pilots, a, b)
+    suspects, doubtful = pixels_to_resample(picture, pilots, a, b)
     places = torch.cat((suspects, doubtful))
     more = torch.stack([noisy(radiance, sparkle, g).reshape(-1, 3)[places] for _ in range(STREAMS)])
-    again = Again(places, len(suspects), more.mean(0), more.var(0) / STREAMS)
-    estimate = known_error(picture, pilots, a, b, None, True, again)
+    again = Resampled(places, len(suspects), more.mean(0), more.var(0) / STREAMS)
+    estimate = error_estimate(picture, pilots, a, b, None, True, again)
     assert estimate is not None
     return estimate, float(((picture - mean).square() / (mean.square() + 0.01)).mean())
 
@@ -85,11 +85,11 @@ def test_an_error_of_few_pixels_is_called_heavy_tailed():
     for seed in range(20):
         picture, pilots = value().clone(), pilots_of(seed, (SIDE, SIDE), (0, 0, SIDE, SIDE))
         first, second = (values.reshape(-1, 3)[pilots.places] for values in (picture, value()))
-        suspects, doubtful = to_look_at(picture, pilots, first, second)
+        suspects, doubtful = pixels_to_resample(picture, pilots, first, second)
         places = torch.cat((suspects, doubtful))
         more = torch.stack([value().reshape(-1, 3)[places] for _ in range(STREAMS)])
-        again = Again(places, len(suspects), more.mean(0), more.var(0) / STREAMS)
-        estimate = known_error(picture, pilots, first, second, None, False, again)
+        again = Resampled(places, len(suspects), more.mean(0), more.var(0) / STREAMS)
+        estimate = error_estimate(picture, pilots, first, second, None, False, again)
         assert estimate is not None
         flags += estimate.heavy_tailed
     assert flags >= 18
@@ -101,10 +101,10 @@ def test_a_sparkle_is_known_wherever_it_is():
     a[33, 50] = 30.0
     pilots = pilots_of(0, (SIDE, SIDE), (0, 0, SIDE, SIDE))
     b = radiance.reshape(-1, 3)[pilots.places]
-    suspects, _ = to_look_at(a, pilots, b, b)
+    suspects, _ = pixels_to_resample(a, pilots, b, b)
     assert 33 * SIDE + 50 in suspects.tolist()
-    again = Again(suspects, len(suspects), radiance.reshape(-1, 3)[suspects], torch.zeros(len(suspects), 3))
-    estimate = known_error(a, pilots, b, b, None, False, again)
+    again = Resampled(suspects, len(suspects), radiance.reshape(-1, 3)[suspects], torch.zeros(len(suspects), 3))
+    estimate = error_estimate(a, pilots, b, b, None, False, again)
     assert estimate is not None and estimate.relmse == pytest.approx(
         29.5**2 / ((30 / 32) ** 2 + 0.01) / SIDE**2, rel=0.01
     )
@@ -116,8 +116,8 @@ def test_pilots_alone_ask_no_other_pixel():
     pilots = pilots_of(1, (64, 64), (0, 0, 64, 64))
     a, b = (0.5 + 0.05 * torch.randn(len(pilots), 3, generator=g, dtype=torch.float64) for _ in range(2))
     exact = 0.05**2 / 0.26
-    assert pilots_alone(pilots, a, b, None, False).relmse == pytest.approx(exact, rel=0.2)
-    alone, both = (pilots_alone(pilots, a, b, None, counted).relmse for counted in (False, True))
+    assert probe_estimate(pilots, a, b, None, False).relmse == pytest.approx(exact, rel=0.2)
+    alone, both = (probe_estimate(pilots, a, b, None, counted).relmse for counted in (False, True))
     assert both == pytest.approx(alone * 31 / 32)
 
 
@@ -129,7 +129,7 @@ def test_second_values_of_another_variance():
     a = 0.5 + 0.05 * torch.randn(n, 3, generator=g, dtype=torch.float64)
     halves = 0.5 + 0.1 * torch.randn(2, n, 3, generator=g, dtype=torch.float64)
     b, spare = halves.mean(0), (halves[0] - halves[1]).square() / 4
-    assert pilots_alone(pilots, a, b, spare, False).relmse == pytest.approx(0.05**2 / 0.26, rel=0.1)
+    assert probe_estimate(pilots, a, b, spare, False).relmse == pytest.approx(0.05**2 / 0.26, rel=0.1)
 
 
 def test_what_lies_around():
@@ -147,11 +147,11 @@ def test_pictures_of_a_few_pixels(side):
     pilots = pilots_of(0, (side, side), (0, 0, side, side))
     picture = torch.rand(side, side, 3, dtype=torch.float64)
     a, b = torch.rand(2, len(pilots), 3, dtype=torch.float64)
-    suspects, doubtful = to_look_at(picture, pilots, a, b)
+    suspects, doubtful = pixels_to_resample(picture, pilots, a, b)
     places = torch.cat((suspects, doubtful))
-    again = Again(places, len(suspects), torch.full((len(places), 3), 0.5).double(), torch.zeros(len(places), 3))
+    again = Resampled(places, len(suspects), torch.full((len(places), 3), 0.5).double(), torch.zeros(len(places), 3))
     for looked in (None, again):
-        estimate = known_error(picture, pilots, a, b, None, True, looked)
+        estimate = error_estimate(picture, pilots, a, b, None, True, looked)
         assert estimate is None or estimate.relmse >= 0
         if estimate is not None:
             assert (len(pilots) - len(suspects) >= 8) <= (estimate.interval is not None) <= (len(pilots) >= 8)
@@ -160,4 +160,4 @@ def test_pictures_of_a_few_pixels(side):
 def test_a_picture_without_error():
     pilots = pilots_of(0, (32, 32), (0, 0, 32, 32))
     black, values = torch.zeros(32, 32, 3).double(), torch.zeros(len(pilots), 3).double()
-    assert known_error(black, pilots, values, values, None, True, None) == ErrorEstimate(0.0, (0.0, 0.0), False)
+    assert error_estimate(black, pilots, values, values, None, True, None) == ErrorEstimate(0.0, (0.0, 0.0), False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchpt.physics.film.error import foreseen, shared_out
+from torchpt.physics.film.error import allocate_samples, expected_errors
 
 PIXELS = torch.full((100,), 16)
 
@@ -15,14 +15,14 @@ def counts(n: int) -> torch.Tensor:
 
 
 def test_even_errors_share_evenly():
-    assert (shared_out(torch.ones(100).double(), counts(16), PIXELS, 64.0) == 64).all()
-    assert (shared_out(torch.zeros(100).double(), counts(16), PIXELS, 32.0) == 32).all()
+    assert (allocate_samples(torch.ones(100).double(), counts(16), PIXELS, 64.0) == 64).all()
+    assert (allocate_samples(torch.zeros(100).double(), counts(16), PIXELS, 32.0) == 32).all()
 
 
 def test_samples_go_with_the_root_of_the_variance():
     error = torch.ones(100).double()
     error[:50] = 4.0
-    aims = shared_out(error, counts(64), PIXELS, 192.0)
+    aims = allocate_samples(error, counts(64), PIXELS, 192.0)
     assert (aims[:50] == 256).all() and (aims[50:] == 128).all()
 
 
@@ -33,7 +33,7 @@ def test_numbers_are_doubled_within_what_there_is():
         16 << torch.randint(0, 4, (100,), generator=g),
     )
     mean = 2.0 * float(have.double().mean())
-    aims = shared_out(error, have, PIXELS, mean)
+    aims = allocate_samples(error, have, PIXELS, mean)
     assert set((aims / have).tolist()) == {1.0, 2.0, 4.0}
     assert 0.9 * mean <= float(aims.double().mean()) <= mean
     ratio = (error * have).sqrt()
@@ -49,24 +49,24 @@ def test_the_last_round_leaves_nothing_over():
         have = 16 << torch.randint(0, 2, (100,), generator=g)
         if float((have * pixels).sum()) > spp * float(pixels.sum()):
             continue
-        aims = shared_out(error, have, pixels, min(spp, 2.0 * float(have.double().mean())), last=True)
+        aims = allocate_samples(error, have, pixels, min(spp, 2.0 * float(have.double().mean())), last=True)
         total = min(spp, 2.0 * float(have.double().mean())) * float(pixels.sum())
         assert (aims >= have).all() and 0.0 <= total - float((aims * pixels).sum()) < 16.0
 
 
 def test_bad_estimates_do_no_harm():
     error = torch.full((100,), -1.0).double()
-    assert (shared_out(error, counts(32), PIXELS, 64.0) == 64).all()
+    assert (allocate_samples(error, counts(32), PIXELS, 64.0) == 64).all()
 
 
 def test_a_constant_is_kept_and_the_known_alone_are_asked():
     values, known = torch.full((9, 7), 3.0).double(), torch.ones(9, 7, dtype=torch.bool)
     values[4, 4], known[4, 4] = 1e9, False
-    torch.testing.assert_close(foreseen(values, known), torch.full((9, 7), 3.0).double())
+    torch.testing.assert_close(expected_errors(values, known), torch.full((9, 7), 3.0).double())
     lonely = torch.zeros(9, 7, dtype=torch.bool)
     lonely[0, 0] = True
-    assert (foreseen(values, lonely) == 3.0).all()  # the mean where nothing near is known
-    assert (foreseen(values, torch.zeros_like(lonely)) == 0.0).all()
+    assert (expected_errors(values, lonely) == 3.0).all()  # the mean where nothing near is known
+    assert (expected_errors(values, torch.zeros_like(lonely)) == 0.0).all()
 
 
 def test_errors_that_gather_are_followed_and_those_that_do_not_are_shared():
@@ -75,15 +75,15 @@ def test_errors_that_gather_are_followed_and_those_that_do_not_are_shared():
     noise = torch.rand(60, 60, generator=g).double()
     edge = noise.clone()
     edge[28:30] *= 100.0
-    found = foreseen(edge, known)
+    found = expected_errors(edge, known)
     assert float(found[28:30].mean()) > 20 * float(found[:20].mean())
     assert float(found.mean()) == pytest.approx(float(edge.mean()), rel=0.1)
     rare = noise.clone()
     rare[torch.rand(60, 60, generator=g) < 0.01] = 100.0
-    found = foreseen(rare, known)
+    found = expected_errors(rare, known)
     assert float(found.mean()) == pytest.approx(float(rare.mean()), rel=0.1)
     assert float(found.max()) < 3 * float(found.min())
     half = noise.clone()  # ordinary noise of which one side has more
     half[:, :30] *= 4.0
-    found = foreseen(half, known)
+    found = expected_errors(half, known)
     assert float(found[:, :28].mean()) == pytest.approx(4 * float(found[:, 32:].mean()), rel=0.2)

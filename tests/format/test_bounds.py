@@ -15,7 +15,7 @@ from small_files import DAE, MTL, OBJ, glb, gltf_document
 
 import torchpt
 from torchpt.core.errors import AssetError, SceneError, TorchptError
-from torchpt.core.files import Unfit, check_regular, read_regular
+from torchpt.core.files import UnreadableFile, check_regular, read_regular
 from torchpt.images import has_alpha, read_header, read_image, read_layers, read_texels
 from torchpt.scene.formats import description, yaml
 from torchpt.scene.formats.description import read_description
@@ -135,10 +135,10 @@ def test_large_files_are_not_read(tmp_path: Path) -> None:
     scene.touch()
     os.truncate(scene, 300 * 2**20)
     assert "at most 256 MiB" in refused(lambda: torchpt.load(str(scene)), SceneError)
-    with pytest.raises(Unfit):
+    with pytest.raises(UnreadableFile):
         read_regular(scene, 10)
     assert check_regular(scene) == 300 * 2**20
-    with pytest.raises(Unfit, match="no file can have"):
+    with pytest.raises(UnreadableFile, match="no file can have"):
         check_regular("a\0b")
 
 

@@ -857,8 +857,8 @@ def test_energy_compensation_beside_textures(kind: str) -> None:
     def picture(**keys: Any) -> Tensor:
         lights, film = {"sky": {"type": "constant"}}, {"width": 8, "height": 8}
         material = {"type": kind, "alpha": 0.5, "energy_compensation": True, **keys}
-        described = {**scene({"m": material}, material="m"), "lights": lights, "film": film}
-        return torchpt.render(torchpt.load(described, "cpu"), spp=64, seed=1, compile="off")
+        read_typed = {**scene({"m": material}, material="m"), "lights": lights, "film": film}
+        return torchpt.render(torchpt.load(read_typed, "cpu"), spp=64, seed=1, compile="off")
 
     def even(*color: float) -> dict[str, Any]:
         return {"type": "checkerboard", "color0": list(color), "color1": list(color)}

@@ -24,7 +24,7 @@ from torchpt.physics.shapes import KINDS as SHAPES
 from torchpt.physics.textures import KINDS as TEXTURES
 from torchpt.scene.formats.compose import compose
 from torchpt.scene.formats.yaml import read_yaml
-from torchpt.scene.settings import RECORDS
+from torchpt.scene.settings import UNTYPED_BLOCKS
 from torchpt.spec import REQUIRED, parameters_of
 
 #: What a document names as meshes and pictures: files that lie beside it.
@@ -143,7 +143,7 @@ def _entry(table: Any, name: str) -> dict[str, Any]:
 @cache
 def keys() -> list[str]:
     """Every key that some kind reads."""
-    tables = (MATERIALS, SHAPES, LIGHTS, CAMERAS, SAMPLERS, INTEGRATORS, FILTERS, TEXTURES, RECORDS)
+    tables = (MATERIALS, SHAPES, LIGHTS, CAMERAS, SAMPLERS, INTEGRATORS, FILTERS, TEXTURES, UNTYPED_BLOCKS)
     found = {key for table in tables for name in table for key in parameters_of(table[name])}
     return sorted(
         found | {"type", "transform", "translate", "scale", "rotate", "matrix", "look_at", "axis", "angle", "version"}

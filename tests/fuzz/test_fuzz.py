@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import tries
 
-from torchpt.core.threads import settle
+from torchpt.core.threads import warm_up
 
 LONG = {"documents": 10_000, "assets": 4_000}
 #: Tries that one process makes.
@@ -29,7 +29,7 @@ def test_damaged_input_is_refused_in_a_line(
 ) -> None:
     import assets
 
-    settle()
+    warm_up()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tries, "COMPILED", 1 << 60)
     assets.write_sound(tmp_path)

@@ -12,7 +12,7 @@ from gradient_rooms import gradient_of, room
 import torchpt
 from torchpt.engines.kernels import backward, engine
 from torchpt.gradients import replay
-from torchpt.gradients.tape import counted, sample_cotangents
+from torchpt.gradients.tape import clamped_samples, sample_cotangents
 from torchpt.scene.formats.description import settings
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
@@ -152,6 +152,6 @@ def test_cotangents_of_samples_are_those_of_how_pixels_count_them():
     for clamp in (None, 0.7):
         wishes = settings(scene.description, {"integrator": {"type": "path", "clamp": clamp}, "render": {"spp": 8}})
         leaf = samples.clone().requires_grad_()
-        (counted(wishes, leaf).mean(1) * pixels).sum().backward()
+        (clamped_samples(wishes, leaf).mean(1) * pixels).sum().backward()
         assert leaf.grad is not None
         torch.testing.assert_close(sample_cotangents(wishes, samples, pixels), leaf.grad)

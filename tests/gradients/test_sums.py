@@ -137,7 +137,7 @@ def sums_of(scene: torchpt.Scene, name: str, **wish: Any) -> torch.Tensor:
     found: list[torch.Tensor] = []
     gradients = SceneTape.gradients
 
-    def noted(self: SceneTape, whole: sums.Sums) -> Any:
+    def noted(self: SceneTape, whole: sums.GradientSums) -> Any:
         found.extend(whole.total(number).flatten() for number in range(len(self.leaves)))
         return gradients(self, whole)
 
@@ -214,7 +214,7 @@ def turned(world: Any, hit: Any) -> Any:
 def test_places_of_lanes_do_not_matter_by_tensor_operations(monkeypatch, name, sorts):
     """Neither to the sums of a CPU nor to those of other devices (here on a CPU)."""
     if sorts:
-        monkeypatch.setattr(sums.Sums, "add_at", sums.Sums.add_sorted)
+        monkeypatch.setattr(sums.GradientSums, "add_at", sums.GradientSums.add_sorted)
     scene = several(0.5 if name.endswith("opacity") else 1.0)
     first = sums_of(scene, name, compile="off")
     monkeypatch.setattr(tensors, "partition", turned)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import torchpt
 from torchpt.ibl import IblMaps, Sky, brdf_table
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.paths.integrators.split_sum import under
 from torchpt.physics import bsdfs
 from torchpt.physics.lights import without_environment
@@ -155,7 +155,7 @@ def test_the_environment_is_cut_from_the_table() -> None:
     assert lights is not None
     left = without_environment(lights)
     assert left is not None and left.kinds == ("point", "directional") and left.environment is None
-    assert isinstance(left.choice, Discrete) and float(left.choice.pmf.sum()) == pytest.approx(1.0)
+    assert isinstance(left.choice, Distribution1D) and float(left.choice.pmf.sum()) == pytest.approx(1.0)
     assert left.radiance.shape == (3, 2) and without_environment(left) is left
     alone = ball({"type": "diffuse"}, WHITE).world(torch.float32)[0].lights
     assert without_environment(alone) is None and without_environment(None) is None

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchpt.images.colour import display
-from torchpt.images.comparison import Shown, compare, map_of
+from torchpt.images.comparison import DisplayTransform, compare, comparison_map
 from torchpt.images.false_colour import NOT_FINITE, false_colour
 from torchpt.images.metrics import METRICS, error_map, psnr, relmse, ssim
 
@@ -19,16 +19,16 @@ REFERENCE = 3.0 * torch.rand((24, 30, 3), generator=DRAW)
 IMAGE = REFERENCE * (1.0 + 0.2 * torch.randn(REFERENCE.shape, generator=DRAW)).clamp(min=0.1)
 
 
-@pytest.mark.parametrize("shown", [Shown(), Shown(-2.0, "aces", 0.5)])
-def test_psnr_and_ssim_see_what_a_screen_shows_and_the_others_radiance(shown: Shown) -> None:
+@pytest.mark.parametrize("shown", [DisplayTransform(), DisplayTransform(-2.0, "aces", 0.5)])
+def test_psnr_and_ssim_see_what_a_screen_shows_and_the_others_radiance(shown: DisplayTransform) -> None:
     found = compare(IMAGE, REFERENCE, shown)
     seen = [display(x.double(), shown.exposure, shown.tonemap, shown.gamma) for x in (IMAGE, REFERENCE)]
     assert list(found.metrics) == list(METRICS)
     assert found.metrics["psnr"] == pytest.approx(psnr(seen[0], seen[1]))
     assert found.metrics["ssim"] == pytest.approx(ssim(seen[0], seen[1]))
     assert found.metrics["relmse"] == relmse(IMAGE, REFERENCE)
-    assert torch.equal(map_of("ssim", IMAGE, REFERENCE, shown), error_map("ssim", seen[0], seen[1]))
-    assert torch.equal(map_of("mse", IMAGE, REFERENCE, shown), error_map("mse", IMAGE, REFERENCE))
+    assert torch.equal(comparison_map("ssim", IMAGE, REFERENCE, shown), error_map("ssim", seen[0], seen[1]))
+    assert torch.equal(comparison_map("mse", IMAGE, REFERENCE, shown), error_map("mse", IMAGE, REFERENCE))
 
 
 def test_means_and_their_ratio_show_bias() -> None:

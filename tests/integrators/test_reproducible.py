@@ -25,7 +25,7 @@ from trials import film_of, shoot
 import torchpt
 from torchpt.engines import tensors
 from torchpt.math.sampling import (
-    Discrete,
+    Distribution1D,
     concentric_disk,
     one_minus_cos,
     power_heuristic,
@@ -64,7 +64,7 @@ def _real(seed: int, *shape: int) -> torch.Tensor:
 
 
 A, B, U = _real(1, 3, N), _real(2, 3, N), torch.rand(3, N, generator=torch.Generator().manual_seed(3))
-CHOICE = Discrete.of(U[0, :999], torch.float32)
+CHOICE = Distribution1D.of(U[0, :999], torch.float32)
 
 #: Arithmetic done on lanes: (name of the operation, function of columns of A, B, U).
 OPERATIONS: list[tuple[str, Callable[..., torch.Tensor]]] = [

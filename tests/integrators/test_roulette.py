@@ -29,8 +29,8 @@ def survival(throughput: float, eta: float | None = None, cap: float = 1.0, chan
     """The chance that a path survives with, from the weight that makes up for it; 0 where it never does."""
     carried = torch.tensor([[throughput], [0.25 * throughput], [0.0]])
     index = None if eta is None else torch.tensor([eta])
-    least = roulette.chance_of(chance, cap, carried.amax(0), index)
-    on, after = roulette.survived(least, _Drawn(0.0), torch.ones(1, dtype=torch.bool), carried)
+    least = roulette.survival_probability(chance, cap, carried.amax(0), index)
+    on, after = roulette.russian_roulette(least, _Drawn(0.0), torch.ones(1, dtype=torch.bool), carried)
     return float(carried[0] / after[0]) if bool(on) else 0.0
 
 
@@ -46,8 +46,8 @@ def test_a_path_survives_with_what_it_can_still_bring(carried):
 
 def test_the_largest_number_ends_no_path_that_loses_nothing():
     one = torch.ones(3, 1)
-    chance = roulette.chance_of(None, 1.0, one[0], None)
-    on, after = roulette.survived(chance, _Drawn(1.0 - 2.0**-24), torch.ones(1, dtype=torch.bool), one)
+    chance = roulette.survival_probability(None, 1.0, one[0], None)
+    on, after = roulette.russian_roulette(chance, _Drawn(1.0 - 2.0**-24), torch.ones(1, dtype=torch.bool), one)
     assert bool(on) and torch.equal(after, one)
 
 

@@ -153,8 +153,8 @@ def test_against_mitsuba(shape: str, mitsuba: Any, images: Path):
         assert surface.side is not None
         through = dot(take(w, lanes).double(), at.ng) * wi[2] * surface.side > 0
         found = found * through
-        if surface.relief is not None:
-            found = found * surface.relief.shadowing(take(w, lanes).double())
+        if surface.perturbed_normal is not None:
+            found = found * surface.perturbed_normal.shadowing(take(w, lanes).double())
 
         uv = surface_uv(world, at)
         off = (uv - take(coordinates, lanes)).abs()

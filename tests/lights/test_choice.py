@@ -12,9 +12,9 @@ from trials import coarse, film_of, shoot, spread, z_limit
 
 import torchpt
 from torchpt.core.errors import EdgeWarning, SceneError
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.physics import lights
-from torchpt.physics.lights.choice import MANY, ByTree, bounds_of, draw, probability
+from torchpt.physics.lights.choice import MANY, TreeSampler, bounds_of, draw, probability
 from torchpt.physics.shapes import interact
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.physics.shapes.interaction import OFFSET
@@ -95,14 +95,14 @@ def every_kind(sources: bool = True) -> dict[str, Any]:
 
 
 def test_few_lights_are_chosen_by_power_and_many_by_the_tree():
-    for count, kind in ((MANY - 1, Discrete), (MANY, ByTree)):
+    for count, kind in ((MANY - 1, Distribution1D), (MANY, TreeSampler)):
         scene = torchpt.load(
             {"camera": {"origin": [0, 0, 5], "target": [0, 0, 0]}, "shapes": bulbs(count)}, device="cpu"
         )
         table = scene.world(torch.float32)[0].lights
         assert table is not None and isinstance(table.choice, kind)
-        assert lights.local(table) == (kind is ByTree)
-        for way, chosen in (("uniform", Discrete), ("power", Discrete), ("tree", ByTree)):
+        assert lights.depends_on_point(table) == (kind is TreeSampler)
+        for way, chosen in (("uniform", Distribution1D), ("power", Distribution1D), ("tree", TreeSampler)):
             table = scene.world(torch.float32, choice=way)[0].lights
             assert table is not None and isinstance(table.choice, chosen)
 
@@ -110,7 +110,7 @@ def test_few_lights_are_chosen_by_power_and_many_by_the_tree():
 def test_uniform_choice_draws_all_lights_alike():
     scene = torchpt.load({"camera": {"origin": [0, 0, 5], "target": [0, 0, 0]}, "shapes": bulbs(30)}, device="cpu")
     table = scene.world(torch.float32, choice="uniform")[0].lights
-    assert table is not None and isinstance(table.choice, Discrete)
+    assert table is not None and isinstance(table.choice, Distribution1D)
     torch.testing.assert_close(table.choice.pmf, torch.full((30,), 1 / 30))
 
 
@@ -133,7 +133,7 @@ def test_bounds_hold_what_the_lights_draw():
     assert near == len(power) - 2  # but the sun and the sky
     count = 400
     for row in range(near):
-        only = Discrete.of(torch.eye(len(power))[row], torch.float64)
+        only = Distribution1D.of(torch.eye(len(power))[row], torch.float64)
         alone = replace(table, choice=only)
         x = torch.randn(3, count, generator=G, dtype=torch.float64) * 3
         u = torch.rand(2, count, generator=G, dtype=torch.float64)
@@ -153,7 +153,7 @@ def test_weights_of_both_strategies_sum_to_one(sky):
     scene = torchpt.load(every_kind(sky), device="cpu")
     world, _ = scene.world(torch.float32)
     table, count = world.lights, 4000
-    assert table is not None and isinstance(table.choice, ByTree)
+    assert table is not None and isinstance(table.choice, TreeSampler)
     x = torch.rand(3, count, generator=G) * torch.tensor([[4.0], [1.5], [4.0]]) - torch.tensor([[2.0], [0.0], [2.0]])
     n = torch.nn.functional.normalize(torch.randn(3, count, generator=G), dim=0) * (
         torch.rand(count, generator=G) < 0.7
@@ -218,7 +218,7 @@ def test_a_floor_under_many_points_and_its_derivatives():
     """Against the closed form: sum of I cos / r^2, and its derivative by the height and the intensity of one light."""
     scene = torchpt.load(floor_under_points(), device="cpu")
     table = scene.world(torch.float32)[0].lights
-    assert table is not None and isinstance(table.choice, ByTree)
+    assert table is not None and isinstance(table.choice, TreeSampler)
     places, powers = PLACES.clone().requires_grad_(), POWERS.clone().requires_grad_()
     expected = (0.6 / math.pi * powers * places[:, 1] / (places * places).sum(1) ** 1.5).sum()
     expected.backward()

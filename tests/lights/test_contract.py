@@ -21,7 +21,7 @@ from trials import SIGNIFICANCE, chi_square_p
 import torchpt
 from torchpt import spec
 from torchpt.core.errors import SceneError
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import Frame, dot, luminance, normalize
 from torchpt.physics import lights
 from torchpt.physics.lights.choice import bounds_of
@@ -183,7 +183,7 @@ def test_every_kind_has_a_case():
 
 def test_rows_are_in_order():
     """Near lights, those infinitely far, the environment last."""
-    ordered = sorted(lights.KINDS, key=lights.order)
+    ordered = sorted(lights.KINDS, key=lights.sort_key)
     assert ordered[:2] == ["point", "spot"] and lights.KINDS[ordered[-1]].environment
     many = {name: {"type": name, **CASES[name].keys} for name in reversed(ordered) if name != "constant"}
     scene = torchpt.load({**block("disk"), "lights": many}, device="cpu")
@@ -286,7 +286,7 @@ def test_power_is_that_of_brute_force(name):
         floor["emission"] = 1.0
     scene = torchpt.load(described, device="cpu")
     world, _ = scene.world(torch.float64, choice="power")
-    assert world.lights is not None and isinstance(world.lights.choice, Discrete)
+    assert world.lights is not None and isinstance(world.lights.choice, Distribution1D)
     choice = world.lights.choice
     rows = [*lights.SURFACES, *lights.KINDS]
     own = int(rows.index(name) > rows.index(known))
@@ -422,7 +422,7 @@ def refusals() -> list[Any]:
 def test_what_is_out_of_range_is_refused(name, key, described, value):
     with pytest.raises(SceneError, match=rf"lights\.it\.{key}"):
         loaded(name, **{key: value})
-    if not described.traced:
+    if not described.differentiable:
         return
     scene = loaded(name)
     own = "to_world" if key == "transform" else key

@@ -12,7 +12,7 @@ from trials import film_of, shoot, z_limit
 
 import torchpt
 from torchpt.core.errors import EdgeWarning, SceneError
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import normalize
 from torchpt.physics import lights
 from torchpt.physics.shapes.interaction import OFFSET
@@ -103,7 +103,7 @@ def test_the_table_tells_deltas_apart():
         torch.float32, choice="power"
     )
     table = world.lights
-    assert table is not None and isinstance(table.choice, Discrete)
+    assert table is not None and isinstance(table.choice, Distribution1D)
     assert table.kinds == ("rectangle", "point", "spot", "directional", "constant")
     n = 4096
     x = torch.rand(3, n, generator=torch.Generator().manual_seed(1))

@@ -15,7 +15,7 @@ from trials import SIGNIFICANCE, chi_square_p, coarse, estimate, film_of, shoot,
 
 import torchpt
 from torchpt.core.errors import AssetError, SceneError
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.physics.lights.kinds.envmap import EnvironmentMap
 from torchpt.scene.formats.description import settings
 
@@ -155,7 +155,7 @@ def test_a_black_map(tmp_path):
     lit["lights"]["lamp"] = {"type": "point", "position": [0, 3, 2], "intensity": 5.0}
     alone = {**lit, "lights": {"lamp": lit["lights"]["lamp"]}}
     world, _ = torchpt.load(lit, "cpu").world(torch.float32, choice="power")
-    assert world.lights is not None and isinstance(world.lights.choice, Discrete)
+    assert world.lights is not None and isinstance(world.lights.choice, Distribution1D)
     assert float(world.lights.choice.pmf[-1]) == 0
     torch.testing.assert_close(shoot(lit, 4).image, shoot(alone, 4).image, rtol=1e-5, atol=1e-6)
 

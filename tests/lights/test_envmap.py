@@ -11,7 +11,7 @@ from few import few
 from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p, z_limit
 
-from torchpt.math.sampling import Cells, cosine_hemisphere, invert_linear, power_heuristic, uniform_sphere
+from torchpt.math.sampling import Distribution2D, cosine_hemisphere, invert_linear, power_heuristic, uniform_sphere
 from torchpt.physics.lights.kinds import envmap
 
 N = 1 << 16
@@ -334,7 +334,7 @@ def test_every_lane_rounds_alike():
 
 def test_cells_and_their_ends():
     weights = torch.tensor([[0.0, 0, 0], [0, 2, 0], [0, 0, 0], [1, 0, 1], [0, 0, 0]])
-    cells = Cells.of(weights)
+    cells = Distribution2D.of(weights)
     u = torch.tensor(
         [[0.0, 0.0], [1 - 2.0**-24, 0.0], [0.0, 1 - 2.0**-24], [1 - 2.0**-24, 1 - 2.0**-24]]
     ).T.contiguous()

@@ -11,7 +11,7 @@ from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p
 
 import torchpt
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import dot
 from torchpt.physics import lights
 from torchpt.physics.lights.surfaces import sphere
@@ -140,7 +140,7 @@ def test_lights_are_chosen_by_power():
     radiance = {"triangle": 3.0, "rectangle": 1.0, "sphere": 0.1}
     world, _ = scene_of(names, radiance).world(torch.float64, choice="power")
     table = world.lights
-    assert table is not None and isinstance(table.choice, Discrete)
+    assert table is not None and isinstance(table.choice, Distribution1D)
     areas = table.area
     power = areas * table.radiance[0]
     expected = 0.99 * power / power.sum() + 0.01 / 3  # a hundredth is even, see Discrete

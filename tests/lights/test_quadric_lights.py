@@ -10,7 +10,7 @@ from few import few
 from trials import film_of, shoot, spread, z_limit
 
 import torchpt
-from torchpt.math.sampling import Discrete, uniform_sphere
+from torchpt.math.sampling import Distribution1D, uniform_sphere
 from torchpt.physics import lights
 from torchpt.physics.shapes import interact
 from torchpt.physics.shapes.geometry import Hit
@@ -100,7 +100,7 @@ def test_power_is_by_true_area():
         shapes = {"light": {**shape, "emission": [1, 1, 1]}, "one": one}
         scene = torchpt.load({"camera": {"origin": [0, 0, 5], "target": [0, 0, 0]}, "shapes": shapes}, device="cpu")
         world, _ = scene.world(torch.float64, choice="power")
-        assert world.lights is not None and isinstance(world.lights.choice, Discrete)
+        assert world.lights is not None and isinstance(world.lights.choice, Distribution1D)
         pmf = (world.lights.choice.pmf - 0.005) / 0.99
         return float(4 * pmf[1] / pmf[0])
 

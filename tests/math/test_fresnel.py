@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.math.microfacet import diffuse_passed, fresnel_conductor, fresnel_dielectric, refract, schlick
+from torchpt.math.microfacet import diffuse_transmittance, fresnel_conductor, fresnel_dielectric, refract, schlick
 
 INDICES = [1e-3, 1 / 1.5, 0.99, 1.0, 1.00001, 1.01, 1.5, 10.0]
 COSINES = torch.linspace(-1, 1, 401, dtype=torch.float64)
@@ -121,12 +121,12 @@ def test_what_passes_a_boundary_of_diffuse_light(eta):
         exact = 1.0 - fresnel_dielectric(cos2.sqrt(), torch.full_like(cos2, eta)).reflectance.mean()
     else:  # all is reflected but in a narrow cone, whose directions the other side has in its whole hemisphere
         exact = eta**2 * (1.0 - fresnel_dielectric(cos2.sqrt(), torch.full_like(cos2, 1.0 / eta)).reflectance.mean())
-    passed = diffuse_passed(torch.tensor([eta], dtype=torch.float64))[0]
+    passed = diffuse_transmittance(torch.tensor([eta], dtype=torch.float64))[0]
     assert abs(passed / exact - 1.0) < 1.5e-4
 
 
 def test_diffuse_light_passes_equal_indices_whole():
-    assert float(diffuse_passed(torch.tensor([1.0], dtype=torch.float64))) == pytest.approx(1.0, abs=1e-7)
+    assert float(diffuse_transmittance(torch.tensor([1.0], dtype=torch.float64))) == pytest.approx(1.0, abs=1e-7)
 
 
 def test_derivatives():
@@ -136,4 +136,4 @@ def test_derivatives():
     k = torch.tensor([3.0, 0.1, 1.0, 2.0, 0.5, 4.0], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda c, e: tuple(fresnel_dielectric(c, e)), (cos, eta))
     assert torch.autograd.gradcheck(fresnel_conductor, (cos, eta, k))
-    assert torch.autograd.gradcheck(diffuse_passed, (eta,))
+    assert torch.autograd.gradcheck(diffuse_transmittance, (eta,))

@@ -133,11 +133,11 @@ def test_masking_correlated_by_height():
     wo, wi = towards(70, 1), towards(50, 1, phi=2.0)
     s_o, s_i = mf.stretched_length(wo, au, av), mf.stretched_length(wi, au, av)
     lambda_o, lambda_i = (s_o / wo[2] - 1) / 2, (s_i / wi[2] - 1) / 2
-    ours = mf.correlated(wo[2], s_o, wi[2], s_i) * mf.masking(wo[2], s_o)
+    ours = mf.height_correlated_masking(wo[2], s_o, wi[2], s_i) * mf.masking(wo[2], s_o)
     torch.testing.assert_close(ours, 1 / (1 + lambda_o + lambda_i))
     assert ours > mf.masking(wo[2], s_o) * mf.masking(wi[2], s_i)
     zero = torch.zeros(1).double()
-    assert mf.correlated(zero, s_o, zero, s_i) == 0
+    assert mf.height_correlated_masking(zero, s_o, zero, s_i) == 0
 
 
 def test_the_narrowest_peak_in_float32():
@@ -200,11 +200,11 @@ def test_what_facets_give_back(alpha):
         m = mf.sample_normal(wo, *rough, u)
         wi = mf.reflect(wo, m, dot(wo, m))
         at = mf.reflection(wo, wi, *rough, by_height=True)
-        energy = mf.energy(wo[:, :1], one, None, None)
-        assert abs(float(energy) - float((at.value / at.pdf.clamp_min(1e-30)).mean())) < 3e-3
-        anisotropic = mf.energy(towards(angle, 1), one, one, None, 64, 64)
-        assert abs(float(anisotropic) - float(energy)) < 1e-3
+        directional_albedo = mf.directional_albedo(wo[:, :1], one, None, None)
+        assert abs(float(directional_albedo) - float((at.value / at.pdf.clamp_min(1e-30)).mean())) < 3e-3
+        anisotropic = mf.directional_albedo(towards(angle, 1), one, one, None, 64, 64)
+        assert abs(float(anisotropic) - float(directional_albedo)) < 1e-3
         cos = wo[2, :1]
         both = mf.coat_reflectance(cos, one, eta) + mf.coat_transmittance(cos, one, eta)
         assert 0 < float(both) <= 1 + 1e-3
-        assert float(both) <= float(mf.energy(wo[:, :1], one, None, eta)) + 1e-3
+        assert float(both) <= float(mf.directional_albedo(wo[:, :1], one, None, eta)) + 1e-3

@@ -8,7 +8,7 @@ import pytest
 import torch
 from trials import SIGNIFICANCE, chi_square_p
 
-from torchpt.math.sampling import Discrete, power_heuristic, uniform_sphere
+from torchpt.math.sampling import Distribution1D, power_heuristic, uniform_sphere
 from torchpt.math.vectors import Frame, cross, dot, luminance, normalize, take
 
 G = torch.Generator().manual_seed(4)
@@ -91,7 +91,7 @@ def shares(weights: torch.Tensor) -> torch.Tensor:
 
 def test_discrete_choice_follows_its_weights():
     weights = torch.tensor([0.0, 1.0, 0.0, 3.0, 2.0, 0.0])
-    choice = Discrete.of(weights, torch.float32)
+    choice = Distribution1D.of(weights, torch.float32)
     drawn = choice.draw(torch.rand(120_000, generator=G))[0]
     counts = torch.bincount(drawn, minlength=6).double()
     assert not counts[weights == 0].any()
@@ -102,7 +102,7 @@ def test_discrete_choice_follows_its_weights():
 
 
 def test_what_a_choice_leaves_is_the_place_in_its_interval():
-    choice = Discrete.of(torch.tensor([0.0, 1.0, 0.0, 3.0, 2.0]), torch.float64)
+    choice = Distribution1D.of(torch.tensor([0.0, 1.0, 0.0, 3.0, 2.0]), torch.float64)
     u = torch.rand(10_000, generator=G, dtype=torch.float64)
     outcome, rest = choice.draw(u)
     low = torch.cat((torch.zeros(1), choice.cdf))[outcome]
@@ -113,7 +113,7 @@ def test_what_a_choice_leaves_is_the_place_in_its_interval():
 def test_a_million_tiny_weights_do_not_collapse():
     n = 1_000_000
     weights = torch.full((n,), 1e-12)
-    choice = Discrete.of(weights, torch.float32)
+    choice = Distribution1D.of(weights, torch.float32)
     u = (torch.arange(n, dtype=torch.float64) + 0.5) / n
     drawn = torch.searchsorted(choice.cdf, u, right=True)  # float64 u: each outcome exactly once
     assert (drawn - torch.arange(n)).abs().max() <= 1
@@ -122,7 +122,7 @@ def test_a_million_tiny_weights_do_not_collapse():
     # One a million times brighter takes its share beside 1e5 dim ones (STIFF_CASES 62).
     weights = torch.ones(100_001)
     weights[50_000] = 1e6
-    drawn = Discrete.of(weights, torch.float32).draw(torch.rand(100_000, generator=G))[0]
+    drawn = Distribution1D.of(weights, torch.float32).draw(torch.rand(100_000, generator=G))[0]
     share, expected = float((drawn == 50_000).double().mean()), float(shares(weights)[50_000])
     assert abs(share - expected) < 4 * math.sqrt(expected * (1 - expected) / 1e5)
 
@@ -131,7 +131,7 @@ def test_no_outcome_is_too_rare_for_a_draw_of_24_bits():
     """1,000 lights, one 1e12 times brighter: the others' own share would lie below 2^-24, and their light be lost."""
     weights = torch.ones(1000, dtype=torch.float64)
     weights[500] = 1e12
-    choice = Discrete.of(weights, torch.float32)
+    choice = Distribution1D.of(weights, torch.float32)
     u = torch.arange(1 << 16).float() / (1 << 16) + 2.0**-20
     drawn = torch.bincount(choice.draw(u)[0], minlength=1000).double() / (1 << 16)
     # One over the probability is what a sampled light weighs: what is never drawn must have none.
@@ -142,7 +142,7 @@ def test_no_outcome_is_too_rare_for_a_draw_of_24_bits():
 @pytest.mark.parametrize("weights", [[0.0, 0.0, 0.0], [5.0], [0.0, 1e-30, 0.0], [1e30, 1e30], [1.0, 0.0]])
 def test_extreme_weights(weights):
     w = torch.tensor(weights)
-    choice = Discrete.of(w, torch.float32)
+    choice = Distribution1D.of(w, torch.float32)
     u = torch.tensor([0.0, 2**-24, 0.5, 1 - 2**-24])
     drawn = choice.draw(u)[0]
     assert ((drawn >= 0) & (drawn < len(w))).all()

@@ -95,7 +95,7 @@ def test_a_picture_that_is_missing_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", [kind for kind, packages in PARSERS.items() if packages])
 def test_a_package_that_is_missing_is_named(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchpt.scene.meshes.others.find_spec", lambda name: None)
+    monkeypatch.setattr("torchpt.scene.meshes.trimesh_formats.find_spec", lambda name: None)
     with pytest.raises(AssetError) as caught:
         loaded(tmp_path, kind, b"")
     line = str(caught.value)
@@ -152,7 +152,7 @@ def test_xml_that_declares_entities_is_refused(tmp_path: Path, encoding: str) ->
 
 
 def test_an_archive_that_unfolds_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchpt.scene.meshes.others.MOST_UNFOLDED", 10_000)
+    monkeypatch.setattr("torchpt.scene.meshes.trimesh_formats.MAX_UNPACKED", 10_000)
     with pytest.raises(AssetError, match="unfolds to 20000 bytes, more than 10000"):
         needs(".3mf")
         loaded(tmp_path, ".3mf", zipped(a_model=b" " * 20_000))

@@ -16,9 +16,9 @@ from torch import Tensor
 import torchpt
 from torchpt.compiler import cpu
 from torchpt.core.errors import SceneError
-from torchpt.core.memory import Meter, release_memory
+from torchpt.core.memory import MemoryMeter, release_memory
 from torchpt.nn import Renderer
-from torchpt.nn.ranges import Above, Bounded, Free, Rigid, range_of
+from torchpt.nn.parametrizations import Bounded, LowerBounded, RigidMotion, Unbounded, parametrization_of
 from torchpt.spec import Angle, Color, Index, Scalar
 
 WALL = "materials.wall.reflectance"
@@ -41,13 +41,13 @@ def renderer(scene) -> Renderer:
 ENDS = {
     "albedo": (Color(high=1.0), [0.0, 0.5, 1.0], Bounded),
     "albedo of a third": (Color(high=1.0), [1 / 3, 1e-6, 1 - 1e-6], Bounded),
-    "radiance": (Color(), [17.0, 0.0, 1e-3], Above),
-    "bright radiance": (Color(), [1e6, 2e6, 0.0], Above),
-    "black radiance": (Color(), [0.0, 0.0, 0.0], Above),
-    "radius": (Scalar(above=0.0), 1e-4, Above),
-    "index": (Index(), 1.5, Above),
+    "radiance": (Color(), [17.0, 0.0, 1e-3], LowerBounded),
+    "bright radiance": (Color(), [1e6, 2e6, 0.0], LowerBounded),
+    "black radiance": (Color(), [0.0, 0.0, 0.0], LowerBounded),
+    "radius": (Scalar(above=0.0), 1e-4, LowerBounded),
+    "index": (Index(), 1.5, LowerBounded),
     "angle of view": (Angle(above=0.0, below=180.0), 179.0, Bounded),
-    "anything": (Color(low=None), [-5.0, 0.0, 1e9], Free),
+    "anything": (Color(low=None), [-5.0, 0.0, 1e9], Unbounded),
 }
 
 
@@ -55,7 +55,7 @@ ENDS = {
 def test_a_value_comes_back_and_no_step_leaves_the_range(kind):
     spec, numbers, expected = ENDS[kind]
     value = torch.tensor(numbers)
-    found = range_of(spec, value)
+    found = parametrization_of(spec, value)
     assert type(found) is expected
     x = found.inverse(value)
     assert torch.isfinite(x).all()
@@ -68,7 +68,7 @@ def test_a_value_comes_back_and_no_step_leaves_the_range(kind):
 
 @pytest.mark.parametrize(("end", "inward"), [(0.0, -1.0), (1.0, 1.0)])
 def test_an_albedo_at_an_end_can_leave_it_and_is_not_driven_beyond(end, inward):
-    found = range_of(Color(high=1.0), torch.full((3,), end))
+    found = parametrization_of(Color(high=1.0), torch.full((3,), end))
     x = found.inverse(torch.full((3,), end)).requires_grad_()
     middle = torch.zeros(3, requires_grad=True)
     slope = torch.autograd.grad(inward * found(x).sum(), x)[0].abs()
@@ -80,7 +80,7 @@ def test_an_albedo_at_an_end_can_leave_it_and_is_not_driven_beyond(end, inward):
 
 def test_a_pose_stays_rigid_and_comes_back():
     start = torch.tensor([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
-    found = Rigid(start)
+    found = RigidMotion(start)
     x = found.inverse(start)
     assert torch.equal(found(x), start)
     moved = found(x + torch.tensor([0.3, -0.2, 2.0, 1.0, 0.0, 0.0]))
@@ -89,7 +89,7 @@ def test_a_pose_stays_rigid_and_comes_back():
     torch.testing.assert_close(found(found.inverse(moved)), moved)
     with pytest.raises(ValueError, match="turned and moved"):
         found.inverse(start * 1.5)
-    torch.autograd.gradcheck(Rigid(start.double()), x.double().requires_grad_())
+    torch.autograd.gradcheck(RigidMotion(start.double()), x.double().requires_grad_())
 
 
 @pytest.mark.parametrize("name", ["material_row", "env_teapot", "noise", "thin_lens"])
@@ -374,7 +374,7 @@ def test_thirty_steps_bring_the_loss_down_and_compile_once():
 
 @pytest.mark.slow
 def test_a_thousand_steps_take_no_more_memory_than_a_hundred():
-    meter = Meter(torch.device("cpu"))
+    meter = MemoryMeter(torch.device("cpu"))
     held: list[int] = []
     made: list[tuple[int, int]] = []
 

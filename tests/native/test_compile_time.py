@@ -28,14 +28,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 def test_nested_compilations_count_once(clock):
     before = compile_time.seconds()
-    compile_time.begun()
+    compile_time.begin()
     clock.now += 2.0
     assert compile_time.seconds() - before == 2.0  # one that is under way counts too
-    compile_time.begun()
+    compile_time.begin()
     clock.now += 1.0
-    compile_time.ended()
+    compile_time.end()
     clock.now += 0.5
-    compile_time.ended()
+    compile_time.end()
     clock.now += 7.0
     assert compile_time.seconds() - before == 3.5
 
@@ -58,11 +58,11 @@ def test_a_kernel_that_compiles_at_its_first_call_is_counted():
 
 def test_threads_that_wait_for_each_other_count_once(clock):
     before = compile_time.seconds()
-    compile_time.begun()
-    other = threading.Thread(target=compile_time.begun)
+    compile_time.begin()
+    other = threading.Thread(target=compile_time.begin)
     other.start()
     other.join()
     clock.now += 4.0
-    compile_time.ended()
-    compile_time.ended()
+    compile_time.end()
+    compile_time.end()
     assert compile_time.seconds() - before == 4.0

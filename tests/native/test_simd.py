@@ -192,7 +192,7 @@ def test_sorting(lanes):
 def test_counting_bits():
     @jit()
     def kernel(x):
-        return simd.trailing_zeros(x), simd.population(x)
+        return simd.trailing_zeros(x), simd.popcount(x)
 
     for x in (1, 2, 0x8000, 0b1011000, 2**62, -1):
         bits = f"{x & (2**64 - 1):064b}"

@@ -171,5 +171,5 @@ def test_all_that_follows_paths_is_a_walk(name: str, monkeypatch: pytest.MonkeyP
     scene = torchpt.load("cornell_box", "cpu")
     job(scene)
     assert len(walks) >= expected
-    kind = tensors.Tensors if "tensors" in name or "printed" in name else chunk.Worker
+    kind = tensors.TensorsEngine if "tensors" in name or "printed" in name else chunk.KernelsEngine
     assert all(isinstance(engine, kind) for engine in walks)

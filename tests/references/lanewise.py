@@ -22,10 +22,10 @@ from torch import Tensor
 import torchpt
 from torchpt.compiler.graph import Unsupported
 from torchpt.engines import tensors
-from torchpt.engines.kernels.engine import Chunk, Worker
+from torchpt.engines.kernels.engine import Chunk, KernelsEngine
 from torchpt.engines.kernels.layout import HIT, Memory
 from torchpt.engines.kernels.programs import Kernels
-from torchpt.engines.tensors import Paths, Tensors
+from torchpt.engines.tensors import Paths, TensorsEngine
 from torchpt.math.vectors import rows
 from torchpt.paths import vertex
 from torchpt.paths.integrators.path import partition
@@ -81,7 +81,7 @@ class Differences:
         return [(*key, self.off[key], self.values[key]) for key in found if self.off[key]]
 
 
-class _Recorder(Tensors):
+class _Recorder(TensorsEngine):
     """The engine by tensors, which keeps what its stages were given."""
 
     def __init__(self, wave: Wave, lanes: int) -> None:
@@ -164,7 +164,7 @@ def _listed(index: Tensor) -> Memory:
 
 def _generate(found: Differences, wave: Wave, kernels: Kernels, pixels: int, samples: int) -> None:
     eager = wave.rays(0, pixels, 0, samples)
-    worker, here = Worker(kernels), arena(kernels)
+    worker, here = KernelsEngine(kernels), arena(kernels)
     worker.start(Chunk(0, pixels, 0, samples))
     worker.calls.clear()
     worker.calls.set_dimensions(0)
@@ -180,7 +180,7 @@ def _generate(found: Differences, wave: Wave, kernels: Kernels, pixels: int, sam
 
 
 def run_bounce(
-    worker: Worker, model: int, roulette: bool, state: PathState, hit: Hit, index: Tensor, depth: int
+    worker: KernelsEngine, model: int, roulette: bool, state: PathState, hit: Hit, index: Tensor, depth: int
 ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
     """One kernel on some lanes of a wave.
 
@@ -215,7 +215,7 @@ def run_bounce(
     return values, place >= 0, ended  # type: ignore[return-value]
 
 
-def _routes(worker: Worker, taken: dict[str, Tensor], lists: list[Memory], counts: list[int]) -> None:
+def _routes(worker: KernelsEngine, taken: dict[str, Tensor], lists: list[Memory], counts: list[int]) -> None:
     """Check that the lists name each lane where it belongs: exactly, for the hits that the kernel itself found."""
     kernels = worker.kernels
     hit = Hit(*(taken[name] for name in HIT))
@@ -236,8 +236,8 @@ def _routes(worker: Worker, taken: dict[str, Tensor], lists: list[Memory], count
 
 
 def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorder) -> None:
-    worker, world = Worker(kernels), wave.context.world
-    engine = Tensors(wave, 0)
+    worker, world = KernelsEngine(kernels), wave.context.world
+    engine = TensorsEngine(wave, 0)
     kind = "fused" if kernels.fused else "apart"
     done: set[tuple[int, bool]] = set()
     for model, state, hit, index, depth in recorder.bounces:
@@ -328,12 +328,12 @@ def _floor(name: str) -> float:
 
 def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorder) -> None:
     """Rays from vertices on, and light: the search with the surfaces that let rays through."""
-    worker, engine = Worker(kernels), Tensors(wave, 0)
+    worker, engine = KernelsEngine(kernels), TensorsEngine(wave, 0)
     for depth, state in enumerate(recorder.states, 1):
         hit = engine.hits(state, depth)
         here = arena(kernels, **_fields(state, Hit(*(torch.zeros_like(hit.t) for _ in range(4)))))
         worker.search.nearest(here, len(state.lane))
-        flying, step = len(state.lane) if kernels.passing else 0, 0
+        flying, step = len(state.lane) if kernels.has_transmission else 0, 0
         while flying:
             flying, step = worker.search.transmit(here, flying, depth, step), step + 1
         taken = kernels.state.take(here, np.arange(len(state.lane)), tuple(HIT))
@@ -360,7 +360,7 @@ def _first_hits(found: Differences, wave: Wave, kernels: Kernels, pixels: int, s
     """The preview has no vertices beyond the first: samples are compared whole."""
     tally = RayCounts()
     eager = tensors.brought(wave, wave.rays(0, pixels, 0, samples), tally)
-    worker = Worker(kernels)
+    worker = KernelsEngine(kernels)
     took = worker.trace(Chunk(0, pixels, 0, samples))
     assert took.rays == tally.rays
     slots = torch.from_numpy(worker.slots.floats[:, : pixels * samples].copy())

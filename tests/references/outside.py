@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from torchpt.spec import Choice, Flag, Spec, Whole
+from torchpt.spec import Choice, Flag, Integer, Spec
 
 __all__ = ["numbers_outside", "values_outside"]
 
@@ -24,9 +24,9 @@ def numbers_outside(spec: Spec) -> list[float]:
 
 def values_outside(spec: Spec) -> list[Any]:
     """What a file may not give."""
-    if hasattr(spec, "low") and not isinstance(spec, Whole):
+    if hasattr(spec, "low") and not isinstance(spec, Integer):
         return [*numbers_outside(spec), True, "much", [1, 2]]
-    if isinstance(spec, Whole):
+    if isinstance(spec, Integer):
         below = spec.low - 1 if spec.low - 1 not in spec.also else spec.low - 2
         return [below, spec.high + 1, spec.low + 0.5, "many", True]
     if isinstance(spec, Choice):

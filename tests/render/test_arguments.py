@@ -17,9 +17,17 @@ import torch
 import torchpt
 from torchpt.cli.arguments import GROUPS, path_keys
 from torchpt.core.errors import SceneError
-from torchpt.scene.settings import BLOCKS, RECORDS, Common, CommonOptions, Render, RenderOptions, TraceOptions
+from torchpt.scene.settings import (
+    BLOCKS,
+    UNTYPED_BLOCKS,
+    BatchOptions,
+    CommonOptions,
+    Render,
+    RenderOptions,
+    TraceOptions,
+)
 from torchpt.spec import Role, parameters_of
-from torchpt.spec.arguments import declared, spelled
+from torchpt.spec.arguments import arguments_of, expand_signature
 
 ROOT = Path(__file__).parents[2]
 BALL: dict[str, Any] = {
@@ -40,15 +48,15 @@ def scene() -> torchpt.Scene:
     [
         (torchpt.render, ("scene", "full"), CommonOptions),
         (torchpt.trace, ("scene", "o", "d", "spp", "seed", "params"), TraceOptions),
-        (torchpt.render_batch, ("scenes", "cameras", "params", "seed", "on_progress", "full"), Common),
-        (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "full"), Common),
-        (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), Common),
+        (torchpt.render_batch, ("scenes", "cameras", "params", "seed", "on_progress", "full"), BatchOptions),
+        (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "full"), BatchOptions),
+        (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), BatchOptions),
     ],
 )
 def test_signatures_spell_every_argument_out(function: Any, own: tuple[str, ...], form: Any) -> None:
     signature = inspect.signature(function)
-    assert tuple(signature.parameters) == (*own, *declared(form))
-    for name, argument in declared(form).items():
+    assert tuple(signature.parameters) == (*own, *arguments_of(form))
+    for name, argument in arguments_of(form).items():
         shown = signature.parameters[name]
         assert (shown.kind, shown.default, shown.annotation) == (shown.KEYWORD_ONLY, argument.default, argument.type)
 
@@ -61,7 +69,7 @@ def test_signatures_are_as_they_were_written_by_hand() -> None:
 
 def test_help_says_what_each_argument_is() -> None:
     lines = [line.strip() for line in (inspect.getdoc(torchpt.render) or "").splitlines()]
-    for name, argument in declared(CommonOptions).items():
+    for name, argument in arguments_of(CommonOptions).items():
         assert sum(line.startswith(f"{name}: {argument.spec.doc}") for line in lines) == 1
     assert (
         "spp: samples a pixel; a limit of time or error may end sooner (a whole number 1..2147483647; None: 64)"
@@ -71,13 +79,16 @@ def test_help_says_what_each_argument_is() -> None:
 
 def test_the_block_of_scene_files_has_the_settings_among_them() -> None:
     own = {"params", "full", "dtype", "adjoint", "seed_grad", "spp_grad", "edges", "edge_spp", "ranks"}
-    assert {*declared(RenderOptions)} - own == {*parameters_of(Render), *BLOCKS} - {"preview", "render"}
+    assert {*arguments_of(RenderOptions)} - own == {*parameters_of(Render), *BLOCKS} - {"preview", "render"}
 
 
 def test_the_command_line_knows_blocks_and_files() -> None:
     assert GROUPS == BLOCKS
     files = {
-        f"{b}.{name}" for b, r in RECORDS.items() for name, s in parameters_of(r).items() if "file path" in s.words
+        f"{b}.{name}"
+        for b, r in UNTYPED_BLOCKS.items()
+        for name, s in parameters_of(r).items()
+        if "file path" in s.words
     }
     assert {*path_keys()} == files == {"render.checkpoint", "render.preview"}
 
@@ -88,12 +99,12 @@ def test_an_argument_without_a_spec_is_no_declaration() -> None:
 
     Form.__annotations__["plain"] = int
     with pytest.raises(TypeError, match=r"Form.plain has no spec"):
-        declared(Form)
+        arguments_of(Form)
 
 
 def test_what_a_function_says_itself_comes_first() -> None:
-    @spelled
-    def f(scene: int, *, seed: int = 0, **wishes: Unpack[Common]) -> None:
+    @expand_signature
+    def f(scene: int, *, seed: int = 0, **wishes: Unpack[BatchOptions]) -> None:
         """Do it."""
 
     assert tuple(inspect.signature(f).parameters)[:3] == ("scene", "seed", "spp")
@@ -141,7 +152,7 @@ def test_wrong_values_are_errors_of_a_line(scene: torchpt.Scene, wishes: Any, sa
 
 
 def test_none_is_what_nobody_said(scene: torchpt.Scene) -> None:
-    unsaid = {name: argument.default for name, argument in declared(CommonOptions).items()}
+    unsaid = {name: argument.default for name, argument in arguments_of(CommonOptions).items()}
     wishes: Any = {**unsaid, "spp": 1, "compile": "off"}
     assert torch.equal(torchpt.render(scene, **wishes), torchpt.render(scene, spp=1, compile="off"))
 

@@ -378,7 +378,7 @@ def counted(monkeypatch):
     plain = loop_kernels.Kernels._make
 
     def make(self, key, *rest):
-        known = self.handed._kernels.get(key)
+        known = self.kernel_cache._kernels.get(key)
         kernel = plain(self, key, *rest)
         if known is None or kernel is not known[0]:
             made["tables"].append(key[0])
@@ -508,14 +508,14 @@ def test_an_error_names_its_scene(threads, compiled):
 
 @pytest.mark.parametrize("compiled", ("auto", "off"))
 def test_an_error_names_its_parameters(monkeypatch, compiled):
-    scene, took = room(), Run.took
+    scene, task_finished = room(), Run.task_finished
 
     def failing(self, share):
         if float(self.wave.camera.to_world[0, 3]) > 1.5:
             raise RenderError("broken")
-        return took(self, share)
+        return task_finished(self, share)
 
-    monkeypatch.setattr(Run, "took", failing)
+    monkeypatch.setattr(Run, "task_finished", failing)
     given = poses(scene, 3)
     given[2, 0, 3] = 2.0
     with pytest.raises(RenderError, match=r"^params\[2\]: broken"):
@@ -539,14 +539,14 @@ def test_too_many_seeds_for_what_an_iterator_gives(make):
 
 def test_a_picture_that_renders_alone_is_not_blamed_for_one_before(monkeypatch):
     bad, alone = room(render={"spp": 512, "threads": 1}), room(render={"time_limit": 5.0, "threads": 1})
-    took = Run.took
+    task_finished = Run.task_finished
 
     def failing(self, share):
         if share is not None and self.scene is bad:
             raise RenderError("broken")
-        return took(self, share)
+        return task_finished(self, share)
 
-    monkeypatch.setattr(Run, "took", failing)
+    monkeypatch.setattr(Run, "task_finished", failing)
     with pytest.raises(RenderError, match=r"^scenes\[0\]: broken"):
         torchpt.render_batch([bad, alone])
 
@@ -555,7 +555,7 @@ def test_a_picture_that_renders_alone_is_not_blamed_for_one_before(monkeypatch):
 def test_nothing_piles_up():
     """Workers go from scene to scene, and scenes without gradients go once they are rendered."""
     made, alive, seen = [], weakref.WeakSet(), []
-    plain = engine.Worker.__init__
+    plain = engine.KernelsEngine.__init__
 
     def counting(self, *args):
         made.append(True)
@@ -572,20 +572,20 @@ def test_nothing_piles_up():
         seen.append(len(alive))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine.Worker, "__init__", counting)
+        patch.setattr(engine.KernelsEngine, "__init__", counting)
         torchpt.render_batch(scenes(), threads=2, on_progress=watch)
     assert len(made) <= 4 and max(seen) <= 8
 
 
 def test_what_watches_may_raise():
-    class Stop(Exception):
+    class StopRules(Exception):
         pass
 
     def stop(done: int, total: int | None) -> None:
         if done == 2:
-            raise Stop
+            raise StopRules
 
-    with pytest.raises(Stop):
+    with pytest.raises(StopRules):
         torchpt.render_batch([room(0.1 * k) for k in range(4)], on_progress=stop, threads=2)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 import torchpt
 from torchpt.core.errors import RenderError, SceneError
 from torchpt.rendering.run import Run
-from torchpt.scene.versions import Editions
+from torchpt.scene.versions import VersionCounter
 
 WALL, BALL, SKY = "materials.wall.reflectance", "materials.ball.reflectance", "lights.sky.radiance"
 SCENE: dict[str, Any] = {
@@ -41,7 +41,7 @@ def gradient(scene: torchpt.Scene) -> tuple[Tensor, Tensor]:
 
 
 def test_editions_are_numbered() -> None:
-    versions, params = Editions(), {"a": torch.zeros(2), "b": torch.zeros(2)}
+    versions, params = VersionCounter(), {"a": torch.zeros(2), "b": torch.zeros(2)}
     first = versions.of(params)
     assert first == versions.of(params) and min(first.values()) > 0
     params["a"].add_(1)
@@ -136,8 +136,10 @@ def test_what_a_batch_returns_can_be_used_outside_of_inference_mode(scene: torch
 def test_renders_that_are_taken_alone_have_all_threads(scene: torchpt.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a batch, while other pictures are traced."""
     threads: list[int] = []
-    go = Run.go
-    monkeypatch.setattr(Run, "go", lambda self, told: (threads.append(self.engine.budget.threads), go(self, told))[1])
+    sample_all = Run.sample_all
+    monkeypatch.setattr(
+        Run, "sample_all", lambda self, told: (threads.append(self.engine.budget.threads), sample_all(self, told))[1]
+    )
     timed = torchpt.load({**SCENE, "render": {"spp": 4, "time_limit": 100.0}}, "cpu")
     torchpt.render_batch([scene, timed], threads=2, compile="on")
     assert threads == [2]

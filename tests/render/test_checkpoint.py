@@ -106,8 +106,10 @@ def test_passes_are_short_enough_for_checkpoints(box: torchpt.Scene, tmp_path: P
     monkeypatch.setattr(checkpoint, "EVERY", 0.05)
     monkeypatch.setattr("torchpt.rendering.run.EVERY", 0.05)
     written: list[float] = []
-    write = checkpoint.Keeper.write
-    monkeypatch.setattr(checkpoint.Keeper, "write", lambda *given: (written.append(time.perf_counter()), write(*given)))
+    write = checkpoint.CheckpointFile.write
+    monkeypatch.setattr(
+        checkpoint.CheckpointFile, "write", lambda *given: (written.append(time.perf_counter()), write(*given))
+    )
     shot(box, film=film_of(128), spp=256, checkpoint=str(tmp_path / "a.ckpt"))
     apart = np.diff(written)
     assert len(written) > 4 and float(np.median(apart)) < 0.3

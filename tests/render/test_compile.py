@@ -12,8 +12,8 @@ from trials import film_of
 import torchpt
 from torchpt.core.errors import SceneError
 from torchpt.engines.kernels import programs
-from torchpt.engines.kernels.threads import Loop
-from torchpt.rendering import looped, scene_cache
+from torchpt.engines.kernels.threads import KernelsForward
+from torchpt.rendering import scene_cache, uses_kernels
 from torchpt.rendering.api import Rendering, render_scene
 from torchpt.scene.formats.description import settings
 
@@ -29,25 +29,25 @@ def run(scene: torchpt.Scene, spp: int, mode: str | bool, seed: int = 1, **more:
 def passes(monkeypatch) -> list[int]:
     """Samples of each pass that the loop took."""
     taken: list[int] = []
-    original = Loop.run
+    original = KernelsForward.run
 
-    def noted(self: Loop, spans: Any, each: Any) -> bool:
+    def noted(self: KernelsForward, spans: Any, each: Any) -> bool:
         taken.append(spans[0][2])
         return original(self, spans, each)
 
-    monkeypatch.setattr(Loop, "run", noted)
+    monkeypatch.setattr(KernelsForward, "run", noted)
     return taken
 
 
 @pytest.mark.parametrize(
-    ("mode", "looped"), [("auto", True), ("on", True), (True, True), ("off", False), (False, False)]
+    ("mode", "uses_kernels"), [("auto", True), ("on", True), (True, True), ("off", False), (False, False)]
 )
-def test_auto_and_on_take_the_loop(passes, mode, looped):
+def test_auto_and_on_take_the_loop(passes, mode, uses_kernels):
     scene = torchpt.load("cornell_box", device="cpu")
     found = run(scene, 8, mode)
-    assert sum(passes) == (8 if looped else 0)
+    assert sum(passes) == (8 if uses_kernels else 0)
     assert found.eager == ()
-    assert (scene_cache(scene).kernels is not None) == looped
+    assert (scene_cache(scene).kernels is not None) == uses_kernels
 
 
 def test_the_summary_tells_the_time_that_compiling_took(monkeypatch):
@@ -84,8 +84,8 @@ def test_on_is_refused_away_from_a_cpu():
     device, box = torch.device("cuda:0"), torchpt.load("cornell_box", device="cpu").description
     on, auto = (settings(box, {"render": {"compile": mode}}) for mode in ("on", "auto"))
     with pytest.raises(SceneError, match=r"render.compile: .* auto or off \(kernels run on a CPU; .* on cuda:0\)"):
-        looped(on, device, torch.float32)
-    assert not looped(auto, device, torch.float32) and looped(on, torch.device("cpu"), torch.float32)
+        uses_kernels(on, device, torch.float32)
+    assert not uses_kernels(auto, device, torch.float32) and uses_kernels(on, torch.device("cpu"), torch.float32)
 
 
 def test_a_cpu_needs_no_compiler_of_the_system(monkeypatch):

@@ -22,7 +22,7 @@ import torchpt
 from torchpt.compiler import cache, cpu
 from torchpt.compiler.cpu import Target
 from torchpt.compiler.form import CAPACITY, SCALAR, VECTORS
-from torchpt.compiler.kernel import text
+from torchpt.compiler.kernel import kernel_ir
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.sinks import Sinks
 from torchpt.engines.kernels import engine as calls
@@ -44,10 +44,10 @@ def stages(monkeypatch) -> Iterator[dict[str, TracedStage]]:
         return program
 
     monkeypatch.setattr(cache, "compiled", noted)
-    monkeypatch.setattr(cache, "key_of", lambda structure: None)
-    cache.forget()
+    monkeypatch.setattr(cache, "cache_key", lambda structure: None)
+    cache.clear_programs()
     yield found
-    cache.forget()
+    cache.clear_programs()
 
 
 class ErrorProbes:
@@ -95,7 +95,7 @@ class ErrorProbes:
     def _single(self, kernel: Kernel, stage: TracedStage) -> Kernel:
         """The kernel on one lane at a time."""
         if id(kernel) not in self._singles:
-            made = cpu.compiled(text(stage, SCALAR), one_lane())
+            made = cpu.compiled(kernel_ir(stage, SCALAR), one_lane())
             single = replace(kernel, program=replace(kernel.program, call=made.call, code=made.key))
             self._singles[id(kernel)] = kernel, single  # both live, so that their ids stay their own
         return self._singles[id(kernel)][1]
@@ -106,11 +106,11 @@ def spans(sinks: Sinks, count: int, before: np.ndarray, after: np.ndarray) -> It
     shift = 0 if sinks.shift is None else int(before[sinks.shift])
     for row, _ in sinks.write:
         yield 0, row, shift, shift + count
-    for pack in sinks.pack:
-        for row, _ in pack.rows:
-            yield 0, row, int(before[pack.counter]), int(after[pack.counter])
-    for note in [*sinks.notes, *(note for pack in sinks.pack for note in pack.notes)]:
-        yield 3 + note.list, 0, int(before[note.counter]), int(after[note.counter])
+    for compact in sinks.compact:
+        for row, _ in compact.rows:
+            yield 0, row, int(before[compact.counter]), int(after[compact.counter])
+    for append in [*sinks.appends, *(append for compact in sinks.compact for append in compact.appends)]:
+        yield 3 + append.list, 0, int(before[append.counter]), int(after[append.counter])
     for scatter in sinks.scatter:
         for row, _ in () if scatter.slots else scatter.rows:
             yield 0, row, 0, CAPACITY - VECTORS.width
@@ -121,9 +121,9 @@ SCENES = {
     "cornell_box": {"generate", "emit", "bounce"},
     "cornell_spheres": {"generate", "emit", "bounce"},
     "veach_mis": {"generate", "emit", "bounce"},
-    "shapes_and_maps": {"generate", "settle", "emit", "escape", "bounce", "transmit", "sift"},
-    "env_teapot": {"generate", "settle", "escape", "bounce"},
-    "many_lights": {"generate", "settle", "emit", "bounce"},
+    "shapes_and_maps": {"generate", "sort_lanes", "emit", "escape", "bounce", "transmit", "list_transmitting"},
+    "env_teapot": {"generate", "sort_lanes", "escape", "bounce"},
+    "many_lights": {"generate", "sort_lanes", "emit", "bounce"},
 }
 FAST = ("cornell_box",)
 
@@ -150,7 +150,7 @@ def test_pictures_and_gradients(name, monkeypatch):
         pytest.skip("these are x86 machines that have what Haswell has")
 
     def made() -> list[Tensor]:
-        cache.forget()
+        cache.clear_programs()
         scene = torchpt.load(room(COLOURED), "cpu")
         picture = torchpt.render(scene, spp=4, **SMALL)
         return [picture, gradient_of(scene, "materials.plate.base_color", adjoint="replay")]
@@ -160,7 +160,7 @@ def test_pictures_and_gradients(name, monkeypatch):
     other = made()
     assert sum(cpu.counts()) > sum(before)  # kernels of their own
     monkeypatch.undo()
-    cache.forget()
+    cache.clear_programs()
     assert float(vectors[1].norm()) > 0
     for a, b in zip(vectors, other, strict=True):
         assert not differing(a, b).any()

@@ -25,7 +25,7 @@ from torchpt.engines.kernels import threads
 from torchpt.physics.film import FILTERS
 from torchpt.physics.samplers import KINDS as SAMPLERS
 from torchpt.rendering.api import Rendering, render_scene
-from torchpt.rendering.stopping import Stop
+from torchpt.rendering.stopping import StopRules
 from torchpt.scene.formats.description import settings
 
 #: Nothing here is a whole number of vectors, and five samples are passes of 2, 2 and 1.
@@ -182,7 +182,7 @@ def same(a: Rendering, b: Rendering) -> bool:
     )
 
 
-def one_by_one(self: Stop, taken: int) -> int:
+def one_by_one(self: StopRules, taken: int) -> int:
     """Passes of one sample each."""
     return int(taken < self.render.spp)
 
@@ -209,15 +209,15 @@ def test_the_same_bits(scene_of, monkeypatch, name, mode):
     scene, wish = scene_of(name), ROWS[name].wish
     whole = shot(scene, wish, mode)
     assert whole.complete and float(whole.image.amax()) > 0
-    monkeypatch.setattr(threads, "FEWEST", 16)  # else a film so small is one task
+    monkeypatch.setattr(threads, "MIN_TASK_LANES", 16)  # else a film so small is one task
     for column, changed in COLUMNS[mode].items():
         assert same(shot(scene, wish, mode, **changed), whole), column
     if mode == "compiled":
         with monkeypatch.context() as patched:
-            patched.setattr(Stop, "step", one_by_one)
+            patched.setattr(StopRules, "step", one_by_one)
             assert same(shot(scene, wish, mode), whole), "passes"
     else:
-        monkeypatch.setattr(Stop, "step", one_by_one)
+        monkeypatch.setattr(StopRules, "step", one_by_one)
     part = shot(scene, wish, mode, {"crop": [4, 2, 11, 9]})
     assert torch.equal(part.image, whole.image[2:11, 4:15]), "crop"
     assert all(torch.equal(part.layers[layer], whole.layers[layer][2:11, 4:15]) for layer in part.layers), "crop"
@@ -244,7 +244,7 @@ def test_tasks_of_the_loop(scene_of, monkeypatch, tasks, fewest):
     scene, wish = scene_of("opacity"), {"film": {"filter": "mitchell", "aovs": LAYERS, **film_of(37, 23)}}
     whole = shot(scene, wish, "compiled", spp=15)
     monkeypatch.setattr(threads, "TASKS", tasks)
-    monkeypatch.setattr(threads, "FEWEST", fewest)
+    monkeypatch.setattr(threads, "MIN_TASK_LANES", fewest)
     assert same(shot(scene, wish, "compiled", spp=15, threads=2), whole)
 
 

@@ -18,9 +18,9 @@ from significance import t_limit
 from trials import coarse, film_of
 
 import torchpt
-from torchpt.engines.kernels.engine import Chunk, Worker
+from torchpt.engines.kernels.engine import Chunk, KernelsEngine
 from torchpt.engines.kernels.layout import HIT
-from torchpt.engines.kernels.threads import Loop
+from torchpt.engines.kernels.threads import KernelsForward
 from torchpt.math.vectors import rows
 from torchpt.paths.layers import LAYERS
 from torchpt.paths.vertex import STRATEGIES
@@ -102,14 +102,14 @@ def test_kernels_of_strategies(strategy):
 
 
 def test_what_goes_where_after_a_hit():
-    """``settle`` makes no arithmetic: lists, ends and light of shadow rays are exact."""
+    """``sort_lanes`` makes no arithmetic: lists, ends and light of shadow rays are exact."""
     described = showcase("lace", "glass", "diffuse")
     described["shapes"]["lamp"]["radius"] = 0.9  # so that some lanes meet it
     scene = loaded(described)
     wave, _ = prepared(scene, {"film": film_of(32), "render": {"spp": 4}})
     with torch.no_grad():
         kernels = kernels_of(scene, wave)
-        worker, recorder = Worker(kernels), waves(wave, 1024, 4)
+        worker, recorder = KernelsEngine(kernels), waves(wave, 1024, 4)
         assert not kernels.fused and kernels.has_environment and kernels.has_emitters and kernels.models == 2
         _, state, hit, _, _ = next(found for found in recorder.bounces if found[4] == 2)
         n = len(state.lane)
@@ -123,7 +123,7 @@ def test_what_goes_where_after_a_hit():
         )  # fmt: skip
         worker.calls.clear()
         lists = worker.room(1).lists
-        worker.calls.run(kernels.settle(True), n, here, here, lists=lists)
+        worker.calls.run(kernels.sort_lanes(True), n, here, here, lists=lists)
         _, places = worker.calls.counted()
         wanted = torch.addcmul(state.radiance, light, clear)
         held = kernels.state.take(here, np.arange(n), ("radiance",))["radiance"]
@@ -143,7 +143,7 @@ def test_what_goes_where_after_a_hit():
 
 @pytest.mark.parametrize("clamp", [None, 0.75])
 def test_samples_enter_the_film_as_eagerly(clamp):
-    """``deposit`` is exact: sums in float64, samples that are not finite black and counted."""
+    """``accumulate`` is exact: sums in float64, samples that are not finite black and counted."""
     scene = loaded("cornell_box")
     wave, _ = prepared(scene, {"film": film_of(20, 10), "render": {"spp": 6}})
     kernels = kernels_of(scene, wave)
@@ -152,8 +152,8 @@ def test_samples_enter_the_film_as_eagerly(clamp):
     for place, bad in (((0, 2, 7), math.nan), ((1, 5, 199), math.inf), ((2, 0, 0), -math.inf), ((0, 0, 0), math.nan)):
         values[place] = bad
     films = [Film(20, 10, 2, torch.device("cpu")) for _ in range(2)]
-    loop = Loop(kernels, 1, clamp, False)
-    worker = Worker(kernels)
+    loop = KernelsForward(kernels, 1, clamp, False)
+    worker = KernelsEngine(kernels)
     finite = torch.isfinite(values).all(0)
     eager = torch.where(finite, values, 0.0)
     if clamp is not None:
@@ -163,7 +163,7 @@ def test_samples_enter_the_film_as_eagerly(clamp):
             part = values[:, first : first + 3, start : start + count].reshape(3, -1)
             worker.slots.floats[:, : part.shape[1]] = part.numpy()
             chunk = Chunk(start, count, first, 3)
-            bad = loop._deposit(worker, worker.slots.floats, chunk, films[0], 3, clamp)
+            bad = loop._accumulate(worker, worker.slots.floats, chunk, films[0], 3, clamp)
             there = slice(start, start + count)
             assert bad == int((~finite[first : first + 3, there]).sum())
             films[1].add(eager[:, first : first + 3, there], start, first)
@@ -255,15 +255,15 @@ def test_pictures_of_shipped_scenes(name):
 
 def test_a_picture_that_differs_is_found(monkeypatch):
     """A hundredth more light in one block of sixteen is seen."""
-    scene, kept = loaded("cornell_box"), Worker.trace
+    scene, kept = loaded("cornell_box"), KernelsEngine.trace
 
-    def brighter(self: Worker, chunk: Chunk) -> Any:
+    def brighter(self: KernelsEngine, chunk: Chunk) -> Any:
         tally = kept(self, chunk)
         places = np.arange(chunk.pixels * chunk.samples) % chunk.pixels + chunk.first_pixel
         self.slots.floats[:, : len(places)][:, (places % 32 < 8) & (places < 8 * 32)] *= 1.01
         return tally
 
-    monkeypatch.setattr(Worker, "trace", brighter)
+    monkeypatch.setattr(KernelsEngine, "trace", brighter)
     assert paired(scene, {}, 32, 4) > 1.0
 
 
@@ -348,7 +348,7 @@ def test_the_same_rays_in_another_order(name):
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():
         kernels = kernels_of(scene, wave)
-        worker, compared = Worker(kernels), 0
+        worker, compared = KernelsEngine(kernels), 0
         for model, state, hit, index, depth in waves(wave, 1024, 4).bounces:
             order = torch.randperm(len(index), generator=generator)
             there = torch.randperm(len(state.lane), generator=generator)
@@ -380,7 +380,7 @@ def test_searches_do_not_depend_on_the_packet(name):
     with torch.no_grad():
         kernels = kernels_of(scene, wave)
         kernels = type(kernels)(wave, kernels.packets, False)
-        worker, states = Worker(kernels), waves(wave, 1024, 4).states
+        worker, states = KernelsEngine(kernels), waves(wave, 1024, 4).states
         state = states[1]
         n = len(state.lane)
 

@@ -19,7 +19,7 @@ from trials import film_of
 
 import torchpt
 from torchpt.core.errors import RenderError
-from torchpt.engines.kernels.engine import Chunk, Worker
+from torchpt.engines.kernels.engine import Chunk, KernelsEngine
 from torchpt.paths.wave import RayCounts
 from torchpt.rendering.api import Progress, Rendering, render_scene
 from torchpt.scene.formats.description import settings
@@ -51,9 +51,9 @@ def same(a: Rendering, b: Rendering) -> bool:
 def broken(monkeypatch) -> set[tuple[int, int]]:
     """Samples ``(pixel, sample)`` that come out as NaN or infinite."""
     chosen: set[tuple[int, int]] = set()
-    kept = Worker.trace
+    kept = KernelsEngine.trace
 
-    def spoiled(self: Worker, chunk: Chunk) -> RayCounts:
+    def spoiled(self: KernelsEngine, chunk: Chunk) -> RayCounts:
         tally = kept(self, chunk)
         for number, (pixel, sample) in enumerate(sorted(chosen)):
             s, p = sample - chunk.first_sample, pixel - chunk.first_pixel
@@ -61,7 +61,7 @@ def broken(monkeypatch) -> set[tuple[int, int]]:
                 self.slots.floats[number % 3, s * chunk.pixels + p] = (math.nan, math.inf, -math.inf)[number % 3]
         return tally
 
-    monkeypatch.setattr(Worker, "trace", spoiled)
+    monkeypatch.setattr(KernelsEngine, "trace", spoiled)
     return chosen
 
 
@@ -131,15 +131,15 @@ def test_an_error_in_a_task_ends_the_render(monkeypatch, threads):
     scene = torchpt.load("cornell_box", "cpu")
     film = film_of(64)
     whole, before = rendered(scene, 4, film), set(threading.enumerate())
-    kept = Worker.trace
+    kept = KernelsEngine.trace
 
-    def fails(self: Worker, chunk: Chunk) -> RayCounts:
+    def fails(self: KernelsEngine, chunk: Chunk) -> RayCounts:
         if chunk.first_pixel > 1000:
             raise RuntimeError("out of order")
         return kept(self, chunk)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Worker, "trace", fails)
+        patched.setattr(KernelsEngine, "trace", fails)
         begin = time.monotonic()
         with pytest.raises(RuntimeError, match="out of order"), few_lanes(500):
             rendered(scene, 4, film, threads=threads)
@@ -212,7 +212,7 @@ def test_a_worker_is_used_again_as_if_new():
     wave, _ = prepared(scene, {"film": film_of(40), "render": {"spp": 4}})
     with torch.no_grad():
         kernels = kernels_of(scene, wave)
-    worker, fresh = Worker(kernels), Worker(kernels)
+    worker, fresh = KernelsEngine(kernels), KernelsEngine(kernels)
     rooms = [memory for depth in (1, 2) for memory in (worker.room(depth).arena, *worker.room(depth).lists)]
     for memory in (*rooms, *worker.search.passed, worker.slots):
         memory.words[:] = np.float32(np.nan).view(np.int32) if memory.words.shape[0] > 1 else 5

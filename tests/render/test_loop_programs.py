@@ -342,7 +342,7 @@ def test_a_stage_that_turns_out_not_to_compile_renders_all_eagerly(monkeypatch, 
         raise Unsupported("the operator nothing_of_the_kind")
 
     monkeypatch.setattr(Kernels, "emit", refuses)
-    monkeypatch.setattr(Kernels, "retire", refuses)
+    monkeypatch.setattr(Kernels, "terminate", refuses)
     for _ in range(2):
         found = rendered(scene, render={"compile": "auto"})
         assert torch.equal(found.image, eager.image) and found.rays == eager.rays

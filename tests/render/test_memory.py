@@ -24,7 +24,7 @@ from torchpt.core.errors import RenderError, SceneError, warn_once
 from torchpt.core.memory import is_out_of_memory, release_memory
 from torchpt.engines.kernels import layout
 from torchpt.engines.kernels import threads as spare
-from torchpt.engines.kernels.engine import Worker
+from torchpt.engines.kernels.engine import KernelsEngine
 
 #: How allocations fail, on a CPU and on CUDA.
 FAILURES: dict[str, Callable[[], Exception]] = {
@@ -56,7 +56,7 @@ def box() -> torchpt.Scene:
 
 
 @contextmanager
-def in_pieces(which: Callable[[int], bool], error: Callable[[], Exception]) -> Iterator[list[int]]:
+def map_in_pieces(which: Callable[[int], bool], error: Callable[[], Exception]) -> Iterator[list[int]]:
     """Context in which operations within pieces of passes fail, counted over the whole render; gives how many there were."""
     from torchpt.engines.tensors_forward import TensorsForward
 
@@ -98,14 +98,14 @@ def same(a: Any, b: Any) -> bool:
 @pytest.mark.slow
 def test_a_failure_at_any_operation_of_a_piece_changes_no_bit(box, step):
     """Each operation of a render fails once, the copies into the films included."""
-    with in_pieces(lambda k: False, MemoryError) as counted:
+    with map_in_pieces(lambda k: False, MemoryError) as counted:
         whole = eager(box)
     count = counted[0]
     assert count > 300 and whole.lanes is None
     kinds = list(FAILURES.values())
     # The last ones are those that put the piece into the films.
     for number in (*range(0, count - 25, step), *range(count - 25, count)):
-        with in_pieces(lambda k, number=number: k == number, kinds[number % len(kinds)]):
+        with map_in_pieces(lambda k, number=number: k == number, kinds[number % len(kinds)]):
             found = eager(box)
         assert same(found, whole), number
 
@@ -115,7 +115,7 @@ def test_a_failure_at_any_operation_of_a_piece_changes_no_bit(box, step):
 def test_failures_again_and_again_halve_waves_further(box, kind, capsys):
     warn_once.cache_clear()
     whole = eager(box, 24, pilots=True)
-    with in_pieces(lambda k: k in (299, 1010, 1300, 1700), FAILURES[kind]):
+    with map_in_pieces(lambda k: k in (299, 1010, 1300, 1700), FAILURES[kind]):
         found = eager(box, 24, pilots=True)
     assert same(found, whole) and found.lanes is not None and found.lanes < 13
     assert found.summary()["lanes"] == found.lanes
@@ -125,7 +125,7 @@ def test_failures_again_and_again_halve_waves_further(box, kind, capsys):
 @pytest.mark.slow
 def test_where_a_single_lane_does_not_fit_it_is_one_line(box):
     with (
-        in_pieces(lambda k: True, MemoryError),
+        map_in_pieces(lambda k: True, MemoryError),
         pytest.raises(RenderError, match="not enough memory for a wave") as told,
     ):
         eager(box)
@@ -136,7 +136,7 @@ def test_other_errors_are_not_taken_for_it(box):
     def other() -> Exception:
         return RuntimeError("shapes do not match")
 
-    with in_pieces(lambda k: k == 40, other), pytest.raises(RuntimeError, match="shapes"):
+    with map_in_pieces(lambda k: k == 40, other), pytest.raises(RuntimeError, match="shapes"):
         eager(box)
     assert not is_out_of_memory(RenderError("not enough memory for it")) and not is_out_of_memory(ValueError("memory"))
     assert is_out_of_memory(OSError(12, "Cannot allocate memory"))
@@ -168,7 +168,7 @@ def backward_failing(
 ) -> tuple[torch.Tensor, int]:
     """The gradient where operations within chunks fail, and how many operations there were."""
     module = importlib.import_module("torchpt.gradients." + {"autograd": "tape", "replay": "replay"}[adjoint])
-    counted, original = [0], module.piece
+    counted, original = [0], module.chunk_sums
 
     def failing(*args: Any) -> Any:
         with Fails(lambda k: which(counted[0] + k), MemoryError) as mode:
@@ -178,7 +178,7 @@ def backward_failing(
                 counted[0] += mode.count
 
     with monkeypatch.context() as patched:
-        patched.setattr(module, "piece", failing)
+        patched.setattr(module, "chunk_sums", failing)
         return gradient(scene, adjoint), counted[0]
 
 
@@ -226,25 +226,25 @@ def test_the_compiled_loop_goes_on_with_one_thread_and_fewer_lanes(box, monkeypa
 
 @pytest.mark.parametrize("method", ["trace", "layers"])
 def test_chunks_of_the_loop_are_added_whole(box, monkeypatch, method):
-    whole, kept, calls = looped(box), getattr(Worker, method), [0]
+    whole, kept, calls = looped(box), getattr(KernelsEngine, method), [0]
 
-    def failing(self: Worker, *args: Any) -> Any:
+    def failing(self: KernelsEngine, *args: Any) -> Any:
         calls[0] += 1
         found = kept(self, *args)
         if calls[0] % 5 == 3 and calls[0] < 30:
             raise MemoryError
         return found
 
-    monkeypatch.setattr(Worker, method, failing)
+    monkeypatch.setattr(KernelsEngine, method, failing)
     assert same(looped(box), whole)
 
 
 @pytest.mark.slow
 def test_the_loop_ends_in_a_line_where_nothing_fits(box, monkeypatch):
-    def failing(self: Worker, *args: Any) -> Any:
+    def failing(self: KernelsEngine, *args: Any) -> Any:
         raise MemoryError
 
-    monkeypatch.setattr(Worker, "trace", failing)
+    monkeypatch.setattr(KernelsEngine, "trace", failing)
     with pytest.raises(RenderError, match="not enough memory for the compiled loop on one thread"):
         looped(box)
 
@@ -389,7 +389,7 @@ def test_memory_of_threads_is_bounded_and_holds_no_scene(monkeypatch):
     gc.collect()
     assert watch() is None and spare._kept
     for size, left in ((max(sizes), 1), (max(sizes) - 1, 0)):
-        monkeypatch.setattr(spare, "MOST", size)
+        monkeypatch.setattr(spare, "MAX_KEPT_BYTES", size)
         torchpt.render(torchpt.load("cornell_box", "cpu"), spp=1, film=film_of(64, 60), threads=2)
         assert len(spare._kept) <= left
 
@@ -400,15 +400,15 @@ def test_memory_of_threads_goes_where_a_chunk_needs_it(box, monkeypatch, capsys)
     torchpt.render(box, spp=1, film=film_of(64, 60), threads=2)
     whole, calls, there = torchpt.render(box, spp=2, film=film_of(64, 60)), [0], []
     torchpt.render(torchpt.load("veach_mis", "cpu"), spp=1, film=film_of(8, 8), threads=1)
-    trace = Worker.trace
+    trace = KernelsEngine.trace
 
-    def failing(self: Worker, *args: Any) -> Any:
+    def failing(self: KernelsEngine, *args: Any) -> Any:
         calls[0] += 1
         there.append(len(spare._kept))
         if calls[0] == 1:
             raise MemoryError
         return trace(self, *args)
 
-    monkeypatch.setattr(Worker, "trace", failing)
+    monkeypatch.setattr(KernelsEngine, "trace", failing)
     assert torch.equal(torchpt.render(box, spp=2, film=film_of(64, 60), threads=2), whole)
     assert there[0] and not there[-1] and "memory ran out" in capsys.readouterr().err

@@ -13,11 +13,11 @@ from torch import Tensor
 
 import torchpt
 from torchpt.core.errors import RenderError
-from torchpt.paths.nonfinite import KEPT, NonFinite, Place
+from torchpt.paths.nonfinite import KEPT, NonFinite, SampleId
 from torchpt.paths.wave import PixelSet
 from torchpt.physics.bsdfs.kinds.diffuse import Diffuse
 from torchpt.physics.bsdfs.records import BsdfSample
-from torchpt.physics.samplers import Streams
+from torchpt.physics.samplers import Randomizations
 from torchpt.rendering.api import Rendering, render_scene
 from torchpt.scene.formats.description import settings
 
@@ -272,10 +272,10 @@ def test_the_first_ones_are_kept_in_order():
     values[0, 1, 2], values[1, 3, 29], values[2, 1, 2] = torch.inf, torch.nan, -torch.inf
     lost = NonFinite.of(values, 10, 5, (3, 2, 16, 12))
     assert (lost.nan, lost.infinite, lost.count) == (1, 1, 2)
-    assert lost.places == [Place(6, 2, 15, nan=False), Place(8, 4, 10, nan=True)]
+    assert lost.places == [SampleId(6, 2, 15, nan=False), SampleId(8, 4, 10, nan=True)]
     assert str(lost.places[0]) == "sample 6 of pixel (15, 2)"
     chosen = PixelSet(
-        torchpt.physics.film.Film(30, 1, 1, torch.device("cpu")), {}, Streams(2, 3), torch.arange(100, 140)
+        torchpt.physics.film.Film(30, 1, 1, torch.device("cpu")), {}, Randomizations(2, 3), torch.arange(100, 140)
     )
     (first, _) = NonFinite.of(values, 10, 5, (3, 2, 16, 12), chosen).places
     assert (first.x, first.y, first.first, first.streams) == (112 % 16 + 3, 112 // 16 + 2, 2, 3)
@@ -288,7 +288,7 @@ def test_no_more_are_kept_than_are_traced():
         lost.add(NonFinite.of(torch.full((3, 1, 50), torch.nan), 0, sample, (0, 0, 50, 1)))
     assert lost.count == 100 and len(lost.places) == KEPT
     assert [place.sample for place in lost.places] == [3] * 50 + [9] * (KEPT - 50)
-    pilots = PixelSet(torchpt.physics.film.Film(50, 1, 1, torch.device("cpu")), {}, Streams(1, 1))
+    pilots = PixelSet(torchpt.physics.film.Film(50, 1, 1, torch.device("cpu")), {}, Randomizations(1, 1))
     lost.add(NonFinite.of(torch.full((3, 1, 50), torch.nan), 0, 0, (0, 0, 50, 1), pilots))
     assert lost.count == 150 and {place.first for place in lost.places} == {0}, "paths of the picture can be looked at"
 
@@ -301,5 +301,5 @@ def test_no_more_are_kept_than_are_traced():
 def test_what_a_checkpoint_says_of_lost_samples_is_held_against_its_form(facts: Any) -> None:
     with pytest.raises(ValueError, match="lost samples"):
         NonFinite.read(facts)
-    whole = NonFinite(2, 1, [Place(1, 2, 3, 0, 1, True)])
+    whole = NonFinite(2, 1, [SampleId(1, 2, 3, 0, 1, True)])
     assert NonFinite.read(whole.plain()) == whole

@@ -124,6 +124,6 @@ def test_without_a_writable_cache_folder(tmp_path):
 
 @pytest.mark.slow
 def test_fresh_processes_give_one_picture(tmp_path):
-    """MKL's first call in two threads at once made one of four differ, see torchpt.core.threads.settle."""
+    """MKL's first call in two threads at once made one of four differ, see torchpt.core.threads.warm_up."""
     found = [run(tmp_path, "print(digest())", "cornell_bunny", {}) for _ in range(24)]
     assert len({tuple(lines) for lines in found}) == 1

@@ -12,7 +12,7 @@ from torchpt.core.errors import SceneError
 from torchpt.core.threads import limited_threads
 from torchpt.rendering.api import render_scene
 from torchpt.scene.formats.description import settings
-from torchpt.scene.sources import labels_of
+from torchpt.scene.sources import unique_labels
 
 LAMP = {
     "camera": {"type": "perspective", "origin": [0, 0, 3], "target": [0, 0, 0], "fov": 20},
@@ -119,7 +119,7 @@ def test_an_explicit_emission_of_zero_stays_a_parameter():
 
 
 def test_labels_of_mesh_parts_are_distinct():
-    labels = labels_of(["a", "a_2", "a", "", "a.b", "a_b"])
+    labels = unique_labels(["a", "a_2", "a", "", "a.b", "a_b"])
     assert len(set(labels)) == 6 and not any("." in label for label in labels)
 
 

@@ -16,11 +16,11 @@ import torchpt
 from torchpt.core.errors import SceneError
 from torchpt.physics.film import ErrorEstimate, pilots_of
 from torchpt.rendering.api import Rendering, render_scene
-from torchpt.rendering.stopping import Stop
+from torchpt.rendering.stopping import StopRules
 from torchpt.scene.formats.description import settings
 from torchpt.scene.settings import Render
 from torchpt.search import tree
-from torchpt.spec.schema import values_of
+from torchpt.spec.schema import read_params
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +33,14 @@ def shot(scene: torchpt.Scene, film: Any = None, sampler: Any = "sobol", **rende
     return render_scene(scene, settings(scene.description, wishes))
 
 
-def rule(**wishes: Any) -> Stop:
-    return Stop(Render(**values_of(Render, wishes, "render", None).values))
+def rule(**wishes: Any) -> StopRules:
+    return StopRules(Render(**read_params(Render, wishes, "render", None).values))
 
 
 # -- the rules
 
 
-def steps(stop: Stop, pace: float, error: Any = None) -> list[int]:
+def steps(stop: StopRules, pace: float, error: Any = None) -> list[int]:
     """Passes until the end, with every sample of the picture taking ``pace`` seconds."""
     taken, out = 0, []
     while size := stop.step(taken):
@@ -92,15 +92,15 @@ def test_slow_scenes_end_by_whole_samples(pace, samples):
 def test_an_error_ends_it_soon_after_it_is_reached():
     for target in (0.03, 0.004, 0.0007):
         stop = rule(spp=100_000, target_error=target)
-        taken = sum(steps(stop, 0.01, lambda n, stop=stop: 1.0 / n if stop.asks(n) else None))
+        taken = sum(steps(stop, 0.01, lambda n, stop=stop: 1.0 / n if stop.checks_error(n) else None))
         assert stop.reason == "target_error" and 1.0 / target <= taken <= 1.25 / target + 1
 
 
 def test_an_error_is_asked_for_seldom_and_not_before_it_means_something():
     stop, asked = rule(spp=200, target_error=1e-9), []
-    steps(stop, 0.01, lambda n: asked.append(n) if stop.asks(n) else None)
+    steps(stop, 0.01, lambda n: asked.append(n) if stop.checks_error(n) else None)
     assert asked == [16, 20, 24, 28, 32, 40, 48, 56, 64, 80, 96, 112, 128, 160, 192]
-    assert not rule(spp=64).asks(32) and stop.asks(33.7, adaptive=True) and not stop.asks(33.7)
+    assert not rule(spp=64).checks_error(32) and stop.checks_error(33.7, adaptive=True) and not stop.checks_error(33.7)
 
 
 def test_the_first_rule_ends_it():
@@ -129,7 +129,7 @@ def test_no_error_in_doubt_ends_a_render(box, monkeypatch, doubt):
         "null": (ErrorEstimate(0.01, (0.009, 0.011), False), "a reason"),
         "wide": (ErrorEstimate(0.01, (0.002, 0.05), False), ""),
     }
-    monkeypatch.setattr("torchpt.rendering.run.known_of", lambda *_: told[doubt])
+    monkeypatch.setattr("torchpt.rendering.run.error_estimate_of", lambda *_: told[doubt])
     found = shot(box, spp=40, target_error=0.02)
     assert (found.spp, found.stopped_by) == (40, "spp") and found.summary()["stopped_by"] == "spp"
     monkeypatch.undo()
@@ -142,7 +142,7 @@ def test_kernels_take_none_of_the_time(monkeypatch):
     """Those of the search are made at their first call, when sampling has begun."""
     scene = torchpt.load("cornell_box", device="cpu")
     shot(scene, spp=2, accel="numba")
-    kept_back, made = tree.compiled, []
+    kept_back, made = tree.ensure_compiled, []
 
     def slow(kernel: Any, *args: Any) -> Any:
         if not made:
@@ -151,7 +151,7 @@ def test_kernels_take_none_of_the_time(monkeypatch):
                 time.sleep(0.25)
         return kept_back(kernel, *args)
 
-    monkeypatch.setattr(tree, "compiled", slow)
+    monkeypatch.setattr(tree, "ensure_compiled", slow)
     start = time.perf_counter()
     found = shot(scene, spp=10**6, accel="numba", time_limit=0.15, threads=1)
     wall = time.perf_counter() - start

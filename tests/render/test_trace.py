@@ -16,7 +16,7 @@ from torch import Tensor
 
 import torchpt
 from torchpt.core.errors import RenderError, SceneError
-from torchpt.engines.kernels.engine import Chunk, Worker
+from torchpt.engines.kernels.engine import Chunk, KernelsEngine
 from torchpt.engines.kernels.programs import Kernels
 from torchpt.gradients.edges.traced import Along
 from torchpt.paths.wave import Rays
@@ -63,7 +63,7 @@ def camera_rays(scene: torchpt.Scene, film: dict[str, Any], seed: int = 0, **wis
         vectors = {"o": state.o, "d": state.d}
     else:
         kernels = Kernels(wave, kernels_of(scene, wave).packets, False)  # whose paths are all kept, whatever they met
-        paths = Worker(kernels).spawn(Chunk(0, count, 0, 1))
+        paths = KernelsEngine(kernels).spawn(Chunk(0, count, 0, 1))
         vectors = kernels.state.take(paths.arena, np.arange(count), ("o", "d"))
     space = scene.space
     o = vectors["o"].double() * space.unit + space.centre[:, None]
@@ -170,8 +170,8 @@ def test_gradients_by_rays_are_those_of_the_formula(dtype, adjoint):
         assert torch.allclose(
             found, right, rtol=0, atol=float(right.abs().max()) * (2e-5 if dtype == torch.float32 else 1e-7)
         )
-    along = (grads[0][1] * d).sum(1).abs().max()
-    assert float(along) < 1e-4 * float(grads[0][1].norm())  # a length changes nothing
+    with_rays = (grads[0][1] * d).sum(1).abs().max()
+    assert float(with_rays) < 1e-4 * float(grads[0][1].norm())  # a length changes nothing
 
 
 @quiet
@@ -380,16 +380,16 @@ def test_rays_by_numbers(compile, accel):
     o = torch.tensor([[278.0], [273.0], [-500.0]]).repeat(1, 6)
     d = torch.tensor([[0.1], [-0.2], [1.0]]).repeat(1, 6) / math.sqrt(1.05)
     number = torch.tensor([4, 70_000, 4, 2, 1 << 30, 70_000])
-    found = Along(scene, wish, wave).radiance(wave.along(Rays(o, d, number)), 1)
+    found = Along(scene, wish, wave).radiance(wave.with_rays(Rays(o, d, number)), 1)
     assert found.dtype == torch.float64
     assert torch.equal(found[:, 0], found[:, 2])
     assert torch.equal(found[:, 1], found[:, 5])
     assert len(set(found[1].tolist())) == 4
     assert float(found.max()) == pytest.approx(0.3)
-    own = Along(scene, wish, wave).radiance(wave.along(Rays(o, d)), 1)
+    own = Along(scene, wish, wave).radiance(wave.with_rays(Rays(o, d)), 1)
     assert torch.equal(own[:, 2], found[:, 3])
     eager = Along(scene, replace(wish, render=wish.render.but(compile="off")), wave)
-    assert torch.allclose(eager.radiance(wave.along(Rays(o, d, number)), 1), found, atol=1e-5)
+    assert torch.allclose(eager.radiance(wave.with_rays(Rays(o, d, number)), 1), found, atol=1e-5)
 
 
 @quiet

@@ -16,7 +16,7 @@ import torchpt
 from torchpt.cli.main import main
 from torchpt.core.errors import NoLightWarning
 from torchpt.rendering.api import Rendering, render_scene
-from torchpt.rendering.missing_light import MissingLight, unlit
+from torchpt.rendering.missing_light import MissingLight, find_missing_light
 from torchpt.rendering.run import Run
 from torchpt.scene.formats.description import settings
 
@@ -125,7 +125,7 @@ def test_dark_pixels_count_where_they_show_what_reflects():
         picture = torch.ones(48, 64, 3, dtype=torch.float64)
         for x, y in pixels:
             picture[y, x] = 0.0
-        return unlit(run.scene, run.wave, run.geometry, picture, relmse)
+        return find_missing_light(run.scene, run.wave, run.geometry, picture, relmse)
 
     on_floor, on_black, on_sky = [(x, 40) for x in range(20, 30)], (32, 20), (2, 2)
     assert dark(0.1) == dark(0.1, on_black) == dark(0.1, on_sky) == MissingLight("", 0.0)
@@ -149,7 +149,7 @@ def test_few_dark_pixels_widen_the_interval(monkeypatch):
     """A black pixel may be off by 1 at most, in squared error over radiance squared."""
     scene = torchpt.load("cornell_box", device="cpu")
     plain = shot(scene, film=film_of(32))
-    monkeypatch.setattr("torchpt.rendering.missing_light.unlit", lambda *_: MissingLight("", 0.003))
+    monkeypatch.setattr("torchpt.rendering.missing_light.find_missing_light", lambda *_: MissingLight("", 0.003))
     wide = shot(scene, film=film_of(32))
     assert plain.relmse_interval is not None and wide.relmse_interval is not None and wide.relmse == plain.relmse
     low, high = plain.relmse_interval

@@ -7,8 +7,8 @@ import torch
 from few import few
 from torch import Tensor
 
-from torchpt.reports.analysis import bias_of, tiles
-from torchpt.reports.runs import Truth
+from torchpt.reports.analysis import bias_test, tiles
+from torchpt.reports.runs import ReferencePicture
 
 SIDE, RUNS, SPP = 32, 5, 16
 TRUTHS, TRUTH_SPP = 8, 64
@@ -25,13 +25,13 @@ def samples(kind: str, count: int, random: torch.Generator) -> Tensor:
     return smooth
 
 
-def case(kind: str, seed: int, change: Tensor | float = 1.0) -> tuple[list[Tensor], Truth, float]:
+def case(kind: str, seed: int, change: Tensor | float = 1.0) -> tuple[list[Tensor], ReferencePicture, float]:
     random = torch.Generator().manual_seed(seed)
     base = 2.0 * torch.rand(SIDE, SIDE, 1, generator=random, dtype=torch.float64) ** 3 + 0.02
     colour = torch.tensor([1.0, 0.8, 0.5], dtype=torch.float64)
     runs = [base * samples(kind, SPP, random) * colour * change for _ in range(RUNS)]
     made = torch.stack([base * samples(kind, TRUTH_SPP, random) * colour for _ in range(TRUTHS)])
-    truth = Truth(made.mean(0), made.var(0) / TRUTHS, tuple(made), {})
+    truth = ReferencePicture(made.mean(0), made.var(0) / TRUTHS, tuple(made), {})
     return runs, truth, TRUTHS * TRUTH_SPP / (RUNS * SPP)
 
 
@@ -48,12 +48,12 @@ def case(kind: str, seed: int, change: Tensor | float = 1.0) -> tuple[list[Tenso
 )
 def test_unbiased_pictures_are_not_flagged(kind: str, cases: int) -> None:
     """The test's level is 0.1 %: of 500 more than 5 (1 %) come with a chance below 0.001."""
-    flagged = sum(bias_of(*case(kind, seed)).biased for seed in range(cases))
+    flagged = sum(bias_test(*case(kind, seed)).biased for seed in range(cases))
     assert flagged <= cases // 100
 
 
 def test_light_that_is_lost_everywhere_is_found() -> None:
-    found = [bias_of(*case("gaussian", seed, 0.95)) for seed in range(5)]
+    found = [bias_test(*case("gaussian", seed, 0.95)) for seed in range(5)]
     assert all(verdict.biased for verdict in found)
     assert all(verdict.low < -0.05 < verdict.high and verdict.high < 0 for verdict in found[:3])
 
@@ -61,13 +61,13 @@ def test_light_that_is_lost_everywhere_is_found() -> None:
 def test_light_that_is_moved_is_found() -> None:
     change = torch.ones(SIDE, SIDE, 1, dtype=torch.float64)
     change[:4], change[4:8] = 1.4, 0.6  # about the same light in all
-    assert all(bias_of(*case("gaussian", seed, change)).biased for seed in range(5))
+    assert all(bias_test(*case("gaussian", seed, change)).biased for seed in range(5))
 
 
 def test_the_size_of_a_bias_is_told_without_noise() -> None:
     runs, truth, more = case("gaussian", 3, 0.5)
     expected = float(((0.5 * truth.image).square() * truth.weight).mean())
-    assert bias_of(runs, truth, more).squared == pytest.approx(expected, rel=0.1)
+    assert bias_test(runs, truth, more).squared == pytest.approx(expected, rel=0.1)
 
 
 def test_a_clamp_that_only_takes_fireflies_which_may_not_have_come_is_no_proof() -> None:
@@ -85,17 +85,17 @@ def test_a_clamp_that_only_takes_fireflies_which_may_not_have_come_is_no_proof()
         for spot in range(2 if k < 5 else 1):
             made[k][3 * k, 7 + spot] += 1000.0
     stack = torch.stack(made)
-    truth = Truth(stack.mean(0), stack.var(0) / 8, tuple(made), {})
-    assert not bias_of(runs, truth, 6.4).biased
+    truth = ReferencePicture(stack.mean(0), stack.var(0) / 8, tuple(made), {})
+    assert not bias_test(runs, truth, 6.4).biased
 
 
 def test_equal_and_black_pictures_are_unbiased_and_a_glow_is_not() -> None:
     black = torch.zeros(8, 8, 3, dtype=torch.float64)
-    truth = Truth(black, black, (), {})
-    assert not bias_of([black, black], truth).biased
-    assert bias_of([black + 0.1, black + 0.1], truth).biased
+    truth = ReferencePicture(black, black, (), {})
+    assert not bias_test([black, black], truth).biased
+    assert bias_test([black + 0.1, black + 0.1], truth).biased
     grey = black + 0.25
-    assert not bias_of([grey, grey * (1 + 1e-7)], Truth(grey, black, (), {})).biased
+    assert not bias_test([grey, grey * (1 + 1e-7)], ReferencePicture(grey, black, (), {})).biased
 
 
 def test_a_part_that_is_black_in_all_says_nothing() -> None:
@@ -103,8 +103,8 @@ def test_a_part_that_is_black_in_all_says_nothing() -> None:
     runs, truth, more = case("gaussian", 3)
     keep = torch.ones(SIDE, SIDE, 1, dtype=torch.float64)
     keep[:9] = 0.0
-    black = Truth(truth.image * keep, truth.variance * keep, tuple(run * keep for run in truth.runs), {})
-    found = bias_of([run * keep for run in runs], black, more)
+    black = ReferencePicture(truth.image * keep, truth.variance * keep, tuple(run * keep for run in truth.runs), {})
+    found = bias_test([run * keep for run in runs], black, more)
     assert not found.biased and 0.0 < found.chance <= 1.0
 
 

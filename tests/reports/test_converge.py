@@ -160,7 +160,7 @@ def test_another_study_has_a_folder_of_its_own(
     renders = Renders(monkeypatch)
 
     def write(study: Any, measured: Any, folder: Path) -> list[Any]:
-        (folder / "report.html").write_text(f"{study.variants} {study.asked}")
+        (folder / "report.html").write_text(f"{study.variants} {study.options}")
         return []
 
     monkeypatch.setattr(report, "write_report", write)

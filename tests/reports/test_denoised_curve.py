@@ -18,7 +18,7 @@ from torchpt.core.errors import SceneError
 from torchpt.images import read_image
 from torchpt.rendering.api import render_scene
 from torchpt.reports import runs
-from torchpt.reports.analysis import Topic, analyse
+from torchpt.reports.analysis import SceneReport, analyse
 from torchpt.reports.plots import curves
 from torchpt.reports.runs import Measured, Store, prepare
 from torchpt.reports.study import Study, study_of
@@ -80,7 +80,7 @@ def measured(folder: Path) -> tuple[Study, Measured]:
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Topic:
+def small(tmp_path_factory: pytest.TempPathFactory) -> SceneReport:
     """Of such a study with fewer samples, without words and files."""
     place = tmp_path_factory.mktemp("small")
     (place / "s.yaml").write_text(SCENE)
@@ -93,7 +93,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Topic:
     return analyse(study, scene)
 
 
-def topic(folder: Path) -> Topic:
+def scene_report(folder: Path) -> SceneReport:
     return analyse(*measured(folder))
 
 
@@ -123,14 +123,14 @@ def test_what_is_denoised_is_the_run_to_the_bit_and_seconds_hold_all_of_it(folde
     _, scene = measured(folder)
     for curve in scene.curves:
         assert curve.denoised is not None and curve.denoised.facts["denoiser"].startswith("pyoidn 2.")
-        assert curve.job.wishes.film.denoise is False and curve.job.wishes.film.aovs == (), (
+        assert curve.job.settings.film.denoise is False and curve.job.settings.film.aovs == (), (
             "no wish of the scene's file"
         )
         for spp in (1, 4):
             noisy, run = curve.steps[spp][1], curve.denoised_steps[spp][1]
-            wishes = curve.denoised.wishes
-            wishes = runs.replace(wishes, render=wishes.render.but(spp=spp, seed=noisy.facts["seed"]))
-            again = render_scene(curve.job.scene, wishes)
+            settings = curve.denoised.settings
+            settings = runs.replace(settings, render=settings.render.but(spp=spp, seed=noisy.facts["seed"]))
+            again = render_scene(curve.job.scene, settings)
             assert torch.equal(again.image.double(), noisy.image())
             assert set(again.guides) == {"albedo", "normal"} and again.relmse is None, "no pilots"
             assert torch.equal(denoise(again.image, **again.guides).double(), run.image())
@@ -145,7 +145,7 @@ def test_the_page_and_the_plots_tell_them_apart(folder: Path) -> None:
     for words in ("sobol, denoised", "○", "□", "Denoised pictures are guesses", "and of denoising"):
         assert words in bare
     assert "enoised" not in re.sub(r'"data:[^"]*"', "", (folder / "plain" / "report.html").read_text())
-    found = topic(folder)
+    found = scene_report(folder)
     for over in ("seconds", "spp"):
         lines = curves(found, "relmse", over).axes[0].get_lines()
         drawn = {line.get_label().partition("   ")[0]: line for line in lines}
@@ -157,7 +157,7 @@ def test_the_page_and_the_plots_tell_them_apart(folder: Path) -> None:
 
 
 @there
-def test_no_figure_of_the_others_is_found_by_them(small: Topic) -> None:
+def test_no_figure_of_the_others_is_found_by_them(small: SceneReport) -> None:
     found = small
     assert [line.of is None for line in found.lines] == [True, False, True, False]
     (level,) = found.targets
@@ -175,9 +175,9 @@ def test_denoised_pictures_are_kept_like_runs(folder: Path, monkeypatch: pytest.
     seen: list[bool] = []
     render = runs.render_scene
 
-    def counted(scene: Any, wishes: Any, on_progress: Any) -> Any:
-        seen.append(wishes.film.denoise)
-        return render(scene, wishes, on_progress=on_progress)
+    def counted(scene: Any, settings: Any, on_progress: Any) -> Any:
+        seen.append(settings.film.denoise)
+        return render(scene, settings, on_progress=on_progress)
 
     monkeypatch.setattr(runs, "render_scene", counted)
     before = told(folder / "study")

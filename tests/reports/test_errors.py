@@ -11,7 +11,7 @@ import torch
 from torchpt.core.errors import AssetError
 from torchpt.images import metrics, write_image
 from torchpt.reports.analysis import error_map, measures, mse, relmse, relmse_trimmed
-from torchpt.reports.runs import Truth, from_file
+from torchpt.reports.runs import ReferencePicture, from_file
 from torchpt.reports.study import MEASURES
 from torchpt.scene.settings import Film
 
@@ -28,7 +28,7 @@ def picture(seed: int) -> torch.Tensor:
 
 @needs_flip
 def test_an_exact_reference_gives_the_measures_of_all_pictures() -> None:
-    image, exact = picture(0), Truth(picture(1), torch.zeros(SHAPE, dtype=torch.float64), (), {})
+    image, exact = picture(0), ReferencePicture(picture(1), torch.zeros(SHAPE, dtype=torch.float64), (), {})
     found = measures(image, exact, MEASURES, Film())
     for name in ("relmse", "mse", "smape", "flip"):
         assert found[name] == pytest.approx(metrics.METRICS[name](image, exact.image), rel=1e-9), name
@@ -47,7 +47,7 @@ def test_the_noise_of_the_reference_is_taken_off() -> None:
     for _ in range(40):
         noisy = right + spread.sqrt() * torch.randn(SHAPE, generator=random, dtype=torch.float64)
         image = right + 0.5 * spread.sqrt() * torch.randn(SHAPE, generator=random, dtype=torch.float64)
-        truth = Truth(noisy, spread, (), {})
+        truth = ReferencePicture(noisy, spread, (), {})
         own.append((mse(image, truth), metrics.mse(image, noisy)))
     debiased, plain = (sum(values) / len(own) for values in zip(*own, strict=True))
     expected = float(spread.mean()) / 4
@@ -56,7 +56,9 @@ def test_the_noise_of_the_reference_is_taken_off() -> None:
 
 @needs_flip
 def test_what_has_no_value_is_not_a_number() -> None:
-    small = Truth(torch.zeros(4, 4, 3, dtype=torch.float64), torch.zeros(4, 4, 3, dtype=torch.float64), (), {})
+    small = ReferencePicture(
+        torch.zeros(4, 4, 3, dtype=torch.float64), torch.zeros(4, 4, 3, dtype=torch.float64), (), {}
+    )
     found = measures(small.image, small, ("ssim", "flip", "relmse"), Film())
     assert math.isnan(found["ssim"]) and math.isnan(found["flip"]) and found["relmse"] == 0.0
     bad = small.image.clone()
@@ -69,7 +71,7 @@ def test_the_variance_in_a_file_counts(tmp_path) -> None:
     write_image(tmp_path / "a.exr", image, {"variance": variance})
     write_image(tmp_path / "b.exr", image)
     truth = from_file(str(tmp_path / "a.exr"), (50, 40))
-    assert torch.equal(truth.variance, variance.double()) and truth.told["variance"] is True
+    assert torch.equal(truth.variance, variance.double()) and truth.origin["variance"] is True
     assert not from_file(str(tmp_path / "b.exr"), (50, 40)).variance.any()
     with pytest.raises(AssetError, match="expected a picture of 64 x 40 pixels as the film is, got 50 x 40"):
         from_file(str(tmp_path / "a.exr"), (64, 40))

@@ -80,9 +80,9 @@ def test_settings_become_blocks() -> None:
     last = study.overrides(study.variants[-1])
     assert last["integrator"] == {"type": "direct"} and last["render"] == {"threads": 1}
     assert last["film"] == {"filter": {"type": "gaussian", "stddev": 0.4}, "width": 16}
-    truth = study.truth(study.variants[-1])
-    assert truth["film"] == last["film"], "the reference is of the same picture"
-    assert truth["integrator"] == {"clamp": None, "max_depth": -1}, "and of the scene's own integrator"
+    reference_overrides = study.reference_overrides(study.variants[-1])
+    assert reference_overrides["film"] == last["film"], "the reference is of the same picture"
+    assert reference_overrides["integrator"] == {"clamp": None, "max_depth": -1}, "and of the scene's own integrator"
     assert (study.reference.spp, study.reference.seeds) == (64, 8)
     assert study_of({"scene": "cornell_box", "spp": [1, 5]}).reference.spp == 20
 

@@ -13,7 +13,7 @@ from trials import SIGNIFICANCE, grid_cells, uniform_p, z_limit
 from torchpt.core.errors import SceneError
 from torchpt.physics.samplers import ADAPTIVE, KINDS, Dimension, Draws, Sampler, points_of, salts
 from torchpt.spec import parameters_of
-from torchpt.spec.schema import described
+from torchpt.spec.schema import read_typed
 
 CPU = torch.device("cpu")
 PIXELS, COUNT, WIDTH = 1 << 12, 16, 64
@@ -45,8 +45,8 @@ def test_what_is_declared(kind):
         assert spec.doc, key
         for value in values_outside(spec):
             with pytest.raises(SceneError, match=rf"sampler\.{key}"):
-                described("sampler", KINDS, {"type": kind, key: value}, "sampler", None)
-    values = described("sampler", KINDS, {"type": kind}, "sampler", None).values
+                read_typed("sampler", KINDS, {"type": kind, key: value}, "sampler", None)
+    values = read_typed("sampler", KINDS, {"type": kind}, "sampler", None).values
     assert points_of(kind) == KINDS[kind](**{key: value for key, value in values.items() if key not in ADAPTIVE})
     if KINDS[kind].needs_count:
         with pytest.raises(ValueError, match="must know their number"):

@@ -59,9 +59,9 @@ def test_dimensions_depths_seeds_and_randomizations_are_uncorrelated():
 
 def test_every_stream_has_a_name_of_its_own():
     names = torch.stack([salts(depth, CPU) for depth in range(5000)])
-    led = names[:, int(Dimension.LED_HERE)].tolist()
+    led = names[:, int(Dimension.PREVIOUS_DIRECTION)].tolist()
     assert led[1] == names[0, int(Dimension.PIXEL)] and led[2:] == names[1:-1, int(Dimension.BSDF)].tolist()
-    own = names[:, [int(d) for d in Dimension if d is not Dimension.LED_HERE]]
+    own = names[:, [int(d) for d in Dimension if d is not Dimension.PREVIOUS_DIRECTION]]
     assert len(torch.unique(own)) == own.numel()
 
 

@@ -329,7 +329,7 @@ def test_every_number_and_word_of_what_was_built_counts(everything: torchpt.Scen
     for place, counts, changed in variants((built, description.camera), "", set()):
         if ".parameters." in place:
             continue  # as they were loaded
-        everything.use(changed[0])
+        everything.replace_build(changed[0])
         everything.description = replace(description, camera=changed[1])
         found = fingerprint(everything)
         if counts:

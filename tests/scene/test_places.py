@@ -140,11 +140,11 @@ def test_a_map_turned_out_of_range(tmp_path: Path) -> None:
 def test_a_light_of_a_mesh_file_too_far() -> None:
     from torchpt.physics.parts import Parameters
     from torchpt.scene.meshes import FileLight
-    from torchpt.scene.sources import file_lights
+    from torchpt.scene.sources import build_file_lights
 
     light = FileLight("bulb", "point", np.array([1e30, 0, 0]), np.array([0, 0, 1.0]), {})
     with pytest.raises(AssetError, match=r"light 'bulb' has no finite place"):
-        file_lights([light], "shapes.s", np.diag([1e10, 1e10, 1e10, 1]), "a.glb", Parameters())
+        build_file_lights([light], "shapes.s", np.diag([1e10, 1e10, 1e10, 1]), "a.glb", Parameters())
 
 
 def pose(scale: float = 1.0, move: float = 0.0) -> torch.Tensor:

@@ -11,7 +11,7 @@ from accel_reference import sphere_mesh, triangles
 from few import few
 from scalar_search import scalar_search
 
-from torchpt.search.tree import Wide
+from torchpt.search.tree import WideBvh
 
 KINDS = ("random", "aimed", "axes")
 
@@ -70,7 +70,7 @@ def check(g, accel, kind, n, seed, sort):
 @pytest.mark.parametrize("kind", KINDS)
 def test_bits_are_those_of_the_scalar_search(kind, sort):
     g = triangles(*sphere_mesh(40))
-    check(g, Wide(g, 1), kind, 20_000, 1, sort)
+    check(g, WideBvh(g, 1), kind, 20_000, 1, sort)
 
 
 @pytest.mark.slow
@@ -78,7 +78,7 @@ def test_bits_are_those_of_the_scalar_search(kind, sort):
 def test_bits_of_many_rays(shift):
     vertices, faces = sphere_mesh(200)
     g = triangles(vertices + np.float32(shift), faces)
-    accel = Wide(g, 1)
+    accel = WideBvh(g, 1)
     for seed in range(10):
         for kind in KINDS:
             check(g, accel, kind, 350_000, seed, seed % 2 == 0)
@@ -86,7 +86,7 @@ def test_bits_of_many_rays(shift):
 
 def test_bits_do_not_depend_on_the_rays_beside():
     g = triangles(*sphere_mesh(40))
-    accel = Wide(g, 1)
+    accel = WideBvh(g, 1)
     for kind in KINDS:
         o, d, t_max = make_rays(kind, g, 40_000, 2, sort=True)
         order = np.random.default_rng(3).permutation(len(t_max))

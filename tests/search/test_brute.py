@@ -17,7 +17,7 @@ import torchpt
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.physics.shapes.kinds.sphere import Ellipsoid
 from torchpt.search import brute, build, tables
-from torchpt.search.brute import Brute, nearer
+from torchpt.search.brute import Brute, merge_quadric_hits
 
 N = 20_000
 
@@ -140,10 +140,10 @@ def test_quadrics_by_a_kernel_and_by_tensor_operations():
     p0, p1, p2 = (p[:, : g.size - 2] for p in (g.p0, g.p1, g.p2))
     plain = Brute(Geometry(p0, p1, p2, (*g.counts[:4], 0)), 1).intersect(*ray)
     for row, number in accel.quadrics:
-        plain = nearer.function(*ray, *plain, row, number)
+        plain = merge_quadric_hits.function(*ray, *plain, row, number)
     for a, b in zip(hits, plain, strict=True):
         assert torch.equal(a, b)
-    kernel: Any = nearer.implementations[0]
+    kernel: Any = merge_quadric_hits.implementations[0]
     assert kernel(*ray, *plain, *accel.quadrics[0]) is not NotImplemented and not kernel.refused
 
 
@@ -198,6 +198,6 @@ def test_a_render_of_few_primitives_needs_no_numba():
 @pytest.mark.parametrize("kind", ["auto", "brute"])
 def test_primitives_are_inspected_once_a_build(kind, monkeypatch):
     seen = []
-    monkeypatch.setattr(brute, "prepare", lambda geometry: seen.append(geometry) or tables.prepare(geometry))
+    monkeypatch.setattr(brute, "affine_rows", lambda geometry: seen.append(geometry) or tables.affine_rows(geometry))
     g = soup(4, SCENES["all"])
     assert build(g, kind, 1).name == "brute" and seen == [g]

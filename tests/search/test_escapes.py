@@ -12,7 +12,7 @@ from few import few
 
 from torchpt.scene.meshes import load_mesh
 from torchpt.search import build
-from torchpt.search.tree import Wide
+from torchpt.search.tree import WideBvh
 
 HERE = (0.0, 0.0, 0.0)
 FAR = (148376.0, 1234.0, -223423.0)
@@ -75,7 +75,7 @@ def escapes(name, place, count):
     vertices, faces = MESHES[name]()
     scale = 1000.0 if any(place) else 1.0  # float32 is 1/64 apart there: no triangle may collapse
     vertices = (vertices * scale + np.array(place)).astype(np.float32)
-    accel = Wide(triangles(vertices, faces), 1)
+    accel = WideBvh(triangles(vertices, faces), 1)
     block = min(BLOCK, count)
     t, u, v = np.empty((3, block), np.float32)
     prim, out = np.empty((2, block), np.int32)
@@ -141,7 +141,7 @@ def test_triangles_that_are_seen_edge_on_make_no_hole(kind):
 def test_a_hole_is_seen():
     """The count above is not zero by construction."""
     vertices, faces = sphere_mesh(20)
-    accel = Wide(triangles(vertices, faces[:-1]), 1)
+    accel = WideBvh(triangles(vertices, faces[:-1]), 1)
     rng = np.random.default_rng(0)
     o, d = directions(rng, vertices, faces, np.zeros((3, 100_000), np.float32), 100_000)
     out = np.empty(100_000, np.int32)

@@ -18,13 +18,13 @@ from torchpt.physics.shapes.geometry import Geometry
 from torchpt.physics.shapes.kinds.cylinder import Cylinder
 from torchpt.physics.shapes.kinds.sphere import Ellipsoid
 from torchpt.search import build
-from torchpt.search import tree as topology
+from torchpt.search import tree as refit_state
 from torchpt.search import tree as wide
 from torchpt.search.bounds import primitive_bounds
-from torchpt.search.tables import prepare
-from torchpt.search.tree import REBUILD, Wide
+from torchpt.search.tables import affine_rows
+from torchpt.search.tree import REBUILD_THRESHOLD, WideBvh
 from torchpt.search.tree_build import mesh_tree
-from torchpt.search.tree_instances import WideInstanced
+from torchpt.search.tree_instances import InstancedWideBvh
 from torchpt.search.tree_layout import CHILDREN, FLOOR, IDS, LINE, PLANES
 
 EMPTY = np.array([np.inf] * 3 + [-np.inf] * 3, np.float32)
@@ -33,10 +33,10 @@ EMPTY = np.array([np.inf] * 3 + [-np.inf] * 3, np.float32)
 @pytest.fixture
 def whatever_it_costs(monkeypatch):
     """Refits however far things have moved."""
-    monkeypatch.setattr(topology, "REBUILD", np.inf)
+    monkeypatch.setattr(refit_state, "REBUILD_THRESHOLD", np.inf)
 
 
-def refitted(before, g) -> Wide:
+def refitted(before, g) -> WideBvh:
     tree = before.refit(g)
     assert tree is not None
     return tree
@@ -83,7 +83,7 @@ def union(boxes):
 def check_blocks(accel, g):
     """Every box is the one about what it holds, every triangle is where the geometry has it."""
     (nodes, leaves), tree = nodes_of(accel), accel.arrays[0]
-    area = prepare(g).area.numpy()
+    area = affine_rows(g).area.numpy()
     bounds = torch.cat(primitive_bounds(g)).T.numpy()
     corners = torch.cat([g.p0, g.p1, g.p2]).T.numpy()
     planes, held = mesh_tree(g)[1], []
@@ -152,7 +152,7 @@ def test_hits_are_those_of_a_tree_built_anew(how, whatever_it_costs):
     """To the bit, but where the nearest triangle is grazed and its distance lies before its leaf: there the leaf decides."""
     v, f = sphere_mesh(20)
     g = triangles(MOVES[how](v, np.random.default_rng(1)), f)
-    old, new = refitted(Wide(triangles(v, f), 1), g), Wide(g, 1)
+    old, new = refitted(WideBvh(triangles(v, f), 1), g), WideBvh(g, 1)
     check_blocks(old, g)
     p = torch.stack((g.p0, g.p1, g.p2)).permute(2, 0, 1).contiguous().numpy()
     rows, differ, hits = mesh_tree(g)[1], 0, 0
@@ -177,7 +177,7 @@ def test_hits_are_those_of_a_tree_built_anew(how, whatever_it_costs):
 def test_all_kinds_move(make, size, whatever_it_costs):
     g = make()
     there = moved(g, 1, size)
-    old, new = refitted(Wide(g, 1), there), Wide(there, 1)
+    old, new = refitted(WideBvh(g, 1), there), WideBvh(there, 1)
     check_blocks(old, there)
     for kind in ("random", "axes"):
         rays = make_rays(kind, there, 30_000, 2)
@@ -189,18 +189,18 @@ def test_all_kinds_move(make, size, whatever_it_costs):
 
 def test_the_same_places_give_the_same_blocks():
     g = soup(5, (300, 8, 6, 6))
-    tree = Wide(g, 1)
+    tree = WideBvh(g, 1)
     again = refitted(tree, g)
     for a, b in zip(tree.arrays[:-1], again.arrays[:-1], strict=True):
         assert a is not b and np.array_equal(a, b, equal_nan=a.dtype != np.int32)
-    assert again.topology.growth == 1.0 and tree.describe() == again.describe() | {
+    assert again.refit_state.sah_ratio == 1.0 and tree.describe() == again.describe() | {
         "build_seconds": tree.describe()["build_seconds"]
     }
 
 
 def test_a_tree_in_use_stays_as_it_is(whatever_it_costs):
     g = soup(6, (300, 8, 6, 6))
-    tree = Wide(g, 1)
+    tree = WideBvh(g, 1)
     before, rays = [x.copy() for x in tree.arrays], make_rays("random", g, 5000)
     hits, facts = found(tree, *rays), tree.describe()
     other = refitted(tree, moved(g, 2, 0.5))
@@ -236,8 +236,8 @@ def test_what_loses_its_area_is_not_hit_and_may_return(name, whatever_it_costs):
     p = torch.cat([(g.p0 * 4).round() / 4, (g.p1 * 4).round() / 4, (g.p2 * 4).round() / 4])  # so that lines are lines
     g = Geometry(p[:3].clone(), p[3:6].clone(), p[6:].clone(), g.counts)
     number, there = without(g, name)
-    assert prepare(g).area[number] and not prepare(there).area[number]
-    tree = Wide(g, 1)
+    assert affine_rows(g).area[number] and not affine_rows(there).area[number]
+    tree = WideBvh(g, 1)
     flat = refitted(tree, there)
     check_blocks(flat, there)
     share = [1, 1, 1] if number < 400 else [0, 1.5, 1.5] if number < 420 else [3, 0, 0]
@@ -246,11 +246,11 @@ def test_what_loses_its_area_is_not_hit_and_may_return(name, whatever_it_costs):
     o[:, ::2] = centre[:, None] + 0.01 * d[:, ::2]  # close by, at where it was
     d[:, ::2] *= -1
     before, hits = found(tree, o, d, t_max), found(flat, o, d, t_max)
-    assert not (hits[1] == number).any() and same_but_grazed(hits, found(Wide(there, 1), o, d, t_max))
+    assert not (hits[1] == number).any() and same_but_grazed(hits, found(WideBvh(there, 1), o, d, t_max))
     assert (before[1] == number).sum() > 50
     assert equal_bits(found(refitted(flat, g), o, d, t_max), before)
     # A tree that was built without it has no place for it.
-    bare = Wide(there, 1)
+    bare = WideBvh(there, 1)
     assert bare.refit(g) is None and same_but_grazed(found(refitted(bare, there), o, d, t_max), hits)
 
 
@@ -262,8 +262,8 @@ def test_a_ball_without_a_radius_is_no_point_to_be_hit():
     )
     o, d = np.array([[-1], [0], [0]], np.float32), np.array([[1], [0], [0]], np.float32)
     ray = o, d, np.full(1, np.inf, np.float32)
-    tree = Wide(big, 1)
-    assert [found(x, *ray)[1][0] for x in (tree, refitted(tree, none), Wide(none, 1))] == [0, -1, -1]
+    tree = WideBvh(big, 1)
+    assert [found(x, *ray)[1][0] for x in (tree, refitted(tree, none), WideBvh(none, 1))] == [0, -1, -1]
 
 
 def test_quadrics_lose_their_volume_and_get_it_back(whatever_it_costs):
@@ -273,23 +273,23 @@ def test_quadrics_lose_their_volume_and_get_it_back(whatever_it_costs):
     frame[3:6, 1] = 0
     flat = Geometry(g.p0, g.p1, g.p2, g.counts, quadric_table((Ellipsoid, Cylinder), frame))
     rays = make_rays("random", g, 40_000)
-    a, b = Wide(g, 1), refitted(Wide(g, 1), flat)
+    a, b = WideBvh(g, 1), refitted(WideBvh(g, 1), flat)
     assert (found(a, *rays)[1] == g.size - 1).sum() > 50 and not (found(b, *rays)[1] == g.size - 1).any()
-    assert equal_bits(found(b, *rays), found(Wide(flat, 1), *rays))
-    assert Wide(flat, 1).refit(g) is None and equal_bits(found(refitted(b, g), *rays), found(a, *rays))
+    assert equal_bits(found(b, *rays), found(WideBvh(flat, 1), *rays))
+    assert WideBvh(flat, 1).refit(g) is None and equal_bits(found(refitted(b, g), *rays), found(a, *rays))
 
 
 def test_nothing_left_is_built_anew():
     v, f = sphere_mesh(6)
     point = triangles(v * 0, f)
-    assert Wide(triangles(v, f), 1).refit(point) is None
+    assert WideBvh(triangles(v, f), 1).refit(point) is None
     nothing = geometry([], [], [], (0, 0, 0, 0))
-    assert Wide(nothing, 1).refit(nothing) is None and Wide(point, 1).refit(point) is None
+    assert WideBvh(nothing, 1).refit(nothing) is None and WideBvh(point, 1).refit(point) is None
 
 
 def test_other_primitives_are_built_anew():
     g, more = soup(1, (20, 4, 3, 3)), soup(1, (20, 3, 4, 3))
-    tree = Wide(g, 1)
+    tree = WideBvh(g, 1)
     assert tree.refit(more) is None and tree.refit(soup(1, (21, 4, 3, 3))) is None
     assert build(more, "numba", 1, before=tree).describe()["primitives"] == more.size
     assert tree.refit(with_copies()) is None
@@ -314,20 +314,20 @@ def cost(accel):
 def test_the_cost_is_that_of_the_tree_as_it_was_built(whatever_it_costs):
     v, f = sphere_mesh(20)
     rng = np.random.default_rng(2)
-    first = tree = Wide(triangles(v, f), 1)
+    first = tree = WideBvh(triangles(v, f), 1)
     for _ in range(3):
         v = v + 0.05 * rng.normal(size=v.shape).astype(np.float32)
         tree = refitted(tree, triangles(v, f))
-        assert tree.topology.growth == pytest.approx(cost(tree) / cost(first), rel=1e-9)
-        assert tree.describe()["sah_cost"] == pytest.approx(first.sah_cost * tree.topology.growth)
-    assert tree.topology.growth > 1.5
+        assert tree.refit_state.sah_ratio == pytest.approx(cost(tree) / cost(first), rel=1e-9)
+        assert tree.describe()["sah_cost"] == pytest.approx(first.sah_cost * tree.refit_state.sah_ratio)
+    assert tree.refit_state.sah_ratio > 1.5
 
 
 def test_a_tree_is_built_anew_once_it_costs_too_much():
     """Small steps add up: what counts is the tree as it was built, not the one before."""
     v, f = sphere_mesh(20)
     rng = np.random.default_rng(3)
-    first = tree = last = Wide(g := triangles(v, f), 1)
+    first = tree = last = WideBvh(g := triangles(v, f), 1)
     steps = []
     for _ in range(60):
         v = v + 0.012 * rng.normal(size=v.shape).astype(np.float32)
@@ -335,12 +335,12 @@ def test_a_tree_is_built_anew_once_it_costs_too_much():
         tree, last = tree.refit(g), tree
         if tree is None:
             break
-        steps.append(tree.topology.growth)
-    assert tree is None and len(steps) > 5 and steps[-1] <= REBUILD and max(np.diff(steps)) < 0.1
+        steps.append(tree.refit_state.sah_ratio)
+    assert tree is None and len(steps) > 5 and steps[-1] <= REBUILD_THRESHOLD and max(np.diff(steps)) < 0.1
     assert first.refit(g) is None and last.refit(triangles(sphere_mesh(20)[0], f)) is not None
-    assert cost(build(g, "numba", 1, before=last)) < cost(first) * REBUILD  # a new one
+    assert cost(build(g, "numba", 1, before=last)) < cost(first) * REBUILD_THRESHOLD  # a new one
     turned = triangles(sphere_mesh(20)[0][:, [1, 2, 0]], f)  # axes for axes: costs what it did
-    assert refitted(first, turned).topology.growth == pytest.approx(1.0)
+    assert refitted(first, turned).refit_state.sah_ratio == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("size", [0.001, 1.0])
@@ -353,7 +353,7 @@ def test_copies_move_with_their_meshes(size, whatever_it_costs):
     there = Geometry(there.p0, there.p1, there.p2, there.counts, None, turn)
     tree = build(g, "numba", 1)
     old, new = tree.refit(there), build(there, "numba", 1)
-    assert isinstance(old, WideInstanced) and isinstance(tree, WideInstanced)
+    assert isinstance(old, InstancedWideBvh) and isinstance(tree, InstancedWideBvh)
     assert len(old.arrays[2]) == len(tree.arrays[2])  # the meshes' blocks; those of the upper level are new
     rays = make_rays("random", there, 30_000, 2)
     hits = found(old, *rays)

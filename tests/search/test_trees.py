@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchpt.search.tree_build import WIDTH, Tree, build_binary, wide_tree
+from torchpt.search.tree_build import WIDTH, WideTree, build_binary, wide_tree
 
 #: Of tests beside one of eight triangles: of a leaf's rectangles together, and of each other primitive.
 RECTANGLES, OTHER = 1.3, 2.0
@@ -46,7 +46,7 @@ def half_area(box: Any) -> float:
     return float(x * y + y * z + z * x)
 
 
-def children(tree: Tree) -> Any:
+def children(tree: WideTree) -> Any:
     return tree.child.reshape(-1, WIDTH)
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from torchpt.search import KINDS, build
 from torchpt.search.bounds import primitive_bounds
-from torchpt.search.tables import prepare
+from torchpt.search.tables import affine_rows
 
 BACKENDS = [k for k in KINDS if k != "auto"]
 INF = float("inf")
@@ -82,7 +82,7 @@ def _same(g, o, d, numba, plain):
 def _edge_on(g, prim, o, d, t):
     """Distances at which rays enter and leave the boxes of what they hit, and how far off its planes' distances may be."""
     prim, missed = prim.clamp(min=0), prim < 0
-    n, c = prepare(g).rows64.T[:3, prim], prepare(g).rows64.T[3, prim]
+    n, c = affine_rows(g).rows64.T[:3, prim], affine_rows(g).rows64.T[3, prim]
     terms = (n * o).abs().sum(0) + c.abs() + t * (n * d).abs().sum(0)
     low, high = ((box[:, prim].double() - o) / d for box in primitive_bounds(g))
     still = d == 0

@@ -228,7 +228,7 @@ def test_points_of_a_quadric_are_uniform_by_area_in_its_own_space(kind: type[Qua
     """Moments of what is drawn against those of a fine grid of it, and both lie on the surface, in its box."""
     grid = (torch.arange(512, dtype=torch.float64) + 0.5) / 512
     q = kind.sample(torch.cartesian_prod(grid, grid).T)
-    assert quadrics._excess(kind.form, q).abs().max() < 1e-12
+    assert quadrics._residual(kind.form, q).abs().max() < 1e-12
     one = torch.eye(3, dtype=torch.float64)[:, :, None]
     low, high = kind.box(*one)
     assert (q >= low - 1e-12).all() and (q <= high + 1e-12).all() and (high - low).max() <= 2

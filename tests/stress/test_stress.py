@@ -11,14 +11,14 @@ from few import few
 
 from torchpt.cli.main import main
 from torchpt.core.errors import SceneError
-from torchpt.stress import Bench, Case, Outcome, Reading, outcome_of
+from torchpt.stress import Case, Harness, Measurement, Outcome, outcome_of
 from torchpt.stress.cases import all_cases
-from torchpt.stress.own_scene import cases_of, moved
+from torchpt.stress.scene_cases import cases_of, moved
 from torchpt.stress.table import line
 
 CASES = {f"{topic}/{case.name}": case for topic, cases in all_cases().items() for case in cases}
 BACKENDS = {
-    f"{accel} {compiled}": Bench(accel=accel, compile=compiled)
+    f"{accel} {compiled}": Harness(accel=accel, compile=compiled)
     for accel, compiled in (("numba", "on"), ("numba", "off"), ("torch", "off"), ("brute", "off"))
 }
 
@@ -29,7 +29,7 @@ def told(outcome: Outcome) -> str:
 
 @pytest.mark.parametrize("name", few(CASES, 6))
 def test_quickly(name: str) -> None:
-    outcome = outcome_of(CASES[name], Bench(), quick=True)
+    outcome = outcome_of(CASES[name], Harness(), quick=True)
     assert outcome.passed, told(outcome)
 
 
@@ -46,7 +46,7 @@ def test_whole_sweeps_by_every_backend(name: str, backend: str) -> None:
 @pytest.mark.parametrize("scene", ["cornell_box", pytest.param("material_row", marks=pytest.mark.slow)])
 def test_a_scene_of_ones_own(scene: str) -> None:
     for case in cases_of(scene, {}):
-        outcome = outcome_of(case, Bench(), quick=True)
+        outcome = outcome_of(case, Harness(), quick=True)
         assert outcome.passed, f"{case.name}: {told(outcome)}"
 
 
@@ -80,40 +80,40 @@ def case(**keys: object) -> Case:
     return Case(**{"name": "it", "measures": "a thing", "bound": 1.0, "figure": lambda b, at: at, **keys})  # type: ignore[arg-type]
 
 
-def failing(bench: Bench, at: float) -> float:
+def failing(harness: Harness, at: float) -> float:
     raise ValueError("two\nlines")
 
 
 def test_the_largest_figure_decides() -> None:
-    good = outcome_of(case(axis="x", places=(0.1, 0.9, 0.5)), Bench())
-    assert good.passed and good.worst == Reading(0.9, 0.9)
-    bad = outcome_of(case(axis="x", places=(0.1, 1.1)), Bench())
+    good = outcome_of(case(axis="x", sweep=(0.1, 0.9, 0.5)), Harness())
+    assert good.passed and good.worst == Measurement(0.9, 0.9)
+    bad = outcome_of(case(axis="x", sweep=(0.1, 1.1)), Harness())
     assert not bad.passed and bad.worst.at == 1.1
-    assert not outcome_of(case(figure=lambda b, at: float("nan")), Bench()).passed
-    broken = outcome_of(case(figure=failing), Bench())
+    assert not outcome_of(case(figure=lambda b, at: float("nan")), Harness()).passed
+    broken = outcome_of(case(figure=failing), Harness())
     assert not broken.passed and broken.worst.problem == "ValueError: two lines"
 
 
-def refusing(bench: Bench, at: float) -> float:
+def refusing(harness: Harness, at: float) -> float:
     if at < 1.0:
         raise SceneError("render.accel", "brute", "numba")
     return 0.5
 
 
 def test_a_search_may_refuse_a_scene() -> None:
-    partly = outcome_of(case(figure=refusing, places=(0.1, 1.0)), Bench(accel="brute"))
-    assert partly.passed and partly.refused == 1 and partly.worst == Reading(1.0, 0.5)
+    partly = outcome_of(case(figure=refusing, sweep=(0.1, 1.0)), Harness(accel="brute"))
+    assert partly.passed and partly.refused == 1 and partly.worst == Measurement(1.0, 0.5)
     assert line(partly).endswith("passed, refused at 1 of 2 places")
-    wholly = outcome_of(case(figure=refusing, places=(0.1,)), Bench(accel="brute"))
+    wholly = outcome_of(case(figure=refusing, sweep=(0.1,)), Harness(accel="brute"))
     assert wholly.passed and "refused: SceneError: render.accel: expected numba" in line(wholly)
-    beyond = outcome_of(case(figure=refusing, places=(0.1, 1.0), bound=0.1), Bench(accel="brute"))
+    beyond = outcome_of(case(figure=refusing, sweep=(0.1, 1.0), bound=0.1), Harness(accel="brute"))
     assert not beyond.passed and "FAILED, refused at 1 of 2 places" in line(beyond)
 
 
 def test_places_of_a_quick_run() -> None:
-    sweep = case(places=tuple(float(k) for k in range(9)))
-    assert sweep.chosen(True) == (0.0, 4.0, 8.0) and len(sweep.chosen(False)) == 9
-    assert case(places=(1.0, 2.0), quick=(2.0,)).chosen(True) == (2.0,)
+    sweep = case(sweep=tuple(float(k) for k in range(9)))
+    assert sweep.points(True) == (0.0, 4.0, 8.0) and len(sweep.points(False)) == 9
+    assert case(sweep=(1.0, 2.0), quick=(2.0,)).points(True) == (2.0,)
 
 
 # -- the command

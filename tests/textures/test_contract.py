@@ -14,15 +14,15 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.compiler.function import lanewise
+from torchpt.compiler.function import compile_lanewise
 from torchpt.core.errors import SceneError
 from torchpt.math.vectors import luminance
 from torchpt.physics.parts import Parameters
 from torchpt.physics.textures import KINDS, Node, Table, TexturePoint
 from torchpt.scene.formats.textures import texture_of
-from torchpt.scene.texels import Opener
+from torchpt.scene.texture_loader import TextureLoader
 from torchpt.spec import Color, Moves, Scalar, Spec, Texels, parameters_of
-from torchpt.spec.schema import described
+from torchpt.spec.schema import read_typed
 
 CPU = torch.device("cpu")
 COLOUR = Color((0.0, 0.0, 0.0), low=0.0, high=1.0, texture=True)
@@ -115,8 +115,8 @@ def opened(path: str) -> Callable[..., Opened]:
 
     def make(name: str, spec: Spec = COLOUR, *, named: str | None = None, **more: Any) -> Opened:
         entry, parameters = entry_of(name, path, **more), Parameters()
-        textures = {"t": described("texture", KINDS, entry, "t", None)}
-        opener = Opener(textures, lambda paths, key: Path(paths[0]), parameters, None)
+        textures = {"t": read_typed("texture", KINDS, entry, "t", None)}
+        opener = TextureLoader(textures, lambda paths, key: Path(paths[0]), parameters, None)
         node = opener(texture_of({"texture": "t", "channel": named} if named else entry, spec), "slot")
         given = {key: torch.from_numpy(np.asarray(value, np.float64)) for key, value in parameters.items()}
         return node, given, parameters.specs
@@ -207,7 +207,7 @@ def test_gradients(name: str, opened: Callable[..., Opened]):
     more = ROWS[name].filters
     node, given, _ = opened(name, uv_transform=TURN, **more) if name in MAPPED else opened(name)
     names = list(given)
-    assert set(names) == {f"slot.{key}" for key, spec in parameters_of(KINDS[name]).items() if spec.traced} or (
+    assert set(names) == {f"slot.{key}" for key, spec in parameters_of(KINDS[name]).items() if spec.differentiable} or (
         name == "image" and names == ["slot"]
     )
     footprint = torch.full((4,), 0.01, dtype=torch.float64) if more else None
@@ -263,7 +263,7 @@ def test_compiled_is_eager(name: str, opened: Callable[..., Opened]):
             slopes = list(inclines(table, at)) if not coloured and name in MAPPED else []
             return [read(table, at, coloured), *slopes]
 
-        eager, compiled = stage(*inputs), lanewise(stage, inputs)(*inputs)
+        eager, compiled = stage(*inputs), compile_lanewise(stage, inputs)(*inputs)
         for a, b in zip(eager, compiled, strict=True):
             off = (a - b).abs() > 1e-4 * (1 + a.abs())
             assert float(off.float().mean()) < 0.005  # a coordinate rounded otherwise lies across an edge

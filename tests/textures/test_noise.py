@@ -13,7 +13,7 @@ from torchpt.math.hashing import mix_int
 from torchpt.physics.textures import KINDS, TexturePoint
 from torchpt.physics.textures.computed import ComputedNode
 from torchpt.physics.textures.kinds.noise import Noise
-from torchpt.spec.schema import values_of
+from torchpt.spec.schema import read_params
 
 CPU = torch.device("cpu")
 COLORS = {"n.color0": torch.zeros(3), "n.color1": torch.ones(3)}
@@ -25,7 +25,7 @@ def noise(uv: Tensor, area: Tensor | None = None, dtype: torch.dtype = torch.flo
 
 
 def _read(uv: Tensor, area: Tensor | None, dtype: torch.dtype, slope: bool, **keys: Any) -> Tensor:
-    values = values_of(Noise, {"scale": 1.0, **keys}, "n", None).values
+    values = read_params(Noise, {"scale": 1.0, **keys}, "n", None).values
     made = Noise.of(values)
     node = ComputedNode(made, "n", 0, Noise.matrix(values), tuple(made.constants(values).items()), area is not None)
     numbers = {

@@ -10,12 +10,12 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from torchpt.cli import collector, keys
+from torchpt.cli import gc_pause, keys
 from torchpt.cli.arguments import UsageError, parse_study
 from torchpt.cli.interrupt import Interrupt, Interrupted
 from torchpt.cli.notices import notices
 from torchpt.cli.progress import Bar
-from torchpt.cli.streams import speaking
+from torchpt.cli.streams import flushed_stdout
 from torchpt.core.errors import OutputError, SceneError
 
 __all__ = ["HELP", "converge", "raw_study", "run"]
@@ -157,12 +157,12 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
     from torchpt.reports.runs import Stopped, Store, measure, prepare, write_whole
     from torchpt.reports.study import study_of
 
-    collector.resume()
+    gc_pause.resume()
     start = time.perf_counter()
     raw, file = raw_study({key: text for key, text in words.items() if key != "out"}, changes)
     with notices():
         study = study_of(raw, file)
-        told = _told(raw, study.asked)
+        told = _told(raw, study.options)
         folder, note = _folder(words.get("out"), f"{_stem(study.scenes, file)}_converge", told)
         prepared = prepare(study)
         check_files(study, prepared)
@@ -187,13 +187,13 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
                 file=sys.stderr,
             )
             return Interrupted(interrupt.signum or 2).exit_code
-    topics = write_report(study, prepared, folder)
+    scene_reports = write_report(study, prepared, folder)
     facts = {
         "out": str(folder / "report.html"),
         "seconds": round(time.perf_counter() - start, 4),
         "scenes": [
             {
-                "scene": topic.name,
+                "scene": scene_report.name,
                 "curves": [
                     {
                         "label": line.label,
@@ -203,13 +203,13 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
                         "biased": line.bias["biased"] if line.bias else None,
                         "nonfinite_samples": sum(step.nonfinite for step in line.steps),
                     }
-                    for line in topic.lines
+                    for line in scene_report.lines
                 ],
             }
-            for topic in topics
+            for scene_report in scene_reports
         ],
     }
-    with speaking():
+    with flushed_stdout():
         print(json.dumps(plain(facts), allow_nan=False))
     return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
 
@@ -250,17 +250,17 @@ def _holds_another(folder: Path, told: dict[str, Any]) -> bool:
     return {**known, "spp": 0, "seeds": 0} != {**told, "spp": 0, "seeds": 0} or not grown
 
 
-def _told(raw: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
+def _told(raw: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """Return all that the runs of a study depend on, as JSON has it.
 
     Args:
         raw: its keys as written.
-        asked: its own keys as read, see :class:`torchpt.reports.study.Study`.
+        options: its own keys as read, see :class:`torchpt.reports.study.Study`.
     """
     from torchpt.reports.report import plain
 
     told = {key: value for key, value in raw.items() if key not in _SHOWN}
-    return json.loads(json.dumps(plain({**told, "spp": asked["spp"], "seeds": asked["seeds"]}), sort_keys=True))
+    return json.loads(json.dumps(plain({**told, "spp": options["spp"], "seeds": options["seeds"]}), sort_keys=True))
 
 
 def _stem(scenes: tuple[str, ...], file: str | None) -> str:

@@ -15,13 +15,13 @@ from torch import Tensor
 
 from torchpt.compiler import cpu
 from torchpt.compiler.graph import DTYPES
-from torchpt.compiler.kernel import text
-from torchpt.compiler.program import Program, TracedStage, holds
+from torchpt.compiler.kernel import kernel_ir
+from torchpt.compiler.program import Program, TracedStage, guards_hold
 from torchpt.compiler.prologue import Guard, Source, Step, Table
 from torchpt.native import cache
 from torchpt.native.content import code_of_folder
 
-__all__ = ["MOST_PROGRAMS", "compiled", "forget", "key_of", "load", "program_of", "store"]
+__all__ = ["MOST_PROGRAMS", "cache_key", "clear_programs", "compiled", "load", "program_of", "store"]
 
 
 # ---- Programs on disk: what a stage was traced to, so that another process need not trace it again
@@ -41,13 +41,13 @@ class _NotKept(Exception):
     """Something that no entry can hold."""
 
 
-def key_of(structure: Any) -> str | None:
+def cache_key(structure: Any) -> str | None:
     """The name of an entry; None where the structure holds objects that only this process knows."""
     try:
-        text = "\n".join((code_of_folder(), torch.__version__, cpu.identity(), _canonical(structure)))
+        kernel_ir = "\n".join((code_of_folder(), torch.__version__, cpu.identity(), _canonical(structure)))
     except _NotKept:
         return None
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(kernel_ir.encode()).hexdigest()
 
 
 def _canonical(value: Any) -> str:
@@ -68,7 +68,7 @@ def load(key: str) -> Program | None:
     if content is None:
         return None
     facts = json.loads(content)
-    function = cpu.kept(facts["code"])
+    function = cpu.load_function(facts["code"])
     if function is None:
         return None
     return Program(
@@ -76,7 +76,7 @@ def load(key: str) -> Program | None:
         code=function.key,
         tables=tuple(Table(_source(x), axis) for x, axis in facts["tables"]),
         steps=tuple(_step(x) for x in facts["steps"]),
-        held=tuple(_tensor(x) for x in facts["held"]),
+        constants=tuple(_tensor(x) for x in facts["constants"]),
         guards=tuple(Guard(_source(x), value) for x, value in facts["guards"]),
         **{name: _frozen(facts[name]) for name in _PLAIN},
     )
@@ -89,7 +89,7 @@ def store(key: str, program: Program) -> None:
             "code": program.code,
             "tables": [[_source_out(t.source), t.axis] for t in program.tables],
             "steps": [[str(s.function), _out(s.args), _out(s.kwargs)] for s in program.steps],
-            "held": [_tensor_out(t) for t in program.held],
+            "constants": [_tensor_out(t) for t in program.constants],
             "guards": [[_source_out(g.source), g.value] for g in program.guards],
             **{name: getattr(program, name) for name in _PLAIN},
         }
@@ -180,10 +180,10 @@ def program_of(structure: Any, tensors: Mapping[str, Tensor], traced: Callable[[
     """
     with _tracing:  # one at a time in a process: see torchpt.compiler.tracing.tracing
         program = _programs.get(structure)
-        name = key_of(structure) if program is None else None
+        name = cache_key(structure) if program is None else None
         if program is None and name is not None:
             program = load(name)
-        if program is None or not holds(program, tensors):
+        if program is None or not guards_hold(program, tensors):
             program = compiled(traced())
             if name is not None:
                 store(name, program)
@@ -198,9 +198,9 @@ def program_of(structure: Any, tensors: Mapping[str, Tensor], traced: Callable[[
 def compiled(stage: TracedStage, target: cpu.Target | None = None) -> Program:
     """Return the program of a stage for a machine; for this one where None."""
     target = target or cpu.host()
-    return Program.of(stage, cpu.compiled(text(stage, target.form), target))
+    return Program.of(stage, cpu.compiled(kernel_ir(stage, target.form), target))
 
 
-def forget() -> None:
+def clear_programs() -> None:
     """Drop the programs of this process; those on disk stay."""
     _programs.clear()

@@ -9,9 +9,9 @@ from torchpt.compiler.form import Form
 from torchpt.compiler.functions import FUNCTIONS
 from torchpt.compiler.graph import FLOATS, Graph, Unsupported
 
-__all__ = ["MEMORY", "Body", "emit"]
+__all__ = ["MEMORY", "LoopBody", "generate_node"]
 
-#: Types of elements as tables and the arena hold them; see :func:`torchpt.compiler.program.bound`.
+#: Types of elements as tables and the arena hold them; see :func:`torchpt.compiler.program.bind_tables`.
 MEMORY = {"f": "float", "d": "double", "i": "i32", "l": "i32", "L": "i32", "u": "i32", "b": "i32"}
 
 _COMPARISONS = {
@@ -24,12 +24,12 @@ _COMPARISONS = {
 }
 
 
-class Body(Block):
+class LoopBody(Block):
     """The body of a kernel's loop.
 
     Attributes:
         listed: whether lanes are those that a list names, else all in order.
-        products: those that are rounded with a sum, by that; see :func:`torchpt.compiler.fusing.fused`.
+        products: those that are rounded with a sum, by that; see :func:`torchpt.compiler.fusing.fused_products`.
     """
 
     def __init__(self, form: Form, listed: bool, products: dict[int, int]) -> None:
@@ -37,7 +37,7 @@ class Body(Block):
         self.listed, self.products = listed, products
 
 
-def emit(block: Body, graph: Graph, node: int, names: dict[int, str]) -> str:
+def generate_node(block: LoopBody, graph: Graph, node: int, names: dict[int, str]) -> str:
     """Write the lines of one node, and return its name. ``names`` has those of its arguments."""
     op, ty, arguments, extra = graph.nodes[node]
     if node in block.products:
@@ -63,7 +63,7 @@ def emit(block: Body, graph: Graph, node: int, names: dict[int, str]) -> str:
     return _byte(block, value) if ty == "u" and op in _CARRIES else value
 
 
-def _fused(block: Body, graph: Graph, node: int, names: dict[int, str]) -> str:
+def _fused(block: LoopBody, graph: Graph, node: int, names: dict[int, str]) -> str:
     """``a b + c``, ``a b - c`` or ``c - a b``, rounded once."""
     op, ty, terms, _ = graph.nodes[node]
     product = block.products[node]
@@ -261,10 +261,10 @@ def _gather(block: Block, ty: str, index: str, extra: tuple[int, int, int]) -> s
     return _from_memory(block, ty, block.gather(element, pointer, index, invariant=True))
 
 
-def _from_memory(block: Block, ty: str, held: str) -> str:
+def _from_memory(block: Block, ty: str, stored: str) -> str:
     if ty == "b":
-        return block.op(f"icmp ne {block.each('i32')} {held}, zeroinitializer")
-    return block.convert("sext", "i", "L", held) if ty == "L" else held
+        return block.op(f"icmp ne {block.each('i32')} {stored}, zeroinitializer")
+    return block.convert("sext", "i", "L", stored) if ty == "L" else stored
 
 
 def _scalar(block: Block, ty: str, pointer: str, place: int) -> str:
@@ -308,19 +308,19 @@ def _iota(block: Block, ty: str) -> str:
     return block.convert("sext", "i", "L", places) if ty == "L" else _cast(block, "i", ty, places)
 
 
-def _place(block: Body, ty: str) -> str:
+def _place(block: LoopBody, ty: str) -> str:
     """Return where in the arena the lane is."""
     return "%place" if block.listed else _iota(block, ty)
 
 
-def _arena(block: Body, ty: str, extra: int) -> str:
+def _arena(block: LoopBody, ty: str, extra: int) -> str:
     """A row of the arena, at the lane's own place or at that which the list names."""
     element = MEMORY[ty]
     if block.listed:
-        held = block.gather(element, f"%row{extra}", "%place")
+        stored = block.gather(element, f"%row{extra}", "%place")
     else:
-        held = block.op(f"load {block.each(element)}, ptr {block.at(f'%row{extra}', element, '%i')}, align 4")
-    return _from_memory(block, ty, held)
+        stored = block.op(f"load {block.each(element)}, ptr {block.at(f'%row{extra}', element, '%i')}, align 4")
+    return _from_memory(block, ty, stored)
 
 
 def _slot(block: Block, ty: str, place: str, extra: int) -> str:
@@ -336,12 +336,12 @@ def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
     element = {"l": "i64", "L": "i64", "b": "i8", "u": "i8"}.get(ty, ELEMENTS[ty])
     size = {"i64": 8, "double": 8, "i8": 1}.get(element, 4)
     row = block.at(f"%in{slot}", "i8", block.op(f"mul i64 %in{slot}s, {k * size}")) if k else f"%in{slot}"
-    held = block.masked_load(element, block.at(row, element, "%i"), "%mask")
+    stored = block.masked_load(element, block.at(row, element, "%i"), "%mask")
     if element == "i64":
-        return held if ty == "L" else block.op(f"trunc {block.each('i64')} {held} to {block.each('i32')}")
+        return stored if ty == "L" else block.op(f"trunc {block.each('i64')} {stored} to {block.each('i32')}")
     if ty == "b":
-        return block.op(f"icmp ne {block.each('i8')} {held}, zeroinitializer")
-    return block.op(f"zext {block.each('i8')} {held} to {block.each('i32')}") if ty == "u" else held
+        return block.op(f"icmp ne {block.each('i8')} {stored}, zeroinitializer")
+    return block.op(f"zext {block.each('i8')} {stored} to {block.each('i32')}") if ty == "u" else stored
 
 
 _HANDLERS: dict[str, Callable[..., str]] = {

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from torchpt.compiler.form import VECTORS, Form
-from torchpt.core.memory import check_room
+from torchpt.core.memory import check_address_space
 from torchpt.native import cache
 
 __all__ = [
@@ -19,7 +19,7 @@ __all__ = [
     "counts",
     "host",
     "identity",
-    "kept",
+    "load_function",
 ]
 
 #: Enters every key: entries that are made otherwise are never read.
@@ -71,7 +71,7 @@ def _llvm() -> Any:
 def host() -> Target:
     """This machine."""
     if "host" not in _state:
-        check_room()
+        check_address_space()
         llvm = _llvm()
         _state["host"] = Target(llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
     return _state["host"]
@@ -90,7 +90,7 @@ def compiled(ir: str, target: Target | None = None) -> Function:
         function = _functions.get(key)
         if function is None:
             code = cache.read(f"{key[:40]}.o")
-            check_room()  # LLVM ends the process where it finds no memory
+            check_address_space()  # LLVM ends the process where it finds no memory
             if code is None:
                 code = _object(ir, target)
                 _state["compiled"] += 1
@@ -101,13 +101,13 @@ def compiled(ir: str, target: Target | None = None) -> Function:
         return function
 
 
-def kept(key: str) -> Function | None:
+def load_function(key: str) -> Function | None:
     """A function of this machine by its key, from this process or from disk; None where there is none."""
     with _lock:
         function = _functions.get(key)
         code = cache.read(f"{key[:40]}.o") if function is None else None
         if code is not None:
-            check_room()
+            check_address_space()
             _state["loaded"] += 1
             function = _functions[key] = _loaded(code, host(), key)
         return function

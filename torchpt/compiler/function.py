@@ -1,6 +1,6 @@
 """Functions of whole tensors by lanes as kernels of their own, where no stage is traced.
 
-:class:`Lanewise` compiles a function for the arguments that it is called with, and keeps what was made; :func:`lanewise`
+:class:`Lanewise` compiles a function for the arguments that it is called with, and keeps what was made; :func:`compile_lanewise`
 compiles one now.
 """
 
@@ -20,15 +20,15 @@ from torchpt.compiler import cache, operators  # noqa: F401  (the operators regi
 from torchpt.compiler.cpu import Target
 from torchpt.compiler.graph import DTYPES, Unsupported
 from torchpt.compiler.kernel import HEAD
-from torchpt.compiler.program import Program, Tables, TracedStage, bound
-from torchpt.compiler.prologue import pruned
+from torchpt.compiler.program import Program, Tables, TracedStage, bind_tables
+from torchpt.compiler.prologue import without_unused_steps
 from torchpt.compiler.sinks import Sinks, Store
-from torchpt.compiler.tracing import Tracer, lanes_for, tracing
-from torchpt.core.threads import share, thread_count
+from torchpt.compiler.tracing import Tracer, choose_lane_count, tracing
+from torchpt.core.threads import parallel_for, thread_count
 from torchpt.core.tree import leaves, signature
 from torchpt.native import compile_time
 
-__all__ = ["Lanewise", "lanewise"]
+__all__ = ["Lanewise", "compile_lanewise"]
 
 #: Lanes that a thread takes together.
 BLOCK = 64
@@ -68,7 +68,7 @@ class Lanewise:
         name = f"{function.__module__}.{getattr(function, '__qualname__', '<')}"
         # A name tells the package's own functions from others, on disk too: an entry there is of the package's code.
         self._name = name if name.startswith("torchpt.") and "<" not in name else function
-        self._made: dict[Any, _Made] = {}
+        self._made: dict[Any, _CompiledFunction] = {}
         self.refused: dict[Any, str] = {}
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
@@ -105,30 +105,32 @@ class Lanewise:
             return NotImplemented
         tables = leaves(records)
         made = self._made.get(key)
-        if made is None or not made.serves(tables):
+        if made is None or not made.is_current(tables):
             if any(map(self._unfit, tables)):
                 return NotImplemented
-            compile_time.begun()
+            compile_time.begin()
             try:
                 made = self._make(key, args, tables)
             except Unsupported as error:
                 self.refused[key] = str(error)
                 return NotImplemented
             finally:
-                compile_time.ended()
+                compile_time.end()
         return made.run(inputs, uniforms, count, thread_count(None))
 
     def _unfit(self, tensor: Tensor) -> bool:
         return tensor.device.type != "cpu" or (tensor.requires_grad and not self._detached)
 
-    def _make(self, key: tuple[Any, ...], args: Sequence[Any], tables: list[Tensor]) -> _Made:
+    def _make(self, key: tuple[Any, ...], args: Sequence[Any], tables: list[Tensor]) -> _CompiledFunction:
         paths = {str(k): table for k, table in enumerate(tables)}
         whole = self._name, tuple(self._kinds), key
         program = cache.program_of(whole, paths, lambda: self._traced(args, paths))
         states = [(table, _version(table)) for table in tables]
         before = self._made.get(key)
         results = self._results(args) if before is None else before.results
-        made = _Made(program, bound(program.tables, program.steps, program.held, paths), states, results)
+        made = _CompiledFunction(
+            program, bind_tables(program.tables, program.steps, program.constants, paths), states, results
+        )
         if before is None and len(self._made) >= _MOST:
             self._made.pop(next(iter(self._made)), None)
         self._made[key] = made
@@ -151,7 +153,7 @@ class Lanewise:
 
     def _traced(self, args: Sequence[Any], paths: dict[str, Tensor]) -> TracedStage:
         near = self._changed(args, lambda x: x[..., 0], lambda x: x)
-        lanes = lanes_for(leaves(near))
+        lanes = choose_lane_count(leaves(near))
         tracer = Tracer(lanes, {id(table): (path, table) for path, table in paths.items()})
         slots = 0
 
@@ -166,14 +168,14 @@ class Lanewise:
         stores = _stores(tracer, [results] if isinstance(results, Tensor) else results)
         if any(op == "iota" for op, *_ in tracer.graph.nodes):
             raise Unsupported("lanes that ask for their own number")
-        tables, steps, guards = pruned(tracer.tables, tracer.steps, tracer.guards)
+        tables, steps, guards = without_unused_steps(tracer.tables, tracer.steps, tracer.guards)
         names = [str(k) for k in range(len(tracer.uniforms))]
         sinks = Sinks(store=stores)
-        return TracedStage(tracer.graph, sinks, tables, steps, tuple(tracer.held), guards, names, slots)
+        return TracedStage(tracer.graph, sinks, tables, steps, tuple(tracer.constants), guards, names, slots)
 
 
 @dataclass
-class _Made:
+class _CompiledFunction:
     """A function compiled for arguments of one structure.
 
     Attributes:
@@ -197,7 +199,7 @@ class _Made:
         work = max(self.program.nodes.values(), default=1)
         self.grain = max(GRAIN // work // BLOCK, 1)
 
-    def serves(self, tables: list[Tensor]) -> bool:
+    def is_current(self, tables: list[Tensor]) -> bool:
         """Return True where its tables are those of these tensors, as they are now."""
         return all(
             table is known and _version(table) == version
@@ -222,11 +224,11 @@ class _Made:
             self.program.call(ctypes.addressof(block), end - start)
 
         blocks = -(-count // BLOCK)
-        share(part, blocks, min(threads, max(blocks // self.grain, 1)))
+        parallel_for(part, blocks, min(threads, max(blocks // self.grain, 1)))
         return outputs[0] if isinstance(self.results, Tensor) else tuple(outputs)
 
 
-def lanewise(
+def compile_lanewise(
     function: Callable[..., Sequence[Tensor]], like: Sequence[Tensor], target: Target | None = None
 ) -> Callable[..., list[Tensor]]:
     """Compile a function of tensors ``(..., N)`` now, for one thread.
@@ -239,16 +241,16 @@ def lanewise(
     Raises:
         Unsupported: for what the lane compiler does not know.
     """
-    lanes = lanes_for([x[..., 0] for x in like if x.numel()])
+    lanes = choose_lane_count([x[..., 0] for x in like if x.numel()])
     tracer = Tracer(lanes, {})
     given = [_input(tracer, slot, _sample(x, lanes)) for slot, x in enumerate(like)]
     with torch.no_grad(), tracer:
         results = list(function(*given))
     sinks = Sinks(store=_stores(tracer, results))
-    stage = TracedStage(tracer.graph, sinks, tracer.tables, tracer.steps, tracer.held, tensors=len(given))
-    tables = bound(stage.tables, stage.steps, stage.held, {})
+    stage = TracedStage(tracer.graph, sinks, tracer.tables, tracer.steps, tracer.constants, tensors=len(given))
+    tables = bind_tables(stage.tables, stage.steps, stage.constants, {})
     program = cache.compiled(stage, target)
-    made = _Made(program, tables, [], tuple(x[..., :0] for x in results))
+    made = _CompiledFunction(program, tables, [], tuple(x[..., :0] for x in results))
 
     def run(*arguments: Tensor) -> list[Tensor]:
         return list(made.run(arguments, (), arguments[0].shape[-1], 1))

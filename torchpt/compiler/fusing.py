@@ -9,10 +9,10 @@ from collections import Counter
 
 from torchpt.compiler.graph import FLOATS, Graph
 
-__all__ = ["fused"]
+__all__ = ["fused_products"]
 
 
-def fused(graph: Graph, needed: list[int], roots: list[int]) -> dict[int, int]:
+def fused_products(graph: Graph, needed: list[int], roots: list[int]) -> dict[int, int]:
     """Return the product that is rounded with each sum or difference: the first of its terms that nothing else asks for.
 
     Args:

@@ -10,15 +10,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 from torchpt.compiler.block import ELEMENTS
-from torchpt.compiler.codegen import MEMORY, Body, emit
+from torchpt.compiler.codegen import MEMORY, LoopBody, generate_node
 from torchpt.compiler.form import Form
-from torchpt.compiler.fusing import fused
+from torchpt.compiler.fusing import fused_products
 from torchpt.compiler.graph import Graph, Unsupported
-from torchpt.compiler.packet import packet_search, search_functions
+from torchpt.compiler.packet import binary_searches, packet_search
 from torchpt.compiler.program import TracedStage
-from torchpt.compiler.sinks import Note, Pack, Scatter, Sinks, Store
+from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 
-__all__ = ["HEAD", "SinkLines", "sink_lines", "text"]
+__all__ = ["HEAD", "SinkWriter", "kernel_ir", "sink_writer"]
 
 
 # ---- The end of a kernel's loop: LLVM IR that puts the results where the sinks say
@@ -27,7 +27,7 @@ __all__ = ["HEAD", "SinkLines", "sink_lines", "text"]
 # held in registers, a single lane takes the next place of a counter in memory and writes behind a branch.
 
 
-class SinkLines(ABC):
+class SinkWriter(ABC):
     """The lines of a kernel's sinks.
 
     In the loop ``%i`` is the lane's number, or that of a vector's first, ``%mask`` says which lanes there are, and ``%first0``,
@@ -39,7 +39,7 @@ class SinkLines(ABC):
         functions: lines of functions that the loop calls.
     """
 
-    def __init__(self, block: Body, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
+    def __init__(self, block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
         self.block, self.graph, self.names, self.sinks = block, graph, names, sinks
         self.before: list[str] = []
         self.after: list[str] = []
@@ -48,10 +48,10 @@ class SinkLines(ABC):
     def write(self) -> None:
         """All of them."""
         block, sinks = self.block, self.sinks
-        for pack in sinks.pack:
-            self._pack(pack)
-        for note in sinks.notes:
-            self._note(note, self._masked(note.mask), "%place" if block.listed else self.block.places("%i"))
+        for compact in sinks.compact:
+            self._compact(compact)
+        for append in sinks.appends:
+            self._append_index(append, self._masked(append.mask), "%place" if block.listed else self.block.places("%i"))
         if sinks.write:
             self._write("%i" if sinks.shift is None else block.op(f"add i64 %i, %first{sinks.shift}"))
         for scatter in sinks.scatter:
@@ -62,10 +62,10 @@ class SinkLines(ABC):
             self._store(k, store)
 
     @abstractmethod
-    def _pack(self, pack: Pack) -> None: ...
+    def _compact(self, compact: Compact) -> None: ...
 
     @abstractmethod
-    def _note(self, note: Note, mask: str, places: str) -> None: ...
+    def _append_index(self, append: AppendIndex, mask: str, places: str) -> None: ...
 
     @abstractmethod
     def _write(self, place: str) -> None:
@@ -77,7 +77,7 @@ class SinkLines(ABC):
     def _masked(self, mask: int) -> str:
         return self.block.op(f"and {self.block.each('i1')} {self.names[mask]}, %mask")
 
-    def _held(self, node: int) -> tuple[str, str]:
+    def _stored_value(self, node: int) -> tuple[str, str]:
         """The 32 bits by which the arena holds a number: their type and name."""
         ty, name, block = self.graph.type(node), self.names[node], self.block
         if ty == "d":
@@ -96,9 +96,9 @@ class SinkLines(ABC):
     def _scatter(self, scatter: Scatter) -> None:
         block = self.block
         mask = "%mask" if scatter.mask < 0 else self._masked(scatter.mask)
-        place = self._held(scatter.place)[1]
+        place = self._stored_value(scatter.place)[1]
         for row, node in scatter.rows:
-            element, value = self._held(node)
+            element, value = self._stored_value(node)
             if scatter.slots:
                 start = block.at("%slots", element, block.op(f"mul i64 %stride, {row}")) if row else "%slots"
             else:
@@ -123,10 +123,10 @@ class SinkLines(ABC):
             block.masked_store(element, value, block.at(row, element, "%i"), "%mask")
 
 
-class _Vectors(SinkLines):
+class _VectorSinks(SinkWriter):
     """Lanes of a vector are moved together and stored whole; counters are values that go around the loop."""
 
-    def __init__(self, block: Body, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
+    def __init__(self, block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
         super().__init__(block, graph, names, sinks)
         self._counters = {k: f"%c{k}" for k in range(sinks.counters())}
 
@@ -149,36 +149,36 @@ class _Vectors(SinkLines):
 
     def _write(self, place: str) -> None:
         for row, node in self.sinks.write:
-            element, value = self._held(node)
+            element, value = self._stored_value(node)
             self._put(element, value, self._row(row, element, place))
 
     def _put(self, element: str, value: str, pointer: str) -> None:
         self.block.do(f"store {self.block.each(element)} {value}, ptr {pointer}, align 4")
 
-    def _pack(self, pack: Pack) -> None:
-        block, mask = self.block, self._masked(pack.mask)
-        start = self._counters[pack.counter]
-        for row, node in pack.rows:
-            element, value = self._held(node)
+    def _compact(self, compact: Compact) -> None:
+        block, mask = self.block, self._masked(compact.mask)
+        start = self._counters[compact.counter]
+        for row, node in compact.rows:
+            element, value = self._stored_value(node)
             self._put(element, block.compress(element, value, mask), self._row(row, element, start))
-        if pack.notes:
+        if compact.appends:
             places = self.block.places(start)
-            for note in pack.notes:
+            for append in compact.appends:
                 # Which of the packed lanes are meant: their mask packed likewise, no further than there are any.
-                both = block.op(f"and {block.each('i1')} {self.names[note.mask]}, {mask}")
+                both = block.op(f"and {block.each('i1')} {self.names[append.mask]}, {mask}")
                 wide = block.op(f"sext {block.each('i1')} {both} to {block.each('i32')}")
-                chosen = block.op(f"icmp ne {block.each('i32')} {self._packed(wide, mask)}, zeroinitializer")
-                self._note(note, chosen, places)
-        self._count(pack.counter, mask)
+                chosen = block.op(f"icmp ne {block.each('i32')} {self._compressed(wide, mask)}, zeroinitializer")
+                self._append_index(append, chosen, places)
+        self._count(compact.counter, mask)
 
-    def _packed(self, value: str, mask: str) -> str:
+    def _compressed(self, value: str, mask: str) -> str:
         """Return integers where the mask holds, moved together, with zeros behind."""
         return self.block.compress("i32", value, mask, "zeroinitializer")
 
-    def _note(self, note: Note, mask: str, places: str) -> None:
-        together = self._packed(places, mask)  # zeros behind: whatever reads on past the end reads a place
-        self._put("i32", together, self.block.at(f"%list{note.list}", "i32", self._counters[note.counter]))
-        self._count(note.counter, mask)
+    def _append_index(self, append: AppendIndex, mask: str, places: str) -> None:
+        together = self._compressed(places, mask)  # zeros behind: whatever reads on past the end reads a place
+        self._put("i32", together, self.block.at(f"%list{append.list}", "i32", self._counters[append.counter]))
+        self._count(append.counter, mask)
 
 
 #: ``@take(counter, mask)``: the next place, and the counter goes on where the mask holds.
@@ -191,10 +191,10 @@ _TAKE = """define internal i64 @take(ptr %counter, i1 %mask) alwaysinline {
 }"""
 
 
-class _Lanes(SinkLines):
+class _LaneSinks(SinkWriter):
     """One lane takes its places from counters in memory by the function ``take``, all that knows in which order lanes come."""
 
-    def __init__(self, block: Body, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
+    def __init__(self, block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
         super().__init__(block, graph, names, sinks)
         self.functions.append(_TAKE)
 
@@ -208,28 +208,28 @@ class _Lanes(SinkLines):
         self._put(self.sinks.write, place, "%mask")
 
     def _put(self, rows: Sequence[tuple[int, int]], place: str, mask: str) -> None:
-        held = [(row, *self._held(node)) for row, node in rows]
+        stored = [(row, *self._stored_value(node)) for row, node in rows]
         with self.block.when(mask):
-            for row, element, value in held:
+            for row, element, value in stored:
                 self.block.do(f"store {element} {value}, ptr {self._row(row, element, place)}")
 
-    def _pack(self, pack: Pack) -> None:
-        mask = self._masked(pack.mask)
-        place = self._take(pack.counter, mask)
-        self._put(pack.rows, place, mask)
-        for note in pack.notes:
-            both = self.block.op(f"and i1 {self.names[note.mask]}, {mask}")
-            self._note(note, both, self.block.places(place))
+    def _compact(self, compact: Compact) -> None:
+        mask = self._masked(compact.mask)
+        place = self._take(compact.counter, mask)
+        self._put(compact.rows, place, mask)
+        for append in compact.appends:
+            both = self.block.op(f"and i1 {self.names[append.mask]}, {mask}")
+            self._append_index(append, both, self.block.places(place))
 
-    def _note(self, note: Note, mask: str, places: str) -> None:
-        end = self._take(note.counter, mask)
+    def _append_index(self, append: AppendIndex, mask: str, places: str) -> None:
+        end = self._take(append.counter, mask)
         with self.block.when(mask):
-            self.block.do(f"store i32 {places}, ptr {self.block.at(f'%list{note.list}', 'i32', end)}")
+            self.block.do(f"store i32 {places}, ptr {self.block.at(f'%list{append.list}', 'i32', end)}")
 
 
-def sink_lines(block: Body, graph: Graph, names: dict[int, str], sinks: Sinks) -> SinkLines:
+def sink_writer(block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> SinkWriter:
     """Return what writes the sinks of a stage whose nodes have names, in the block's form."""
-    return (_Vectors if block.width > 1 else _Lanes)(block, graph, names, sinks)
+    return (_VectorSinks if block.width > 1 else _LaneSinks)(block, graph, names, sinks)
 
 
 # ---- A kernel: the loop over lanes around the nodes of a stage
@@ -239,15 +239,15 @@ def sink_lines(block: Body, graph: Graph, names: dict[int, str], sinks: Sinks) -
 HEAD = ("src", "dst", "list", "slots", "stride", "counters", "tables", "search")
 
 
-def text(stage: TracedStage, form: Form) -> str:
+def kernel_ir(stage: TracedStage, form: Form) -> str:
     """Return the IR of ``void kernel(ptr arguments, i64 lanes)``.
 
     Raises:
         Unsupported: for an operation, or a table that is not there.
     """
     graph, sinks, needed = stage.graph, stage.sinks, stage.needed()
-    products = fused(graph, needed, sinks.roots())
-    body = Body(form, stage.listed, products)
+    products = fused_products(graph, needed, sinks.roots())
+    body = LoopBody(form, stage.listed, products)
     _enter(body, stage, needed)
     entry, body.lines, body.label = body.lines, [], "loop"
     _begin(body)
@@ -255,10 +255,10 @@ def text(stage: TracedStage, form: Form) -> str:
     within = set(products.values())
     for node in needed:
         if node not in within:
-            names[node] = emit(body, graph, node, names)
-    ends = sink_lines(body, graph, names, sinks)
+            names[node] = generate_node(body, graph, node, names)
+    ends = sink_writer(body, graph, names, sinks)
     ends.write()
-    inner = [search_functions(graph, needed, form)]
+    inner = [binary_searches(graph, needed, form)]
     if stage.searched is not None:
         inner.append(packet_search(stage.searched, form))
     declarations = set().union(*(block.declarations for block in (body, *inner)))
@@ -292,7 +292,7 @@ def text(stage: TracedStage, form: Form) -> str:
 _PREFERRED = ' "prefer-vector-width"="512" "min-legal-vector-width"="512"'
 
 
-def _begin(body: Body) -> None:
+def _begin(body: LoopBody) -> None:
     """Begin a turn of the loop: its lanes (``%mask``), and their places in the arena (``%place``)."""
     body.declarations.add("declare i64 @llvm.smin.i64(i64, i64)")
     left = body.op("sub i64 %n, %i")
@@ -304,7 +304,7 @@ def _begin(body: Body) -> None:
         body.do(f"%place = load {body.each('i32')}, ptr {listed}, align 4")
 
 
-def _enter(body: Body, stage: TracedStage, needed: list[int]) -> None:
+def _enter(body: LoopBody, stage: TracedStage, needed: list[int]) -> None:
     """Read the arguments before the loop."""
     graph, sinks = stage.graph, stage.sinks
     words = [(name, "i64" if name == "stride" else "ptr") for name in HEAD]

@@ -14,17 +14,17 @@ from torchpt.compiler.codegen import MEMORY
 from torchpt.compiler.form import Form
 from torchpt.compiler.graph import Graph
 
-__all__ = ["KINDS", "packet_search", "packet_words", "search_functions"]
+__all__ = ["KINDS", "binary_searches", "packet_search", "scene_words"]
 
 
 # ---- Binary searches in sorted tables, as LLVM IR: functions that kernels call
 
 
-def search_functions(graph: Graph, needed: list[int], form: Form) -> Block:
+def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
     """Binary searches: all lanes take as many steps, which are as many as the table's length asks for."""
-    asked = {extra[1:] for op, _, _, extra in map(graph.nodes.__getitem__, needed) if op == "search"}
+    searches = {extra[1:] for op, _, _, extra in map(graph.nodes.__getitem__, needed) if op == "search"}
     whole = Block(form)
-    for ty, right in sorted(asked):
+    for ty, right in sorted(searches):
         block, element = Block(form), MEMORY[ty]
         vector, places = block.vector(ty), block.each("i32")
         block.lines += [
@@ -80,7 +80,7 @@ _RAY = ("ox", "oy", "oz", "dx", "dy", "dz")
 
 
 def packet_search(kinds: Sequence[str], form: Form) -> Block:
-    """Functions ``nearest`` and ``occluded`` of rays and the address of what is searched, see :func:`packet_words`.
+    """Functions ``nearest`` and ``occluded`` of rays and the address of what is searched, see :func:`scene_words`.
 
     Args:
         kinds: those that the scene has.
@@ -95,7 +95,7 @@ def packet_search(kinds: Sequence[str], form: Form) -> Block:
     return whole
 
 
-def packet_words(rows: Tensor, balls: Tensor, counts: Sequence[int], extent: float) -> Any:
+def scene_words(rows: Tensor, balls: Tensor, counts: Sequence[int], extent: float) -> Any:
     """Return what the functions read of a scene, as an array of ctypes; the tensors must live as long.
 
     There lie, 64 bits each: the address of the rows of planar primitives, that of the spheres, for each of :data:`KINDS` the
@@ -184,8 +184,8 @@ class _Search(Block):
             f"  %{kind}_p = phi {self.i} [ {prim}, %{before} ], [ %{kind}_p1, %{last} ]",
         ]
         if kind == "sphere":
-            self._near_ball(kind)
-        distance, hit = self._ball(kind) if kind == "sphere" else self._planar(kind)
+            self._near_sphere(kind)
+        distance, hit = self._sphere(kind) if kind == "sphere" else self._planar(kind)
         tests = [
             self.compare("ogt", "f", distance, self.constant("f", 0.0)),
             self.compare("olt", "f", distance, f"%{kind}_t"),
@@ -253,7 +253,7 @@ class _Search(Block):
             value = self.fma("d", x, y, value)
         return value
 
-    def _near_ball(self, kind: str) -> None:
+    def _near_sphere(self, kind: str) -> None:
         """Go on to the exact test where any ray comes near the sphere, by float32 and a bound of its rounding.
 
         The perpendicular from the centre to the ray errs by less than ``2^-20 (|f| + |c|)``, with ``f`` from the centre ``c``
@@ -283,7 +283,7 @@ class _Search(Block):
         some = self.some(near)
         self.lines += [f"  br i1 {some}, label %{kind}_exact, label %{kind}_last", f"{kind}_exact:"]
 
-    def _ball(self, kind: str) -> tuple[str, str | None]:
+    def _sphere(self, kind: str) -> tuple[str, str | None]:
         """See :func:`torchpt.search.tree_leaf.sphere_distance`."""
         own = self.op(f"sub i64 %{kind}_id, %end_disk")
         base = self.op(f"getelementptr [4 x double], ptr %balls, i64 {own}")

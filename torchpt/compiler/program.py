@@ -13,10 +13,10 @@ from torch import Tensor
 
 from torchpt.compiler.cpu import Function
 from torchpt.compiler.graph import Graph, Unsupported
-from torchpt.compiler.prologue import Guard, Name, Source, Step, Table, names_of, replayed
+from torchpt.compiler.prologue import Guard, Source, Step, StepKey, Table, run_prologue, step_keys
 from torchpt.compiler.sinks import Sinks
 
-__all__ = ["Program", "Tables", "TracedStage", "bound", "holds", "laid_out"]
+__all__ = ["Program", "Tables", "TracedStage", "bind_tables", "guards_hold", "lay_out_table"]
 
 
 # ---- A stage as it was traced: a graph. What it is compiled to is another thing, see :mod:`torchpt.compiler.program`
@@ -31,7 +31,7 @@ class TracedStage:
         sinks: what becomes of its results.
         tables: what it reads.
         steps: the prologue, which makes some of that from leaves.
-        held: tensors of its own.
+        constants: tensors of its own.
         guards: numbers that must be what they were.
         uniforms: names of the inputs that all lanes share.
         tensors: how many inputs are tensors instead of rows of an arena.
@@ -45,7 +45,7 @@ class TracedStage:
     sinks: Sinks
     tables: Sequence[Table] = ()
     steps: Sequence[Step] = ()
-    held: Sequence[Tensor] = ()
+    constants: Sequence[Tensor] = ()
     guards: Sequence[Guard] = ()
     uniforms: Sequence[str] = ()
     tensors: int = 0
@@ -70,7 +70,7 @@ class Program:
         code: the name of that on disk.
         tables: what it reads.
         steps: the prologue, which makes some of that from leaves.
-        held: tensors of the program's own.
+        constants: tensors of the program's own.
         guards: numbers that must be what they were.
         uniforms: names of the inputs that all lanes share.
         lists: how many lists of places it writes.
@@ -86,7 +86,7 @@ class Program:
     code: str
     tables: tuple[Table, ...]
     steps: tuple[Step, ...]
-    held: tuple[Tensor, ...]
+    constants: tuple[Tensor, ...]
     guards: tuple[Guard, ...]
     uniforms: tuple[str, ...]
     lists: int
@@ -109,7 +109,7 @@ class Program:
             code=function.key,
             tables=tuple(stage.tables),
             steps=tuple(stage.steps),
-            held=tuple(stage.held),
+            constants=tuple(stage.constants),
             guards=tuple(stage.guards),
             uniforms=tuple(stage.uniforms),
             lists=stage.sinks.lists(),
@@ -126,9 +126,9 @@ class Program:
         return self._leaves
 
     @cached_property
-    def names(self) -> tuple[Name | None, ...]:
-        """Of its steps, see :func:`torchpt.compiler.prologue.names_of`."""
-        return names_of(self.steps)
+    def names(self) -> tuple[StepKey | None, ...]:
+        """Of its steps, see :func:`torchpt.compiler.prologue.step_keys`."""
+        return step_keys(self.steps)
 
     @cached_property
     def _leaves(self) -> frozenset[str]:
@@ -161,7 +161,7 @@ class Tables:
     keep: tuple[Any, ...]
 
 
-def laid_out(tensor: Tensor, axis: int | None) -> Tensor:
+def lay_out_table(tensor: Tensor, axis: int | None) -> Tensor:
     """A table as kernels read it: entries first, contiguous, integers and truth values in 32 bits.
 
     Raises:
@@ -181,28 +181,28 @@ def laid_out(tensor: Tensor, axis: int | None) -> Tensor:
     return tensor.contiguous()
 
 
-def bound(
+def bind_tables(
     tables: Sequence[Table],
     steps: Sequence[Step],
-    held: Sequence[Tensor],
+    constants: Sequence[Tensor],
     leaves: Mapping[str, Tensor],
     known: dict[Any, Tensor] | None = None,
-    names: Sequence[Name | None] = (),
-    results: dict[Name, Tensor] | None = None,
+    names: Sequence[StepKey | None] = (),
+    results: dict[StepKey, Tensor] | None = None,
 ) -> Tables:
     """The tables of a kernel for one scene.
 
     Args:
         tables: of the trace.
         steps: its prologue.
-        held: its own tensors.
+        constants: its own tensors.
         leaves: the scene's tensors by path.
         known: leaves that were laid out before, by path and axis; filled.
         names: of the steps.
-        results: what steps of other kernels came to, see :func:`torchpt.compiler.prologue.replayed`; filled.
+        results: what steps of other kernels came to, see :func:`torchpt.compiler.prologue.run_prologue`; filled.
     """
     known = {} if known is None else known
-    tensor = replayed(steps, held, leaves, names, results)
+    tensor = run_prologue(steps, constants, leaves, names, results)
     words: list[int] = []
     keep: list[Tensor] = []
     for table in tables:
@@ -210,7 +210,7 @@ def bound(
         numbers = known.get(key) if key is not None else None
         plain = tensor(table.source)
         if numbers is None:
-            numbers = laid_out(plain, table.axis)
+            numbers = lay_out_table(plain, table.axis)
             if key is not None:
                 known[key] = numbers
         keep.append(numbers)
@@ -219,11 +219,11 @@ def bound(
     return Tables(ctypes.addressof(block), (block, keep))
 
 
-def holds(program: Program, leaves: Mapping[str, Tensor]) -> bool:
+def guards_hold(program: Program, leaves: Mapping[str, Tensor]) -> bool:
     """Return True where the numbers that a trace relied on are the same for other leaves."""
     if not program.guards:
         return True
-    tensor = replayed(program.steps, program.held, leaves)
+    tensor = run_prologue(program.steps, program.constants, leaves)
 
     def number(value: Any) -> Any:
         return value.item() if isinstance(value, Tensor) else value

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["Guard", "Name", "Source", "Step", "Table", "names_of", "pruned", "replayed"]
+__all__ = ["Guard", "Source", "Step", "StepKey", "Table", "run_prologue", "step_keys", "without_unused_steps"]
 
 #: Bytes of a tensor up to which it is kept for other prologues.
 SMALL = 1 << 16
@@ -24,7 +24,7 @@ class Source:
     """Where a tensor that holds no lanes comes from.
 
     Attributes:
-        kind: ``leaf`` (of the records that the stage was given), ``step`` (of the prologue) or ``held`` (an object of the
+        kind: ``leaf`` (of the records that the stage was given), ``step`` (of the prologue) or ``constants`` (an object of the
             program's own, a network's weights among them).
         name: of a leaf its path, else a number.
         item: which result of a step that gives several; -1 where it gives one.
@@ -65,24 +65,24 @@ class Guard:
     value: Any
 
 
-def pruned(
+def without_unused_steps(
     tables: Sequence[Table], steps: Sequence[Step], guards: Sequence[Guard]
 ) -> tuple[tuple[Table, ...], tuple[Step, ...], tuple[Guard, ...]]:
     """The same without the steps that nothing asks for."""
     needed: set[int] = set()
 
-    def asked(value: Any) -> None:
+    def mark_needed(value: Any) -> None:
         if isinstance(value, Source):
             if value.kind == "step" and int(value.name) not in needed:
                 needed.add(int(value.name))
                 step = steps[int(value.name)]
-                asked((step.args, tuple(step.kwargs.values())))
+                mark_needed((step.args, tuple(step.kwargs.values())))
         elif isinstance(value, list | tuple):
             for x in value:
-                asked(x)
+                mark_needed(x)
 
-    asked([table.source for table in tables])
-    asked([guard.source for guard in guards])
+    mark_needed([table.source for table in tables])
+    mark_needed([guard.source for guard in guards])
     numbers = {old: new for new, old in enumerate(sorted(needed))}
 
     def renamed(value: Any) -> Any:
@@ -102,7 +102,7 @@ def pruned(
 
 
 @dataclass(frozen=True)
-class Name:
+class StepKey:
     """Of a step: the same in all prologues of the process for the same arithmetic on leaves of the same paths.
 
     Attributes:
@@ -114,14 +114,14 @@ class Name:
     leaves: frozenset[str]
 
 
-def names_of(steps: Sequence[Step]) -> tuple[Name | None, ...]:
+def step_keys(steps: Sequence[Step]) -> tuple[StepKey | None, ...]:
     """Names of steps; None where a tensor of the program's own has part in one, or what its arguments are cannot be told."""
-    names: list[Name | None] = []
+    names: list[StepKey | None] = []
     leaves: set[str] = set()  # of the step that is looked at
 
-    def told(value: Any) -> Any:
+    def content_of(value: Any) -> Any:
         if isinstance(value, Source):
-            if value.kind == "held":
+            if value.kind == "constants":
                 raise TypeError("a tensor of the program's own")
             if value.kind == "leaf":
                 leaves.add(str(value.name))
@@ -132,7 +132,7 @@ def names_of(steps: Sequence[Step]) -> tuple[Name | None, ...]:
             leaves.update(name.leaves)
             return "step", name.number, value.item
         if isinstance(value, list | tuple):
-            return type(value), tuple(told(x) for x in value)
+            return type(value), tuple(content_of(x) for x in value)
         return type(value), repr(value) if isinstance(value, float) else value
 
     for step in steps:
@@ -141,8 +141,12 @@ def names_of(steps: Sequence[Step]) -> tuple[Name | None, ...]:
         try:
             if schema is None or schema.is_mutable:
                 raise TypeError("what writes into its arguments")
-            key = step.function, told(step.args), tuple((k, told(value)) for k, value in step.kwargs.items())
-            names.append(Name(_numbers.setdefault(key, next(_count)), frozenset(leaves)))
+            key = (
+                step.function,
+                content_of(step.args),
+                tuple((k, content_of(value)) for k, value in step.kwargs.items()),
+            )
+            names.append(StepKey(_numbers.setdefault(key, next(_count)), frozenset(leaves)))
         except TypeError:  # of what cannot be hashed, too
             names.append(None)
     return tuple(names)
@@ -157,20 +161,20 @@ def _small(result: Any) -> bool:
     return isinstance(result, Tensor) and result.untyped_storage().nbytes() <= SMALL
 
 
-def replayed(
+def run_prologue(
     steps: Sequence[Step],
-    held: Sequence[Tensor],
+    constants: Sequence[Tensor],
     leaves: Mapping[str, Tensor],
-    names: Sequence[Name | None] = (),
-    known: dict[Name, Tensor] | None = None,
+    names: Sequence[StepKey | None] = (),
+    known: dict[StepKey, Tensor] | None = None,
 ) -> Any:
     """Runs a prologue; returns ``tensor(source)``.
 
     Args:
         steps: the prologue.
-        held: the program's own tensors.
+        constants: the program's own tensors.
         leaves: the scene's by path.
-        names: of the steps, see :func:`names_of`.
+        names: of the steps, see :func:`step_keys`.
         known: what steps came to in other prologues on the same leaves, by name; filled with what is small.
     """
     results: list[Any] = []
@@ -178,8 +182,8 @@ def replayed(
     def tensor(source: Source) -> Tensor:
         if source.kind == "leaf":
             return leaves[str(source.name)]
-        if source.kind == "held":
-            return held[int(source.name)]
+        if source.kind == "constants":
+            return constants[int(source.name)]
         result = results[int(source.name)]
         return result if source.item < 0 else result[source.item]
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-__all__ = ["Note", "Pack", "Scatter", "Sinks", "Store"]
+__all__ = ["AppendIndex", "Compact", "Scatter", "Sinks", "Store"]
 
 
 @dataclass(frozen=True)
-class Note:
+class AppendIndex:
     """Places written one after the other into list ``list``, where ``mask`` holds; ``counter`` counts them."""
 
     mask: int
@@ -20,7 +20,7 @@ class Note:
 
 
 @dataclass(frozen=True)
-class Pack:
+class Compact:
     """Lanes where ``mask`` holds, written together into rows of the target arena from ``counter`` on.
 
     The notes name the places where they went.
@@ -29,7 +29,7 @@ class Pack:
     mask: int
     rows: tuple[tuple[int, int], ...]  # row, node
     counter: int
-    notes: tuple[Note, ...] = ()
+    appends: tuple[AppendIndex, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class Sinks:
 
     Attributes:
         write: rows of the target arena and their nodes, each at the lane's own place (of a list: its number in it).
-        pack: see :class:`Pack`.
-        notes: lists of the lanes' own places.
+        compact: see :class:`Compact`.
+        appends: lists of the lanes' own places.
         scatter: see :class:`Scatter`.
         count: masks whose lanes are counted, and by which counter.
         store: result tensors.
@@ -66,8 +66,8 @@ class Sinks:
     """
 
     write: list[tuple[int, int]] = field(default_factory=list)
-    pack: list[Pack] = field(default_factory=list)
-    notes: list[Note] = field(default_factory=list)
+    compact: list[Compact] = field(default_factory=list)
+    appends: list[AppendIndex] = field(default_factory=list)
     scatter: list[Scatter] = field(default_factory=list)
     count: list[tuple[int, int]] = field(default_factory=list)
     store: list[Store] = field(default_factory=list)
@@ -77,9 +77,9 @@ class Sinks:
     def roots(self) -> list[int]:
         """The nodes that are asked for."""
         roots = [node for _, node in self.write]
-        for pack in self.pack:
-            roots += [pack.mask, *(node for _, node in pack.rows), *(note.mask for note in pack.notes)]
-        roots += [note.mask for note in self.notes]
+        for compact in self.compact:
+            roots += [compact.mask, *(node for _, node in compact.rows), *(append.mask for append in compact.appends)]
+        roots += [append.mask for append in self.appends]
         for scatter in self.scatter:
             roots += [scatter.place, *(node for _, node in scatter.rows)]
             roots += [scatter.mask] if scatter.mask >= 0 else []
@@ -88,12 +88,16 @@ class Sinks:
 
     def counters(self) -> int:
         """How many counters there are."""
-        numbers = [pack.counter for pack in self.pack] + [counter for _, counter in self.count]
-        numbers += [note.counter for pack in self.pack for note in pack.notes] + [note.counter for note in self.notes]
+        numbers = [compact.counter for compact in self.compact] + [counter for _, counter in self.count]
+        numbers += [append.counter for compact in self.compact for append in compact.appends] + [
+            append.counter for append in self.appends
+        ]
         numbers += [] if self.shift is None else [self.shift]
         return max(numbers, default=-1) + 1
 
     def lists(self) -> int:
         """How many lists there are."""
-        notes = [note.list for pack in self.pack for note in pack.notes] + [note.list for note in self.notes]
-        return max(notes, default=-1) + 1
+        appends = [append.list for compact in self.compact for append in compact.appends] + [
+            append.list for append in self.appends
+        ]
+        return max(appends, default=-1) + 1

@@ -22,12 +22,12 @@ from torchpt.compiler.graph import DTYPES, Graph, Unsupported
 from torchpt.compiler.prologue import Guard, Source, Step, Table
 
 __all__ = [
-    "HANDLERS",
     "LANES",
+    "LOWERINGS",
     "Tracer",
     "Value",
-    "handles",
-    "lanes_for",
+    "choose_lane_count",
+    "register_lowering",
     "tracer_of",
     "tracing",
 ]
@@ -38,24 +38,24 @@ LANES = (97, 89, 101, 83, 103, 79, 107, 109, 113, 127)
 
 Handler = Callable[..., None]
 #: What becomes of each operator of torch, by its name without overload.
-HANDLERS: dict[str, Handler] = {}
+LOWERINGS: dict[str, Handler] = {}
 
 _PACKAGE = __file__.rpartition("compiler")[0]
 _active: list[Tracer] = []
 
 
-def handles(*names: str) -> Callable[[Handler], Handler]:
+def register_lowering(*names: str) -> Callable[[Handler], Handler]:
     """Register ``handler(tracer, out, *args, **kwargs)``, which tells what ``out`` is made of."""
 
     def register(handler: Handler) -> Handler:
         for name in names:
-            HANDLERS[name] = handler
+            LOWERINGS[name] = handler
         return handler
 
     return register
 
 
-def lanes_for(tables: Iterable[Tensor]) -> int:
+def choose_lane_count(tables: Iterable[Tensor]) -> int:
     """A number of :data:`LANES` that is the length of no axis of the tables, nor divides one.
 
     Raises:
@@ -99,7 +99,7 @@ class Tracer(TorchDispatchMode):
         tables: what is read, in order.
         steps: the prologue.
         guards: numbers that the trace relies on.
-        held: tensors that are no leaves and no results of steps.
+        constants: tensors that are no leaves and no results of steps.
     """
 
     @classmethod
@@ -114,7 +114,7 @@ class Tracer(TorchDispatchMode):
         self.tables: list[Table] = []
         self.steps: list[Step] = []
         self.guards: list[Guard] = []
-        self.held: list[Tensor] = []
+        self.constants: list[Tensor] = []
         self._values: dict[int, Value] = {}
         self._sources = {key: Source("leaf", path) for key, (path, _) in leaves.items()}
         self._tensors: dict[Table, Tensor] = {}
@@ -232,8 +232,8 @@ class Tracer(TorchDispatchMode):
         """Return where a tensor without lanes comes from."""
         source = self._sources.get(id(tensor))
         if source is None:
-            source = self._sources[id(tensor)] = Source("held", len(self.held))
-            self.held.append(tensor)
+            source = self._sources[id(tensor)] = Source("constants", len(self.constants))
+            self.constants.append(tensor)
         return source
 
     def table(self, tensor: Tensor, axis: int | None) -> int:
@@ -260,7 +260,7 @@ class Tracer(TorchDispatchMode):
             return out
         out = func(*_safe(name, args) if traced else args, **kwargs)
         if traced:
-            handler = HANDLERS.get(name) if func.namespace == "aten" else None
+            handler = LOWERINGS.get(name) if func.namespace == "aten" else None
             if handler is None:
                 raise Unsupported(f"the operator {name}")
             try:

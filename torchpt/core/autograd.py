@@ -14,7 +14,7 @@ from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wr
 from torchpt.core.errors import TorchptError
 from torchpt.core.threads import without_autocast
 
-__all__ = ["Backward", "Forward", "custom_vjp", "in_batch", "in_transform", "outside_transforms", "wants_gradients"]
+__all__ = ["Backward", "Forward", "custom_vjp", "is_batched", "is_transformed", "outside_transforms", "wants_gradients"]
 
 Forward = Callable[..., tuple[Tensor, ...]]
 Backward = Callable[..., Sequence[Tensor | None]]
@@ -33,7 +33,7 @@ _BATCHES = (
 
 
 def custom_vjp(
-    forward: Forward, backward: Backward, tensors: tuple[Tensor, ...], held: tuple[Tensor, ...] = ()
+    forward: Forward, backward: Backward, tensors: tuple[Tensor, ...], captured: tuple[Tensor, ...] = ()
 ) -> tuple[Tensor, ...]:
     """What ``forward`` gives, as a function of ``tensors`` that autograd can go back through.
 
@@ -42,14 +42,14 @@ def custom_vjp(
 
     Args:
         forward: from ``tensors`` to its results.
-        backward: from the derivatives by these (a tuple) and ``tensors`` to those by ``tensors`` and ``held``.
+        backward: from the derivatives by these (a tuple) and ``tensors`` to those by ``tensors`` and ``captured``.
         tensors: what is handed to both.
-        held: what both use by themselves, such as weights of modules; they may change before the backward pass.
+        captured: what both use by themselves, such as weights of modules; they may change before the backward pass.
 
     Raises:
         TorchptError: forward mode is asked for; in the backward pass, second derivatives.
     """
-    return _Taped.apply(forward, backward, len(held), *tensors, *held)  # pyright: ignore[reportReturnType]
+    return _CustomVjp.apply(forward, backward, len(captured), *tensors, *captured)  # pyright: ignore[reportReturnType]
 
 
 def wants_gradients(value: Tensor) -> bool:
@@ -57,12 +57,12 @@ def wants_gradients(value: Tensor) -> bool:
     return any(level.requires_grad for level in _levels(value))
 
 
-def in_batch(value: Tensor) -> bool:
+def is_batched(value: Tensor) -> bool:
     """Whether a tensor stands for a batch of them, at any level of nested transforms of ``torch.func``."""
     return any(is_batchedtensor(level) for level in _levels(value))
 
 
-def in_transform(value: Tensor) -> bool:
+def is_transformed(value: Tensor) -> bool:
     """Whether a transform of ``torch.func`` is at work on a tensor, whose numbers cannot be read there."""
     return is_functorch_wrapped_tensor(value)
 
@@ -80,19 +80,19 @@ def _levels(value: Tensor) -> Iterator[Tensor]:
         yield value
 
 
-class _Taped(torch.autograd.Function):
+class _CustomVjp(torch.autograd.Function):
     @staticmethod
-    def forward(forward: Forward, backward: Backward, held: int, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return tuple(forward(*(t.detach() for t in tensors[: len(tensors) - held])))
+    def forward(forward: Forward, backward: Backward, captured: int, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return tuple(forward(*(t.detach() for t in tensors[: len(tensors) - captured])))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        _, ctx.work, ctx.held, *tensors = inputs
-        ctx.save_for_backward(*tensors[: len(tensors) - ctx.held])
+        _, ctx.work, ctx.captured, *tensors = inputs
+        ctx.save_for_backward(*tensors[: len(tensors) - ctx.captured])
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        found = _Back.apply(ctx.work, len(cotangents), *cotangents, *ctx.saved_tensors)
+        found = _CustomVjpBackward.apply(ctx.work, len(cotangents), *cotangents, *ctx.saved_tensors)
         assert found is not None
         return (None, None, None, *found)
 
@@ -102,10 +102,10 @@ class _Taped(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
-        return _each(_Taped.apply, info.batch_size, in_dims, arguments)
+        return _each(_CustomVjp.apply, info.batch_size, in_dims, arguments)
 
 
-class _Back(torch.autograd.Function):
+class _CustomVjpBackward(torch.autograd.Function):
     """The backward pass, which ``torch.func`` differentiates once more without looking at it."""
 
     @staticmethod
@@ -131,7 +131,7 @@ class _Back(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
-        return _each(_Back.apply, info.batch_size, in_dims, arguments)
+        return _each(_CustomVjpBackward.apply, info.batch_size, in_dims, arguments)
 
 
 def _each(

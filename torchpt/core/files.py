@@ -13,7 +13,7 @@ from typing import Any
 
 from torchpt.core.errors import SceneError
 
-__all__ = ["MAX_BYTES", "Unfit", "as_path", "check_regular", "configs", "is_regular", "read_regular"]
+__all__ = ["MAX_BYTES", "UnreadableFile", "as_path", "check_regular", "configs", "is_regular", "read_regular"]
 
 #: Bytes of the largest mesh or picture file that is read.
 MAX_BYTES = 4 * 2**30
@@ -22,7 +22,7 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 _PIECE = 2**20  # bytes read at a time of a file that is longer than it said
 
 
-class Unfit(OSError):
+class UnreadableFile(OSError):
     """Something that is there and is not read; ``strerror`` says why, as what "it" is or has."""
 
 
@@ -54,19 +54,19 @@ def check_regular(path: str | os.PathLike[str], most: int | None = None) -> int:
         most: bytes that it may have; None: any number.
 
     Raises:
-        Unfit: a folder, device, pipe or socket, or a file of more than ``most`` bytes.
+        UnreadableFile: a folder, device, pipe or socket, or a file of more than ``most`` bytes.
         OSError: no such file.
     """
     try:
         facts = os.stat(path)
     except ValueError:
-        raise Unfit(errno.EINVAL, "has a name that no file can have") from None
+        raise UnreadableFile(errno.EINVAL, "has a name that no file can have") from None
     if stat.S_ISDIR(facts.st_mode):
-        raise Unfit(errno.EISDIR, "is a folder")
+        raise UnreadableFile(errno.EISDIR, "is a folder")
     if not stat.S_ISREG(facts.st_mode):
-        raise Unfit(errno.EINVAL, "is a device, a pipe or a socket")
+        raise UnreadableFile(errno.EINVAL, "is a device, a pipe or a socket")
     if most is not None and facts.st_size > most:
-        raise Unfit(errno.EFBIG, f"has {facts.st_size} bytes; at most {most} are read")
+        raise UnreadableFile(errno.EFBIG, f"has {facts.st_size} bytes; at most {most} are read")
     return facts.st_size
 
 
@@ -82,7 +82,7 @@ def read_regular(path: str | os.PathLike[str], most: int = MAX_BYTES) -> bytes:
         total = len(parts[0])
         while parts[-1]:  # it has grown, or is one of those that do not know their size
             if total > most:
-                raise Unfit(errno.EFBIG, f"has more than {most} bytes; at most so many are read")
+                raise UnreadableFile(errno.EFBIG, f"has more than {most} bytes; at most so many are read")
             parts.append(file.read(min(_PIECE, most + 1 - total)))
             total += len(parts[-1])
     return parts[0] if total == len(parts[0]) else b"".join(parts)  # not twice in memory

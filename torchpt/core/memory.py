@@ -29,20 +29,20 @@ from torchpt.core.errors import RenderError, SceneError, TorchptError, warn_once
 __all__ = [
     "FEWEST",
     "Budget",
-    "Meter",
+    "MemoryMeter",
     "Span",
     "after_import",
+    "check_address_space",
     "check_limit",
     "check_memory",
-    "check_room",
+    "explain_out_of_memory",
     "fits_in_memory",
     "free_memory",
     "is_out_of_memory",
     "mb",
-    "needing",
     "on_low_memory",
     "release_memory",
-    "retried",
+    "retry_out_of_memory",
 ]
 
 #: Lanes of the first wave under a limit, after which all code is there: what it adds for good is no lane's.
@@ -78,7 +78,7 @@ Span = tuple[int, int, int, int]
 # -- what is held, and what is free
 
 
-class Meter:
+class MemoryMeter:
     """What is held of a device's memory, in bytes: of the process on a CPU (pages that are really there), of tensors on CUDA.
 
     Args:
@@ -164,7 +164,7 @@ def _of_group() -> int | None:
         return None
 
 
-def check_room(size: int = MARGIN) -> None:
+def check_address_space(size: int = MARGIN) -> None:
     """Refuse to go on where the system would not let the process have so many bytes of addresses more.
 
     Libraries that end the process where they find none (LLVM, OpenMP, BLAS) are called behind this.
@@ -244,7 +244,7 @@ def fits_in_memory(work: Callable[[], object]) -> bool:
 
 
 @contextmanager
-def needing(what: str | Callable[[], str]) -> Iterator[None]:
+def explain_out_of_memory(what: str | Callable[[], str]) -> Iterator[None]:
     """Context that says in a line what it was for that there is not enough memory: a text, or what makes one.
 
     Raises:
@@ -257,20 +257,22 @@ def needing(what: str | Callable[[], str]) -> Iterator[None]:
             raise
     else:
         return
-    told = what if isinstance(what, str) else what()
-    raise RenderError(f"not enough memory for {told}, with {mb(Meter(torch.device('cpu')).above())} held already")
+    subject = what if isinstance(what, str) else what()
+    raise RenderError(
+        f"not enough memory for {subject}, with {mb(MemoryMeter(torch.device('cpu')).above())} held already"
+    )
 
 
-def retried(what: str | Callable[[], str], work: Callable[[], T]) -> T:
+def retry_out_of_memory(what: str | Callable[[], str], work: Callable[[], T]) -> T:
     """Return what work comes to; where memory runs out it is tried again, once what nobody needs is given back.
 
     Raises:
-        RenderError: as :func:`needing`.
+        RenderError: as :func:`explain_out_of_memory`.
     """
     found: list[T] = []
     if not fits_in_memory(lambda: found.append(work())):
         release_memory()
-        with needing(what):
+        with explain_out_of_memory(what):
             return work()
     return found[0]
 
@@ -304,7 +306,7 @@ def check_memory(limit: int, device: torch.device, least: Callable[[int], int], 
         SceneError: it is too small; says the least that is not.
     """
     release_memory()
-    enough = max(least(Meter(device).above()), loading)
+    enough = max(least(MemoryMeter(device).above()), loading)
     check_limit(limit, enough, f"at least {mb(enough)} for this scene and film")
 
 
@@ -339,7 +341,7 @@ class Budget:
         per_lane: int = 0,
         fewest: int = 1,
     ) -> None:
-        self.meter, self.threads, self.fewest, self.per_lane = Meter(device), threads, fewest, per_lane
+        self.meter, self.threads, self.fewest, self.per_lane = MemoryMeter(device), threads, fewest, per_lane
         self.what, self.instead, self.short = what, instead, False
         self.limit = None if limit is None else self.meter.base() + limit
         self._most = max(lanes, 1)
@@ -361,7 +363,7 @@ class Budget:
                 self.threads, self.lanes = threads, min(max(lanes, least), self._most)
                 return
 
-    def steady(self) -> None:
+    def drop_unneeded_limit(self) -> None:
         """Forget the limit where all lanes are expected to fit: then pieces are of the same size with it and without."""
         if self.limit is None or self._most * self.per_lane <= SHARE * (self.limit - self.meter.now()):
             self.limit, self.lanes = None, self._most

@@ -1,13 +1,13 @@
 """Threads: the one pool of the process, who is dealt which task, and what torch is set to while they work.
 
 A thread of the pool waits until somebody has work for it. Whoever needs threads takes as many as wait and starts the others, so
-renders that overlap never wait for each other's threads. Three ways to use them: :func:`deal` runs a task for each item and
-hands over what they come to in the order of items; a :class:`Crew` takes tasks from a list that grows; :func:`share` cuts a
+renders that overlap never wait for each other's threads. Three ways to use them: :func:`map_in_order` runs a task for each item and
+hands over what they come to in the order of items; a :class:`TaskQueue` takes tasks from a list that grows; :func:`parallel_for` cuts a
 range into a part for each thread. No idle thread lives while the process forks, and a child has a pool of its own.
 
 On a CPU torch cuts a tensor of more than 32,768 elements into a part for each of its own threads. The last elements of a part
 fill no vector, and where another function computes those than computes vectors (``atan2``, ``pow``) they round differently. A
-sum over all elements becomes a sum of the threads' own. :func:`in_pieces`, :func:`sum_all` and :func:`mean_all` give on any
+sum over all elements becomes a sum of the threads' own. :func:`map_in_pieces`, :func:`sum_all` and :func:`mean_all` give on any
 number of threads what one thread alone computes.
 """
 
@@ -28,21 +28,21 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import RenderError
-from torchpt.core.memory import check_room, fits_in_memory
+from torchpt.core.memory import check_address_space, fits_in_memory
 
 __all__ = [
-    "Crew",
-    "deal",
-    "in_pieces",
-    "lasting",
+    "TaskQueue",
     "limited_threads",
+    "map_in_order",
+    "map_in_pieces",
     "mean_all",
     "one_thread",
-    "settle",
-    "share",
-    "start_team",
+    "outside_inference_mode",
+    "parallel_for",
+    "start_torch_threads",
     "sum_all",
     "thread_count",
+    "warm_up",
     "without_autocast",
 ]
 
@@ -101,7 +101,7 @@ _starting = threading.Lock()
 _idle: list[_Thread] = []
 
 
-def _assigned(work: Callable[[], object], ended: SimpleQueue[None]) -> bool:
+def _run_in_pool(work: Callable[[], object], ended: SimpleQueue[None]) -> bool:
     """Give work, which raises nothing, to a thread of the pool; return False where there is no memory for one."""
     try:
         thread = _idle.pop()
@@ -127,17 +127,17 @@ def _before_fork() -> None:
 
 def _after_fork() -> None:
     """Forget threads: a child has none of its parent's, torch's included, and waiting for those would never end."""
-    global _wish, _starting
+    global _torch_threads, _starting
     _idle.clear()
     _starting = threading.Lock()
-    _wish = _Wish(forked=True)
+    _torch_threads = _TorchThreads(forked=True)
 
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_before_fork, after_in_child=_after_fork)
 
 
-class Crew(Generic[T, R]):
+class TaskQueue(Generic[T, R]):
     """Threads of the pool that take tasks from one list, which may grow.
 
     Args:
@@ -165,7 +165,7 @@ class Crew(Generic[T, R]):
         self._todo.put((tag, task))
         if self._size >= min(self.threads, self.pending):
             return
-        if _assigned(self._work, self._ended):
+        if _run_in_pool(self._work, self._ended):
             self._size += 1
         elif self._size:
             self.threads = self._size
@@ -204,7 +204,7 @@ class Crew(Generic[T, R]):
             del job, tag, task
 
 
-def deal(
+def map_in_order(
     items: Iterable[T],
     task: Callable[[T], R],
     threads: int,
@@ -229,16 +229,16 @@ def deal(
         Exception: what a task or ``each`` raised; of several tasks the first one in order.
     """
     halt = halt or threading.Event()
-    crew, left = Crew[int, R](threads), enumerate(items)
+    queue, left = TaskQueue[int, R](threads), enumerate(items)
     found: dict[int, R | BaseException] = {}
-    begun = told = 0
+    begun = delivered = 0
 
     def tell() -> None:
         """Hand over what is next, as far as it is there."""
-        nonlocal told
-        while told in found:
-            result = found.pop(told)
-            told += 1
+        nonlocal delivered
+        while delivered in found:
+            result = found.pop(delivered)
+            delivered += 1
             if isinstance(result, BaseException):
                 try:
                     raise result
@@ -249,15 +249,15 @@ def deal(
 
     try:
         while not halt.is_set():
-            while ahead is None or begun - told < ahead:
+            while ahead is None or begun - delivered < ahead:
                 item = next(left, None)
                 if item is None:
                     break
-                crew.add(item[0], functools.partial(task, item[1]))
+                queue.add(item[0], functools.partial(task, item[1]))
                 begun += 1
-            if told == begun:
+            if delivered == begun:
                 return
-            came = crew.next(wait=True)
+            came = queue.next(wait=True)
             if came is not None:
                 found[came[0]] = came[1]
             tell()
@@ -267,8 +267,8 @@ def deal(
         halt.set()
         raise
     finally:
-        crew.close()
-    while (came := crew.next(wait=False)) is not None:  # of tasks that were on their way
+        queue.close()
+    while (came := queue.next(wait=False)) is not None:  # of tasks that were on their way
         found[came[0]] = came[1]
     late = [found[number] for number in sorted(found)]
     for result in late:
@@ -279,7 +279,7 @@ def deal(
             raise result
 
 
-def share(work: Callable[[int, int], object], items: int, threads: int) -> None:
+def parallel_for(work: Callable[[int, int], object], items: int, threads: int) -> None:
     """Call ``work(first, last)`` for parts of ``range(items)``, one for each thread; the first in the calling one.
 
     Args:
@@ -306,7 +306,7 @@ def share(work: Callable[[int, int], object], items: int, threads: int) -> None:
 
     ended = SimpleQueue[None]()
     first = parts.popleft()
-    helpers = sum(_assigned(take, ended) for _ in range(threads - 1))
+    helpers = sum(_run_in_pool(take, ended) for _ in range(threads - 1))
     try:
         work(*first)
         take()  # what nobody has begun
@@ -325,23 +325,23 @@ def thread_count(threads: int | None) -> int:
     return max(1, int(threads)) if threads else max(1, torch.get_num_threads())
 
 
-class _Wish:
+class _TorchThreads:
     """The thread count that renders found, and how many of them run."""
 
     def __init__(self, forked: bool) -> None:
         self.forked, self.lock = forked, threading.Lock()
         self.before, self.renders = 0, 0
 
-    def enter(self, wish: int | str) -> None:
+    def enter(self, threads: int | str) -> None:
         with self.lock:
             if self.renders == 0:
                 self.before = torch.get_num_threads()
             self.renders += 1
             # The thread pool of the parent does not survive a fork: waiting for it would never end.
-            now = 1 if self.forked else self.before if wish == "auto" else int(wish)
+            now = 1 if self.forked else self.before if threads == "auto" else int(threads)
             if now != torch.get_num_threads():
                 torch.set_num_threads(now)
-            start_team()
+            start_torch_threads()
 
     def leave(self) -> None:
         with self.lock:
@@ -352,18 +352,18 @@ class _Wish:
 
 
 #: Of the process, as the thread count is.
-_wish = _Wish(forked=False)
+_torch_threads = _TorchThreads(forked=False)
 
 
 @contextmanager
-def limited_threads(wish: int | str) -> Iterator[None]:
-    """Let torch use ``wish`` threads for a while, in renders that may overlap."""
-    here = _wish
-    here.enter(wish)
+def limited_threads(threads: int | str) -> Iterator[None]:
+    """Let torch use ``threads`` threads for a while, in renders that may overlap."""
+    here = _torch_threads
+    here.enter(threads)
     try:
         yield
     finally:
-        if here is _wish:  # else this is the child of a fork, where another thread may have held the lock
+        if here is _torch_threads:  # else this is the child of a fork, where another thread may have held the lock
             here.leave()
 
 
@@ -381,7 +381,7 @@ def one_thread() -> Iterator[None]:
 
 
 @functools.cache
-def settle() -> None:
+def warm_up() -> None:
     """Call the vector functions once, before several threads do.
 
     MKL finds out at its first call which code suits the processor. Two threads that find it out together may compute half a
@@ -397,14 +397,14 @@ def settle() -> None:
 _started: set[int] = set()
 
 
-def start_team() -> None:
+def start_torch_threads() -> None:
     """Start torch's threads for the calling one while there is memory for them; where there is not, it renders alone.
 
     OpenMP ends the process where it cannot start a thread, which it does at the first large tensor, however late that is.
     """
     count = torch.get_num_threads()
     if count > 1 and count not in _started:
-        if fits_in_memory(lambda: check_room(count * _STACK)):
+        if fits_in_memory(lambda: check_address_space(count * _STACK)):
             torch.zeros(count * _GRAIN).add_(1.0)
             _started.add(count)
         else:
@@ -412,7 +412,7 @@ def start_team() -> None:
 
 
 @contextmanager
-def lasting() -> Iterator[None]:
+def outside_inference_mode() -> Iterator[None]:
     """What is made here can be used outside of ``torch.inference_mode`` too: tensors made in that mode could not."""
     if torch.is_inference_mode_enabled():
         with torch.inference_mode(False), torch.no_grad():  # the former alone would turn gradients on
@@ -424,14 +424,14 @@ def lasting() -> Iterator[None]:
 @contextmanager
 def without_autocast(device: torch.device) -> Iterator[None]:
     """No gradients, no ``torch.autocast`` (which would round products to half precision), and what is made lasts."""
-    with lasting(), torch.no_grad(), torch.autocast(device.type, enabled=False):
+    with outside_inference_mode(), torch.no_grad(), torch.autocast(device.type, enabled=False):
         yield
 
 
 # -- what does not depend on the number of threads
 
 
-def in_pieces(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
+def map_in_pieces(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
     """Return ``function`` of each element of tensors of one shape."""
     first = given[0]
     if first.device.type != "cpu" or first.numel() <= PIECE:

@@ -21,12 +21,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["UNPRINTED", "fingerprint", "leaves", "map_leaves", "named_leaves", "rebuild", "signature"]
+__all__ = ["NOT_FINGERPRINTED", "fingerprint", "leaves", "map_leaves", "named_leaves", "rebuild", "signature"]
 
 T = TypeVar("T")
 
-#: ``field(metadata=UNPRINTED)``: of a dataclass's field that no picture depends on, such as the file that it was read from.
-UNPRINTED = {"fingerprint": False}
+#: ``field(metadata=NOT_FINGERPRINTED)``: of a dataclass's field that no picture depends on, such as the file that it was read from.
+NOT_FINGERPRINTED = {"fingerprint": False}
 
 _TENSOR, _MAPPING, _SEQUENCE, _STATIC = range(4)
 #: By class how its instances are walked: one of the above, or the names of a dataclass's fields.
@@ -194,17 +194,17 @@ _LIBRARIES = {"torchpt", "torch", "numpy", "builtins", *sys.stdlib_module_names}
 def fingerprint(record: Any) -> bytes:
     """Return 16 bytes that two records share where all that they hold is equal, in any process and on any device.
 
-    It goes by types, values, and the bytes of tensors and arrays; fields that say :data:`UNPRINTED` are left out. Of classes
+    It goes by types, values, and the bytes of tensors and arrays; fields that say :data:`NOT_FINGERPRINTED` are left out. Of classes
     and functions of a user's own it takes the code, comments apart, with the functions and plain values of their modules that
     the code names.
 
     Raises:
         TypeError: something whose contents cannot be known, such as a lock or an open file.
     """
-    return _Printer().digest(record)
+    return _Fingerprinter().digest(record)
 
 
-class _Printer:
+class _Fingerprinter:
     """One call of :func:`fingerprint`."""
 
     def __init__(self) -> None:

@@ -12,15 +12,15 @@ from torchpt.core.memory import Budget, Span
 from torchpt.engines import work
 from torchpt.engines.kernels.engine import LANES as LANES_OF_KERNELS
 from torchpt.engines.kernels.programs import Kernels
-from torchpt.engines.kernels.threads import Loop
+from torchpt.engines.kernels.threads import KernelsForward
 from torchpt.engines.tensors import brought, hits, layers, radiance, seen, trace
 from torchpt.engines.tensors_forward import TensorsForward
-from torchpt.engines.work import TASKS, Block, Share
+from torchpt.engines.work import TASKS, Block, TaskResult
 from torchpt.paths.walk import Engine, Population
 from torchpt.paths.wave import Wave
 
 if TYPE_CHECKING:  # the way back is imported where somebody goes it
-    from torchpt.math.sums import ChunkSums, Sums
+    from torchpt.math.sums import ChunkGradientSums, GradientSums
     from torchpt.paths.adjoint import Tape
 
 __all__ = [
@@ -31,11 +31,12 @@ __all__ = [
     "Block",
     "Forward",
     "Kernels",
-    "Share",
+    "TaskResult",
     "Tasks",
     "backward_kernels",
     "backward_tensors",
     "brought",
+    "describe_kernels",
     "forward_kernels",
     "forward_tensors",
     "hits",
@@ -43,7 +44,6 @@ __all__ = [
     "layers",
     "radiance",
     "seen",
-    "told",
     "trace",
 ]
 
@@ -75,7 +75,7 @@ class Forward(Protocol):
         """Return how many 32-bit numbers a lane takes in a thread, where the picture has such layers; 0: it is measured."""
         ...
 
-    def run(self, spans: Sequence[work.Span], each: Callable[[Share | None], bool]) -> bool:
+    def run(self, spans: Sequence[work.Span], each: Callable[[TaskResult | None], bool]) -> bool:
         """Take samples of every pixel of plates; return whether all were taken.
 
         Args:
@@ -84,7 +84,7 @@ class Forward(Protocol):
         """
         ...
 
-    def dismiss(self, keeps: bool) -> None:
+    def release_workers(self, keeps: bool) -> None:
         """Give up the memory of threads, or keep it for the next render of the same structure."""
 
 
@@ -95,11 +95,11 @@ class Tasks(Forward, Protocol):
         """Cut samples of plates into blocks of pixels: ``tasks`` for each plate, as far as they repay."""
         ...
 
-    def task(self, block: Block) -> Share:
+    def task(self, block: Block) -> TaskResult:
         """Take a block, in a thread of its own."""
         ...
 
-    def take_rest(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> bool:
+    def retry_blocks(self, blocks: list[Block], each: Callable[[TaskResult | None], bool]) -> bool:
         """Take blocks for which there was no memory, by fewer threads or lanes; else as :meth:`run`."""
         ...
 
@@ -120,7 +120,7 @@ def kernels_of(wave: Wave, own: Sequence[int], before: Kernels | None = None) ->
         own: numbers of the models that are the caller's: it is tried at once whether kernels can be made of them.
         before: those of another render, whose tables are taken over where they are made of the same tensors.
     """
-    packets = packets_of(wave)
+    packets = uses_packets(wave)
     opaque = wave.context.world.materials.opacity is None and not wave.integrator.own_transmit
     fused = packets and opaque and wave.first is None and not wave.integrator.splats
     kernels = Kernels(wave, packets, fused, before, fixed=not own)
@@ -139,10 +139,10 @@ def forward_kernels(kernels: Kernels, threads: int | None = None, strict: bool =
         threads: None: as many as torch's.
         strict: whether a task ends at a sample that is not finite; whoever is told of it ends the render.
     """
-    return Loop(kernels, threads or torch.get_num_threads(), kernels.wave.integrator.clamp, strict)
+    return KernelsForward(kernels, threads or torch.get_num_threads(), kernels.wave.integrator.clamp, strict)
 
 
-def told(kernels: Kernels) -> dict[str, Any]:
+def describe_kernels(kernels: Kernels) -> dict[str, Any]:
     """Tell how a render runs by kernels."""
     search = (
         "inside the stages" if kernels.fused else "kernels of packets" if kernels.packets else kernels.wave.accel.name
@@ -204,7 +204,7 @@ class BackwardKernels(Protocol):
 
     eager_vjps: dict[tuple[Any, ...], str]
 
-    def engine(self) -> Backward[Any, Any, ChunkSums]:
+    def engine(self) -> Backward[Any, Any, ChunkGradientSums]:
         """Return an engine for one more thread."""
         ...
 
@@ -213,12 +213,12 @@ class BackwardKernels(Protocol):
         ...
 
 
-def packets_of(wave: Wave) -> bool:
+def uses_packets(wave: Wave) -> bool:
     """Return True where kernels search by packets, which know no quadrics."""
     return wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
 
 
-def backward_tensors(tape: Tape, cotangent: Tensor | None) -> Backward[Any, Any, Sums]:
+def backward_tensors(tape: Tape, cotangent: Tensor | None) -> Backward[Any, Any, GradientSums]:
     """Return the way back by tensor operations.
 
     Args:
@@ -240,6 +240,6 @@ def backward_kernels(tape: Tape, own: Sequence[int], cotangent: Tensor | None) -
     """
     from torchpt.engines.kernels.backward import VjpKernels
 
-    kernels = VjpKernels(tape, packets_of(tape.wave), None if cotangent is None else cotangent.float().contiguous())
+    kernels = VjpKernels(tape, uses_packets(tape.wave), None if cotangent is None else cotangent.float().contiguous())
     kernels.eager = kernels.probe(own)
     return kernels

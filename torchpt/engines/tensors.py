@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.tree import map_leaves
-from torchpt.math.vectors import joined, rows, take
+from torchpt.math.vectors import concatenate_lanes, rows, take
 from torchpt.paths import layers as aov
 from torchpt.paths.integrators.base import check_fields, check_output
 from torchpt.paths.integrators.path import Ends, follows_shape, partition
@@ -28,14 +28,14 @@ from torchpt.physics.film.splats import LARGEST, Splats
 from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Hit
 
-__all__ = ["Paths", "Tensors", "brought", "hits", "layers", "radiance", "seen", "trace"]
+__all__ = ["Paths", "TensorsEngine", "brought", "hits", "layers", "radiance", "seen", "trace"]
 
 #: Groups before lanes are sorted.
 _UNSORTED = Ends(torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.int64))
 
 
 @dataclass
-class Flight:
+class RaysInTransit:
     """Rays on their way through what lets them pass.
 
     Attributes:
@@ -61,29 +61,29 @@ class Paths:
         state: of the paths as they arrive.
         depth: of the vertex.
         hit: what their rays met; None where that is not known yet.
-        flight: rays that are still on their way to it; None where nothing lets rays pass.
+        in_transit: rays that are still on their way to it; None where nothing lets rays pass.
         ends: lanes that met light by chance, once they are sorted.
         groups: number and lanes of each BSDF model that was met; None before lanes are sorted.
         pending: shadow rays from the vertex before, with the first lane that they bring light to.
         clear: how much of their light gets through ``(n,)``, one for each of ``pending``, once they are traced.
         splats: light from the vertex before to other pixels, with the lanes of the wave that it comes from.
-        splat_clear: how much of it gets through, likewise.
+        splat_transmittance: how much of it gets through, likewise.
         emissions: light that lanes met here by chance, where an engine keeps it.
         outputs: of the vertex before: number of the BSDF model, lanes of the wave, and what its surfaces made of them, where an
             engine keeps it.
-        passed: ``clear`` and ``splat_clear`` of the light that was sampled here, where an engine goes back.
+        passed: ``clear`` and ``splat_transmittance`` of the light that was sampled here, where an engine goes back.
     """
 
     state: PathState
     depth: int = 1
     hit: Hit | None = None
-    flight: Flight | None = None
+    in_transit: RaysInTransit | None = None
     ends: Ends = field(default=_UNSORTED)
     groups: list[tuple[int, Tensor]] | None = None
     pending: list[tuple[int, Shadow]] = field(default_factory=list)
     clear: list[Tensor] = field(default_factory=list)
     splats: list[tuple[Tensor, Splat]] = field(default_factory=list)
-    splat_clear: list[Tensor] = field(default_factory=list)
+    splat_transmittance: list[Tensor] = field(default_factory=list)
     emissions: list[tuple[Tensor, Emission]] = field(default_factory=list)
     outputs: list[tuple[int, Tensor, VertexOutput]] = field(default_factory=list)
     passed: tuple[list[Tensor], list[Tensor]] = field(default_factory=lambda: ([], []))
@@ -95,7 +95,7 @@ class Paths:
         return self.hit
 
 
-class Tensors:
+class TensorsEngine:
     """The engine of one wave.
 
     Args:
@@ -121,7 +121,7 @@ class Tensors:
         self.keeps = keeps
         self.wave, self.context, self.tally = wave, wave.context, RayCounts() if tally is None else tally
         self.plan, self.world = wave.context.plan, wave.context.world
-        self.passing = self.world.materials.opacity is not None or wave.integrator.own_transmit
+        self.has_transmission = self.world.materials.opacity is not None or wave.integrator.own_transmit
         self.splats = splats
         self._clear(lanes)
 
@@ -132,7 +132,7 @@ class Tensors:
 
     def spawn(self, state: PathState) -> Paths:
         """Start paths with rays."""
-        return Paths(self.wave.begun(state))
+        return Paths(self.wave.with_optional_fields(state))
 
     def intersect(self, paths: Paths) -> bool:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -140,18 +140,18 @@ class Tensors:
         if paths.hit is None:
             state = paths.state
             paths.hit = self._nearest(state.o, state.d, state.t_max)
-            if self.passing:
-                lanes = self._held_up(state, paths.hit)
+            if self.has_transmission:
+                lanes = self._may_transmit(state, paths.hit)
                 before = torch.zeros_like(take(state.t_max, lanes))
-                paths.flight = Flight(lanes, rows(state, lanes), rows(paths.hit, lanes), before)
-        return paths.flight is not None
+                paths.in_transit = RaysInTransit(lanes, rows(state, lanes), rows(paths.hit, lanes), before)
+        return paths.in_transit is not None
 
     def _nearest(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
         """Find the nearest surfaces, opaque or not."""
         t, prim, u, v = self.wave.accel.intersect(o, d, t_max)
         return Hit(t.to(self.plan.dtype), prim.to(torch.int64), u.to(self.plan.dtype), v.to(self.plan.dtype))
 
-    def _held_up(self, state: PathState, hit: Hit) -> Tensor:
+    def _may_transmit(self, state: PathState, hit: Hit) -> Tensor:
         """Return the lanes that the stage ``transmit`` is asked for."""
         if self.wave.integrator.own_transmit:
             some = state.t_max > 0
@@ -161,17 +161,19 @@ class Tensors:
 
     def transmit(self, paths: Paths) -> bool:
         """See :class:`torchpt.paths.walk.Engine`."""
-        flight = paths.flight
-        if flight is None or not len(flight.lanes):
+        in_transit = paths.in_transit
+        if in_transit is None or not len(in_transit.lanes):
             return False
-        salt = salts(paths.depth, flight.lanes.device, flight.step)
-        out = self.wave.integrator.transmit(self.context.at(salt), VertexInput(flight.state, flight.hit))
+        salt = salts(paths.depth, in_transit.lanes.device, in_transit.step)
+        out = self.wave.integrator.transmit(self.context.at(salt), VertexInput(in_transit.state, in_transit.hit))
         hit, on = paths.met, out.on.nonzero().squeeze(1)
         if out.chance is not None:
             chance = torch.ones_like(hit.t) if hit.chance is None else hit.chance
-            hit = replace(hit, chance=chance.index_copy(0, flight.lanes, take(chance, flight.lanes) * out.chance))
-        home, state = take(flight.lanes, on), replace(rows(flight.state, on), o=take(out.o, on))
-        before = take(flight.before, on) + take(flight.hit.t, on)
+            hit = replace(
+                hit, chance=chance.index_copy(0, in_transit.lanes, take(chance, in_transit.lanes) * out.chance)
+            )
+        home, state = take(in_transit.lanes, on), replace(rows(in_transit.state, on), o=take(out.o, on))
+        before = take(in_transit.before, on) + take(in_transit.hit.t, on)
         if out.state is not None and out.scattered is not None:
             turned, own = take(out.scattered, on), rows(out.state, on)
             state = map_leaves(lambda new, old: torch.where(turned, new, old), own, state)
@@ -184,16 +186,16 @@ class Tensors:
         # Distances are counted from where the ray began; the step over a surface is below their rounding.
         values = {"t": behind.t + before, "prim": behind.prim, "u": behind.u, "v": behind.v}
         paths.hit = replace(hit, **{name: getattr(hit, name).index_copy(0, home, x) for name, x in values.items()})
-        again = self._held_up(state, behind)
+        again = self._may_transmit(state, behind)
         state = rows(state, again)
         lanes, before = take(home, again), take(before, again)
-        paths.flight = Flight(lanes, state, rows(behind, again), before, flight.step + 1)
+        paths.in_transit = RaysInTransit(lanes, state, rows(behind, again), before, in_transit.step + 1)
         return True
 
     def hits(self, state: PathState, depth: int) -> Hit:
         """Return what rays meet on their way to a vertex, behind what lets them pass; they are not counted."""
         paths = Paths(state, depth)
-        find(Tensors(self.wave, 0), paths)
+        find(TensorsEngine(self.wave, 0), paths)
         return paths.met
 
     def sort(self, paths: Paths) -> Counts:
@@ -253,8 +255,8 @@ class Tensors:
             if self.keeps:
                 after.outputs.append((model, take(paths.state.lane, index), output))
             start += len(index)
-        after.state = joined(leaving)
-        after.hit = joined(next_hit) if next_hit else None
+        after.state = concatenate_lanes(leaving)
+        after.hit = concatenate_lanes(next_hit) if next_hit else None
         return after
 
     def occlude(self, paths: Paths) -> None:
@@ -274,8 +276,8 @@ class Tensors:
             paths.state = replace(paths.state, radiance=parts[0] if len(parts) == 1 else torch.cat(parts, 1))
         paths.pending.clear()
         for lane, splat in paths.splats:
-            paths.splat_clear.append(self.clear(splat.light))
-            self._splat(lane, splat, paths.splat_clear[-1])
+            paths.splat_transmittance.append(self.clear(splat.light))
+            self._splat(lane, splat, paths.splat_transmittance[-1])
 
     def _splat(self, lane: Tensor, splat: Splat, clear: Tensor) -> None:
         """Note the light of splats that gets through; one that is not finite is left out, and its sample's own light too."""
@@ -353,7 +355,7 @@ def trace(
         observer: looks on, and finds what stages returned in populations.
         splats: gets what they bring to other pixels; None: nobody asks.
     """
-    engine = Tensors(wave, len(state.lane), tally, observer is not None, splats)
+    engine = TensorsEngine(wave, len(state.lane), tally, observer is not None, splats)
     if len(state.lane):
         walk(engine, engine.spawn(state), wave.integrator.limits, observer)
     return engine.brought()
@@ -361,7 +363,7 @@ def trace(
 
 def hits(wave: Wave, state: PathState) -> Hit:
     """Return what camera rays meet, behind what lets them pass."""
-    engine = Tensors(wave, 0)
+    engine = TensorsEngine(wave, 0)
     return engine.hits(engine.spawn(state).state, 1)
 
 
@@ -415,7 +417,7 @@ def seen(wave: Wave, names: tuple[str, ...], state: PathState, follow_shape: boo
 
     They are not weighted by the filter. ``follow_shape``: whether points follow the rays and the geometry, for derivatives.
     """
-    engine, layer = Tensors(wave, len(state.lane)), _Layers(wave, names, follow_shape)
+    engine, layer = TensorsEngine(wave, len(state.lane)), _Layers(wave, names, follow_shape)
     walk(engine, engine.spawn(state), wave.integrator.limits, layer)
     return layer.found
 

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from torchpt.core.memory import Span
-from torchpt.engines.tensors import Paths, Tensors, escaped
+from torchpt.engines.tensors import Paths, TensorsEngine, escaped
 from torchpt.math.gathers import recording_gathers
-from torchpt.math.sums import Sums
+from torchpt.math.sums import GradientSums
 from torchpt.math.vectors import rows, take
 from torchpt.paths import adjoint
 from torchpt.paths.adjoint import Tape, VertexCotangents
@@ -27,7 +27,7 @@ from torchpt.physics.shapes.geometry import Hit
 __all__ = ["TensorsBackward"]
 
 
-class TensorsBackward(Tensors):
+class TensorsBackward(TensorsEngine):
     """The engine of one chunk after the other that also goes back; see :class:`torchpt.engines.engine.Backward`.
 
     Args:
@@ -39,10 +39,10 @@ class TensorsBackward(Tensors):
         super().__init__(tape.wave, 0)
         self.tape, self.taped, self._cotangent = tape, tape.taped, cotangent
         # What is asked of what lets rays pass is asked under a tape.
-        self._under_tape = Tensors(replace(tape.wave, context=tape.taped.context), 0)
+        self._under_tape = TensorsEngine(replace(tape.wave, context=tape.taped.context), 0)
         self._rows = ("throughput", "o", "d") if self.plan.attached else ("throughput",)
 
-    def begin(self, span: Span, sums: Sums) -> Paths:
+    def begin(self, span: Span, sums: GradientSums) -> Paths:
         """See :class:`torchpt.engines.engine.Backward`."""
         self.sums, self._span = sums, span
         state = self.wave.rays(*span)
@@ -62,7 +62,7 @@ class TensorsBackward(Tensors):
     def scatter(self, paths: Paths, roulette: float) -> Paths:
         """See :class:`torchpt.paths.walk.Engine`; how much of the light got through is kept with the vertex it left."""
         after = super().scatter(paths, roulette)
-        paths.passed = after.clear, after.splat_clear
+        paths.passed = after.clear, after.splat_transmittance
         return after
 
     def radiance_of_samples(self) -> Tensor:
@@ -73,11 +73,11 @@ class TensorsBackward(Tensors):
     def receive(self, cotangent: Tensor) -> None:
         """See :class:`torchpt.engines.engine.Backward`."""
         # What the rest of its path asks of each lane's ray, and what that ray met.
-        self._asked = cotangent if self._weight is None else cotangent * self._weight
-        self._behind = {name: torch.zeros_like(cotangent) for name in self._rows}
+        self._radiance_cotangent = cotangent if self._weight is None else cotangent * self._weight
+        self._ray_cotangents = {name: torch.zeros_like(cotangent) for name in self._rows}
         for own in self.wave.integrator.fields:
             if not own.whole:
-                self._behind[EXTRA + own.name] = torch.zeros_like(own.begin(cotangent[0]))
+                self._ray_cotangents[EXTRA + own.name] = torch.zeros_like(own.begin(cotangent[0]))
         zero = torch.zeros_like(cotangent[0])
         none = torch.full(zero.shape, -1, dtype=torch.int64, device=zero.device)
         self._met = Hit(zero.clone(), none, zero.clone(), zero.clone())
@@ -88,16 +88,16 @@ class TensorsBackward(Tensors):
         place = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
         state, hit = rows(paths.state, order), rows(paths.met, order)
         ends = Ends(take(place, paths.ends.emissive).msort(), take(place, paths.ends.missed).msort())
-        chance, asked = self._chance(state, depth)
+        chance, chance_cotangent = self._chance(state, depth)
         hit = replace(hit, chance=chance)
         if depth < self.wave.integrator.limits.last:
-            clear, splat_clear = (iter(kept) for kept in paths.passed)
+            clear, splat_transmittance = (iter(kept) for kept in paths.passed)
             for model, came in paths.groups or ():
                 index, turn = take(place, came).sort()
-                self._bounce(model, depth, clear, splat_clear, turn, state, hit, index, asked)
-        self._light(ends, depth, state, hit, asked)
-        if chance is not None and asked is not None:
-            self.sums.add_each(torch.autograd.grad(chance, self.tape.tables, asked, allow_unused=True))
+                self._bounce(model, depth, clear, splat_transmittance, turn, state, hit, index, chance_cotangent)
+        self._light(ends, depth, state, hit, chance_cotangent)
+        if chance is not None and chance_cotangent is not None:
+            self.sums.add_each(torch.autograd.grad(chance, self.tape.tables, chance_cotangent, allow_unused=True))
         if self.plan.attached:
             for name in ("t", "prim", "u", "v"):
                 getattr(self._met, name).index_copy_(0, state.lane, getattr(hit, name))
@@ -121,21 +121,23 @@ class TensorsBackward(Tensors):
         model: int,
         depth: int,
         clear: Iterator[Tensor],
-        splat_clear: Iterator[Tensor],
+        splat_transmittance: Iterator[Tensor],
         turn: Tensor,
         state: PathState,
         hit: Hit,
         index: Tensor,
-        asked: Tensor | None,
+        chance_cotangent: Tensor | None,
     ) -> None:
         """Back through what happened at the surfaces of a model, at lanes ``index``."""
         lane = take(state.lane, index)
         next_hit = rows(self._met, lane) if self.plan.attached else None
-        behind = VertexCotangents(
-            take(self._asked, lane),
-            take(self._behind["throughput"], lane),
-            *(take(self._behind[name], lane) if self.plan.attached else None for name in ("o", "d")),
-            extra={k.removeprefix(EXTRA): take(x, lane) for k, x in self._behind.items() if k.startswith(EXTRA)},
+        cotangents = VertexCotangents(
+            take(self._radiance_cotangent, lane),
+            take(self._ray_cotangents["throughput"], lane),
+            *(take(self._ray_cotangents[name], lane) if self.plan.attached else None for name in ("o", "d")),
+            extra={
+                k.removeprefix(EXTRA): take(x, lane) for k, x in self._ray_cotangents.items() if k.startswith(EXTRA)
+            },
         )
 
         def passed(shadow: Shadow) -> Tensor:
@@ -143,7 +145,7 @@ class TensorsBackward(Tensors):
             return self._under_tape.clear(shadow) if self.tape.differentiates_opacity else take(kept, turn)
 
         def landed(splat: Splat) -> tuple[Tensor, Tensor]:
-            kept = next(splat_clear)
+            kept = next(splat_transmittance)
             through = self._under_tape.clear(splat.light) if self.tape.differentiates_opacity else take(kept, turn)
             assert self._cotangent is not None
             return adjoint.splatted(self.wave.integrator.clamp, self._cotangent, splat, through)
@@ -152,21 +154,23 @@ class TensorsBackward(Tensors):
             context = self._at(depth, lane, self.wave.integrator.limits.roulette(depth))
             vertex = VertexInput(rows(state, index), rows(hit, index))
             stage = self.wave.integrator.bounce
-            before = adjoint.bounce(stage, context, model, vertex, next_hit, passed, behind, self._tables, landed)
-        for name, found, like in before.of_rays(vertex.state, self.plan.attached):
-            self._behind[name].index_copy_(-1, lane, torch.zeros_like(like) if found is None else found)
-        self.sums.add_each(before.others)
-        if asked is not None and before.chance is not None:
-            asked.index_add_(0, index, before.chance)
+            input_cotangents = adjoint.bounce(
+                stage, context, model, vertex, next_hit, passed, cotangents, self._tables, landed
+            )
+        for name, found, like in input_cotangents.of_rays(vertex.state, self.plan.attached):
+            self._ray_cotangents[name].index_copy_(-1, lane, torch.zeros_like(like) if found is None else found)
+        self.sums.add_each(input_cotangents.extra_leaves)
+        if chance_cotangent is not None and input_cotangents.chance is not None:
+            chance_cotangent.index_add_(0, index, input_cotangents.chance)
 
-    def _light(self, ends: Ends, depth: int, state: PathState, hit: Hit, asked: Tensor | None) -> None:
+    def _light(self, ends: Ends, depth: int, state: PathState, hit: Hit, chance_cotangent: Tensor | None) -> None:
         """Back through light that was met by chance; what a bounce asks of the same lanes is there already."""
         table, integrator = self.world.lights, self.wave.integrator
         if table is None:
             return
-        self._gathered(integrator.emit, ends.emissive, depth, state, hit, asked)
+        self._gathered(integrator.emit, ends.emissive, depth, state, hit, chance_cotangent)
         if table.environment is not None:
-            self._gathered(integrator.escape, escaped(self.wave, state, ends), depth, state, hit, asked)
+            self._gathered(integrator.escape, escaped(self.wave, state, ends), depth, state, hit, chance_cotangent)
 
     def _gathered(
         self,
@@ -175,21 +179,23 @@ class TensorsBackward(Tensors):
         depth: int,
         state: PathState,
         hit: Hit,
-        asked: Tensor | None,
+        chance_cotangent: Tensor | None,
     ) -> None:
         if not len(index):
             return
         lane = take(state.lane, index)
         vertex = VertexInput(rows(state, index), rows(hit, index))
         with recording_gathers(self.sums):
-            before = adjoint.gather(stage, self._at(depth, lane), vertex, take(self._asked, lane), self._tables)
-        for name, found, _ in before.of_rays(vertex.state, self.plan.attached):
+            input_cotangents = adjoint.gather(
+                stage, self._at(depth, lane), vertex, take(self._radiance_cotangent, lane), self._tables
+            )
+        for name, found, _ in input_cotangents.of_rays(vertex.state, self.plan.attached):
             if found is not None:
-                behind = self._behind[name]
-                behind.index_copy_(-1, lane, take(behind, lane) + found)
-        self.sums.add_each(before.others)
-        if asked is not None and before.chance is not None:
-            asked.index_add_(0, index, before.chance)
+                cotangents = self._ray_cotangents[name]
+                cotangents.index_copy_(-1, lane, take(cotangents, lane) + found)
+        self.sums.add_each(input_cotangents.extra_leaves)
+        if chance_cotangent is not None and input_cotangents.chance is not None:
+            chance_cotangent.index_add_(0, index, input_cotangents.chance)
 
     def vjp_rays(self) -> None:
         """See :class:`torchpt.engines.engine.Backward`."""
@@ -197,10 +203,10 @@ class TensorsBackward(Tensors):
             return
         with torch.enable_grad(), recording_gathers(self.sums):
             state = self.taped.rays(*self._span)
-            pairs = [(x, self._behind[name]) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
+            pairs = [(x, self._ray_cotangents[name]) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
             if pairs:
-                rays, asked = [x for x, _ in pairs], [g for _, g in pairs]
-                self.sums.add_each(torch.autograd.grad(rays, self.tape.tables, asked, allow_unused=True))
+                rays, chance_cotangent = [x for x, _ in pairs], [g for _, g in pairs]
+                self.sums.add_each(torch.autograd.grad(rays, self.tape.tables, chance_cotangent, allow_unused=True))
 
     def _tables(self) -> Sequence[Tensor]:
         return self.tape.tables

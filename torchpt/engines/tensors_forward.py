@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpt.core.errors import RenderError
 from torchpt.core.memory import Budget, Span, fits_in_memory
 from torchpt.engines import tensors, work
-from torchpt.engines.work import Share
+from torchpt.engines.work import TaskResult
 from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts, Wave, clamp_scale
 from torchpt.physics.film.splats import Splats
@@ -42,7 +42,7 @@ class TensorsForward:
         """Return 0: no memory is taken beforehand."""
         return 0
 
-    def run(self, spans: Sequence[work.Span], each: Callable[[Share | None], bool]) -> bool:
+    def run(self, spans: Sequence[work.Span], each: Callable[[TaskResult | None], bool]) -> bool:
         """See :class:`torchpt.engines.engine.Forward`."""
         for pixel_set, first, count in spans:
             pixels = pixel_set.film.width * pixel_set.film.height
@@ -54,10 +54,10 @@ class TensorsForward:
     def _take(self, pixel_set: PixelSet, span: Span) -> None:
         """Take a piece: all of it, or nothing where it raises."""
         piece = _piece(self.wave, pixel_set, span)
-        self._share = Share(piece.tally, span[1] * span[3], piece.lost, piece.light)
+        self._share = TaskResult(piece.tally, span[1] * span[3], piece.lost, piece.light)
         piece.write()
 
-    def dismiss(self, keeps: bool) -> None:
+    def release_workers(self, keeps: bool) -> None:
         """See :class:`torchpt.engines.engine.Forward`: there is nothing to keep."""
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts
 
-__all__ = ["TASKS", "Block", "Share", "Span"]
+__all__ = ["TASKS", "Block", "Span", "TaskResult"]
 
 #: Tasks of a pass for each thread, so that none waits long for the last one.
 TASKS = 6
@@ -19,7 +19,7 @@ Block = tuple[PixelSet, int, int, int, int]
 
 
 @dataclass
-class Share:
+class TaskResult:
     """Results of a task beside its samples.
 
     Attributes:

@@ -28,7 +28,7 @@ from torchpt.gradients.tape import tape
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.ranks import Group
 from torchpt.scene import Scene
-from torchpt.scene.memory_estimate import loaded, memory_estimate
+from torchpt.scene.memory_estimate import mark_loaded, memory_estimate
 from torchpt.scene.settings import Settings
 
 __all__ = ["attached", "film_space_applies", "gradients"]
@@ -43,7 +43,7 @@ def gradients(
     attached: bool,
     kind: str,
     cotangent: Tensor,
-    held: bool = False,
+    film_space: bool = False,
     ranks: Group | None = None,
     rays: tuple[Tensor, Tensor] | None = None,
     by_rays: bool = False,
@@ -59,7 +59,7 @@ def gradients(
         attached: whether geometry is differentiated.
         kind: ``replay`` or ``autograd``.
         cotangent: derivatives of a loss by the pixels ``(3, H W)``.
-        held: whether what the camera sees is held in place (:func:`film_space_applies`), and the picture moves over it.
+        film_space: whether what the camera sees is held in place (:func:`film_space_applies`), and the picture moves over it.
         ranks: those that share the pixels, which are the same on each.
         rays: in place of the camera's, see :func:`torchpt.scene.prepare.make_wave`.
         by_rays: whether they are differentiated: their origins and directions follow the parameters.
@@ -72,30 +72,30 @@ def gradients(
     if attached and integrator.own_transmit:
         expected = "one whose rays are held up by surfaces alone, where geometry is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)
-    if (attached or held) and integrator.splats:
+    if (attached or film_space) and integrator.splats:
         expected = "one whose samples light their own pixels alone, where geometry or the camera is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)
     with limited_threads(settings.render.threads):
-        attached = needs_direction_gradients(scene, wanted) if held else attached
-        assembly = SceneTape(scene, settings, params, wanted, scene.weights(), dtype, attached, ranks, rays, by_rays)
+        attached = needs_direction_gradients(scene, wanted) if film_space else attached
+        scene_tape = SceneTape(scene, settings, params, wanted, scene.weights(), dtype, attached, ranks, rays, by_rays)
         if settings.render.max_memory is not None:
-            need = memory_estimate(settings, scene.device, "tape", len(assembly.wave.context.world.materials.models))
+            need = memory_estimate(settings, scene.device, "tape", len(scene_tape.wave.context.world.materials.models))
             check_memory(settings.render.max_memory, scene.device, need.backward_bytes, 0)
         carried = any(not own.whole for own in integrator.fields)
-        if kind == "replay" and integrator.own_transmit and (carried or assembly.differentiates_opacity):
+        if kind == "replay" and integrator.own_transmit and (carried or scene_tape.differentiates_opacity):
             what = "its fields" if carried else "opacity"
             raise NotBuiltError(
                 "adjoint", "replay", f"autograd, as {integrator.name} holds rays up and {what} is differentiated"
             )
-        sums = assembly.sums()
+        sums = scene_tape.sums()
         # Integrators that end at the first surface have but one vertex to keep.
-        if held:
-            film_space_backward(assembly, settings, cotangent, sums)
-        elif kind == "replay" and isinstance(assembly.wave.integrator, PathIntegrator):
-            replay_paths(scene, assembly, settings, cotangent, sums)
+        if film_space:
+            film_space_backward(scene_tape, settings, cotangent, sums)
+        elif kind == "replay" and isinstance(scene_tape.wave.integrator, PathIntegrator):
+            replay_paths(scene, scene_tape, settings, cotangent, sums)
         else:
-            tape(assembly, settings, cotangent, sums)
+            tape(scene_tape, settings, cotangent, sums)
         if ranks is not None:
             sums.join_ranks(ranks)
-        loaded("tape")
-        return assembly.gradients(sums)
+        mark_loaded("tape")
+        return scene_tape.gradients(sums)

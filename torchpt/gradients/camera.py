@@ -34,8 +34,8 @@ from torch import Tensor
 from torchpt.core.memory import Span
 from torchpt.engines.engine import hits, trace
 from torchpt.gradients.parameters import SceneTape, attached
-from torchpt.gradients.tape import chunk_by_chunk, counted
-from torchpt.math.sums import Sums
+from torchpt.gradients.tape import chunk_by_chunk, clamped_samples
+from torchpt.math.sums import GradientSums
 from torchpt.math.vectors import dot, normalize, take
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.paths.state import PathState
@@ -74,11 +74,11 @@ def needs_direction_gradients(scene: Scene, wanted: Iterable[str]) -> bool:
     return bent or attached(scene, [name for name in wanted if not name.startswith("camera.")])
 
 
-def film_space_backward(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums) -> None:
+def film_space_backward(scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums) -> None:
     """Reverse mode in this form, a chunk at a time.
 
     Args:
-        assembly: what waves read.
+        scene_tape: what waves read.
         settings: of the backward pass.
         cotangent: derivatives by the pixels ``(3, H W)``.
         sums: what is added to.
@@ -86,8 +86,8 @@ def film_space_backward(assembly: SceneTape, settings: Settings, cotangent: Tens
     Raises:
         RenderError: not even the tape of a single lane fits in memory.
     """
-    primal, wave, spp = assembly.wave, assembly.taped, settings.render.spp
-    count = partial(counted, settings)
+    primal, wave, spp = scene_tape.wave, scene_tape.taped, settings.render.spp
+    count = partial(clamped_samples, settings)
 
     def inner(span: Span) -> tuple[Tensor, Tensor]:
         return count(interior(primal, wave, span)).sum(1) / spp, cotangent[:, span[0] : span[0] + span[1]]
@@ -96,22 +96,22 @@ def film_space_backward(assembly: SceneTape, settings: Settings, cotangent: Tens
         values = splats(primal, wave, span, spp, cotangent, count)
         return values, torch.ones_like(values)
 
-    def border(upright: bool, each: int, span: Span) -> tuple[Tensor, Tensor]:
-        values = borders(primal, wave, upright, span, each, cotangent, count)
+    def border(vertical: bool, each: int, span: Span) -> tuple[Tensor, Tensor]:
+        values = borders(primal, wave, vertical, span, each, cotangent, count)
         return values, torch.ones_like(values)
 
     _, _, width, height = primal.crop
     if not primal.filter.jumps:
-        chunk_by_chunk(assembly, settings, sums, splat, cells(primal), spp)
+        chunk_by_chunk(scene_tape, settings, sums, splat, cells(primal), spp)
         return
     each = -(-spp // 4)
-    chunk_by_chunk(assembly, settings, sums, inner, width * height, spp)
-    for upright, number in borders_of(primal):
-        chunk_by_chunk(assembly, settings, sums, partial(border, upright, each), number, each)
+    chunk_by_chunk(scene_tape, settings, sums, inner, width * height, spp)
+    for vertical, number in borders_of(primal):
+        chunk_by_chunk(scene_tape, settings, sums, partial(border, vertical, each), number, each)
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _HeldPoints:
     """Surfaces that are seen at places of the film, held where they are."""
 
     state: PathState  # camera rays that follow the camera to the points
@@ -130,36 +130,36 @@ def interior(primal: Wave, wave: Wave, span: Span) -> Tensor:
     """
     with torch.no_grad():
         state = primal.rays(*span)
-    seen = _held(primal, wave, state)
-    return (_brought(wave, seen.state) * seen.stretch).view(3, span[3], span[1])
+    seen = _hold_points(primal, wave, state)
+    return (_radiance(wave, seen.state) * seen.stretch).view(3, span[3], span[1])
 
 
 def borders(
-    primal: Wave, wave: Wave, upright: bool, span: Span, samples: int, cotangent: Tensor, count: Count
+    primal: Wave, wave: Wave, vertical: bool, span: Span, samples: int, cotangent: Tensor, count: Count
 ) -> Tensor:
     """Return what moves through borders of pixels is worth, ``(3, N)``: values are 0, derivatives are not.
 
     Args:
         primal: a wave of detached parameters.
         wave: the same under a tape.
-        upright: borders between neighbours in a row; else in a column.
+        vertical: borders between neighbours in a row; else in a column.
         span: first border, how many, first sample, how many of them.
         samples: of each border, in all.
         cotangent: derivatives by the pixels ``(3, H W)``.
         count: how samples count in pixels.
     """
     x0, y0, width, _ = primal.crop
-    columns = width + 1 if upright else width
-    column, row, offset, key = _cells(primal, span, columns, samples, int(upright))
+    columns = width + 1 if vertical else width
+    column, row, offset, key = _cells(primal, span, columns, samples, int(vertical))
     along = offset[0]
     with torch.no_grad():
-        state = _rays(primal, column + x0 + (0.0 if upright else along), row + y0 + (along if upright else 0.0), key)
-        brought = count(_brought(primal, state))
-        before = _of_pixel(cotangent, column - (1 if upright else 0), row - (0 if upright else 1), width)
-        worth = _of_pixel(cotangent, column, row, width) - before
-    seen = _held(primal, wave, state)
-    at = seen.x if upright else seen.y
-    return worth.to(brought.dtype) * brought * (at - at.detach()) / samples
+        state = _rays(primal, column + x0 + (0.0 if vertical else along), row + y0 + (along if vertical else 0.0), key)
+        radiance = count(_radiance(primal, state))
+        before = _of_pixel(cotangent, column - (1 if vertical else 0), row - (0 if vertical else 1), width)
+        film_cotangent = _of_pixel(cotangent, column, row, width) - before
+    seen = _hold_points(primal, wave, state)
+    at = seen.x if vertical else seen.y
+    return film_cotangent.to(radiance.dtype) * radiance * (at - at.detach()) / samples
 
 
 def borders_of(primal: Wave) -> tuple[tuple[bool, int], ...]:
@@ -187,16 +187,18 @@ def splats(primal: Wave, wave: Wave, span: Span, samples: int, cotangent: Tensor
     column, row = column - beyond, row - beyond
     with torch.no_grad():
         state = _rays(primal, column + x0 + offset[0], row + y0 + offset[1], key)
-    seen = _held(primal, wave, state)
-    radiance = count(_brought(wave, seen.state) * seen.stretch)
+    seen = _hold_points(primal, wave, state)
+    radiance = count(_radiance(wave, seen.state) * seen.stretch)
     reach = range(-beyond, beyond + 1)
     across = [_filter(primal, seen.x - (column + (x0 + k + 0.5))) for k in reach]
     down = [_filter(primal, seen.y - (row + (y0 + k + 0.5))) for k in reach]
-    worth = torch.zeros_like(radiance)
+    film_cotangent = torch.zeros_like(radiance)
     for i, along in zip(reach, down, strict=True):
         for k, weight in zip(reach, across, strict=True):
-            worth = worth + _of_pixel(cotangent, column + k, row + i, width).to(worth.dtype) * (weight * along)
-    return radiance * worth / samples
+            film_cotangent = film_cotangent + _of_pixel(cotangent, column + k, row + i, width).to(
+                film_cotangent.dtype
+            ) * (weight * along)
+    return radiance * film_cotangent / samples
 
 
 def cells(primal: Wave) -> int:
@@ -246,12 +248,12 @@ def _rays(primal: Wave, x: Tensor, y: Tensor, key: Tensor) -> PathState:
     return camera_state(o.expand_as(d), d, key)
 
 
-def _brought(wave: Wave, state: PathState) -> Tensor:
+def _radiance(wave: Wave, state: PathState) -> Tensor:
     """Radiance ``(3, N)`` that camera rays bring."""
     return trace(wave, state)
 
 
-def _held(primal: Wave, wave: Wave, state: PathState) -> _Seen:
+def _hold_points(primal: Wave, wave: Wave, state: PathState) -> _HeldPoints:
     """Return what camera rays of detached parameters meet, as a camera under a tape sees it."""
     world = primal.context.world
     with torch.no_grad():
@@ -267,4 +269,4 @@ def _held(primal: Wave, wave: Wave, state: PathState) -> _Seen:
     stretch = torch.where(value > 0, area / torch.where(value > 0, value, 1.0), 1.0)
     towards = normalize(offset)
     o = state.o + (origin - origin.detach())
-    return _Seen(replace(state, o=o, d=state.d + (towards - towards.detach())), x, y, stretch)
+    return _HeldPoints(replace(state, o=o, d=state.d + (towards - towards.detach())), x, y, stretch)

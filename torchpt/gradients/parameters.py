@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpt.core.memory import Budget, Span
 from torchpt.core.tree import map_leaves
-from torchpt.math.sums import Sums
+from torchpt.math.sums import GradientSums
 from torchpt.paths.adjoint import Tape
 from torchpt.paths.wave import Wave
 from torchpt.ranks import Group, blocks
@@ -54,7 +54,7 @@ class SceneTape(Tape):
         settings: of the backward pass.
         params: tensors in place of the scene's.
         wanted: names of those that are differentiated.
-        held: tensors that stages use by themselves, such as weights of modules.
+        captured: tensors that stages use by themselves, such as weights of modules.
         dtype: of the lanes.
         attached: whether geometry is differentiated.
         ranks: those that share the pixels; None: there is but one process.
@@ -68,7 +68,7 @@ class SceneTape(Tape):
         settings: Settings,
         params: Mapping[str, Tensor],
         wanted: Sequence[str],
-        held: Sequence[Tensor],
+        captured: Sequence[Tensor],
         dtype: torch.dtype,
         attached: bool,
         ranks: Group | None = None,
@@ -84,25 +84,25 @@ class SceneTape(Tape):
         with torch.enable_grad():
             made = make_wave(scene, settings, given, dtype, True, attached, rays=rays)
         self._outputs: list[Tensor] = []
-        plain: dict[int, Tensor] = {}
+        primals: dict[int, Tensor] = {}
         leaves: dict[int, Tensor] = {}
 
         def detached(tensor: Tensor) -> Tensor:
             if not tensor.requires_grad or (tensor.is_leaf and id(tensor) not in inputs):
                 return tensor
-            if id(tensor) not in plain:
-                plain[id(tensor)] = tensor.detach()
+            if id(tensor) not in primals:
+                primals[id(tensor)] = tensor.detach()
                 self._outputs.append(tensor)
-            return plain[id(tensor)]
+            return primals[id(tensor)]
 
         def leaf(tensor: Tensor) -> Tensor:
             return leaves.get(id(tensor), tensor)
 
         inputs = {id(tensor) for tensor in self._inputs}
         wave = _over(made, detached)
-        ones = [plain[id(tensor)] for tensor in self._outputs]
+        ones = [primals[id(tensor)] for tensor in self._outputs]
         leaves |= {id(one): one.detach().requires_grad_() for one in ones}
-        super().__init__(wave, _over(wave, leaf), [leaves[id(one)] for one in ones], ones, tuple(held))
+        super().__init__(wave, _over(wave, leaf), [leaves[id(one)] for one in ones], ones, tuple(captured))
 
     def blocks(self, pixels: int, samples: int) -> list[tuple[int, int]]:
         """Consecutive pixels, first and how many, that this process takes: the same ones by kernels and without."""
@@ -118,18 +118,18 @@ class SceneTape(Tape):
             for _ in budget.through(moved, count, 0, samples):
                 pass
 
-    def sums(self) -> Sums:
+    def sums(self) -> GradientSums:
         """Sums of the gradients of the leaves, and of what is held."""
-        return Sums(self.tables)
+        return GradientSums(self.tables)
 
-    def gradients(self, sums: Sums) -> list[Tensor]:
+    def gradients(self, sums: GradientSums) -> list[Tensor]:
         """Gradients of the parameters, of rays, and of what is held, from those of the leaves."""
         found = sums.gradients()
         pairs = [(y, g) for y, g in zip(self._outputs, found, strict=False) if g is not None]
         own: Sequence[Tensor | None] = [None] * len(self._inputs)
         if pairs and self._inputs:
             own = torch.autograd.grad([y for y, _ in pairs], self._inputs, [g for _, g in pairs], allow_unused=True)
-        given = zip((*self._inputs, *self.held), (*own, *found[len(self.leaves) :]), strict=True)
+        given = zip((*self._inputs, *self.captured), (*own, *found[len(self.leaves) :]), strict=True)
         return [torch.zeros_like(tensor) if gradient is None else gradient for tensor, gradient in given]
 
 

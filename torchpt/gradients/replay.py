@@ -19,11 +19,11 @@ from torch import Tensor
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import warn_once
 from torchpt.core.memory import Budget, Span, is_out_of_memory
-from torchpt.core.threads import deal
+from torchpt.core.threads import map_in_order
 from torchpt.engines.engine import LANES_OF_KERNELS, Backward, BackwardKernels, backward_kernels, backward_tensors
 from torchpt.gradients.parameters import SceneTape
 from torchpt.gradients.tape import sample_cotangents
-from torchpt.math.sums import ChunkSums, Sums
+from torchpt.math.sums import ChunkGradientSums, GradientSums
 from torchpt.paths.walk import KEPT, Counts, Observer, Population, walk
 from torchpt.scene import Scene
 from torchpt.scene.memory_estimate import BYTES_PER_LANE
@@ -43,7 +43,7 @@ MARKS = 8
 # ---- A chunk: forward, and back
 
 
-class Keeper(Observer[Any]):
+class VertexRecorder(Observer[Any]):
     """Keeps the vertices of a walk; where they are too many, marks on the way instead.
 
     Args:
@@ -85,7 +85,9 @@ class Chunk:
         sums: what is added to.
     """
 
-    def __init__(self, engine: Backward[Any, Any, Any], settings: Settings, span: Span, sums: Sums | ChunkSums) -> None:
+    def __init__(
+        self, engine: Backward[Any, Any, Any], settings: Settings, span: Span, sums: GradientSums | ChunkGradientSums
+    ) -> None:
         self.engine, self.settings, self.span, self.sums = engine, settings, span, sums
 
     def run(self, pixels: Tensor) -> None:
@@ -99,14 +101,14 @@ class Chunk:
             self._back(keeper, None)
             self.engine.vjp_rays()
 
-    def _forward(self, first: int, mark: Any, end: int | None) -> Keeper:
+    def _forward(self, first: int, mark: Any, end: int | None) -> VertexRecorder:
         """Trace paths from a mark (None: the camera) to vertex ``end`` (None: to their ends)."""
         paths = self.engine.begin(self.span, self.sums) if mark is None else self.engine.resume(mark)
-        keeper = Keeper(self.engine, first, mark)
+        keeper = VertexRecorder(self.engine, first, mark)
         walk(self.engine, paths, self.engine.wave.integrator.limits, keeper, end)
         return keeper
 
-    def _back(self, keeper: Keeper, end: int | None) -> None:
+    def _back(self, keeper: VertexRecorder, end: int | None) -> None:
         """Go back along what was kept, or from mark to mark."""
         for paths in reversed(keeper.kept):
             self.engine.vjp(paths)
@@ -120,7 +122,9 @@ class Chunk:
 # ---- All chunks: over threads by kernels, where these can be made; else one after the other by tensor operations
 
 
-def replay_paths(scene: Scene, assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums) -> None:
+def replay_paths(
+    scene: Scene, scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums
+) -> None:
     """Reverse mode by replaying paths; as :func:`torchpt.gradients.tape.tape`, but memory hardly grows with depth.
 
     Sums are joined in the order of chunks, whichever thread took them. Chunks of tensor operations have fewer lanes only
@@ -128,7 +132,7 @@ def replay_paths(scene: Scene, assembly: SceneTape, settings: Settings, cotangen
 
     Args:
         scene: what is rendered.
-        assembly: what waves read.
+        scene_tape: what waves read.
         settings: of the backward pass.
         cotangent: derivatives by the pixels ``(3, H W)``.
         sums: what is added to.
@@ -136,11 +140,11 @@ def replay_paths(scene: Scene, assembly: SceneTape, settings: Settings, cotangen
     Raises:
         RenderError: not even a single lane fits in memory.
     """
-    wave = assembly.wave
+    wave = scene_tape.wave
     share = cotangent / settings.render.spp if wave.integrator.splats else None
-    if _compiled(assembly, settings):
-        kernels = backward_kernels(assembly, own_models(scene, wave), share)
-        reason = _over_threads(kernels, assembly, settings, cotangent, sums)
+    if _compiled(scene_tape, settings):
+        kernels = backward_kernels(scene_tape, own_models(scene, wave), share)
+        reason = _over_threads(kernels, scene_tape, settings, cotangent, sums)
         models = wave.context.world.materials.models
         for stage, why in kernels.eager_vjps.items():
             model = f" at {models[stage[1]]}" if stage[0] == "bounce" else ""
@@ -153,47 +157,49 @@ def replay_paths(scene: Scene, assembly: SceneTape, settings: Settings, cotangen
         sums.clear()
 
     def whole(span: Span) -> None:
-        sums.join(piece(assembly, settings, cotangent, share, span))
+        sums.join(chunk_sums(scene_tape, settings, cotangent, share, span))
 
     budget = _budget_of_tensors(wave.centre.device, settings)
-    assembly.through(budget, whole, wave.crop[2] * wave.crop[3], settings.render.spp)
+    scene_tape.through(budget, whole, wave.crop[2] * wave.crop[3], settings.render.spp)
 
 
-def piece(assembly: SceneTape, settings: Settings, cotangent: Tensor, share: Tensor | None, span: Span) -> Sums:
+def chunk_sums(
+    scene_tape: SceneTape, settings: Settings, cotangent: Tensor, share: Tensor | None, span: Span
+) -> GradientSums:
     """Return the sums of a chunk of tensor operations."""
-    sums = assembly.sums()
-    engine = backward_tensors(assembly, share)
+    sums = scene_tape.sums()
+    engine = backward_tensors(scene_tape, share)
     Chunk(engine, settings, span, sums).run(cotangent)
     return sums
 
 
 def _over_threads(
-    kernels: BackwardKernels, assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums
+    kernels: BackwardKernels, scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums
 ) -> str:
     """Take all chunks by kernels; return why that cannot be, or ""."""
-    wave, cotangent = assembly.wave, cotangent.float()
+    wave, cotangent = scene_tape.wave, cotangent.float()
     budget = _budget(kernels, settings)
-    blocks = assembly.blocks(wave.crop[2] * wave.crop[3], settings.render.spp)
+    blocks = scene_tape.blocks(wave.crop[2] * wave.crop[3], settings.render.spp)
     engines: list[Backward[Any, Any, Any]] = []
     lock = threading.Lock()
 
-    def task(span: Span) -> ChunkSums:
+    def task(span: Span) -> ChunkGradientSums:
         with lock:
             engine = engines.pop() if engines else kernels.engine()
-        found = ChunkSums(assembly.tables, sums if budget.threads == 1 else None)
+        found = ChunkGradientSums(scene_tape.tables, sums if budget.threads == 1 else None)
         Chunk(engine, settings, span, found).run(cotangent)
         with lock:
             engines.append(engine)
         return found
 
-    def merge(part: ChunkSums | None) -> bool:
+    def merge(part: ChunkGradientSums | None) -> bool:
         if part is not None:
             sums.merge(part)
         return False
 
     while True:
         try:
-            deal(_spans(blocks, settings.render.spp), task, budget.threads, merge, ahead=2 * budget.threads)
+            map_in_order(_spans(blocks, settings.render.spp), task, budget.threads, merge, ahead=2 * budget.threads)
             return ""
         except Unsupported as error:
             return f"no kernel can be made of {error}"
@@ -239,9 +245,9 @@ def _budget(kernels: BackwardKernels, settings: Settings) -> Budget:
     return budget
 
 
-def _compiled(assembly: SceneTape, settings: Settings) -> bool:
+def _compiled(scene_tape: SceneTape, settings: Settings) -> bool:
     """Return True where kernels may be made: on a CPU, in float32, without derivatives by weights of modules or opacity."""
-    wave = assembly.wave
+    wave = scene_tape.wave
     if wave.centre.device.type != "cpu" or wave.context.plan.dtype != torch.float32 or settings.render.compile == "off":
         return False
-    return not assembly.held and not assembly.differentiates_opacity
+    return not scene_tape.captured and not scene_tape.differentiates_opacity

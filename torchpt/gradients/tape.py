@@ -12,14 +12,14 @@ from torchpt.core.threads import one_thread
 from torchpt.engines.engine import radiance as radiance_of
 from torchpt.gradients.parameters import SceneTape
 from torchpt.math.gathers import recording_gathers
-from torchpt.math.sums import Sums
+from torchpt.math.sums import GradientSums
 from torchpt.math.vectors import take
 from torchpt.paths.wave import clamp_scale
 from torchpt.physics.film.splats import Splats
 from torchpt.scene.memory_estimate import BYTES_PER_LANE
 from torchpt.scene.settings import Settings
 
-__all__ = ["chunk_by_chunk", "counted", "sample_cotangents", "tape", "tape_per_lane"]
+__all__ = ["chunk_by_chunk", "clamped_samples", "sample_cotangents", "tape", "tape_per_lane"]
 
 
 # ---- What a loss asks of single samples, of what it asks of the picture's pixels
@@ -28,7 +28,7 @@ __all__ = ["chunk_by_chunk", "counted", "sample_cotangents", "tape", "tape_per_l
 def sample_cotangents(settings: Settings, radiance: Tensor, pixels: Tensor) -> Tensor:
     """Derivatives ``(3, samples, n)`` by the radiance of samples, of those ``(3, n)`` by pixels.
 
-    A pixel is the mean of its samples as they are :func:`counted`.
+    A pixel is the mean of its samples as they are :func:`clamped_samples`.
 
     Args:
         settings: of the backward pass.
@@ -49,7 +49,7 @@ def sample_cotangents(settings: Settings, radiance: Tensor, pixels: Tensor) -> T
     return (cotangent * scale).scatter_add(0, channel, -back)
 
 
-def counted(settings: Settings, values: Tensor) -> Tensor:
+def clamped_samples(settings: Settings, values: Tensor) -> Tensor:
     """Return samples ``(3, ...)`` as pixels count them, differentiable: none that is not finite, each within the clamp."""
     values = torch.where(torch.isfinite(values.detach()).all(0), values, 0.0)
     clamp = settings.integrator.clamp
@@ -62,19 +62,19 @@ def counted(settings: Settings, values: Tensor) -> Tensor:
 #: Lanes of a chunk. Always the same, as sums of others would be rounded otherwise.
 LANES = {"cpu": 1 << 16, "cuda": 1 << 18}
 #: Bytes of a chunk's tape where memory is not limited.
-TAPE = 1 << 29
+TAPE_BYTES = 1 << 29
 #: Vertices of a path that memory is planned for where its depth is without end.
-LONGEST = 64
+ASSUMED_DEPTH = 64
 
 #: From a chunk to values that depend on the leaves of an assembly, and what is asked of them.
-Part = Callable[[Span], tuple[Tensor, Tensor]]
+ChunkLoss = Callable[[Span], tuple[Tensor, Tensor]]
 
 
-def tape(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums) -> None:
+def tape(scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums) -> None:
     """Reverse mode on a plain tape, a chunk of pixels at a time: memory grows with depth, not with the picture.
 
     Args:
-        assembly: what waves read.
+        scene_tape: what waves read.
         settings: of the backward pass.
         cotangent: derivatives by the pixels ``(3, H W)``.
         sums: what is added to.
@@ -82,9 +82,9 @@ def tape(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums)
     Raises:
         RenderError: not even the tape of a single lane fits in memory.
     """
-    wave = assembly.taped
+    wave = scene_tape.taped
 
-    def part(span: Span) -> tuple[Tensor, Tensor]:
+    def chunk_loss(span: Span) -> tuple[Tensor, Tensor]:
         splats: list[Splats] = []
         radiance = radiance_of(wave, *span, splats=splats)
         share = sample_cotangents(
@@ -94,22 +94,24 @@ def tape(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums)
         values = torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0)
         if not wave.integrator.splats:
             return values, share
-        other = [counted(settings, one.value) for one in splats]
+        other = [clamped_samples(settings, one.value) for one in splats]
         pixels = torch.cat([values.new_zeros(0, dtype=torch.int64), *(one.pixel for one in splats)])
         wanted = take(cotangent, pixels).to(share.dtype) / settings.render.spp
         return torch.cat((values.flatten(1), *other), 1), torch.cat((share.flatten(1), wanted), 1)
 
-    chunk_by_chunk(assembly, settings, sums, part, wave.crop[2] * wave.crop[3], settings.render.spp)
+    chunk_by_chunk(scene_tape, settings, sums, chunk_loss, wave.crop[2] * wave.crop[3], settings.render.spp)
 
 
-def chunk_by_chunk(assembly: SceneTape, settings: Settings, sums: Sums, part: Part, count: int, samples: int) -> None:
+def chunk_by_chunk(
+    scene_tape: SceneTape, settings: Settings, sums: GradientSums, chunk_loss: ChunkLoss, count: int, samples: int
+) -> None:
     """Add the derivatives of a part of a loss, chunk by chunk.
 
     Args:
-        assembly: with the leaves.
+        scene_tape: with the leaves.
         settings: of the backward pass.
         sums: what is added to.
-        part: makes the tape of a chunk.
+        chunk_loss: makes the tape of a chunk.
         count: of what chunks are made of: pixels, say.
         samples: of each.
 
@@ -118,34 +120,34 @@ def chunk_by_chunk(assembly: SceneTape, settings: Settings, sums: Sums, part: Pa
     """
 
     def add(span: Span) -> None:
-        sums.join(piece(assembly, part, span))
+        sums.join(chunk_sums(scene_tape, chunk_loss, span))
 
-    assembly.through(_budget(settings, assembly), add, count, samples)
+    scene_tape.through(_budget(settings, scene_tape), add, count, samples)
 
 
-def piece(assembly: SceneTape, part: Part, span: Span) -> Sums:
+def chunk_sums(scene_tape: SceneTape, chunk_loss: ChunkLoss, span: Span) -> GradientSums:
     """Return the sums of a chunk."""
-    found = assembly.sums()
+    found = scene_tape.sums()
     with torch.enable_grad(), recording_gathers(found):
-        values, cotangent = part(span)
+        values, cotangent = chunk_loss(span)
     if values.requires_grad:  # else nothing in these pixels depends on the parameters
-        leaves = [*assembly.leaves, *assembly.held]
+        leaves = [*scene_tape.leaves, *scene_tape.captured]
         with one_thread():  # several round sums over lanes otherwise
             found.add_each(torch.autograd.grad(values, leaves, cotangent.to(values.dtype), allow_unused=True))
     return found
 
 
-def _budget(settings: Settings, assembly: SceneTape) -> Budget:
+def _budget(settings: Settings, scene_tape: SceneTape) -> Budget:
     """Chunks of always the same size, or, where that is more than ``render.max_memory`` leaves, of what fits."""
-    device, each = assembly.wave.centre.device, tape_per_lane(settings)
-    lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE // each, 1))
+    device, each = scene_tape.wave.centre.device, tape_per_lane(settings)
+    lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE_BYTES // each, 1))
     limit = settings.render.max_memory
     budget = Budget(device, lanes, what="the tape of a single lane", limit=limit, per_lane=each)
-    budget.steady()
+    budget.drop_unneeded_limit()
     return budget
 
 
 def tape_per_lane(settings: Settings) -> int:
     """Bytes that the tape of a lane is expected to take: each vertex keeps about what a lane takes without one."""
     limits = settings.integrator.limits
-    return BYTES_PER_LANE * max(limits.max_depth if 0 <= limits.max_depth < LONGEST else LONGEST, 1)
+    return BYTES_PER_LANE * max(limits.max_depth if 0 <= limits.max_depth < ASSUMED_DEPTH else ASSUMED_DEPTH, 1)

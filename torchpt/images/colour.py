@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError
-from torchpt.core.threads import in_pieces
+from torchpt.core.threads import map_in_pieces
 
 __all__ = ["TONEMAPS", "display", "linear_to_srgb", "srgb_to_linear"]
 
@@ -25,7 +25,7 @@ _BRIGHTEST = 1e9
 
 
 def _power(x: Tensor, exponent: float) -> Tensor:
-    return in_pieces(lambda piece: piece**exponent, x)
+    return map_in_pieces(lambda piece: piece**exponent, x)
 
 
 def linear_to_srgb(x: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchpt.images.colour import display
 from torchpt.images.metrics import METRICS, error_map
 
-__all__ = ["Comparison", "Shown", "compare", "map_of"]
+__all__ = ["Comparison", "DisplayTransform", "compare", "comparison_map"]
 
 #: Measures of what a screen shows.
 OF_SHOWN = ("psnr", "ssim")
@@ -20,7 +20,7 @@ OF_COLOURS = (*OF_SHOWN, "flip")
 
 
 @dataclass(frozen=True)
-class Shown:
+class DisplayTransform:
     """How a screen shows radiance, for the measures of `OF_SHOWN`: see `colour.display`."""
 
     exposure: float = 0.0
@@ -52,7 +52,9 @@ class Comparison:
     reasons: dict[str, str] = field(default_factory=dict)
 
 
-def compare(image: Tensor, reference: Tensor, shown: Shown | None = None, colours: bool = True) -> Comparison:
+def compare(
+    image: Tensor, reference: Tensor, shown: DisplayTransform | None = None, colours: bool = True
+) -> Comparison:
     """Take all measures.
 
     Args:
@@ -75,7 +77,7 @@ def compare(image: Tensor, reference: Tensor, shown: Shown | None = None, colour
             reasons[name] = "a measure of colours, which this layer is not"
             continue
         try:
-            values[name] = METRICS[name](*_seen(name, image, reference, shown or Shown()))
+            values[name] = METRICS[name](*_seen(name, image, reference, shown or DisplayTransform()))
         except (ImportError, ValueError) as problem:
             reasons[name] = (
                 str(problem).removeprefix("torchpt.metrics.").removeprefix(f"{name}: ").removeprefix(f"{name} ")
@@ -97,12 +99,12 @@ def compare(image: Tensor, reference: Tensor, shown: Shown | None = None, colour
     )
 
 
-def map_of(name: str, image: Tensor, reference: Tensor, shown: Shown | None = None) -> Tensor:
+def comparison_map(name: str, image: Tensor, reference: Tensor, shown: DisplayTransform | None = None) -> Tensor:
     """The error map ``(H, W)`` of a measure as `compare` takes it: see `metrics.error_map`."""
-    return error_map(name, *_seen(name, image, reference, shown or Shown()))
+    return error_map(name, *_seen(name, image, reference, shown or DisplayTransform()))
 
 
-def _seen(name: str, image: Tensor, reference: Tensor, shown: Shown) -> tuple[Tensor, Tensor]:
+def _seen(name: str, image: Tensor, reference: Tensor, shown: DisplayTransform) -> tuple[Tensor, Tensor]:
     """The pictures as a measure takes them."""
     if name in OF_COLOURS and image.shape[-1] == 1:
         image, reference = image.expand(*image.shape[:2], 3), reference.expand(*image.shape[:2], 3)

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
 from torchpt.core.files import as_path, read_regular
-from torchpt.images.png import plain_png
+from torchpt.images.png import sanitize_png
 
-__all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "complaint", "existing", "pixels_of"]
+__all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "decode_image", "existing_image", "oiio_error"]
 
 MAX_PIXELS = 64 * 2**20  # a header may claim anything: refuse before memory is asked for
 FLOAT_FORMATS = (".exr", ".hdr")
@@ -81,7 +81,7 @@ class Pixels:
         return self.values.dtype.kind in "ub" and self.white <= 255
 
 
-def existing(path: str | PathLike[str]) -> Path:
+def existing_image(path: str | PathLike[str]) -> Path:
     """The path of a picture file that is there.
 
     Raises:
@@ -101,7 +101,7 @@ def existing(path: str | PathLike[str]) -> Path:
     return path
 
 
-def pixels_of(source: Path | EncodedImage, max_pixels: int) -> Pixels:
+def decode_image(source: Path | EncodedImage, max_pixels: int) -> Pixels:
     """Decodes a file that exists, or one in memory.
 
     Raises:
@@ -121,7 +121,7 @@ def pixels_of(source: Path | EncodedImage, max_pixels: int) -> Pixels:
             whole = read_regular(source) if isinstance(source, Path) else source.data
             width, height = (int.from_bytes(whole[at : at + 4], "big") for at in (16, 20))
             _check_size(label, width, height, 4, max_pixels, len(whole))
-            source = EncodedImage(label, plain_png(whole), "png")
+            source = EncodedImage(label, sanitize_png(whole), "png")
             return _through_oiio(source, label, kind, "uint16", max_pixels)
         if kind in FLOAT_FORMATS:
             return _through_oiio(source, label, kind, "float", max_pixels)
@@ -166,7 +166,7 @@ def _through_oiio(source: Path | EncodedImage, label: str, kind: str, stored: st
     wishes.attribute("oiio:RawColor", 1)
     picture = oiio.ImageInput.open(str(source), wishes)
     if picture is None:
-        raise AssetError(label, f"cannot be read ({complaint(oiio) or 'unknown format'})")
+        raise AssetError(label, f"cannot be read ({oiio_error(oiio) or 'unknown format'})")
     try:
         spec = picture.spec()
         if spec.deep:
@@ -176,14 +176,14 @@ def _through_oiio(source: Path | EncodedImage, label: str, kind: str, stored: st
         if spec.tile_width:
             values = picture.read_image(stored)
             if values is None:
-                raise AssetError(label, f"cannot be read ({complaint(picture) or 'truncated'})")
+                raise AssetError(label, f"cannot be read ({oiio_error(picture) or 'truncated'})")
             return Pixels(values.reshape(spec.height, spec.width, spec.nchannels), 65535, tuple(spec.channelnames))
         step = max(1, _BAND // (spec.width * spec.nchannels))
         for start in range(0, spec.height, step):
             end = min(start + step, spec.height)
             band = picture.read_scanlines(0, 0, spec.y + start, spec.y + end, 0, 0, spec.nchannels, stored)
             if band is None:
-                raise AssetError(label, f"cannot be read ({complaint(picture) or 'truncated'})")
+                raise AssetError(label, f"cannot be read ({oiio_error(picture) or 'truncated'})")
             if values is None:
                 values = np.empty((spec.height, spec.width, spec.nchannels), band.dtype)
             values[start:end] = band.reshape(end - start, spec.width, spec.nchannels)
@@ -233,7 +233,7 @@ _MODES = {
 }
 
 
-def complaint(teller: Any) -> str:
+def oiio_error(teller: Any) -> str:
     """What OpenImageIO, or one of its inputs, says is wrong: one line, empty where it says nothing."""
     try:
         found = teller.geterror()

@@ -11,7 +11,7 @@ from os import PathLike
 from typing import Any
 
 from torchpt.core.errors import AssetError
-from torchpt.images.decode import complaint, existing
+from torchpt.images.decode import existing_image, oiio_error
 
 __all__ = ["Fact", "checked_header", "put_header", "read_header"]
 
@@ -64,7 +64,7 @@ def read_header(path: str | PathLike[str]) -> dict[str, Fact]:
         SceneError: ``path`` is none.
         AssetError: a file that is missing, of no known ending, or malformed.
     """
-    path = existing(path)
+    path = existing_image(path)
     try:
         with path.open("rb") as file:
             if file.read(4) != b"\x76\x2f\x31\x01":
@@ -75,7 +75,7 @@ def read_header(path: str | PathLike[str]) -> dict[str, Fact]:
 
     picture = oiio.ImageInput.open(str(path))
     if picture is None:
-        raise AssetError(path, f"cannot be read ({complaint(oiio) or 'unknown format'})")
+        raise AssetError(path, f"cannot be read ({oiio_error(oiio) or 'unknown format'})")
     try:
         found = [_told(item) for item in picture.spec().extra_attribs]
     finally:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.core.errors import OutputError
-from torchpt.images.write import check_writable, place_of, reason_of, temporary_beside
+from torchpt.images.write import check_writable, output_path, temporary_beside, write_error
 
 __all__ = ["MOVIES", "check_movie", "write_movie"]
 
@@ -55,13 +55,13 @@ def write_movie(path: str | PathLike[str], frames: Iterable[Frame], fps: float) 
     Raises:
         OutputError: as `check_movie`, or an encoder that fails.
     """
-    destination = place_of(path, tuple(MOVIES))
+    destination = output_path(path, tuple(MOVIES))
     temporary = temporary_beside(destination)
     try:
         MOVIES[temporary.suffix](temporary, frames, fps)
         os.replace(temporary, destination)
     except (OSError, ValueError, TypeError, ImportError) as problem:
-        raise OutputError(path, reason_of(problem, destination)) from problem
+        raise OutputError(path, write_error(problem, destination)) from problem
     finally:
         with suppress(OSError):  # it is only there after a failure
             temporary.unlink()

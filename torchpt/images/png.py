@@ -7,14 +7,14 @@ import zlib
 
 import numpy as np
 
-__all__ = ["plain_png"]
+__all__ = ["sanitize_png"]
 
 _CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}
 # first column and row of a pass, and steps between them (PNG specification, 8.2: Adam7)
 _PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 
 
-def plain_png(data: bytes) -> bytes:
+def sanitize_png(data: bytes) -> bytes:
     """A PNG of 16 bits a value with nothing but its header, transparent colour and pixels, all of which are sound.
 
     Args:

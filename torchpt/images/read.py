@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchpt.images.colour import srgb_to_linear
-from torchpt.images.decode import MAX_PIXELS, existing, pixels_of
+from torchpt.images.decode import MAX_PIXELS, decode_image, existing_image
 from torchpt.images.layers import group_channels
-from torchpt.images.texels import picture_of
+from torchpt.images.texels import select_picture
 
 __all__ = ["read_image", "read_layers"]
 
@@ -33,8 +33,8 @@ def read_image(path: str | PathLike[str], linear: bool = False) -> Tensor:
         SceneError: ``path`` is none.
         AssetError: a file that is missing, of no known ending, malformed, truncated, CMYK or larger than 64 Mpixel.
     """
-    pixels = pixels_of(existing(path), MAX_PIXELS)
-    image = _tensor(picture_of(pixels))
+    pixels = decode_image(existing_image(path), MAX_PIXELS)
+    image = _tensor(select_picture(pixels))
     if pixels.values.dtype.kind == "f":
         return image
     image /= pixels.white
@@ -53,10 +53,10 @@ def read_layers(path: str | PathLike[str]) -> dict[str, Tensor]:
     Raises:
         SceneError, AssetError: as `read_image`.
     """
-    path = existing(path)
+    path = existing_image(path)
     if path.suffix.lower() != ".exr":
         return {"image": read_image(path)}
-    pixels = pixels_of(path, MAX_PIXELS)
+    pixels = decode_image(path, MAX_PIXELS)
     if pixels.values.dtype.kind != "f":  # another format under this name
         return {"image": read_image(path)}
     groups = group_channels(pixels.channels)

@@ -14,11 +14,20 @@ from numpy.typing import NDArray
 from torchpt.core.errors import AssetError
 from torchpt.core.files import read_regular
 from torchpt.images.colour import srgb_to_linear
-from torchpt.images.decode import MAX_PIXELS, EncodedImage, Pixels, existing, pixels_of
+from torchpt.images.decode import MAX_PIXELS, EncodedImage, Pixels, decode_image, existing_image
 from torchpt.images.layers import group_channels
 from torchpt.spec import Refused
 
-__all__ = ["TEXELS", "Texels", "check_source", "has_alpha", "picture_of", "radiance_of", "read_texels", "texels_of"]
+__all__ = [
+    "TEXELS",
+    "Texels",
+    "check_source",
+    "has_alpha",
+    "read_texels",
+    "select_picture",
+    "texels_from_array",
+    "texels_to_radiance",
+]
 
 #: What is accepted.
 TEXELS = "texels (H, W, C), channels last, or (H, W), C from 1 to 4: finite numbers, or 8 bits a value (uint8)"
@@ -49,10 +58,10 @@ def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MA
         AssetError: a file that is missing, of no known kind, malformed, truncated, too large, CMYK, of more than 4
             channels, or with a value that is not finite.
     """
-    file = source if isinstance(source, EncodedImage) else existing(source)
-    pixels = pixels_of(file, max_pixels)
+    file = source if isinstance(source, EncodedImage) else existing_image(source)
+    pixels = decode_image(file, max_pixels)
     label = file.label if isinstance(file, EncodedImage) else str(file)
-    values = picture_of(pixels)
+    values = select_picture(pixels)
     if values.shape[-1] > 4:
         raise AssetError(label, f"has {values.shape[-1]} channels, expected 1 to 4")
     scaled = np.ascontiguousarray(values, dtype=np.float32)
@@ -65,7 +74,7 @@ def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MA
     return Texels(scaled, pixels.eight_bit)
 
 
-def texels_of(value: Any) -> Texels:
+def texels_from_array(value: Any) -> Texels:
     """Return numbers as a picture ``(H, W, C)``: row 0 at the top, linear; of 8 or 16 bits they are scaled to 0..1 as a file's.
 
     Raises:
@@ -92,7 +101,7 @@ def texels_of(value: Any) -> Texels:
     return Texels(values, array.dtype == np.uint8)
 
 
-def radiance_of(read: Texels, source: str, key: str) -> NDArray[np.float32]:
+def texels_to_radiance(read: Texels, source: str, key: str) -> NDArray[np.float32]:
     """Return a picture as radiance ``(H, W, 3)``: grey ones in all channels, 8-bit ones decoded from sRGB, no alpha.
 
     Args:
@@ -139,7 +148,7 @@ def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:
     return data[chunk + 4 : chunk + 8] == b"tRNS"
 
 
-def picture_of(pixels: Pixels) -> NDArray:
+def select_picture(pixels: Pixels) -> NDArray:
     """The picture ``R G B [A]`` of a file with layers, or its first layer; else all there is."""
     if not pixels.channels or pixels.values.dtype.kind != "f":
         return pixels.values

@@ -27,7 +27,7 @@ from torchpt.images.colour import display
 from torchpt.images.header import Fact, checked_header, put_header
 from torchpt.images.layers import channel_names
 
-__all__ = ["WRITABLE", "check_writable", "place_of", "reason_of", "temporary_beside", "write_image"]
+__all__ = ["WRITABLE", "check_writable", "output_path", "temporary_beside", "write_error", "write_image"]
 
 WRITABLE = (".exr", ".hdr", ".png", ".jpg", ".jpeg", ".ppm")
 
@@ -64,7 +64,7 @@ def write_image(
         OutputError: an ending that is not written, or a place that cannot be written.
         ValueError: an image or layer of another shape, a header that no file could hold.
     """
-    destination = place_of(path)
+    destination = output_path(path)
     pixels, facts = _pixels("image", image), checked_header(header or {})
     temporary = temporary_beside(destination)
     if temporary.suffix == ".exr":
@@ -87,7 +87,7 @@ def write_image(
         encode()
         os.replace(temporary, destination)
     except (OSError, ValueError) as problem:
-        raise OutputError(path, reason_of(problem, destination)) from problem
+        raise OutputError(path, write_error(problem, destination)) from problem
     finally:
         with suppress(OSError):  # it is only there after a failure
             temporary.unlink()
@@ -106,7 +106,7 @@ def check_writable(path: str | PathLike[str], endings: tuple[str, ...] = WRITABL
     Raises:
         OutputError: an ending that is not written, a folder that is missing or cannot be written, a folder in the way.
     """
-    destination = place_of(path, endings)
+    destination = output_path(path, endings)
     try:
         if destination.is_dir():
             raise OutputError(path, "is a folder")
@@ -117,11 +117,11 @@ def check_writable(path: str | PathLike[str], endings: tuple[str, ...] = WRITABL
             os.stat(destination)  # a name too long is another error
         os.stat(destination.parent)
     except (OSError, ValueError) as problem:
-        raise OutputError(path, reason_of(problem, destination)) from problem
+        raise OutputError(path, write_error(problem, destination)) from problem
     return destination
 
 
-def place_of(path: str | PathLike[str], endings: tuple[str, ...] = WRITABLE) -> Path:
+def output_path(path: str | PathLike[str], endings: tuple[str, ...] = WRITABLE) -> Path:
     """The file that is meant, links resolved; an ending that is not among those accepted is an OutputError."""
     destination = as_path(path)
     if destination.suffix.lower() not in endings:
@@ -132,7 +132,7 @@ def place_of(path: str | PathLike[str], endings: tuple[str, ...] = WRITABLE) -> 
         if found.exists() and not (found.is_file() or found.is_dir()):
             raise OutputError(path, "is a device or pipe, no file that could be replaced")
     except (OSError, ValueError) as problem:
-        raise OutputError(path, reason_of(problem, destination)) from problem
+        raise OutputError(path, write_error(problem, destination)) from problem
     return found
 
 
@@ -141,7 +141,7 @@ def temporary_beside(destination: Path) -> Path:
     return destination.parent / f".torchpt-{secrets.token_hex(8)}{destination.suffix.lower()}"
 
 
-def reason_of(problem: Exception, destination: Path) -> str:
+def write_error(problem: Exception, destination: Path) -> str:
     """Why a file could not be written, for an OutputError."""
     if not destination.parent.exists():
         return f"cannot be written: there is no folder {destination.parent}"

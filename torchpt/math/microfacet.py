@@ -20,13 +20,13 @@ __all__ = [
     "Reflection",
     "coat_reflectance",
     "coat_transmittance",
-    "correlated",
-    "diffuse_passed",
-    "energy",
+    "diffuse_transmittance",
+    "directional_albedo",
     "fresnel_conductor",
     "fresnel_dielectric",
     "ggx",
     "half_vector",
+    "height_correlated_masking",
     "is_smooth",
     "masking",
     "reflect",
@@ -124,7 +124,7 @@ def schlick(cos_i: Tensor, f0: Tensor) -> Tensor:
     return f0 + (1.0 - f0) * (x2 * x2 * x)
 
 
-def diffuse_passed(eta: Tensor) -> Tensor:
+def diffuse_transmittance(eta: Tensor) -> Tensor:
     """The part of diffuse light that a smooth boundary lets through, from the side with ``eta`` = far index over near index.
 
     A fit of ours to the integral of :func:`fresnel_dielectric` over the hemisphere, for all indices. What passes a boundary to
@@ -185,7 +185,7 @@ def masking(cos: Tensor, length: Tensor) -> Tensor:
     return 2.0 * cos / (cos + length)
 
 
-def correlated(cos_o: Tensor, s_o: Tensor, cos_i: Tensor, s_i: Tensor) -> Tensor:
+def height_correlated_masking(cos_o: Tensor, s_o: Tensor, cos_i: Tensor, s_i: Tensor) -> Tensor:
     """``G2 / G1(wo)`` of height-correlated masking ``(N,)`` (Heitz 2014, equation 99), at most 1, finite everywhere.
 
     For refraction too, where it stands for a beta function (Dupuy, Heitz, d'Eon 2016) of nearly the same values.
@@ -279,7 +279,7 @@ def reflection(
     cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].clamp_min(0.0)
     s_o, s_i = stretched_length(wo, alpha_u, alpha_v), stretched_length(wi, alpha_u, alpha_v)
     d = ggx(m, alpha_u, alpha_v) * above
-    shadowing = correlated(cos_o, s_o, cos_i, s_i) if by_height else masking(cos_i, s_i)
+    shadowing = height_correlated_masking(cos_o, s_o, cos_i, s_i) if by_height else masking(cos_i, s_i)
     value = 0.5 * d / (cos_o + s_o) * shadowing
     scaled = _bound(wo, alpha_u, alpha_v).k * cos_o if bounded else cos_o
     return Reflection(m, dot(wo, m), value, 0.5 * d / (scaled + s_o))
@@ -304,7 +304,7 @@ class _Normals(NamedTuple):
         return (x.reshape(-1, len(self.weights)) * self.weights).sum(1)
 
 
-def energy(
+def directional_albedo(
     wo: Tensor, alpha_u: Tensor, alpha_v: Tensor | None, eta: Tensor | None, azimuths: int = 32, heights: int = 32
 ) -> Tensor:
     """Light ``(K,)`` that leaves the facets after one reflection or refraction, masking correlated by height.
@@ -328,13 +328,13 @@ def energy(
     m = sample_normal(wo, au, av, u.repeat(1, k), bounded=eta is None)
     cos, s_o = dot(wo, m), stretched_length(wo, au, av)
     back = reflect(wo, m, cos)
-    out = correlated(wo[2], s_o, back[2].clamp_min(0.0), stretched_length(back, au, av))
+    out = height_correlated_masking(wo[2], s_o, back[2].clamp_min(0.0), stretched_length(back, au, av))
     if eta is None:
         out = out * (_bound(wo, au, av).k * wo[2] + s_o) / (wo[2] + s_o)
     else:
         boundary = fresnel_dielectric(cos, eta)
         on = normalize(refract(wo, m, cos, boundary))
-        through = correlated(wo[2], s_o, (-on[2]).clamp_min(0.0), stretched_length(on, au, av))
+        through = height_correlated_masking(wo[2], s_o, (-on[2]).clamp_min(0.0), stretched_length(on, au, av))
         out = boundary.reflectance * out + (1.0 - boundary.reflectance) * through
     return (out.reshape(k, q) * wo.new_tensor(np.outer(wa, wb).ravel())).sum(1)
 

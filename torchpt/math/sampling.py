@@ -12,8 +12,8 @@ from torchpt.core.threads import sum_all
 from torchpt.math.vectors import safe_reciprocal, take
 
 __all__ = [
-    "Cells",
-    "Discrete",
+    "Distribution1D",
+    "Distribution2D",
     "concentric_disk",
     "cosine_hemisphere",
     "invert_linear",
@@ -128,7 +128,7 @@ def uniform_triangle(u: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Discrete:
+class Distribution1D:
     """Choice among K outcomes.
 
     Attributes:
@@ -140,7 +140,7 @@ class Discrete:
     pmf: Tensor
 
     @staticmethod
-    def of(weights: Tensor, dtype: torch.dtype, even: float = 0.01) -> Discrete:
+    def of(weights: Tensor, dtype: torch.dtype, even: float = 0.01) -> Distribution1D:
         """From non-negative weights ``(K,)``; all zero gives the uniform choice.
 
         Args:
@@ -159,7 +159,7 @@ class Discrete:
         # From the last possible outcome on the sum is 1, so that rounding never lets a draw fall on an impossible one.
         last = int((w > 0).nonzero().max())
         cdf[last:] = 1.0
-        return Discrete(cdf, w.to(dtype))
+        return Distribution1D(cdf, w.to(dtype))
 
     def draw(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return outcomes ``(N,)`` int64 for ``u (N,)`` in ``[0, 1]``, and what is left of ``u``, float64 in ``[0, 1]``.
@@ -173,7 +173,7 @@ class Discrete:
 
 
 @dataclass(frozen=True)
-class Cells:
+class Distribution2D:
     """Choice of a cell of an R x C grid, rows first; what a draw leaves over is a fresh number within the cell.
 
     The cells' preimages are rectangles of the unit square, so points that are stratified there stay so.
@@ -190,7 +190,7 @@ class Cells:
     width: Tensor
 
     @staticmethod
-    def of(weights: Tensor) -> Cells:
+    def of(weights: Tensor) -> Distribution2D:
         """From non-negative weights ``(R, C)`` of which one is positive."""
         w = weights.detach().double()
         number = w.shape[0]
@@ -202,7 +202,7 @@ class Cells:
         down = torch.cumsum(total[:, 0], 0)
         zero = down.new_zeros(1)
         width = torch.tensor(w.shape[1], dtype=torch.int64, device=w.device)
-        return Cells(torch.cat((zero, down / down[-1])), torch.cat((zero, along.reshape(-1))), width)
+        return Distribution2D(torch.cat((zero, down / down[-1])), torch.cat((zero, along.reshape(-1))), width)
 
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Rows and columns ``(N,)`` int64 for ``u (2, N)`` in ``[0, 1)``, and what is left ``(2, N)``: columns by ``u[0]``.

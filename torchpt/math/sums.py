@@ -32,7 +32,7 @@ from torch import Tensor
 
 from torchpt.ranks import Group
 
-__all__ = ["ChunkSums", "Sums", "summed_by_entry"]
+__all__ = ["ChunkGradientSums", "GradientSums", "summed_by_entry"]
 
 #: Tables of more numbers than this are summed in the lanes' own precision: few paths meet in one of so many places.
 WIDE = 1 << 20
@@ -42,7 +42,7 @@ DENSE = 1 << 15
 FEW = 1 << 7
 
 
-class Sums:
+class GradientSums:
     """What was added up of the gradients of some tables.
 
     Args:
@@ -97,7 +97,7 @@ class Sums:
             if gradient is not None:
                 self.add(number, gradient)
 
-    def join(self, part: Sums) -> None:
+    def join(self, part: GradientSums) -> None:
         """Add the sums of a piece: all of them, or nothing where there is no memory for that."""
         own = [
             total if more is None else more if total is None else total + more
@@ -112,7 +112,7 @@ class Sums:
             if count:
                 self._totals[number] = ranks.sum(self.total(number))
 
-    def merge(self, part: ChunkSums) -> None:
+    def merge(self, part: ChunkGradientSums) -> None:
         """Add the sums of a chunk: its terms of large tables first, as they come where they are added at once."""
         for number, index, values in part.stream:
             self.add_rows(number, index, values)
@@ -137,7 +137,7 @@ class Sums:
         ]
 
 
-class ChunkSums:
+class ChunkGradientSums:
     """Sums of one chunk: dense ones of small tables, and of large ones the terms themselves.
 
     Args:
@@ -149,7 +149,7 @@ class ChunkSums:
         stream: numbers of tables, indices ``(n,)`` and values ``(R, n)``.
     """
 
-    def __init__(self, tables: Sequence[Tensor], whole: Sums | None = None) -> None:
+    def __init__(self, tables: Sequence[Tensor], whole: GradientSums | None = None) -> None:
         self.tables, self._whole = tuple(tables), whole
         self._numbers = {id(table): number for number, table in enumerate(self.tables)}
         self.dense: dict[int, Tensor] = {}
@@ -161,7 +161,7 @@ class ChunkSums:
         return None if number is None else _Taken.apply(table, index, self, number)
 
     def add_at(self, number: int, index: Tensor, values: Tensor) -> None:
-        """See :class:`Sums`."""
+        """See :class:`GradientSums`."""
         _, width = _form(self.tables[number])
         terms = np.arange(len(index), dtype=np.int32)
         self.add_rows(number, index.to(torch.int32).numpy(), values.reshape(width, -1).numpy(), terms)
@@ -199,7 +199,7 @@ class ChunkSums:
         total += gradient.reshape(total.shape[1], total.shape[0]).T
 
     def add_each(self, gradients: Iterable[Tensor | None]) -> None:
-        """See :class:`Sums`."""
+        """See :class:`GradientSums`."""
         for number, gradient in enumerate(gradients):
             if gradient is not None:
                 self.add(number, gradient)
@@ -242,7 +242,7 @@ class _Taken(torch.autograd.Function):
     """Columns of a table, whose derivative is added to sums instead of being handed on."""
 
     @staticmethod
-    def forward(ctx, table: Tensor, index: Tensor, sums: Sums | ChunkSums, number: int) -> Tensor:
+    def forward(ctx, table: Tensor, index: Tensor, sums: GradientSums | ChunkGradientSums, number: int) -> Tensor:
         ctx.save_for_backward(index)
         ctx.sums, ctx.number = sums, number
         return torch.index_select(table, table.dim() - 1, index)

@@ -17,9 +17,9 @@ __all__ = [
     "Frame",
     "affine",
     "azimuth",
+    "concatenate_lanes",
     "cross",
     "dot",
-    "joined",
     "largest",
     "luminance",
     "normalize",
@@ -105,7 +105,7 @@ def rows(record: T, index: Tensor | None) -> T:
     return record if index is None else map_leaves(lambda table: take(table, index), record)
 
 
-def joined(records: list[T]) -> T:
+def concatenate_lanes(records: list[T]) -> T:
     """Records joined along the lane axis."""
     return records[0] if len(records) == 1 else map_leaves(lambda *parts: torch.cat(parts, -1), *records)
 

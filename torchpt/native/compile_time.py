@@ -6,7 +6,7 @@ import os
 import threading
 import time
 
-__all__ = ["begun", "ended", "seconds"]
+__all__ = ["begin", "end", "seconds"]
 
 _lock = threading.Lock()
 _state = {"total": 0.0, "since": 0.0, "depth": 0}
@@ -19,7 +19,7 @@ def seconds() -> float:
         return _state["total"] + under_way
 
 
-def begun() -> None:
+def begin() -> None:
     """Note that a thread compiles from now on, or waits for another one that does."""
     with _lock:
         if not _state["depth"]:
@@ -27,8 +27,8 @@ def begun() -> None:
         _state["depth"] += 1
 
 
-def ended() -> None:
-    """Note that a thread that had :func:`begun` is done."""
+def end() -> None:
+    """Note that a thread that had :func:`begin` is done."""
     with _lock:
         _state["depth"] -= 1
         if not _state["depth"]:

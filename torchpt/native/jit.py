@@ -23,15 +23,15 @@ from numba.core.compiler import CompileResult
 from numba.core.event import Event, Listener, register
 
 from torchpt.core.errors import RenderError
-from torchpt.core.memory import MARGIN, check_room
-from torchpt.core.threads import share
+from torchpt.core.memory import MARGIN, check_address_space
+from torchpt.core.threads import parallel_for
 from torchpt.native import cache, compile_time
 from torchpt.native.content import code_of_function
 
 if getattr(numba_config, "DISABLE_JIT", 0):
     raise RenderError("NUMBA_DISABLE_JIT is set, and kernels are machine code that Python cannot run: unset it")
 
-__all__ = ["compiled", "jit", "launch", "parallel_allowed", "part"]
+__all__ = ["ensure_compiled", "jit", "jit_internal", "launch", "parallel_allowed"]
 
 _lock = threading.Lock()
 _state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "said": False}
@@ -58,10 +58,10 @@ class _Compiling(Listener):
     """Tells :mod:`torchpt.native.compile_time` of every kernel, also of those that compile at their first call."""
 
     def on_start(self, event: Event) -> None:
-        compile_time.begun()
+        compile_time.begin()
 
     def on_end(self, event: Event) -> None:
-        compile_time.ended()
+        compile_time.end()
 
 
 # Numba holds this lock while it compiles, and while it looks a kernel up on disk.
@@ -121,16 +121,16 @@ class _ByContent(NullCache):
         return hashlib.sha256(repr(facts).encode()).hexdigest()[:40] + ".nbc"
 
 
-def part(**options: Any) -> Callable[[Callable], Any]:
+def jit_internal(**options: Any) -> Callable[[Callable], Any]:
     """:func:`jit` for what kernels alone call: without entries from Python and C, which would be compiled beside it."""
     return jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
 
 
-def compiled(kernel: Any, *args: Any) -> Any:
+def ensure_compiled(kernel: Any, *args: Any) -> Any:
     """The kernel, compiled for arguments with which it does nothing; says so on stderr, once, where that takes long."""
     if not kernel.overloads:
         # LLVM ends the process where it finds no memory, and so does the BLAS that numba brings along with its first kernel.
-        check_room(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN)
+        check_address_space(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN)
         timer = threading.Timer(_PATIENCE, _say)
         timer.daemon = True
         timer.start()
@@ -192,15 +192,15 @@ def launch(serial: Any, parallel: Any, items: int, threads: int, grain: int, arg
     """
     threads = min(threads, max(1, items // grain))
     if threads == 1:
-        compiled(serial, 0, 0, *args)(0, items, *args)
+        ensure_compiled(serial, 0, 0, *args)(0, items, *args)
     elif parallel_allowed():
         threads = min(threads, _most_threads())
         before = numba.get_num_threads()
         numba.set_num_threads(threads)
         try:
-            compiled(parallel, 0, 0, *args)(threads, items, *args)
+            ensure_compiled(parallel, 0, 0, *args)(threads, items, *args)
         finally:
             numba.set_num_threads(before)
     else:
-        compiled(serial, 0, 0, *args)
-        share(lambda first, last: serial(first, last, *args), items, threads)
+        ensure_compiled(serial, 0, 0, *args)
+        parallel_for(lambda first, last: serial(first, last, *args), items, threads)

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor, nn
 
 from torchpt.core.errors import SceneError
-from torchpt.nn.ranges import range_of
+from torchpt.nn.parametrizations import parametrization_of
 from torchpt.rendering.api import render
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import Common, RenderOptions
-from torchpt.spec.arguments import check_names, spelled
+from torchpt.scene.settings import BatchOptions, RenderOptions
+from torchpt.spec.arguments import check_names, expand_signature
 
 __all__ = ["Renderer"]
 
@@ -25,7 +25,7 @@ __all__ = ["Renderer"]
 class Renderer(nn.Module):
     """A scene that is rendered, and optimized, as any other module.
 
-    The chosen parameters are ``nn.Parameter`` objects without bounds, which :mod:`torchpt.nn.ranges` keeps in range: as long as
+    The chosen parameters are ``nn.Parameter`` objects without bounds, which :mod:`torchpt.nn.parametrizations` keeps in range: as long as
     they are finite, the scene can be rendered, but for places too far away and for what must go together: a spot whose
     ``beam_width`` is larger than its ``cutoff_angle``, or whose ``position`` is its ``target``, is refused by the render.
     ``values()`` gives what they stand for.
@@ -45,7 +45,7 @@ class Renderer(nn.Module):
         rigid: whether poses are turned and moved alone (six numbers each); False: their 16 numbers are parameters, as they are,
             where poses need not keep angles, as those of balls and cameras must.
         full: whether calls return a :class:`torchpt.Rendering`.
-        wishes: further arguments of ``torchpt.render`` for each call.
+        options: further arguments of ``torchpt.render`` for each call.
 
     Raises:
         SceneError: no scene, a name or pattern without a parameter, a render's argument that has a place of its own here.
@@ -54,7 +54,7 @@ class Renderer(nn.Module):
 
     steps: Tensor
 
-    @spelled
+    @expand_signature
     def __init__(
         self,
         scene: Scene,
@@ -63,22 +63,23 @@ class Renderer(nn.Module):
         seed: int = 0,
         rigid: bool = True,
         full: bool = False,
-        **wishes: Unpack[Common],
+        **options: Unpack[BatchOptions],
     ) -> None:
         super().__init__()
-        check_names("Renderer", wishes, RenderOptions, ("names", "rigid"))
+        check_names("Renderer", options, RenderOptions, ("names", "rigid"))
         if type(rigid) is not bool:
             raise SceneError("rigid", rigid, "True or False")
-        if "params" in wishes:
-            raise SceneError("params", wishes["params"], "an argument of Renderer.forward")
+        if "params" in options:
+            raise SceneError("params", options["params"], "an argument of Renderer.forward")
         if type(seed) is not int or seed < 0:
             raise SceneError("seed", seed, "a whole number >= 0")
-        self.scene, self.seed, self.full, self.wishes = as_scene(scene), seed, full, wishes
-        self.names = () if names is None else _chosen(scene, (names,) if isinstance(names, str) else names)
+        self.scene, self.seed, self.full, self.options = as_scene(scene), seed, full, options
+        self.names = () if names is None else _matching_names(scene, (names,) if isinstance(names, str) else names)
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
             ranges = [
-                range_of(scene.spec(n), start, rigid, scene.length) for n, start in zip(self.names, starts, strict=True)
+                parametrization_of(scene.spec(n), start, rigid, scene.length)
+                for n, start in zip(self.names, starts, strict=True)
             ]
             free = {
                 _key(name): nn.Parameter(found.inverse(start).clone())
@@ -87,14 +88,14 @@ class Renderer(nn.Module):
         self.ranges, self.free = nn.ModuleList(ranges), nn.ParameterDict(free)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
-    @spelled
+    @expand_signature
     def forward(
         self,
         params: Mapping[str, Tensor] | None = None,
         *,
         seed: int | None = None,
         full: bool | None = None,
-        **wishes: Unpack[Common],
+        **options: Unpack[BatchOptions],
     ) -> Any:
         """Render.
 
@@ -103,12 +104,12 @@ class Renderer(nn.Module):
                 parameter of this module, in place of that.
             seed: in place of the counted one.
             full: in place of what was said at first.
-            wishes: arguments of ``torchpt.render``, in place of those given at first.
+            options: arguments of ``torchpt.render``, in place of those given at first.
 
         Returns:
             The picture ``(H, W, 3)``; with ``full=True`` a :class:`torchpt.Rendering`.
         """
-        given: Common = {**self.wishes, **wishes}
+        given: BatchOptions = {**self.options, **options}
         if seed is None:
             seed = self._next_seed(given.get("ranks") is not None)
         full = self.full if full is None else full
@@ -172,7 +173,7 @@ def _key(name: str) -> str:
     return name.replace(".", "/")
 
 
-def _chosen(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
+def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
     """The parameters that names and patterns stand for, in the scene's order."""
     if not isinstance(names, Iterable) or isinstance(names, Mapping):
         raise SceneError("names", names, "a name of scene.params, or a sequence of names and patterns")

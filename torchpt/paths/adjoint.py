@@ -31,20 +31,20 @@ class Tape:
         wave: with plain tensors.
         taped: the same with leaves in place of those tensors that are differentiated.
         leaves: these leaves.
-        plain: the tensors that they stand for.
-        held: tensors that stages use by themselves and that are differentiated too, such as weights of modules.
+        primals: the tensors that they stand for.
+        captured: tensors that stages use by themselves and that are differentiated too, such as weights of modules.
     """
 
     wave: Wave
     taped: Wave
     leaves: list[Tensor]
-    plain: list[Tensor]
-    held: tuple[Tensor, ...]
+    primals: list[Tensor]
+    captured: tuple[Tensor, ...]
 
     @property
     def tables(self) -> tuple[Tensor, ...]:
         """Return all tensors that derivatives are summed for, in the order of their sums."""
-        return (*self.leaves, *self.held)
+        return (*self.leaves, *self.captured)
 
     @property
     def differentiates_opacity(self) -> bool:
@@ -83,7 +83,7 @@ class InputCotangents:
     Attributes:
         throughput, o, d: of the rays that came ``(3, n)``.
         chance: of :attr:`torchpt.physics.shapes.geometry.Hit.chance` ``(n,)``.
-        others: of the tensors that were asked for.
+        extra_leaves: of the tensors that were asked for.
         extra: of what the integrator carries along, by name.
     """
 
@@ -91,7 +91,7 @@ class InputCotangents:
     o: Tensor | None
     d: Tensor | None
     chance: Tensor | None
-    others: tuple[Tensor | None, ...]
+    extra_leaves: tuple[Tensor | None, ...]
     extra: Mapping[str, Tensor | None] = field(default_factory=dict)
 
     def of_rays(self, state: PathState, attached: bool) -> Iterator[tuple[str, Tensor | None, Tensor]]:
@@ -105,7 +105,7 @@ class InputCotangents:
             yield EXTRA + name, found, state.extra[name]
 
 
-Leaves = Callable[[], Sequence[Tensor]]
+LeafSource = Callable[[], Sequence[Tensor]]
 
 
 def bounce(
@@ -116,7 +116,7 @@ def bounce(
     next_hit: Hit | None,
     clear: Callable[[Shadow], Tensor],
     cotangents: VertexCotangents,
-    others: Leaves,
+    extra_leaves: LeafSource,
     splat: Callable[[Splat], tuple[Tensor, Tensor]] | None = None,
 ) -> InputCotangents:
     """Go back through what happens at surfaces.
@@ -129,7 +129,7 @@ def bounce(
         next_hit: what the rays that leave met; None where geometry is not differentiated.
         clear: how much of the light of shadow rays gets through.
         cotangents: what is asked of what the vertex hands on.
-        others: tensors whose derivatives are wanted too, asked for after the stage ran.
+        extra_leaves: tensors whose derivatives are wanted too, asked for after the stage ran.
         splat: says what splats bring to other pixels ``(3, n)``, differentiable, and the cotangents of these.
     """
 
@@ -138,22 +138,22 @@ def bounce(
         return next_hit
 
     with torch.enable_grad():
-        vertex, given = _given(context.plan, vertex)
+        vertex, input_leaves = _with_leaves(context.plan, vertex)
         output = stage(replace(context, search=found), model, vertex)
         after, shadow = output.leaving, output.shadow
-        asked = [(after.throughput, cotangents.throughput), (after.radiance, cotangents.radiance)]
+        pairs = [(after.throughput, cotangents.throughput), (after.radiance, cotangents.radiance)]
         if cotangents.o is not None and cotangents.d is not None:
-            asked += [(after.o, cotangents.o), (after.d, cotangents.d)]
-        asked += [(after.extra[name], cotangent) for name, cotangent in cotangents.extra.items()]
+            pairs += [(after.o, cotangents.o), (after.d, cotangents.d)]
+        pairs += [(after.extra[name], cotangent) for name, cotangent in cotangents.extra.items()]
         if shadow is not None:
             passed = clear(shadow)
             if passed.requires_grad:
-                asked.append((shadow.radiance * passed, cotangents.radiance))
+                pairs.append((shadow.radiance * passed, cotangents.radiance))
             else:
-                asked.append((shadow.radiance, cotangents.radiance * passed))
+                pairs.append((shadow.radiance, cotangents.radiance * passed))
         if output.splat is not None and splat is not None:
-            asked.append(splat(output.splat))
-        return _back(asked, given, others)
+            pairs.append(splat(output.splat))
+        return _vjp(pairs, input_leaves, extra_leaves)
 
 
 def gather(
@@ -161,7 +161,7 @@ def gather(
     context: StageContext,
     vertex: VertexInput,
     radiance: Tensor,
-    others: Leaves,
+    extra_leaves: LeafSource,
 ) -> InputCotangents:
     """Go back through light that was met by chance.
 
@@ -170,11 +170,11 @@ def gather(
         context: as for :func:`bounce`.
         vertex: as of the stage.
         radiance: what is asked of the samples' ``(3, n)``.
-        others: as for :func:`bounce`.
+        extra_leaves: as for :func:`bounce`.
     """
     with torch.enable_grad():
-        vertex, given = _given(context.plan, vertex)
-        return _back([(stage(context, vertex).brought, radiance)], given, others)
+        vertex, input_leaves = _with_leaves(context.plan, vertex)
+        return _vjp([(stage(context, vertex).brought, radiance)], input_leaves, extra_leaves)
 
 
 def splatted(clamp: float | None, cotangent: Tensor, splat: Splat, clear: Tensor) -> tuple[Tensor, Tensor]:
@@ -189,12 +189,12 @@ def splatted(clamp: float | None, cotangent: Tensor, splat: Splat, clear: Tensor
     value = splat.light.radiance * clear
     with torch.no_grad():
         counts = (splat.pixel >= 0) & (value.abs() < LARGEST).all(0)
-        asked = torch.where(counts, take(cotangent, splat.pixel.clamp_min(0)), 0.0)
-    return value if clamp is None else value * clamp_scale(value, clamp), asked
+        pairs = torch.where(counts, take(cotangent, splat.pixel.clamp_min(0)), 0.0)
+    return value if clamp is None else value * clamp_scale(value, clamp), pairs
 
 
 @dataclass(frozen=True)
-class _Given:
+class _InputLeaves:
     """Leaves in the place of what a vertex was given; None where nothing is asked of it."""
 
     throughput: Tensor
@@ -204,7 +204,7 @@ class _Given:
     extra: Mapping[str, Tensor]
 
 
-def _given(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _Given]:
+def _with_leaves(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _InputLeaves]:
     """Return the vertex with leaves for what may be differentiated, and these."""
 
     def leaf(x: Tensor) -> Tensor:
@@ -222,22 +222,27 @@ def _given(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _Given]:
         extra={**state.extra, **extra},
     )
     chance = None if hit.chance is None else leaf(hit.chance)
-    return VertexInput(state, replace(hit, chance=chance)), _Given(throughput, o, d, chance, extra)
+    return VertexInput(state, replace(hit, chance=chance)), _InputLeaves(throughput, o, d, chance, extra)
 
 
-def _back(asked: list[tuple[Tensor, Tensor]], given: _Given, others: Leaves) -> InputCotangents:
-    asked = [(y, g) for y, g in asked if y.requires_grad]
-    own, rest = leaves(given), list(others())
+def _vjp(pairs: list[tuple[Tensor, Tensor]], input_leaves: _InputLeaves, extra_leaves: LeafSource) -> InputCotangents:
+    pairs = [(y, g) for y, g in pairs if y.requires_grad]
+    own, rest = leaves(input_leaves), list(extra_leaves())
     grads: Sequence[Any] = [None] * (len(own) + len(rest))
-    if asked:
-        outputs, wanted = [y for y, _ in asked], [g for _, g in asked]
+    if pairs:
+        outputs, wanted = [y for y, _ in pairs], [g for _, g in pairs]
         grads = torch.autograd.grad(outputs, [*own, *rest], wanted, allow_unused=True)
     found = {id(leaf): gradient for leaf, gradient in zip(own, grads, strict=False)}
 
     def of(leaf: Tensor | None) -> Tensor | None:
         return None if leaf is None else found[id(leaf)]
 
-    extra = {name: of(leaf) for name, leaf in given.extra.items()}
+    extra = {name: of(leaf) for name, leaf in input_leaves.extra.items()}
     return InputCotangents(
-        of(given.throughput), of(given.o), of(given.d), of(given.chance), tuple(grads[len(own) :]), extra
+        of(input_leaves.throughput),
+        of(input_leaves.o),
+        of(input_leaves.d),
+        of(input_leaves.chance),
+        tuple(grads[len(own) :]),
+        extra,
     )

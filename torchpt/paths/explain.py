@@ -16,11 +16,11 @@ from torch import Tensor
 
 from torchpt.core.tree import leaves
 from torchpt.math.vectors import take
-from torchpt.paths.nonfinite import Place
+from torchpt.paths.nonfinite import SampleId
 from torchpt.paths.state import Emission, PathState, VertexOutput
 from torchpt.paths.walk import Observer, Population
 from torchpt.paths.wave import Wave
-from torchpt.physics.samplers import Streams
+from torchpt.physics.samplers import Randomizations
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.physics.world import World
 
@@ -31,15 +31,15 @@ __all__ = [
     "Event",
     "Explainer",
     "Intersection",
-    "Legible",
     "NonFiniteCause",
+    "ReadablePopulation",
     "Scattering",
     "Trace",
     "causes_of_samples",
 ]
 
 
-class Legible(Population, Protocol):
+class ReadablePopulation(Population, Protocol):
     """Paths whose tensors may be looked at, of an engine that keeps what its stages returned."""
 
     @property
@@ -136,10 +136,10 @@ class Scattering:
 
 Event = CameraRay | Intersection | EmitterHit | Scattering
 #: From camera rays of a wave to the radiance that they bring, while an observer looks on.
-Trace = Callable[[Wave, PathState, Observer[Legible]], Tensor]
+Trace = Callable[[Wave, PathState, Observer[ReadablePopulation]], Tensor]
 
 
-class Explainer(Observer[Legible]):
+class Explainer(Observer[ReadablePopulation]):
     """Keeps what happens along the paths of a walk; to be used for few lanes.
 
     Args:
@@ -161,20 +161,20 @@ class Explainer(Observer[Legible]):
         """Look at camera rays."""
         self.keep(CameraRay(state.lane, state))
 
-    def arrived(self, paths: Legible) -> bool:
+    def arrived(self, paths: ReadablePopulation) -> bool:
         """See :class:`Observer`."""
         state = paths.state
         self.keep(Intersection(paths.depth, state.lane, replace(state, radiance=state.radiance.clone()), paths.met))
         return False
 
-    def gathered(self, paths: Legible) -> None:
+    def gathered(self, paths: ReadablePopulation) -> None:
         """See :class:`Observer`."""
         for index, light in paths.emissions:
             prim = take(paths.met.prim, index)
             slot = None if bool((prim < 0).any()) else self.world.geometry.slot(prim)
             self.keep(EmitterHit(paths.depth, take(paths.state.lane, index), slot, light))
 
-    def left(self, paths: Legible) -> None:
+    def left(self, paths: ReadablePopulation) -> None:
         """See :class:`Observer`."""
         clear = iter(paths.clear)
         for model, lanes, output in paths.outputs:
@@ -222,7 +222,7 @@ class NonFiniteCause:
         return self.cause if self.cause == "not repeated" else f"{'nan' if self.nan else 'infinite'} {self.cause}"
 
 
-def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[Place]) -> list[NonFiniteCause]:
+def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[SampleId]) -> list[NonFiniteCause]:
     """The faults of samples, each traced again by tensor operations.
 
     Args:
@@ -230,31 +230,31 @@ def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[Place]) -> list
         wave: of their render.
         places: of the samples.
     """
-    found: dict[Place, NonFiniteCause] = {}
+    found: dict[SampleId, NonFiniteCause] = {}
     for streams in sorted({(place.first, place.streams) for place in places}):
         own = [place for place in places if (place.first, place.streams) == streams]
-        found |= zip(own, _again(trace, wave, own, Streams(*streams)), strict=True)
+        found |= zip(own, _find_causes(trace, wave, own, Randomizations(*streams)), strict=True)
     return [found[place] for place in places]
 
 
 @torch.no_grad()
-def _again(trace: Trace, wave: Wave, places: Sequence[Place], streams: Streams) -> list[NonFiniteCause]:
+def _find_causes(trace: Trace, wave: Wave, places: Sequence[SampleId], streams: Randomizations) -> list[NonFiniteCause]:
     """The same for samples of the same streams."""
-    watch = _Watch(wave.context.world, len(places))
+    finder = _CauseFinder(wave.context.world, len(places))
     x, y, sample = (
         torch.tensor([getattr(place, name) for place in places], device=wave.centre.device)
         for name in ("x", "y", "sample")
     )
     state = wave.rays_of(x, y, sample, streams)
-    watch.began(state)
-    radiance = trace(wave, state, watch)
-    if not watch.full:  # a path that is given up has brought nothing
-        watch.look("sum", radiance, torch.arange(len(places), device=x.device), 0, None)
+    finder.began(state)
+    radiance = trace(wave, state, finder)
+    if not finder.full:  # a path that is given up has brought nothing
+        finder.look("sum", radiance, torch.arange(len(places), device=x.device), 0, None)
     rest = NonFiniteCause("not repeated", False, 0)
-    return [fault or rest for fault in watch.faults]
+    return [cause or rest for cause in finder.causes]
 
 
-class _Watch(Explainer):
+class _CauseFinder(Explainer):
     """Finds the first value of each lane that is not finite, and keeps no events.
 
     Args:
@@ -262,19 +262,19 @@ class _Watch(Explainer):
         lanes: how many.
 
     Attributes:
-        faults: by lane; None where none was found yet.
+        causes: by lane; None where none was found yet.
     """
 
     def __init__(self, world: World, lanes: int) -> None:
         super().__init__(world)
-        self.faults: list[NonFiniteCause | None] = [None] * lanes
+        self.causes: list[NonFiniteCause | None] = [None] * lanes
 
     @property
     def full(self) -> bool:
         """Return True where every lane has its fault."""
-        return None not in self.faults
+        return None not in self.causes
 
-    def arrived(self, paths: Legible) -> bool:
+    def arrived(self, paths: ReadablePopulation) -> bool:
         """See :class:`Explainer`: paths that carry what is not finite may have no end, and need none here."""
         super().arrived(paths)
         return self.full
@@ -298,9 +298,9 @@ class _Watch(Explainer):
         bad = ~torch.isfinite(value).all(0)
         for n in bad.nonzero().squeeze(1).tolist():  # of KEPT lanes at most
             lane = int(lanes[n])
-            if self.faults[lane] is None:
+            if self.causes[lane] is None:
                 nan = bool(torch.isnan(value[:, n]).any())
-                self.faults[lane] = NonFiniteCause(cause, nan, depth, -1 if slot is None else int(slot[n]))
+                self.causes[lane] = NonFiniteCause(cause, nan, depth, -1 if slot is None else int(slot[n]))
 
 
 def _checks(event: Event, world: World) -> Iterator[tuple[str, Tensor]]:
@@ -336,7 +336,7 @@ def _of_vertex(event: Scattering, world: World) -> Iterator[tuple[str, Tensor]]:
         for value in leaves(surface.parameters):
             if value.dim() and value.shape[-1] == len(spoiled):
                 yield of(read, value.reshape(-1, len(spoiled)))
-        yield of("surface" if surface.relief is None else "texture", torch.cat((surface.frame.n, surface.wo)))
+        yield of("surface" if surface.perturbed_normal is None else "texture", torch.cat((surface.frame.n, surface.wo)))
     if direct is not None:
         unlit = torch.isfinite(brought).all(0)
         factors = [("light", direct.radiance), ("light", direct.sample.weight), ("bsdf", direct.reflected)]

@@ -13,22 +13,22 @@ import torch
 from torch import Tensor
 
 from torchpt.paths.wave import PixelSet
-from torchpt.physics.samplers import Streams
+from torchpt.physics.samplers import Randomizations
 
-__all__ = ["KEPT", "NonFinite", "Place"]
+__all__ = ["KEPT", "NonFinite", "SampleId"]
 
 #: How many are kept, and traced again: the first ones of the picture, whichever thread took them.
 KEPT = 64
 
 
 @dataclass(frozen=True)
-class Place:
+class SampleId:
     """One sample.
 
     Attributes:
         sample: its number in the pixel.
         y, x: the pixel on the whole film.
-        first, streams: which streams share the pixel's samples, see :class:`torchpt.physics.samplers.Streams`.
+        first, streams: which streams share the pixel's samples, see :class:`torchpt.physics.samplers.Randomizations`.
         nan: whether it was NaN; else it was infinite.
     """
 
@@ -40,7 +40,7 @@ class Place:
     nan: bool = True
 
     @property
-    def rank(self) -> tuple[int, ...]:
+    def sort_key(self) -> tuple[int, ...]:
         """By which they are ordered: those of the picture first, then those of pilots, each as they are taken."""
         return self.first, self.sample, self.y, self.x
 
@@ -60,7 +60,7 @@ class NonFinite:
 
     nan: int = 0
     infinite: int = 0
-    places: list[Place] = field(default_factory=list)
+    places: list[SampleId] = field(default_factory=list)
 
     @property
     def count(self) -> int:
@@ -72,7 +72,7 @@ class NonFinite:
         if other.count:
             self.nan += other.nan
             self.infinite += other.infinite
-            self.places = sorted([*self.places, *other.places], key=lambda place: place.rank)[:KEPT]
+            self.places = sorted([*self.places, *other.places], key=lambda place: place.sort_key)[:KEPT]
 
     def plain(self) -> dict[str, Any]:
         """As plain values, for a checkpoint."""
@@ -93,7 +93,7 @@ class NonFinite:
                 raise ValueError("lost samples")
         except (KeyError, TypeError):
             raise ValueError("lost samples") from None
-        return NonFinite(facts["nan"], facts["infinite"], [Place(*place) for place in facts["places"]])
+        return NonFinite(facts["nan"], facts["infinite"], [SampleId(*place) for place in facts["places"]])
 
     @staticmethod
     def of(
@@ -115,12 +115,12 @@ class NonFinite:
         bad = ~torch.isfinite(radiance).all(0)
         nan = torch.isnan(radiance).any(0)
         count, nans = int(bad.sum()), int(nan.sum())
-        streams = Streams() if pixel_set is None else pixel_set.streams
+        streams = Randomizations() if pixel_set is None else pixel_set.streams
         places = []
         for s, p in bad.nonzero()[:KEPT].tolist():
             pixel = first_pixel + p
             pixel = pixel if pixel_set is None or pixel_set.places is None else int(pixel_set.places[pixel])
             y, x = divmod(pixel, crop[2])
             of_nan = bool(nan[s, p])
-            places.append(Place(first_sample + s, y + crop[1], x + crop[0], streams.first, streams.count, of_nan))
+            places.append(SampleId(first_sample + s, y + crop[1], x + crop[0], streams.first, streams.count, of_nan))
         return NonFinite(nans, count - nans, places)

@@ -11,7 +11,7 @@ from torchpt.math.vectors import Frame, affine, cross, dot, normalize, take
 from torchpt.physics.shapes.geometry import Interaction
 from torchpt.physics.textures import MaterialTextures
 
-__all__ = ["PerturbedNormal", "mapped"]
+__all__ = ["PerturbedNormal", "perturb_normal"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class PerturbedNormal:
         return 2.0 / (1.0 + (1.0 + self.alpha2 * (1.0 - square).clamp_min(0.0) / square).sqrt())
 
 
-def mapped(
+def perturb_normal(
     textures: MaterialTextures,
     row: Tensor,
     local: Tensor | None,

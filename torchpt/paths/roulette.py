@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchpt.physics.samplers import Dimension, Draws
 
-__all__ = ["DEEP", "DEEP_CAP", "LEAST", "chance_of", "survived"]
+__all__ = ["DEEP", "DEEP_CAP", "LEAST", "russian_roulette", "survival_probability"]
 
 #: Where nothing else ends paths, those of more vertices than this may be ended whatever they carry. Before it a cap below 1
 #: would only cost: each vertex of a path that loses nothing multiplies its variance by one over the cap.
@@ -20,11 +20,11 @@ DEEP_CAP = 0.999
 LEAST = 0.25
 
 
-def survived(chance: Tensor, draws: Draws, alive: Tensor, throughput: Tensor) -> tuple[Tensor, Tensor]:
+def russian_roulette(chance: Tensor, draws: Draws, alive: Tensor, throughput: Tensor) -> tuple[Tensor, Tensor]:
     """Return which paths are alive after roulette ``(N,)``, and their throughput ``(3, N)``.
 
     Args:
-        chance: to survive ``(N,)``, see :func:`chance_of`.
+        chance: to survive ``(N,)``, see :func:`survival_probability`.
         draws: the vertex's random numbers.
         alive: before.
         throughput: before.
@@ -33,7 +33,9 @@ def survived(chance: Tensor, draws: Draws, alive: Tensor, throughput: Tensor) ->
     return alive, throughput / torch.where(alive, chance, 1.0)
 
 
-def chance_of(chance: float | None, cap: float, brightest: Tensor, eta: Tensor | None, tape: bool = False) -> Tensor:
+def survival_probability(
+    chance: float | None, cap: float, brightest: Tensor, eta: Tensor | None, tape: bool = False
+) -> Tensor:
     """Return the chance with which paths survive ``(N,)``.
 
     Args:

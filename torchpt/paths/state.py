@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EXTRA",
-    "FOREVER",
     "STRATEGIES",
+    "T_MAX",
     "DirectLight",
     "Drawn",
     "Emission",
@@ -85,7 +85,7 @@ class Shadow:
 #: mis: light and BSDF sampling combined; bsdf, light: one of them; uniform: directions uniform over the hemisphere.
 STRATEGIES = ("mis", "bsdf", "light", "uniform")
 #: ``t_max`` of a path that goes on; times 0 it is that of one that ended.
-FOREVER = torch.finfo(torch.float32).max
+T_MAX = torch.finfo(torch.float32).max
 
 
 @dataclass(frozen=True)

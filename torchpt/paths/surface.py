@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.vectors import Frame, cross, dot, normalize, take
-from torchpt.paths.perturbed_normals import PerturbedNormal, mapped
+from torchpt.paths.perturbed_normals import PerturbedNormal, perturb_normal
 from torchpt.physics import bsdfs
 from torchpt.physics.shapes import surface_uv, vertex_colors
 from torchpt.physics.shapes.geometry import Interaction
@@ -74,10 +74,10 @@ class Surface:
 
     frame: Frame  # about the shading normal, turned to the side of wo where light does not pass through
     side: Tensor | None  # (N,) -1 where it was turned around; None where light passes through
-    shown: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
+    front_mask: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
     parameters: bsdfs.Parameters  # lane values of the BSDF
     wo: Tensor  # (3, N) local
-    relief: PerturbedNormal | None  # None where no map bends the normals
+    perturbed_normal: PerturbedNormal | None  # None where no map bends the normals
 
 
 def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Tensor | None = None) -> Surface:
@@ -93,19 +93,21 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
     model, row = world.materials.models[number], take(world.materials.row, at.slot)
     textures = world.materials.textures[number]
     point = texture_point_at(world, number, at, pixel)
-    ns, side, shown, relief = at.ns, None, None, None
+    ns, side, front_mask, perturbed_normal = at.ns, None, None, None
     if not model.transmits:
         side = torch.copysign(torch.ones_like(ns[0]), -dot(d, ns).detach())
         both = world.materials.two_sided[number]
         if both is not None:
-            shown = ((side > 0) | take(both, row)).to(side.dtype)
+            front_mask = ((side > 0) | take(both, row)).to(side.dtype)
     if textures is not None and (textures.normal is not None or textures.bump is not None):
         assert point is not None
-        frame, relief = _mapped(world, textures, row, point, d, at, side)
+        frame, perturbed_normal = _mapped(world, textures, row, point, d, at, side)
     else:
         ns = ns if side is None else ns * side
         frame = Frame.along(ns, at.tangent) if model.anisotropic and at.tangent is not None else Frame.about(ns)
-    return Surface(frame, side, shown, parameters_at(world, number, row, at, point), frame.to_local(-d), relief)
+    return Surface(
+        frame, side, front_mask, parameters_at(world, number, row, at, point), frame.to_local(-d), perturbed_normal
+    )
 
 
 def parameters_at(
@@ -204,4 +206,4 @@ def _mapped(
         table = world.textures.tables[textures.bump.table]
         point = point if textures.bump.filtered else point.bare
         slope = table.slope(take(textures.bump.nodes, row), point)
-    return mapped(textures, row, local, slope, d, at, side)
+    return perturb_normal(textures, row, local, slope, d, at, side)

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from torchpt.math.sampling import power_heuristic, uniform_hemisphere, uniform_sphere
 from torchpt.math.vectors import dot, largest
-from torchpt.paths.roulette import chance_of, survived
+from torchpt.paths.roulette import russian_roulette, survival_probability
 from torchpt.paths.state import (
-    FOREVER,
     STRATEGIES,
+    T_MAX,
     DirectLight,
     Drawn,
     Emission,
@@ -43,23 +43,23 @@ from torchpt.physics.world import World
 
 __all__ = [
     "STRATEGIES",
-    "Onward",
+    "Continuation",
     "Plan",
     "attach",
     "bounce",
-    "carry_on",
-    "draw",
+    "continue_paths",
     "emit",
     "escape",
     "generate",
-    "leaning",
+    "has_shading_normals",
     "light_radiance",
     "next_ray",
+    "same_hemisphere",
+    "sample_bsdf",
     "sample_light",
     "scatter",
     "shade",
-    "shared",
-    "through",
+    "shading_weight",
 ]
 
 
@@ -93,7 +93,7 @@ def shade(
         weight = weight * heuristic
     else:
         reflected = kind.eval(surface.parameters, surface.wo, wi)
-    share = shared(world, model, at, surface, light.wi, wi)
+    share = shading_weight(world, model, at, surface, light.wi, wi)
     weight = weight if share is None else weight * share
     shining = light_radiance(world, light)
     radiance = state.throughput * reflected * shining * weight
@@ -101,7 +101,9 @@ def shade(
     return surface, direct, _shadow_ray(plan, world, at, light, radiance, weight)
 
 
-def shared(world: World, model: int, at: Interaction, surface: Surface, light: Tensor, wi: Tensor) -> Tensor | None:
+def shading_weight(
+    world: World, model: int, at: Interaction, surface: Surface, light: Tensor, wi: Tensor
+) -> Tensor | None:
     """Return the share ``(n,)`` of light that a surface lets pass before its BSDF is asked; None: all.
 
     Args:
@@ -113,12 +115,12 @@ def shared(world: World, model: int, at: Interaction, surface: Surface, light: T
         wi: the same in the surface's frame.
     """
     share: Tensor | None = None
-    if leaning(world, model):
-        share = (through(at, surface, light, wi) > 0).to(wi.dtype)
-    if surface.shown is not None:
-        share = surface.shown if share is None else share * surface.shown
-    if surface.relief is not None:
-        shadowing = surface.relief.shadowing(light)
+    if has_shading_normals(world, model):
+        share = (same_hemisphere(at, surface, light, wi) > 0).to(wi.dtype)
+    if surface.front_mask is not None:
+        share = surface.front_mask if share is None else share * surface.front_mask
+    if surface.perturbed_normal is not None:
+        shadowing = surface.perturbed_normal.shadowing(light)
         share = shadowing if share is None else share * shadowing
     return share
 
@@ -131,13 +133,13 @@ def sample_light(context: StageContext, model: int, state: PathState, at: Intera
     draws = Draws(plan.sampler, state.key, context.salts)
     # The density of a light that a ray meets is asked for from where the ray left. That is where a reflected one will leave,
     # unless paths keep the vertex itself, or nothing that can be met shines.
-    kept = lights.local(table) or table.row_of_prim is None
+    kept = lights.depends_on_point(table) or table.row_of_prim is None
     x = at.p if kept else offset_origin(world, at, -state.d)
     n = None if world.materials.models[model].transmits else surface.frame.n
     numbers, which = draws.two(Dimension.LIGHT), None
     if table.choice is not None:
         # One number chooses the light and goes on to the place on it, so that both are stratified together.
-        which = lights.fine(torch.stack((numbers[0], draws.one(Dimension.LIGHT_DIGITS))))
+        which = lights.from_digits(torch.stack((numbers[0], draws.one(Dimension.LIGHT_DIGITS))))
     return lights.sample(table, x, which, numbers.to(plan.dtype), OFFSET, n, plan.strategy == "mis")
 
 
@@ -170,7 +172,7 @@ def _shadow_ray(
     return Shadow(o, d, t_max, radiance)
 
 
-def leaning(world: World, model: int) -> bool:
+def has_shading_normals(world: World, model: int) -> bool:
     """Return True where the shading normals of a model's surfaces may differ from the geometric ones."""
     textures = world.materials.textures[model]
     return world.geometry.normals is not None or (
@@ -178,7 +180,7 @@ def leaning(world: World, model: int) -> bool:
     )
 
 
-def through(at: Interaction, surface: Surface, world_wi: Tensor, wi: Tensor) -> Tensor:
+def same_hemisphere(at: Interaction, surface: Surface, world_wi: Tensor, wi: Tensor) -> Tensor:
     """Positive where a direction lies on the same side of both normals: a shading normal must not let light through."""
     same = dot(world_wi, at.ng) * wi[2]
     return same if surface.side is None else same * surface.side
@@ -186,12 +188,12 @@ def through(at: Interaction, surface: Surface, world_wi: Tensor, wi: Tensor) -> 
 
 # ---- Where a path goes behind a surface, and whether it does
 #
-# :func:`scatter` = :func:`draw` (BSDF sampling) -> :func:`attach` (only under derivatives) -> :func:`carry_on` (throughput and
+# :func:`scatter` = :func:`sample_bsdf` (BSDF sampling) -> :func:`attach` (only under derivatives) -> :func:`continue_paths` (throughput and
 # roulette) -> :func:`next_ray`. Each hands a record to the next.
 
 
 @dataclass(frozen=True)
-class Onward:
+class Continuation:
     """Quantities that paths carry on, after roulette."""
 
     alive: Tensor  # (n,) bool
@@ -203,7 +205,7 @@ class Onward:
 
 def scatter(
     context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface
-) -> tuple[PathState, Hit | None, Drawn, Onward]:
+) -> tuple[PathState, Hit | None, Drawn, Continuation]:
     """Draw the next direction from the BSDF and let roulette decide who goes on.
 
     Where derivatives with respect to geometry are wanted, the next hit is found here already, since the throughput must
@@ -211,16 +213,16 @@ def scatter(
     """
     plan = context.plan
     draws = Draws(plan.sampler, state.key, context.salts)
-    drawn, hit = draw(context, model, at, surface, draws), None
+    drawn, hit = sample_bsdf(context, model, at, surface, draws), None
     if plan.tape:
         drawn, hit = attach(context, model, state, at, surface, drawn)
-    onward = carry_on(plan, state, surface, drawn, draws, context.roulette)
+    continuation = continue_paths(plan, state, surface, drawn, draws, context.roulette)
     if hit is not None:
-        hit = replace(hit, prim=torch.where(onward.alive, hit.prim, -1))
-    return next_ray(context, model, state, at, surface, drawn, onward), hit, drawn, onward
+        hit = replace(hit, prim=torch.where(continuation.alive, hit.prim, -1))
+    return next_ray(context, model, state, at, surface, drawn, continuation), hit, drawn, continuation
 
 
-def draw(context: StageContext, model: int, at: Interaction, surface: Surface, draws: Draws) -> Drawn:
+def sample_bsdf(context: StageContext, model: int, at: Interaction, surface: Surface, draws: Draws) -> Drawn:
     """Draw a direction from the BSDF, or from the hemisphere (strategy ``uniform``), and the ray that leaves along it."""
     plan, world = context.plan, context.world
     kind = world.materials.models[model]
@@ -238,10 +240,10 @@ def draw(context: StageContext, model: int, at: Interaction, surface: Surface, d
     o = offset_origin(world, at, d)
     # Least of what must be positive for the path to go on: comparisons cost more than minima.
     least = pdf
-    if leaning(world, model):
-        least = torch.minimum(least, through(at, surface, d, sample.wi.detach()))
-    if surface.shown is not None:
-        least = torch.minimum(least, surface.shown)
+    if has_shading_normals(world, model):
+        least = torch.minimum(least, same_hemisphere(at, surface, d, sample.wi.detach()))
+    if surface.front_mask is not None:
+        least = torch.minimum(least, surface.front_mask)
     return Drawn(o, d, sample.wi, pdf, sample.weight, least, sharp, sample.eta)
 
 
@@ -257,7 +259,7 @@ def attach(
     d, weight, pdf, sharp = drawn.d, drawn.weight, drawn.pdf, drawn.sharp
     hit, follow, measure, alive = None, d, 1.0, drawn.least > 0
     if plan.attached:
-        hit = context.search(replace(state, o=drawn.o, d=d, t_max=alive.to(plan.dtype) * FOREVER))
+        hit = context.search(replace(state, o=drawn.o, d=d, t_max=alive.to(plan.dtype) * T_MAX))
         follow, measure = reattach(world, at.p, hit, d)
     if not kind.smooth:
         value = kind.eval(surface.parameters, surface.wo, frame.to_local(follow))
@@ -269,11 +271,13 @@ def attach(
     return replace(drawn, d=d, weight=weight), hit
 
 
-def carry_on(plan: Plan, state: PathState, surface: Surface, drawn: Drawn, draws: Draws, roulette: float) -> Onward:
+def continue_paths(
+    plan: Plan, state: PathState, surface: Surface, drawn: Drawn, draws: Draws, roulette: float
+) -> Continuation:
     """Throughput behind the surface, and which paths go on: those that carry something, and that roulette lets live."""
     weight = drawn.weight
-    if surface.relief is not None:
-        weight = weight * surface.relief.shadowing(drawn.d)
+    if surface.perturbed_normal is not None:
+        weight = weight * surface.perturbed_normal.shadowing(drawn.d)
     throughput = state.throughput * weight
     brightest = largest(throughput.detach())
     # Under a tape a path that carries nothing goes on: what it would meet is the derivative by a colour that is 0.
@@ -282,10 +286,10 @@ def carry_on(plan: Plan, state: PathState, surface: Surface, drawn: Drawn, draws
     if eta is not None and drawn.eta is not None:
         eta = eta * drawn.eta.detach()
     if not roulette:
-        return Onward(alive, throughput, eta, throughput, None)
-    chance = chance_of(plan.rr_prob, roulette, brightest, eta, plan.tape)
-    alive, survivors = survived(chance, draws, alive, throughput)
-    return Onward(alive, survivors, eta, throughput, chance)
+        return Continuation(alive, throughput, eta, throughput, None)
+    chance = survival_probability(plan.rr_prob, roulette, brightest, eta, plan.tape)
+    alive, survivors = russian_roulette(chance, draws, alive, throughput)
+    return Continuation(alive, survivors, eta, throughput, chance)
 
 
 def next_ray(
@@ -295,11 +299,11 @@ def next_ray(
     at: Interaction,
     surface: Surface,
     drawn: Drawn,
-    onward: Onward,
+    continuation: Continuation,
 ) -> PathState:
     """Return the paths with the rays that leave the surface; those that ended have rays of length 0."""
     plan, world = context.plan, context.world
-    on = onward.alive.to(plan.dtype)
+    on = continuation.alive.to(plan.dtype)
     # What MIS is to know of the density, should the ray meet a light.
     if plan.strategy == "mis" and world.lights is not None:
         pdf = drawn.pdf
@@ -309,17 +313,17 @@ def next_ray(
         if alone and drawn.sharp is not None:
             pdf = torch.where(drawn.sharp, drawn.pdf, pdf)
     # A path that carries what is not finite must not end unseen: no comparison holds for NaN, so it would count as dark.
-    radiance = state.radiance if plan.tape else state.radiance + onward.throughput * 0.0
+    radiance = state.radiance if plan.tape else state.radiance + continuation.throughput * 0.0
     leaving = PathState(
         o=drawn.o,
         d=drawn.d,
-        t_max=on * FOREVER,
-        throughput=onward.throughput * on,
+        t_max=on * T_MAX,
+        throughput=continuation.throughput * on,
         radiance=radiance,
         pdf=pdf,
         lane=state.lane,
         key=state.key,
-        eta=onward.eta,
+        eta=continuation.eta,
         extra=state.extra,
     )
     if state.p is None:
@@ -384,5 +388,7 @@ def bounce(context: StageContext, model: int, vertex: VertexInput) -> VertexOutp
     if hit.chance is not None:
         state = replace(state, throughput=state.throughput * hit.chance)
     surface, direct, shadow = shade(context, model, state, at)
-    leaving, next_hit, drawn, onward = scatter(context, model, state, at, surface)
-    return VertexOutput(leaving, next_hit, shadow, at, surface, direct, drawn, onward.carried, onward.chance)
+    leaving, next_hit, drawn, continuation = scatter(context, model, state, at, surface)
+    return VertexOutput(
+        leaving, next_hit, shadow, at, surface, direct, drawn, continuation.carried, continuation.chance
+    )

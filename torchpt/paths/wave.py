@@ -17,7 +17,7 @@ from torchpt.paths.vertex import generate
 from torchpt.physics import lights
 from torchpt.physics.cameras import Camera
 from torchpt.physics.film import Film, Filter, filter_of
-from torchpt.physics.samplers import Dimension, Draws, Sampler, Streams, salts
+from torchpt.physics.samplers import Dimension, Draws, Randomizations, Sampler, salts
 from torchpt.search.base import Accel
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class PixelSet:
 
     film: Film
     layers: dict[str, Film] = field(default_factory=dict)
-    streams: Streams = field(default_factory=Streams)
+    streams: Randomizations = field(default_factory=Randomizations)
     places: Tensor | None = None
 
 
@@ -140,7 +140,7 @@ class Wave:
             x.repeat(samples), y.repeat(samples), sample, None if pixel_set is None else pixel_set.streams
         )
 
-    def rays_of(self, x: Tensor, y: Tensor, sample: Tensor, streams: Streams | None = None) -> PathState:
+    def rays_of(self, x: Tensor, y: Tensor, sample: Tensor, streams: Randomizations | None = None) -> PathState:
         """Return rays of single samples: the camera's, or those that are given.
 
         Args:
@@ -159,7 +159,7 @@ class Wave:
         x, y = (a.to(self.context.plan.dtype) for a in (x, y))
         return generate(self.context.plan, self.camera, self.filter, x, y, key, salts(0, self.centre.device))
 
-    def along(self, rays: Rays) -> Wave:
+    def with_rays(self, rays: Rays) -> Wave:
         """Return the wave whose paths begin with rays; no filter weighs them."""
         n = rays.d.shape[1]
         # Of filters that weigh nothing nothing is asked: kernels are those of renders.
@@ -167,12 +167,12 @@ class Wave:
         camera = replace(self.camera, resolution=(n, 1))
         return replace(self, camera=camera, crop=(0, 0, n, 1), filter=filter, given=rays)
 
-    def begun(self, state: PathState) -> PathState:
+    def with_optional_fields(self, state: PathState) -> PathState:
         """Return rays with what only some scenes and integrators ask of a path that begins."""
         world = self.context.world
         if any(model.refracts for model in world.materials.models):
             state = replace(state, eta=torch.ones_like(state.t_max))
-        if lights.local(world.lights):
+        if lights.depends_on_point(world.lights):
             state = replace(state, p=state.o.clone(), n=torch.zeros_like(state.o))
         if self.integrator.fields:
             state = replace(state, extra={own.name: own.begin(state.t_max) for own in self.integrator.fields})

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchpt.core.tree import UNPRINTED
+from torchpt.core.tree import NOT_FINGERPRINTED
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.shapes.quadrics import Quadric
 from torchpt.physics.textures import Node
@@ -42,7 +42,7 @@ class Parameters(dict[str, np.ndarray]):
     def declare_all(self, prefix: str, kind: Any, values: Mapping[str, Any]) -> None:
         """Add those parameters of a kind that are traced and have a value; ``transform`` is called ``to_world``."""
         for key, spec in parameters_of(kind).items():
-            if not spec.traced:
+            if not spec.differentiable:
                 continue
             if key == "transform":
                 self.declare(f"{prefix}.to_world", np.eye(4) if values[key] is None else values[key], spec)
@@ -102,8 +102,8 @@ class Part:
     colors: np.ndarray | None = None
     smooth: bool = False
     dropped: int = 0
-    source: str = field(default="", metadata=UNPRINTED)
-    ignored: tuple[str, ...] = field(default=(), metadata=UNPRINTED)
+    source: str = field(default="", metadata=NOT_FINGERPRINTED)
+    ignored: tuple[str, ...] = field(default=(), metadata=NOT_FINGERPRINTED)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@
 One process never comes here, and imports nothing of torch.distributed.
 """
 
-from torchpt.ranks.dealing import blocks, dealt, share
 from torchpt.ranks.group import Group, together
+from torchpt.ranks.partition import blocks, dealt, share
 
 __all__ = ["Group", "blocks", "dealt", "share", "together"]

@@ -75,13 +75,13 @@ class Group:
         except RuntimeError as error:
             raise LostRankError(f"ranks: no connection between all of them ({_first_line(error)})") from None
         assert isinstance(own, dist.ProcessGroup)
-        self._dist, self._of = dist, own
+        self._dist, self._process_group = dist, own
         self._work: Any = None
         self.rank, self.size, self.timeout, self.over = members.index(dist.get_rank()), len(members), timeout, False
 
     # -- a few numbers
 
-    def agree(self, what: str, *numbers: float) -> list[tuple[float, ...]]:
+    def all_gather_numbers(self, what: str, *numbers: float) -> list[tuple[float, ...]]:
         """What all ranks say: the numbers (whole ones up to 2^53) of each, in the order of ranks.
 
         Args:
@@ -93,16 +93,16 @@ class Group:
             OtherRankError: one failed.
             RenderError: ranks do different things.
         """
-        return self._said(what, 0, numbers)
+        return self._exchange_step(what, 0, numbers)
 
     def end(self, code: int) -> int:
         """Say that this rank is done, with an exit code; returns the highest one of all that are."""
-        every = self._exchanged(END, code, ())
+        every = self._exchange(END, code, ())
         self.over = True
         return max(status for status, _, _ in every)
 
-    def _said(self, what: str, status: int, numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
-        every = self._exchanged(what, status, numbers)
+    def _exchange_step(self, what: str, status: int, numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
+        every = self._exchange(what, status, numbers)
         if status:
             return []
         number = zlib.crc32(what.encode())
@@ -115,28 +115,26 @@ class Group:
             raise RenderError(f"ranks: rank {rank} does something else than rank {self.rank}, which is at: {what}")
         return [said for _, _, said in every]
 
-    def _exchanged(
-        self, what: str, status: int, numbers: tuple[float, ...]
-    ) -> list[tuple[int, int, tuple[float, ...]]]:
+    def _exchange(self, what: str, status: int, numbers: tuple[float, ...]) -> list[tuple[int, int, tuple[float, ...]]]:
         """Status, what comes next, and numbers of every rank."""
         own = torch.zeros(WORDS, dtype=torch.float64)
         own[: 2 + len(numbers)] = torch.tensor([status, zlib.crc32(what.encode()), *numbers], dtype=torch.float64)
         every = [torch.empty_like(own) for _ in range(self.size)]
-        self._done(lambda: self._dist.all_gather(every, own, group=self._of, async_op=True))
+        self._wait(lambda: self._dist.all_gather(every, own, group=self._process_group, async_op=True))
         return [(int(said[0]), int(said[1]), tuple(said[2 : 2 + len(numbers)].tolist())) for said in every]
 
-    def decide(self, what: str, *numbers: float) -> tuple[float, ...]:
+    def broadcast_numbers(self, what: str, *numbers: float) -> tuple[float, ...]:
         """Numbers as the first rank has them; NaN goes through."""
-        return self.agree(what, *numbers)[0]
+        return self.all_gather_numbers(what, *numbers)[0]
 
-    def same(self, what: str, content: bytes) -> None:
+    def check_same(self, what: str, content: bytes) -> None:
         """Make sure that all ranks have the same.
 
         Raises:
             RenderError: they do not; on every rank.
         """
-        if len({check for (check,) in self.agree(what, zlib.crc32(content))}) > 1:
-            raise _known(RenderError(f"ranks: {what} must be the same on every rank"))
+        if len({check for (check,) in self.all_gather_numbers(what, zlib.crc32(content))}) > 1:
+            raise _mark_known(RenderError(f"ranks: {what} must be the same on every rank"))
 
     @contextmanager
     def together(self) -> Iterator[None]:
@@ -148,8 +146,8 @@ class Group:
         except Exception as error:
             if not self.over and not getattr(error, _TOLD, False):
                 with suppress(LostRankError):
-                    self._said(FAILED, 2, ())
-                _known(error)
+                    self._exchange_step(FAILED, 2, ())
+                _mark_known(error)
             raise
 
     # -- many numbers
@@ -158,51 +156,51 @@ class Group:
         """The tensors ``(n,)`` of all ranks, in their order; n may differ, the dtype may not.
 
         Raises:
-            LostRankError, OtherRankError, RenderError: as :meth:`agree`.
+            LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
         """
-        sizes = [int(n) for (n,) in self.agree("gather", len(own))]
+        sizes = [int(n) for (n,) in self.all_gather_numbers("gather", len(own))]
         sent = torch.zeros(max(sizes), dtype=own.dtype)
         sent[: len(own)] = own.cpu()
         every = [torch.empty_like(sent) for _ in sizes]
-        self._done(lambda: self._dist.all_gather(every, sent, group=self._of, async_op=True))
+        self._wait(lambda: self._dist.all_gather(every, sent, group=self._process_group, async_op=True))
         return [values[:size].to(own.device) for values, size in zip(every, sizes, strict=True)]
 
     def first(self, own: Tensor) -> Tensor:
         """The tensor ``(n,)`` of the first rank; n may differ, the dtype may not.
 
         Raises:
-            LostRankError, OtherRankError, RenderError: as :meth:`agree`.
+            LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
         """
-        (size,) = self.decide("first", len(own))
-        return self._from(own if self.rank == 0 else own.new_empty(int(size)), 0)
+        (size,) = self.broadcast_numbers("first", len(own))
+        return self._broadcast(own if self.rank == 0 else own.new_empty(int(size)), 0)
 
     def sum(self, own: Tensor) -> Tensor:
         """The sum of a tensor of the same shape over ranks, added in their order: the same bits on every rank.
 
         Raises:
-            LostRankError, OtherRankError, RenderError: as :meth:`agree`.
+            LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
         """
-        self.agree("sum", own.numel())
+        self.all_gather_numbers("sum", own.numel())
         total = torch.zeros_like(own)
         for rank in range(self.size):
-            total += self._from(own if rank == self.rank else torch.empty_like(own), rank)
+            total += self._broadcast(own if rank == self.rank else torch.empty_like(own), rank)
         return total
 
     def barrier(self) -> None:
         """Wait for all ranks.
 
         Raises:
-            LostRankError, OtherRankError, RenderError: as :meth:`agree`.
+            LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
         """
-        self.agree("barrier")
+        self.all_gather_numbers("barrier")
 
-    def _from(self, values: Tensor, rank: int) -> Tensor:
+    def _broadcast(self, values: Tensor, rank: int) -> Tensor:
         """The values that a rank has."""
         sent = values.cpu().contiguous()
-        self._done(lambda: self._dist.broadcast(sent, group=self._of, group_src=rank, async_op=True))
+        self._wait(lambda: self._dist.broadcast(sent, group=self._process_group, group_src=rank, async_op=True))
         return sent.to(values.device)
 
-    def _done(self, begin: Any) -> None:
+    def _wait(self, begin: Any) -> None:
         """Wait for what is sent, but not for ever, and with an ear for signals."""
         end, pause = time.monotonic() + self.timeout, SOON
         try:
@@ -216,7 +214,7 @@ class Group:
                 pause = min(1.5 * pause, LATE)
             work.wait()
         except BaseException as error:
-            _never_freed(self._work)
+            _leak(self._work)
             if not isinstance(error, RuntimeError):
                 raise
             self.over = True
@@ -244,7 +242,7 @@ def together(group: Group | None, what: str, content: Callable[[], bytes]) -> It
         yield
         return
     with group.together():
-        group.same(what, content())
+        group.check_same(what, content())
         yield
 
 
@@ -260,12 +258,12 @@ def _members(dist: Any, group: Any) -> list[int]:
     raise SceneError("process_group", group, "a process group of torch.distributed, or None")
 
 
-def _never_freed(work: Any) -> None:
+def _leak(work: Any) -> None:
     """Keep what is still under way beyond the end of Python: gloo's thread would free its tensors then, and abort."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(work))
 
 
-def _known(error: Exception) -> Exception:
+def _mark_known(error: Exception) -> Exception:
     """Mark an error of which all ranks know."""
     setattr(error, _TOLD, True)
     return error

@@ -13,7 +13,7 @@ from typing import Any
 from torchpt.core.errors import LostRankError, RenderError, TorchptError
 from torchpt.ranks.group import TIMEOUT, Group
 
-__all__ = ["Started"]
+__all__ = ["LaunchedProcess"]
 
 #: Seconds between two looks whether a signal has come.
 PAUSE = 0.02
@@ -21,7 +21,7 @@ PAUSE = 0.02
 NAMES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 
-class Started:
+class LaunchedProcess:
     """A process that was started as one of several.
 
     Args:
@@ -49,7 +49,7 @@ class Started:
         self._timeout = timeout
         self._store: Any = None
 
-    def meet(self, check: Callable[[], None]) -> None:
+    def connect(self, check: Callable[[], None]) -> None:
         """Wait for the other ranks.
 
         Args:
@@ -62,7 +62,7 @@ class Started:
 
         def work() -> None:
             try:
-                self._meet()
+                self._connect()
             except TorchptError as error:
                 failed.append(error)
             except (RuntimeError, ValueError) as error:
@@ -78,7 +78,7 @@ class Started:
         if failed:
             raise failed[0]
 
-    def _meet(self) -> None:
+    def _connect(self) -> None:
         import torch
         import torch.distributed as dist
         from torch.distributed.distributed_c10d import PrefixStore
@@ -102,7 +102,7 @@ class Started:
             return self._store is None or self._store.add(f"said/{zlib.crc32(line.encode())}", 1) == 1
         return True
 
-    def leave(self) -> None:
+    def disconnect(self) -> None:
         """Close connections, where all ranks are there to do so."""
         import torch.distributed as dist
 

@@ -19,23 +19,31 @@ May import: ``gradients`` and what lies below. (It is not called ``render``: tha
 
 from __future__ import annotations
 
-from torchpt.rendering.many import Entry, render_many
+from torchpt.rendering.many import QueuedRender, render_many
 from torchpt.rendering.result import Progress, Rendering
 from torchpt.rendering.run import Run, render_scene
-from torchpt.scene.prepare import SceneCache, kernels_of, loop_facts, looped, make_wave, rebound, scene_cache
+from torchpt.scene.prepare import (
+    SceneCache,
+    describe_engine,
+    kernels_of,
+    make_wave,
+    rebuild_with_tape,
+    scene_cache,
+    uses_kernels,
+)
 
 __all__ = [
-    "Entry",
     "Progress",
+    "QueuedRender",
     "Rendering",
     "Run",
     "SceneCache",
+    "describe_engine",
     "kernels_of",
-    "loop_facts",
-    "looped",
     "make_wave",
-    "rebound",
+    "rebuild_with_tape",
     "render_many",
     "render_scene",
     "scene_cache",
+    "uses_kernels",
 ]

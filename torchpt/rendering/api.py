@@ -10,32 +10,32 @@ from torch import Tensor
 
 from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.rendering import Progress, Rendering, render_scene
-from torchpt.rendering.graphs import opaque, outside
-from torchpt.rendering.requests import ordered, ordered_along, rendered
+from torchpt.rendering.graphs import as_custom_op, with_graph_break
+from torchpt.rendering.requests import execute_request, prepare_request, prepare_trace_request
 from torchpt.scene import Scene
 from torchpt.scene.settings import FILTERS, CommonOptions, Settings, TraceOptions
-from torchpt.spec.arguments import check_names, spelled
+from torchpt.spec.arguments import check_names, expand_signature
 from torchpt.spec.schema import ParsedParams
 
 __all__ = ["Progress", "Rendering", "first_hit", "render", "render_scene", "trace"]
 
 
 @overload
-def render(scene: Scene, *, full: Literal[False] = False, **wishes: Unpack[CommonOptions]) -> Tensor: ...
+def render(scene: Scene, *, full: Literal[False] = False, **options: Unpack[CommonOptions]) -> Tensor: ...
 @overload
-def render(scene: Scene, *, full: Literal[True], **wishes: Unpack[CommonOptions]) -> Rendering: ...
+def render(scene: Scene, *, full: Literal[True], **options: Unpack[CommonOptions]) -> Rendering: ...
 @overload
-def render(scene: Scene, *, full: bool, **wishes: Unpack[CommonOptions]) -> Tensor | Rendering: ...
-@opaque
-@spelled
-def render(scene: Scene, *, full: bool = False, **wishes: Unpack[CommonOptions]) -> Tensor | Rendering:
+def render(scene: Scene, *, full: bool, **options: Unpack[CommonOptions]) -> Tensor | Rendering: ...
+@as_custom_op
+@expand_signature
+def render(scene: Scene, *, full: bool = False, **options: Unpack[CommonOptions]) -> Tensor | Rendering:
     """Render a scene to linear RGB ``(H, W, 3)`` on the scene's device; differentiable in ``params``.
 
     Args:
         scene: from :func:`torchpt.load`.
         full: True returns a :class:`torchpt.Rendering`: picture, layers, error, counts and seconds as one object.
-        wishes: settings, which win over the scene file's (None keeps the scene's own wish), and what is said of this call
-            alone, as :class:`torchpt.scene.settings.CommonOptions` declares them: ``spp``, ``seed``, ``params`` (tensors in
+        options: settings, which win over the scene file's (None keeps the scene's own wish), and what is said of this call
+            probe_estimate, as :class:`torchpt.scene.settings.CommonOptions` declares them: ``spp``, ``seed``, ``params`` (tensors in
             place of those of ``scene.params``: where one requires gradients, so does the picture), ``film``, ``integrator``...
             ``help`` lists them, and docs/guides/ml.md has them as a table.
 
@@ -44,13 +44,13 @@ def render(scene: Scene, *, full: bool = False, **wishes: Unpack[CommonOptions])
         RenderError: a device, compiler or denoiser that is not there; a rank that is lost, or at something else.
         TypeError: an argument that there is not.
     """
-    check_names("render", wishes, CommonOptions, ("full",))
-    rendering = rendered(ordered(scene, full, **wishes))
+    check_names("render", options, CommonOptions, ("full",))
+    rendering = execute_request(prepare_request(scene, full, **options))
     return rendering if full else rendering.image
 
 
-@outside
-@spelled
+@with_graph_break
+@expand_signature
 def trace(
     scene: Scene,
     o: Tensor,
@@ -59,7 +59,7 @@ def trace(
     spp: int | None = 1,
     seed: int | None = 0,
     params: Mapping[str, Tensor] | None = None,
-    **wishes: Unpack[TraceOptions],
+    **options: Unpack[TraceOptions],
 ) -> Tensor:
     """Return the radiance that arrives at ``o`` from ``d``, linear RGB ``(..., 3)``; differentiable in both and in ``params``.
 
@@ -76,7 +76,7 @@ def trace(
         spp: samples a ray, which are averaged.
         seed: any integer from 0; the same seed gives the same numbers.
         params: tensors in place of ``scene.params`` by dotted name, but for those of the camera.
-        wishes: others, as of :func:`render`: those that :class:`torchpt.scene.settings.TraceOptions` declares. What a scene
+        options: others, as of :func:`render`: those that :class:`torchpt.scene.settings.TraceOptions` declares. What a scene
             file says of its film, and of when a picture is done, does not count here.
 
     Raises:
@@ -84,11 +84,11 @@ def trace(
         RenderError: a device or compiler that is not there.
         TypeError: an argument that there is not.
     """
-    check_names("trace", wishes, TraceOptions, ("spp", "seed", "params"))
-    order = ordered_along(scene, o, d, spp=spp, seed=seed, params=params, **wishes)
-    assert order.rays is not None
-    o, d = order.rays
-    return rendered(order).image.reshape(o.shape) if o.numel() else (o + d).to(order.call.dtype)
+    check_names("trace", options, TraceOptions, ("spp", "seed", "params"))
+    request = prepare_trace_request(scene, o, d, spp=spp, seed=seed, params=params, **options)
+    assert request.rays is not None
+    o, d = request.rays
+    return execute_request(request).image.reshape(o.shape) if o.numel() else (o + d).to(request.call.dtype)
 
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:

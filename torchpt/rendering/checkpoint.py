@@ -22,19 +22,29 @@ from torchpt.core.errors import AssetError, OutputError
 from torchpt.core.files import check_regular
 from torchpt.core.tree import fingerprint
 from torchpt.core.version import __version__
-from torchpt.images.write import check_writable, place_of, reason_of, temporary_beside
-from torchpt.paths.nonfinite import NonFinite, Place
+from torchpt.images.write import check_writable, output_path, temporary_beside, write_error
+from torchpt.paths.nonfinite import NonFinite, SampleId
 from torchpt.rendering.error import FIRST_ROUND
-from torchpt.rendering.stopping import BLOCK, Stop
+from torchpt.rendering.stopping import BLOCK, StopRules
 from torchpt.scene.fingerprint import fingerprints
 from torchpt.scene.scene import Scene
-from torchpt.scene.settings import Settings, having
+from torchpt.scene.settings import Settings, settings_with
 from torchpt.spec import Role
 
 if TYPE_CHECKING:
     from torchpt.rendering.run import Run
 
-__all__ = ["EVERY", "FREE", "Keeper", "State", "check_samples", "check_whole", "ends_a_pass", "identity", "read_arrays"]
+__all__ = [
+    "EVERY",
+    "FREE",
+    "CheckpointFile",
+    "RenderState",
+    "check_plausible",
+    "check_samples",
+    "ends_a_pass",
+    "identity",
+    "read_arrays",
+]
 
 
 # ---- Arrays out of an ``.npz`` archive that may be anybody's: numbers only, none larger than the bytes that are there
@@ -102,14 +112,14 @@ def _array(data: bytes) -> np.ndarray:
 #: Seconds between two checkpoints, at least; and at least so many times as long as it takes to write one.
 EVERY, PATIENCE = 5.0, 20.0
 #: Settings that may differ between a checkpoint and the render that goes on from it: no sample depends on them.
-FREE = having(Role.FREE)
+FREE = settings_with(Role.FREE)
 #: Name of the JSON text among the arrays.
 _FACTS = "facts"
 _FORMAT = 3
 
 
 @dataclass
-class State:
+class RenderState:
     """Of a render between two passes.
 
     Attributes:
@@ -136,7 +146,7 @@ def identity(
     }
 
 
-class Keeper:
+class CheckpointFile:
     """Writes and reads the checkpoints of one render.
 
     Args:
@@ -166,7 +176,7 @@ class Keeper:
         """Return True where it is time for another."""
         return time.perf_counter() - self._last >= max(EVERY, PATIENCE * self._took)
 
-    def write(self, state: State) -> None:
+    def write(self, state: RenderState) -> None:
         """Replace the checkpoint.
 
         Raises:
@@ -180,8 +190,8 @@ class Keeper:
             self._took = self._last - begun
             self.seconds += self._took
 
-    def _write(self, state: State) -> None:
-        destination = place_of(self.path, (self.path.suffix.lower(),))
+    def _write(self, state: RenderState) -> None:
+        destination = output_path(self.path, (self.path.suffix.lower(),))
         temporary = temporary_beside(destination)
         text = json.dumps({"format": _FORMAT, "of": self._of, **state.facts})
         arrays = {name: value.detach().cpu().numpy() for name, value in state.arrays.items()}
@@ -192,12 +202,12 @@ class Keeper:
                 os.fsync(file.fileno())
             os.replace(temporary, destination)
         except (OSError, ValueError) as problem:
-            raise OutputError(self.path, reason_of(problem, destination)) from None
+            raise OutputError(self.path, write_error(problem, destination)) from None
         finally:
             with suppress(OSError):  # it is only there after a failure
                 temporary.unlink()
 
-    def read(self, like: State, check: Callable[[State], None] | None = None) -> State | None:
+    def read(self, like: RenderState, check: Callable[[RenderState], None] | None = None) -> RenderState | None:
         """Return the checkpoint, with ``render.spp`` as it was among its facts; None where there is none.
 
         Args:
@@ -235,7 +245,7 @@ class Keeper:
         for key, there, here in _differences(facts.pop("of"), of):
             said = f"its {key} are others" if key.startswith("scene.") else f"{key}: {there} there, {here} here"
             raise AssetError(self.path, f"is the checkpoint of another render ({said})")
-        state = State(facts, {name: torch.from_numpy(value) for name, value in arrays.items()})
+        state = RenderState(facts, {name: torch.from_numpy(value) for name, value in arrays.items()})
         _check_facts(state, like, self.path)
         if check is not None:
             check(state)
@@ -243,7 +253,7 @@ class Keeper:
         return state
 
 
-def _check_facts(state: State, like: State, path: Path) -> None:
+def _check_facts(state: RenderState, like: RenderState, path: Path) -> None:
     """Refuse facts of other kinds."""
     for name, value in like.facts.items():
         there: Any = state.facts.get(name)
@@ -258,7 +268,7 @@ def _check_facts(state: State, like: State, path: Path) -> None:
             raise AssetError(path, f"is no whole checkpoint ({name} is {str(there)[:40]})")
 
 
-def _check_arrays(state: State, like: State, path: Path) -> None:
+def _check_arrays(state: RenderState, like: RenderState, path: Path) -> None:
     """Refuse arrays that the render could not hold."""
     for name, value in like.arrays.items():
         found = state.arrays.get(name)
@@ -282,7 +292,7 @@ def _differences(a: Any, b: Any, key: str = "") -> Iterator[tuple[str, str, str]
 # ---- What a checkpoint has to hold for a render to go on from it, and when that render may take more samples than it was of
 
 
-def check_samples(run: Run, state: State, path: Path) -> None:
+def check_samples(run: Run, state: RenderState, path: Path) -> None:
     """Refuse a checkpoint of another ``render.spp`` where the picture would not have the bits of one that is taken at once.
 
     Raises:
@@ -311,14 +321,14 @@ def check_samples(run: Run, state: State, path: Path) -> None:
 
 def ends_a_pass(run: Run, taken: int) -> bool:
     """Return True if a render that ends by its error, and is not short of time, asks for that at so many samples."""
-    stop = Stop(run.settings.render.but(spp=taken + BLOCK, time_limit=None), run.picture.streams.count)
+    stop = StopRules(run.settings.render.but(spp=taken + BLOCK, time_limit=None), run.picture.streams.count)
     end = taken - taken % (4 * BLOCK)  # from there on passes are whole blocks
     while end < taken:
         end += stop.step(end)
     return end == taken
 
 
-def check_whole(run: Run, state: State, path: Path) -> None:
+def check_plausible(run: Run, state: RenderState, path: Path) -> None:
     """Refuse numbers that no render of these settings comes to.
 
     Sums may be negative: those of signed filters are. Layers may hold what is not finite, as models of a user's own may.
@@ -344,17 +354,17 @@ def check_whole(run: Run, state: State, path: Path) -> None:
     seen = counts["picture"] if run.integrator.light else next(iter(c for n, c in counts.items() if n != "picture"))
     total = int(seen.sum())
     if rounds:
-        assert run.twice is not None and run.twice.pixel_set.places is not None
-        pilots = seen.sum(0)[run.twice.pixel_set.places.cpu()]
+        assert run.probes is not None and run.probes.pixel_set.places is not None
+        pilots = seen.sum(0)[run.probes.pixel_set.places.cpu()]
         problems["pilots.counts"] |= bool((counts["pilots"].sum(0) != pilots).any())
         for name in run.picture.layers:
             problems[f"layers.{name}.counts"] |= bool((counts[f"layers.{name}"].sum(0) != seen.sum(0)).any())
         problems["picture.counts"] |= total > (facts["spp"] + BLOCK) * seen.shape[1]
-    if run.twice is not None:
+    if run.probes is not None:
         total += int(counts["pilots"].sum())
     problems["done"] = done != total
     problems["truncated"] = facts["truncated"] > done
-    problems["lost"] = lost.count > done or not all(_is_there(run, place, int(seen.max())) for place in lost.places)
+    problems["lost"] = lost.count > done or not all(_is_taken(run, place, int(seen.max())) for place in lost.places)
     for name, wrong in problems.items():
         if wrong:
             raise AssetError(path, f"is no whole checkpoint (no render comes to its {name})")
@@ -364,10 +374,10 @@ def _finite(values: Iterable[Tensor]) -> bool:
     return all(bool(torch.isfinite(value).all()) for value in values)
 
 
-def _is_there(run: Run, place: Place, samples: int) -> bool:
+def _is_taken(run: Run, place: SampleId, samples: int) -> bool:
     """Return True for a sample that a plate of the render takes."""
     x, y, width, height = run.wave.crop
-    pixel_sets = [run.picture] if run.twice is None else [run.picture, run.twice.pixel_set]
+    pixel_sets = [run.picture] if run.probes is None else [run.picture, run.probes.pixel_set]
     inside = x <= place.x < x + width and y <= place.y < y + height and place.sample < samples
     return inside and (place.first, place.streams) in [
         (pixel_set.streams.first, pixel_set.streams.count) for pixel_set in pixel_sets

@@ -13,19 +13,19 @@ from torchpt.physics.film import ErrorEstimate, Film, Pilots, pilots_of
 from torchpt.physics.film.error import (
     BLOCK,
     STREAMS,
-    Again,
-    again_counts,
+    Resampled,
+    allocate_samples,
     error_by_pilots,
-    foreseen,
-    known_error,
-    pilots_alone,
-    shared_out,
-    to_look_at,
+    error_estimate,
+    expected_errors,
+    pixels_to_resample,
+    probe_estimate,
+    resample_counts,
 )
-from torchpt.physics.samplers import Streams
+from torchpt.physics.samplers import Randomizations
 from torchpt.scene.settings import Settings
 
-__all__ = ["FIRST_ROUND", "ErrorProbes", "Shares", "error_probes"]
+__all__ = ["FIRST_ROUND", "ErrorProbes", "SampleAllocation", "error_probes"]
 
 
 # ---- The second values of a render's pilots: pixels that are sampled again by other random numbers
@@ -42,15 +42,15 @@ class ErrorProbes:
         pilots: where they are.
         pixel_set: sums of their second values.
         counted: whether these are part of the picture.
-        third: what was looked at again, and how many of those pixels are suspects.
-        looked: samples a pixel that the picture had then; None: nothing was looked at yet.
+        resampled: what was looked at again, and how many of those pixels are suspects.
+        resampled_at: samples a pixel that the picture had then; None: nothing was looked at yet.
     """
 
     pilots: Pilots
     pixel_set: PixelSet
     counted: bool
-    third: tuple[PixelSet, int] | None = None
-    looked: float | None = None
+    resampled: tuple[PixelSet, int] | None = None
+    resampled_at: float | None = None
 
     def picture(self, film: Film) -> Tensor:
         """The picture ``(H, W, 3)`` in float64."""
@@ -70,49 +70,51 @@ class ErrorProbes:
             counts[self.pixel_set.places] += self.pixel_set.film.counts
         return counts
 
-    def known(self, film: Film, picture: Tensor) -> ErrorEstimate | None:
+    def estimate(self, film: Film, picture: Tensor) -> ErrorEstimate | None:
         """What the picture, :meth:`picture` of the film, knows of its error."""
         if not len(self.pilots) or int(self.pixel_set.film.counts.min()) == 0:
             return None
         again = None
-        if self.third is not None:
-            pixel_set, suspects = self.third
+        if self.resampled is not None:
+            pixel_set, suspects = self.resampled
             values = torch.stack(pixel_set.film.streams()).cpu()
             assert pixel_set.places is not None
-            again = Again(pixel_set.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
+            again = Resampled(pixel_set.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
         first = self._first(film)
-        return known_error(picture.cpu(), self.pilots, first, self._second(), self._spare(), self.counted, again)
+        return error_estimate(
+            picture.cpu(), self.pilots, first, self._second(), self._second_variance(), self.counted, again
+        )
 
-    def looks(self, pixels: int) -> float:
+    def resampling_share(self, pixels: int) -> float:
         """Return what looking again takes, as a share of the samples of a picture of so many pixels."""
-        return STREAMS * sum(again_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
+        return STREAMS * sum(resample_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
 
     def resample_outliers(
-        self, film: Film, agreed: Callable[[Tensor], Tensor] | None = None
+        self, film: Film, from_first_rank: Callable[[Tensor], Tensor] | None = None
     ) -> list[tuple[PixelSet, int, int]]:
         """What is to be sampled for the picture to know its error better, once it is finished or may be.
 
-        ``agreed`` makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
+        ``from_first_rank`` makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
         """
         if not len(self.pilots):
             return []
         picture, first = self.picture(film).cpu(), self._first(film)
-        suspects, doubtful = to_look_at(picture, self.pilots, first, self._second())
-        if agreed is not None:
-            suspects, doubtful = agreed(suspects), agreed(doubtful)
+        suspects, doubtful = pixels_to_resample(picture, self.pilots, first, self._second())
+        if from_first_rank is not None:
+            suspects, doubtful = from_first_rank(suspects), from_first_rank(doubtful)
         places = torch.cat((suspects, doubtful)).to(film.sums.device)
-        streams = Streams(self.pixel_set.streams.first + self.pixel_set.streams.count, STREAMS)
+        streams = Randomizations(self.pixel_set.streams.first + self.pixel_set.streams.count, STREAMS)
         pixel_set = PixelSet(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
-        self.third = pixel_set, len(suspects)
-        self.looked = float(film.counts.double().mean())
-        samples = round(self.looked)
+        self.resampled = pixel_set, len(suspects)
+        self.resampled_at = float(film.counts.double().mean())
+        samples = round(self.resampled_at)
         return [(pixel_set, 0, STREAMS * samples)]
 
-    def alone(self, film: Film) -> ErrorEstimate | None:
+    def probe_estimate(self, film: Film) -> ErrorEstimate | None:
         """RelMSE as the pilots alone tell it."""
         if not len(self.pilots):
             return None
-        return pilots_alone(self.pilots, self._first(film), self._second(), self._spare(), self.counted)
+        return probe_estimate(self.pilots, self._first(film), self._second(), self._second_variance(), self.counted)
 
     def _first(self, film: Film) -> Tensor:
         assert self.pixel_set.places is not None
@@ -121,7 +123,7 @@ class ErrorProbes:
     def _second(self) -> Tensor:
         return self.pixel_set.film.values().cpu()
 
-    def _spare(self) -> Tensor | None:
+    def _second_variance(self) -> Tensor | None:
         """The variance of second values where it is not that of the first ones."""
         if self.counted:
             return None
@@ -133,7 +135,7 @@ def error_probes(wave: Wave, settings: Settings, device: torch.device) -> ErrorP
     """Pilots of a render, nothing sampled yet."""
     film = settings.film
     pilots = pilots_of(settings.render.seed, (film.width, film.height), wave.crop)
-    streams = Streams(wave.sampler.randomizations, 2 if settings.adaptive else 1)
+    streams = Randomizations(wave.sampler.randomizations, 2 if settings.adaptive else 1)
     sums = Film(len(pilots), 1, streams.count, device)
     return ErrorProbes(pilots, PixelSet(sums, {}, streams, pilots.places.to(device)), not settings.adaptive)
 
@@ -145,17 +147,17 @@ def error_probes(wave: Wave, settings: Settings, device: torch.device) -> ErrorP
 FIRST_ROUND = 16
 
 
-class Shares:
+class SampleAllocation:
     """Samples of the blocks of a picture.
 
     Args:
         pilots: of the picture.
         film: of the picture.
-        agreed: makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
+        from_first_rank: makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
     """
 
-    def __init__(self, pilots: Pilots, film: Film, agreed: Callable[[Tensor], Tensor] | None = None) -> None:
-        self.pilots, self._agreed = pilots, agreed
+    def __init__(self, pilots: Pilots, film: Film, from_first_rank: Callable[[Tensor], Tensor] | None = None) -> None:
+        self.pilots, self._from_first_rank = pilots, from_first_rank
         x, y = torch.arange(film.width) + pilots.corner[0], torch.arange(film.height) + pilots.corner[1]
         rows, columns = pilots.blocks
         #: Block of each pixel.
@@ -163,17 +165,17 @@ class Shares:
         self.pixels = torch.bincount(self.block, minlength=rows * columns)
         self._parts: list[tuple[Film, Tensor, Film]] = []
 
-    def spans(self, picture: PixelSet, twice: ErrorProbes, mean: float, last: bool) -> list[tuple[PixelSet, int, int]]:
+    def spans(self, picture: PixelSet, probes: ErrorProbes, mean: float, last: bool) -> list[tuple[PixelSet, int, int]]:
         """What is to be sampled for the picture to have ``mean`` samples a pixel: plates of pixels with as many samples.
 
-        ``last``: whether no round follows, see :func:`torchpt.physics.film.error.shared_out`.
+        ``last``: whether no round follows, see :func:`torchpt.physics.film.error.allocate_samples`.
         """
         device = picture.film.sums.device
         counts = self._of_blocks(picture.film.counts.cpu())
-        aims = shared_out(self._errors(twice), counts, self.pixels, mean, last)
+        aims = allocate_samples(self._errors(probes), counts, self.pixels, mean, last)
         spans: list[tuple[PixelSet, int, int]] = []
-        if self._agreed is not None:
-            aims = self._agreed(aims)
+        if self._from_first_rank is not None:
+            aims = self._from_first_rank(aims)
         most = int(aims.max()) + 1
         kinds = (counts * most + aims)[aims > counts].unique().tolist()
         pilot_blocks = self.block[self.pilots.places]
@@ -183,11 +185,11 @@ class Shares:
             spans.append((self._part(picture, places, places), have, aim - have))
             seconds = chosen[pilot_blocks].nonzero()[:, 0]
             if len(seconds):
-                part = self._part(twice.pixel_set, seconds.to(device), self.pilots.places[seconds].to(device))
+                part = self._part(probes.pixel_set, seconds.to(device), self.pilots.places[seconds].to(device))
                 spans.append((part, have, aim - have))
         return spans
 
-    def put_back(self) -> None:
+    def merge(self) -> None:
         """Add what was sampled to the films that it is of."""
         for whole, places, part in self._parts:
             whole.put(places, part)
@@ -207,10 +209,10 @@ class Shares:
         found[self.block] = counts
         return found
 
-    def _errors(self, twice: ErrorProbes) -> Tensor:
+    def _errors(self, probes: ErrorProbes) -> Tensor:
         """Relative variance of the pixels of each block, up to a factor: second values alone are asked."""
-        a, b = (x.cpu() for x in twice.pixel_set.film.streams())
-        errors, known = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
+        a, b = (x.cpu() for x in probes.pixel_set.film.streams())
+        errors, estimate = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
         at = tuple(self.pilots.block)
-        errors[at], known[at] = error_by_pilots(self.pilots, a, b), True
-        return foreseen(errors, known).reshape(-1)
+        errors[at], estimate[at] = error_by_pilots(self.pilots, a, b), True
+        return expected_errors(errors, estimate).reshape(-1)

@@ -23,11 +23,11 @@ from torchpt.core.errors import RenderError
 from torchpt.rendering import Rendering
 from torchpt.scene import Scene
 from torchpt.scene.formats.description import settings
-from torchpt.scene.scene import numbered
+from torchpt.scene.scene import scene_by_number
 from torchpt.scene.settings import BLOCKS
 from torchpt.scene.versions import AFTER, check_unchanged
 
-__all__ = ["known", "opaque", "outside"]
+__all__ = ["as_custom_op", "reuse_rendering", "with_graph_break"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -35,10 +35,10 @@ R = TypeVar("R")
 #: What arguments that are written down in a graph may be. (Older torch traces no unions of types, but tuples of them.)
 _LISTS, _PLAIN = (list, tuple), (bool, int, str)
 #: While an operator is at work: what its forward pass made, which its backward pass is not to make again.
-_known: ContextVar[list[Rendering] | None] = ContextVar("known", default=None)
+_known: ContextVar[list[Rendering] | None] = ContextVar("reuse_rendering", default=None)
 
 
-def known(make: Callable[[], Rendering]) -> Rendering:
+def reuse_rendering(make: Callable[[], Rendering]) -> Rendering:
     """What the forward pass of an operator made, where this is its backward pass; else what is made now."""
     made = _known.get()
     if made:
@@ -49,25 +49,25 @@ def known(make: Callable[[], Rendering]) -> Rendering:
     return rendering
 
 
-def opaque(render: Callable[P, R]) -> Callable[P, R]:
+def as_custom_op(render: Callable[P, R]) -> Callable[P, R]:
     """``render`` for eager code and for graphs, whose operators are registered here."""
     _register(render)
 
     @wraps(render)
-    def call(*args: Any, **wishes: Any) -> Any:
-        return in_graph(*args, **wishes) if torch.compiler.is_compiling() else render(*args, **wishes)
+    def call(*args: Any, **options: Any) -> Any:
+        return in_graph(*args, **options) if torch.compiler.is_compiling() else render(*args, **options)
 
     in_graph = partial(_in_graph, render)
     return call
 
 
-def outside(call: Callable[P, R]) -> Callable[P, R]:
+def with_graph_break(call: Callable[P, R]) -> Callable[P, R]:
     """``call`` for eager code and for graphs, which break there."""
 
     @wraps(call)
-    def either(*args: P.args, **wishes: P.kwargs) -> R:
+    def either(*args: P.args, **options: P.kwargs) -> R:
         made: Any = torch.compiler.disable(call) if torch.compiler.is_compiling() else call
-        return made(*args, **wishes)
+        return made(*args, **options)
 
     return either
 
@@ -79,31 +79,31 @@ def _in_graph(
     full: bool = False,
     seed: int | None = None,
     dtype: torch.dtype = torch.float32,
-    **wishes: Any,
+    **options: Any,
 ) -> Any:
     """The render as an operator of the graph that is being traced, or outside of it. It is torch that reads this function."""
-    if full or len(scene.own_models) > 0 or not _fits(params, seed, dtype, wishes):
-        outside: Any = torch.compiler.disable(render)
-        return outside(scene, params=params, full=full, seed=seed, dtype=dtype, **wishes)
+    if full or len(scene.own_models) > 0 or not _fits_graph(params, seed, dtype, options):
+        with_graph_break: Any = torch.compiler.disable(render)
+        return with_graph_break(scene, params=params, full=full, seed=seed, dtype=dtype, **options)
     given = dict(params) if params is not None else {}
     if torch.is_grad_enabled():
         for name, value in scene.params.items():
             if value.requires_grad and name not in given:
                 given[name] = value
     wanted = [name for name in given if given[name].requires_grad]
-    text = _text([wishes, list(given), wanted, dtype is torch.float64])
+    text = _text([options, list(given), wanted, dtype is torch.float64])
     return torch.ops.torchpt.render(scene.number, text, -1 if seed is None else seed, list(given.values()))[0]
 
 
-def _fits(params: Any, seed: Any, dtype: Any, wishes: Mapping[str, Any]) -> bool:
+def _fits_graph(params: Any, seed: Any, dtype: Any, options: Mapping[str, Any]) -> bool:
     """Whether arguments can be written down in a graph; others, what is not accepted among them, are seen to outside of it."""
-    known = dtype is torch.float32 or dtype is torch.float64
+    reuse_rendering = dtype is torch.float32 or dtype is torch.float64
     number = isinstance(seed, int) and not isinstance(seed, bool)
     if params is not None and not (
         isinstance(params, Mapping) and all([isinstance(value, Tensor) for value in params.values()])
     ):
         return False
-    return known and (seed is None or (number and 0 <= seed < 1 << 63)) and _plain(wishes)
+    return reuse_rendering and (seed is None or (number and 0 <= seed < 1 << 63)) and _plain(options)
 
 
 def _plain(value: Any) -> bool:
@@ -126,30 +126,30 @@ def _text(value: Any) -> str:
     return repr(value)
 
 
-class _Order(NamedTuple):
+class _OperatorCall(NamedTuple):
     """A render as an operator is asked for it.
 
     Attributes:
         scene: what.
-        wishes: arguments of ``render``.
+        options: arguments of ``render``.
         names: of the parameters that are handed over.
         wanted: which of them are differentiated.
     """
 
     scene: Scene
-    wishes: dict[str, Any]
+    options: dict[str, Any]
     names: list[str]
     wanted: list[str]
 
     @classmethod
-    def read(cls, number: int, text: str, seed: int) -> _Order:
+    def read(cls, number: int, text: str, seed: int) -> _OperatorCall:
         """Raises RenderError where the scene is gone."""
-        scene = numbered(int(number))
+        scene = scene_by_number(int(number))
         if scene is None:
             raise RenderError("the scene that this compiled graph renders is gone: keep a reference to it")
-        wishes, names, wanted, double = ast.literal_eval(text)
-        wishes |= {"dtype": torch.float64 if double else torch.float32, "seed": None if seed < 0 else int(seed)}
-        return cls(scene, wishes, names, wanted)
+        options, names, wanted, double = ast.literal_eval(text)
+        options |= {"dtype": torch.float64 if double else torch.float32, "seed": None if seed < 0 else int(seed)}
+        return cls(scene, options, names, wanted)
 
     def versions(self) -> dict[str, int]:
         """Of the scene's own parameters, but for those that are handed over."""
@@ -157,13 +157,13 @@ class _Order(NamedTuple):
 
     def like(self) -> Tensor:
         """A picture of the right size, unfilled."""
-        blocks = {name: self.wishes.get(name) for name in BLOCKS if name != "render"}
+        blocks = {name: self.options.get(name) for name in BLOCKS if name != "render"}
         film = settings(self.scene.description, blocks).film
         _, _, width, height = film.crop or (0, 0, film.width, film.height)
-        return torch.empty(height, width, 3, dtype=self.wishes["dtype"], device=self.scene.device)
+        return torch.empty(height, width, 3, dtype=self.options["dtype"], device=self.scene.device)
 
 
-def _apart(work: Callable[[], R], made: list[Rendering], device: torch.device) -> R:
+def _in_thread(work: Callable[[], R], made: list[Rendering], device: torch.device) -> R:
     """Work of an operator, in a thread of its own: in that of the operator torch would not note what depends on what."""
     stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
     found: list[R] = []
@@ -189,38 +189,38 @@ def _register(render: Callable[..., Any]) -> None:
     """Make the operators ``torchpt::render`` and ``torchpt::render_gradients``."""
 
     def picture(number: int, text: str, seed: int, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        order, made = _Order.read(number, text, seed), []
+        request, made = _OperatorCall.read(number, text, seed), []
 
         def work() -> Tensor:
-            given = {name: value.detach() for name, value in zip(order.names, tensors, strict=True)}
+            given = {name: value.detach() for name, value in zip(request.names, tensors, strict=True)}
             with torch.no_grad():
-                return render(order.scene, params=given, **order.wishes).contiguous()
+                return render(request.scene, params=given, **request.options).contiguous()
 
-        versions = order.versions().values()
-        return _apart(work, made, order.scene.device), torch.tensor([made[0].spp, *versions])
+        versions = request.versions().values()
+        return _in_thread(work, made, request.scene.device), torch.tensor([made[0].spp, *versions])
 
     def like_picture(number: int, text: str, seed: int, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        order = _Order.read(number, text, 0)
-        return order.like(), torch.empty(1 + len(order.versions()), dtype=torch.int64)
+        request = _OperatorCall.read(number, text, 0)
+        return request.like(), torch.empty(1 + len(request.versions()), dtype=torch.int64)
 
     def gradients(
         number: int, text: str, seed: int, tensors: Sequence[Tensor], facts: Tensor, cotangent: Tensor
     ) -> list[Tensor]:
-        order = _Order.read(number, text, seed)
+        request = _OperatorCall.read(number, text, seed)
         spp, *versions = facts.tolist()
-        now = order.versions()
+        now = request.versions()
         check_unchanged(dict(zip(now, versions, strict=True)), now, AFTER)
-        made = [Rendering(order.like(), spp=spp)]
+        made = [Rendering(request.like(), spp=spp)]
 
         def work() -> list[Tensor]:
-            given = {name: value.detach() for name, value in zip(order.names, tensors, strict=True)}
-            leaves = {name: given[name].requires_grad_() for name in order.wanted}
-            image = render(order.scene, params=given, **order.wishes)
+            given = {name: value.detach() for name, value in zip(request.names, tensors, strict=True)}
+            leaves = {name: given[name].requires_grad_() for name in request.wanted}
+            image = render(request.scene, params=given, **request.options)
             grads = dict(zip(leaves, torch.autograd.grad(image, list(leaves.values()), cotangent), strict=True))
             every = (grads.get(name, torch.zeros_like(value)) for name, value in given.items())
             return [value.detach().contiguous() for value in every]
 
-        return _apart(work, made, order.scene.device)
+        return _in_thread(work, made, request.scene.device)
 
     def like_gradients(
         number: int, text: str, seed: int, tensors: Sequence[Tensor], facts: Tensor, cotangent: Tensor

@@ -10,19 +10,19 @@ from functools import partial
 import torch
 
 from torchpt.compiler.graph import Unsupported
-from torchpt.core.threads import Crew, one_thread, without_autocast
-from torchpt.engines.engine import Block, Share
+from torchpt.core.threads import TaskQueue, one_thread, without_autocast
+from torchpt.engines.engine import Block, TaskResult
 from torchpt.rendering.result import Rendering
 from torchpt.rendering.run import Run
 
-__all__ = ["Entry", "render_many"]
+__all__ = ["QueuedRender", "render_many"]
 
 #: Renders a thread that are made ready in advance.
-AHEAD = 2
+PREFETCH = 2
 
 
 @dataclass
-class Entry:
+class QueuedRender:
     """A render of several.
 
     Attributes:
@@ -44,7 +44,7 @@ class Entry:
     rest: list[Block] = field(init=False, default_factory=list)
 
 
-def render_many(entries: Iterable[Entry], tasks: int) -> None:
+def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
     """Render them, each to the very bits that it has alone.
 
     Renders that the compiled loop takes, and that nothing but their number of samples ends, share threads and a work list.
@@ -57,49 +57,49 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
     Raises:
         Exception: what an entry's ``failed`` raises; the others are given up then.
     """
-    crew = Crew[Entry, Share](torch.get_num_threads())
-    waiting, begun = iter(entries), dict[int, Entry]()
+    queue = TaskQueue[QueuedRender, TaskResult](torch.get_num_threads())
+    waiting, begun = iter(entries), dict[int, QueuedRender]()
     try:
         while True:
-            with _beside(crew):
+            with _single_threaded(queue):
                 entry = next(waiting, None)
             if entry is None:
                 break
-            with without_autocast(entry.device), _blamed(entry), _beside(crew):
-                entry.run = entry.make(crew.threads)
-                spans = entry.run.at_once()
+            with without_autocast(entry.device), _errors_to(entry), _single_threaded(queue):
+                entry.run = entry.make(queue.threads)
+                spans = entry.run.all_spans()
             if spans is None:
-                _drain(crew, begun, 0)
-                with without_autocast(entry.device), _blamed(entry):
-                    entry.done(entry.run.go(None))
+                _collect(queue, begun, 0)
+                with without_autocast(entry.device), _errors_to(entry):
+                    entry.done(entry.run.sample_all(None))
                 del entry.run
                 continue
-            with _blamed(entry):
+            with _errors_to(entry):
                 engine = entry.run.tasks
                 assert engine is not None
                 begun[id(entry)] = entry
                 blocks = engine.blocks(spans, tasks)
                 entry.left = len(blocks)
                 for block in blocks:
-                    crew.add(entry, partial(engine.task, block))
-            _drain(crew, begun, AHEAD * crew.threads * tasks)
-        _drain(crew, begun, 0)
+                    queue.add(entry, partial(engine.task, block))
+            _collect(queue, begun, PREFETCH * queue.threads * tasks)
+        _collect(queue, begun, 0)
     finally:
         for entry in begun.values():  # those that are not done stop at their next kernel
             if entry.run.tasks is not None:
                 entry.run.tasks.halt()
-        crew.close()
+        queue.close()
 
 
 @contextmanager
-def _beside(crew: Crew[Entry, Share]) -> Iterator[None]:
+def _single_threaded(queue: TaskQueue[QueuedRender, TaskResult]) -> Iterator[None]:
     """While all cores trace, tensor operations of this thread are its own: a team would wait for a core, and spin meanwhile."""
-    with one_thread() if crew.pending else nullcontext():
+    with one_thread() if queue.pending else nullcontext():
         yield
 
 
 @contextmanager
-def _blamed(entry: Entry) -> Iterator[None]:
+def _errors_to(entry: QueuedRender) -> Iterator[None]:
     """Tell an entry of the errors within."""
     try:
         yield
@@ -108,17 +108,17 @@ def _blamed(entry: Entry) -> Iterator[None]:
         raise
 
 
-def _drain(crew: Crew[Entry, Share], begun: dict[int, Entry], most: int) -> None:
+def _collect(queue: TaskQueue[QueuedRender, TaskResult], begun: dict[int, QueuedRender], most: int) -> None:
     """Take in what threads have done, until no more than ``most`` blocks are pending."""
     while True:
-        found = crew.next(wait=crew.pending > most)
+        found = queue.next(wait=queue.pending > most)
         if found is None:
-            if crew.pending <= most:
+            if queue.pending <= most:
                 return
             continue
         entry, share = found
         entry.left -= 1
-        with without_autocast(entry.device), _blamed(entry), _beside(crew):
+        with without_autocast(entry.device), _errors_to(entry), _single_threaded(queue):
             if isinstance(share, Unsupported):
                 entry.run.unsupported = share
                 assert entry.run.tasks is not None
@@ -127,8 +127,8 @@ def _drain(crew: Crew[Entry, Share], begun: dict[int, Entry], most: int) -> None
                 raise share
             else:
                 entry.rest += share.rest
-                entry.run.took(share)
+                entry.run.task_finished(share)
             if entry.left == 0:
                 del begun[id(entry)]
-                entry.done(entry.run.completed(entry.rest))
+                entry.done(entry.run.finish(entry.rest))
                 del entry.run

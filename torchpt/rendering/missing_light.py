@@ -27,14 +27,14 @@ from torchpt.scene.scene import Scene
 from torchpt.search import Accel
 from torchpt.search.bounds import primitive_bounds
 
-__all__ = ["MissingLight", "unlit"]
+__all__ = ["MissingLight", "find_missing_light"]
 
 #: Share of the picture that may be dark for the rest to tell the error.
 DARK = 0.05
 #: Dark pixels of which one camera ray each is asked whether it meets anything that reflects.
-ASKED = 256
+DARK_PIXELS = 256
 #: Rays from a light that are asked what they meet first; and from each dark pixel's surface, what is in sight.
-RAYS, SIGHTS = 512, 8
+RAYS, DIRECTIONS = 512, 8
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,9 @@ class MissingLight:
 
 
 @torch.no_grad()
-def unlit(scene: Scene, wave: Wave, geometry: Callable[[], Geometry], picture: Tensor, relmse: float) -> MissingLight:
+def find_missing_light(
+    scene: Scene, wave: Wave, geometry: Callable[[], Geometry], picture: Tensor, relmse: float
+) -> MissingLight:
     """Look for light that a picture lacks.
 
     Args:
@@ -66,14 +68,14 @@ def unlit(scene: Scene, wave: Wave, geometry: Callable[[], Geometry], picture: T
         return MissingLight("there is no light at all in the scene", 0.0)
     search = _Search(wave, geometry)
     if wave.integrator.lit and lights is not None:
-        for row, kind in _deltas(lights):
-            problem = _hidden(search, names, lights, row, kind)
+        for row, kind in _delta_lights(lights):
+            problem = _why_unreachable(search, names, lights, row, kind)
             if problem:
                 return MissingLight(f"lights.{names.light(row)}: {problem}", 0.0)
     black = (picture == 0.0).all(2).reshape(-1)
     if bool(black.all()):
         return MissingLight("no sample met any light", 1.0)
-    dark = _dark(search, black)
+    dark = _dark_share(search, black)
     if dark > min(DARK, relmse):
         return MissingLight(f"no sample met any light in {100.0 * dark:.2g} % of the picture", dark)
     return MissingLight("", dark)
@@ -99,7 +101,7 @@ class _Search:
         return replace(self._wave, accel=self._own)
 
 
-def _dark(search: _Search, black: Tensor) -> float:
+def _dark_share(search: _Search, black: Tensor) -> float:
     """Share of all pixels that are ``black (pixels,)`` although their first camera ray meets what reflects.
 
     Shadows of direct light are black, and known to be: each sample asked a light for what it would bring.
@@ -109,21 +111,21 @@ def _dark(search: _Search, black: Tensor) -> float:
     if not count or not integrator.light or 0 <= integrator.limits.max_depth <= 2:
         return 0.0
     wave = search.wave
-    asked = places[torch.linspace(0, count - 1, min(count, ASKED), dtype=torch.float64).round().long()].to(
+    asked = places[torch.linspace(0, count - 1, min(count, DARK_PIXELS), dtype=torch.float64).round().long()].to(
         wave.centre.device
     )
-    state = _through(wave, asked)
+    state = _camera_rays(wave, asked)
     hit = hits(wave, state)
     reflects = hit.prim >= 0
     with suppress(NotImplementedError):  # a model of the caller's own without an albedo
         reflects = seen(wave, ("albedo",), state)["albedo"].abs().amax(0) > 0
     on = reflects.nonzero()[:, 0]
-    if not len(on) or not _in_sight(wave, rows(state, on), rows(hit, on)):
+    if not len(on) or not _any_surface_visible(wave, rows(state, on), rows(hit, on)):
         return 0.0
     return float(reflects.double().mean()) * count / len(black)
 
 
-def _through(wave: Wave, places: Tensor) -> PathState:
+def _camera_rays(wave: Wave, places: Tensor) -> PathState:
     """Rays from the middle of the lens through the middles of pixels ``places (n,)`` of the picture."""
     x0, y0, width, _ = wave.crop
     x, y = places % width + x0, places // width + y0
@@ -134,7 +136,7 @@ def _through(wave: Wave, places: Tensor) -> PathState:
     return camera_state(o.expand_as(d), d, key)
 
 
-def _in_sight(wave: Wave, state: PathState, hit: Hit) -> bool:
+def _any_surface_visible(wave: Wave, state: PathState, hit: Hit) -> bool:
     """Return True where anything can be seen from the surfaces that camera rays meet, or light passes them.
 
     Else, as behind a single ball in the sun, no path goes on, and what the lights were asked for is all there is.
@@ -145,8 +147,10 @@ def _in_sight(wave: Wave, state: PathState, hit: Hit) -> bool:
             return True
     at = interact(world, state.o, state.d, hit)
     near = torch.where(dot(at.ng, state.d) < 0.0, 1.0, -1.0) * at.ng
-    for k in range(SIGHTS):
-        d = _sphere(torch.arange(len(hit.t), device=near.device) * SIGHTS + k, len(hit.t) * SIGHTS).to(near.dtype)
+    for k in range(DIRECTIONS):
+        d = _sphere(torch.arange(len(hit.t), device=near.device) * DIRECTIONS + k, len(hit.t) * DIRECTIONS).to(
+            near.dtype
+        )
         d = torch.where(dot(d, near) < 0.0, -d, d)
         prim = wave.accel.intersect(offset_origin(world, at, d), d, torch.full_like(hit.t, math.inf))[1]
         if bool((prim >= 0).any()):
@@ -161,7 +165,7 @@ def _sphere(k: Tensor, count: int) -> Tensor:
     return torch.stack((radius * turn.cos(), radius * turn.sin(), height))
 
 
-def _deltas(lights: Lights) -> list[tuple[int, str]]:
+def _delta_lights(lights: Lights) -> list[tuple[int, str]]:
     """Rows of the lights that no ray meets by chance, and their kinds; those without power are none."""
     kinds = [lights.kinds[0]] if lights.kind is None else [lights.kinds[k] for k in lights.kind.tolist()]
     bright = lights.radiance.abs().amax(0).tolist()
@@ -170,7 +174,7 @@ def _deltas(lights: Lights) -> list[tuple[int, str]]:
     ]
 
 
-def _hidden(search: _Search, names: Names, lights: Lights, row: int, kind: str) -> str:
+def _why_unreachable(search: _Search, names: Names, lights: Lights, row: int, kind: str) -> str:
     """Return why no path finds a light that no ray meets by chance; "" where one may.
 
     A path takes its light at a surface that the light shines on directly, and only where that scatters: polished ones have

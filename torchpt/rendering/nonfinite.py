@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from torchpt.engines.engine import brought
-from torchpt.paths.nonfinite import NonFinite, Place
+from torchpt.paths.nonfinite import NonFinite, SampleId
 from torchpt.paths.state import PathState
 from torchpt.paths.wave import Wave
 from torchpt.scene.names import Names
@@ -44,7 +44,7 @@ def causes_of(scene: Scene, wave: Wave, lost: NonFinite) -> tuple[dict[str, int]
     return {name: count for name, count in causes.most_common() if count}, first
 
 
-def told(scene: Scene, wave: Wave, place: Place) -> str:
+def told(scene: Scene, wave: Wave, place: SampleId) -> str:
     """Return a sentence about one sample that is not finite."""
     from torchpt.paths.explain import causes_of_samples
 
@@ -55,7 +55,7 @@ def _trace(wave: Wave, state: PathState, observer: Any) -> Tensor:
     return brought(wave, state, observer=observer)
 
 
-def _named(wave: Wave, place: Place) -> str:
+def _named(wave: Wave, place: SampleId) -> str:
     """A sample by number and pixel, or ray; pilots take some of their own."""
     if wave.given is not None:
         return f"sample {place.sample} of ray {place.y * wave.crop[2] + place.x}"

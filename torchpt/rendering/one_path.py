@@ -22,14 +22,14 @@ from torchpt.scene.names import Names
 from torchpt.scene.prepare import make_wave
 from torchpt.scene.settings import Settings
 
-__all__ = ["Chosen", "Emission", "Path", "Scattered", "Vertex", "one_path"]
+__all__ = ["BsdfSampleRecord", "EmissionRecord", "LightSampleRecord", "Path", "Vertex", "one_path"]
 
 #: Three numbers: a colour, a point or a direction.
 Triple = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class Emission:
+class EmissionRecord:
     """Light that the path met by chance.
 
     Attributes:
@@ -48,7 +48,7 @@ class Emission:
 
 
 @dataclass(frozen=True)
-class Chosen:
+class LightSampleRecord:
     """Light that was sampled.
 
     Attributes:
@@ -73,7 +73,7 @@ class Chosen:
 
 
 @dataclass(frozen=True)
-class Scattered:
+class BsdfSampleRecord:
     """The direction in which the path goes on, as the material drew it.
 
     Attributes:
@@ -124,9 +124,9 @@ class Vertex:
     normal: Triple | None = None
     geometric_normal: Triple | None = None
     wo: Triple
-    emission: Emission | None = None
-    light: Chosen | None = None
-    scattered: Scattered | None = None
+    emission: EmissionRecord | None = None
+    light: LightSampleRecord | None = None
+    scattered: BsdfSampleRecord | None = None
     radiance: Triple
 
 
@@ -188,10 +188,10 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         state = wave.rays_of(x, y, number)
         explainer.began(state)
         radiance = brought(wave, state, observer=explainer)
-        return _Story(scene, explainer).told(settings, pixel, sample, radiance)
+        return _PathBuilder(scene, explainer).build(settings, pixel, sample, radiance)
 
 
-class _Story:
+class _PathBuilder:
     """Turns what happened in one lane into a :class:`Path`."""
 
     def __init__(self, scene: Scene, explainer: Explainer) -> None:
@@ -199,7 +199,7 @@ class _Story:
         self.names = Names(scene.built, self.world)
         self.centre, self.unit = scene.space.centre, scene.space.unit
 
-    def told(self, settings: Settings, pixel: tuple[int, int], sample: int, brought: Tensor) -> Path:
+    def build(self, settings: Settings, pixel: tuple[int, int], sample: int, brought: Tensor) -> Path:
         left = self.events[0]
         assert isinstance(left, CameraRay)
         vertices = tuple(self._vertices())
@@ -212,15 +212,15 @@ class _Story:
             pixel=pixel,
             sample=sample,
             seed=settings.render.seed,
-            origin=self._place(left.state.o),
-            direction=_three(left.state.d),
+            origin=self._scene_point(left.state.o),
+            direction=_first_lane(left.state.d),
             vertices=vertices,
-            ended=self._ended(),
+            ended=self._why_ended(),
             radiance=vertices[-1].radiance,
-            value=_three(value),
+            value=_first_lane(value),
         )
 
-    def _place(self, p: Tensor) -> Triple:
+    def _scene_point(self, p: Tensor) -> Triple:
         """A point in the scene's own coordinates."""
         return tuple((p[:, 0].double() * self.unit + self.centre).tolist())
 
@@ -241,33 +241,33 @@ class _Story:
         if bounced is not None and bounced.clear is not None:
             output = bounced.output
             assert output.direct is not None and output.shadow is not None
-            light = self._chosen(output.direct, output.shadow.radiance, bounced.clear)
+            light = self._light_sample(output.direct, output.shadow.radiance, bounced.clear)
             radiance = torch.addcmul(output.leaving.radiance, output.shadow.radiance, bounced.clear)
-        wo, escaped = _three(-met.state.d), int(met.hit.prim) < 0
+        wo, escaped = _first_lane(-met.state.d), int(met.hit.prim) < 0
         emission = None if shone is None else self._emission(shone)
         if escaped:
-            return Vertex(depth=met.depth, wo=wo, emission=emission, radiance=_three(radiance))
+            return Vertex(depth=met.depth, wo=wo, emission=emission, radiance=_first_lane(radiance))
         at = interact(self.world, met.state.o, met.state.d, met.hit)
         found = self.names.surface(int(at.slot), int(at.prim))
         normal = at.ns if output is None or output.surface is None else output.surface.frame.n
         return Vertex(
             depth=met.depth,
-            position=self._place(at.p),
+            position=self._scene_point(at.p),
             shape=found.shape,
             kind=found.kind,
             primitive=found.primitive,
             material=found.material,
             model=found.model,
-            normal=_three(normal),
-            geometric_normal=_three(at.ng),
+            normal=_first_lane(normal),
+            geometric_normal=_first_lane(at.ng),
             wo=wo,
             emission=emission,
             light=light,
-            scattered=None if output is None else _scattered(output),
-            radiance=_three(radiance),
+            scattered=None if output is None else _bsdf_sample(output),
+            radiance=_first_lane(radiance),
         )
 
-    def _emission(self, shone: EmitterHit) -> Emission:
+    def _emission(self, shone: EmitterHit) -> EmissionRecord:
         lights = self.world.lights
         assert lights is not None
         row = len(lights.area) - 1  # the environment
@@ -275,28 +275,28 @@ class _Story:
             assert lights.row_of_prim is not None
             row = int(lights.row_of_prim[shone.slot])
         light = shone.light
-        return Emission(
+        return EmissionRecord(
             self.names.light(row),
-            _three(light.radiance),
+            _first_lane(light.radiance),
             float(light.pdf),
             float(light.weight),
-            _three(light.brought),
+            _first_lane(light.brought),
         )
 
-    def _chosen(self, direct: DirectLight, brought: Tensor, clear: Tensor) -> Chosen:
+    def _light_sample(self, direct: DirectLight, brought: Tensor, clear: Tensor) -> LightSampleRecord:
         sample, reflected = direct.sample, direct.reflected
-        return Chosen(
+        return LightSampleRecord(
             light=self.names.light(0 if sample.row is None else int(sample.row)),
-            wi=_three(sample.wi),
+            wi=_first_lane(sample.wi),
             pdf=float(sample.pdf),
-            arriving=_three(direct.radiance * sample.weight),
-            bsdf=_three(reflected if direct.share is None else reflected * direct.share),
+            arriving=_first_lane(direct.radiance * sample.weight),
+            bsdf=_first_lane(reflected if direct.share is None else reflected * direct.share),
             mis_weight=1.0 if direct.weight is None else float(direct.weight),
             visible=float(clear) if bool((brought != 0).any()) else None,
-            contribution=_three(brought * clear),
+            contribution=_first_lane(brought * clear),
         )
 
-    def _ended(self) -> str:
+    def _why_ended(self) -> str:
         """Return how the path did."""
         last = next(event for event in reversed(self.events) if not isinstance(event, EmitterHit))
         if isinstance(last, Intersection) and float(last.state.t_max) > 0.0:
@@ -310,22 +310,22 @@ class _Story:
         return "absorbed"
 
 
-def _scattered(output: VertexOutput) -> Scattered:
+def _bsdf_sample(output: VertexOutput) -> BsdfSampleRecord:
     drawn, carried, chance, after = output.drawn, output.carried, output.chance, output.leaving
     assert drawn is not None and carried is not None and output.surface is not None
-    goes_on, weight, relief = float(after.t_max) > 0.0, drawn.weight, output.surface.relief
-    if relief is not None:
-        weight = weight * relief.shadowing(drawn.d)
-    return Scattered(
-        wi=_three(drawn.d),
+    goes_on, weight, perturbed_normal = float(after.t_max) > 0.0, drawn.weight, output.surface.perturbed_normal
+    if perturbed_normal is not None:
+        weight = weight * perturbed_normal.shadowing(drawn.d)
+    return BsdfSampleRecord(
+        wi=_first_lane(drawn.d),
         pdf=float(drawn.pdf),
-        weight=_three(weight),
+        weight=_first_lane(weight),
         eta=None if drawn.eta is None else float(drawn.eta),
         survival=None if chance is None else float(chance),
-        throughput=_three(after.throughput if goes_on else carried),
+        throughput=_first_lane(after.throughput if goes_on else carried),
     )
 
 
-def _three(value: Tensor) -> Triple:
+def _first_lane(value: Tensor) -> Triple:
     """The numbers of one lane."""
     return tuple(value.detach().reshape(3, -1)[:, 0].tolist())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchpt.core.memory import Meter, mb, retried
+from torchpt.core.memory import MemoryMeter, mb, retry_out_of_memory
 from torchpt.images.denoiser import GUIDES
 from torchpt.paths.layers import LAYERS
 from torchpt.physics.film import ErrorEstimate
@@ -18,13 +18,15 @@ from torchpt.rendering.result import Rendering
 if TYPE_CHECKING:
     from torchpt.rendering.run import Run
 
-__all__ = ["final", "known_of", "rendering_of"]
+__all__ = ["error_estimate_of", "finished_rendering", "rendering_of"]
 
 
-def final(run: Run) -> Rendering:
+def finished_rendering(run: Run) -> Rendering:
     """The picture at the end, and why samples of it are not finite."""
     size = mb(run.need.picture)
-    return retried(lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}", lambda: _told(run))
+    return retry_out_of_memory(
+        lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}", lambda: _told(run)
+    )
 
 
 def _told(run: Run) -> Rendering:
@@ -37,10 +39,10 @@ def rendering_of(run: Run) -> Rendering:
     """The picture so far; where ranks share a render, what their films hold was joined before."""
     radiant, film = run.integrator.light, run.picture.film
     layers = _layers(run)
-    known, unknown = None, ""
+    estimate, unknown = None, ""
     if radiant:
-        values = film.mean() if run.twice is None else run.twice.picture(film)
-        image, (known, unknown) = values.to(run.dtype), known_of(run, values)
+        values = film.mean() if run.probes is None else run.probes.picture(film)
+        image, (estimate, unknown) = values.to(run.dtype), error_estimate_of(run, values)
     else:
         shown = layers[next(iter(run.seen))]
         blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))
@@ -51,7 +53,7 @@ def rendering_of(run: Run) -> Rendering:
         clamped = 1.0 - after / before if before > 0 else 0.0
     counts = (film if radiant else next(iter(run.picture.layers.values()))).counts
     names = run.settings.film.aovs or run.integrator.layers
-    meter = Meter(run.device)
+    meter = MemoryMeter(run.device)
     return Rendering(
         image=image,
         layers={name: layers[name] for name in names},
@@ -67,10 +69,10 @@ def rendering_of(run: Run) -> Rendering:
         nonfinite_samples=run.lost.count,
         truncated_paths=run.tally.truncated,
         clamped=clamped,
-        relmse=None if known is None or unknown else known.relmse,
-        relmse_interval=None if known is None or unknown else known.interval,
+        relmse=None if estimate is None or unknown else estimate.relmse,
+        relmse_interval=None if estimate is None or unknown else estimate.interval,
         relmse_unknown=unknown,
-        heavy_tailed=known is not None and known.heavy_tailed,
+        heavy_tailed=estimate is not None and estimate.heavy_tailed,
         stopped_by=run.stop.reason,
         complete=bool(run.stop.reason) and not run.ended,
         peak_memory=max(meter.peak() - meter.base(), 0),
@@ -82,25 +84,25 @@ def rendering_of(run: Run) -> Rendering:
     )
 
 
-def known_of(run: Run, picture: Tensor) -> tuple[ErrorEstimate | None, str]:
+def error_estimate_of(run: Run, picture: Tensor) -> tuple[ErrorEstimate | None, str]:
     """Return what the samples tell of the picture's own error, None where nobody asked, and why that is not known, or ""."""
     film = run.picture.film
-    if run.twice is not None:
-        known = run.twice.known(film, picture)
+    if run.probes is not None:
+        estimate = run.probes.estimate(film, picture)
     else:
         relmse = film.relmse()
-        known = None if relmse is None else ErrorEstimate(relmse, None, False)
-    if known is None or not run.done:
-        return known, ""
-    from torchpt.rendering.missing_light import unlit
+        estimate = None if relmse is None else ErrorEstimate(relmse, None, False)
+    if estimate is None or not run.done:
+        return estimate, ""
+    from torchpt.rendering.missing_light import find_missing_light
 
-    lacks = unlit(run.scene, run.wave, run.geometry, picture, known.relmse)
+    lacks = find_missing_light(run.scene, run.wave, run.geometry, picture, estimate.relmse)
     if lacks.reason:
-        return known, lacks.reason
-    if known.interval is not None:
-        low, high = known.interval
-        known = replace(known, interval=(low, high + lacks.dark))
-    return known, ""
+        return estimate, lacks.reason
+    if estimate.interval is not None:
+        low, high = estimate.interval
+        estimate = replace(estimate, interval=(low, high + lacks.dark))
+    return estimate, ""
 
 
 def _layers(run: Run) -> dict[str, Tensor]:
@@ -114,6 +116,6 @@ def _layers(run: Run) -> dict[str, Tensor]:
     for name in run.settings.film.aovs:
         if name not in run.seen:
             made: Any = LAYERS[name]  # a FilmLayer
-            counts = film.counts if run.twice is None else run.twice.counts(film)
+            counts = film.counts if run.probes is None else run.probes.counts(film)
             layers[name] = made.of(film, counts).to(run.dtype)
     return layers

@@ -10,24 +10,24 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import custom_vjp, in_batch, wants_gradients
+from torchpt.core.autograd import custom_vjp, is_batched, wants_gradients
 from torchpt.core.errors import EdgeWarning, NoLightWarning, SceneError, warn_caller
 from torchpt.images.denoiser import check_denoiser
 from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.paths.layers import LAYERS, SurfaceLayer
 from torchpt.ranks import together
 from torchpt.rendering import Rendering, render_scene
-from torchpt.rendering.graphs import known
+from torchpt.rendering.graphs import reuse_rendering
 from torchpt.rendering.result import denoise_rendering
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
 from torchpt.scene.formats.description import settings as complete
-from torchpt.scene.settings import SAMPLERS, Call, CommonOptions, Settings, blocks_of
-from torchpt.scene.textured import renew, with_texels
+from torchpt.scene.settings import SAMPLERS, CallArguments, CommonOptions, Settings, settings_of_call
+from torchpt.scene.texel_params import update_texels, with_texel_params
 from torchpt.scene.versions import AFTER, check_unchanged
 from torchpt.spec import Role
 
-__all__ = ["RenderRequest", "ordered", "ordered_along", "rendered"]
+__all__ = ["RenderRequest", "execute_request", "prepare_request", "prepare_trace_request"]
 
 _FLOATS = (torch.float32, torch.float64)
 
@@ -49,7 +49,7 @@ class RenderRequest:
     given: Scene
     scene: Scene
     settings: Settings
-    call: Call
+    call: CallArguments
     params: Mapping[str, Tensor]
     versions: Mapping[str, int] = field(default_factory=dict)
     rays: tuple[Tensor, Tensor] | None = None
@@ -60,16 +60,16 @@ class RenderRequest:
         return tuple(name for name, value in self.params.items() if wants_gradients(value))
 
     @property
-    def by_rays(self) -> bool:
+    def differentiates_rays(self) -> bool:
         """Return True where rays are differentiated."""
         return any(wants_gradients(vectors) for vectors in self.rays or ())
 
     @property
-    def taped(self) -> bool:
+    def needs_gradients(self) -> bool:
         """Return True where the picture is to carry gradients."""
-        return torch.is_grad_enabled() and bool(self.wanted or self.by_rays or self.scene.weights())
+        return torch.is_grad_enabled() and bool(self.wanted or self.differentiates_rays or self.scene.weights())
 
-    def noted(self) -> RenderRequest:
+    def with_versions(self) -> RenderRequest:
         """The same, with what :meth:`check_unchanged` compares."""
         now = self.given.versions()
         return replace(self, versions={name: edition for name, edition in now.items() if name not in self.params})
@@ -81,10 +81,10 @@ class RenderRequest:
             RenderError: one of the scene's own parameters was replaced, or changed in place.
         """
         check_unchanged(self.versions, self.given.versions(), since)
-        renew(self.scene, self.given, self.params)
+        update_texels(self.scene, self.given, self.params)
 
 
-def ordered(scene: Scene, full: bool, **wishes: Unpack[CommonOptions]) -> RenderRequest:
+def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) -> RenderRequest:
     """Return what the arguments of ``render`` ask for.
 
     Raises:
@@ -92,21 +92,21 @@ def ordered(scene: Scene, full: bool, **wishes: Unpack[CommonOptions]) -> Render
         RenderError: a denoiser that is not there.
     """
     scene = as_scene(scene)
-    call = Call.of({**wishes, "full": full})
-    _check(scene, call, wishes.get("device"))
-    settings = complete(scene.description, blocks_of(wishes))
+    call = CallArguments.of({**options, "full": full})
+    _check(scene, call, options.get("device"))
+    settings = complete(scene.description, settings_of_call(options))
     if not full:
-        settings = _of_one_picture(settings, wishes.get("film"))
+        settings = _without_aovs(settings, options.get("film"))
     elif settings.film.denoise:
         check_denoiser()
-    params = _given(scene, call.params, full)
-    textured = with_texels(scene, params)
+    params = _parameters(scene, call.params, full)
+    textured = with_texel_params(scene, params)
     textured.check_own()
-    order = RenderRequest(scene, textured, settings, call, params)
-    return order.noted() if order.taped else order
+    request = RenderRequest(scene, textured, settings, call, params)
+    return request.with_versions() if request.needs_gradients else request
 
 
-def ordered_along(scene: Scene, o: Tensor, d: Tensor, **wishes: Unpack[CommonOptions]) -> RenderRequest:
+def prepare_trace_request(scene: Scene, o: Tensor, d: Tensor, **options: Unpack[CommonOptions]) -> RenderRequest:
     """Return what the arguments of ``trace`` ask for: a picture whose pixels are the rays.
 
     Raises:
@@ -114,9 +114,9 @@ def ordered_along(scene: Scene, o: Tensor, d: Tensor, **wishes: Unpack[CommonOpt
     """
     as_scene(scene)
     o, d = _broadcast(scene, o, d)
-    wishes["edges"] = False
-    order = ordered(scene, False, **wishes)
-    settings, sampler = order.settings, order.settings.sampler
+    options["edges"] = False
+    request = prepare_request(scene, False, **options)
+    settings, sampler = request.settings, request.settings.sampler
     if not settings.integrator.light:
         radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
         raise SceneError(
@@ -127,10 +127,10 @@ def ordered_along(scene: Scene, o: Tensor, d: Tensor, **wishes: Unpack[CommonOpt
     if sampler.kind.of_film:
         others = ", ".join(name for name in SAMPLERS if not SAMPLERS[name].of_film)
         raise SceneError("sampler.type", sampler.name, f"one of {others}: rays have no places on a film")
-    wished = wishes.get("sampler")
+    wished = options.get("sampler")
     if isinstance(wished, Mapping) and wished.get("adaptive"):
         raise SceneError("sampler.adaptive", True, "false: rays have the same number of samples")
-    if seen := [name for name in wishes.get("params") or {} if name.startswith("camera.")]:
+    if seen := [name for name in options.get("params") or {} if name.startswith("camera.")]:
         raise SceneError("params", seen[0], "none of the camera's, which rays do not come from")
     # What a scene file says of its picture, and of when that is done, is not meant for rays.
     settings = replace(
@@ -139,9 +139,9 @@ def ordered_along(scene: Scene, o: Tensor, d: Tensor, **wishes: Unpack[CommonOpt
         sampler=replace(sampler, values={key: value for key, value in sampler.values.items() if key != "adaptive"}),
         render=settings.render.without(Role.ENDS | Role.FILES).but(pilots=False),
     )
-    params = {name: value for name, value in order.params.items() if not name.startswith("camera.")}
-    order = replace(order, settings=settings, params=params, rays=(o, d))
-    return order.noted() if order.taped else order
+    params = {name: value for name, value in request.params.items() if not name.startswith("camera.")}
+    request = replace(request, settings=settings, params=params, rays=(o, d))
+    return request.with_versions() if request.needs_gradients else request
 
 
 def _broadcast(scene: Scene, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
@@ -164,7 +164,7 @@ def _broadcast(scene: Scene, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
     return o, d
 
 
-def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
+def _parameters(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
     """Return parameters in place of the scene's, those of its own that want gradients among them.
 
     Raises:
@@ -174,14 +174,14 @@ def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dic
     given = dict(params or {})
     if any(name not in scene.params or not isinstance(value, Tensor) or value.is_meta for name, value in given.items()):
         scene.check(given)
-    if full and any(in_batch(value) for value in given.values()):
+    if full and any(is_batched(value) for value in given.values()):
         raise SceneError("full", True, "False under torch.func.vmap, where a render gives pictures alone")
     if not torch.is_grad_enabled():
         return given
     return {name: value for name, value in scene.params.items() if getattr(value, "requires_grad", False)} | given
 
 
-def rendered(order: RenderRequest, made: list[Rendering] | None = None) -> Rendering:
+def execute_request(request: RenderRequest, made: list[Rendering] | None = None) -> Rendering:
     """The rendering that was asked for, on a tape where one is wanted, and denoised where that is.
 
     ``made``: a list of the rendering alone, without gradients, where it is there already; it is taken out.
@@ -189,7 +189,7 @@ def rendered(order: RenderRequest, made: list[Rendering] | None = None) -> Rende
     Raises:
         SceneError: a parameter that is not accepted.
     """
-    scene, settings, call = order.scene, order.settings, order.call
+    scene, settings, call = request.scene, request.settings, request.call
 
     def render(params: Mapping[str, Tensor], rays: tuple[Tensor, ...]) -> Rendering:
         if made:
@@ -197,14 +197,14 @@ def rendered(order: RenderRequest, made: list[Rendering] | None = None) -> Rende
         with nullcontext() if call.ranks is None else call.ranks.together():
             scene.check(params)
         given = _pair(rays)
-        return known(
+        return reuse_rendering(
             lambda: render_scene(scene, settings, params=params, dtype=call.dtype, ranks=call.ranks, rays=given)
         )
 
-    if order.taped:
-        rendering = _differentiable(order, render)
-    elif order.params or order.rays is not None:
-        rendering = _constant(order, render)
+    if request.needs_gradients:
+        rendering = _differentiable(request, render)
+    elif request.params or request.rays is not None:
+        rendering = _constant(request, render)
     else:
         rendering = render({}, ())
     if settings.film.denoise:
@@ -214,7 +214,7 @@ def rendered(order: RenderRequest, made: list[Rendering] | None = None) -> Rende
     return rendering
 
 
-def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Settings:
+def _without_aovs(settings: Settings, film: Mapping[str, Any] | None) -> Settings:
     """Settings of a render that returns a tensor; a scene file's wishes for layers and to denoise are for files.
 
     Raises:
@@ -231,19 +231,19 @@ def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Setti
     return replace(settings, film=settings.film.but(denoise=False, aovs=aovs))
 
 
-def _check(scene: Scene, call: Call, device: str | torch.device | None) -> None:
+def _check(scene: Scene, call: CallArguments, device: str | torch.device | None) -> None:
     """Refuse arguments of :func:`render` that do not fit the scene."""
     for name in call.params or {}:
         if not isinstance(name, str):
             raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.params))}")
-    if device not in (None, "auto") and not _same(device, scene.device):
+    if device not in (None, "auto") and not _same_device(device, scene.device):
         raise SceneError("device", str(device), f"the scene's own device {scene.device}; load the scene on the other")
 
 
-def _same(wish: str | torch.device, own: torch.device) -> bool:
+def _same_device(requested: str | torch.device, own: torch.device) -> bool:
     """Return True where a wish for a device names the one that a scene is on."""
     try:
-        device = torch.device(wish)
+        device = torch.device(requested)
     except RuntimeError:
         return False
     return device.type == own.type and device.index in (None, own.index or 0)
@@ -258,22 +258,22 @@ def _pair(rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor] | None:
 _Make = Callable[[Mapping[str, Tensor], tuple[Tensor, ...]], Rendering]
 
 
-def _differentiable(order: RenderRequest, render: _Make) -> Rendering:
+def _differentiable(request: RenderRequest, render: _Make) -> Rendering:
     """Return a rendering whose picture is on a tape from the parameters and rays wanted; ``render`` makes it without."""
     from torchpt import gradients as adjoint
     from torchpt.gradients import edges
 
-    scene, settings, call, params = order.scene, order.settings, order.call, order.params
-    wanted, dtype, ranks = order.wanted, call.dtype, call.ranks
+    scene, settings, call, params = request.scene, request.settings, request.call, request.params
+    wanted, dtype, ranks = request.wanted, call.dtype, call.ranks
     seed = settings.render.seed ^ 0x5DEECE66D if call.seed_grad is None else call.seed_grad
     if not settings.integrator.light:
         radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
         raise SceneError("integrator.type", settings.integrator.name, f"one of {radiant} where gradients are wanted")
     if settings.render.checkpoint is not None:
         raise SceneError("render.checkpoint", settings.render.checkpoint, "null where gradients are wanted")
-    by_rays = order.by_rays
-    attached = by_rays or adjoint.attached(scene, wanted)
-    if by_rays or edges.concerns(scene, wanted):
+    differentiates_rays = request.differentiates_rays
+    attached = differentiates_rays or adjoint.attached(scene, wanted)
+    if differentiates_rays or edges.concerns(scene, wanted):
         _warn_of_edges(edges.left_out(scene, settings), not call.edges)
     for name in edges.without_gradient(scene, wanted):
         said = f"{name} changes the picture by jumps alone, which are not differentiated: its gradient is 0"
@@ -291,7 +291,7 @@ def _differentiable(order: RenderRequest, render: _Make) -> Rendering:
 
     def backward_pass(cotangents: tuple[Tensor, ...], *tensors: Tensor) -> list[Tensor | None]:
         cotangent = cotangents[0].reshape(-1, 3).T  # (3, H W)
-        order.check_unchanged(AFTER)
+        request.check_unchanged(AFTER)
         with together(ranks, "the loss", lambda: cotangent.detach().cpu().contiguous().numpy().tobytes()):
             return gradients(cotangent, *tensors)
 
@@ -303,7 +303,18 @@ def _differentiable(order: RenderRequest, render: _Make) -> Rendering:
         held = not exact and adjoint.film_space_applies(scene, settings, wanted)
         rays = _pair(tensors[len(names) :])
         found = adjoint.gradients(
-            scene, again(), given, wanted, dtype, attached, call.adjoint, cotangent, held, ranks, rays, by_rays
+            scene,
+            again(),
+            given,
+            wanted,
+            dtype,
+            attached,
+            call.adjoint,
+            cotangent,
+            held,
+            ranks,
+            rays,
+            differentiates_rays,
         )
         if of_edges and edges.concerns(scene, wanted):
             _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
@@ -311,7 +322,7 @@ def _differentiable(order: RenderRequest, render: _Make) -> Rendering:
                 scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges, held, ranks
             )
             found[: len(wanted)] = [a if b is None else a + b for a, b in zip(found, moved, strict=False)]
-        still = [None] * (len(tensors) - len(wanted) - (2 if by_rays else 0))
+        still = [None] * (len(tensors) - len(wanted) - (2 if differentiates_rays else 0))
         return [*found[: len(wanted)], *still, *found[len(wanted) :]]
 
     def again(spp: int | None = None) -> Settings:
@@ -322,10 +333,10 @@ def _differentiable(order: RenderRequest, render: _Make) -> Rendering:
         return (call.edge_spp or call.spp_grad or taken[0]) if call.edges else 0
 
     def asked() -> edges.Asked:
-        order.check_unchanged(AFTER)
+        request.check_unchanged(AFTER)
         return edges.Asked(scene, again(), wanted, dtype, edges_taken())
 
-    tensors = (*(params[name] for name in names), *(order.rays or ()))
+    tensors = (*(params[name] for name in names), *(request.rays or ()))
     (image,) = custom_vjp(forward, backward_pass, tensors, scene.weights())
     rendering = made[-1]
     made.clear()  # the tape keeps the closures, which are not to keep pictures
@@ -337,15 +348,15 @@ def _differentiable(order: RenderRequest, render: _Make) -> Rendering:
     return replace(rendering, image=image)
 
 
-def _constant(order: RenderRequest, render: _Make) -> Rendering:
+def _constant(request: RenderRequest, render: _Make) -> Rendering:
     """Return a rendering without gradients, of parameters and rays that may still be those of a transform of ``torch.func``."""
-    params, made = order.params, list[Rendering]()
+    params, made = request.params, list[Rendering]()
 
     def forward(*tensors: Tensor) -> tuple[Tensor]:
         made.append(render(dict(zip(params, tensors, strict=False)), tensors[len(params) :]))
         return (made[-1].image,)
 
-    (image,) = custom_vjp(forward, lambda *_: (), (*params.values(), *(order.rays or ())), ())
+    (image,) = custom_vjp(forward, lambda *_: (), (*params.values(), *(request.rays or ())), ())
     return replace(made[-1], image=image)
 
 

@@ -315,8 +315,8 @@ def png_of(image: Tensor, film: Any) -> bytes:
     """
     from PIL import Image
 
-    wishes = {} if film is None else {"exposure": film.exposure, "tonemap": film.tonemap, "gamma": film.gamma}
-    shown = display(image.detach().cpu().float(), **wishes)
+    options = {} if film is None else {"exposure": film.exposure, "tonemap": film.tonemap, "gamma": film.gamma}
+    shown = display(image.detach().cpu().float(), **options)
     picture = Image.fromarray((shown * 255 + 0.5).byte().numpy())
     picture.thumbnail((LONGEST, LONGEST), Image.Resampling.BOX)  # leaves what is smaller as it is
     encoded = BytesIO()

@@ -13,25 +13,32 @@ from torch import Tensor
 
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import LostRankError, OutputError, RenderError, SceneError, warn_once
-from torchpt.core.memory import Budget, Meter, check_memory, mb, needing, retried
+from torchpt.core.memory import Budget, MemoryMeter, check_memory, explain_out_of_memory, mb, retry_out_of_memory
 from torchpt.core.threads import limited_threads, without_autocast
-from torchpt.engines.engine import Block, Forward, Share, Tasks, forward_tensors
+from torchpt.engines.engine import Block, Forward, TaskResult, Tasks, forward_tensors
 from torchpt.native import compile_time
 from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts, Wave
 from torchpt.physics.film import ErrorEstimate, Film
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.ranks import Group, together
-from torchpt.rendering.checkpoint import EVERY, Keeper, State, check_samples, check_whole, identity
-from torchpt.rendering.error import FIRST_ROUND, Shares, error_probes
+from torchpt.rendering.checkpoint import EVERY, CheckpointFile, RenderState, check_plausible, check_samples, identity
+from torchpt.rendering.error import FIRST_ROUND, SampleAllocation, error_probes
 from torchpt.rendering.nonfinite import told
-from torchpt.rendering.picture import final, known_of, rendering_of
+from torchpt.rendering.picture import error_estimate_of, finished_rendering, rendering_of
 from torchpt.rendering.result import Progress, Rendering
-from torchpt.rendering.split import Split, stamp
-from torchpt.rendering.stopping import Stop
+from torchpt.rendering.split import DistributedRender, render_fingerprint
+from torchpt.rendering.stopping import StopRules
 from torchpt.scene import Scene
-from torchpt.scene.memory_estimate import BYTES_PER_LANE, FEWEST_OF_LOOP, LANES, check_film, loaded, memory_estimate
-from torchpt.scene.prepare import loop_of, looped, make_wave, surface_layers
+from torchpt.scene.memory_estimate import (
+    BYTES_PER_LANE,
+    FEWEST_OF_KERNELS,
+    LANES,
+    check_film,
+    mark_loaded,
+    memory_estimate,
+)
+from torchpt.scene.prepare import kernel_engine, make_wave, surface_layers, uses_kernels
 from torchpt.scene.settings import Settings
 
 __all__ = ["Run", "render_scene"]
@@ -44,9 +51,9 @@ __all__ = ["Run", "render_scene"]
 SMALL_ROUND = 8
 
 
-def _most(known: ErrorEstimate | None) -> float:
+def _upper_bound(estimate: ErrorEstimate | None) -> float:
     """The upper end of an interval; infinite where there is none that is to be trusted."""
-    return math.inf if known is None or known.interval is None or known.heavy_tailed else known.interval[1]
+    return math.inf if estimate is None or estimate.interval is None or estimate.heavy_tailed else estimate.interval[1]
 
 
 class Run:
@@ -67,16 +74,16 @@ class Run:
         rays: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         self.start = time.perf_counter()
-        self._others = compile_time.seconds()
+        self._compiled_before = compile_time.seconds()
         self._kernels = 0.0  # seconds of kernels that were given up
-        self.split = None if group is None or group.size == 1 else Split(group)
+        self.split = None if group is None or group.size == 1 else DistributedRender(group)
         self.shared: tuple[int, int] = 0, 1  # samples before this pass, and how many ranks take it
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
-        meter, limit = Meter(self.device), settings.render.max_memory
+        meter, limit = MemoryMeter(self.device), settings.render.max_memory
         before = 0 if limit is None else meter.peak()
-        compiled = looped(settings, self.device, dtype)
-        self.wave = retried(
+        compiled = uses_kernels(settings, self.device, dtype)
+        self.wave = retry_out_of_memory(
             lambda: f"a scene of {scene.told}",
             lambda: make_wave(scene, settings, params, dtype, like=like, rays=rays),
         )
@@ -88,13 +95,13 @@ class Run:
         self.on_progress: Callable[[Progress], bool | None] | None = None
         self.eager: list[str] = []
         self.unsupported: Unsupported | None = None
-        self.keeper: Keeper | None = None
+        self.checkpoint_file: CheckpointFile | None = None
         self.warned = False  # that it cannot write
         self.keeps = settings.render.checkpoint is not None
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
-            self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
-            self.keeper.check(settings.render.resume)
-        self.tasks: Tasks | None = loop_of(scene, self.wave, self.eager, threads) if compiled else None
+            self.checkpoint_file = CheckpointFile(settings.render.checkpoint, identity(scene, settings, params, dtype))
+            self.checkpoint_file.check(settings.render.resume)
+        self.tasks: Tasks | None = kernel_engine(scene, self.wave, self.eager, threads) if compiled else None
         self.engine: Forward = self._by_tensors() if self.tasks is None else self.tasks
         rows = self.engine.rows(self.seen)
         how = "compiled" if self.engine.compiled else "eager"
@@ -103,9 +110,9 @@ class Run:
             loading = max(scene.peak, built - meter.base() if built > before else 0)
             check_memory(limit, self.device, self.need.least, loading)
             if self.engine.compiled:
-                self.engine.budget.fit(self.need.left(limit, meter.above()), 4 * rows, FEWEST_OF_LOOP)
+                self.engine.budget.fit(self.need.left(limit, meter.above()), 4 * rows, FEWEST_OF_KERNELS)
         films = mb(self.need.films)
-        retried(lambda: f"films of {self.width} x {self.height} pixels, which take {films}", self._begin)
+        retry_out_of_memory(lambda: f"films of {self.width} x {self.height} pixels, which take {films}", self._begin)
         self._compiled = self.compile_seconds()
         self.build_seconds = time.perf_counter() - self.start - self._compiled
 
@@ -124,28 +131,31 @@ class Run:
             name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()
         }
         self.picture = PixelSet(film, layers, streams)
-        self.twice = error_probes(self.wave, self.settings, device) if self.settings.pilots else None
+        self.probes = error_probes(self.wave, self.settings, device) if self.settings.pilots else None
         self.tally, self.done, self.left, self.taken, self.ended = RayCounts(), 0, 0, 0, False
-        self._keeps_no_more = False  # what follows is done again by whoever goes on
+        self._final_checkpoint_written = False  # what follows is done again by whoever goes on
         self.cut = False  # whether a round of adaptive sampling was shortened
         self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
         bounded = self.keeps or self.split is not None  # a rank that is gone is noticed after a pass
-        self.stop = Stop(self.settings.render, streams.count, EVERY if bounded else None)
-        if self.twice is not None:
-            self.stop.after = self.twice.looks(self.width * self.height)
+        self.stop = StopRules(self.settings.render, streams.count, EVERY if bounded else None)
+        if self.probes is not None:
+            self.stop.after = self.probes.resampling_share(self.width * self.height)
         if self.split is not None:
             self.split.begin()
         self.lost = NonFinite()
-        self._unlooked: tuple[dict[str, Any], Tensor] = {}, torch.empty(0)  # counted before pixels were looked at again
+        self._before_resampling: tuple[dict[str, Any], Tensor] = (
+            {},
+            torch.empty(0),
+        )  # counted before pixels were looked at again
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
         self.begun: float | None = None
 
-    def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
+    def sample_all(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, or as many as the rules or ``on_progress`` let."""
         self.on_progress = on_progress
         self.stop.watched = on_progress is not None or self.settings.adaptive or self.keeps or self.split is not None
         try:
-            with needing("a render"):
+            with explain_out_of_memory("a render"):
                 self._all()
                 self._join()
         except LostRankError as error:
@@ -154,34 +164,34 @@ class Run:
             raise LostRankError(f"{error}; render.resume=true goes on from the last checkpoint") from None
         return self._final()
 
-    def at_once(self) -> list[tuple[PixelSet, int, int]] | None:
-        """All samples, to be handed to :meth:`took` as they come, and then :meth:`completed`.
+    def all_spans(self) -> list[tuple[PixelSet, int, int]] | None:
+        """All samples, to be handed to :meth:`task_finished` as they come, and then :meth:`finish`.
 
         None where that cannot be: there are no kernels, something but their number may end them, or memory is bounded.
         """
-        ends = self.keeps or self.stop.open or self.twice is not None or self.split is not None
+        ends = self.keeps or self.stop.open or self.probes is not None or self.split is not None
         if self.tasks is None or ends or self.settings.render.max_memory is not None:
             return None
         self.begun = time.perf_counter()
         return [(self.picture, 0, self.settings.render.spp)]
 
-    def completed(self, rest: list[Block]) -> Rendering:
+    def finish(self, rest: list[Block]) -> Rendering:
         """The picture of samples that were taken at once, but for the blocks for which there was no memory."""
-        with needing("a render"):
+        with explain_out_of_memory("a render"):
             if self.unsupported is not None:
-                self._eagerly(self.unsupported)
+                self._restart_by_tensors(self.unsupported)
             else:
                 if rest:
                     assert self.tasks is not None
-                    self.tasks.take_rest(rest, self.took)
+                    self.tasks.retry_blocks(rest, self.task_finished)
                 self.taken = self.settings.render.spp
                 self.stop.told(self.taken, self.seconds_of_sampling(), None)
         return self._final()
 
     def _final(self) -> Rendering:
-        loaded("compiled" if self.engine.compiled else "eager")
-        self.engine.dismiss(keeps=self.settings.render.max_memory is None)
-        return final(self)
+        mark_loaded("compiled" if self.engine.compiled else "eager")
+        self.engine.release_workers(keeps=self.settings.render.max_memory is None)
+        return finished_rendering(self)
 
     def _all(self) -> None:
         """All samples, by tensor operations where there can be no kernels."""
@@ -190,9 +200,9 @@ class Run:
         except Unsupported as error:
             if not self.engine.compiled:
                 raise
-            self._eagerly(error)
+            self._restart_by_tensors(error)
 
-    def _eagerly(self, error: Unsupported) -> None:
+    def _restart_by_tensors(self, error: Unsupported) -> None:
         """All samples, once more, by tensor operations.
 
         Raises:
@@ -215,16 +225,16 @@ class Run:
         self._sample()
         self._join()
         if not self.ended:
-            self._look_again()
+            self._resample_outliers()
 
-    def _look_again(self) -> None:
+    def _resample_outliers(self) -> None:
         """Sample what it takes to know the picture's error better, unless that was done with as many samples."""
-        if self.twice is None or self.twice.looked == self._mean():
+        if self.probes is None or self.probes.resampled_at == self._mean():
             return
-        self._unlooked = self._counted()
-        again = self.twice.resample_outliers(self.picture.film, None if self.split is None else self.split.places)
+        self._before_resampling = self._counted()
+        again = self.probes.resample_outliers(self.picture.film, None if self.split is None else self.split.places)
         if not self._take(again):
-            self.twice.third = None
+            self.probes.resampled = None
         self._join()
 
     def _sample(self) -> None:
@@ -234,8 +244,8 @@ class Run:
             if self.settings.adaptive:  # the first round is the same whatever spp and the seconds of a pass
                 size = min(size, FIRST_ROUND - self.taken)
             spans = [(self.picture, self.taken, size)]
-            if self.twice is not None:
-                spans.append((self.twice.pixel_set, self.taken, size))
+            if self.probes is not None:
+                spans.append((self.probes.pixel_set, self.taken, size))
             if not self._take(spans):
                 return
             self.taken += size
@@ -248,29 +258,31 @@ class Run:
 
     def _adapts(self) -> bool:
         """Return True where pilots say from now on where samples go."""
-        return self.twice is not None and self.settings.adaptive and self.taken >= FIRST_ROUND
+        return self.probes is not None and self.settings.adaptive and self.taken >= FIRST_ROUND
 
     def _adapt(self) -> None:
         """Rounds that double the samples there are, each where pilots say."""
-        assert self.twice is not None
+        assert self.probes is not None
         self._join()
-        shares = Shares(self.twice.pilots, self.picture.film, None if self.split is None else self.split.places)
+        allocation = SampleAllocation(
+            self.probes.pilots, self.picture.film, None if self.split is None else self.split.places
+        )
         mean = self._mean()
-        while self.stop.going(mean):
-            wish = min(2.0 * mean, float(self.settings.render.spp)) - mean
-            more = self.stop.affordable(wish)
-            last = more == wish and more < mean and mean + more >= self.settings.render.spp
-            spans = shares.spans(self.picture, self.twice, mean + more, last)
+        while self.stop.should_continue(mean):
+            requested = min(2.0 * mean, float(self.settings.render.spp)) - mean
+            more = self.stop.affordable(requested)
+            last = more == requested and more < mean and mean + more >= self.settings.render.spp
+            spans = allocation.spans(self.picture, self.probes, mean + more, last)
             if not spans:  # a sample of one block's pixels is more than what is left
-                self.stop.reason = "spp" if more == wish else "time_limit"
+                self.stop.reason = "spp" if more == requested else "time_limit"
                 break
             if last and SMALL_ROUND * more < mean and not self.cut:  # quickly done again, and then for any spp
                 self._keep(last=True)
-                self._keeps_no_more = True
+                self._final_checkpoint_written = True
             self.cut |= more < mean
             whole = self._take(spans)
             self._join()
-            shares.put_back()
+            allocation.merge()
             if not whole:
                 break
             mean = self._mean()
@@ -283,34 +295,36 @@ class Run:
         """Return all that samples are added to, by name."""
         films = {"picture": self.picture.film}
         films |= {f"layers.{name}": film for name, film in self.picture.layers.items()}
-        return films if self.twice is None else films | {"pilots": self.twice.pixel_set.film}
+        return films if self.probes is None else films | {"pilots": self.probes.pixel_set.film}
 
     def _keep(self, last: bool = False) -> None:
         """Write a checkpoint where it is time for one."""
-        if not self.keeps or self._keeps_no_more:
+        if not self.keeps or self._final_checkpoint_written:
             return
-        due = self.keeper is not None and (last or self.keeper.due())
+        due = self.checkpoint_file is not None and (last or self.checkpoint_file.due())
         if due if self.split is None else self.split.due(due):
             self._join()
-            if self.keeper is not None:
-                self._write(self.keeper)
+            if self.checkpoint_file is not None:
+                self._write(self.checkpoint_file)
 
-    def _write(self, keeper: Keeper) -> None:
+    def _write(self, checkpoint_file: CheckpointFile) -> None:
         """Write a checkpoint; where that fails the render goes on, as its picture may have a better place."""
         try:
-            keeper.write(self._state())
+            checkpoint_file.write(self._state())
         except OutputError as problem:
             if not self.warned:
                 print(f"torchpt: {problem}; the render goes on without it", file=sys.stderr, flush=True)
             self.warned = True
 
-    def _state(self) -> State:
+    def _state(self) -> RenderState:
         """Return where the render is."""
-        looked = self.twice is not None and self.twice.looked == self._mean()  # whoever goes on looks once more
-        counted, light = self._unlooked if looked else self._counted()
+        resampled_at = (
+            self.probes is not None and self.probes.resampled_at == self._mean()
+        )  # whoever goes on looks once more
+        counted, light = self._before_resampling if resampled_at else self._counted()
         facts = {"taken": self.taken, "seconds": self.seconds_of_sampling(), "cut": int(self.cut), **counted}
         arrays = {f"{name}.{key}": value for name, film in self.films().items() for key, value in film.state().items()}
-        return State(facts, arrays | {"light": light})
+        return RenderState(facts, arrays | {"light": light})
 
     def _counted(self) -> tuple[dict[str, Any], Tensor]:
         """Return what is counted beside the films, by name, and the light before and after the clamp."""
@@ -325,9 +339,9 @@ class Run:
         """Go on from the checkpoint, where that is wished and there is one."""
         if not self.keeps or not self.settings.render.resume:
             return
-        state = None if self.keeper is None else self._kept(self.keeper)
-        if state is None and self.keeper is not None:
-            warn_once(f"torchpt: there is no checkpoint {self.keeper.path} yet: the render starts anew")
+        state = None if self.checkpoint_file is None else self._kept(self.checkpoint_file)
+        if state is None and self.checkpoint_file is not None:
+            warn_once(f"torchpt: there is no checkpoint {self.checkpoint_file.path} yet: the render starts anew")
         if self.split is not None:
             state = self.split.state(state, self._state())
         if state is None:
@@ -341,27 +355,27 @@ class Run:
         mean = self._mean() if self._adapts() else self.taken
         self._reached(mean, self.before)
 
-    def _kept(self, keeper: Keeper) -> State | None:
+    def _kept(self, checkpoint_file: CheckpointFile) -> RenderState | None:
         """Return the checkpoint, once it is known to be one that this render can go on from; None where there is none."""
-        state = keeper.read(self._state(), lambda state: check_samples(self, state, keeper.path))
+        state = checkpoint_file.read(self._state(), lambda state: check_samples(self, state, checkpoint_file.path))
         if state is not None:
-            check_whole(self, state, keeper.path)
+            check_plausible(self, state, checkpoint_file.path)
         return state
 
     def _reached(self, mean: float, seconds: float) -> None:
         """Tell the rules what was reached; where ranks share a render, as the first one sees it."""
         if self.settings.render.target_error is not None:
             self._join()
-        error = self._by_pilots() if self.stop.asks(mean, self._adapts()) else None
+        error = self._probe_error_bound() if self.stop.checks_error(mean, self._adapts()) else None
         if self.split is not None:
-            seconds, error = self.split.decide(seconds, error)
+            seconds, error = self.split.broadcast_numbers(seconds, error)
         target = self.settings.render.target_error
         if error is not None and target is not None and error <= target:
-            error = self._certain()
+            error = self._error_bound()
             if self.split is not None:
-                _, error = self.split.decide(seconds, error)
+                _, error = self.split.broadcast_numbers(seconds, error)
             if (error is None or error > target) and not self.ended:
-                self._forget_look()
+                self._undo_resampling()
         self.stop.told(mean, seconds, error)
 
     def _join(self) -> None:
@@ -369,25 +383,25 @@ class Run:
         if self.split is not None:
             self.split.join()
 
-    def _by_pilots(self) -> float:
+    def _probe_error_bound(self) -> float:
         """The relMSE that pilots alone hold possible: the upper end of its interval."""
-        assert self.twice is not None
-        return _most(self.twice.alone(self.picture.film))
+        assert self.probes is not None
+        return _upper_bound(self.probes.probe_estimate(self.picture.film))
 
-    def _certain(self) -> float:
+    def _error_bound(self) -> float:
         """The relMSE that the picture itself holds possible, once suspects were looked at again; it takes some samples."""
-        assert self.twice is not None
-        self._look_again()
-        known, unknown = known_of(self, self.twice.picture(self.picture.film))
-        return math.inf if self.ended or unknown else _most(known)
+        assert self.probes is not None
+        self._resample_outliers()
+        estimate, unknown = error_estimate_of(self, self.probes.picture(self.picture.film))
+        return math.inf if self.ended or unknown else _upper_bound(estimate)
 
-    def _forget_look(self) -> None:
+    def _undo_resampling(self) -> None:
         """Count as if no pixel had been looked at again: the picture gets more samples, and will be then."""
-        assert self.twice is not None
-        counts, self.light = self._unlooked
+        assert self.probes is not None
+        counts, self.light = self._before_resampling
         self.done, self.tally = counts["done"], RayCounts(counts["rays"], counts["truncated"])
         self.lost = NonFinite.read(counts["lost"])
-        self.twice.third, self.twice.looked = None, None
+        self.probes.resampled, self.probes.resampled_at = None, None
 
     def geometry(self) -> Geometry:
         """The primitives as the search sees them."""
@@ -403,11 +417,11 @@ class Run:
 
     def compile_seconds(self) -> float:
         """Since the start, for kernels: those of stages, and others that a first call makes, such as those of searches."""
-        return self._kernels + self.engine.seconds + compile_time.seconds() - self._others
+        return self._kernels + self.engine.seconds + compile_time.seconds() - self._compiled_before
 
     def write_seconds(self) -> float:
         """For checkpoints."""
-        return 0.0 if self.keeper is None else self.keeper.seconds
+        return 0.0 if self.checkpoint_file is None else self.checkpoint_file.seconds
 
     # -- how they are taken
 
@@ -426,9 +440,9 @@ class Run:
     def take_alone(self, spans: list[tuple[PixelSet, int, int]]) -> bool:
         """The same by this process alone."""
         self.left = sum(pixel_set.film.width * pixel_set.film.height * samples for pixel_set, _, samples in spans)
-        return self.engine.run(spans, self.took)
+        return self.engine.run(spans, self.task_finished)
 
-    def took(self, share: Share | None) -> bool:
+    def task_finished(self, share: TaskResult | None) -> bool:
         """Count what a task brought; returns whether the render is to stop."""
         if share is None:
             return self._advanced(0, False)
@@ -449,9 +463,9 @@ class Run:
         before, ranks = self.shared  # the others are about as far
         done = before + ranks * (self.done - before)
         state = Progress(done, max(self._total(), done), self.tally.rays, seconds, ends, self.result)
-        wish = bool(self.on_progress(state))
+        requested = bool(self.on_progress(state))
         if samples or ranks > 1 or self.split is None:  # between passes ranks do not part
-            self.ended = wish and self.done < self.asked()
+            self.ended = requested and self.done < self.asked()
         return self.ended
 
     def _total(self) -> int:
@@ -463,7 +477,7 @@ class Run:
 
     def asked(self) -> int:
         """Camera samples that ``render.spp`` comes to."""
-        pixels = self.width * self.height + (0 if self.twice is None else len(self.twice.pilots))
+        pixels = self.width * self.height + (0 if self.probes is None else len(self.probes.pilots))
         return pixels * self.settings.render.spp
 
     def _count(self, lost: NonFinite) -> None:
@@ -507,5 +521,5 @@ def render_scene(
         OutputError: a checkpoint that cannot be written, or that is there although nobody wishes to go on from it.
     """
     with without_autocast(scene.device), limited_threads(settings.render.threads):
-        with together(ranks, "what is rendered", lambda: stamp(scene, settings, params, dtype)):
-            return Run(scene, settings, params, dtype, group=ranks, rays=rays).go(on_progress)
+        with together(ranks, "what is rendered", lambda: render_fingerprint(scene, settings, params, dtype)):
+            return Run(scene, settings, params, dtype, group=ranks, rays=rays).sample_all(on_progress)

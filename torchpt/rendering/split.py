@@ -20,22 +20,22 @@ from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts
 from torchpt.physics.film import Film
 from torchpt.ranks import Group, dealt
-from torchpt.rendering.checkpoint import State
+from torchpt.rendering.checkpoint import RenderState
 from torchpt.scene import Scene
 from torchpt.scene.fingerprint import fingerprints
-from torchpt.scene.settings import Settings, having
+from torchpt.scene.settings import Settings, settings_with
 from torchpt.spec import Role
 
 if TYPE_CHECKING:
     from torchpt.rendering.run import Run
 
-__all__ = ["Span", "Split", "stamp"]
+__all__ = ["DistributedRender", "Span", "render_fingerprint"]
 
 #: A plate, its first sample and how many.
 Span = tuple[PixelSet, int, int]
 
 
-class Split:
+class DistributedRender:
     """This rank's part in a render.
 
     Args:
@@ -65,7 +65,7 @@ class Split:
         except Unsupported as error:
             reason = str(error) or "unsupported"
         own = run.done - done, run.tally.rays - rays, run.tally.truncated - truncated, run.lost.count
-        every = self.group.agree("a pass", *own, run.ended, bool(reason))
+        every = self.group.all_gather_numbers("a pass", *own, run.ended, bool(reason))
         if any(failed for *_, failed in every):
             raise Unsupported(reason or "what another rank met")
         run.done, run.shared = done + sum(int(n) for n, *_ in every), (0, 1)
@@ -88,20 +88,20 @@ class Split:
                 self._join(film, own)
         self._parts.clear()
 
-    def decide(self, seconds: float, error: float | None) -> tuple[float, float | None]:
+    def broadcast_numbers(self, seconds: float, error: float | None) -> tuple[float, float | None]:
         """Seconds and an error as the first rank has them."""
-        seconds, known, error_there = self.group.decide("seconds", seconds, error is not None, error or 0.0)
+        seconds, known, error_there = self.group.broadcast_numbers("seconds", seconds, error is not None, error or 0.0)
         return seconds, error_there if known else None
 
     def due(self, due: bool) -> bool:
         """Return True where the first rank is to write a checkpoint."""
-        return bool(self.group.decide("a checkpoint", due)[0])
+        return bool(self.group.broadcast_numbers("a checkpoint", due)[0])
 
     def places(self, own: Tensor) -> Tensor:
         """Whole numbers that the first rank computed; those of another kind of processor may round otherwise."""
         return self.group.first(own)
 
-    def state(self, own: State | None, like: State) -> State | None:
+    def state(self, own: RenderState | None, like: RenderState) -> RenderState | None:
         """Return what the first rank read from a checkpoint, which is ``like`` a state of this render; None: nothing."""
         text = "" if own is None else json.dumps(own.facts)
         sent = bytes(self.group.first(torch.tensor(list(text.encode()), dtype=torch.uint8)).tolist())
@@ -111,7 +111,7 @@ class Split:
         for name, value in like.arrays.items():
             values = value if own is None else own.arrays[name]
             arrays[name] = self.group.first(values.reshape(-1)).view(value.shape)
-        return State(json.loads(sent), arrays)
+        return RenderState(json.loads(sent), arrays)
 
     def _part(self, pixel_set: PixelSet) -> PixelSet:
         """The pixels of a plate that are this rank's."""
@@ -152,9 +152,11 @@ def _films(pixel_set: PixelSet) -> list[Film]:
     return [pixel_set.film, *pixel_set.layers.values()]
 
 
-def stamp(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype) -> bytes:
+def render_fingerprint(
+    scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
+) -> bytes:
     """Return a hash of what ranks must have in common to render one picture."""
-    free = having(Role.FREE, but=Role.FILES)  # upon files ranks must agree all the same
+    free = settings_with(Role.FREE, but=Role.FILES)  # upon files ranks must agree all the same
     free["render"] = (*free["render"], "device")
     own = settings.integrator if settings.integrator.foreign else None
     return tree.fingerprint((__version__, settings.plain(free), own, fingerprints(scene, params), dtype))

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from torchpt.scene.settings import Render
 
-__all__ = ["BLOCK", "Stop"]
+__all__ = ["BLOCK", "StopRules"]
 
 #: A pass never holds more samples a pixel than this.
 LARGEST_PASS = 64
@@ -31,7 +31,7 @@ FADING = 0.75
 
 
 @dataclass
-class Stop:
+class StopRules:
     """The rules of one render.
 
     Attributes:
@@ -59,7 +59,7 @@ class Stop:
         """Whether something else than the number of samples may end it."""
         return bool(self.render.stops)
 
-    def asks(self, taken: float, adaptive: bool = False) -> bool:
+    def checks_error(self, taken: float, adaptive: bool = False) -> bool:
         """Whether an error may end the render at so many samples a pixel; adaptive rounds are few, so each may."""
         if self.render.target_error is None or taken < FEWEST:
             return False
@@ -114,7 +114,7 @@ class Stop:
                 return 0
         return min(size, left)
 
-    def going(self, mean: float) -> bool:
+    def should_continue(self, mean: float) -> bool:
         """Whether adaptive sampling goes on, at so many samples a pixel."""
         if not self.reason and mean >= self.render.spp:
             self.reason = "spp"

@@ -14,20 +14,20 @@ from torch import Tensor
 from torchpt.core.errors import AssetError
 from torchpt.images import colour, metrics, read_image
 from torchpt.images.metrics import relative
-from torchpt.reports.runs import Curve, Job, Measured, Run, Truth, film_size, from_file, from_runs
+from torchpt.reports.runs import Curve, Job, Measured, ReferencePicture, Run, film_size, from_file, from_runs
 from torchpt.reports.statistics import Estimate, Fit, estimate, f_tail, fit, t_quantile
 from torchpt.reports.study import ERRORS, Extra, Study, denoised_label
 
 __all__ = [
     "SIGNIFICANCE",
-    "Line",
+    "BiasTest",
+    "ErrorCurve",
+    "SceneReport",
     "Step",
-    "Topic",
-    "Verdict",
     "analyse",
-    "bias_of",
+    "bias_test",
     "check_files",
-    "common_levels",
+    "common_targets",
     "error_map",
     "measures",
     "mse",
@@ -60,7 +60,7 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
-class Verdict:
+class BiasTest:
     """What the test found.
 
     Attributes:
@@ -93,37 +93,42 @@ def tiles(image: Tensor, count: int) -> Tensor:
     return sums / torch.bincount(cells, minlength=count * count)
 
 
-def bias_of(runs: Sequence[Tensor], truth: Truth, more: float = 0.0) -> Verdict:
+def bias_test(runs: Sequence[Tensor], reference: ReferencePicture, more: float = 0.0) -> BiasTest:
     """Test independent pictures ``(H, W, 3)`` of one setting against their reference.
 
     Args:
         runs: two or more.
-        truth: the reference; a file without variances is taken to be exact.
+        reference: the reference; a file without variances is taken to be exact.
         more: how many times the samples of all runs together the reference has, where that is known: it has seen rare bright
             paths of which the runs may have had none, so the runs' variance is not believed to be less than its own at as
             many samples.
     """
-    high, wide = truth.image.shape[:2]
+    high, wide = reference.image.shape[:2]
     grids = [count for count in _GRIDS if count == 1 or min(high, wide) >= 2 * count]
     chances: list[float] = []
     for known_by in (0.0, more):
-        sides = [_compared(torch.stack([tiles(x, n) for x in runs]), *_known(truth, n), known_by) for n in grids]
-        found = [chance for side in sides[1:] for chance in _of_squares(side)] + _of_sums(sides[0], sides[-1])
+        sides = [
+            _difference(torch.stack([tiles(x, n) for x in runs]), *_reference_tiles(reference, n), known_by)
+            for n in grids
+        ]
+        found = [chance for side in sides[1:] for chance in _p_values_of_f(side)] + _p_values_of_means(
+            sides[0], sides[-1]
+        )
         chances = [max(pair) for pair in zip(chances, found, strict=True)] if chances else found
     chance = min(1.0, min(chances) * len(chances))
     stack = torch.stack(list(runs))
     mean, variance = stack.mean(0), stack.var(0) / len(runs)
-    squared = float((((mean - truth.image).square() - variance - truth.variance) * truth.weight).mean())
-    return Verdict(chance < SIGNIFICANCE, chance, squared, *_share(runs, truth))
+    squared = float((((mean - reference.image).square() - variance - reference.variance) * reference.weight).mean())
+    return BiasTest(chance < SIGNIFICANCE, chance, squared, *_share(runs, reference))
 
 
-def _known(truth: Truth, count: int) -> tuple[Tensor, Tensor, float]:
+def _reference_tiles(reference: ReferencePicture, count: int) -> tuple[Tensor, Tensor, float]:
     """Tiles of the reference, the variance of each, and its degrees of freedom."""
-    if len(truth.runs) > 1:
-        own = torch.stack([tiles(run, count) for run in truth.runs])
+    if len(reference.runs) > 1:
+        own = torch.stack([tiles(run, count) for run in reference.runs])
         return own.mean(0), own.var(0) / len(own), len(own) - 1.0
-    pixels = truth.image[..., 0].numel() / count**2
-    return tiles(truth.image, count), tiles(truth.variance, count) / pixels, math.inf
+    pixels = reference.image[..., 0].numel() / count**2
+    return tiles(reference.image, count), tiles(reference.variance, count) / pixels, math.inf
 
 
 @dataclass(frozen=True)
@@ -136,7 +141,7 @@ class _Side:
     weight: Tensor
 
 
-def _compared(own: Tensor, reference: Tensor, known: Tensor, freedom: float, more: float) -> _Side:
+def _difference(own: Tensor, reference: Tensor, known: Tensor, freedom: float, more: float) -> _Side:
     """``own`` is ``(runs, C, tiles)``; with ``more`` the variance is all the reference's."""
     count, rounding = len(own), (_ROUNDING * reference.abs()).square()
     if more > 0:
@@ -149,7 +154,7 @@ def _compared(own: Tensor, reference: Tensor, known: Tensor, freedom: float, mor
     return _Side(own.mean(0) - reference, total, freedoms, relative(1.0, reference))
 
 
-def _of_squares(side: _Side) -> list[float]:
+def _p_values_of_f(side: _Side) -> list[float]:
     """The chance of each channel's F."""
     found = []
     for x, u, d, w in zip(side.away, side.variance, side.freedom, side.weight, strict=True):
@@ -164,7 +169,7 @@ def _of_squares(side: _Side) -> list[float]:
     return found
 
 
-def _of_sums(whole: _Side, fine: _Side) -> list[float]:
+def _p_values_of_means(whole: _Side, fine: _Side) -> list[float]:
     """The chance of each channel's mean over the picture.
 
     Its variance is known twice: from how the runs' means spread, by few degrees of freedom, and from tiles, by many, where
@@ -186,15 +191,19 @@ def _freedom(parts: Tensor, freedom: Tensor) -> float:
     return min(float(parts.sum().square() / (parts.square() / freedom).sum().clamp_min(1e-300)), 1e5)
 
 
-def _share(runs: Sequence[Tensor], truth: Truth) -> tuple[float, float, float]:
+def _share(runs: Sequence[Tensor], reference: ReferencePicture) -> tuple[float, float, float]:
     """How much too bright the whole is, relative, with its interval (Welch)."""
     own = torch.stack([run.mean() for run in runs])
-    light = float(truth.image.mean())
+    light = float(reference.image.mean())
     if not light > 0:
         return 0.0, 0.0, 0.0
     spread = float(own.var()) / len(own)
-    made = torch.stack([run.mean() for run in truth.runs]) if len(truth.runs) > 1 else None
-    known = float(made.var()) / len(made) if made is not None else float(truth.variance.mean()) / truth.image.numel()
+    made = torch.stack([run.mean() for run in reference.runs]) if len(reference.runs) > 1 else None
+    known = (
+        float(made.var()) / len(made)
+        if made is not None
+        else float(reference.variance.mean()) / reference.image.numel()
+    )
     share = float(own.mean()) / light - 1.0
     total = spread + known
     if total == 0:
@@ -211,30 +220,30 @@ def _share(runs: Sequence[Tensor], truth: Truth) -> tuple[float, float, float]:
 # and taken off, so that what is left is the picture's own error (and may, by chance, be negative where that is small).
 
 
-def error_map(image: Tensor, truth: Truth) -> Tensor:
+def error_map(image: Tensor, reference: ReferencePicture) -> Tensor:
     """``(x - r)² / (r² + 0.01)``, the mean of the channels: ``(H, W)``."""
-    return metrics.error_map("relmse", image, truth.image)
+    return metrics.error_map("relmse", image, reference.image)
 
 
-def relmse(image: Tensor, truth: Truth) -> float:
+def relmse(image: Tensor, reference: ReferencePicture) -> float:
     """Relative mean squared error without the reference's part."""
-    return float((((image - truth.image).square() - truth.variance) * truth.weight).mean())
+    return float((((image - reference.image).square() - reference.variance) * reference.weight).mean())
 
 
-def relmse_trimmed(image: Tensor, truth: Truth) -> float:
+def relmse_trimmed(image: Tensor, reference: ReferencePicture) -> float:
     """The same without the 0.1 % of pixels that are furthest off (rounded down)."""
-    found, own = error_map(image, truth).flatten(), (truth.variance * truth.weight).mean(-1).flatten()
+    found, own = error_map(image, reference).flatten(), (reference.variance * reference.weight).mean(-1).flatten()
     if not torch.isfinite(found).all():
         return math.nan
     return float((found - own)[metrics.trimmed(found)].mean())
 
 
-def mse(image: Tensor, truth: Truth) -> float:
+def mse(image: Tensor, reference: ReferencePicture) -> float:
     """Mean squared error without the reference's part."""
-    return float(((image - truth.image).square() - truth.variance).mean())
+    return float(((image - reference.image).square() - reference.variance).mean())
 
 
-_SQUARED: dict[str, Callable[[Tensor, Truth], float]] = {
+_SQUARED: dict[str, Callable[[Tensor, ReferencePicture], float]] = {
     "relmse": relmse,
     "relmse_trimmed": relmse_trimmed,
     "mse": mse,
@@ -242,23 +251,23 @@ _SQUARED: dict[str, Callable[[Tensor, Truth], float]] = {
 _SHOWN = ("psnr", "ssim")
 
 
-def measures(image: Tensor, truth: Truth, names: tuple[str, ...], film: Any) -> Mapping[str, float]:
+def measures(image: Tensor, reference: ReferencePicture, names: tuple[str, ...], film: Any) -> Mapping[str, float]:
     """The measures by name; NaN where one has no value, as SSIM of a picture smaller than its window.
 
     Args:
         image: ``(H, W, 3)`` float64, linear.
-        truth: the reference.
+        reference: the reference.
         names: which.
         film: how a screen shows it (exposure, tonemap, gamma): what PSNR and SSIM look at.
     """
     found: dict[str, float] = {}
-    plain = shown = image, truth.image
+    plain = shown = image, reference.image
     if set(_SHOWN) & set(names):
-        shown = colour.display(image, film.exposure, film.tonemap, film.gamma), truth.shown(film)
+        shown = colour.display(image, film.exposure, film.tonemap, film.gamma), reference.shown(film)
     for name in names:
         pair = shown if name in _SHOWN else plain
         try:
-            found[name] = _SQUARED[name](image, truth) if name in _SQUARED else metrics.METRICS[name](*pair)
+            found[name] = _SQUARED[name](image, reference) if name in _SQUARED else metrics.METRICS[name](*pair)
         except ValueError:
             found[name] = math.nan
     return found
@@ -271,7 +280,7 @@ def measures(image: Tensor, truth: Truth, names: tuple[str, ...], film: Any) -> 
 _NOISY = 0.5
 #: Measures that take longer than many a run, and hardly differ from one to the next: of the first run of a step only, but
 #: where curves show them.
-_DEAR = ("flip",)
+_EXPENSIVE = ("flip",)
 #: Runs of fewer seconds are mostly beginning and end.
 _SHORT = 0.05
 #: How far a line is followed: the logarithm of a ratio of times to the first step's.
@@ -317,13 +326,13 @@ class Step:
 
 
 @dataclass
-class Line:
+class ErrorCurve:
     """A curve of the report.
 
     Attributes:
         label: what it is called.
         steps: in the order of time.
-        truth: what it is compared with.
+        reference: what it is compared with.
         measured: whether these are runs of a study; else pictures that others made.
         settings: complete, of a study's runs.
         of: the curve whose runs' pictures these are, denoised; else None. They are guesses: no slope, no efficiency.
@@ -336,10 +345,10 @@ class Line:
 
     label: str
     steps: list[Step]
-    truth: Truth
+    reference: ReferencePicture
     measured: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
-    of: Line | None = None
+    of: ErrorCurve | None = None
     look: int = 0
     by_spp: Fit | None = None
     by_seconds: Fit | None = None
@@ -363,7 +372,7 @@ class Line:
             "measured": self.measured,
             "denoised": self.of is not None,
             "settings": self.settings,
-            "reference": {**self.truth.told, "relmse": self.truth.noise},
+            "reference": {**self.reference.origin, "relmse": self.reference.noise},
             "slope_over_spp": asdict(self.by_spp.slope) if self.by_spp else None,
             "slope_over_seconds": asdict(self.by_seconds.slope) if self.by_seconds else None,
             "bias": self.bias,
@@ -388,7 +397,7 @@ def _step_plain(step: Step) -> dict[str, Any]:
 
 
 @dataclass
-class Topic:
+class SceneReport:
     """A scene of the report.
 
     Attributes:
@@ -400,7 +409,7 @@ class Topic:
     """
 
     name: str
-    lines: list[Line]
+    lines: list[ErrorCurve]
     film: Any
     targets: list[float] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -413,74 +422,79 @@ def check_files(study: Study, prepared: Sequence[Measured]) -> None:
         AssetError: one that cannot be used.
     """
     for measured in prepared:
-        for size in {film_size(curve.job.wishes) for curve in measured.curves}:
+        for size in {film_size(curve.job.settings) for curve in measured.curves}:
             if measured.name in study.reference.files:
                 from_file(study.reference.files[measured.name], size)
         for extra in study.extras:
             if extra.scene == measured.name:
-                _picture(extra, film_size(measured.curves[0].job.wishes))
+                _picture(extra, film_size(measured.curves[0].job.settings))
 
 
-def analyse(study: Study, measured: Measured) -> Topic:
+def analyse(study: Study, measured: Measured) -> SceneReport:
     """All figures of one scene."""
-    names, first = study.asked["metrics"], measured.curves[0]
-    truths: dict[str, Truth] = {}
+    names, first = study.options["metrics"], measured.curves[0]
+    truths: dict[str, ReferencePicture] = {}
 
-    def truth_of(curve: Curve) -> Truth:
-        key = str(curve.truths[0].file) if curve.truths else repr(film_size(curve.job.wishes))
+    def truth_of(curve: Curve) -> ReferencePicture:
+        key = str(curve.truths[0].file) if curve.truths else repr(film_size(curve.job.settings))
         if key not in truths:
             file = study.reference.files.get(measured.name, "")
-            truths[key] = from_runs(curve.truths) if curve.truths else from_file(file, film_size(curve.job.wishes))
+            truths[key] = from_runs(curve.truths) if curve.truths else from_file(file, film_size(curve.job.settings))
         return truths[key]
 
-    topic = Topic(measured.name, [], first.job.wishes.film)
+    scene_report = SceneReport(measured.name, [], first.job.settings.film)
     for curve in measured.curves:
         line = _line(curve.variant.label, curve.job, curve.steps, truth_of(curve), names)
-        topic.lines.append(line)
+        scene_report.lines.append(line)
         if curve.denoised is not None:
             label = denoised_label(line.label)
-            topic.lines.append(_line(label, curve.denoised, curve.denoised_steps, line.truth, names, line))
-    topic.lines += _extra_lines(study, measured, truth_of(first), names)
-    for look, line in enumerate(line for line in topic.lines if line.of is None):
+            scene_report.lines.append(_line(label, curve.denoised, curve.denoised_steps, line.reference, names, line))
+    scene_report.lines += _extra_lines(study, measured, truth_of(first), names)
+    for look, line in enumerate(line for line in scene_report.lines if line.of is None):
         line.look = look
-    for line in topic.lines:
+    for line in scene_report.lines:
         line.look = line.look if line.of is None else line.of.look
     main = names[0]
-    topic.targets = list(study.asked["target"] or common_levels(topic.lines, main))
-    for line in topic.lines:
-        _fits(line, main, topic.targets)
-    topic.notes = _notes(topic, main)
-    return topic
+    scene_report.targets = list(study.options["target"] or common_targets(scene_report.lines, main))
+    for line in scene_report.lines:
+        _fits(line, main, scene_report.targets)
+    scene_report.notes = _notes(scene_report, main)
+    return scene_report
 
 
 def _line(
     label: str,
     job: Job,
     steps_of: Mapping[int, Sequence[Run]],
-    truth: Truth,
+    reference: ReferencePicture,
     names: tuple[str, ...],
-    of: Line | None = None,
-) -> Line:
-    film, steps = job.wishes.film, []
+    of: ErrorCurve | None = None,
+) -> ErrorCurve:
+    film, steps = job.settings.film, []
     images: list[Tensor] = []
     for spp, runs in steps_of.items():
         images = [run.image() for run in runs]
-        steps.append(_step(spp, runs, images, truth, names, film))
+        steps.append(_step(spp, runs, images, reference, names, film))
         if of is not None:
             steps[-1].variance = []  # a guess that varies little is not better for it
-    last, told = steps[-1], truth.told
-    more = told["spp"] * told["seeds"] / ((last.spp or 1) * len(images)) if told["made"] else 0.0
-    verdict = bias_of(images, truth, more)
-    return Line(label, steps, truth, settings=job.facts["settings"], of=of, bias=verdict.plain())
+    last, origin = steps[-1], reference.origin
+    more = origin["spp"] * origin["seeds"] / ((last.spp or 1) * len(images)) if origin["made"] else 0.0
+    verdict = bias_test(images, reference, more)
+    return ErrorCurve(label, steps, reference, settings=job.facts["settings"], of=of, bias=verdict.plain())
 
 
 def _step(
-    spp: int, runs: Sequence[Run], images: Sequence[Tensor], truth: Truth, names: tuple[str, ...], film: Any
+    spp: int,
+    runs: Sequence[Run],
+    images: Sequence[Tensor],
+    reference: ReferencePicture,
+    names: tuple[str, ...],
+    film: Any,
 ) -> Step:
-    cheap = tuple(name for name in names if name not in _DEAR or name == names[0])
-    found = [measures(image, truth, cheap if index else names, film) for index, image in enumerate(images)]
+    cheap = tuple(name for name in names if name not in _EXPENSIVE or name == names[0])
+    found = [measures(image, reference, cheap if index else names, film) for index, image in enumerate(images)]
     mean, count = torch.stack(list(images)).mean(0), len(images)
-    spread = [float(((image - mean).square() * truth.weight).mean()) * count / (count - 1) for image in images]
+    spread = [float(((image - mean).square() * reference.weight).mean()) * count / (count - 1) for image in images]
     return Step(
         spp,
         median(run.seconds for run in runs),
@@ -493,16 +507,18 @@ def _step(
     )
 
 
-def _extra_lines(study: Study, measured: Measured, truth: Truth, names: tuple[str, ...]) -> list[Line]:
+def _extra_lines(
+    study: Study, measured: Measured, reference: ReferencePicture, names: tuple[str, ...]
+) -> list[ErrorCurve]:
     """Other renderers' pictures: those of one name are one curve, of one time one step."""
-    film, lines = measured.curves[0].job.wishes, {}
+    film, lines = measured.curves[0].job.settings, {}
     for extra in sorted(study.extras, key=lambda extra: extra.seconds):
         if extra.scene != measured.name:
             continue
         image = _picture(extra, film_size(film))
-        found = measures(torch.nan_to_num(image, 0.0, 0.0, 0.0), truth, names, film.film)
+        found = measures(torch.nan_to_num(image, 0.0, 0.0, 0.0), reference, names, film.film)
         bad = int((~torch.isfinite(image)).any(-1).sum())
-        line = lines.setdefault(extra.name, Line(extra.name, [], truth, measured=False))
+        line = lines.setdefault(extra.name, ErrorCurve(extra.name, [], reference, measured=False))
         step = next((s for s in line.steps if s.seconds == extra.seconds and s.spp == extra.spp), None)
         if step is None:
             step = Step(extra.spp, extra.seconds, {name: [] for name in names}, 0)
@@ -526,7 +542,7 @@ def _picture(extra: Extra, size: tuple[int, int]) -> Tensor:
     return image.double()
 
 
-def common_levels(lines: Sequence[Line], main: str) -> tuple[float, ...]:
+def common_targets(lines: Sequence[ErrorCurve], main: str) -> tuple[float, ...]:
     """An error that all measured curves without bias come down to: the least of the worst of them."""
     measured = [line for line in lines if line.estimates]
     lines = [line for line in measured if not (line.bias and line.bias["biased"])] or measured
@@ -534,7 +550,7 @@ def common_levels(lines: Sequence[Line], main: str) -> tuple[float, ...]:
     return (float(f"{max(least):.2g}"),) if least and max(least) > 0 else ()
 
 
-def _fits(line: Line, main: str, targets: Sequence[float]) -> None:
+def _fits(line: ErrorCurve, main: str, targets: Sequence[float]) -> None:
     """Slopes over samples and seconds, and when the curve reaches each target: of denoised ones only within their runs."""
     values = [step.errors[main] for step in line.steps]
     if all(step.spp for step in line.steps):
@@ -542,18 +558,18 @@ def _fits(line: Line, main: str, targets: Sequence[float]) -> None:
     line.by_seconds = fit([step.seconds for step in line.steps], values)
     for target in targets:
         found = line.by_seconds.reach(math.log(target)) if line.by_seconds else None
-        told: dict[str, Any] = {"error": target, "seconds": None}
+        origin: dict[str, Any] = {"error": target, "seconds": None}
         if found is not None:
             place, beyond = found
             inside = abs(place.mean - math.log(line.steps[0].seconds)) < _FARTHEST
             if beyond and line.of is not None:  # no line tells how a guess goes on
                 pass
             elif beyond and line.floor >= target:  # it never gets there
-                told["never"] = True
+                origin["never"] = True
             elif inside or not beyond:
                 bounds = [None if x is None else _exp(x) for x in (place.mean, place.low, place.high)]
-                told |= dict(zip(("seconds", "low", "high"), bounds, strict=True)) | {"extrapolated": beyond}
-        line.times.append(told)
+                origin |= dict(zip(("seconds", "low", "high"), bounds, strict=True)) | {"extrapolated": beyond}
+        line.times.append(origin)
     if line.of is not None:
         line.by_spp = line.by_seconds = None
 
@@ -562,28 +578,30 @@ def _exp(x: float) -> float | None:
     return math.exp(x) if x < 700 else None
 
 
-def _notes(topic: Topic, main: str) -> list[str]:
+def _notes(scene_report: SceneReport, main: str) -> list[str]:
     notes = []
-    least = min((e.mean for line in topic.lines for s in line.steps if (e := s.estimate(main)).mean > 0), default=0.0)
-    noise = max(line.truth.noise for line in topic.lines)
+    least = min(
+        (e.mean for line in scene_report.lines for s in line.steps if (e := s.estimate(main)).mean > 0), default=0.0
+    )
+    noise = max(line.reference.noise for line in scene_report.lines)
     if main.startswith("relmse") and noise > _NOISY * least:
         notes.append(
             f"The reference is noisy: its own relMSE is {noise:.2g}, the least error here {least:.2g}. "
             "A larger reference.spp or reference.seeds narrows the bands."
         )
-    shortest = min(step.seconds for line in topic.lines if line.measured for step in line.steps)
+    shortest = min(step.seconds for line in scene_report.lines if line.measured for step in line.steps)
     if shortest < _SHORT:
         notes.append(
             f"The shortest runs take {1e3 * shortest:.2g} ms, of which a part is the same for any number of samples: "
             "slopes over seconds come out too steep. A larger film, or steps of more samples, tell more."
         )
-    told = topic.lines[0].truth.told
-    if not told["made"] and not told["variance"]:
+    origin = scene_report.lines[0].reference.origin
+    if not origin["made"] and not origin["variance"]:
         notes.append(
             "The reference file says nothing of its variance, so it is taken to be exact; its noise counts as error."
         )
-    drowned = [line.label for line in topic.lines if any(s.estimate(main).mean <= 0 for s in line.steps)]
-    if any(line.of is not None for line in topic.lines):
+    drowned = [line.label for line in scene_report.lines if any(s.estimate(main).mean <= 0 for s in line.steps)]
+    if any(line.of is not None for line in scene_report.lines):
         notes.append(
             "Denoised pictures are guesses: they are biased by an amount that falls with samples by no known law. So their "
             "curves have no slope and no efficiency, and no time to an error beyond their runs."

@@ -17,12 +17,12 @@ from torch import Tensor
 
 from torchpt.images import colour
 from torchpt.images.false_colour import MAP, false_colour
-from torchpt.reports import words
-from torchpt.reports.analysis import Line, Step, Topic, error_map
+from torchpt.reports import formatting
+from torchpt.reports.analysis import ErrorCurve, SceneReport, Step, error_map
 from torchpt.reports.plots import COLOURS, NAMES
 from torchpt.reports.study import Study
 
-__all__ = ["Figure", "Panel", "Sheet", "hardest", "page", "sheet_of", "step_near"]
+__all__ = ["Figure", "ImageStrip", "Panel", "closest_step", "largest_errors", "page", "sheet_of"]
 
 
 # ---- Pictures of the report: at equal time, where errors are largest, and maps of the errors
@@ -45,14 +45,14 @@ class Panel:
         errors: PNG of the map.
     """
 
-    line: Line
+    line: ErrorCurve
     step: Step
     crop: bytes
     errors: bytes
 
 
 @dataclass
-class Sheet:
+class ImageStrip:
     """A scene's pictures.
 
     Attributes:
@@ -74,12 +74,12 @@ class Sheet:
     scale: tuple[float, float]
 
 
-def step_near(line: Line, seconds: float) -> Step:
+def closest_step(line: ErrorCurve, seconds: float) -> Step:
     """The step of a curve whose time is nearest, as a ratio."""
     return min(line.steps, key=lambda step: abs(math.log(step.seconds / seconds)))
 
 
-def hardest(errors: Tensor, side: int) -> tuple[int, int]:
+def largest_errors(errors: Tensor, side: int) -> tuple[int, int]:
     """Where a square of ``side`` pixels holds most error: x and y of its corner in a map ``(H, W)``.
 
     Errors count by their root, so that a single firefly does not choose.
@@ -89,29 +89,29 @@ def hardest(errors: Tensor, side: int) -> tuple[int, int]:
     return place % sums.shape[1], place // sums.shape[1]
 
 
-def sheet_of(topic: Topic) -> Sheet | None:
+def sheet_of(scene_report: SceneReport) -> ImageStrip | None:
     """The pictures of all curves that have the first one's film, at the longest time that each of them has.
 
     Denoised ones have no say in where the crop lies.
     """
-    truth, film = topic.lines[0].truth, topic.film
-    lines = [line for line in topic.lines if line.truth.image.shape == truth.image.shape]
+    reference, film = scene_report.lines[0].reference, scene_report.film
+    lines = [line for line in scene_report.lines if line.reference.image.shape == reference.image.shape]
     seconds = min(line.steps[-1].seconds for line in lines)
-    chosen = [step_near(line, seconds) for line in lines]
+    chosen = [closest_step(line, seconds) for line in lines]
     images = [torch.nan_to_num(step.pictures[0](), 0.0, 0.0, 0.0) for step in chosen]
-    maps = [error_map(image, line.truth) for image, line in zip(images, lines, strict=True)]
+    maps = [error_map(image, line.reference) for image, line in zip(images, lines, strict=True)]
     high, wide = maps[0].shape
     side = min(max(min(high, wide) // _PART, _LEAST), _MOST, high, wide)
     rendered = [found for found, line in zip(maps, lines, strict=True) if line.of is None]
-    x, y = hardest(torch.stack(rendered).mean(0), side)
+    x, y = largest_errors(torch.stack(rendered).mean(0), side)
     smaller = [_reduced(found) for found in maps]
     scale = _scale(smaller)
     panels = [
         Panel(line, step, _png(_shown(image[y : y + side, x : x + side], film)), _png(_coloured(found, scale)))
         for line, step, image, found in zip(lines, chosen, images, smaller, strict=True)
     ]
-    whole, crop = _png(_shown(truth.image, film)), _png(_shown(truth.image[y : y + side, x : x + side], film))
-    return Sheet(seconds, (x, y, side, side), whole, crop, (wide, high), panels, scale)
+    whole, crop = _png(_shown(reference.image, film)), _png(_shown(reference.image[y : y + side, x : x + side], film))
+    return ImageStrip(seconds, (x, y, side, side), whole, crop, (wide, high), panels, scale)
 
 
 def _shown(image: Tensor, film: Any) -> np.ndarray:
@@ -162,13 +162,17 @@ Figure = tuple[bytes, bytes]
 
 
 def page(
-    study: Study, topics: Sequence[Topic], sheets: Sequence[Sheet | None], plots: Sequence[dict[str, Figure]], made: str
+    study: Study,
+    scene_reports: Sequence[SceneReport],
+    sheets: Sequence[ImageStrip | None],
+    plots: Sequence[dict[str, Figure]],
+    made: str,
 ) -> str:
     """The text of ``report.html``.
 
     Args:
         study: what was asked.
-        topics: a scene each.
+        scene_reports: a scene each.
         sheets: their pictures.
         plots: their figures: ``seconds``, ``spp`` (where there is one) and ``measures``.
         made: when and on what.
@@ -176,38 +180,40 @@ def page(
     template = (Path(__file__).parent / "report.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
     return environment.from_string(template).render(
-        title=study.asked["title"],
+        title=study.options["title"],
         made=made,
         ramp=_ramp(),
-        scenes=[_scene(study, *parts) for parts in zip(topics, sheets, plots, strict=True)],
+        scenes=[_scene(study, *parts) for parts in zip(scene_reports, sheets, plots, strict=True)],
         method=_method(study),
-        settings=_settings(topics),
+        settings=_settings(scene_reports),
     )
 
 
-def _scene(study: Study, topic: Topic, sheet: Sheet | None, plots: dict[str, Figure]) -> dict[str, Any]:
-    names = study.asked["metrics"]
-    main, most = NAMES[names[0]], words.count(study.asked["spp"][-1])
-    columns = ["Setting", *(f"Time to {main} {words.number(target, 2)}" for target in topic.targets)]
+def _scene(
+    study: Study, scene_report: SceneReport, sheet: ImageStrip | None, plots: dict[str, Figure]
+) -> dict[str, Any]:
+    names = study.options["metrics"]
+    main, most = NAMES[names[0]], formatting.count(study.options["spp"][-1])
+    columns = ["Setting", *(f"Time to {main} {formatting.number(target, 2)}" for target in scene_report.targets)]
     columns += [f"{main} at {most} samples", "Slope over samples", "Efficiency", "Bias", "Not finite"]
     return {
-        "name": topic.name,
-        "about": _about(topic),
-        "headline": _headline(topic, main),
-        "notes": topic.notes,
+        "name": scene_report.name,
+        "about": _about(scene_report),
+        "headline": _headline(scene_report, main),
+        "notes": scene_report.notes,
         "columns": columns,
-        "rows": [_row(topic, line, names[0]) for line in topic.lines],
+        "rows": [_row(scene_report, line, names[0]) for line in scene_report.lines],
         "plots": [_plot(plots[over], f"{main} over {over}") for over in ("seconds", "spp") if over in plots],
         "overview": _plot(plots["measures"], "all measures over seconds") if "measures" in plots else None,
         "sheet": None if sheet is None else _sheet(sheet, names[0]),
         "step_columns": ["Setting", "Samples", "Time", *(NAMES[name] for name in names), "Efficiency"],
-        "step_rows": [_step_row(line, step, names) for line in topic.lines for step in line.steps],
+        "step_rows": [_step_row(line, step, names) for line in scene_report.lines for step in line.steps],
     }
 
 
-def _headline(topic: Topic, main: str) -> str:
+def _headline(scene_report: SceneReport, main: str) -> str:
     """Who is first, and by how much, among settings without bias; or that the runs do not tell."""
-    able = [line for line in topic.lines if line.estimates and not (line.bias and line.bias["biased"])]
+    able = [line for line in scene_report.lines if line.estimates and not (line.bias and line.bias["biased"])]
     lines = sorted(
         (line for line in able if line.times and line.times[-1]["seconds"]), key=lambda line: line.times[-1]["seconds"]
     )
@@ -215,24 +221,27 @@ def _headline(topic: Topic, main: str) -> str:
     if len(timed) < 2:
         return ""
     (least, first), (_, second), (most, last) = timed[0], timed[1], timed[-1]
-    aim, (high, low) = words.number(topic.targets[-1], 2), (lines[0].times[-1]["high"], lines[1].times[-1]["low"])
+    aim, (high, low) = (
+        formatting.number(scene_report.targets[-1], 2),
+        (lines[0].times[-1]["high"], lines[1].times[-1]["low"]),
+    )
     if high is None or low is None or high >= low:
         return f"Which comes to {main} {aim} first, {first} or {second}, these runs do not tell: more would."
-    text = f"{first} comes to {main} {aim} first, in {words.seconds(least)}: "
-    text += f"{words.times(timed[1][0] / least)} as fast as {second}"
-    return f"{text}." if len(timed) == 2 else f"{text}, {words.times(most / least)} as fast as {last}."
+    text = f"{first} comes to {main} {aim} first, in {formatting.seconds(least)}: "
+    text += f"{formatting.times(timed[1][0] / least)} as fast as {second}"
+    return f"{text}." if len(timed) == 2 else f"{text}, {formatting.times(most / least)} as fast as {last}."
 
 
-def _about(topic: Topic) -> str:
-    truth = topic.lines[0].truth
-    high, wide = truth.image.shape[:2]
+def _about(scene_report: SceneReport) -> str:
+    reference = scene_report.lines[0].reference
+    high, wide = reference.image.shape[:2]
     size = f"{wide} × {high} pixels."
-    if not truth.told["made"]:
-        return f"{size} Reference: {truth.told['file']}."
-    told, spp = truth.told, words.count(truth.told["spp"])
+    if not reference.origin["made"]:
+        return f"{size} Reference: {reference.origin['file']}."
+    origin, spp = reference.origin, formatting.count(reference.origin["spp"])
     return (
-        f"{size} Reference: the mean of {told['seeds']} independent runs of {spp} samples a pixel "
-        f"({words.seconds(told['seconds'])} in all); its own relMSE, {words.number(truth.noise, 2)}, is taken off."
+        f"{size} Reference: the mean of {origin['seeds']} independent runs of {spp} samples a pixel "
+        f"({formatting.seconds(origin['seconds'])} in all); its own relMSE, {formatting.number(reference.noise, 2)}, is taken off."
     )
 
 
@@ -240,43 +249,47 @@ def _cell(text: str, *small: str, tone: str = "") -> dict[str, Any]:
     return {"text": text, "small": [line for line in small if line], "tone": tone}
 
 
-def _row(topic: Topic, line: Line, main: str) -> dict[str, Any]:
-    cells = [_time_cell(topic, line, number) for number in range(len(topic.targets))]
+def _row(scene_report: SceneReport, line: ErrorCurve, main: str) -> dict[str, Any]:
+    cells = [_time_cell(scene_report, line, number) for number in range(len(scene_report.targets))]
     last = line.steps[-1]
     found = last.estimate(main)
-    cells.append(_cell(words.number(found.mean), words.interval(found)))
+    cells.append(_cell(formatting.number(found.mean), formatting.interval(found)))
     slope = line.by_spp.slope if line.by_spp else None
-    cells.append(_cell("–") if slope is None else _cell(words.number(slope.mean), words.interval(slope)))
-    cells.append(_efficiency_cell(topic, line))
+    cells.append(_cell("–") if slope is None else _cell(formatting.number(slope.mean), formatting.interval(slope)))
+    cells.append(_efficiency_cell(scene_report, line))
     cells.append(_bias_cell(line))
     bad = sum(step.nonfinite for step in line.steps)
-    cells.append(_cell(words.count(bad), tone="bad" if bad else ""))
+    cells.append(_cell(formatting.count(bad), tone="bad" if bad else ""))
     colour, marks = COLOURS[line.look % len(COLOURS)], _MARKS if line.of is None else _HOLLOW
     return {"label": line.label, "mark": marks[line.look % len(marks)], "colour": colour, "cells": cells}
 
 
-def _time_cell(topic: Topic, line: Line, number: int) -> dict[str, Any]:
-    told, first = line.times[number], topic.lines[0].times[number]
-    if told.get("never"):
+def _time_cell(scene_report: SceneReport, line: ErrorCurve, number: int) -> dict[str, Any]:
+    origin, first = line.times[number], scene_report.lines[0].times[number]
+    if origin.get("never"):
         return _cell("never", "its bias is larger", tone="bad")
-    if told["seconds"] is None:
+    if origin["seconds"] is None:
         return _cell("–", "too far to tell" if line.by_seconds else "beyond its runs" if line.of else "")
-    parts = [words.span(told["low"], told["high"]), "extrapolated" if told["extrapolated"] else ""]
-    if line is not topic.lines[0] and first["seconds"]:
-        ratio = first["seconds"] / told["seconds"]
-        parts.insert(0, f"{words.times(max(ratio, 1 / ratio))} {'faster' if ratio >= 1 else 'slower'}")
-    return _cell(words.seconds(told["seconds"]), *parts)
+    parts = [formatting.span(origin["low"], origin["high"]), "extrapolated" if origin["extrapolated"] else ""]
+    if line is not scene_report.lines[0] and first["seconds"]:
+        ratio = first["seconds"] / origin["seconds"]
+        parts.insert(0, f"{formatting.times(max(ratio, 1 / ratio))} {'faster' if ratio >= 1 else 'slower'}")
+    return _cell(formatting.seconds(origin["seconds"]), *parts)
 
 
-def _efficiency_cell(topic: Topic, line: Line) -> dict[str, Any]:
-    found, first = line.steps[-1].efficiency(), topic.lines[0].steps[-1].efficiency()
+def _efficiency_cell(scene_report: SceneReport, line: ErrorCurve) -> dict[str, Any]:
+    found, first = line.steps[-1].efficiency(), scene_report.lines[0].steps[-1].efficiency()
     if found is None:
         return _cell("–")
-    ratio = f"{words.times(found.mean / first.mean)} that of the first" if first and line is not topic.lines[0] else ""
-    return _cell(words.number(found.mean), words.interval(found), ratio)
+    ratio = (
+        f"{formatting.times(found.mean / first.mean)} that of the first"
+        if first and line is not scene_report.lines[0]
+        else ""
+    )
+    return _cell(formatting.number(found.mean), formatting.interval(found), ratio)
 
 
-def _bias_cell(line: Line) -> dict[str, Any]:
+def _bias_cell(line: ErrorCurve) -> dict[str, Any]:
     if line.bias is None:
         return _cell("–", "one picture")
     share = f"light {100 * line.bias['share']:+.2g} %".replace("-", "−")
@@ -291,23 +304,25 @@ def _chance(value: float) -> str:
     return "< 0.0001" if value < 1e-4 else f"= {value:.2g}"
 
 
-def _step_row(line: Line, step: Any, names: Sequence[str]) -> list[dict[str, Any]]:
+def _step_row(line: ErrorCurve, step: Any, names: Sequence[str]) -> list[dict[str, Any]]:
     cells = [
         _cell(line.label),
-        _cell("–" if step.spp is None else words.count(step.spp)),
-        _cell(words.seconds(step.seconds)),
+        _cell("–" if step.spp is None else formatting.count(step.spp)),
+        _cell(formatting.seconds(step.seconds)),
     ]
     for name in names:
         found = step.estimate(name)
-        cells.append(_cell(words.number(found.mean), words.interval(found)))
+        cells.append(_cell(formatting.number(found.mean), formatting.interval(found)))
     efficiency = step.efficiency()
     return [
         *cells,
-        _cell("–") if efficiency is None else _cell(words.number(efficiency.mean), words.interval(efficiency)),
+        _cell("–")
+        if efficiency is None
+        else _cell(formatting.number(efficiency.mean), formatting.interval(efficiency)),
     ]
 
 
-def _sheet(sheet: Sheet, main: str) -> dict[str, Any]:
+def _sheet(sheet: ImageStrip, main: str) -> dict[str, Any]:
     x, y, wide, high = sheet.place
     across, down = sheet.size
     frame = "; ".join(
@@ -321,26 +336,26 @@ def _sheet(sheet: Sheet, main: str) -> dict[str, Any]:
     )
     panels = []
     for panel in sheet.panels:
-        samples = "" if panel.step.spp is None else f"{words.count(panel.step.spp)} samples, "
-        error = f"{NAMES[main]} {words.number(panel.step.errors[main][0])}"
+        samples = "" if panel.step.spp is None else f"{formatting.count(panel.step.spp)} samples, "
+        error = f"{NAMES[main]} {formatting.number(panel.step.errors[main][0])}"
         panels.append(
             {
                 "label": panel.line.label,
-                "caption": f"{samples}{words.seconds(panel.step.times[0])}, {error}",
+                "caption": f"{samples}{formatting.seconds(panel.step.times[0])}, {error}",
                 "crop": _data(panel.crop, "png"),
                 "errors": _data(panel.errors, "png"),
             }
         )
     return {
-        "about": f"Of every setting the run nearest to {words.seconds(sheet.seconds)}, where errors are largest: "
+        "about": f"Of every setting the run nearest to {formatting.seconds(sheet.seconds)}, where errors are largest: "
         f"{wide} × {high} pixels, enlarged. Times are told, since steps of samples do not meet exactly.",
         "whole": _data(sheet.whole, "png"),
         "crop": _data(sheet.crop, "png"),
         "side": 3 * wide,
         "frame": frame,
         "panels": panels,
-        "low": words.number(sheet.scale[0], 1),
-        "top": words.number(sheet.scale[1], 1),
+        "low": formatting.number(sheet.scale[0], 1),
+        "top": formatting.number(sheet.scale[1], 1),
     }
 
 
@@ -364,7 +379,7 @@ def _ramp() -> str:
 
 def _method(study: Study) -> list[str]:
     """What a reader must know to trust the figures."""
-    seeds, steps = study.asked["seeds"], ", ".join(map(words.count, study.asked["spp"]))
+    seeds, steps = study.options["seeds"], ", ".join(map(formatting.count, study.options["spp"]))
     denoised = (
         "Denoised curves, of loose dashes and hollow marks, show the pictures of the same runs, denoised by what first "
         "surfaces are like (albedo and normals). Their times are those of the runs with these layers, and of denoising."
@@ -381,17 +396,17 @@ def _method(study: Study) -> list[str]:
         "1 / (variance × seconds) at the largest step, the variance relative to the reference's square + 0.01.",
         "Bias: the mean of the runs of the largest step differs from the reference by more than the spread of both explains, "
         "with a chance of less than 0.1 % otherwise. A dotted line is the error at which such a curve ends.",
-        *((denoised,) if study.asked["denoise"] else ()),
+        *((denoised,) if study.options["denoise"] else ()),
     ]
 
 
-def _settings(topics: Sequence[Topic]) -> str:
+def _settings(scene_reports: Sequence[SceneReport]) -> str:
     """What ran, as a scene file would state it."""
     import yaml
 
     shown: dict[str, Any] = {}
-    for topic in topics:
-        shown[topic.name] = {line.label: _listed(line.settings) for line in topic.lines if line.estimates}
+    for scene_report in scene_reports:
+        shown[scene_report.name] = {line.label: _listed(line.settings) for line in scene_report.lines if line.estimates}
     return yaml.safe_dump(shown, sort_keys=False, allow_unicode=True, width=100)
 
 

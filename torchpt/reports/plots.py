@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from io import BytesIO
 from typing import Any
 
-from torchpt.reports.analysis import Line, Topic
+from torchpt.reports.analysis import ErrorCurve, SceneReport
 from torchpt.reports.study import ERRORS
 
 __all__ = ["COLOURS", "NAMES", "curves", "encoded", "overview"]
@@ -53,19 +53,19 @@ def _matplotlib() -> Any:
     return matplotlib
 
 
-def curves(topic: Topic, measure: str, over: str) -> Any:
+def curves(scene_report: SceneReport, measure: str, over: str) -> Any:
     """One figure: a measure over ``seconds`` or ``spp``, of every curve that has it."""
     matplotlib = _matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(_STYLE):
-        lines = [line for line in topic.lines if over == "seconds" or all(step.spp for step in line.steps)]
+        lines = [line for line in scene_report.lines if over == "seconds" or all(step.spp for step in line.steps)]
         rows = len(lines) + (1 if over == "spp" else 0)
         figure = Figure(figsize=(4.9, 3.4 + 0.23 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
-        for line in topic.lines:
+        for line in scene_report.lines:
             if line in lines:
                 _draw(axes, line, measure, over)
         if over == "spp":
@@ -81,7 +81,7 @@ def curves(topic: Topic, measure: str, over: str) -> Any:
     return figure
 
 
-def overview(topic: Topic, measures: Sequence[str]) -> Any:
+def overview(scene_report: SceneReport, measures: Sequence[str]) -> Any:
     """All measures over seconds, small, in one figure."""
     matplotlib = _matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -89,11 +89,11 @@ def overview(topic: Topic, measures: Sequence[str]) -> Any:
 
     with matplotlib.rc_context(_STYLE):
         rows = -(-len(measures) // 2)
-        figure = Figure(figsize=(7.2, 2.3 * rows + 0.21 * len(topic.lines)), layout="constrained")
+        figure = Figure(figsize=(7.2, 2.3 * rows + 0.21 * len(scene_report.lines)), layout="constrained")
         FigureCanvasAgg(figure)
         for place, measure in enumerate(measures):
             axes = figure.add_subplot(rows, 2, place + 1)
-            for line in topic.lines:
+            for line in scene_report.lines:
                 _draw(axes, line, measure, "seconds", slopes=False if place == 0 else None)
             _finish(axes, measure, "seconds")
             axes.set_title(NAMES[measure], loc="left", fontsize=10.0)
@@ -113,7 +113,7 @@ def encoded(figure: Any) -> tuple[bytes, bytes]:
     return png.getvalue(), svg.getvalue()
 
 
-def _points(line: Line, measure: str, over: str) -> list[tuple[float, float, float, float]]:
+def _points(line: ErrorCurve, measure: str, over: str) -> list[tuple[float, float, float, float]]:
     """x, mean, lower and upper bound of the steps that can be shown."""
     points = []
     for step in line.steps:
@@ -129,7 +129,7 @@ def _points(line: Line, measure: str, over: str) -> list[tuple[float, float, flo
     return points
 
 
-def _draw(axes: Any, line: Line, measure: str, over: str, slopes: bool | None = True) -> None:
+def _draw(axes: Any, line: ErrorCurve, measure: str, over: str, slopes: bool | None = True) -> None:
     """One curve; named in the legend with its slope, without it, or (None) not at all."""
     look, inside = line.look, "auto" if line.of is None else "white"
     colour, mark = COLOURS[look % len(COLOURS)], _MARKS[look % len(_MARKS)]
@@ -154,12 +154,12 @@ def _draw(axes: Any, line: Line, measure: str, over: str, slopes: bool | None = 
             axes.annotate("bias", (1.0, floor), fontsize=9, color=colour, **place)
 
 
-def _slope(line: Line, over: str) -> str:
+def _slope(line: ErrorCurve, over: str) -> str:
     found = line.by_seconds if over == "seconds" else line.by_spp
     return "" if found is None or found.slope.low is None else f"   slope {found.slope.mean:.2f}".replace("-", "−")
 
 
-def _guide(axes: Any, lines: Sequence[Line], measure: str) -> None:
+def _guide(axes: Any, lines: Sequence[ErrorCurve], measure: str) -> None:
     """How an unbiased estimate of independent samples falls."""
     points = [point for line in lines if line.of is None for point in _points(line, measure, "spp")]
     if measure not in ("relmse", "mse", "relmse_trimmed") or not points:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.core.version import __version__
-from torchpt.reports.analysis import Topic, analyse
+from torchpt.reports.analysis import SceneReport, analyse
 from torchpt.reports.page import Figure, page, sheet_of
 from torchpt.reports.plots import curves, encoded, overview
 from torchpt.reports.runs import Measured, machine, write_whole
@@ -20,7 +20,7 @@ from torchpt.spec.schema import ParsedParams
 __all__ = ["facts_of", "write_report"]
 
 
-def write_report(study: Study, measured: Sequence[Measured], folder: Path) -> list[Topic]:
+def write_report(study: Study, measured: Sequence[Measured], folder: Path) -> list[SceneReport]:
     """Work everything out and write the files.
 
     Args:
@@ -34,53 +34,57 @@ def write_report(study: Study, measured: Sequence[Measured], folder: Path) -> li
     Raises:
         OutputError: a file that cannot be written.
     """
-    topics = [analyse(study, scene) for scene in measured]
-    sheets = [sheet_of(topic) for topic in topics]
-    figures = [_figures(topic, study.asked["metrics"]) for topic in topics]
+    scene_reports = [analyse(study, scene) for scene in measured]
+    sheets = [sheet_of(scene_report) for scene_report in scene_reports]
+    figures = [_figures(scene_report, study.options["metrics"]) for scene_report in scene_reports]
     made = time.strftime("%Y-%m-%d %H:%M")
-    facts = json.dumps(plain(facts_of(study, topics, made)), indent=1, allow_nan=False)
+    facts = json.dumps(plain(facts_of(study, scene_reports, made)), indent=1, allow_nan=False)
     where = ", ".join(
         f"{value} {key}" if key in ("cores", "threads") else str(value) for key, value in machine().items()
     )
-    text = page(study, topics, sheets, figures, f"torchpt {__version__}, {made}, {where}")
+    text = page(study, scene_reports, sheets, figures, f"torchpt {__version__}, {made}, {where}")
     plots = folder / "plots"
     plots.mkdir(exist_ok=True)
-    for topic, found in zip(topics, figures, strict=True):
+    for scene_report, found in zip(scene_reports, figures, strict=True):
         for name, (png, svg) in found.items():
-            stem = re.sub(r"\W+", "_", Path(topic.name).stem if topic.name.endswith((".yaml", ".yml")) else topic.name)
+            stem = re.sub(
+                r"\W+",
+                "_",
+                Path(scene_report.name).stem if scene_report.name.endswith((".yaml", ".yml")) else scene_report.name,
+            )
             write_whole(plots / f"{stem}_{name}.png", png)
             write_whole(plots / f"{stem}_{name}.svg", svg)
     write_whole(folder / "report.json", facts.encode())
     write_whole(folder / "report.html", text.encode())
-    return topics
+    return scene_reports
 
 
-def _figures(topic: Topic, measures: tuple[str, ...]) -> dict[str, Figure]:
+def _figures(scene_report: SceneReport, measures: tuple[str, ...]) -> dict[str, Figure]:
     found = {
-        "seconds": encoded(curves(topic, measures[0], "seconds")),
-        "spp": encoded(curves(topic, measures[0], "spp")),
+        "seconds": encoded(curves(scene_report, measures[0], "seconds")),
+        "spp": encoded(curves(scene_report, measures[0], "spp")),
     }
     if len(measures) > 1:
-        found["measures"] = encoded(overview(topic, measures))
+        found["measures"] = encoded(overview(scene_report, measures))
     return found
 
 
-def facts_of(study: Study, topics: Sequence[Topic], made: str) -> dict[str, Any]:
+def facts_of(study: Study, scene_reports: Sequence[SceneReport], made: str) -> dict[str, Any]:
     """All that the report says, in plain values."""
-    asked = {key: value for key, value in study.asked.items() if key not in ("extra", "target")}
+    options = {key: value for key, value in study.options.items() if key not in ("extra", "target")}
     return {
         "torchpt": __version__,
         "made": made,
         "machine": machine(),
-        "study": {**asked, "scene": study.scenes},
+        "study": {**options, "scene": study.scenes},
         "scenes": [
             {
-                "scene": topic.name,
-                "targets": topic.targets,
-                "notes": topic.notes,
-                "curves": [line.plain() for line in topic.lines],
+                "scene": scene_report.name,
+                "targets": scene_report.targets,
+                "notes": scene_report.notes,
+                "curves": [line.plain() for line in scene_report.lines],
             }
-            for topic in topics
+            for scene_report in scene_reports
         ],
     }
 

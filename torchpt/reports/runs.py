@@ -29,20 +29,20 @@ from torchpt.reports.study import Study, Variant
 from torchpt.scene.devices import device_of
 from torchpt.scene.fingerprint import fingerprint as fingerprint_of
 from torchpt.scene.formats.description import Description, overridden, read_description
-from torchpt.scene.formats.overrides import told
+from torchpt.scene.formats.overrides import origin
 from torchpt.scene.prepare import SceneCache, scene_cache
 from torchpt.scene.scene import Scene
-from torchpt.scene.settings import Settings, having
+from torchpt.scene.settings import Settings, settings_with
 from torchpt.spec import Role
 
 __all__ = [
     "Curve",
     "Job",
     "Measured",
+    "ReferencePicture",
     "Run",
     "Stopped",
     "Store",
-    "Truth",
     "film_size",
     "from_file",
     "from_runs",
@@ -63,7 +63,7 @@ __all__ = [
 
 
 #: Rooms that no picture depends on.
-_ABOVE = ("reports", "commands", "cli/main.py", "__main__.py", "share")
+_WITHOUT_EFFECT = ("reports", "commands", "cli/main.py", "__main__.py", "share")
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def _source() -> str:
     hashed = hashlib.blake2b(digest_size=12)
     for path in sorted(root.rglob("*.py")):
         name = path.relative_to(root)
-        if name.parts[0] not in _ABOVE:
+        if name.parts[0] not in _WITHOUT_EFFECT:
             hashed.update(str(name).encode() + path.read_bytes())
     return hashed.hexdigest()
 
@@ -178,20 +178,20 @@ def _source() -> str:
 
 
 @dataclass(frozen=True)
-class Truth:
+class ReferencePicture:
     """What pictures are compared with.
 
     Attributes:
         image: ``(H, W, 3)`` float64.
         variance: of ``image`` by value, the same shape; 0 where nobody knows it.
         runs: the independent pictures ``(H, W, 3)`` that it is the mean of; empty for a file.
-        told: where it comes from, for the report.
+        origin: where it comes from, for the report.
     """
 
     image: Tensor
     variance: Tensor
     runs: tuple[Tensor, ...]
-    told: dict[str, Any]
+    origin: dict[str, Any]
 
     @cached_property
     def weight(self) -> Tensor:
@@ -216,21 +216,21 @@ class Truth:
         return float((self.variance * self.weight).mean())
 
 
-def from_runs(runs: Sequence[Run]) -> Truth:
+def from_runs(runs: Sequence[Run]) -> ReferencePicture:
     """The mean of independent runs; the variance of that mean is their spread over their number."""
     images = tuple(run.image() for run in runs)
     stack = torch.stack(images)
-    told = {
+    origin = {
         "made": True,
         "spp": runs[0].facts["spp"],
         "seeds": len(runs),
         "seconds": sum(run.seconds for run in runs),
         "settings": runs[0].facts["settings"],
     }
-    return Truth(stack.mean(0), stack.var(0) / len(runs), images, told)
+    return ReferencePicture(stack.mean(0), stack.var(0) / len(runs), images, origin)
 
 
-def from_file(path: str, size: tuple[int, int]) -> Truth:
+def from_file(path: str, size: tuple[int, int]) -> ReferencePicture:
     """A picture from a file; its layer ``variance`` (of the mean, as ``film.aovs=[variance]`` writes it) counts.
 
     Args:
@@ -255,7 +255,7 @@ def from_file(path: str, size: tuple[int, int]) -> Truth:
     variance = layers.get("variance")
     usable = variance is not None and variance.shape == image.shape and bool(torch.isfinite(variance).all())
     spread = variance.double().clamp_min(0.0) if variance is not None and usable else torch.zeros_like(image).double()
-    return Truth(image.double(), spread, (), {"made": False, "file": path, "variance": usable})
+    return ReferencePicture(image.double(), spread, (), {"made": False, "file": path, "variance": usable})
 
 
 # ---- The runs of a study: which there are, and how each is timed
@@ -270,8 +270,8 @@ def from_file(path: str, size: tuple[int, int]) -> Truth:
 
 #: Settings that no run depends on, or that each has its own of.
 _FREE = {
-    "film": (*having(Role.FREE)["film"], "aovs"),
-    "render": (*having(Role.FILES)["render"], "seed", "spp"),
+    "film": (*settings_with(Role.FREE)["film"], "aovs"),
+    "render": (*settings_with(Role.FILES)["render"], "seed", "spp"),
 }
 
 
@@ -294,14 +294,14 @@ class Job:
 
     Attributes:
         scene: loaded.
-        wishes: complete; spp and seed are set for each run.
+        settings: complete; spp and seed are set for each run.
         facts: what runs depend on, beside spp and seed.
         purpose: ``run`` or ``reference``: their seeds never meet.
         left: what its runs left for the next one: its kernels, while those of another setting are in the scene's hands.
     """
 
     scene: Scene
-    wishes: Settings
+    settings: Settings
     facts: dict[str, Any]
     purpose: str
     left: SceneCache | None = None
@@ -309,7 +309,7 @@ class Job:
     @property
     def pixels(self) -> int:
         """Of the picture."""
-        wide, high = film_size(self.wishes)
+        wide, high = film_size(self.settings)
         return wide * high
 
 
@@ -349,9 +349,9 @@ class Measured:
     curves: list[Curve]
 
 
-def film_size(wishes: Settings) -> tuple[int, int]:
+def film_size(settings: Settings) -> tuple[int, int]:
     """Width and height of the picture."""
-    film = wishes.film
+    film = settings.film
     return (film.width, film.height) if film.crop is None else film.crop[2:]
 
 
@@ -367,22 +367,22 @@ def prepare(study: Study) -> list[Measured]:
     Raises:
         TorchptError: a scene or setting that cannot be used; a denoiser that is wanted and not there.
     """
-    if study.asked["denoise"]:
+    if study.options["denoise"]:
         check_denoiser()
     found = []
     for name in study.scenes:
         known: dict[tuple[str, ...], tuple[Description, dict[str, tuple[Scene, str]]]] = {}
         curves = []
         for variant in study.variants:
-            words = told(variant.changes)
+            words = origin(variant.changes)
             if words not in known:
                 known[words] = read_description(name, overrides=variant.changes), {}
             description, loaded = known[words]
             curve = Curve(variant, _job(description, study.overrides(variant), loaded, "run"))
-            if study.asked["denoise"]:
+            if study.options["denoise"]:
                 curve.denoised = _denoised(curve.job)
             if not study.reference.files:
-                curve.reference = _job(description, study.truth(variant), loaded, "reference")
+                curve.reference = _job(description, study.reference_overrides(variant), loaded, "reference")
             curves.append(curve)
         found.append(Measured(name, curves))
     return found
@@ -394,25 +394,25 @@ def _job(
     loaded: dict[str, tuple[Scene, str]],
     purpose: str,
 ) -> Job:
-    description, wishes = overridden(description, overrides)
+    description, settings = overridden(description, overrides)
     # Such wishes of a scene are about files.
-    film, render = wishes.film.but(denoise=False, aovs=()), wishes.render.without(Role.FILES)
-    wishes = replace(wishes, film=film, render=render)
-    if not wishes.integrator.light:
-        raise SceneError("integrator.type", wishes.integrator.name, "an integrator that carries light")
-    device = str(device_of(wishes.render.device))
+    film, render = settings.film.but(denoise=False, aovs=()), settings.render.without(Role.FILES)
+    settings = replace(settings, film=film, render=render)
+    if not settings.integrator.light:
+        raise SceneError("integrator.type", settings.integrator.name, "an integrator that carries light")
+    device = str(device_of(settings.render.device))
     if device not in loaded:
         scene = Scene(description, device_of(device))
         loaded[device] = scene, fingerprint_of(scene)
     scene, named = loaded[device]
-    return Job(scene, wishes, {"scene": named, "device": device, "settings": wishes.plain(_FREE)}, purpose)
+    return Job(scene, settings, {"scene": named, "device": device, "settings": settings.plain(_FREE)}, purpose)
 
 
 def _denoised(job: Job) -> Job:
     """The same runs with the layers that the denoiser looks at."""
-    wishes = replace(job.wishes, film=job.wishes.film.but(denoise=True))
-    facts = {**job.facts, "settings": wishes.plain(_FREE), "denoiser": denoiser_version()}
-    return Job(job.scene, wishes, facts, job.purpose)
+    settings = replace(job.settings, film=job.settings.film.but(denoise=True))
+    facts = {**job.facts, "settings": settings.plain(_FREE), "denoiser": denoiser_version()}
+    return Job(job.scene, settings, facts, job.purpose)
 
 
 def measure(
@@ -432,7 +432,7 @@ def measure(
     Raises:
         Stopped: ``on_progress`` said so; finished runs are kept.
     """
-    wanted = _wanted(study, prepared)
+    wanted = _all_runs(study, prepared)
     names = [_name(job, spp, seed) for job, spp, seed, _ in wanted]
     missing = {name: job.pixels * spp for name, (job, spp, _, _) in zip(names, wanted, strict=True)}
     missing = {name: samples for name, samples in missing.items() if store.get(name) is None}
@@ -442,8 +442,8 @@ def measure(
         run = store.get(name)
         if run is None:
             if job is not latest:  # what it leaves is there for the runs that follow
-                _turn(latest, job)
-                thrown = _render(job, min(study.asked["spp"][0], spp), seed, clock, counts=False)
+                _swap_kernels(latest, job)
+                thrown = _render(job, min(study.options["spp"][0], spp), seed, clock, counts=False)
                 if not clock.stop:
                     _denoise(job, thrown)  # its first time takes longer too
                 latest = job
@@ -456,30 +456,30 @@ def measure(
         place.append(run)
 
 
-def _turn(latest: Job | None, job: Job) -> None:
+def _swap_kernels(latest: Job | None, job: Job) -> None:
     """Another setting's turn: a scene keeps the kernels of its latest render only, and making them anew takes seconds."""
     if latest is not None:
         latest.left = replace(scene_cache(latest.scene))
     if job.left is not None:
         keeper = scene_cache(job.scene)
-        keeper.kernels, keeper.first, keeper.dark = job.left.kernels, job.left.first, job.left.dark
+        keeper.kernels, keeper.first, keeper.without_lights = job.left.kernels, job.left.first, job.left.without_lights
 
 
 Wanted = tuple[Job, int, int, list[Run]]
 
 
-def _wanted(study: Study, prepared: list[Measured]) -> list[Wanted]:
+def _all_runs(study: Study, prepared: list[Measured]) -> list[Wanted]:
     """All runs in order, each with the list that it goes to."""
     found: list[Wanted] = []
     for measured in prepared:
-        for number in range(study.asked["seeds"]):
+        for number in range(study.options["seeds"]):
             for curve in measured.curves:
                 pairs = [(curve.job, curve.steps)]
                 if curve.denoised is not None:
                     pairs.append((curve.denoised, curve.denoised_steps))
                 for job, steps in pairs:
-                    for spp in study.asked["spp"]:
-                        seed = seed_of(study.asked["seed"], "run", spp, number)
+                    for spp in study.options["spp"]:
+                        seed = seed_of(study.options["seed"], "run", spp, number)
                         found.append((job, spp, seed, steps.setdefault(spp, [])))
         shared: dict[str, Job] = {}
         for curve in measured.curves:
@@ -487,7 +487,7 @@ def _wanted(study: Study, prepared: list[Measured]) -> list[Wanted]:
                 continue
             job = shared.setdefault(_name(curve.reference, 0, 0), curve.reference)
             for number in range(study.reference.seeds):
-                seed = seed_of(study.asked["seed"], "reference", study.reference.spp, number)
+                seed = seed_of(study.options["seed"], "reference", study.reference.spp, number)
                 found.append((job, study.reference.spp, seed, curve.truths))
     return found
 
@@ -497,8 +497,8 @@ def _name(job: Job, spp: int, seed: int) -> str:
 
 
 def _render(job: Job, spp: int, seed: int, clock: _Clock, counts: bool = True) -> Rendering:
-    wishes = replace(job.wishes, render=job.wishes.render.but(spp=spp, seed=seed))
-    rendering = render_scene(job.scene, wishes, on_progress=clock.watch if counts else clock.glance)
+    settings = replace(job.settings, render=job.settings.render.but(spp=spp, seed=seed))
+    rendering = render_scene(job.scene, settings, on_progress=clock.watch if counts else clock.glance)
     if counts:
         clock.passed(rendering)
     return rendering
@@ -506,7 +506,7 @@ def _render(job: Job, spp: int, seed: int, clock: _Clock, counts: bool = True) -
 
 def _denoise(job: Job, rendering: Rendering) -> float | None:
     """Denoise where that is wanted; returns the seconds that it took."""
-    return denoise_rendering(rendering, job.wishes) if job.wishes.film.denoise else None
+    return denoise_rendering(rendering, job.settings) if job.settings.film.denoise else None
 
 
 def _told(job: Job, spp: int, seed: int, rendering: Rendering, denoising: float | None) -> dict[str, Any]:

@@ -112,7 +112,7 @@ class Fit:
         away = (y - self.middle[1]) / slope
         x = self.middle[0] + away
         share = 1.0 / len(self.levels)
-        parts = [-(share + away * c) / slope for c in _pulls(self.levels)]  # derivative by each y
+        parts = [-(share + away * c) / slope for c in _slope_derivatives(self.levels)]  # derivative by each y
         falls = self.slope.high is not None and self.slope.high < 0  # else the line may never come down there
         spread = _combined(self.levels, parts) if falls else None
         beyond = not self.levels[0].x <= x <= self.levels[-1].x
@@ -141,14 +141,14 @@ def fit(xs: Sequence[float], values: Sequence[Sequence[float]]) -> Fit | None:
     if len(levels) < 2 or levels[0].x == levels[-1].x:
         return None
     middle = math.fsum(v.x for v in levels) / len(levels), math.fsum(v.y for v in levels) / len(levels)
-    pulls = _pulls(levels)
+    pulls = _slope_derivatives(levels)
     slope = math.fsum(c * v.y for c, v in zip(pulls, levels, strict=True))
     spread = _combined(levels, pulls)
     bounds = () if spread is None else (slope - spread, slope + spread)
     return Fit(Estimate(slope, *bounds), middle, tuple(levels))
 
 
-def _pulls(levels: Sequence[Level]) -> list[float]:
+def _slope_derivatives(levels: Sequence[Level]) -> list[float]:
     """The derivative of the slope by each level's y."""
     middle = math.fsum(v.x for v in levels) / len(levels)
     square = math.fsum((v.x - middle) ** 2 for v in levels)

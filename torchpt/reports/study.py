@@ -14,19 +14,19 @@ from torchpt.core.errors import SceneError
 from torchpt.core.files import configs
 from torchpt.images.metrics import METRICS
 from torchpt.scene.formats.yaml import plain, read_yaml
-from torchpt.scene.settings import BLOCKS, Render, having
-from torchpt.spec import Flag, Other, Refused, Role, Valued, Whole, parameters_of
-from torchpt.spec.schema import check_keys, values_of
+from torchpt.scene.settings import BLOCKS, Render, settings_with
+from torchpt.spec import Custom, Flag, FrozenConfig, Integer, Refused, Role, parameters_of
+from torchpt.spec.schema import check_keys, read_params
 
 __all__ = [
     "ERRORS",
     "LISTS",
     "MEASURES",
     "OWN_KEYS",
-    "RECORDS",
+    "UNTYPED_BLOCKS",
     "Extra",
-    "Plan",
     "Reference",
+    "ReferencePlan",
     "Study",
     "Variant",
     "blocks_of",
@@ -44,10 +44,14 @@ __all__ = [
 #: Settings whose value is a list: of these only a list of lists is an axis.
 LISTS = ("film.crop",)
 #: Settings that a study has its own way of saying, or that have no place in one.
-_TAKEN = {
-    **{f"render.{name}": "nothing: every run takes the samples that spp= says" for name in having(Role.ENDS)["render"]},
+_REFUSED = {
     **{
-        f"render.{name}": "nothing: a study that was stopped resumes by itself" for name in having(Role.FILES)["render"]
+        f"render.{name}": "nothing: every run takes the samples that spp= says"
+        for name in settings_with(Role.ENDS)["render"]
+    },
+    **{
+        f"render.{name}": "nothing: a study that was stopped resumes by itself"
+        for name in settings_with(Role.FILES)["render"]
     },
     "render.preview": "nothing: a study keeps every picture in its folder",
     "render.spp": "spp=[...], the steps of every curve",
@@ -105,8 +109,8 @@ def variants_of(
     """
     for key in settings:
         check_keys({key.partition(".")[0]: 0}, BLOCKS, "", "a study", file)
-        if key in _TAKEN:
-            raise SceneError(key, settings[key], _TAKEN[key], file)
+        if key in _REFUSED:
+            raise SceneError(key, settings[key], _REFUSED[key], file)
     axes = {key: _values(key, value, file) for key, value in settings.items() if _is_axis(key, value)}
     wide = tuple(key for key, values in axes.items() if len(values) > 1)
     swept = [key for key, values in changes.items() if len(_values(key, values, file)) > 1]
@@ -162,8 +166,8 @@ def blocks_of(settings: Mapping[str, Any], file: str | None) -> dict[str, dict[s
     for key, value in sorted(settings.items(), key=lambda item: item[0] not in BLOCKS):  # a group first
         if key in BLOCKS:
             blocks[key] = dict(value) if isinstance(value, Mapping) else _group(key, value, file)
-            if taken := next((name for name in blocks[key] if f"{key}.{name}" in _TAKEN), None):
-                raise SceneError(f"{key}.{taken}", blocks[key][taken], _TAKEN[f"{key}.{taken}"], file)
+            if taken := next((name for name in blocks[key] if f"{key}.{name}" in _REFUSED), None):
+                raise SceneError(f"{key}.{taken}", blocks[key][taken], _REFUSED[f"{key}.{taken}"], file)
             continue
         block, *inner, last = key.split(".")
         place = blocks.setdefault(block, {})
@@ -270,46 +274,46 @@ def _extras(value: Any) -> tuple[dict[str, Any], ...]:
     return tuple(dict(item) for item in _list(value))
 
 
-class Asked(Valued):
+class StudyOptions(FrozenConfig):
     """The keys that are the study's own, beside ``scene`` and ``reference``."""
 
     parameters: ClassVar = {
-        "spp": Other((4, 16, 64, 256), reader=_steps, words="growing numbers", doc="samples a pixel of each step"),
-        "seeds": Whole(5, low=2, high=1000, doc="independent runs of each step"),
+        "spp": Custom((4, 16, 64, 256), reader=_steps, words="growing numbers", doc="samples a pixel of each step"),
+        "seeds": Integer(5, low=2, high=1000, doc="independent runs of each step"),
         "seed": replace(parameters_of(Render)["seed"], doc="the seeds of all runs follow from it"),
-        "metrics": Other(
+        "metrics": Custom(
             ("relmse", "relmse_trimmed", "mse", "smape", "psnr", "ssim", "flip"),
             reader=_metrics,
             words="names of measures",
             doc="what is measured; curves show the first",
         ),
-        "target": Other(
+        "target": Custom(
             None, reader=_targets, words="errors > 0", doc="of the first measure: the time to reach them is told"
         ),
-        "extra": Other(
+        "extra": Custom(
             (), reader=_extras, words="a list of {name, seconds, file}", doc="other renderers' pictures, linear"
         ),
         "denoise": Flag(False, doc="beside every curve a second one, of the denoised pictures of its runs"),
-        "title": Other("Error against run time", reader=str, words="text", doc="of the page"),
+        "title": Custom("Error against run time", reader=str, words="text", doc="of the page"),
     }
 
 
-class Reference(Valued):
+class Reference(FrozenConfig):
     """How the reference is made, where it is no file."""
 
     parameters: ClassVar = {
-        "spp": Whole(None, low=1, doc="samples a pixel of each of its runs; 4 times the largest step"),
-        "seeds": Whole(8, low=2, high=1000, doc="independent runs that it is the mean of"),
+        "spp": Integer(None, low=1, doc="samples a pixel of each of its runs; 4 times the largest step"),
+        "seeds": Integer(8, low=2, high=1000, doc="independent runs that it is the mean of"),
     }
 
 
-OWN_KEYS = (*Asked.parameters, "scene", "reference", "overrides")
+OWN_KEYS = (*StudyOptions.parameters, "scene", "reference", "overrides")
 #: For the tables of the docs.
-RECORDS = {"study": Asked, "reference": Reference}
+UNTYPED_BLOCKS = {"study": StudyOptions, "reference": Reference}
 
 
 @dataclass(frozen=True)
-class Plan:
+class ReferencePlan:
     """How a reference comes about: of files, or by runs.
 
     Attributes:
@@ -332,7 +336,7 @@ class Study:
     Attributes:
         scenes: names or paths.
         variants: the grid.
-        asked: spp, seeds, seed, metrics, target, denoise, title.
+        options: spp, seeds, seed, metrics, target, denoise, title.
         extras: other renderers' pictures.
         reference: how it comes about.
         file: the study file.
@@ -340,16 +344,16 @@ class Study:
 
     scenes: tuple[str, ...]
     variants: tuple[Variant, ...]
-    asked: Any
+    options: Any
     extras: tuple[Extra, ...]
-    reference: Plan
+    reference: ReferencePlan
     file: str | None = None
 
     def overrides(self, variant: Variant) -> dict[str, dict[str, Any]]:
         """The variant's settings by block."""
         return blocks_of(variant.settings, self.file)
 
-    def truth(self, variant: Variant) -> dict[str, dict[str, Any]]:
+    def reference_overrides(self, variant: Variant) -> dict[str, dict[str, Any]]:
         """The settings of a variant's reference by block: what all share, its own film, no clamp; then what was asked."""
         own = {k: v for k, v in variant.settings.items() if k not in variant.axes or k.partition(".")[0] == "film"}
         return blocks_of({**own, "integrator.clamp": None, **self.reference.settings}, self.file)
@@ -414,12 +418,14 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
         raise SceneError(
             "scene", raw.get("scene"), "the name of a scene, a path ending in .yaml, or a list of them", file
         )
-    asked = values_of(Asked, {key: raw[key] for key in Asked.parameters if key in raw}, "", file, "a study")
-    if "flip" in asked["metrics"] and find_spec("flip_evaluator") is None:
-        if "metrics" in asked.given:
+    options = read_params(
+        StudyOptions, {key: raw[key] for key in StudyOptions.parameters if key in raw}, "", file, "a study"
+    )
+    if "flip" in options["metrics"] and find_spec("flip_evaluator") is None:
+        if "metrics" in options.given:
             expected = "measures that are there (flip: pip install '.[compare]' in the checkout of torchpt)"
-            raise SceneError("metrics", list(asked["metrics"]), expected, file)
-        asked.values["metrics"] = tuple(name for name in asked["metrics"] if name != "flip")
+            raise SceneError("metrics", list(options["metrics"]), expected, file)
+        options.values["metrics"] = tuple(name for name in options["metrics"] if name != "flip")
     settings: dict[str, Any] = {}
     for key, value in raw.items():
         if key not in OWN_KEYS and not key.startswith("reference."):
@@ -427,22 +433,22 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
     changes = raw.get("overrides") or {}
     variants = tuple(variants_of(settings, file, changes))
     labels = {variant.label for variant in variants}
-    labels |= {denoised_label(label) for label in labels if asked["denoise"]}
+    labels |= {denoised_label(label) for label in labels if options["denoise"]}
     extras = []
-    for index, item in enumerate(asked["extra"]):
+    for index, item in enumerate(options["extra"]):
         scene = item.get("scene", scenes[0] if len(scenes) == 1 else None)
         if scene not in scenes:
             raise SceneError(f"extra.{index}.scene", scene, f"one of {', '.join(scenes)}", file)
         if item["name"] in labels:
             raise SceneError(f"extra.{index}.name", item["name"], "a name that no curve has", file)
         extras.append(Extra(item["name"], float(item["seconds"]), item["file"], scene, item.get("spp")))
-    plan = _plan(raw.get("reference"), scenes, asked["spp"][-1], file)
+    plan = _plan(raw.get("reference"), scenes, options["spp"][-1], file)
     if plan.files and (several := next((key for key, values in changes.items() if len(values) > 1), None)):
         raise SceneError(several, changes[several], "one value where reference= is a file, which shows one scene", file)
-    return Study(scenes, variants, asked.values, tuple(extras), plan, file)
+    return Study(scenes, variants, options.values, tuple(extras), plan, file)
 
 
-def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> Plan:
+def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> ReferencePlan:
     """The reference: a file's name, or a mapping with ``file``, or one with ``spp``, ``seeds`` and settings."""
     if raw is None or isinstance(raw, str):
         raw = {} if raw is None else {"file": raw}
@@ -455,12 +461,12 @@ def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> Pla
         files = {scenes[0]: files} if isinstance(files, str) and len(scenes) == 1 else files
         if not isinstance(files, Mapping) or set(files) != set(scenes):
             raise SceneError("reference.file", files, f"a file for each of {', '.join(scenes)}", file)
-        return Plan(dict(files), 0, 0, {})
+        return ReferencePlan(dict(files), 0, 0, {})
     own = {key: value for key, value in raw.items() if key in parameters_of(Reference)}
-    made = values_of(Reference, own, "reference", file, "a reference")
+    made = read_params(Reference, own, "reference", file, "a reference")
     settings = flat({key: value for key, value in raw.items() if key not in own})
     for key, value in settings.items():
         if isinstance(value, list) and key not in LISTS:
             raise SceneError(f"reference.{key}", value, "one value: there is one reference", file)
     variants_of(settings, file)  # refuses what is no setting
-    return Plan({}, made["spp"] or 4 * most, made["seeds"], settings)
+    return ReferencePlan({}, made["spp"] or 4 * most, made["seeds"], settings)

@@ -8,22 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchpt.core.errors import SceneError
-from torchpt.physics.lights import order
+from torchpt.physics.lights import sort_key
 from torchpt.physics.parts import Copy, Parameters, Part, Source
 from torchpt.physics.shapes.geometry import KINDS
 from torchpt.scene.formats.description import Description
 from torchpt.scene.materials import declare, resolved
-from torchpt.scene.mesh_shapes import warn_of_touching
-from torchpt.scene.shapes import Owner, ShapeBuilder
-from torchpt.scene.sources import check_coordinates, declare_corners, sources_of
+from torchpt.scene.mesh_triangles import warn_of_coplanar_refraction
+from torchpt.scene.shapes import ShapeBuilder, ShapeEntry
+from torchpt.scene.sources import build_lights, check_coordinates, declare_vertex_attributes
 from torchpt.scene.space import centre_and_unit
-from torchpt.scene.texels import Opener
+from torchpt.scene.texture_loader import TextureLoader
 
-__all__ = ["Built", "build_parts"]
+__all__ = ["SceneBuild", "build_parts"]
 
 
 @dataclass(frozen=True)
-class Built:
+class SceneBuild:
     """Parts in the order of ``records.KINDS``, their parameters, and the lanes' own coordinates (:mod:`torchpt.scene.space`).
 
     Attributes:
@@ -31,7 +31,7 @@ class Built:
         parameters: arrays by dotted name.
         centre: ``(3,)`` float64, subtracted from all positions.
         unit: what all lengths are divided by.
-        sources: lights that are no surfaces, in the order of ``lights.order``.
+        sources: lights that are no surfaces, in the order of ``lights.sort_key``.
         copies: instances of parts.
     """
 
@@ -43,12 +43,12 @@ class Built:
     copies: tuple[Copy, ...] = ()
 
 
-def build_parts(description: Description, traced: Collection[str] = ()) -> Built:
+def build_parts(description: Description, vertex_params: Collection[str] = ()) -> SceneBuild:
     """Resolve a description.
 
     Args:
         description: of the scene.
-        traced: dotted names of normals and texture coordinates that are to be parameters.
+        vertex_params: dotted names of normals and texture coordinates that are to be parameters.
 
     Raises:
         SceneError: more than one environment, a shape that cannot be placed, or sizes too far apart for float32.
@@ -58,26 +58,26 @@ def build_parts(description: Description, traced: Collection[str] = ()) -> Built
         EnergyWarning: two refracting shapes touch.
     """
     try:
-        return _built(description, traced)
+        return _built(description, vertex_params)
     except SceneError as error:
         raise description.layers.blame(error) from None
 
 
-def _built(description: Description, traced: Collection[str]) -> Built:
+def _built(description: Description, vertex_params: Collection[str]) -> SceneBuild:
     parameters = Parameters()
-    opener = Opener(description.textures, description.resolve, parameters, description.file)
-    builder = ShapeBuilder(description, parameters, opener)
-    owners = [Owner(name, number, shape) for number, (name, shape) in enumerate(description.shapes.items(), 1)]
+    texture_loader = TextureLoader(description.textures, description.resolve, parameters, description.file)
+    builder = ShapeBuilder(description, parameters, texture_loader)
+    owners = [ShapeEntry(name, number, shape) for number, (name, shape) in enumerate(description.shapes.items(), 1)]
     parts = [part for owner in owners if not owner.shape.kind.copies for part in builder.parts(owner)]
     copies = [copy for owner in owners if owner.shape.kind.copies for copy in builder.copies(owner, parts)]
     for name, material in description.materials.items():
-        declare(resolved(material, f"materials.{name}", description.materials, opener), parameters)
-    sources = sources_of(description, parameters)
-    sources = sorted([*sources, *builder.sources], key=lambda source: order(source.kind))
+        declare(resolved(material, f"materials.{name}", description.materials, texture_loader), parameters)
+    sources = build_lights(description, parameters)
+    sources = sorted([*sources, *builder.sources], key=lambda source: sort_key(source.kind))
     parameters.declare_all("camera", description.camera.kind, description.camera.values)
-    declare_corners(parts, traced, parameters)
+    declare_vertex_attributes(parts, vertex_params, parameters)
     check_coordinates(parts, parameters.stated, description.file)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     centre, unit = centre_and_unit(parts, copies, sources, parameters, description.camera, description.file)
-    warn_of_touching(parts, copies, description.file)
-    return Built(tuple(parts), parameters, centre, unit, tuple(sources), tuple(copies))
+    warn_of_coplanar_refraction(parts, copies, description.file)
+    return SceneBuild(tuple(parts), parameters, centre, unit, tuple(sources), tuple(copies))

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import in_transform
+from torchpt.core.autograd import is_transformed
 from torchpt.core.errors import SceneError
 from torchpt.math.transforms import affine
 from torchpt.physics.cameras import opencv
@@ -74,7 +74,7 @@ def from_opencv(K: Any, R: Any, t: Any, size: Size, first_pixel: float = 0.5) ->
     Raises:
         SceneError: numbers that are not finite or of another shape, an ``R`` that is no rotation, or no size.
     """
-    inner, wide_and_tall = _moved(_tensor(K, "K", (3, 3)), 0.5 - _first(first_pixel)), size_of(size)
+    inner, wide_and_tall = _with_offset(_tensor(K, "K", (3, 3)), 0.5 - _first_pixel(first_pixel)), size_of(size)
     pose = {"R": _rotation(R), "t": _tensor(t, "t", (3,))}
     return {"type": "perspective", "K": inner, **pose, "size": wide_and_tall}
 
@@ -98,8 +98,8 @@ def to_opencv(
     Raises:
         SceneError: no scene, parameters or film settings that are wrong, or a camera that is no pinhole's.
     """
-    inner, turn, move = _seen(scene, params, film, dtype)
-    return _moved(inner, _first(first_pixel) - 0.5).to(dtype), turn.to(dtype), move.to(dtype)
+    inner, rotation, translation = _seen(scene, params, film, dtype)
+    return _with_offset(inner, _first_pixel(first_pixel) - 0.5).to(dtype), rotation.to(dtype), translation.to(dtype)
 
 
 def from_opengl(
@@ -136,12 +136,12 @@ def from_opengl(
     }
     if K is None:
         angle = _tensor(fov, "fov", ())
-        if not in_transform(angle) and not 0.0 < float(angle) < 180.0:
+        if not is_transformed(angle) and not 0.0 < float(angle) < 180.0:
             raise SceneError("fov", fov, "an angle in degrees above 0 and below 180")
         if fov_axis not in FOV_AXES:
             raise SceneError("fov_axis", fov_axis, f"one of {', '.join(FOV_AXES)}")
         return {**block, "fov": fov, "fov_axis": fov_axis}
-    return {**block, "K": _moved(_tensor(K, "K", (3, 3)), 0.5 - _first(first_pixel)), "size": size_of(size)}
+    return {**block, "K": _with_offset(_tensor(K, "K", (3, 3)), 0.5 - _first_pixel(first_pixel)), "size": size_of(size)}
 
 
 def to_opengl(
@@ -151,9 +151,9 @@ def to_opengl(
     dtype: torch.dtype = torch.float32,
 ) -> OpenGLCamera:
     """A scene's camera with OpenGL's axes. Arguments and errors as :func:`to_opencv`."""
-    inner, turn, move = _seen(scene, params, film, dtype)
+    inner, rotation, translation = _seen(scene, params, film, dtype)
     width, height = scene.film_size(film)
-    matrix = affine(turn.T * turn.new_tensor([1.0, -1.0, -1.0]), -(turn.T @ move))
+    matrix = affine(rotation.T * rotation.new_tensor([1.0, -1.0, -1.0]), -(rotation.T @ translation))
     halves = inner.new_tensor([width, height]) * 0.5
     fov = torch.atan2(halves, torch.stack((inner[0, 0], inner[1, 1]))) * (360.0 / math.pi)
     return OpenGLCamera(matrix.to(dtype), inner.to(dtype), fov.to(dtype), (width, height))
@@ -194,11 +194,11 @@ def to_kornia(
     """
     from kornia.geometry.camera import PinholeCamera
 
-    inner, turn, move = _seen(scene, params, film, dtype)
-    inner = _moved(inner, -0.5)
-    whole = affine(inner, torch.zeros_like(move))
-    size = [torch.tensor([side], device=turn.device) for side in scene.film_size(film)]
-    return PinholeCamera(whole[None].to(dtype), affine(turn, move)[None].to(dtype), size[1], size[0])
+    inner, rotation, translation = _seen(scene, params, film, dtype)
+    inner = _with_offset(inner, -0.5)
+    whole = affine(inner, torch.zeros_like(translation))
+    size = [torch.tensor([side], device=rotation.device) for side in scene.film_size(film)]
+    return PinholeCamera(whole[None].to(dtype), affine(rotation, translation)[None].to(dtype), size[1], size[0])
 
 
 def from_pytorch3d(
@@ -220,7 +220,7 @@ def from_pytorch3d(
     if type(in_ndc) is not bool:
         raise SceneError("in_ndc", in_ndc, "True or False")
     # Ours is the same camera space, and R's columns are its axes in the world.
-    turn, move = _rotation(R), _tensor(T, "T", (3,))
+    rotation, translation = _rotation(R), _tensor(T, "T", (3,))
     tall, wide = size_of(_tensor(image_size, "image_size", (2,)), "image_size", "[height, width]")
     focal, point = _tensor(focal_length, "focal_length", None), _tensor(principal_point, "principal_point", (2,))
     if focal.numel() not in (1, 2):
@@ -231,7 +231,7 @@ def from_pytorch3d(
         focal, point = focal * half, point.new_tensor([wide, tall]) * 0.5 - point * half
     zero = torch.zeros_like(focal[0])
     inner = (focal[0], zero, point[0], zero, focal[1], point[1], zero, zero, torch.ones_like(zero))
-    pose = affine(turn, -(turn @ move))
+    pose = affine(rotation, -(rotation @ translation))
     return {"type": "perspective", "to_world": pose, "K": torch.stack(inner).reshape(3, 3), "size": [wide, tall]}
 
 
@@ -242,17 +242,17 @@ def to_pytorch3d(
     dtype: torch.dtype = torch.float32,
 ) -> dict[str, Any]:
     """What PyTorch3D's ``PerspectiveCameras(**numbers)`` takes, a batch of one. Arguments and errors as :func:`to_opencv`."""
-    inner, turn, move = _seen(scene, params, film, dtype)
+    inner, rotation, translation = _seen(scene, params, film, dtype)
     wide, tall = scene.film_size(film)
-    half, flip = min(wide, tall) * 0.5, turn.new_tensor([-1.0, -1.0, 1.0])
+    half, flip = min(wide, tall) * 0.5, rotation.new_tensor([-1.0, -1.0, 1.0])
     numbers = {
-        "R": turn.T * flip,
-        "T": move * flip,
+        "R": rotation.T * flip,
+        "T": translation * flip,
         "focal_length": inner.diagonal()[:2] / half,
         "principal_point": (inner.new_tensor([wide, tall]) * 0.5 - inner[:2, 2]) / half,
     }
     found: dict[str, Any] = {key: value[None].to(dtype) for key, value in numbers.items()}
-    return {**found, "image_size": torch.tensor([[tall, wide]], device=turn.device), "in_ndc": True}
+    return {**found, "image_size": torch.tensor([[tall, wide]], device=rotation.device), "in_ndc": True}
 
 
 def _seen(
@@ -277,7 +277,7 @@ def _numbers(value: Any, key: str, expected: str) -> Tensor:
         found = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise SceneError(key, value, expected) from None
-    if not in_transform(found) and not bool(found.isfinite().all()):
+    if not is_transformed(found) and not bool(found.isfinite().all()):
         raise SceneError(key, value, "finite numbers")
     return found
 
@@ -285,7 +285,7 @@ def _numbers(value: Any, key: str, expected: str) -> Tensor:
 def _rotation(value: Any) -> Tensor:
     """A rotation in float64."""
     found = _tensor(value, "R", (3, 3))
-    if not in_transform(found):
+    if not is_transformed(found):
         try:
             opencv.rotation(found.detach().tolist())
         except Refused as error:
@@ -293,7 +293,7 @@ def _rotation(value: Any) -> Tensor:
     return found
 
 
-def _first(value: Any) -> float:
+def _first_pixel(value: Any) -> float:
     """Where the middle of the first pixel is."""
     return float(_tensor(value, "first_pixel", ()))
 
@@ -333,16 +333,16 @@ def _pose(matrix: Any) -> Tensor:
     if found.shape not in ((4, 4), (3, 4)):
         raise SceneError("matrix", f"shape {tuple(found.shape)}", "a matrix (4, 4) or (3, 4)")
     last = found.new_tensor([0.0, 0.0, 0.0, 1.0])
-    if len(found) == 4 and not in_transform(found) and not found[3].detach().equal(last):
+    if len(found) == 4 and not is_transformed(found) and not found[3].detach().equal(last):
         raise SceneError("matrix", found[3].tolist(), "a matrix whose last row is 0 0 0 1")
     axes = found[:3, :3]
     lengths = torch.linalg.vector_norm(axes, dim=0)
-    if not in_transform(lengths) and not bool((lengths > 0.0).all()):
+    if not is_transformed(lengths) and not bool((lengths > 0.0).all()):
         raise SceneError("matrix", matrix, "finite numbers, and axes of a length")
     return torch.cat((axes / lengths, found[:3, 3:]), 1)
 
 
-def _moved(matrix: Tensor, offset: float) -> Tensor:
+def _with_offset(matrix: Tensor, offset: float) -> Tensor:
     """``K`` with its principal point moved by the same number of pixels along both axes."""
     if offset == 0.0:
         return matrix

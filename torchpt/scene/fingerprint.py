@@ -14,13 +14,13 @@ from torch import Tensor
 
 from torchpt.core import tree
 from torchpt.core.errors import SceneError
-from torchpt.scene.build import Built
+from torchpt.scene.build import SceneBuild
 from torchpt.scene.scene import Scene
 
 __all__ = ["fingerprint", "fingerprints"]
 
 #: What scenes came to, and its hashes.
-_known: WeakKeyDictionary[Scene, tuple[Built, dict[str, str]]] = WeakKeyDictionary()
+_known: WeakKeyDictionary[Scene, tuple[SceneBuild, dict[str, str]]] = WeakKeyDictionary()
 
 
 def fingerprints(scene: Scene, params: Mapping[str, Tensor] | None = None) -> dict[str, str]:
@@ -40,25 +40,25 @@ def fingerprints(scene: Scene, params: Mapping[str, Tensor] | None = None) -> di
     for name in sorted(tensors):
         parts.setdefault(name.partition(".")[0], []).append((name, tensors[name]))
     try:
-        return _printed(parts) | _of_built(scene)
+        return _hashes(parts) | _build_hashes(scene)
     except TypeError as problem:
         raise SceneError("materials", str(problem), "models whose contents can be compared") from None
 
 
-def _of_built(scene: Scene) -> dict[str, str]:
+def _build_hashes(scene: Scene) -> dict[str, str]:
     """Return the hashes of what a scene came to; once, unless models of the caller's own may have changed since."""
     built, known = scene.built, _known.get(scene)
     if known is not None and known[0] is built:
         return known[1]
     parts = {field.name: getattr(built, field.name) for field in fields(built)}
     del parts["parameters"]  # as it was loaded: its tensors count as they are now
-    found = _printed(parts)
+    found = _hashes(parts)
     if not scene.own_models:
         _known[scene] = built, found
     return found
 
 
-def _printed(parts: Mapping[str, Any]) -> dict[str, str]:
+def _hashes(parts: Mapping[str, Any]) -> dict[str, str]:
     return {name: tree.fingerprint(part).hex() for name, part in parts.items()}
 
 

@@ -15,16 +15,16 @@ from torchpt.math.transforms import is_usable
 from torchpt.scene.loading import load
 from torchpt.scene.meshes import FileLight, MeshPart
 from torchpt.scene.meshes.mesh import checked
-from torchpt.scene.meshes.trimesh_objects import Looks, lights_of, parts_of, placed_in
+from torchpt.scene.meshes.trimesh_objects import MaterialConverter, lights_of, parts_of, placed_in
 from torchpt.scene.scene import Scene
-from torchpt.scene.settings import shaped
-from torchpt.scene.sources import labels_of
+from torchpt.scene.settings import keep_aspect
+from torchpt.scene.sources import unique_labels
 
 __all__ = ["description_of", "from_trimesh"]
 
 _LABEL = "trimesh"
 #: From trimesh's camera, which looks along -z with +x to the right, to ours, which looks along +z with +x to the left.
-_TURN = np.diag([-1.0, 1.0, -1.0, 1.0])
+_CAMERA_AXES = np.diag([-1.0, 1.0, -1.0, 1.0])
 #: Degrees of view of a scene without a camera, along the film's shorter side.
 _FOV = 45.0
 
@@ -67,7 +67,7 @@ def from_trimesh(
     for name, block in blocks.items():
         if block is not None:
             below = description.get(name, {})
-            description[name] = below | (shaped(below, block) if name == "film" else dict(block))
+            description[name] = below | (keep_aspect(below, block) if name == "film" else dict(block))
     return load(description, device)
 
 
@@ -85,7 +85,7 @@ def description_of(source: Any) -> dict[str, Any]:
     description: dict[str, Any] = {"shapes": shapes, **_view(source)}
     lights, _ = lights_of(source, _LABEL)
     if lights:
-        names = labels_of([light.name for light in lights])
+        names = unique_labels([light.name for light in lights])
         description["lights"] = {name: _light(light) for name, light in zip(names, lights, strict=True)}
     elif not glows:
         description["lights"] = {"sky": {"type": "constant", "radiance": 1.0}}
@@ -94,14 +94,14 @@ def description_of(source: Any) -> dict[str, Any]:
 
 def _shapes(source: Any) -> tuple[dict[str, Any], bool]:
     """A ``mesh`` where a geometry comes first and ``instance``s of it after; whether any of them emits."""
-    looks, shapes, glows = Looks(_LABEL), {}, False
+    converter, shapes, glows = MaterialConverter(_LABEL), {}, False
     nodes = list(placed_in(source))
     first: dict[str, str] = {}
     known: dict[str, list[MeshPart]] = {}
-    labels = labels_of(["".join(c if c.isprintable() else "_" for c in node).strip() for node, _, _ in nodes])
+    labels = unique_labels(["".join(c if c.isprintable() else "_" for c in node).strip() for node, _, _ in nodes])
     for label, (_, name, matrix) in zip(labels, nodes, strict=True):
         if name not in known:
-            known[name] = checked(parts_of(source.geometry[name], str(name)[:80], looks), Path(_LABEL))
+            known[name] = checked(parts_of(source.geometry[name], str(name)[:80], converter), Path(_LABEL))
         emits = any("emission" in part.material.material for part in known[name] if part.material is not None)
         glows |= emits
         if name in first and not emits and is_usable(matrix):
@@ -127,7 +127,7 @@ def _view(source: Any) -> dict[str, Any]:
         if abs(down / across - 1.0) > 1e-9:
             pose["pixel_aspect"] = down / across
         return {
-            "camera": {**pose, "to_world": (matrix @ _TURN).tolist()},
+            "camera": {**pose, "to_world": (matrix @ _CAMERA_AXES).tolist()},
             "film": {"width": width, "height": height},
         }
     corners = source.bounds
@@ -135,7 +135,7 @@ def _view(source: Any) -> dict[str, Any]:
         corners = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
     matrix = look_at(np.array(corners, np.float64), fov=np.array([_FOV, _FOV]), pad=1.1)
     pose = {"type": "perspective", "fov": _FOV, "fov_axis": "smaller"}
-    return {"camera": {**pose, "to_world": (matrix @ _TURN).tolist()}}
+    return {"camera": {**pose, "to_world": (matrix @ _CAMERA_AXES).tolist()}}
 
 
 def _light(light: FileLight) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from torchpt.physics import bsdfs
 from torchpt.physics.film import FILTERS
 from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.lights import SURFACES, Environment
-from torchpt.physics.lights.choice import ByTree
+from torchpt.physics.lights.choice import TreeSampler
 from torchpt.physics.lights.records import Lights
 from torchpt.physics.shapes.geometry import KINDS
 from torchpt.physics.world import World
@@ -17,13 +17,15 @@ from torchpt.scene.settings import Settings
 from torchpt.search import Accel
 
 if TYPE_CHECKING:
-    from torchpt.scene.build import Built
+    from torchpt.scene.build import SceneBuild
     from torchpt.scene.formats.description import Description
 
 __all__ = ["describe"]
 
 
-def describe(description: Description, built: Built, world: World, accel: Accel, settings: Settings) -> dict[str, Any]:
+def describe(
+    description: Description, built: SceneBuild, world: World, accel: Accel, settings: Settings
+) -> dict[str, Any]:
     """A nested dict of plain values: ``scene``, ``shapes``, ``built``, ``left_out``, ``notes``, ``settings``."""
     lights = world.lights
     shapes: dict[str, Any] = {}
@@ -89,7 +91,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
 
 def _lights(lights: Lights) -> dict[str, Any]:
     found: dict[str, Any] = {"rows": len(lights.area), "kinds": list(lights.kinds)}
-    if isinstance(lights.choice, ByTree):
+    if isinstance(lights.choice, TreeSampler):
         tree = lights.choice.tree
         found["choice"] = {"tree": {"nodes": len(tree.nodes), "levels": tree.levels}}
     elif lights.choice is not None:
@@ -127,7 +129,7 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
     else:
         if lights.choice is None:
             absent.append("choice among lights (one light)")
-        elif not isinstance(lights.choice, ByTree):
+        elif not isinstance(lights.choice, TreeSampler):
             absent.append("light tree (few lights)")
         if lights.environment is None:
             absent.append("environment")

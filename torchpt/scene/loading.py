@@ -8,14 +8,14 @@ from typing import Any
 
 import torch
 
-from torchpt.core.memory import needing
-from torchpt.core.threads import lasting
+from torchpt.core.memory import explain_out_of_memory
+from torchpt.core.threads import outside_inference_mode
 from torchpt.physics.bsdfs import Bsdf
 from torchpt.scene.devices import device_of
 from torchpt.scene.formats.description import Source, read_description, settings
-from torchpt.scene.formats.tensors import Tensors
+from torchpt.scene.formats.tensors import DictTensors
+from torchpt.scene.params_from_tensors import params_from_tensors, vertex_attributes_in, with_all_intrinsics
 from torchpt.scene.scene import Scene
-from torchpt.scene.traced import corners_in, traced, widened
 
 __all__ = ["load"]
 
@@ -58,13 +58,18 @@ def _load(
     overrides: Mapping[str, Any] | None,
 ) -> Scene:
     start = time.perf_counter()
-    tensors = Tensors()
-    with needing("the scene file"):
+    tensors = DictTensors()
+    with explain_out_of_memory("the scene file"):
         may_hold_tensors = bool(overrides) or isinstance(source, Mapping)
-        description = read_description(source, bsdfs, tensors.taken_from if may_hold_tensors else None, overrides)
+        description = read_description(source, bsdfs, tensors.extract if may_hold_tensors else None, overrides)
     chosen = device_of(settings(description).render.device if device is None else device)
-    with lasting():
-        scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))
-    scene.params |= traced(tensors, scene.description, scene.built, scene.params)
+    with outside_inference_mode():
+        scene = Scene(
+            with_all_intrinsics(description, tensors),
+            chosen,
+            tuple((bsdfs or {}).values()),
+            vertex_attributes_in(tensors),
+        )
+    scene.params |= params_from_tensors(tensors, scene.description, scene.built, scene.params)
     scene.load_seconds = time.perf_counter() - start
     return scene

@@ -17,14 +17,22 @@ from torchpt.physics.film import Film
 from torchpt.scene.prepare import surface_layers
 from torchpt.scene.settings import Settings
 
-__all__ = ["BYTES_PER_LANE", "FEWEST_OF_LOOP", "LANES", "MemoryEstimate", "check_film", "loaded", "memory_estimate"]
+__all__ = [
+    "BYTES_PER_LANE",
+    "FEWEST_OF_KERNELS",
+    "LANES",
+    "MemoryEstimate",
+    "check_film",
+    "mark_loaded",
+    "memory_estimate",
+]
 
 #: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
 LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
 #: Peak bytes a lane takes in a wave, measured on the Cornell box; under a tape each vertex keeps about this much.
 BYTES_PER_LANE = 640
 #: Lanes that repay a thread of the compiled loop.
-FEWEST_OF_LOOP = 1024
+FEWEST_OF_KERNELS = 1024
 #: Of machine code and tables of libraries, which are read from disk when they are first called, once a process.
 CODE = {"eager": 75_000_000, "compiled": 54_000_000, "tape": 100_000_000}
 #: Of numba, which not all renders import.
@@ -42,7 +50,7 @@ SLACK, SPARE = 1.04, 3_000_000
 _ran: set[str] = set()
 
 
-def loaded(how: str) -> None:
+def mark_loaded(how: str) -> None:
     """Say that code of a kind is there."""
     _ran.add(how)
 
@@ -101,7 +109,7 @@ def memory_estimate(settings: Settings, device: torch.device, how: str, models: 
         code += NUMBA
     if device.type != "cpu":
         code = 0
-    waves = FEWEST_OF_LOOP * 4 * rows if how == "compiled" else FEWEST * 2 * BYTES_PER_LANE
+    waves = FEWEST_OF_KERNELS * 4 * rows if how == "compiled" else FEWEST * 2 * BYTES_PER_LANE
     return MemoryEstimate(pixels * films, code, waves, pixels * picture)
 
 

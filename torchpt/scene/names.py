@@ -8,13 +8,13 @@ from itertools import accumulate
 
 from torchpt.physics.parts import Copy, Part
 from torchpt.physics.world import World
-from torchpt.scene.build import Built
+from torchpt.scene.build import SceneBuild
 
-__all__ = ["Names", "Surface"]
+__all__ = ["Names", "SurfaceNames"]
 
 
 @dataclass(frozen=True)
-class Surface:
+class SurfaceNames:
     """A primitive.
 
     Attributes:
@@ -40,7 +40,7 @@ class Names:
         world: its tensors.
     """
 
-    def __init__(self, built: Built, world: World) -> None:
+    def __init__(self, built: SceneBuild, world: World) -> None:
         self._parts, self._copies, self._sources = built.parts, built.copies, built.sources
         self._ends = [0, *accumulate(1 if part.faces is None else len(part.faces) for part in built.parts)]
         rows = None if world.lights is None else world.lights.row_of_prim
@@ -49,14 +49,14 @@ class Names:
             slots = (rows >= 0).nonzero().squeeze(1)
             self._shining = slots[rows[slots].argsort()].tolist()
 
-    def surface(self, slot: int, prim: int) -> Surface:
+    def surface(self, slot: int, prim: int) -> SurfaceNames:
         """A surface by its :class:`~torchpt.physics.shapes.geometry.Interaction`'s slot and primitive."""
         number = bisect_right(self._ends, prim) - 1
         part, first = self._parts[number], self._ends[number]
         copied = slot >= self._ends[-1]
         owner: Part | Copy = self._copies[slot - self._ends[-1]] if copied else part
         name = owner.material.name.removeprefix("materials.")
-        return Surface(owner.shape, part.kind, prim - first, name, owner.material.model.name)
+        return SurfaceNames(owner.shape, part.kind, prim - first, name, owner.material.model.name)
 
     def owner(self, slot: int) -> str:
         """The shape and material of a surface by its slot alone."""

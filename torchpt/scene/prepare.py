@@ -34,15 +34,15 @@ if TYPE_CHECKING:
 
 __all__ = [
     "SceneCache",
+    "describe_engine",
+    "kernel_engine",
     "kernels_of",
-    "loop_facts",
-    "loop_of",
-    "looped",
     "make_wave",
     "own_models",
-    "rebound",
+    "rebuild_with_tape",
     "scene_cache",
     "surface_layers",
+    "uses_kernels",
 ]
 
 
@@ -56,14 +56,14 @@ class SceneCache:
     Attributes:
         kernels: of its latest render by the compiled loop.
         first: the integrator and the world that this was made of, and what happens at first surfaces.
-        dark: a world, and the same without lights.
+        without_lights: a world, and the same without lights.
         camera: the latest one on a film, with what it was made of.
         outlines: the edges of its meshes, as :mod:`torchpt.gradients.edges.curves` finds them.
     """
 
     kernels: Kernels | None = None
     first: tuple[Integrator, World, FirstSurface] | None = None
-    dark: tuple[World, World] | None = None
+    without_lights: tuple[World, World] | None = None
     camera: tuple[Any, Camera] | None = None
     outlines: dict[str, Any] = field(default_factory=dict)
 
@@ -113,7 +113,7 @@ def make_wave(
         if accel.name == "brute" and not packets:
             accel = scene.accel("numba", threads, geometry if moved else None)
         if not integrator.lit:
-            world = _dark(scene, world, own)
+            world = _without_lights(scene, world, own)
     else:
         world, accel = like.context.world, like.accel
     points = points_of(settings.sampler)
@@ -132,15 +132,17 @@ def make_wave(
         centre=scene.space.shift,
         first=_first(scene, integrator, world, own) if like is None else like.first,
     )
-    return wave if rays is None else wave.along(_given(scene, *rays, dtype))
+    return wave if rays is None else wave.with_rays(_lane_rays(scene, *rays, dtype))
 
 
-def _given(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
+def _lane_rays(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
     """Return rays ``(..., 3)`` of the scene's coordinates as lanes have them, differentiable."""
     o, d = (x.reshape(-1, 3).T.double() for x in (o, d))
     origin = ((o - scene.space.centre[:, None]) / scene.space.unit).to(dtype).contiguous()
-    _refuse("o", o, torch.isfinite(origin).all(0), f"an origin that is finite in {str(dtype).removeprefix('torch.')}")
-    _refuse("d", d, torch.isfinite(d).all(0) & (d != 0).any(0), "a direction that is finite and not zero")
+    _check_rays(
+        "o", o, torch.isfinite(origin).all(0), f"an origin that is finite in {str(dtype).removeprefix('torch.')}"
+    )
+    _check_rays("d", d, torch.isfinite(d).all(0) & (d != 0).any(0), "a direction that is finite and not zero")
     unit = normalize(d)
     # What is of unit length up to rounding keeps its bits.
     near = (dot(d, d) - 1.0).abs() < 8.0 * torch.finfo(dtype).eps
@@ -148,7 +150,7 @@ def _given(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
     return Rays(origin, unit.to(dtype).contiguous())
 
 
-def _refuse(key: str, given: Tensor, good: Tensor, expected: str) -> None:
+def _check_rays(key: str, given: Tensor, good: Tensor, expected: str) -> None:
     """Refuse the first of some vectors ``(3, N)`` that is not ``good (N,)``.
 
     Raises:
@@ -182,7 +184,7 @@ def _filter(kind: type[Filter], values: tuple[tuple[str, Any], ...], device: tor
     return kind(dict(values), device)
 
 
-def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Wave:
+def rebuild_with_tape(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Wave:
     """An eager wave whose world and camera follow ``params`` under a tape, of one of the same parameters detached.
 
     The search structure stays.
@@ -223,14 +225,14 @@ def _first(scene: Scene, integrator: Integrator, world: World, own: bool) -> Fir
     return first
 
 
-def _dark(scene: Scene, world: World, own: bool) -> World:
+def _without_lights(scene: Scene, world: World, own: bool) -> World:
     """The world without lights; one of the scene's ``own`` is kept with it."""
     if not own:
         return replace(world, lights=None)
     keeper = scene_cache(scene)
-    if keeper.dark is None or keeper.dark[0] is not world:
-        keeper.dark = world, replace(world, lights=None)
-    return keeper.dark[1]
+    if keeper.without_lights is None or keeper.without_lights[0] is not world:
+        keeper.without_lights = world, replace(world, lights=None)
+    return keeper.without_lights[1]
 
 
 def _context(
@@ -246,7 +248,7 @@ def _pixel_of(world: World, camera: Camera) -> Tensor | None:
     return camera.pixel() if world.textures.filtered else None
 
 
-def looped(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool:
+def uses_kernels(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool:
     """Return True where a render runs as kernels, False where it runs as tensor operations.
 
     Raises:
@@ -275,15 +277,15 @@ def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kerne
     return engine.kernels_of(wave, own_models(scene, wave), before)
 
 
-def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
+def describe_engine(scene: Scene, settings: Settings) -> dict[str, Any]:
     """Tell how a render of the scene would run: as the compiled loop, and how that searches, or as tensor operations."""
     with torch.no_grad():
-        if not looped(settings, scene.device, torch.float32):
+        if not uses_kernels(settings, scene.device, torch.float32):
             return {"stages": "eager, by tensor operations"}
-        return engine.told(kernels_of(scene, make_wave(scene, settings, None, torch.float32)))
+        return engine.describe_kernels(kernels_of(scene, make_wave(scene, settings, None, torch.float32)))
 
 
-def loop_of(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Tasks:
+def kernel_engine(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Tasks:
     """Return the compiled loop of a render on ``threads`` (None: as many as torch's), whose kernels are kept with the scene.
 
     Materials without kernels join ``eager``.

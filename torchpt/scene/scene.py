@@ -19,28 +19,28 @@ from torch import Tensor
 from torchpt import search
 from torchpt.core.autograd import outside_transforms
 from torchpt.core.errors import SceneError
-from torchpt.core.memory import Meter, mb, retried
-from torchpt.core.threads import lasting, settle
+from torchpt.core.memory import MemoryMeter, mb, retry_out_of_memory
+from torchpt.core.threads import outside_inference_mode, warm_up
 from torchpt.physics.bsdfs import Bsdf
 from torchpt.physics.cameras import Camera
 from torchpt.physics.cameras.opencv import PinholeMatrices, extrinsics
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.physics.world import World
-from torchpt.scene.build import Built, build_parts
+from torchpt.scene.build import SceneBuild, build_parts
 from torchpt.scene.devices import device_of
 from torchpt.scene.formats.description import Description, settings
 from torchpt.scene.info import describe
 from torchpt.scene.settings import Film, Settings
-from torchpt.scene.sources import check_sources
-from torchpt.scene.space import FARTHEST, Space, extent_of, middle_of
-from torchpt.scene.validation import check_tensor, shared, validate_changes
-from torchpt.scene.versions import Editions, changes
-from torchpt.scene.view import through
+from torchpt.scene.sources import check_light_params
+from torchpt.scene.space import MAX_COORDINATE, Space, bounds_center, bounds_extent
+from torchpt.scene.validation import check_tensor, inherited_checks, validate_changes
+from torchpt.scene.versions import VersionCounter, changed_versions
+from torchpt.scene.view import view_attributes
 from torchpt.scene.world import assemble
 from torchpt.search import Accel
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
-__all__ = ["Scene", "numbered"]
+__all__ = ["Scene", "scene_by_number"]
 
 #: Of a scene, what copies of it have: all else is made of it on demand.
 _KEPT = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
@@ -49,7 +49,7 @@ _numbers = itertools.count(1)
 _scenes: WeakValueDictionary[int, Scene] = WeakValueDictionary()
 
 
-def numbered(number: int) -> Scene | None:
+def scene_by_number(number: int) -> Scene | None:
     """The scene of a number, where it is still there."""
     return _scenes.get(number)
 
@@ -78,15 +78,17 @@ class Scene:
         description: Description,
         device: torch.device,
         own_models: tuple[Bsdf, ...] = (),
-        traced: Collection[str] = (),
+        vertex_params: Collection[str] = (),
     ) -> None:
-        settle()
-        meter = Meter(device)
+        warm_up()
+        meter = MemoryMeter(device)
         meter.base()  # only now all modules are there
         before = meter.peak()
         self.load_seconds = 0.0
         self.description, self.device, self.own_models = description, device, own_models
-        self._built: Built = retried("the files and shapes of the scene", lambda: build_parts(description, traced))
+        self._built: SceneBuild = retry_out_of_memory(
+            "the files and shapes of the scene", lambda: build_parts(description, vertex_params)
+        )
         # Geometry far from the origin would lose its detail in float32 before it can be moved there.
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {
@@ -98,10 +100,10 @@ class Scene:
         after = meter.peak()
         #: The most that was held above import while the scene was read; 0 where it is not known.
         self.peak = after - meter.base() if after > before else 0
-        self._begin()
-        self._vetted = self.versions()  # numbers of a file were checked as they were read
+        self._reset_caches()
+        self._checked_versions = self.versions()  # numbers of a file were checked as they were read
 
-    def _begin(self) -> None:
+    def _reset_caches(self) -> None:
         """Nothing is made of the parameters yet."""
         self._space = Space(torch.from_numpy(self._built.centre).to(self.device), self._built.unit)
         self._lock = threading.RLock()
@@ -109,14 +111,17 @@ class Scene:
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
         # What these were made of; views of the scene have the same.
-        self._sources, self._made_of = Editions(), dict[str, int]()
+        self._sources, self._made_of = VersionCounter(), dict[str, int]()
         self._origin: Scene | None = None
-        self._number()
+        self._assign_number()
 
-    def _number(self) -> None:
+    def _assign_number(self) -> None:
         """Become another scene than any before."""
-        self.textured: dict[Any, Scene] = {}  # of :mod:`torchpt.scene.textured`
-        self._editions, self._vetted = Editions(), dict[str, int]()  # and by name the edition that was checked
+        self.textured: dict[Any, Scene] = {}  # of :mod:`torchpt.scene.texel_params`
+        self._version_counter, self._checked_versions = (
+            VersionCounter(),
+            dict[str, int](),
+        )  # and by name the edition that was checked
         #: Of all scenes of this process, by which compiled graphs name it.
         self.number = next(_numbers)
         _scenes[self.number] = self
@@ -137,12 +142,12 @@ class Scene:
             SceneError: what is wrong with the camera.
         """
         view = object.__new__(type(self))
-        with lasting():
-            own = through(self.description, self._built, self.params, camera, {} if film is None else film)
+        with outside_inference_mode():
+            own = view_attributes(self.description, self._built, self.params, camera, {} if film is None else film)
         view.__dict__.update(self.__dict__ | own)
         view._origin = self.origin
-        view._number()
-        view.trust(self)
+        view._assign_number()
+        view.mark_checked(self)
         return view
 
     def to(self, device: str | torch.device) -> Scene:
@@ -185,9 +190,9 @@ class Scene:
         return held | {"params": {name: _leaf(value) for name, value in self.params.items()}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        settle()
+        warm_up()
         self.__dict__.update(state)
-        self._begin()
+        self._reset_caches()
 
     def weights(self) -> tuple[Tensor, ...]:
         """Tensors of the caller's own models that want gradients."""
@@ -206,12 +211,12 @@ class Scene:
         held = sum(value.numel() * value.element_size() for value in self.params.values())
         return f"{len(self._built.parts)} parts with {triangles} vertices, whose parameters alone take {mb(held)}"
 
-    def use(self, built: Built) -> None:
+    def replace_build(self, built: SceneBuild) -> None:
         """Come to something else, of the same parameters by name, before anything was made of them."""
         self._built = built
 
     @property
-    def built(self) -> Built:
+    def built(self) -> SceneBuild:
         """What its description came to, static."""
         return self._built
 
@@ -220,14 +225,14 @@ class Scene:
         """The lanes' own coordinates."""
         return self._space
 
-    def middle(self) -> np.ndarray:
+    def center(self) -> np.ndarray:
         """The middle of the box around all that can be hit, ``(3,)`` float64; the origin where nothing can."""
-        return middle_of(self._built.parts, self._built.copies)
+        return bounds_center(self._built.parts, self._built.copies)
 
     @property
     def length(self) -> float:
         """About how large the scene is, as a power of two: the side of the box around all that can be hit."""
-        return 2.0 ** round(math.log2(max(extent_of(self._built.parts, self._built.copies), 2.0**-100)))
+        return 2.0 ** round(math.log2(max(bounds_extent(self._built.parts, self._built.copies), 2.0**-100)))
 
     def check(self, params: Mapping[str, Tensor] | None) -> None:
         """Refuse parameters that this scene cannot be rendered with.
@@ -243,7 +248,7 @@ class Scene:
                 raise SceneError(f"params.{name}", name, f"a parameter of this scene such as {', '.join(close)}")
             check_tensor(name, value, self.params[name].shape, self.spec(name).texture)
             self.check_number(name, value.detach())
-        check_sources(self._built.sources, params or {}, self.merged(params))
+        check_light_params(self._built.sources, params or {}, self.merged(params))
 
     def check_own(self) -> None:
         """Refuse what was put into :attr:`params`, or changed there in place, as :meth:`check` does; once for each change.
@@ -252,15 +257,15 @@ class Scene:
             SceneError: likewise, and names that are gone or new.
         """
         with outside_transforms():
-            validate_changes(self, self._vetted)
+            validate_changes(self, self._checked_versions)
 
-    def trust(self, other: Scene) -> None:
+    def mark_checked(self, other: Scene) -> None:
         """Take what another scene checked of tensors that both have as checked."""
-        self._vetted = shared(self, other, other._vetted)
+        self._checked_versions = inherited_checks(self, other, other._checked_versions)
 
     def versions(self) -> dict[str, int]:
-        """Numbers of what :attr:`params` hold: see :class:`torchpt.scene.versions.Editions`."""
-        return self._editions.of(self.params)
+        """Numbers of what :attr:`params` hold: see :class:`torchpt.scene.versions.VersionCounter`."""
+        return self._version_counter.of(self.params)
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """All parameters, those of ``params`` (once checked) in place of the scene's."""
@@ -281,7 +286,7 @@ class Scene:
             shown = value.tolist() if error.value is ... else error.value
             raise SceneError(f"params.{name}", shown, error.expected) from None
         if isinstance(spec, Pose) and spec.moves is Moves.SURFACES:
-            reach, place = FARTHEST * self._space.unit, value.double().cpu().numpy()[:3, 3]
+            reach, place = MAX_COORDINATE * self._space.unit, value.double().cpu().numpy()[:3, 3]
             if not np.abs(place - self._built.centre).max() <= reach:
                 expected = f"a place up to {reach:.3g} from the middle of this scene as it was loaded"
                 raise SceneError(f"params.{name}", place.tolist(), expected)
@@ -299,7 +304,7 @@ class Scene:
             self._refresh()
             key = dtype, uv, choice
             if key not in self._worlds:
-                with lasting(), torch.no_grad():
+                with outside_inference_mode(), torch.no_grad():
                     self._worlds[key] = self._assemble(self.merged(None), dtype, uv, choice)
             return self._worlds[key]
 
@@ -329,7 +334,7 @@ class Scene:
         camera, values = self.description.camera, dict(self.description.camera.values)
         for key, spec in parameters_of(camera.kind).items():
             number = params.get(f"camera.{key}")
-            if spec.traced and number is not None:
+            if spec.vertex_params and number is not None:
                 values[key] = (number.double() / self._space.unit if spec.length else number).to(dtype)
         pose = params["camera.to_world"]
         pose = torch.cat((self._space.pose(pose), pose[3:].double())).to(dtype)
@@ -337,8 +342,8 @@ class Scene:
 
     def film_size(self, film: Mapping[str, Any] | None = None) -> tuple[int, int]:
         """Width and height in pixels of the whole film, under film settings in place of the scene's own."""
-        wished = settings(self.description, {"film": film or {}}).film
-        return wished.width, wished.height
+        film_settings = settings(self.description, {"film": film or {}}).film
+        return film_settings.width, film_settings.height
 
     def pinhole(
         self,
@@ -381,7 +386,7 @@ class Scene:
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""
         now, before = self._sources.of(self.params), self._made_of.copy()
-        changed = changes(before, now)
+        changed = changed_versions(before, now)
         gone = any(name not in now and not name.startswith("camera.") for name in before)
         if not changed and not gone:
             return

@@ -18,29 +18,38 @@ from torchpt.paths.layers import LAYERS
 from torchpt.physics.film import FILTERS
 from torchpt.physics.samplers import KINDS as SAMPLERS
 from torchpt.ranks import Group
-from torchpt.spec import Choice, Flag, Other, Refused, Role, Scalar, Valued, Whole, parameters_of, reading
-from torchpt.spec.arguments import Argument, declared
-from torchpt.spec.schema import Memo, ParsedParams, check_keys, described, dotted, refuse_foreign, refused, values_of
+from torchpt.spec import Choice, Custom, Flag, FrozenConfig, Integer, Refused, Role, Scalar, parameters_of, reading
+from torchpt.spec.arguments import Argument, arguments_of
+from torchpt.spec.schema import (
+    ParsedParams,
+    ResultCache,
+    check_keys,
+    dotted,
+    read_params,
+    read_typed,
+    refuse_unused_keys,
+    scene_error,
+)
 
 __all__ = [
     "BLOCKS",
     "FILTERS",
     "INTEGRATORS",
-    "RECORDS",
     "SAMPLERS",
-    "TYPED",
-    "Call",
-    "Common",
+    "TYPED_BLOCKS",
+    "UNTYPED_BLOCKS",
+    "BatchOptions",
+    "CallArguments",
     "CommonOptions",
     "Film",
     "Render",
     "RenderOptions",
     "Settings",
     "TraceOptions",
-    "blocks_of",
-    "having",
+    "keep_aspect",
     "merge",
-    "shaped",
+    "settings_of_call",
+    "settings_with",
 ]
 
 BLOCKS = ("film", "integrator", "sampler", "render")
@@ -55,7 +64,7 @@ MOST_SEED = 2**63 - 1
 
 
 #: What has a type: the kinds it may be of, and the one it is of where nothing is said.
-TYPED: dict[str, tuple[Mapping[str, Any], str]] = {
+TYPED_BLOCKS: dict[str, tuple[Mapping[str, Any], str]] = {
     "integrator": (INTEGRATORS, "path"),
     "sampler": (SAMPLERS, "sobol"),
     "filter": (FILTERS, "gaussian"),
@@ -89,24 +98,26 @@ def _gamma(value: Any) -> float | str:
     return float(value)
 
 
-class Film(Valued):
+class Film(FrozenConfig):
     """The picture: its size in pixels, its reconstruction filter, and how 8-bit files show it."""
 
     parameters: ClassVar = {
-        "width": Whole(512, low=1, high=MAX_SIDE, doc="in pixels; said alone, the height follows in the scene's shape"),
-        "height": Whole(512, low=1, high=MAX_SIDE, doc="in pixels; said alone, the width follows"),
-        "filter": Other(
+        "width": Integer(
+            512, low=1, high=MAX_SIDE, doc="in pixels; said alone, the height follows in the scene's shape"
+        ),
+        "height": Integer(512, low=1, high=MAX_SIDE, doc="in pixels; said alone, the width follows"),
+        "filter": Custom(
             lambda _: _typed("filter", {}, "film.filter"),
             words=f"{', '.join(FILTERS)}, or a mapping",
             doc="how samples become pixels",
         ),
-        "crop": Other(
+        "crop": Custom(
             None,
             reader=_crop,
             words="[x, y, width, height]",
             doc="the part that is rendered, in pixels",
         ),
-        "aovs": Other(
+        "aovs": Custom(
             (),
             reader=_aovs,
             words=f"a list of {', '.join(LAYERS)}",
@@ -117,7 +128,7 @@ class Film(Valued):
             0.0, low=-64, high=64, words="a number of stops in -64..64", doc="of 8-bit files", role=Role.FREE
         ),
         "tonemap": Choice("none", names=("none", "filmic", "aces", "reinhard"), doc="of 8-bit files", role=Role.FREE),
-        "gamma": Other(
+        "gamma": Custom(
             "srgb",
             reader=_gamma,
             words="srgb or an exponent > 0",
@@ -128,7 +139,7 @@ class Film(Valued):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Valued`."""
+        """See :class:`FrozenConfig`."""
         wide, high, crop = values["width"], values["height"], values["crop"]
         if wide * high > MAX_PIXELS:
             raise Refused(f"a film of at most {MAX_PIXELS} pixels", [wide, high], ("width",))
@@ -177,10 +188,10 @@ def _truth(default: bool, doc: str) -> Argument:
 # `scripts/make_tables.py`).
 
 
-class _Samples(TypedDict, total=False):
+class _SampleOptions(TypedDict, total=False):
     """What lists begin with."""
 
-    spp: Annotated[int | None, Whole(64, low=1, doc="samples a pixel; a limit of time or error may end sooner")]
+    spp: Annotated[int | None, Integer(64, low=1, doc="samples a pixel; a limit of time or error may end sooner")]
 
 
 class TraceOptions(TypedDict, total=False):
@@ -188,15 +199,15 @@ class TraceOptions(TypedDict, total=False):
 
     integrator: Annotated[
         str | Mapping[str, Any] | Integrator | None,
-        Other(TYPED["integrator"][1], words=_TYPE, doc="what is estimated"),
+        Custom(TYPED_BLOCKS["integrator"][1], words=_TYPE, doc="what is estimated"),
     ]
     sampler: Annotated[
         str | Mapping[str, Any] | None,
-        Other(TYPED["sampler"][1], words=_TYPE, doc="where sample points come from"),
+        Custom(TYPED_BLOCKS["sampler"][1], words=_TYPE, doc="where sample points come from"),
     ]
     device: Annotated[
         str | torch.device | None,
-        Other(
+        Custom(
             "auto",
             reader=_device,
             words="auto, cpu, cuda or cuda:N",
@@ -218,11 +229,11 @@ class TraceOptions(TypedDict, total=False):
     ]
     threads: Annotated[
         int | str | None,
-        Whole("auto", low=1, high=1024, also=("auto",), doc="auto: as many as torch uses", role=Role.FREE),
+        Integer("auto", low=1, high=1024, also=("auto",), doc="auto: as many as torch uses", role=Role.FREE),
     ]
     max_memory: Annotated[
         int | str | None,
-        Other(
+        Custom(
             None,
             reader=reading.memory_size,
             words="null, bytes, or a size such as 4GB",
@@ -260,16 +271,16 @@ class TraceOptions(TypedDict, total=False):
     ]
 
 
-class Common(_Samples, TraceOptions, total=False):
+class BatchOptions(_SampleOptions, TraceOptions, total=False):
     """Arguments of :func:`torchpt.render` that are the same for all pictures of a batch."""
 
     film: Annotated[
         Mapping[str, Any] | None,
-        Other(None, words=f"a mapping of {', '.join(Film.parameters)}", doc="the picture: its size, its layers"),
+        Custom(None, words=f"a mapping of {', '.join(Film.parameters)}", doc="the picture: its size, its layers"),
     ]
     pilots: Annotated[
         bool | str | None,
-        Other(
+        Custom(
             "auto",
             reader=_pilots,
             words="auto, true or false",
@@ -298,7 +309,7 @@ class Common(_Samples, TraceOptions, total=False):
     ]
     checkpoint: Annotated[
         str | None,
-        Other(
+        Custom(
             None,
             reader=_file,
             words=_FILE,
@@ -328,10 +339,10 @@ class Common(_Samples, TraceOptions, total=False):
     ]
 
 
-class CommonOptions(Common, total=False):
+class CommonOptions(BatchOptions, total=False):
     """Arguments of :func:`torchpt.render` beside the scene and ``full``."""
 
-    seed: Annotated[int | None, Whole(0, high=MOST_SEED, doc="the same seed gives the same picture")]
+    seed: Annotated[int | None, Integer(0, high=MOST_SEED, doc="the same seed gives the same picture")]
     params: Annotated[
         Mapping[str, Tensor] | None,
         Argument(
@@ -353,16 +364,16 @@ class RenderOptions(CommonOptions, total=False):
     ]
 
 
-_ARGUMENTS = {name: argument.spec for name, argument in declared(RenderOptions).items()}
+_ARGUMENTS = {name: argument.spec for name, argument in arguments_of(RenderOptions).items()}
 
 
-class Render(Valued):
+class Render(FrozenConfig):
     """Settings of how the work is done; none of them but ``spp`` and ``seed`` changes what the picture converges to."""
 
     parameters: ClassVar = {
         **{name: _ARGUMENTS[name] for name in ("spp", "seed")},  # which lists begin with
         **{name: s for name, s in _ARGUMENTS.items() if name not in BLOCKS and not isinstance(s, Argument)},
-        "preview": Other(
+        "preview": Custom(
             None,
             reader=_file,
             words=_FILE,
@@ -374,56 +385,58 @@ class Render(Valued):
     @property
     def stops(self) -> dict[str, Any]:
         """The stop rules that are set besides ``spp``, by name."""
-        every = {name: getattr(self, name) for name in having(Role.ENDS)["render"]}
+        every = {name: getattr(self, name) for name in settings_with(Role.ENDS)["render"]}
         return {name: value for name, value in every.items() if value is not None}
 
     def without(self, role: Role) -> Render:
         """Return the same with the settings of a role left out."""
-        return Render(**{name: value for name, value in self.values.items() if name not in having(role)["render"]})
+        return Render(
+            **{name: value for name, value in self.values.items() if name not in settings_with(role)["render"]}
+        )
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Valued`."""
+        """See :class:`FrozenConfig`."""
         if values["resume"] and values["checkpoint"] is None:
             raise Refused("false without render.checkpoint, the file to go on from", True, ("resume",))
 
 
-class Call(Valued):
+class CallArguments(FrozenConfig):
     """What a call of :func:`torchpt.render` says beside settings of the scene file."""
 
     parameters: ClassVar = {name: s for name, s in _ARGUMENTS.items() if isinstance(s, Argument)}
 
     @classmethod
-    def of(cls, wishes: Mapping[str, Any]) -> Call:
+    def of(cls, options: Mapping[str, Any]) -> CallArguments:
         """Return what arguments say, checked.
 
         Raises:
             SceneError: one that is not accepted.
         """
         values: dict[str, Any] = {}
-        for name in [name for name in cls.parameters if name in wishes]:
+        for name in [name for name in cls.parameters if name in options]:
             try:
-                values[name] = declared(RenderOptions)[name].read(wishes[name])
+                values[name] = arguments_of(RenderOptions)[name].read(options[name])
             except Refused as error:
-                raise refused(error, name, wishes[name], None) from None
+                raise scene_error(error, name, options[name], None) from None
         return cls(**values)
 
 
-def blocks_of(wishes: Mapping[str, Any]) -> dict[str, Any]:
+def settings_of_call(options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings among the arguments of a call by block; the device is none of them: it is the scene's."""
-    own = {name: wishes.get(name) for name in Render.parameters if name in _ARGUMENTS and name != "device"}
-    return {**{name: wishes.get(name) for name in BLOCKS}, "render": own}
+    own = {name: options.get(name) for name in Render.parameters if name in _ARGUMENTS and name != "device"}
+    return {**{name: options.get(name) for name in BLOCKS}, "render": own}
 
 
 #: The blocks without types.
-RECORDS: Mapping[str, type[Valued]] = {"film": Film, "render": Render}
+UNTYPED_BLOCKS: Mapping[str, type[FrozenConfig]] = {"film": Film, "render": Render}
 
 
-def having(role: Role, but: Role = Role.NONE) -> dict[str, tuple[str, ...]]:
+def settings_with(role: Role, but: Role = Role.NONE) -> dict[str, tuple[str, ...]]:
     """Return the settings of a role by block, without those that have the role ``but`` too."""
     return {
         block: tuple(name for name, s in parameters_of(record).items() if s.role & role and not s.role & but)
-        for block, record in RECORDS.items()
+        for block, record in UNTYPED_BLOCKS.items()
     }
 
 
@@ -476,7 +489,7 @@ class Settings:
 
 
 def _plain(value: Any) -> Any:
-    if not isinstance(value, Valued | ParsedParams):
+    if not isinstance(value, FrozenConfig | ParsedParams):
         return value
     kind = {"type": value.name} if hasattr(value, "name") else {}
     return kind | {key: _plain(item) for key, item in value.values.items()}
@@ -486,7 +499,7 @@ def _set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
     """The keys of a block that are really set (null means unset); a filter's or block's bare name is its type."""
     if raw is None:
         return {}
-    if isinstance(raw, str) and key.rpartition(".")[2] in TYPED:
+    if isinstance(raw, str) and key.rpartition(".")[2] in TYPED_BLOCKS:
         return {"type": raw}
     if not isinstance(raw, Mapping):
         raise SceneError(key, raw, "a mapping of settings", file)
@@ -495,7 +508,7 @@ def _set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
 
 def _overlay(what: str, below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     """``above`` over ``below``; keys of ``below`` that another type was meant to read do not follow."""
-    table, default = TYPED[what]
+    table, default = TYPED_BLOCKS[what]
     before, after = below.get("type", default), above.get("type", below.get("type", default))
     if before != after and isinstance(after, str) and after in table:
         own = parameters_of(table[after])
@@ -503,7 +516,7 @@ def _overlay(what: str, below: dict[str, Any], above: dict[str, Any]) -> dict[st
     return {**below, **above}
 
 
-def shaped(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+def keep_aspect(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keys of a film over those of another: a width or a height alone keeps the other's shape.
 
     Args:
@@ -538,7 +551,7 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
 
 
 #: Settings by what was said of them: a loop of renders says the same again and again.
-_merged: Memo[Settings] = Memo(256)
+_merged: ResultCache[Settings] = ResultCache(256)
 
 
 def _plain_mappings(blocks: Mapping[str, Any]) -> Any:
@@ -553,8 +566,8 @@ def _merge(
     for block in BLOCKS:
         below, above = _set(scene.get(block), block, file), _set(overrides.get(block), block, None)
         if block == "film":
-            above = shaped(below, above)
-        raw = _overlay(block, below, above) if block in TYPED else {**below, **above}
+            above = keep_aspect(below, above)
+        raw = _overlay(block, below, above) if block in TYPED_BLOCKS else {**below, **above}
         if "filter" in raw:
             inner = [_set(part.get("filter"), "film.filter", name) for part, name in ((below, file), (above, None))]
             raw["filter"] = _overlay("filter", *inner)
@@ -606,7 +619,7 @@ def _check_pilots(settings: Settings, file: str | None) -> None:
 
 def _open_end(raw: Mapping[str, Any], sampler: ParsedParams) -> None:
     """Raise where something else than ``spp`` is to end a render whose points depend on their number."""
-    for name in having(Role.ENDS)["render"]:
+    for name in settings_with(Role.ENDS)["render"]:
         if sampler.kind.needs_count and raw.get(name) is not None:
             free = ", ".join(kind for kind in SAMPLERS if not SAMPLERS[kind].needs_count)
             expected = (
@@ -626,17 +639,17 @@ def _given(overrides: Mapping[str, Any], key: str) -> bool:
 
 
 def _block(block: str, raw: dict[str, Any]) -> Any:
-    if block in TYPED:
-        refuse_foreign(block, TYPED[block][0], raw, TYPED[block][1], None)
+    if block in TYPED_BLOCKS:
+        refuse_unused_keys(block, TYPED_BLOCKS[block][0], raw, TYPED_BLOCKS[block][1], None)
         made = _typed(block, raw, block)
         return made.kind(**made.values) if block == "integrator" else made
     if block == "film":
         if "filter" in raw:
             raw["filter"] = _typed("filter", raw["filter"], "film.filter")
-        return Film(**values_of(Film, raw, block, None, "the film").values)
-    return Render(**values_of(Render, raw, block, None, "the render settings").values)
+        return Film(**read_params(Film, raw, block, None, "the film").values)
+    return Render(**read_params(Render, raw, block, None, "the render settings").values)
 
 
 def _typed(what: str, raw: dict[str, Any], key: str) -> ParsedParams:
     """A thing whose type picks its kind."""
-    return described(what, TYPED[what][0], raw, key, None, TYPED[what][1])
+    return read_typed(what, TYPED_BLOCKS[what][0], raw, key, None, TYPED_BLOCKS[what][1])

@@ -18,18 +18,18 @@ from torchpt.physics.textures import Node
 from torchpt.scene.formats.description import Description
 from torchpt.scene.formats.materials import check_material, plain_material, read_material
 from torchpt.scene.materials import declare, resolved
-from torchpt.scene.mesh_shapes import Mesh, ignored, mesh_of, solid
+from torchpt.scene.mesh_triangles import Mesh, ignored, mesh_of, solid
 from torchpt.scene.meshes import FileMaterial, MeshPart
-from torchpt.scene.sources import file_lights, labels_of
-from torchpt.scene.texels import Opener
+from torchpt.scene.sources import build_file_lights, unique_labels
+from torchpt.scene.texture_loader import TextureLoader
 from torchpt.spec import Pose, Vertices, parameters_of
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["Owner", "ShapeBuilder"]
+__all__ = ["ShapeBuilder", "ShapeEntry"]
 
 
 @dataclass(frozen=True)
-class Owner:
+class ShapeEntry:
     """A shape of a scene.
 
     Attributes:
@@ -60,18 +60,18 @@ class ShapeBuilder:
         sources: lights that mesh files have beside the triangles, in the order in which they were met.
     """
 
-    def __init__(self, description: Description, parameters: Parameters, opener: Opener) -> None:
-        self.description, self.parameters, self.opener = description, parameters, opener
+    def __init__(self, description: Description, parameters: Parameters, texture_loader: TextureLoader) -> None:
+        self.description, self.parameters, self.texture_loader = description, parameters, texture_loader
         self.sources: list[Source] = []
         self._slots: dict[str, ResolvedMaterial] = {}
         self._declared: set[int] = set()
 
-    def parts(self, owner: Owner) -> list[Part]:
+    def parts(self, owner: ShapeEntry) -> list[Part]:
         """What a shape comes to; no instance."""
         triangles = owner.shape.kind.triangles(owner.shape.values)
         return self._primitives(owner) if triangles is None else self._meshes(owner, triangles)
 
-    def copies(self, owner: Owner, parts: list[Part]) -> list[Copy]:
+    def copies(self, owner: ShapeEntry, parts: list[Part]) -> list[Copy]:
         """An instance, as one copy of each of the ``parts`` of its mesh."""
         key, file, shapes = owner.key, self.description.file, self.description.shapes
         of, material = owner.shape["of"], owner.shape["material"]
@@ -86,7 +86,7 @@ class ShapeBuilder:
             raise SceneError(f"{key}.transform", owner.to_world.tolist(), expected, file)
         made = []
         for part in (part for part in parts if part.shape == of):
-            slot = part.material if material is None else self._slot(material, key)
+            slot = part.material if material is None else self._material(material, key)
             if slot.emission is not None:
                 raise SceneError(
                     f"{key}.material", slot.name, "a material that does not emit: an instance cannot", file
@@ -97,7 +97,7 @@ class ShapeBuilder:
             made.append(Copy(key, owner.name, owner.number, part.name, slot, flip, pose))
         return made
 
-    def _primitives(self, owner: Owner) -> list[Part]:
+    def _primitives(self, owner: ShapeEntry) -> list[Part]:
         """A shape of primitives that share one pose."""
         shape, pose = owner.shape, owner.to_world
         own = shape.kind.own(shape.values)
@@ -109,7 +109,7 @@ class ShapeBuilder:
                 raise SceneError(owner.key, pose.tolist(), expected, self.description.file)
         surfaces = shape.kind.surfaces(shape.values, pose)
         self._declare_pose(owner.key, pose, surfaces)
-        slot = self._slot(shape["material"], owner.key)
+        slot = self._material(shape["material"], owner.key)
         return [
             self._part(owner, owner.key, slot, surface, pose if surface.local is None else pose @ surface.local)
             for surface in surfaces
@@ -119,13 +119,13 @@ class ShapeBuilder:
         angles = any(PRIMITIVES[surface.kind].angles for surface in surfaces)
         self.parameters.declare(f"{stem}.to_world", pose, Pose(angles=angles))
 
-    def _meshes(self, owner: Owner, triangles: Triangles) -> list[Part]:
+    def _meshes(self, owner: ShapeEntry, triangles: Triangles) -> list[Part]:
         """A shape of triangles: a part for each material of its file."""
         shape, pose = owner.shape, owner.to_world
-        mesh = mesh_of(triangles, owner.key, self.description, self.opener, materials=shape["material"] is None)
+        mesh = mesh_of(triangles, owner.key, self.description, self.texture_loader, materials=shape["material"] is None)
         lights = [light for piece in mesh.pieces for light in piece.lights]
-        self.sources += file_lights(lights, owner.key, pose, mesh.source, self.parameters)
-        labels = labels_of([piece.name for piece in mesh.pieces])
+        self.sources += build_file_lights(lights, owner.key, pose, mesh.source, self.parameters)
+        labels = unique_labels([piece.name for piece in mesh.pieces])
         parts: list[Part] = []
         known: dict[int, ResolvedMaterial] = {}
         for piece, label in zip(mesh.pieces, labels, strict=True):
@@ -134,13 +134,13 @@ class ShapeBuilder:
             self._declare_pose(stem, pose, [])
             own = piece.material if shape["material"] is None else None
             if own is None:
-                slot = self._slot(shape["material"], stem)
+                slot = self._material(shape["material"], stem)
             elif id(own) in known:  # parts of one material share its row and its textures
                 slot = known[id(own)]
             else:
-                slot = known[id(own)] = self._file_slot(own, owner.key, f"{stem}.material", mesh.source)
+                slot = known[id(own)] = self._file_material(own, owner.key, f"{stem}.material", mesh.source)
             part = self._part(owner, stem, slot, Surface("triangle"), pose)
-            parts.append(_filled(part, piece, mesh))
+            parts.append(_with_triangles(part, piece, mesh))
         if all(len(part.faces) == 0 for part in parts if part.faces is not None):
             problem = "every face is degenerate (without area)"
             if mesh.source:
@@ -148,16 +148,16 @@ class ShapeBuilder:
             raise SceneError(f"{owner.key}.faces", "no face with area", "a face with area", self.description.file)
         return parts
 
-    def _slot(self, given: Any, stem: str) -> ResolvedMaterial:
+    def _material(self, given: Any, stem: str) -> ResolvedMaterial:
         """The material that the scene gives a shape, by name or its own; the grey of one that has none."""
         known = self.description.materials
         if isinstance(given, str):
             if given not in self._slots:
-                self._slots[given] = resolved(known[given], f"materials.{given}", known, self.opener)
+                self._slots[given] = resolved(known[given], f"materials.{given}", known, self.texture_loader)
             return self._slots[given]
-        return resolved(plain_material() if given is None else given, f"{stem}.material", known, self.opener)
+        return resolved(plain_material() if given is None else given, f"{stem}.material", known, self.texture_loader)
 
-    def _file_slot(self, own: FileMaterial, prefix: str, key: str, source: str) -> ResolvedMaterial:
+    def _file_material(self, own: FileMaterial, prefix: str, key: str, source: str) -> ResolvedMaterial:
         """A mesh file's own material.
 
         Raises:
@@ -166,11 +166,11 @@ class ShapeBuilder:
         try:
             material = read_material(own.material, key, BSDFS, None)
             check_material(material, key, {}, {}, None)
-            return resolved(material, key, {}, self.opener.sharing(f"{prefix}.textures"))
+            return resolved(material, key, {}, self.texture_loader.sharing(f"{prefix}.textures"))
         except SceneError as error:
             raise AssetError(source, f"material {own.name[:80]!r}: {error}") from None
 
-    def _part(self, owner: Owner, stem: str, slot: ResolvedMaterial, surface: Surface, pose: np.ndarray) -> Part:
+    def _part(self, owner: ShapeEntry, stem: str, slot: ResolvedMaterial, surface: Surface, pose: np.ndarray) -> Part:
         """A surface of a shape, without what only triangles have; its emission and its material's numbers are declared."""
         if slot is not self._slots.get(slot.name.removeprefix("materials.")) or id(slot) not in self._declared:
             declare(slot, self.parameters)
@@ -202,7 +202,7 @@ class ShapeBuilder:
         )
 
 
-def _filled(part: Part, piece: MeshPart, mesh: Mesh) -> Part:
+def _with_triangles(part: Part, piece: MeshPart, mesh: Mesh) -> Part:
     """A part with its triangles."""
     faces, dropped = solid(piece, part.to_world)
     return replace(

@@ -15,21 +15,28 @@ from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.parts import Parameters, Part, Source
 from torchpt.scene.formats.description import Description
 from torchpt.scene.meshes import FileLight
-from torchpt.spec import Corners, Refused, parameters_of
-from torchpt.spec.schema import ParsedParams, refused
+from torchpt.spec import Refused, VertexAttribute, parameters_of
+from torchpt.spec.schema import ParsedParams, scene_error
 
-__all__ = ["check_coordinates", "check_sources", "declare_corners", "file_lights", "labels_of", "sources_of"]
+__all__ = [
+    "build_file_lights",
+    "build_lights",
+    "check_coordinates",
+    "check_light_params",
+    "declare_vertex_attributes",
+    "unique_labels",
+]
 
 
 # ---- Texture coordinates and normals of meshes: those that gradients are wanted of, and meshes that lack what texels need
 
 
-def declare_corners(parts: Sequence[Part], traced: Collection[str], parameters: Parameters) -> None:
+def declare_vertex_attributes(parts: Sequence[Part], vertex_params: Collection[str], parameters: Parameters) -> None:
     """Make normals and texture coordinates of meshes parameters, those that are asked for by name."""
-    for part in parts if traced else ():
+    for part in parts if vertex_params else ():
         for key, value in (("normals", part.normals), ("uvs", part.uvs)):
-            if value is not None and f"{part.name}.{key}" in traced:
-                parameters.declare(f"{part.name}.{key}", value, Corners())
+            if value is not None and f"{part.name}.{key}" in vertex_params:
+                parameters.declare(f"{part.name}.{key}", value, VertexAttribute())
 
 
 def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str | None) -> None:
@@ -61,7 +68,7 @@ def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str 
 # ---- Lights that are no surfaces: those of the scene's block, and those that mesh files bring
 
 
-def sources_of(description: Description, parameters: Parameters) -> list[Source]:
+def build_lights(description: Description, parameters: Parameters) -> list[Source]:
     """The lights block; its numbers become parameters."""
     lights = description.lights
     around = [name for name, light in lights.items() if light.kind.environment]
@@ -75,7 +82,7 @@ def sources_of(description: Description, parameters: Parameters) -> list[Source]
         try:
             arrays = light.kind.files(light.values, partial(_file, description, key, light))
         except Refused as error:
-            raise refused(error, key, None, description.file) from None
+            raise scene_error(error, key, None, description.file) from None
         for stem, (values, spec) in arrays.items():
             parameters.declare(f"{key}.{stem}", values, spec)
     return [Source(f"lights.{name}", light.name, light.values) for name, light in lights.items()]
@@ -85,7 +92,7 @@ def _file(description: Description, key: str, light: ParsedParams, parameter: st
     return description.resolve(light[parameter], f"{key}.{parameter}")
 
 
-def check_sources(sources: Sequence[Source], given: Collection[str], parameters: Mapping[str, Tensor]) -> None:
+def check_light_params(sources: Sequence[Source], given: Collection[str], parameters: Mapping[str, Tensor]) -> None:
     """Refuse parameters that do not go together.
 
     Args:
@@ -105,15 +112,15 @@ def check_sources(sources: Sequence[Source], given: Collection[str], parameters:
         try:
             kind.check({**source.values, **numbers}, frozenset(numbers))
         except Refused as error:
-            raise refused(error, f"params.{source.name}", None, None) from None
+            raise scene_error(error, f"params.{source.name}", None, None) from None
 
 
-def file_lights(
+def build_file_lights(
     lights: list[FileLight], prefix: str, pose: np.ndarray, source: str, parameters: Parameters
 ) -> list[Source]:
     """The lights of a mesh file, placed in the scene; their numbers become parameters."""
     sources = []
-    for light, label in zip(lights, labels_of([light.name for light in lights]), strict=True):
+    for light, label in zip(lights, unique_labels([light.name for light in lights]), strict=True):
         stem = f"{prefix}.lights.{label}"
         with np.errstate(over="ignore", invalid="ignore"):
             position, direction = apply_points(pose, light.position), pose[:3, :3] @ light.direction
@@ -132,7 +139,7 @@ def file_lights(
     return sources
 
 
-def labels_of(names: list[str]) -> list[str]:
+def unique_labels(names: list[str]) -> list[str]:
     """Distinct labels without dots for the pieces of a mesh."""
     labels: dict[str, None] = {}  # in order, and quick to textures up
     for number, name in enumerate(names):

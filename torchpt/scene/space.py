@@ -20,16 +20,16 @@ from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.parts import Copy, Part, Source
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["FARTHEST", "Space", "centre_and_unit", "extent_of", "middle_of"]
+__all__ = ["MAX_COORDINATE", "Space", "bounds_center", "bounds_extent", "centre_and_unit"]
 
 #: A scene is moved to the origin where it lies further away than this many times its own size.
-RECENTRE = 8.0
+RECENTRE_DISTANCE = 8.0
 #: Lengths from one over this to this are left as they are.
-ORDINARY = 2.0**30
+UNSCALED_RANGE = 2.0**30
 #: The longest length over the smallest shape, at most: about their geometric mean the cubes of both are within float32.
-RANGE = 2.0**80
+MAX_RATIO = 2.0**80
 #: Units from the origin beyond which float32 loses cubes of coordinates.
-FARTHEST = 2.0**42
+MAX_COORDINATE = 2.0**42
 
 Array = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def centre_and_unit(
         raise SceneError(names[worst], [boxes[worst].min(0).tolist(), boxes[worst].max(0).tolist()], expected, file)
     low, high = boxes.min((0, 1)), boxes.max((0, 1))
     middle = 0.5 * (low + high)
-    if np.abs(middle).max() > RECENTRE * (high - low).max():
+    if np.abs(middle).max() > RECENTRE_DISTANCE * (high - low).max():
         centre = middle
     reaches = np.abs(boxes - centre).max((1, 2))
     far, near = int(reaches.argmax()), int(sizes.argmin())
@@ -100,13 +100,13 @@ def centre_and_unit(
     return centre, _unit(lengths, (names[near], float(sizes[near])), file)
 
 
-def middle_of(parts: Sequence[Part], copies: Sequence[Copy]) -> Array:
+def bounds_center(parts: Sequence[Part], copies: Sequence[Copy]) -> Array:
     """The middle of the box around all that can be hit, ``(3,)``; the origin where nothing can."""
     names, boxes, _ = _boxes(parts, copies)
     return 0.5 * (boxes.min((0, 1)) + boxes.max((0, 1))) if names else np.zeros(3)
 
 
-def extent_of(parts: Sequence[Part], copies: Sequence[Copy]) -> float:
+def bounds_extent(parts: Sequence[Part], copies: Sequence[Copy]) -> float:
     """The longest side of the box around all that can be hit; 1 where nothing can."""
     names, boxes, _ = _boxes(parts, copies)
     return float((boxes.max((0, 1)) - boxes.min((0, 1))).max()) if names else 1.0
@@ -153,11 +153,9 @@ def _unit(lengths: Sequence[tuple[str, float]], smallest: tuple[str, float], fil
     """One, or a power of two near the geometric mean of the longest length and the smallest shape."""
     (far, longest), (near, size) = max(lengths, key=lambda item: item[1]), smallest
     longest = max(longest, size)
-    if longest > RANGE * size:
-        expected = (
-            f"a size of at least {longest / RANGE:.3g} beside a length of {longest:.3g} ({far}): float32 holds no more"
-        )
+    if longest > MAX_RATIO * size:
+        expected = f"a size of at least {longest / MAX_RATIO:.3g} beside a length of {longest:.3g} ({far}): float32 holds no more"
         raise SceneError(near, float(f"{size:.3g}"), expected, file)
-    if longest <= ORDINARY and size * ORDINARY >= 1.0:
+    if longest <= UNSCALED_RANGE and size * UNSCALED_RANGE >= 1.0:
         return 1.0
     return 2.0 ** round(0.5 * (math.log2(longest) + math.log2(size)))

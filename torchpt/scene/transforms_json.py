@@ -23,7 +23,7 @@ from torchpt.core.errors import AssetError, OutputError, SceneError
 from torchpt.core.files import as_path, read_regular
 from torchpt.scene.conventions import from_opengl, size_of, to_opengl
 from torchpt.spec import Refused, reading
-from torchpt.spec.schema import described
+from torchpt.spec.schema import read_typed
 
 if TYPE_CHECKING:
     from torchpt.scene.scene import Scene
@@ -33,13 +33,13 @@ __all__ = ["Frame", "frame_of", "read_transforms", "write_transforms"]
 _MOST = 256 * 2**20
 _NUMBERS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y")
 #: What bends rays, or turns the picture otherwise: none of it is built, so it must be 0.
-_BENT = ("k1", "k2", "k3", "k4", "p1", "p2")
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 _FOCAL = "a number > 0", lambda x: x > 0.0
 _SIDE = "a whole number in 1..16777216", lambda x: 1.0 <= x <= 2.0**24 and x.is_integer()
 _ANGLE = "an angle above 0 and below pi", lambda x: 1e-30 < x < math.pi
 #: What is accepted of numbers that have ends.
-_ENDS: dict[str, tuple[str, Callable[[float], bool]]] = {
+_RANGES: dict[str, tuple[str, Callable[[float], bool]]] = {
     "fl_x": _FOCAL,
     "fl_y": _FOCAL,
     "w": _SIDE,
@@ -138,7 +138,7 @@ def _number(path: Any, key: str, row: Mapping[str, Any], name: str) -> float | N
     value = row.get(name)
     if value is None:
         return None
-    expected, fits = _ENDS.get(name, ("a finite number", lambda _: True))
+    expected, fits = _RANGES.get(name, ("a finite number", lambda _: True))
     try:
         found = reading.number(value)
     except Refused:
@@ -153,9 +153,9 @@ def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
     model = row.get("camera_model", _MODELS[0])
     if model not in _MODELS or row.get("is_fisheye"):
         raise AssetError(path, f"{key}: a camera of model {model!r} is not built; one of {', '.join(_MODELS)}")
-    if any(_number(path, key, row, name) for name in _BENT):
+    if any(_number(path, key, row, name) for name in _DISTORTION):
         raise AssetError(
-            path, f"{key}: a lens that bends rays ({', '.join(_BENT)}) is not built; undistort the pictures"
+            path, f"{key}: a lens that bends rays ({', '.join(_DISTORTION)}) is not built; undistort the pictures"
         )
     image, matrix = row.get("file_path", ""), row.get("transform_matrix")
     if not isinstance(image, str):
@@ -242,7 +242,7 @@ def _seen(block: Any, size: tuple[int, int], key: str) -> tuple[Tensor, Tensor]:
         raise SceneError(key, sorted(map(str, block)), expected)
     if "K" in block:
         block = {"size": list(size), **block}
-    values = described("camera", {Perspective.name: Perspective}, block, key, None, Perspective.name).values
+    values = read_typed("camera", {Perspective.name: Perspective}, block, key, None, Perspective.name).values
     numbers = {
         name: torch.tensor(value, dtype=torch.float64) if isinstance(value, float) else value
         for name, value in values.items()

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError
-from torchpt.scene.sources import check_sources
-from torchpt.scene.versions import changes
+from torchpt.scene.sources import check_light_params
+from torchpt.scene.versions import changed_versions
 
 if TYPE_CHECKING:
     from torchpt.scene.scene import Scene
 
-__all__ = ["check_tensor", "shared", "validate_changes"]
+__all__ = ["check_tensor", "inherited_checks", "validate_changes"]
 
 
 def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], texels: bool = False) -> None:
@@ -46,22 +46,22 @@ def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:
         raise SceneError(
             f"params.{name}", "nothing" if name in own else name, "the names that the scene was loaded with"
         )
-    changed = changes(validated_versions, scene.versions())
+    changed = changed_versions(validated_versions, scene.versions())
     if not changed:
         return
     for name in changed:
         value = scene.params[name]
         check_tensor(name, value, own[name].shape)
         scene.check_number(name, value.detach())
-    check_sources(scene.built.sources, changed, scene.merged(None))
+    check_light_params(scene.built.sources, changed, scene.merged(None))
     validated_versions |= changed
 
 
-def shared(made: Scene, scene: Scene, validated_versions: dict[str, int]) -> dict[str, int]:
+def inherited_checks(made: Scene, scene: Scene, validated_versions: dict[str, int]) -> dict[str, int]:
     """Of what was checked of a scene, that which another one made of it has too: the same tensors, as they were checked."""
     before, now = scene.versions(), made.versions()
     return {
-        name: edition
-        for name, edition in now.items()
+        name: version
+        for name, version in now.items()
         if 0 < before.get(name, 0) == validated_versions.get(name) and made.params[name] is scene.params[name]
     }

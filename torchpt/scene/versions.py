@@ -9,15 +9,15 @@ from torch import Tensor
 
 from torchpt.core.errors import RenderError
 
-__all__ = ["AFTER", "Editions", "changes", "check_unchanged"]
+__all__ = ["AFTER", "VersionCounter", "changed_versions", "check_unchanged"]
 
 #: Since when a scene may not have changed whose gradient is asked for.
 AFTER = "after the picture whose gradient is asked for"
 
 
-def changes(before: Mapping[str, int], now: Mapping[str, int]) -> dict[str, int]:
+def changed_versions(before: Mapping[str, int], now: Mapping[str, int]) -> dict[str, int]:
     """Of editions, those that are others than before, and those of which nobody can tell."""
-    return {name: edition for name, edition in now.items() if not 0 < edition == before.get(name)}
+    return {name: version for name, version in now.items() if not 0 < version == before.get(name)}
 
 
 def check_unchanged(before: Mapping[str, int], now: Mapping[str, int], since: str) -> None:
@@ -31,13 +31,13 @@ def check_unchanged(before: Mapping[str, int], now: Mapping[str, int], since: st
     Raises:
         RenderError: one of the scene's own parameters was replaced, or changed in place.
     """
-    for name, edition in before.items():
-        if now.get(name) != edition:
+    for name, version in before.items():
+        if now.get(name) != version:
             hint = "hand it over by params, whose values a picture keeps, or change it later"
             raise RenderError(f"scene.params[{name!r}] was changed {since}: {hint}")
 
 
-class Editions:
+class VersionCounter:
     """Numbers what tensors hold, by their names, as far as it is asked for."""
 
     def __init__(self) -> None:

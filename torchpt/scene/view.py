@@ -11,19 +11,19 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError
 from torchpt.physics.parts import Parameters
-from torchpt.scene.build import Built
+from torchpt.scene.build import SceneBuild
 from torchpt.scene.formats.cameras import read_camera
 from torchpt.scene.formats.description import Description
-from torchpt.scene.formats.tensors import Tensors
+from torchpt.scene.formats.tensors import DictTensors
 from torchpt.scene.formats.yaml import plain
-from torchpt.scene.traced import traced, widened
+from torchpt.scene.params_from_tensors import params_from_tensors, with_all_intrinsics
 
-__all__ = ["through"]
+__all__ = ["view_attributes"]
 
 
-def through(
+def view_attributes(
     description: Description,
-    built: Built,
+    built: SceneBuild,
     params: Mapping[str, Tensor],
     camera: Mapping[str, Any],
     film: Mapping[str, Any],
@@ -43,9 +43,9 @@ def through(
     if not isinstance(film, Mapping):
         raise SceneError("film", film, "a mapping")
     size = description.film | {name: value for name, value in film.items() if value is not None}
-    tensors = Tensors()
-    chosen = read_camera(tensors.taken_from(plain({"camera": camera}))["camera"], size, None)
-    description = widened(replace(description, camera=chosen), tensors)
+    tensors = DictTensors()
+    chosen = read_camera(tensors.extract(plain({"camera": camera}))["camera"], size, None)
+    description = with_all_intrinsics(replace(description, camera=chosen), tensors)
     chosen, parameters = description.camera, Parameters()
     for name, value in built.parameters.items():
         if not name.startswith("camera."):
@@ -62,4 +62,8 @@ def through(
     }
     built = replace(built, parameters=parameters)
     every = {name: value for name, value in params.items() if not name.startswith("camera.")} | own
-    return {"description": description, "_built": built, "params": every | traced(tensors, description, built, every)}
+    return {
+        "description": description,
+        "_built": built,
+        "params": every | params_from_tensors(tensors, description, built, every),
+    }

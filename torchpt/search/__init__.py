@@ -69,12 +69,12 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
 
         return Brute(geometry, threads)
     if geometry.copies is not None:
-        from torchpt.search.tree_instances import WideInstanced
+        from torchpt.search.tree_instances import InstancedWideBvh
 
-        return WideInstanced(geometry, threads)
-    from torchpt.search.tree import Wide
+        return InstancedWideBvh(geometry, threads)
+    from torchpt.search.tree import WideBvh
 
-    return Wide(geometry, threads)
+    return WideBvh(geometry, threads)
 
 
 def _packets(geometry: Geometry, threads: int | None) -> Accel | None:

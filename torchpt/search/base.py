@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.physics.shapes.geometry import Geometry
 
-__all__ = ["Accel", "Array", "Hits", "closer"]
+__all__ = ["Accel", "Array", "Hits", "mark_non_opaque"]
 
 #: A numpy array, float32 or int32.
 Array = np.ndarray[Any, Any]
@@ -92,7 +92,7 @@ class Accel(ABC):
         """
         rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
         out[:count] = self.occluded(*rays).numpy()
-        closer(out[:count], non_opaque)
+        mark_non_opaque(out[:count], non_opaque)
 
     @abstractmethod
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits: ...
@@ -105,7 +105,7 @@ class Accel(ABC):
         """What was built: name, primitives, nodes, leaves, sah_cost, depth, bytes, build_seconds."""
 
 
-def closer(out: Array, non_opaque: Array | None) -> None:
+def mark_non_opaque(out: Array, non_opaque: Array | None) -> None:
     """What was found without a look at ``non_opaque`` as :meth:`Accel.blocked` tells it: 2 for 1 where there are any."""
     if non_opaque is not None:
         np.left_shift(out, 1, out=out)

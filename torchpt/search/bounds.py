@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchpt.physics.shapes.geometry import Geometry, QuadricTable
 
-__all__ = ["chosen", "primitive_bounds", "surface"]
+__all__ = ["half_areas", "primitive_bounds", "select_primitives"]
 
 
 def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
@@ -38,7 +38,7 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
     return down.contiguous(), up.contiguous()
 
 
-def chosen(geometry: Geometry, prim: Tensor) -> Geometry:
+def select_primitives(geometry: Geometry, prim: Tensor) -> Geometry:
     """Some of the primitives, given by rising ids ``(K,)`` int64."""
     starts = torch.tensor([sum(geometry.counts[:k]) for k in range(6)], device=prim.device)
     a, b, c, d, e = torch.diff(torch.searchsorted(prim, starts)).tolist()
@@ -51,7 +51,7 @@ def chosen(geometry: Geometry, prim: Tensor) -> Geometry:
     return Geometry(p0, p1, p2, (a, b, c, d, e), quadrics)
 
 
-def surface(low: Tensor, high: Tensor) -> Tensor:
+def half_areas(low: Tensor, high: Tensor) -> Tensor:
     """Half the surface area of boxes ``(3, N)``."""
     x, y, z = (high - low).unbind(0)
     return x * y + y * z + z * x

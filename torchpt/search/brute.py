@@ -2,7 +2,7 @@
 
 The code is that of compiled renders (:mod:`torchpt.compiler.packet`), as kernels of whole tensors: in a render by tensor
 operations a ray meets what it meets inside of a stage, wherever in the batch it stands. Packets know planar
-primitives and spheres; quadrics come afterwards, one by one (:func:`nearer`).
+primitives and spheres; quadrics come afterwards, one by one (:func:`merge_quadric_hits`).
 Edges are watertight because primitives accept their own rounding error (:func:`torchpt.search.tables.tolerances`).
 """
 
@@ -21,19 +21,19 @@ from torchpt.compiler import cache
 from torchpt.compiler.function import Lanewise
 from torchpt.compiler.graph import Graph
 from torchpt.compiler.kernel import HEAD
-from torchpt.compiler.packet import KINDS, packet_words
+from torchpt.compiler.packet import KINDS, scene_words
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.sinks import Sinks, Store
 from torchpt.core.dispatch import dispatched
 from torchpt.core.errors import SceneError
-from torchpt.core.threads import share, thread_count
+from torchpt.core.threads import parallel_for, thread_count
 from torchpt.native import compile_time
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.base import Accel, Hits
 from torchpt.search.leaf import quadric
-from torchpt.search.tables import Tables, extent, inverses, prepare, tolerances
+from torchpt.search.tables import Tables, affine_rows, extent, quadric_rows, tolerances
 
-__all__ = ["MAX_TOLERANCE", "Brute", "Rows", "nearer", "rows_of"]
+__all__ = ["MAX_TOLERANCE", "Brute", "Rows", "merge_quadric_hits", "rows_of"]
 
 #: Largest share of its own size by which a primitive may be enlarged (rays across it, from within the scene).
 MAX_TOLERANCE = 1e-3
@@ -65,7 +65,7 @@ class Rows(NamedTuple):
 
 def rows_of(geometry: Geometry) -> Rows:
     """Return the rows of primitives; whether they are fine enough is for the caller to ask."""
-    size, tables = extent(geometry), prepare(geometry)
+    size, tables = extent(geometry), affine_rows(geometry)
     return Rows(tables, size, tolerances(tables.rows64, size))
 
 
@@ -78,7 +78,7 @@ class Brute(Accel):
         rows: of the primitives, where they are known already.
 
     Attributes:
-        words: what kernels read of the primitives, see :func:`torchpt.compiler.packet.packet_words`.
+        words: what kernels read of the primitives, see :func:`torchpt.compiler.packet.scene_words`.
 
     Raises:
         SceneError: the geometry is not on the CPU, or float32 rows are too coarse for it.
@@ -98,12 +98,12 @@ class Brute(Accel):
         self.table = table.float().contiguous()
         balls = torch.cat([geometry.p0, geometry.p1[:1]])[:, planar:round_].T.double()
         self.spheres = torch.where(tables.area[planar:round_, None], balls, torch.nan).contiguous()
-        columns = inverses(geometry).T.contiguous()
+        columns = quadric_rows(geometry).T.contiguous()
         self.quadrics = [(row, torch.tensor(round_ + k, dtype=torch.int32)) for k, row in enumerate(columns)]
         self.counts = list(geometry.counts)
         self.kinds = tuple(kind for kind, some in zip(KINDS, self.counts, strict=False) if some)
         self.threads = threads
-        self.words = packet_words(self.table, self.spheres, self.counts, size)
+        self.words = scene_words(self.table, self.spheres, self.counts, size)
         self.build_seconds = time.perf_counter() - start
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
@@ -111,7 +111,7 @@ class Brute(Accel):
         prim = torch.empty_like(t_max, dtype=torch.int32)
         self._search(False, (o, d, t_max), (t, prim, u, v))
         for row, number in self.quadrics:
-            t, prim, u, v = nearer(o, d, t_max, t, prim, u, v, row, number)
+            t, prim, u, v = merge_quadric_hits(o, d, t_max, t, prim, u, v, row, number)
         return t, prim, u, v
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
@@ -138,7 +138,7 @@ class Brute(Accel):
         most = max(count * sum(self.counts) // _GRAIN, 1)
         # In threads of the pool torch has but one: loops that search there share the work already.
         threads = min(thread_count(self.threads), torch.get_num_threads(), most)
-        share(part, -(-count // _BLOCK), threads)
+        parallel_for(part, -(-count // _BLOCK), threads)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; there are no nodes, and the cost is one test a primitive."""
@@ -165,15 +165,15 @@ def _kernel(kinds: tuple[str, ...], any_hit: bool) -> Any:
     else:
         hits = graph.node("nearest", "S", *ray)
         stores = [Store((graph.node("part", ty, hits, extra=k),), ty) for k, ty in enumerate("fiff")]
-    compile_time.begun()
+    compile_time.begin()
     try:
         return cache.compiled(TracedStage(graph, Sinks(store=stores), tensors=3, searched=kinds)).call
     finally:
-        compile_time.ended()
+        compile_time.end()
 
 
 @dispatched
-def nearer(
+def merge_quadric_hits(
     o: Tensor, d: Tensor, t_max: Tensor, t: Tensor, prim: Tensor, u: Tensor, v: Tensor, row: Tensor, number: Tensor
 ) -> Hits:
     """Return hits, those on one quadric where it is nearer: its ``row (19,)`` and its id."""
@@ -183,4 +183,6 @@ def nearer(
     return torch.where(hit, at, t), torch.where(hit, number, prim), torch.where(hit, a, u), torch.where(hit, b, v)
 
 
-nearer.register(Lanewise(nearer.function, ("o", "d", "t_max", "t", "prim", "u", "v"), ("row", "number")))
+merge_quadric_hits.register(
+    Lanewise(merge_quadric_hits.function, ("o", "d", "t_max", "t", "prim", "u", "v"), ("row", "number"))
+)

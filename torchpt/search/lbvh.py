@@ -11,11 +11,11 @@ from torch import Tensor
 
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.base import Accel, Hits
-from torchpt.search.bounds import primitive_bounds, surface
+from torchpt.search.bounds import half_areas, primitive_bounds
 from torchpt.search.leaf import Rays, distances, prepare_rays
-from torchpt.search.tables import inverses, prepare
+from torchpt.search.tables import affine_rows, quadric_rows
 
-__all__ = ["Lbvh", "Tree", "build_tree", "intersect", "morton_codes", "occluded"]
+__all__ = ["Lbvh", "RadixTree", "build_tree", "intersect", "morton_codes", "occluded"]
 
 
 # ---- The radix tree over Morton codes, by tensor operations without a loop over primitives
@@ -26,7 +26,7 @@ __all__ = ["Lbvh", "Tree", "build_tree", "intersect", "morton_codes", "occluded"
 _BITS = 21
 
 
-class Tree(NamedTuple):
+class RadixTree(NamedTuple):
     """A binary tree over sorted primitives; node 0 is the root.
 
     Attributes:
@@ -58,7 +58,7 @@ def morton_codes(centre: Tensor) -> Tensor:
     return (cell[0] << 2) | (cell[1] << 1) | cell[2]
 
 
-def build_tree(low: Tensor, high: Tensor, ids: Tensor) -> Tree:
+def build_tree(low: Tensor, high: Tensor, ids: Tensor) -> RadixTree:
     """Builds the tree of primitives with boxes ``low, high`` ``(3, L)`` and primitive ids ``ids`` ``(L,)``.
 
     Equal codes are told apart by their place in the stable order, so that a million coincident centroids give a
@@ -70,7 +70,7 @@ def build_tree(low: Tensor, high: Tensor, ids: Tensor) -> Tree:
         boxes = torch.full((12, min(n, 1)), torch.inf, device=device)
         boxes[9:12] = -torch.inf
         boxes[0:3], boxes[3:6] = low, high
-        return Tree(torch.full((2, min(n, 1)), -1, dtype=torch.int32, device=device), boxes, ids.int(), min(n, 1))
+        return RadixTree(torch.full((2, min(n, 1)), -1, dtype=torch.int32, device=device), boxes, ids.int(), min(n, 1))
     codes, perm = torch.sort(morton_codes(low.double() / 2 + high.double() / 2), stable=True)
     low, high, order = low[:, perm], high[:, perm], ids[perm].int().contiguous()
     left, right, split = _ranges(codes >> 1)  # room above for "outside"; the lost bit is settled by place
@@ -83,7 +83,7 @@ def build_tree(low: Tensor, high: Tensor, ids: Tensor) -> Tree:
     for child in (first, second):
         inner = child >= 0
         parent[child[inner]] = node[inner]
-    return Tree(children, boxes.contiguous(), order, _depth(parent))
+    return RadixTree(children, boxes.contiguous(), order, _depth(parent))
 
 
 def _below(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
@@ -295,11 +295,11 @@ class Lbvh(Accel):
 
     def __init__(self, geometry: Geometry) -> None:
         start = time.perf_counter()
-        tables = prepare(geometry)
+        tables = affine_rows(geometry)
         self.counts = list(geometry.counts)
         self.corners = torch.cat([geometry.p0, geometry.p1, geometry.p2]).float()
         self.rows = tables.rows.T.contiguous()
-        quadrics = inverses(geometry)
+        quadrics = quadric_rows(geometry)
         self.quadrics = quadrics if bool(quadrics[-1].any()) else quadrics[:-1]
         keep = torch.nonzero(tables.area)[:, 0]
         low, high = primitive_bounds(geometry)
@@ -329,11 +329,11 @@ class Lbvh(Accel):
         }
 
 
-def sah_cost(tree: Tree) -> float:
+def sah_cost(tree: RadixTree) -> float:
     """Expected cost of a random ray through the root's box: 1 a node, 1 a primitive (MacDonald & Booth 1990)."""
     if tree.children.shape[1] == 0:
         return float(tree.order.shape[0])
     boxes = tree.boxes.double()
-    area = torch.stack([surface(boxes[0:3], boxes[3:6]), surface(boxes[6:9], boxes[9:12])])
+    area = torch.stack([half_areas(boxes[0:3], boxes[3:6]), half_areas(boxes[6:9], boxes[9:12])])
     low, high = torch.minimum(boxes[0:3, :1], boxes[6:9, :1]), torch.maximum(boxes[3:6, :1], boxes[9:12, :1])
-    return float(1 + area.sum() / surface(low, high).clamp(min=torch.finfo(torch.float64).tiny))
+    return float(1 + area.sum() / half_areas(low, high).clamp(min=torch.finfo(torch.float64).tiny))

@@ -61,7 +61,7 @@ def distances(
         prim: ``(N,)`` int64 primitive ids.
         corners: ``(9, P)`` float32: p0, p1, p2.
         rows: ``(12, P)`` float32, see :mod:`torchpt.search.tables`.
-        quadrics: ``(19, Q)`` float64, or 18 rows where no form has a ``half``, see :func:`torchpt.search.tables.inverses`.
+        quadrics: ``(19, Q)`` float64, or 18 rows where no form has a ``half``, see :func:`torchpt.search.tables.quadric_rows`.
         counts: primitives of each kind.
 
     Returns:

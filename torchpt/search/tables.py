@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchpt.physics.shapes.geometry import Geometry
 
-__all__ = ["QUADRIC", "ROUNDING", "Tables", "extent", "inverses", "prepare", "tolerances"]
+__all__ = ["QUADRIC", "ROUNDING", "Tables", "affine_rows", "extent", "quadric_rows", "tolerances"]
 
 #: 32 units of float32 rounding. The affine test of a primitive errs by at most 16 of them times the magnitudes that
 #: enter (see :func:`tolerances`); the other half covers grazing rays, where ``n . d`` itself is uncertain.
@@ -38,7 +38,7 @@ class Tables(NamedTuple):
     area: Tensor
 
 
-def prepare(geometry: Geometry) -> Tables:
+def affine_rows(geometry: Geometry) -> Tables:
     """The affine rows of all primitives.
 
     Args:
@@ -63,11 +63,11 @@ def prepare(geometry: Geometry) -> Tables:
     rows = torch.where(good, rows, 0.0)
     round_ = ~planar & (number < balls) & torch.isfinite(p0).all(0) & (p1[0].abs() > 0) & torch.isfinite(p1[0])
     if geometry.quadrics is not None:
-        round_[balls:] = torch.isfinite(inverses(geometry)[:12]).all(0)
+        round_[balls:] = torch.isfinite(quadric_rows(geometry)[:12]).all(0)
     return Tables(rows.float().T.contiguous(), rows.T, good | round_)
 
 
-def inverses(geometry: Geometry) -> Tensor:
+def quadric_rows(geometry: Geometry) -> Tensor:
     """World to own space of the quadrics ``(19, Q)`` float64: three affine rows, NaN where there are none, and the form.
 
     Searches intersect quadrics in their own space and in float64: however thin, sheared or distant one is, a ray that

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.threads import thread_count
-from torchpt.native.jit import compiled, jit, launch, part
+from torchpt.native.jit import ensure_compiled, jit, jit_internal, launch
 from torchpt.native.simd import (
     bits,
     gather,
@@ -19,7 +19,7 @@ from torchpt.native.simd import (
     item,
     load,
     lowest,
-    population,
+    popcount,
     put,
     select,
     splat,
@@ -30,25 +30,25 @@ from torchpt.native.simd import (
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search import tree_packet as kernels
 from torchpt.search.base import Accel, Array, Hits
-from torchpt.search.bounds import chosen
+from torchpt.search.bounds import select_primitives
 from torchpt.search.tree_build import (
     Floats,
-    Others,
-    Tree,
-    aligned,
+    NonTriangles,
+    WideTree,
+    aligned_buffer,
     boxes_of,
     corners,
-    lines_of,
+    line_count,
     mesh_tree,
     planes_of,
-    room_of,
-    tables_of,
-    write,
+    primitive_tables,
+    stack_size,
+    write_tree,
 )
-from torchpt.search.tree_layout import CHILDREN, IDS, LEAF, LINE, MORE, NODE, PLANES, place
+from torchpt.search.tree_layout import CHILDREN, IDS, LEAF, LINE, MORE, NODE, PLANES, block_offset
 from torchpt.search.tree_leaf import RECTANGLES, RULED
 
-__all__ = ["REBUILD", "Topology", "Wide", "refit"]
+__all__ = ["REBUILD_THRESHOLD", "RefitState", "WideBvh", "refit"]
 
 
 # ---- A tree's blocks for primitives that have moved (numba): the same nodes, leaves and ids, with new boxes and triangles
@@ -57,7 +57,7 @@ __all__ = ["REBUILD", "Topology", "Wide", "refit"]
 _INF, _NAN = np.float32(np.inf), np.float32(np.nan)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _moved(tree, at, p, ids, here):
     """Corners of a leaf's triangles where the mask is set, NaN elsewhere: as they are written, in float64."""
     n, none = np.int32(p.shape[1]), splat(_NAN, 8)
@@ -70,7 +70,7 @@ def _moved(tree, at, p, ids, here):
     return widen(x), widen(y), widen(z)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _half_area(tree, at):
     """Half the area of a box whose six numbers begin at ``at``, eight apart; 0 where it ends before it begins."""
     x = np.float64(item(tree, at + 24)) - np.float64(item(tree, at))
@@ -79,7 +79,7 @@ def _half_area(tree, at):
     return x * y + y * z + z * x if x >= 0.0 and y >= 0.0 and z >= 0.0 else 0.0
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _union(boxes, first, out, at):
     """Writes the box about eight to ``at``; the numbers lie as in a node."""
     for j in range(0, 24, 8):
@@ -87,8 +87,8 @@ def _union(boxes, first, out, at):
         put(out, at + 24 + j, highest(load(boxes, first + 24 + j, 8)))
 
 
-@part()
-def _leaf(at, old, tree, codes, p0, p1, p2, triangles, others, boxes):
+@jit_internal()
+def _leaf(at, old, tree, codes, p0, p1, p2, triangles, non_triangles, boxes):
     """Writes the block of a leaf; ``boxes`` ``(48,)`` gets low x, y, z, high x, y, z of what it holds."""
     ids, none = load(old, at + IDS, 8), splat(_NAN, 8)
     store(codes, at + IDS, ids)
@@ -120,10 +120,10 @@ def _leaf(at, old, tree, codes, p0, p1, p2, triangles, others, boxes):
         k = trailing_zeros(mixed)
         mixed &= mixed - 1
         for j in range(6):
-            boxes[j * 8 + k] = others[-2 - item(old, at + IDS + k) - triangles, j]
+            boxes[j * 8 + k] = non_triangles[-2 - item(old, at + IDS + k) - triangles, j]
 
 
-@part()
+@jit_internal()
 def _rectangles(at, before, old, tree, corner, rows, triangles, disk):
     """Writes the rectangles of a leaf; the other places hold NaN, as before."""
     for j in range(RECTANGLES, RECTANGLES + MORE * LINE):
@@ -138,7 +138,7 @@ def _rectangles(at, before, old, tree, corner, rows, triangles, disk):
 
 
 @jit()
-def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, others, tree, codes):
+def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, non_triangles, tree, codes):
     """Fills the blocks of a tree by the topology of another, which stays as it is.
 
     Children must lie behind their parents, and the leaves of a node right behind it.
@@ -155,7 +155,7 @@ def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, o
         disk: id of the first primitive that is neither triangle nor rectangle.
         corner: ``(P - triangles, 12)`` corners of the others.
         rows: ``(P - triangles, 12)`` their affine rows.
-        others: ``(P - triangles, 6)`` float32 boxes of the others: low x, y, z, high x, y, z.
+        non_triangles: ``(P - triangles, 6)`` float32 boxes of the others: low x, y, z, high x, y, z.
         tree: float32, as long as ``before``, filled.
         codes: the same memory as int32.
 
@@ -169,7 +169,7 @@ def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, o
         children, none = load(old, line * LINE + CHILDREN, 8), splat(np.int32(0), 8)
         leaves = bits(children < none)
         ruled = leaves & bits((children & splat(np.int32(2), 8)) == none)
-        line += NODE + LEAF * population(leaves) + MORE * population(ruled)
+        line += NODE + LEAF * popcount(leaves) + MORE * popcount(ruled)
     work, work_before = 0.0, 0.0
     for node in range(nodes - 1, -1, -1):
         base = lines[node] * LINE
@@ -177,11 +177,11 @@ def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, o
         for k in range(8):
             code, at = np.int64(item(old, base + CHILDREN + k)), base + k
             if code > 0:
-                _union(tree, place(code), tree, at)
+                _union(tree, block_offset(code), tree, at)
             elif code < 0:
-                _leaf(place(code), old, tree, codes, p0, p1, p2, triangles, others, boxes)
+                _leaf(block_offset(code), old, tree, codes, p0, p1, p2, triangles, non_triangles, boxes)
                 if code & 2 == 0:
-                    _rectangles(place(code), before, old, tree, corner, rows, triangles, disk)
+                    _rectangles(block_offset(code), before, old, tree, corner, rows, triangles, disk)
                 _union(boxes, first, tree, at)
             else:  # a box that ends before it begins is met by no ray
                 for j in range(0, 24, 8):
@@ -201,10 +201,10 @@ def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, o
 #: A tree is built anew where moves have made the expected work of a random ray more than this many times what it was when
 #: the tree was built. Up to there searches took up to a quarter longer than in a tree built anew, mostly less than a tenth
 #: (scripts/bench_refit.py): with 70,000 triangles, a build repays itself after some two million rays then.
-REBUILD = 1.2
+REBUILD_THRESHOLD = 1.2
 
 
-class Topology:
+class RefitState:
     """Where a tree lies in its buffer, and what decides whether it can be refitted.
 
     Args:
@@ -213,42 +213,44 @@ class Topology:
         line: the line of the buffer where its root lies.
 
     Attributes:
-        growth: expected work of a random ray, as a multiple of what it was when the tree was built.
+        sah_ratio: expected work of a random ray, as a multiple of what it was when the tree was built.
     """
 
-    def __init__(self, tree: Tree, geometry: Geometry, line: int = 0) -> None:
+    def __init__(self, tree: WideTree, geometry: Geometry, line: int = 0) -> None:
         self.nodes, self.line, self.counts = tree.nodes, line, geometry.counts
-        self.left_out = np.zeros(0, np.int32)  # rising ids of what had no area
+        self.without_area = np.zeros(0, np.int32)  # rising ids of what had no area
         if (tree.ids >= 0).sum() < geometry.size:
-            self.left_out = np.setdiff1d(np.arange(geometry.size, dtype=np.int32), tree.ids)
-        self.built: float | None = None  # the work, which the first refit finds out
-        self.growth = 1.0
+            self.without_area = np.setdiff1d(np.arange(geometry.size, dtype=np.int32), tree.ids)
+        self.built_cost: float | None = None  # the work, which the first refit finds out
+        self.sah_ratio = 1.0
 
-    def refit(self, geometry: Geometry, others: Others, before: Floats, memory: Floats) -> Topology | None:
+    def refit(
+        self, geometry: Geometry, non_triangles: NonTriangles, before: Floats, memory: Floats
+    ) -> RefitState | None:
         """Fills this tree's part of ``memory`` by that of ``before``, for primitives that have moved.
 
         None where the counts are others, where a primitive that had no area when the tree was built has one now, where
-        nothing has an area, and where the tree has become :data:`REBUILD` times as costly as it was; what ``memory`` holds
+        nothing has an area, and where the tree has become :data:`REBUILD_THRESHOLD` times as costly as it was; what ``memory`` holds
         then means nothing.
         """
-        if geometry.counts != self.counts or self._is_more(geometry):
+        if geometry.counts != self.counts or self._gains_area(geometry):
             return None
         codes, triangles = before.view(np.int32), self.counts[0]
-        corner, rows, _ = (x.numpy() for x in others.tensors)
-        tables = (triangles, triangles + self.counts[1], corner, rows, others.boxes)
+        corner, rows, _ = (x.numpy() for x in non_triangles.tensors)
+        tables = (triangles, triangles + self.counts[1], corner, rows, non_triangles.boxes)
         args = (before, codes, self.line, self.nodes, *corners(geometry), *tables)
         work, moved = refit(*args, memory, memory.view(np.int32))
         found = copy.copy(self)
-        found.built = work if self.built is None else self.built
-        found.growth = moved / found.built
-        return found if found.growth <= REBUILD else None  # NaN where nothing has an area
+        found.built_cost = work if self.built_cost is None else self.built_cost
+        found.sah_ratio = moved / found.built_cost
+        return found if found.sah_ratio <= REBUILD_THRESHOLD else None  # NaN where nothing has an area
 
-    def _is_more(self, geometry: Geometry) -> bool:
-        if not len(self.left_out):
+    def _gains_area(self, geometry: Geometry) -> bool:
+        if not len(self.without_area):
             return False
-        some = chosen(geometry, torch.from_numpy(self.left_out).long())
-        _, _, ids, others = tables_of(some)
-        return len(ids) > 0 or bool(others.area.any())
+        some = select_primitives(geometry, torch.from_numpy(self.without_area).long())
+        _, _, ids, non_triangles = primitive_tables(some)
+        return len(ids) > 0 or bool(non_triangles.area.any())
 
 
 # ---- The CPU's tree: binned SAH, eight children a node, searched by vector kernels
@@ -258,7 +260,7 @@ _GRAIN = 512  # rays that repay another thread
 _ALL_OPAQUE = np.empty(0, np.uint8)
 
 
-class Wide(Accel):
+class WideBvh(Accel):
     """SAH tree with eight children a node (numba, CPU).
 
     Args:
@@ -271,32 +273,32 @@ class Wide(Accel):
     def __init__(self, geometry: Geometry, threads: int | None = None) -> None:
         start = time.perf_counter()
         self.threads = threads
-        tree, planes, others = mesh_tree(geometry)
+        tree, planes, non_triangles = mesh_tree(geometry)
         self.counts, self.depth, self.sah_cost = geometry.counts, tree.depth, tree.cost
         self.nodes, self.leaves = tree.nodes, tree.leaves
-        self.topology, self.copied = Topology(tree, geometry), geometry.copies is not None
-        memory = aligned(lines_of(tree, geometry.counts) * LINE)
-        write(tree, geometry, planes, others, 0, memory)
-        self._take(memory, others, start)
+        self.refit_state, self.copied = RefitState(tree, geometry), geometry.copies is not None
+        memory = aligned_buffer(line_count(tree, geometry.counts) * LINE)
+        write_tree(tree, geometry, planes, non_triangles, 0, memory)
+        self._take(memory, non_triangles, start)
 
-    def _take(self, memory: np.ndarray, others: Others, start: float) -> None:
-        kinds = torch.tensor([*(sum(self.counts[:k]) for k in range(1, 5)), room_of(self.depth)], dtype=torch.int64)
-        self.tensors = [torch.from_numpy(memory), *others.tensors, kinds]
+    def _take(self, memory: np.ndarray, non_triangles: NonTriangles, start: float) -> None:
+        kinds = torch.tensor([*(sum(self.counts[:k]) for k in range(1, 5)), stack_size(self.depth)], dtype=torch.int64)
+        self.tensors = [torch.from_numpy(memory), *non_triangles.tensors, kinds]
         self.arrays = _arrays(self.tensors)
         self.build_seconds = time.perf_counter() - start
 
-    def refit(self, geometry: Geometry, threads: int | None = None) -> Wide | None:
-        """See :meth:`Accel.refit` and :meth:`Topology.refit`; the new tree has memory of its own."""
+    def refit(self, geometry: Geometry, threads: int | None = None) -> WideBvh | None:
+        """See :meth:`Accel.refit` and :meth:`RefitState.refit`; the new tree has memory of its own."""
         start = time.perf_counter()
         if (geometry.copies is not None) != self.copied:
             return None
-        others, memory = Others(geometry), aligned(len(self.arrays[0]))
-        topology = self.topology.refit(geometry, others, self.arrays[0], memory)
-        if topology is None:
+        non_triangles, memory = NonTriangles(geometry), aligned_buffer(len(self.arrays[0]))
+        refit_state = self.refit_state.refit(geometry, non_triangles, self.arrays[0], memory)
+        if refit_state is None:
             return None
         tree = copy.copy(self)
-        tree.threads, tree.topology = threads, topology
-        tree._take(memory, others, start)
+        tree.threads, tree.refit_state = threads, refit_state
+        tree._take(memory, non_triangles, start)
         return tree
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
@@ -317,14 +319,14 @@ class Wide(Accel):
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
         args = (o, d, t_max, *self.arrays, t, prim, u, v)
-        compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
+        ensure_compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
 
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
     ) -> None:
         """See :meth:`Accel.blocked`."""
         args = (o, d, t_max, *self.arrays, _ALL_OPAQUE if non_opaque is None else non_opaque, out)
-        compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
+        ensure_compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`.
@@ -336,7 +338,7 @@ class Wide(Accel):
             "primitives": sum(self.counts),
             "nodes": self.nodes,
             "leaves": self.leaves,
-            "sah_cost": self.sah_cost * self.topology.growth,
+            "sah_cost": self.sah_cost * self.refit_state.sah_ratio,
             "depth": self.depth,
             "bytes": sum(x.nbytes for x in self.tensors),
             "build_seconds": self.build_seconds,

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchpt.native.jit import jit, part
+from torchpt.native.jit import jit, jit_internal
 from torchpt.native.simd import (
     absolute,
     as_float,
@@ -26,31 +26,31 @@ from torchpt.native.simd import (
 )
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.bounds import primitive_bounds
-from torchpt.search.tables import QUADRIC, inverses, prepare
+from torchpt.search.tables import QUADRIC, affine_rows, quadric_rows
 from torchpt.search.tree_layout import CHILDREN, IDS, LEAF, LINE, MORE, NODE, PLANES
 from torchpt.search.tree_leaf import RECTANGLES, RULED
 
 __all__ = [
     "WIDTH",
-    "Others",
-    "Tree",
-    "aligned",
+    "NonTriangles",
+    "WideTree",
+    "aligned_buffer",
     "boxes_of",
     "build_binary",
-    "choose",
+    "choose_collapse",
     "collapse",
     "corners",
     "half_area",
     "lay_out",
     "leaf_ids",
-    "lines_of",
+    "line_count",
     "mesh_tree",
     "planes_of",
-    "room_of",
-    "tables_of",
+    "primitive_tables",
+    "stack_size",
     "triangle_tables",
     "wide_tree",
-    "write",
+    "write_tree",
 ]
 
 
@@ -260,7 +260,7 @@ def _leaf_cost(ids, start, stop, rectangle, other):
 
 
 @jit()
-def choose(nodes, spans, ids, rectangle, other, cost, share):
+def choose_collapse(nodes, spans, ids, rectangle, other, cost, share):
     """Finds what is best done with each node of a binary tree.
 
     Args:
@@ -319,7 +319,7 @@ def _children(root, spans, share, slots, nodes, room):
 
 @jit()
 def collapse(nodes, spans, share, boxes, child, first):
-    """Writes down the wide tree that :func:`choose` found.
+    """Writes down the wide tree that :func:`choose_collapse` found.
 
     Args:
         nodes: boxes of the binary tree.
@@ -366,7 +366,7 @@ def collapse(nodes, spans, share, boxes, child, first):
 _INF, _NAN = np.float32(np.inf), np.float32(np.nan)
 
 
-@part()
+@jit_internal()
 def _kinds(ids, first, triangles, disk):
     """2 for a leaf that holds rectangles, plus 1 for one that holds other primitives beside triangles."""
     found = 0
@@ -379,7 +379,7 @@ def _kinds(ids, first, triangles, disk):
     return found
 
 
-@part()
+@jit_internal()
 def _leaf(base, tree, codes, ids, first, p0, p1, p2, planes, triangles):
     """Writes a leaf's triangles and ids."""
     for k in range(8):
@@ -394,7 +394,7 @@ def _leaf(base, tree, codes, ids, first, p0, p1, p2, planes, triangles):
             tree[base + PLANES + c * 8 + k] = planes[q, c] if here else _NAN
 
 
-@part()
+@jit_internal()
 def _rectangles(base, tree, ids, first, corner, rows, triangles, disk):
     """Writes a leaf's rectangles."""
     for k in range(8):
@@ -462,7 +462,7 @@ def lay_out(boxes, child, ids, p0, p1, p2, planes, corner, rows, triangles, disk
             codes[base + CHILDREN + 8 + k] = 0
 
 
-# ---- What the tree needs of triangles (numba): the float64 operations of ``tables.prepare`` and ``bounds`` in one pass
+# ---- What the tree needs of triangles (numba): the float64 operations of ``tables.affine_rows`` and ``bounds`` in one pass
 #
 # Eight triangles go together, as vectors of float64.
 
@@ -470,28 +470,28 @@ def lay_out(boxes, child, ids, p0, p1, p2, planes, corner, rows, triangles, disk
 _MARGIN = 2.0**-22
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _finite(row, p):
     """Whether affine rows about points are finite in float32."""
     total, zero = narrow(row[0]) + narrow(row[1]) + narrow(row[2]) + narrow(-_dot(row, p)), splat(_ZERO, 8)
     return total * zero == zero
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def planes_of(a, b, c):
     """Unit normals and distances of eight triangles by float64 corners, and which can be hit.
 
-    See :func:`torchpt.search.tables.prepare`. The numbers of those that cannot mean nothing.
+    See :func:`torchpt.search.tables.affine_rows`. The numbers of those that cannot mean nothing.
     """
     e1 = (b[0] - a[0], b[1] - a[1], b[2] - a[2])
     e2 = (c[0] - a[0], c[1] - a[1], c[2] - a[2])
@@ -504,7 +504,7 @@ def planes_of(a, b, c):
     return narrow(n[0]), narrow(n[1]), narrow(n[2]), narrow(-_dot(n, a)), good
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _down(x):
     """The float32 below float64 lanes, or their own."""
     near, one = narrow(x), splat(np.int32(1), 8)
@@ -515,12 +515,12 @@ def _down(x):
     return select(widen(near) > x, as_float(below), near)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _span(a, b, c):
     return minimum(minimum(a, b), c), maximum(maximum(a, b), c)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def boxes_of(a, b, c):
     """Boxes of eight triangles with their margin: low x, y, z, high x, y, z.
 
@@ -536,7 +536,7 @@ def boxes_of(a, b, c):
     return _down(x0 - x), _down(y0 - y), _down(z0 - z), -_down(-(x1 + x)), -_down(-(y1 + y)), -_down(-(z1 + z))
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _corner(p, i, some):
     """Corners of the triangles from ``i`` on, where the mask is set."""
     n, none = p.shape[1], splat(_ZERO, 8)
@@ -617,7 +617,7 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 
 
-class Tree:
+class WideTree:
     """A tree of boxes, before it is laid out.
 
     Attributes:
@@ -642,7 +642,7 @@ class Tree:
         return len(self.ids) // WIDTH
 
 
-class Others:
+class NonTriangles:
     """The K primitives of a geometry that are no triangles.
 
     Attributes:
@@ -658,30 +658,32 @@ class Others:
             self.area, self.boxes = np.zeros(0, bool), np.zeros((0, 6), np.float32)
             self.tensors = [torch.zeros(0, 12), torch.zeros(0, 12), torch.zeros(0, QUADRIC, dtype=torch.float64)]
             return
-        tables = prepare(rest)
+        tables = affine_rows(rest)
         good = tables.area
         low, high = primitive_bounds(rest)
         boxes = torch.cat((torch.where(good, low, torch.inf), torch.where(good, high, -torch.inf)))
         self.area, self.boxes = good.numpy(), boxes.T.contiguous().numpy()
         corner = torch.cat([rest.p0, rest.p1, rest.p2, (rest.p1 + rest.p2) - rest.p0]).float()
-        corner, quadrics = torch.where(good, corner, torch.nan), inverses(rest)
+        corner, quadrics = torch.where(good, corner, torch.nan), quadric_rows(rest)
         quadrics = torch.where(good[rest.size - rest.counts[4] :], quadrics, torch.nan)
         self.tensors = [corner.T.contiguous(), tables.rows, quadrics.T.contiguous()]
 
 
-def wide_tree(boxes: Floats, ids: Ints, counts: tuple[int, ...] = (0, 0)) -> Tree:
+def wide_tree(boxes: Floats, ids: Ints, counts: tuple[int, ...] = (0, 0)) -> WideTree:
     """Builds over boxes ``(L, 6)`` of ``ids (L,)``; both are permuted.
 
     ``counts`` says how many triangles there are and how many rectangles, whose ids come first in this order.
     """
     n = len(ids)
     if n == 0:
-        return Tree(np.full(6 * WIDTH, np.inf, np.float32), np.zeros(WIDTH, np.int32), np.zeros(0, np.int32), 1, 0.0)
+        return WideTree(
+            np.full(6 * WIDTH, np.inf, np.float32), np.zeros(WIDTH, np.int32), np.zeros(0, np.int32), 1, 0.0
+        )
     nodes, spans = np.empty((2 * n, 6), np.float32), np.empty((2 * n, 3), np.int32)
     used = build_binary(boxes, ids, nodes, spans, counts[0])
     nodes, spans = nodes[:used], spans[:used]
     cost, share = np.empty((used, WIDTH), np.float32), np.empty((used, WIDTH), np.int8)
-    choose(nodes, spans, ids, counts[0], counts[0] + counts[1], cost, share)
+    choose_collapse(nodes, spans, ids, counts[0], counts[0] + counts[1], cost, share)
     wide, ends = max(1, int((share[:, 0] > 0).sum())), int((share[:, 0] == 0).sum())
     flat, child = np.empty(wide * 6 * WIDTH, np.float32), np.empty(wide * WIDTH, np.int32)
     first = np.empty((ends, 2), np.int32)
@@ -692,51 +694,53 @@ def wide_tree(boxes: Floats, ids: Ints, counts: tuple[int, ...] = (0, 0)) -> Tre
     area = x * y + y * z + z * x
     # Expected cost of a random ray through the root's box (MacDonald & Booth 1990).
     expected = float(cost[0, 0] / area) if area > 0 else float(n)
-    return Tree(flat[: count * 6 * WIDTH], child[: count * WIDTH], slots.reshape(-1), depth, expected)
+    return WideTree(flat[: count * 6 * WIDTH], child[: count * WIDTH], slots.reshape(-1), depth, expected)
 
 
-def lines_of(tree: Tree, counts: tuple[int, ...]) -> int:
+def line_count(tree: WideTree, counts: tuple[int, ...]) -> int:
     """Cache lines that a tree takes over primitives of which there are ``counts`` of each kind."""
     ids = tree.ids.reshape(-1, WIDTH)
     ruled = ((ids >= counts[0]) & (ids < counts[0] + counts[1])).any(1).sum() if counts[1] else 0
     return NODE * tree.nodes + LEAF * tree.leaves + MORE * int(ruled)
 
 
-def room_of(depth: int) -> int:
+def stack_size(depth: int) -> int:
     """Entries of a stack for trees of that depth: seven a level stay, and eight are written at once."""
     return depth * (WIDTH - 1) + 2 * WIDTH
 
 
-def aligned(count: int) -> Floats:
+def aligned_buffer(count: int) -> Floats:
     """Memory for ``count`` float32 that begins with a cache line."""
     raw = np.zeros(count * 4 + LINE * 4, np.uint8)
     skip = -raw.ctypes.data % (LINE * 4)
     return raw[skip : skip + count * 4].view(np.float32)
 
 
-def tables_of(geometry: Geometry) -> tuple[Floats, Floats, Ints, Others]:
+def primitive_tables(geometry: Geometry) -> tuple[Floats, Floats, Ints, NonTriangles]:
     """Planes ``(T, 4)`` of the triangles, boxes ``(K, 6)`` and rising ids ``(K,)`` of those with an area, and the others."""
     count = geometry.counts[0]
     planes, boxes, ids = np.empty((count, 4), np.float32), np.empty((count, 6), np.float32), np.empty(count, np.int32)
     kept = triangle_tables(*corners(geometry), count, planes, boxes, ids)
-    return planes, boxes[:kept], ids[:kept], Others(geometry)
+    return planes, boxes[:kept], ids[:kept], NonTriangles(geometry)
 
 
-def mesh_tree(geometry: Geometry) -> tuple[Tree, Floats, Others]:
+def mesh_tree(geometry: Geometry) -> tuple[WideTree, Floats, NonTriangles]:
     """The tree over a geometry's primitives, the planes ``(T, 4)`` of its triangles, and what there is of others."""
-    planes, boxes, ids, others = tables_of(geometry)
-    if others.area.size:
-        keep = np.flatnonzero(others.area)
-        boxes = np.concatenate([boxes, others.boxes[keep]])
+    planes, boxes, ids, non_triangles = primitive_tables(geometry)
+    if non_triangles.area.size:
+        keep = np.flatnonzero(non_triangles.area)
+        boxes = np.concatenate([boxes, non_triangles.boxes[keep]])
         ids = np.concatenate([ids, (keep + geometry.counts[0]).astype(np.int32)])
-    return wide_tree(boxes, ids, geometry.counts), planes, others
+    return wide_tree(boxes, ids, geometry.counts), planes, non_triangles
 
 
-def write(tree: Tree, geometry: Geometry, planes: Floats, others: Others, line: int, memory: Floats) -> None:
+def write_tree(
+    tree: WideTree, geometry: Geometry, planes: Floats, non_triangles: NonTriangles, line: int, memory: Floats
+) -> None:
     """Lays a tree out in ``memory`` from a line on."""
     codes, triangles = memory.view(np.int32), geometry.counts[0]
     disk = triangles + geometry.counts[1]
-    tables = (planes, others.tensors[0].numpy(), others.tensors[1].numpy())
+    tables = (planes, non_triangles.tensors[0].numpy(), non_triangles.tensors[1].numpy())
     lay_out(tree.boxes, tree.child, tree.ids, *corners(geometry), *tables, triangles, disk, line, memory, codes)
 
 

@@ -12,19 +12,28 @@ from numba import prange
 from torch import Tensor
 
 from torchpt.core.threads import thread_count
-from torchpt.native.jit import compiled, jit, launch, part
+from torchpt.native.jit import ensure_compiled, jit, jit_internal, launch
 from torchpt.native.simd import item, pointer, put, splat
 from torchpt.physics.shapes.geometry import Geometry
-from torchpt.search.base import Accel, Array, Hits, closer
+from torchpt.search.base import Accel, Array, Hits, mark_non_opaque
 from torchpt.search.instances import CopyTables
-from torchpt.search.tree import Topology, Wide
-from torchpt.search.tree_build import Others, Tree, aligned, lines_of, mesh_tree, room_of, wide_tree, write
-from torchpt.search.tree_layout import IDS, LINE, SLACK, boxes, fits, place, push
-from torchpt.search.tree_leaf import setup
+from torchpt.search.tree import RefitState, WideBvh
+from torchpt.search.tree_build import (
+    NonTriangles,
+    WideTree,
+    aligned_buffer,
+    line_count,
+    mesh_tree,
+    stack_size,
+    wide_tree,
+    write_tree,
+)
+from torchpt.search.tree_layout import IDS, LINE, SLACK, block_offset, boxes, is_valid_ray, push
+from torchpt.search.tree_leaf import setup_ray
 from torchpt.search.tree_packet import PIECES
-from torchpt.search.tree_single import SCRATCH, nearest_of, pop
+from torchpt.search.tree_single import SCRATCH, pop, trace_single
 
-__all__ = ["WideInstanced", "blocked", "blocked_parallel", "nearest", "nearest_parallel"]
+__all__ = ["InstancedWideBvh", "blocked", "blocked_parallel", "nearest", "nearest_parallel"]
 
 
 # ---- Copies of meshes (numba): a tree over their boxes, and for each that is met the tree of its mesh
@@ -33,13 +42,13 @@ __all__ = ["WideInstanced", "blocked", "blocked_parallel", "nearest", "nearest_p
 _ZERO, _INF = np.float32(0.0), np.float32(np.inf)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _row(table, k, x, y, z):
     """Three float64 numbers of an affine map's row with a point, without its last number."""
     return item(table, k) * x + item(table, k + 1) * y + item(table, k + 2) * z
 
 
-@part()
+@jit_internal()
 def _moved(table, copy, o, d):
     """A ray in the place of a copy's mesh: moved in float64, rounded to float32."""
     k = 12 * copy
@@ -58,18 +67,18 @@ def _moved(table, copy, o, d):
     return at, along
 
 
-@part()
+@jit_internal()
 def _ray(o, d, best, prim, upper, lower, copies, work, any_hit):
     """The nearest hit of one ray among the copies where it is nearer than ``best``, or any such hit: ``t, prim, u, v``."""
     tree, codes = upper
     table, shift, roots = copies
     keys, parents, scratch = work
-    _, _, _, _, _, _, ix, iy, iz = setup(d[0], d[1], d[2])
+    _, _, _, _, _, _, ix, iy, iz = setup_ray(d[0], d[1], d[2])
     nx, ny, nz = 0 if ix > _ZERO else 24, 8 if iy > _ZERO else 32, 16 if iz > _ZERO else 40
     u, v = _ZERO, _ZERO
     top, code, first = np.int64(0), np.int64(0), prim
     while top >= 0:
-        base = place(code)
+        base = block_offset(code)
         if code >= 0:
             a, met = boxes(
                 tree, base, nx, ny, nz, splat(o[0], 8), splat(o[1], 8), splat(o[2], 8),
@@ -82,12 +91,12 @@ def _ray(o, d, best, prim, upper, lower, copies, work, any_hit):
                 if copy < 0:
                     continue
                 at, along = _moved(table, copy, o, d)
-                had = prim
-                best, prim, a, b = nearest_of(
+                previous = prim
+                best, prim, a, b = trace_single(
                     lower, item(roots, copy), at, along, best, prim, item(shift, copy),
                     keys, parents, top, scratch, any_hit,
                 )  # fmt: skip
-                if prim != had:
+                if prim != previous:
                     u, v = a, b
             if any_hit and prim != first:
                 break
@@ -95,11 +104,32 @@ def _ray(o, d, best, prim, upper, lower, copies, work, any_hit):
     return best, prim, u, v
 
 
-@part(inline="always")
+@jit_internal(inline="always")
 def _search(
-    first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v, any_hit
+    first,
+    last,
+    o,
+    d,
+    t_max,
+    upper,
+    upper_codes,
+    lower,
+    lower_codes,
+    table,
+    shift,
+    roots,
+    stack_length,
+    t,
+    prim,
+    u,
+    v,
+    any_hit,
 ):
-    keys, parents, scratch = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(SCRATCH, np.float32)
+    keys, parents, scratch = (
+        np.empty(stack_length, np.int32),
+        np.empty(stack_length, np.int32),
+        np.empty(SCRATCH, np.float32),
+    )
     none = np.empty(1, np.uint8)
     work = (pointer(keys), pointer(parents), pointer(scratch))
     above, below = (
@@ -109,7 +139,7 @@ def _search(
     copies = (pointer(table), pointer(shift), pointer(roots))
     for i in range(first, last):
         p, r = (o[0, i], o[1, i], o[2, i]), (d[0, i], d[1, i], d[2, i])
-        if not fits(p[0], p[1], p[2], r[0], r[1], r[2], t_max[i]):
+        if not is_valid_ray(p[0], p[1], p[2], r[0], r[1], r[2], t_max[i]):
             continue
         if any_hit:
             if prim[i] == 0:
@@ -124,7 +154,9 @@ def _search(
 
 
 @jit()
-def nearest(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v):
+def nearest(
+    first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, t, prim, u, v
+):
     """Takes the copies into the hits of the rays ``first <= i < last``.
 
     Args:
@@ -140,7 +172,7 @@ def nearest(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, ta
         table: ``(I, 12)`` float64 maps from the world to the meshes.
         shift: ``(I,)`` int32 from a triangle's number in its mesh to its id in the copy.
         roots: ``(I,)`` int64 codes of the meshes' roots.
-        room: entries of the stack.
+        stack_length: entries of the stack.
         t: found so far, inf for none.
         prim: found so far, -1 for none.
         u: found so far.
@@ -159,7 +191,7 @@ def nearest(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, ta
         table,
         shift,
         roots,
-        room,
+        stack_length,
         t,
         prim,
         u,
@@ -170,35 +202,53 @@ def nearest(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, ta
 
 @jit(parallel=True)
 def nearest_parallel(
-    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v
+    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, t, prim, u, v
 ):
     """:func:`nearest` over the rays in equal pieces, which the threads take in turn."""
     pieces = chunks * PIECES
     for c in prange(chunks):
         for k in range(c, pieces, chunks):
             a, b = k * items // pieces, (k + 1) * items // pieces
-            nearest(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v)
+            nearest(
+                a,
+                b,
+                o,
+                d,
+                t_max,
+                upper,
+                upper_codes,
+                lower,
+                lower_codes,
+                table,
+                shift,
+                roots,
+                stack_length,
+                t,
+                prim,
+                u,
+                v,
+            )
 
 
 @jit()
-def blocked(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out):
+def blocked(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out):
     """Puts 1 in ``out (N,)`` for rays that hit a copy; those that have it already are left alone."""
     _search(
-        first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room,
+        first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length,
         t_max, out, t_max, t_max, True,
     )  # fmt: skip
 
 
 @jit(parallel=True)
 def blocked_parallel(
-    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out
+    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out
 ):
     """:func:`blocked` over the rays in equal pieces, which the threads take in turn."""
     pieces = chunks * PIECES
     for c in prange(chunks):
         for k in range(c, pieces, chunks):
             a, b = k * items // pieces, (k + 1) * items // pieces
-            blocked(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out)
+            blocked(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out)
 
 
 # ---- Copies on the CPU: a tree over their boxes above the trees of their meshes (numba)
@@ -207,7 +257,7 @@ def blocked_parallel(
 _GRAIN = 256  # rays that repay another thread
 
 
-class WideInstanced(Accel):
+class InstancedWideBvh(Accel):
     """The primitives in one wide tree, and two levels of them for the copies.
 
     Args:
@@ -220,11 +270,11 @@ class WideInstanced(Accel):
     def __init__(self, geometry: Geometry, threads: int | None = None) -> None:
         start = time.perf_counter()
         tables = CopyTables(geometry)
-        trees, self.topologies, lower = _meshes(tables.meshes)
+        trees, self.refit_states, lower = _meshes(tables.meshes)
         self._below = [sum(x.nodes for x in trees), sum(x.leaves for x in trees), max(x.depth for x in trees)]
-        self._take(geometry, Wide(geometry, threads), tables, lower, start)
+        self._take(geometry, WideBvh(geometry, threads), tables, lower, start)
 
-    def _take(self, geometry: Geometry, base: Wide, tables: CopyTables, lower: np.ndarray, start: float) -> None:
+    def _take(self, geometry: Geometry, base: WideBvh, tables: CopyTables, lower: np.ndarray, start: float) -> None:
         """Builds the upper level."""
         assert geometry.copies is not None
         self.base, self.threads, self.places = base, base.threads, geometry.copies[12:]
@@ -232,20 +282,20 @@ class WideInstanced(Accel):
         boxes = torch.cat((tables.low, tables.high)).T.contiguous().numpy()[some]
         top = wide_tree(boxes, some.copy())
         none = _nothing()
-        upper = aligned(lines_of(top, none.counts) * LINE)
-        write(top, none, np.zeros((0, 4), np.float32), Others(none), 0, upper)
+        upper = aligned_buffer(line_count(top, none.counts) * LINE)
+        write_tree(top, none, np.zeros((0, 4), np.float32), NonTriangles(none), 0, upper)
         nodes, leaves, depth = self._below
         depth += top.depth
-        roots = np.array([4 * x.line for x in self.topologies], np.int64)
+        roots = np.array([4 * x.line for x in self.refit_states], np.int64)
         self.arrays = (
             upper, upper.view(np.int32), lower, lower.view(np.int32), tables.inverse.numpy(),
-            tables.shift.numpy().astype(np.int32), roots[tables.mesh.numpy()], room_of(depth),
+            tables.shift.numpy().astype(np.int32), roots[tables.mesh.numpy()], stack_size(depth),
         )  # fmt: skip
         self.depth, self.copies, self.nodes, self.leaves = depth, len(some), top.nodes + nodes, top.leaves + leaves
         self.ids = int(geometry.size + geometry.copies[13].sum())
         self.build_seconds = time.perf_counter() - start
 
-    def refit(self, geometry: Geometry, threads: int | None = None) -> WideInstanced | None:
+    def refit(self, geometry: Geometry, threads: int | None = None) -> InstancedWideBvh | None:
         """See :meth:`Accel.refit`; the upper level, of a few boxes beside the primitives', is always built anew."""
         start = time.perf_counter()
         if geometry.copies is None or not torch.equal(geometry.copies[12:], self.places):
@@ -254,15 +304,15 @@ class WideInstanced(Accel):
         if base is None:
             return None
         tables, before, found = CopyTables(geometry), self.arrays[2], []
-        lower = aligned(len(before))
-        for topology, mesh in zip(self.topologies, tables.meshes, strict=True):
+        lower = aligned_buffer(len(before))
+        for refit_state, mesh in zip(self.refit_states, tables.meshes, strict=True):
             # no copy of an empty mesh is in the upper level
-            moved = topology if not mesh.size else topology.refit(mesh, Others(mesh), before, lower)
+            moved = refit_state if not mesh.size else refit_state.refit(mesh, NonTriangles(mesh), before, lower)
             if moved is None:
                 return None
             found.append(moved)
         tree = shallow(self)
-        tree.topologies = found
+        tree.refit_states = found
         tree._take(geometry, base, tables, lower, start)
         return tree
 
@@ -284,7 +334,7 @@ class WideInstanced(Accel):
         """See :meth:`Accel.nearest`."""
         self.base.nearest(o, d, t_max, count, t, prim, u, v)
         args = (o, d, t_max, *self.arrays, t, prim, u, v)
-        compiled(nearest, 0, 0, *args)(0, count, *args)
+        ensure_compiled(nearest, 0, 0, *args)(0, count, *args)
 
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
@@ -292,8 +342,8 @@ class WideInstanced(Accel):
         """See :meth:`Accel.blocked`; where there are non_opaque, every ray that meets anything is to be looked at closer."""
         self.base.blocked(o, d, t_max, count, out)
         args = (o, d, t_max, *self.arrays, out)
-        compiled(blocked, 0, 0, *args)(0, count, *args)
-        closer(out[:count], non_opaque)
+        ensure_compiled(blocked, 0, 0, *args)(0, count, *args)
+        mark_non_opaque(out[:count], non_opaque)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost is that of what is no copy."""
@@ -316,13 +366,13 @@ def _nothing() -> Geometry:
     return Geometry(none, none, none, (0, 0, 0, 0, 0))
 
 
-def _meshes(meshes: list[Geometry]) -> tuple[list[Tree], list[Topology], np.ndarray]:
+def _meshes(meshes: list[Geometry]) -> tuple[list[WideTree], list[RefitState], np.ndarray]:
     """The trees of all meshes, where they lie, and their blocks one after the other."""
     built = [mesh_tree(mesh) for mesh in meshes]
-    lines = [lines_of(tree, mesh.counts) for (tree, _, _), mesh in zip(built, meshes, strict=True)]
+    lines = [line_count(tree, mesh.counts) for (tree, _, _), mesh in zip(built, meshes, strict=True)]
     lines = np.cumsum([0, *lines]).tolist()
-    memory = aligned(lines[-1] * LINE)
-    for (tree, planes, others), mesh, line in zip(built, meshes, lines[:-1], strict=True):
-        write(tree, mesh, planes, others, line, memory)
+    memory = aligned_buffer(lines[-1] * LINE)
+    for (tree, planes, non_triangles), mesh, line in zip(built, meshes, lines[:-1], strict=True):
+        write_tree(tree, mesh, planes, non_triangles, line, memory)
     trees = [tree for tree, _, _ in built]
-    return trees, [Topology(*args) for args in zip(trees, meshes, lines[:-1], strict=True)], memory
+    return trees, [RefitState(*args) for args in zip(trees, meshes, lines[:-1], strict=True)], memory

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchpt.native.jit import part
+from torchpt.native.jit import jit_internal
 from torchpt.native.simd import (
     as_int,
     bits,
@@ -28,7 +28,7 @@ from torchpt.native.simd import (
     load,
     maximum,
     minimum,
-    population,
+    popcount,
     prefetch,
     select,
     sort_descending,
@@ -47,13 +47,13 @@ __all__ = [
     "NODE",
     "PLANES",
     "SLACK",
+    "block_offset",
     "blocking",
     "boxes",
-    "crossed",
-    "fetch",
-    "fits",
-    "place",
+    "crossed_triangles",
+    "is_valid_ray",
     "planes",
+    "prefetch_block",
     "push",
     "triangles_alone",
 ]
@@ -69,19 +69,19 @@ MAY_PASS = np.int32(-2)
 _ZERO = np.float32(0.0)
 
 
-@part(forceinline=True)
-def place(code):
+@jit_internal(forceinline=True)
+def block_offset(code):
     """Where a code's block begins in the buffer."""
     return ((code ^ (code >> 63)) & ~3) * (LINE // 4)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def triangles_alone(code):
     """Whether a leaf's code says that it holds nothing else."""
     return code & 3 == 3
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def blocking(scene, prim):
     """The id of a primitive that any-hit rays end at, or :data:`MAY_PASS`.
 
@@ -90,14 +90,14 @@ def blocking(scene, prim):
     return MAY_PASS if scene[5] > 0 and item(scene[4], prim) != 0 else prim
 
 
-@part(forceinline=True)
-def fits(ox, oy, oz, dx, dy, dz, t_max):
+@jit_internal(forceinline=True)
+def is_valid_ray(ox, oy, oz, dx, dy, dz, t_max):
     """Whether a ray can hit anything: finite, and ``t_max > 0``."""
     zero = ox * _ZERO + oy * _ZERO + oz * _ZERO + dx * _ZERO + dy * _ZERO + dz * _ZERO
     return t_max > _ZERO and zero == _ZERO
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def boxes(tree, base, nx, ny, nz, ox, oy, oz, ix, iy, iz, far):
     """Entries of a node's eight boxes, and the mask of those met before ``far``.
 
@@ -111,7 +111,7 @@ def boxes(tree, base, nx, ny, nz, ox, oy, oz, ix, iy, iz, far):
     return a, a <= b
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def push(keys, parents, top, base, a, met):
     """Puts the boxes that were met on the stack, the nearest on top; returns the new top.
 
@@ -121,11 +121,11 @@ def push(keys, parents, top, base, a, met):
     key = select(met, (as_int(a) & splat(np.int32(-8), 8)) | lane_numbers(8), splat(np.int32(-1), 8))
     store(keys, top, sort_descending(key))
     store(parents, top, splat(np.int32(base), 8))
-    return top + population(bits(met))
+    return top + popcount(bits(met))
 
 
-@part(forceinline=True)
-def crossed(tree, base, kx, ky, kz, px, py, pz, sx, sy):
+@jit_internal(forceinline=True)
+def crossed_triangles(tree, base, kx, ky, kz, px, py, pz, sx, sy):
     """Which of a leaf's triangles the ray's line crosses, the corners' depths, and what ``u`` and ``v`` come from.
 
     Edge functions of Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection" (2013), without any tolerance. Origin
@@ -142,7 +142,7 @@ def crossed(tree, base, kx, ky, kz, px, py, pz, sx, sy):
     return ((low >= zero) | (high <= zero)) & (det != zero), za, zb, zc, f, g, det
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def planes(tree, base, o, d, za, zb, zc, sz, floor):
     """``t`` of a leaf's planes, held within the corners' depths and beyond ``floor``; and where it is a distance."""
     zero = splat(_ZERO, 8)
@@ -155,8 +155,8 @@ def planes(tree, base, o, d, za, zb, zc, sz, floor):
     return maximum(t, splat(floor, 8)), (plane == plane) & (t > zero)
 
 
-@part(forceinline=True)
-def fetch(tree, code):
+@jit_internal(forceinline=True)
+def prefetch_block(tree, code):
     """Asks for the lines of a block.
 
     Nodes and leaves take one path with computed addresses: a branch would be mispredicted as often as the one that

@@ -6,17 +6,26 @@ import math
 
 import numpy as np
 
-from torchpt.native.jit import part
+from torchpt.native.jit import jit_internal
 from torchpt.native.simd import absolute, bits, item, load, maximum, minimum, splat, store, trailing_zeros
 from torchpt.search.tree_layout import IDS, LEAF, LINE, blocking
 
-__all__ = ["FOURTH", "RECTANGLES", "RULED", "distance", "others", "quadric_hit", "setup", "sphere_distance"]
+__all__ = [
+    "FOURTH",
+    "RECTANGLES",
+    "RULED",
+    "intersect_others",
+    "intersect_primitive",
+    "quadric_hit",
+    "setup_ray",
+    "sphere_distance",
+]
 
 
 # ---- The distance to a sphere (numba), shared by the packet and the tree kernels
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def sphere_distance(ox, oy, oz, dx, dy, dz, cx, cy, cz, radius):
     """Nearest positive ``t`` at which ``o + t d`` meets the sphere, as float32; NaN where it does not.
 
@@ -47,12 +56,12 @@ _INFINITE = np.float64(np.inf)
 _NAN32 = np.float32(np.nan)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _sign(x):
     return math.copysign(1.0, x)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _diamond(x, y):
     """Way along the square ``|x| + |y| = 1`` from +x to a direction: in [-2, 2], monotonic in the angle."""
     s = abs(x) + abs(y)
@@ -60,7 +69,7 @@ def _diamond(x, y):
     return (1.0 - c if x >= 0.0 else 1.0 + c) * _sign(y)
 
 
-@part()
+@jit_internal()
 def quadric_hit(table, k, ox, oy, oz, dx, dy, dz):
     """``t, u, v`` as float32 of the nearest positive root on quadric ``k`` of ``table (Q, 19)``; ``t`` is NaN for a miss.
 
@@ -132,8 +141,8 @@ _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 
 
-@part(forceinline=True)
-def setup(dx, dy, dz):
+@jit_internal(forceinline=True)
+def setup_ray(dx, dy, dz):
     """Axes with the largest component last, the shear, and reciprocals that are never infinite."""
     x, y, z = abs(dx), abs(dy), abs(dz)
     kz = 0 if x >= y and x >= z else (1 if y >= z else 2)
@@ -146,8 +155,8 @@ def setup(dx, dy, dz):
     return kx, ky, kz, px / pz, py / pz, _ONE / pz, ix, iy, iz
 
 
-@part()
-def distance(prim, corner, rows, quadrics, n2, n3, n4, o, d):
+@jit_internal()
+def intersect_primitive(prim, corner, rows, quadrics, n2, n3, n4, o, d):
     """``t, u, v`` of ray ``o, d`` (tuples) at a disk, sphere or quadric; ``t`` is NaN where it misses.
 
     Primitives are rectangles first; ``n2`` to ``n4`` are the numbers of the first disk, sphere and quadric. ``corner`` is
@@ -194,15 +203,15 @@ RECTANGLES = LEAF * LINE
 FOURTH, RULED = 72, 96
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _corner(tree, at, axes, p, s):
-    """A corner of eight rectangles in the ray's sheared place; see :func:`torchpt.search.tree_layout.crossed`."""
+    """A corner of eight rectangles in the ray's sheared place; see :func:`torchpt.search.tree_layout.crossed_triangles`."""
     z = load(tree, at + axes[2] * 8, 8) - p[2]
     x = (load(tree, at + axes[0] * 8, 8) - p[0]) - s[0] * z
     return x, (load(tree, at + axes[1] * 8, 8) - p[1]) - s[1] * z, z * s[2]
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _rectangles(tree, at, axes, o, d, p, s):
     """Eight rectangles: which are met, ``t``, u and v; the operations of :func:`torchpt.search.leaf.distances`."""
     zero = splat(_ZERO, 8)
@@ -225,8 +234,8 @@ def _rectangles(tree, at, axes, o, d, p, s):
     return met & (t > zero), t, f / (f + h), g / (g + k)
 
 
-@part()
-def others(scene, code, base, o, d, axes, shear, floor, best, prim, scratch, any_hit):
+@jit_internal()
+def intersect_others(scene, code, base, o, d, axes, shear, floor, best, prim, scratch, any_hit):
     """The best hit so far of one ray after a leaf's primitives that are no triangles, with ``u`` and ``v``.
 
     Args:
@@ -237,7 +246,7 @@ def others(scene, code, base, o, d, axes, shear, floor, best, prim, scratch, any
         o: origin.
         d: direction.
         axes: order of the axes.
-        shear: see :func:`torchpt.search.tree_leaf.setup`.
+        shear: see :func:`torchpt.search.tree_leaf.setup_ray`.
         floor: least distance of a hit here.
         best: the best distance so far.
         prim: its primitive, or -1; of any hit see :func:`torchpt.search.tree_layout.blocking`.
@@ -276,7 +285,7 @@ def others(scene, code, base, o, d, axes, shear, floor, best, prim, scratch, any
             q = np.int32(-2 - item(codes, base + IDS + k))
             if q < disk:  # a triangle's or an empty place is below 0
                 continue
-            t, a, b = distance(
+            t, a, b = intersect_primitive(
                 q - first, tables[0], tables[1], tables[2], disk - first, sphere - first, quadric - first, o, d
             )
             if not t > _ZERO:

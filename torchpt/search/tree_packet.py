@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from torchpt.native.jit import jit, part
+from torchpt.native.jit import jit, jit_internal
 from torchpt.native.simd import (
     absolute,
     as_float,
@@ -19,7 +19,7 @@ from torchpt.native.simd import (
     maximum,
     minimum,
     pointer,
-    population,
+    popcount,
     put,
     select,
     splat,
@@ -33,16 +33,16 @@ from torchpt.search.tree_layout import (
     MAY_PASS,
     PLANES,
     SLACK,
+    block_offset,
     blocking,
     boxes,
-    crossed,
-    fetch,
-    place,
+    crossed_triangles,
+    prefetch_block,
     push,
     triangles_alone,
 )
-from torchpt.search.tree_leaf import FOURTH, RECTANGLES, RULED, others
-from torchpt.search.tree_single import SCRATCH, blocker, nearer, pop
+from torchpt.search.tree_leaf import FOURTH, RECTANGLES, RULED, intersect_others
+from torchpt.search.tree_single import SCRATCH, nearest_triangle, occluding_triangle, pop
 
 __all__ = [
     "AXIS",
@@ -56,23 +56,23 @@ __all__ = [
     "ORIGIN",
     "PIECES",
     "RAYS",
+    "RAYS_IN_FLIGHT",
     "RAY_IDS",
     "SCRATCH",
     "SHEAR",
     "SPARE",
     "STATE",
-    "TURNS",
     "U",
     "V",
     "blocked",
     "blocked_parallel",
-    "coherent",
-    "deliver",
+    "is_coherent",
+    "load_rays",
     "nearest",
     "nearest_parallel",
-    "packet",
-    "prepare",
-    "turn",
+    "store_hits",
+    "trace_interleaved",
+    "trace_packet",
 ]
 
 
@@ -91,20 +91,20 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _LEAST, _TINY = np.float32(1e-20), np.float32(1e-37)  # as in kernels_leaf.setup
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _inverse(d, least):
     """Reciprocals that are never infinite."""
     sign = as_int(d) & splat(np.int32(-(2**31)), 16)
     return splat(_ONE, 16) / select(absolute(d) >= least, d, as_float(as_int(least) | sign))
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _facing(inverse, at):
     return select(inverse > splat(_ZERO, 16), splat(np.int32(at), 16), splat(np.int32(at + 24), 16))
 
 
-@part(forceinline=True)
-def prepare(i, rays, c, rows, ids):
+@jit_internal(forceinline=True)
+def load_rays(i, rays, c, rows, ids):
     """Fills columns ``c`` to ``c + 15`` with rays ``i`` to ``i + 15``; returns the mask of those that can hit anything."""
     o, d, t_max, n = rays
     ox, oy, oz = load(o, i, 16), load(o, n + i, 16), load(o, 2 * n + i, 16)
@@ -148,29 +148,29 @@ def prepare(i, rays, c, rows, ids):
 # ---- Several single rays in turn, one block each (numba): while the block of one is on its way from memory, others work
 
 
-TURNS = 16  # rays in flight
+RAYS_IN_FLIGHT = 16  # rays in flight
 _ROW = 4
-STATE = TURNS * _ROW
+STATE = RAYS_IN_FLIGHT * _ROW
 _ZERO = np.float32(0.0)
 #: Places in a row of int64: column of the ray, next code, its key, top of the stack (below 0: no ray is left).
 _RAY, _CODE, _KEY, _TOP = 0, 1, 2, 3
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _splats(rows, at):
     return splat(item(rows, at), 8), splat(item(rows, at + COLUMNS), 8), splat(item(rows, at + 2 * COLUMNS), 8)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _scalars(rows, at):
     return item(rows, at), item(rows, at + COLUMNS), item(rows, at + 2 * COLUMNS)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
     """Tests a leaf and writes down what is nearer; returns whether an any-hit ray is settled."""
     tree, codes = scene[0], scene[1]
-    base, mixed = place(code), not triangles_alone(code)
+    base, mixed = block_offset(code), not triangles_alone(code)
     kx, ky, kz = _scalars(ids, AXIS + c)
     axes = (np.int64(kx), np.int64(ky), np.int64(kz))
     px, py, pz = (
@@ -178,51 +178,57 @@ def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
         item(rows, ORIGIN + axes[2] * COLUMNS + c),
     )  # fmt: skip
     sx, sy = splat(item(rows, SHEAR + c), 8), splat(item(rows, SHEAR + COLUMNS + c), 8)
-    met = crossed(tree, base, axes[0], axes[1], axes[2], splat(px, 8), splat(py, 8), splat(pz, 8), sx, sy)
+    met = crossed_triangles(tree, base, axes[0], axes[1], axes[2], splat(px, 8), splat(py, 8), splat(pz, 8), sx, sy)
     if bits(met[0]) == 0 and not mixed:
         return False
-    best, had = item(rows, BEST + c), item(ids, RAY_IDS + c)
+    best, previous = item(rows, BEST + c), item(ids, RAY_IDS + c)
     floor = as_float(key & -8) * FLOOR
     o, d, shear = _scalars(rows, ORIGIN + c), _scalars(rows, DIRECTION + c), _scalars(rows, SHEAR + c)
     if any_hit:
-        q = blocker(scene, base, met, shear[2], o, d, floor, best, had, np.int32(0)) if bits(met[0]) != 0 else had
+        q = (
+            occluding_triangle(scene, base, met, shear[2], o, d, floor, best, previous, np.int32(0))
+            if bits(met[0]) != 0
+            else previous
+        )
         if mixed and q < 0:
-            _, q, _, _ = others(scene, code, base, o, d, axes, shear, floor, best, q, scratch, any_hit)
+            _, q, _, _ = intersect_others(scene, code, base, o, d, axes, shear, floor, best, q, scratch, any_hit)
         put(ids, RAY_IDS + c, q)
         return q >= 0
-    best, q, lane = nearer(tree, codes, base, met, shear[2], o, d, floor, best, had, np.int32(0), scratch)
+    best, q, lane = nearest_triangle(
+        tree, codes, base, met, shear[2], o, d, floor, best, previous, np.int32(0), scratch
+    )
     if lane >= 0:
         put(rows, U + c, item(scratch, 8 + lane))
         put(rows, V + c, item(scratch, 16 + lane))
     if mixed:
         before = q
-        best, q, a, b = others(scene, code, base, o, d, axes, shear, floor, best, q, scratch, any_hit)
+        best, q, a, b = intersect_others(scene, code, base, o, d, axes, shear, floor, best, q, scratch, any_hit)
         if q != before:
             put(rows, U + c, a)
             put(rows, V + c, b)
-    if q != had:
+    if q != previous:
         put(rows, BEST + c, best)
         put(ids, RAY_IDS + c, q)
     return False
 
 
-@part(forceinline=True)
-def turn(count, scene, room, rows, ids, work, any_hit):
+@jit_internal(forceinline=True)
+def trace_interleaved(count, scene, stack_length, rows, ids, work, any_hit):
     """The nearest hits of the rays in the first ``count`` columns, or any hits.
 
     Args:
         count: how many columns.
         scene: the tree as float32 and as int32, tables of other primitives, where their kinds begin.
-        room: entries of a ray's stack.
+        stack_length: entries of a ray's stack.
         rows: rays, see :mod:`torchpt.search.tree_packet`.
         ids: likewise.
-        work: memory: keys and parents of the stacks (``TURNS * room`` int32 each), ``STATE`` int64, ``SCRATCH`` float32.
+        work: memory: keys and parents of the stacks (``RAYS_IN_FLIGHT * stack_length`` int32 each), ``STATE`` int64, ``SCRATCH`` float32.
         any_hit: whether any hit will do.
     """
     tree, codes = scene[0], scene[1]
     keys, parents, slots, scratch = work
     at, live = np.int64(0), np.int64(0)
-    for r in range(TURNS):
+    for r in range(RAYS_IN_FLIGHT):
         while at < count and not item(rows, BEST + at) > _ZERO:
             at += 1
         if at < count:
@@ -234,7 +240,7 @@ def turn(count, scene, room, rows, ids, work, any_hit):
     flying = live
     while live > 0:
         for r in range(flying):
-            s, bottom = r * _ROW, r * room
+            s, bottom = r * _ROW, r * stack_length
             top = bottom + item(slots, s + _TOP)
             if top < bottom:
                 continue
@@ -242,7 +248,7 @@ def turn(count, scene, room, rows, ids, work, any_hit):
             ended = False
             key = np.int32(0)
             if code >= 0:
-                base = place(code)
+                base = block_offset(code)
                 nx, ny, nz = _scalars(ids, NEAR + c)
                 ox, oy, oz = _splats(rows, ORIGIN + c)
                 ix, iy, iz = _splats(rows, INVERSE + c)
@@ -269,7 +275,7 @@ def turn(count, scene, room, rows, ids, work, any_hit):
             put(slots, s + _TOP, top - bottom)
             put(slots, s + _CODE, code)
             put(slots, s + _KEY, np.int64(key))
-            fetch(tree, code)
+            prefetch_block(tree, code)
 
 
 # ---- Sixteen rays at a time (numba): intervals of the packet cull a node's boxes, each box left is tested by every ray
@@ -286,8 +292,8 @@ FEWEST = 4
 _ZERO, _INF = np.float32(0.0), np.float32(np.inf)
 
 
-@part(forceinline=True)
-def coherent(c, good, rows):
+@jit_internal(forceinline=True)
+def is_coherent(c, good, rows):
     """Whether the rays in columns ``c`` to ``c + 15`` go as a packet: those in the mask ``good`` are many, and of one octant.
 
     Returns also whether directions rise along x, y and z. Signs are those of the sign bit, as -0 counts as falling.
@@ -297,10 +303,10 @@ def coherent(c, good, rows):
     uy = bits(as_int(load(rows, DIRECTION + COLUMNS + c, 16)) >= none) & good
     uz = bits(as_int(load(rows, DIRECTION + 2 * COLUMNS + c, 16)) >= none) & good
     alike = (ux == 0 or ux == good) and (uy == 0 or uy == good) and (uz == 0 or uz == good)
-    return alike and population(good) >= FEWEST, ux != 0, uy != 0, uz != 0
+    return alike and popcount(good) >= FEWEST, ux != 0, uy != 0, uz != 0
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _filled(rows, c, first, whole):
     """Three rows of columns ``c`` to ``c + 15``, those of column ``first`` where a ray is none that can hit."""
     return (
@@ -310,7 +316,7 @@ def _filled(rows, c, first, whole):
     )
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _interval(o, inverse, up):
     """What the culling test takes of 16 rays on one axis: origins for near and far planes, least and greatest reciprocal."""
     low, high = lowest(o), highest(o)
@@ -318,7 +324,7 @@ def _interval(o, inverse, up):
     return splat(near, 8), splat(far, 8), splat(lowest(inverse), 8), splat(highest(inverse), 8)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _met(tree, base, nx, ny, nz, x, y, z, limit):
     """Entries no later than those of any ray, and the mask of the boxes that some ray may meet before ``limit``."""
     ax, bx = load(tree, base + nx, 8) - x[0], load(tree, base + (24 - nx), 8) - x[1]
@@ -335,7 +341,7 @@ def _met(tree, base, nx, ny, nz, x, y, z, limit):
     return a, a <= b * splat(SLACK, 8)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _box(tree, at, nx, ny, nz, o, inverse, best):
     """Every ray's entry into one box, whose first number lies at ``at``, and the mask of those that meet it."""
     ax = (splat(item(tree, at + nx), 16) - o[0]) * inverse[0]
@@ -348,7 +354,7 @@ def _box(tree, at, nx, ny, nz, o, inverse, best):
     return a, a <= minimum(minimum(bx, by), minimum(bz, best)) * splat(SLACK, 16)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _corner(tree, at, m, p, s):
     """A corner in the sheared place of every ray, see kernels_blocks.crossed; ``m`` says whose longest axis is x, whose y."""
     x = splat(item(tree, at), 16) - p[0]
@@ -362,7 +368,7 @@ def _corner(tree, at, m, p, s):
     )
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _triangle(tree, at, axes, s, o, d, floor):
     """16 rays against one triangle, whose first number lies at ``at``: mask, ``t``, and what ``u`` and ``v`` come from."""
     zero = splat(_ZERO, 16)
@@ -385,9 +391,9 @@ def _triangle(tree, at, axes, s, o, d, floor):
     return m, t, f, g, det
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _rectangle(tree, at, axes, s, o, d):
-    """16 rays against one rectangle: mask, ``t``, u and v; the operations of :func:`torchpt.search.tree_leaf.others`."""
+    """16 rays against one rectangle: mask, ``t``, u and v; the operations of :func:`torchpt.search.tree_leaf.intersect_others`."""
     zero = splat(_ZERO, 16)
     n0, n1 = splat(item(tree, at + RULED), 16), splat(item(tree, at + RULED + 8), 16)
     n2, n3 = splat(item(tree, at + RULED + 16), 16), splat(item(tree, at + RULED + 24), 16)
@@ -407,7 +413,7 @@ def _rectangle(tree, at, axes, s, o, d):
     return m & (t > zero), t, f / (f + h), g / (g + k)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _rest(scene, code, base, memory, o, d, floor, lanes, best, prim, u, v, any_hit):
     """Every ray of the mask, one by one, against a leaf's primitives that are neither triangles nor rectangles.
 
@@ -426,18 +432,18 @@ def _rest(scene, code, base, memory, o, d, floor, lanes, best, prim, u, v, any_h
     while left != 0:
         j = trailing_zeros(left)
         left &= left - 1
-        had = item(ids, j)
-        near, q, a, b = others(
+        previous = item(ids, j)
+        near, q, a, b = intersect_others(
             scene, code | 2, base,
             (item(spare, j), item(spare, 16 + j), item(spare, 32 + j)),
             (item(spare, 48 + j), item(spare, 64 + j), item(spare, 80 + j)),
-            (0, 1, 2), (_ZERO, _ZERO, _ZERO), item(spare, 96 + j), item(spare, 112 + j), had, scratch, any_hit,
+            (0, 1, 2), (_ZERO, _ZERO, _ZERO), item(spare, 96 + j), item(spare, 112 + j), previous, scratch, any_hit,
         )  # fmt: skip
         if any_hit:
             put(ids, j, q)
             if q >= 0:
                 put(spare, 112 + j, np.float32(-1.0))
-        elif q != had:
+        elif q != previous:
             put(ids, j, q)
             put(spare, 112 + j, near)
             put(spare, 128 + j, a)
@@ -445,11 +451,11 @@ def _rest(scene, code, base, memory, o, d, floor, lanes, best, prim, u, v, any_h
     return load(spare, 112, 16), load(ids, 0, 16), load(spare, 128, 16), load(spare, 144, 16)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _packet_leaf(scene, code, memory, axes, s, o, d, floor, lanes, best, prim, u, v, any_hit):
     """Takes a leaf into the hits of the packet's rays that are in the mask; a ray that any hit settles gets ``best`` -1."""
     tree, codes = scene[0], scene[1]
-    base = place(code)
+    base = block_offset(code)
     ruled = code & 2 == 0
     for k in range(8):
         q = item(codes, base + IDS + k)
@@ -477,8 +483,8 @@ def _packet_leaf(scene, code, memory, axes, s, o, d, floor, lanes, best, prim, u
     return best, prim, u, v
 
 
-@part(forceinline=True)
-def deliver(i, out, best, prim, u, v, any_hit):
+@jit_internal(forceinline=True)
+def store_hits(i, out, best, prim, u, v, any_hit):
     """Writes the hits of 16 rays, or for each 1 where it is blocked, 2 where it met what may let light pass, else 0."""
     missed = prim < splat(np.int32(0), 16)
     if any_hit:
@@ -491,9 +497,9 @@ def deliver(i, out, best, prim, u, v, any_hit):
         store(out[3], i, v)
 
 
-@part(forceinline=True)
-def packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, any_hit):
-    """The hits of rays ``i`` to ``i + 15`` in columns ``c`` to ``c + 15``, which :func:`coherent` has found to go together."""
+@jit_internal(forceinline=True)
+def trace_packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, any_hit):
+    """The hits of rays ``i`` to ``i + 15`` in columns ``c`` to ``c + 15``, which :func:`is_coherent` has found to go together."""
     tree, codes = scene[0], scene[1]
     keys, parents = stack
     first, whole = c + trailing_zeros(good), mask(good, 16)
@@ -511,7 +517,7 @@ def packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, any_hi
     top, code = np.int64(0), np.int64(0)
     while top >= 0:
         if code >= 0:
-            base = place(code)
+            base = block_offset(code)
             a, met = _met(tree, base, nx, ny, nz, x, y, z, limit)
             top = push(keys, parents, top, base, a, met)
         else:
@@ -532,7 +538,7 @@ def packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, any_hi
             if bits(lanes) != 0:
                 code = np.int64(item(codes, base + CHILDREN + k))
                 break
-    deliver(i, out, best, prim, u, v, any_hit)
+    store_hits(i, out, best, prim, u, v, any_hit)
 
 
 # ---- Closest and any hits of a range of rays (numba): packets where sixteen rays go together, the others in turn
@@ -542,45 +548,45 @@ def packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, any_hi
 PIECES = 8
 
 
-@part(inline="always")
-def _trace(first, last, rays, scene, room, groups, columns, work, spare, out, any_hit):
+@jit_internal(inline="always")
+def _trace(first, last, rays, scene, stack_length, groups, columns, work, spare, out, any_hit):
     """Rays ``first`` to ``last``, a multiple of 16."""
     rows, ids = columns
     i, count = first, np.int64(0)
     while i < last:
-        good = prepare(i, rays, count, rows, ids)
-        together, ux, uy, uz = coherent(count, good, rows)
+        good = load_rays(i, rays, count, rows, ids)
+        together, ux, uy, uz = is_coherent(count, good, rows)
         if together:
-            packet(i, count, good, ux, uy, uz, rows, ids, scene, (work[0], work[1]), spare, out, any_hit)
+            trace_packet(i, count, good, ux, uy, uz, rows, ids, scene, (work[0], work[1]), spare, out, any_hit)
         else:
             put(groups, count >> 4, i)
             count += 16
         i += 16
         if count == COLUMNS or (i >= last and count > 0):
-            turn(count, scene, room, rows, ids, work, any_hit)
+            trace_interleaved(count, scene, stack_length, rows, ids, work, any_hit)
             for k in range(count >> 4):
                 best, u, v = load(rows, BEST + 16 * k, 16), load(rows, U + 16 * k, 16), load(rows, V + 16 * k, 16)
-                deliver(item(groups, k), out, best, load(ids, RAY_IDS + 16 * k, 16), u, v, any_hit)
+                store_hits(item(groups, k), out, best, load(ids, RAY_IDS + 16 * k, 16), u, v, any_hit)
             count = np.int64(0)
 
 
-@part()
+@jit_internal()
 def _none():
     return np.empty(0, np.uint8)
 
 
-@part(inline="always")
+@jit_internal(inline="always")
 def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, t, prim, u, v, any_hit):
     """:func:`_trace` with its memory; the rays beyond the last sixteen in memory of their own."""
-    room = kinds[4]
-    keys, parents = np.empty(TURNS * room, np.int32), np.empty(TURNS * room, np.int32)
+    stack_length = kinds[4]
+    keys, parents = np.empty(RAYS_IN_FLIGHT * stack_length, np.int32), np.empty(RAYS_IN_FLIGHT * stack_length, np.int32)
     slots, scratch, groups = np.empty(STATE, np.int64), np.empty(SCRATCH, np.float32), np.empty(COLUMNS >> 4, np.int64)
     columns, numbers = np.empty(FLOATS, np.float32), np.empty(NUMBERS, np.int32)
     lanes, kept = np.empty(SPARE, np.float32), np.empty(RAYS, np.int32)
     tables = (pointer(corner), pointer(rows), pointer(quadrics))
     scene = (pointer(tree), pointer(codes), tables, pointer(kinds), pointer(non_opaque), len(non_opaque))
     work = (pointer(keys), pointer(parents), pointer(slots), pointer(scratch))
-    held = (pointer(columns), pointer(numbers))
+    ray_rows = (pointer(columns), pointer(numbers))
     spare = (pointer(lanes), pointer(kept), pointer(scratch))
     given = (pointer(o), pointer(d), pointer(t_max), d.shape[1])
     found = (pointer(t), pointer(prim), pointer(u), pointer(v))
@@ -596,7 +602,7 @@ def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
     for k in range(2):  # one place of call: what is inlined is compiled once
         rays, out = (given, found) if k == 0 else (given_edge, found_edge)
         start, stop = (first, end) if k == 0 else (0, RAYS if end < last else 0)
-        _trace(start, stop, rays, scene, room, pointer(groups), held, work, spare, out, any_hit)
+        _trace(start, stop, rays, scene, stack_length, pointer(groups), ray_rows, work, spare, out, any_hit)
     for j in range(last - end):
         prim[end + j] = number[j]
         if not any_hit:

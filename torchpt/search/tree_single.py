@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchpt.native.jit import part
+from torchpt.native.jit import jit_internal
 from torchpt.native.simd import as_float, bits, item, splat, store, trailing_zeros
-from torchpt.search.tree_layout import CHILDREN, FLOOR, IDS, SLACK, blocking, boxes, crossed, place, planes, push
-from torchpt.search.tree_leaf import setup
+from torchpt.search.tree_layout import (
+    CHILDREN,
+    FLOOR,
+    IDS,
+    SLACK,
+    block_offset,
+    blocking,
+    boxes,
+    crossed_triangles,
+    planes,
+    push,
+)
+from torchpt.search.tree_leaf import setup_ray
 
-__all__ = ["SCRATCH", "blocker", "nearer", "nearest_of", "pop"]
+__all__ = ["SCRATCH", "nearest_triangle", "occluding_triangle", "pop", "trace_single"]
 
 _ZERO = np.float32(0.0)
 #: Numbers of a kernel's scratch row: ``t``, ``u``, ``v`` of eight triangles.
 SCRATCH = 24
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def pop(codes, keys, parents, top, bottom, limit):
     """The next box that is entered before ``limit``: top of the stack (below ``bottom`` if there is none), code, key."""
     code, key = np.int64(0), np.int32(0)
@@ -31,9 +42,9 @@ def pop(codes, keys, parents, top, bottom, limit):
     return top, code, key
 
 
-@part(forceinline=True)
-def nearer(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch):
-    """The nearest of a leaf's triangles that :func:`crossed` has found.
+@jit_internal(forceinline=True)
+def nearest_triangle(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch):
+    """The nearest of a leaf's triangles that :func:`crossed_triangles` has found.
 
     Returns ``best``, ``prim`` (ids count from ``shift``) and the lane of ``scratch`` where u and v are, -1 where no triangle is
     nearer than what came in.
@@ -55,9 +66,9 @@ def nearer(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch):
     return best, prim, lane
 
 
-@part(forceinline=True)
-def blocker(scene, base, met, sz, o, d, floor, best, prim, shift):
-    """The id of a triangle that :func:`crossed` has found and that lets no light pass; else :data:`MAY_PASS` or ``prim``."""
+@jit_internal(forceinline=True)
+def occluding_triangle(scene, base, met, sz, o, d, floor, best, prim, shift):
+    """The id of a triangle that :func:`crossed_triangles` has found and that lets no light pass; else :data:`MAY_PASS` or ``prim``."""
     tree, codes = scene[0], scene[1]
     t, ahead = planes(tree, base, o, d, met[1], met[2], met[3], splat(sz, 8), floor)
     w = bits(met[0] & ahead & (t < splat(best, 8)))
@@ -67,8 +78,8 @@ def blocker(scene, base, met, sz, o, d, floor, best, prim, shift):
     return prim
 
 
-@part()
-def nearest_of(scene, root, o, d, best, prim, shift, keys, parents, bottom, scratch, any_hit):
+@jit_internal()
+def trace_single(scene, root, o, d, best, prim, shift, keys, parents, bottom, scratch, any_hit):
     """The nearest hit of a ray below a node of triangles alone where it is nearer than ``best``, or any such hit.
 
     Args:
@@ -89,7 +100,7 @@ def nearest_of(scene, root, o, d, best, prim, shift, keys, parents, bottom, scra
         ``t, prim, u, v``; ``u`` and ``v`` mean nothing where ``prim`` is the one that came in.
     """
     tree, codes = scene[0], scene[1]
-    kx, ky, kz, sx, sy, sz, ix, iy, iz = setup(d[0], d[1], d[2])
+    kx, ky, kz, sx, sy, sz, ix, iy, iz = setup_ray(d[0], d[1], d[2])
     px, py, pz = splat(o[kx], 8), splat(o[ky], 8), splat(o[kz], 8)
     nx, ny, nz = 0 if ix > _ZERO else 24, 8 if iy > _ZERO else 32, 16 if iz > _ZERO else 40
     ox, oy, oz, vx, vy, vz = (
@@ -98,20 +109,22 @@ def nearest_of(scene, root, o, d, best, prim, shift, keys, parents, bottom, scra
     u, v = _ZERO, _ZERO
     top, code, key = np.int64(bottom), np.int64(root), np.int32(0)
     while top >= bottom:
-        base = place(code)
+        base = block_offset(code)
         if code >= 0:
             a, met = boxes(tree, base, nx, ny, nz, ox, oy, oz, vx, vy, vz, splat(best, 8))
             top = push(keys, parents, top, base, a, met)
         else:
-            met = crossed(tree, base, kx, ky, kz, px, py, pz, splat(sx, 8), splat(sy, 8))
+            met = crossed_triangles(tree, base, kx, ky, kz, px, py, pz, splat(sx, 8), splat(sy, 8))
             if bits(met[0]) != 0:
                 floor = as_float(key & np.int32(-8)) * FLOOR
                 if any_hit:
-                    prim = blocker(scene, base, met, sz, o, d, floor, best, prim, shift)
+                    prim = occluding_triangle(scene, base, met, sz, o, d, floor, best, prim, shift)
                     if prim >= 0:
                         break
                 else:
-                    best, prim, lane = nearer(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch)
+                    best, prim, lane = nearest_triangle(
+                        tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch
+                    )
                     if lane >= 0:
                         u, v = item(scratch, 8 + lane), item(scratch, 16 + lane)
         top, code, key = pop(codes, keys, parents, top, bottom, best * SLACK)

@@ -1,6 +1,6 @@
 """Keyword arguments that are declared once, in a ``TypedDict``: a static type and, by ``Annotated``, a spec for each.
 
-A function takes them as ``**wishes: Unpack[Form]``. Type checkers read the form; what is seen at run time
+A function takes them as ``**options: Unpack[Form]``. Type checkers read the form; what is seen at run time
 (``inspect.signature``, ``help``), checks and tables are made of it here.
 """
 
@@ -16,7 +16,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 from torchpt.spec.parameters import Spec
 from torchpt.spec.reading import Refused
 
-__all__ = ["Argument", "Declared", "check_names", "declared", "spelled"]
+__all__ = ["Argument", "DeclaredArgument", "arguments_of", "check_names", "expand_signature"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -44,7 +44,7 @@ class Argument(Spec):
 
 
 @dataclass(frozen=True)
-class Declared:
+class DeclaredArgument:
     """A keyword argument.
 
     Attributes:
@@ -80,26 +80,26 @@ class Declared:
 
 
 @cache
-def declared(form: Any) -> dict[str, Declared]:
+def arguments_of(form: Any) -> dict[str, DeclaredArgument]:
     """Return the arguments that a ``TypedDict`` declares by name, those of its bases first.
 
     Raises:
         TypeError: one without a spec.
     """
-    found: dict[str, Declared] = {}
+    found: dict[str, DeclaredArgument] = {}
     for name, hint in get_type_hints(form, include_extras=True).items():
         spec = next((item for item in getattr(hint, "__metadata__", ()) if isinstance(item, Spec)), None)
         if spec is None:
             raise TypeError(f"{form.__name__}.{name} has no spec: Annotated[TYPE, SPEC] declares one")
-        found[name] = Declared(hint.__origin__, spec)
+        found[name] = DeclaredArgument(hint.__origin__, spec)
     return found
 
 
-def spelled(function: F) -> F:
-    """Spell out ``**wishes: Unpack[Form]`` in a function's run-time signature and at the end of its docstring."""
+def expand_signature(function: F) -> F:
+    """Spell out ``**options: Unpack[Form]`` in a function's run-time signature and at the end of its docstring."""
     signature = inspect.signature(function, eval_str=True)
     *own, rest = signature.parameters.values()
-    arguments = declared(get_args(rest.annotation)[0])
+    arguments = arguments_of(get_args(rest.annotation)[0])
     every = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=argument.default, annotation=argument.type)
         for name, argument in arguments.items()
@@ -126,7 +126,7 @@ def check_names(call: str, given: Collection[str], form: Any, own: Collection[st
     Raises:
         TypeError: an unknown one.
     """
-    known = declared(form)
+    known = arguments_of(form)
     for name in given:
         if name not in known:
             close = difflib.get_close_matches(name, sorted({*known, *own}), 1)

@@ -25,13 +25,13 @@ __all__ = [
     "Angle",
     "Choice",
     "Color",
-    "Corners",
+    "Custom",
     "Direction",
     "Flag",
     "Index",
+    "Integer",
     "Map",
     "Moves",
-    "Other",
     "Pair",
     "Path",
     "Point",
@@ -40,8 +40,8 @@ __all__ = [
     "Scalar",
     "Spec",
     "Texels",
+    "VertexAttribute",
     "Vertices",
-    "Whole",
     "spec_of",
 ]
 
@@ -102,7 +102,7 @@ class Spec:
     role: Role = field(default=Role.NONE, kw_only=True)
 
     #: Whether it is a tensor of ``scene.params``; else it is fixed once the scene is loaded.
-    traced: ClassVar[bool] = False
+    differentiable: ClassVar[bool] = False
     #: Whether it is a place, in the scene's own coordinates: kept in float64 where the scene lies far from the origin.
     place: ClassVar[bool] = False
     #: How many channels of a texture it takes.
@@ -160,7 +160,7 @@ class _Numbers(Spec):
     above: float | None = field(default=None, kw_only=True)
     below: float | None = field(default=None, kw_only=True)
 
-    traced: ClassVar[bool] = True
+    differentiable: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if isinstance(self.default, int | float) and not isinstance(self.default, bool):  # as a file's would be read
@@ -345,7 +345,7 @@ def spec_of(value: Any) -> Spec:
 class _Vector(Spec):
     """Three numbers."""
 
-    traced: ClassVar[bool] = True
+    differentiable: ClassVar[bool] = True
 
     def read(self, value: Any) -> tuple[float, float, float]:
         """See :class:`Spec`."""
@@ -413,7 +413,7 @@ class Vertices(_Vector):
 
 
 @dataclass(frozen=True)
-class Corners(Vertices):
+class VertexAttribute(Vertices):
     """Normals ``(V, 3)`` or coordinates ``(V, 2)`` of a mesh: a tensor of the scene where its gradients are wanted."""
 
     place: ClassVar[bool] = False
@@ -435,7 +435,7 @@ class Pose(Spec):
     operations: bool = field(default=True, kw_only=True)
     moves: Moves = field(default=Moves.SURFACES, kw_only=True)
 
-    traced: ClassVar[bool] = True
+    differentiable: ClassVar[bool] = True
     place: ClassVar[bool] = True
 
     @property
@@ -513,7 +513,7 @@ class Choice(Spec):
 
 
 @dataclass(frozen=True)
-class Whole(Spec):
+class Integer(Spec):
     """A whole number in a range, or one of some other values.
 
     Attributes:
@@ -595,7 +595,7 @@ class Map(Spec):
 
 
 @dataclass(frozen=True)
-class Other(Spec):
+class Custom(Spec):
     """Whatever a function reads.
 
     Attributes:

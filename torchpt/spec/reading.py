@@ -18,8 +18,21 @@ from torchpt.core.errors import SceneError
 from torchpt.math import transforms
 
 __all__ = [
-    "LARGEST", "Refused", "bounded", "faces", "file_paths", "flag", "matrix", "memory_size", "number", "pair", "rows", "text",
-    "transform", "vector", "within",
+    "LARGEST",
+    "Refused",
+    "as_refused",
+    "bounded",
+    "faces",
+    "file_paths",
+    "flag",
+    "matrix",
+    "memory_size",
+    "number",
+    "pair",
+    "rows",
+    "text",
+    "transform",
+    "vector",
 ]  # fmt: skip
 
 LARGEST = float(np.finfo(np.float32).max)
@@ -42,7 +55,7 @@ class Refused(ValueError):
         super().__init__(expected)
 
 
-def within(error: SceneError) -> Refused:
+def as_refused(error: SceneError) -> Refused:
     """The same refusal of a part of a value, by its key relative to the value."""
     return Refused(error.expected, error.value, tuple(part for part in error.key.split(".") if part))
 
@@ -111,7 +124,7 @@ def transform(value: Any, device: torch.device | None = None) -> Any:
     try:
         return transforms.compose(value, device)
     except SceneError as error:
-        raise within(error) from None
+        raise as_refused(error) from None
 
 
 def matrix(value: Any) -> NDArray[np.float64]:
@@ -119,7 +132,7 @@ def matrix(value: Any) -> NDArray[np.float64]:
     try:
         found = transforms.matrix4(value, "")
     except SceneError as error:
-        raise within(error) from None
+        raise as_refused(error) from None
     if not transforms.is_usable(found):
         raise Refused(f"a matrix that can be inverted, {transforms.WITHIN}")
     return found

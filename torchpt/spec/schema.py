@@ -15,29 +15,29 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from torchpt.core.errors import NotBuiltError, SceneError
-from torchpt.core.tree import UNPRINTED
+from torchpt.core.tree import NOT_FINGERPRINTED
 from torchpt.spec import Map, Refused, unsupported
 from torchpt.spec.parameters import REQUIRED, Spec, spec_of
-from torchpt.spec.reading import within
+from torchpt.spec.reading import as_refused
 
 if TYPE_CHECKING:
     from typing import Self
 
 __all__ = [
     "Block",
+    "FrozenConfig",
     "Kinds",
-    "Memo",
     "ParsedParams",
-    "Valued",
+    "ResultCache",
     "check_keys",
-    "described",
     "dotted",
     "frozen",
     "parameters_of",
-    "refuse_foreign",
+    "read_params",
+    "read_typed",
     "refuse_not_built",
-    "refused",
-    "values_of",
+    "refuse_unused_keys",
+    "scene_error",
 ]
 
 
@@ -142,7 +142,7 @@ class Block(Spec):
 # ---- Kinds whose instances are the values of their parameters
 
 
-class Valued:
+class FrozenConfig:
     """A frozen record with an attribute for each parameter that its class declares.
 
     Args:
@@ -185,7 +185,7 @@ class Valued:
         raise AttributeError(f"{type(self).__name__} is frozen")
 
     def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and isinstance(other, Valued) and other.values == self.values
+        return type(other) is type(self) and isinstance(other, FrozenConfig) and other.values == self.values
 
     def __hash__(self) -> int:
         return hash((type(self), *self.values.values()))
@@ -231,7 +231,7 @@ def frozen(value: Any) -> Hashable:
     raise TypeError(kind.__name__)
 
 
-class Memo(Generic[T]):
+class ResultCache(Generic[T]):
     """Results by what they were made of; the oldest ones go.
 
     Args:
@@ -280,7 +280,7 @@ def check_keys(raw: Mapping[str, Any], known: Iterable[str], key: str, what: str
             raise SceneError(dotted(key, name), name, f"a known key of {what}{hint}: {', '.join(names)}", file)
 
 
-def refused(error: Refused, key: str, value: Any, file: str | None) -> SceneError:
+def scene_error(error: Refused, key: str, value: Any, file: str | None) -> SceneError:
     """The refusal of a value as the error that names its key."""
     shown = value if error.value is ... else error.value
     kind = NotBuiltError if error.not_built else SceneError
@@ -319,7 +319,7 @@ class ParsedParams:
     kind: Any
     values: dict[str, Any]
     given: frozenset[str] = field(
-        default=frozenset(), repr=False, metadata=UNPRINTED
+        default=frozenset(), repr=False, metadata=NOT_FINGERPRINTED
     )  # a default that is stated is no other one
 
     @property
@@ -335,7 +335,7 @@ class ParsedParams:
 ReadTexture = Callable[[Mapping[str, Any], Spec], Any]
 
 
-def described(
+def read_typed(
     what: str,
     table: Mapping[str, Any],
     raw: Any,
@@ -384,7 +384,7 @@ def described(
 
 
 #: Things by what was written of them.
-_known: Memo[ParsedParams] = Memo(4096)
+_known: ResultCache[ParsedParams] = ResultCache(4096)
 
 
 def _read(
@@ -397,10 +397,10 @@ def _read(
     check_keys({k: v for k, v in raw.items() if k not in later}, ("type", *names), key, words, file)
     rest = refuse_not_built(raw, later, key, ", ".join(names), file)
     values = {k: value for k, value in rest.items() if k != "type"}
-    return values_of(kind, values, key, file, words, texture)
+    return read_params(kind, values, key, file, words, texture)
 
 
-def values_of(
+def read_params(
     kind: Any,
     raw: Mapping[str, Any],
     key: str,
@@ -424,7 +424,7 @@ def values_of(
             try:
                 values[name] = _read_value(spec, given[name], texture)
             except Refused as error:
-                raise refused(error, dotted(key, name), given[name], file) from None
+                raise scene_error(error, dotted(key, name), given[name], file) from None
         elif spec.default is REQUIRED:
             raise SceneError(dotted(key, name), None, "a value (this key is required)", file)
         else:
@@ -437,11 +437,11 @@ def values_of(
         try:
             check(values, frozenset(given))
         except Refused as error:
-            raise refused(error, key, None, file) from None
+            raise scene_error(error, key, None, file) from None
     return ParsedParams(kind, values, frozenset(given))
 
 
-def refuse_foreign(what: str, table: Mapping[str, Any], raw: Any, default: str, file: str | None) -> None:
+def refuse_unused_keys(what: str, table: Mapping[str, Any], raw: Any, default: str, file: str | None) -> None:
     """Raises for a key of a block that another type of the table reads: it could be accepted only to do nothing.
 
     Args:
@@ -489,6 +489,6 @@ def _block(spec: Block, texture: ReadTexture | None, value: Any) -> ParsedParams
     if not isinstance(value, Mapping):
         raise Refused(spec.expected)
     try:
-        return values_of(spec.kind, value, "", None, spec.kind.__name__.lower(), texture)
+        return read_params(spec.kind, value, "", None, spec.kind.__name__.lower(), texture)
     except SceneError as error:
-        raise within(error) from None
+        raise as_refused(error) from None

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from torchpt.stress.bench import Bench
+    from torchpt.stress.harness import Harness
 
-__all__ = ["Case", "Outcome", "Reading", "powers"]
+__all__ = ["Case", "Measurement", "Outcome", "powers"]
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Case:
         bound: the largest figure that passes.
         figure: of one place in the sweep. It may raise: that is a failure, and is told.
         axis: what is swept.
-        places: values of it.
+        sweep: values of it.
         quick: those that stand for all in a quick run; by default the first, the middle and the last.
         backend: whether the figure depends on how rays are searched and stages are run; else one run tells for all.
     """
@@ -31,21 +31,21 @@ class Case:
     name: str
     measures: str
     bound: float
-    figure: Callable[[Bench, float], float]
+    figure: Callable[[Harness, float], float]
     axis: str = ""
-    places: tuple[float, ...] = (0.0,)
+    sweep: tuple[float, ...] = (0.0,)
     quick: tuple[float, ...] = ()
     backend: bool = True
 
-    def chosen(self, quick: bool) -> tuple[float, ...]:
+    def points(self, quick: bool) -> tuple[float, ...]:
         """Places of a run."""
         if not quick:
-            return self.places
-        return self.quick or tuple(dict.fromkeys((self.places[0], self.places[len(self.places) // 2], self.places[-1])))
+            return self.sweep
+        return self.quick or tuple(dict.fromkeys((self.sweep[0], self.sweep[len(self.sweep) // 2], self.sweep[-1])))
 
 
 @dataclass(frozen=True)
-class Reading:
+class Measurement:
     """One figure.
 
     Attributes:
@@ -72,11 +72,11 @@ class Outcome:
     """
 
     case: Case
-    readings: tuple[Reading, ...] = field(default=())
+    readings: tuple[Measurement, ...] = field(default=())
     seconds: float = 0.0
 
     @property
-    def worst(self) -> Reading:
+    def worst(self) -> Measurement:
         """The one that decides: a failure to measure, else the largest figure; a refusal where there is nothing else."""
         measured = [one for one in self.readings if not one.refused] or self.readings
         return max(measured, key=lambda one: math.inf if math.isnan(one.figure) else one.figure)

@@ -67,8 +67,8 @@ def markdown(outcomes: Mapping[str, Sequence[Outcome]]) -> str:
     rows = ["| case | sweep | what is measured | worst | at | bound |", "|---|---|---|---|---|---|"]
     for row in outcomes.values():
         for outcome in row:
-            case, worst, places = outcome.case, outcome.worst, outcome.case.places
-            swept = f"{case.axis} {places[0]:g} .. {places[-1]:g}" if case.axis else ""
+            case, worst, sweep = outcome.case, outcome.worst, outcome.case.sweep
+            swept = f"{case.axis} {sweep[0]:g} .. {sweep[-1]:g}" if case.axis else ""
             figure = "-" if math.isnan(worst.figure) else f"{worst.figure:.1e}"
             at = f"{worst.at:g}" if case.axis else ""
             verdict = _verdict(outcome)

@@ -29,5 +29,5 @@ def clamped(b: Block, ty: str, x: str, low: float, high: float) -> str:
 
 def negative(b: Block, ty: str, x: str) -> str:
     """Whether the sign bit is set."""
-    held = "i" if ty == "f" else "L"
-    return b.compare("slt", held, b.convert("bitcast", ty, held, x), "zeroinitializer")
+    integer_type = "i" if ty == "f" else "L"
+    return b.compare("slt", integer_type, b.convert("bitcast", ty, integer_type, x), "zeroinitializer")

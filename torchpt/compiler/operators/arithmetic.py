@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchpt.compiler.graph import DTYPES, FLOATS, Unsupported
 from torchpt.compiler.operators.nodes import apply, type_of
-from torchpt.compiler.tracing import Tracer, handles
+from torchpt.compiler.tracing import Tracer, register_lowering
 
 __all__ = ["binary"]
 
@@ -47,15 +47,15 @@ for _names, _op in (
     (("atan2",), "atan2"),
     (("copysign",), "copysign"),
 ):
-    handles(*_names)(binary(_op))
+    register_lowering(*_names)(binary(_op))
 
 
-@handles("mul")
+@register_lowering("mul")
 def _mul(tracer: Tracer, out: Tensor, a: Any, b: Any) -> None:
     binary("and" if out.dtype == torch.bool else "mul")(tracer, out, a, b)
 
 
-@handles("div", "true_divide")
+@register_lowering("div", "true_divide")
 def _div(tracer: Tracer, out: Tensor, a: Any, b: Any, rounding_mode: str | None = None) -> None:
     if rounding_mode not in (None, "floor", "trunc"):
         raise Unsupported(f"division with rounding mode {rounding_mode}")
@@ -78,18 +78,18 @@ def _sum(op: str) -> Any:
     return handler
 
 
-handles("add")(_sum("add"))
-handles("sub")(_sum("sub"))
+register_lowering("add")(_sum("add"))
+register_lowering("sub")(_sum("sub"))
 
 
-@handles("rsub")
+@register_lowering("rsub")
 def _rsub(tracer: Tracer, out: Tensor, a: Any, b: Any, alpha: float = 1) -> None:
     if alpha != 1:
         raise Unsupported("rsub with alpha")
     _sum("sub")(tracer, out, b, a)
 
 
-@handles("addcmul")
+@register_lowering("addcmul")
 def _addcmul(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, c: Tensor, value: float = 1) -> None:
     graph, ty = tracer.graph, "L" if out.dtype == torch.int64 else DTYPES[out.dtype]
 
@@ -105,7 +105,7 @@ def _addcmul(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, c: Tensor, value
     apply(tracer, out, function, a, b, c)
 
 
-@handles("lerp")
+@register_lowering("lerp")
 def _lerp(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, weight: Any) -> None:
     graph, ty = tracer.graph, DTYPES[out.dtype]
 
@@ -136,15 +136,15 @@ for _name in (
     "sqrt abs neg sign floor ceil round trunc exp exp2 expm1 log log2 log10 log1p "
     "sin cos tan asin acos atan sinh cosh tanh sigmoid"
 ).split():
-    handles(_name)(_unary(_name))
+    register_lowering(_name)(_unary(_name))
 
 
-@handles("reciprocal")
+@register_lowering("reciprocal")
 def _reciprocal(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     binary("div")(tracer, out, 1.0, a)
 
 
-@handles("rsqrt")
+@register_lowering("rsqrt")
 def _rsqrt(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     graph, ty = tracer.graph, DTYPES[out.dtype]
     apply(
@@ -155,17 +155,17 @@ def _rsqrt(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     )
 
 
-@handles("square")
+@register_lowering("square")
 def _square(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     binary("mul")(tracer, out, a, a)
 
 
-@handles("relu")
+@register_lowering("relu")
 def _relu(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     binary("max")(tracer, out, a, 0)
 
 
-@handles("softplus")
+@register_lowering("softplus")
 def _softplus(tracer: Tracer, out: Tensor, a: Tensor, beta: float = 1, threshold: float = 20) -> None:
     graph, ty = tracer.graph, DTYPES[out.dtype]
 
@@ -178,7 +178,7 @@ def _softplus(tracer: Tracer, out: Tensor, a: Tensor, beta: float = 1, threshold
     apply(tracer, out, function, a)
 
 
-@handles("pow")
+@register_lowering("pow")
 def _pow(tracer: Tracer, out: Tensor, a: Any, b: Any) -> None:
     graph, ty = tracer.graph, "L" if out.dtype == torch.int64 else DTYPES[out.dtype]
 

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from torchpt.compiler.graph import DTYPES, FLOATS
 from torchpt.compiler.operators.nodes import apply, type_of
-from torchpt.compiler.tracing import Tracer, handles
+from torchpt.compiler.tracing import Tracer, register_lowering
 
 __all__ = ["masked_fill"]
 
 
-@handles("bitwise_not", "logical_not")
+@register_lowering("bitwise_not", "logical_not")
 def _not(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     graph = tracer.graph
 
@@ -29,7 +29,7 @@ def _not(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     apply(tracer, out, function, a)
 
 
-@handles("isinf")
+@register_lowering("isinf")
 def _isinf(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     graph, ty = tracer.graph, DTYPES[a.dtype]
     if ty not in FLOATS:
@@ -37,18 +37,18 @@ def _isinf(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     apply(tracer, out, lambda x: graph.node("eq", "b", graph.node("abs", ty, x), graph.constant(ty, math.inf)), a)
 
 
-@handles("isnan")
+@register_lowering("isnan")
 def _isnan(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     apply(tracer, out, lambda x: tracer.graph.node("ne", "b", x, x), a)
 
 
-@handles("isfinite")
+@register_lowering("isfinite")
 def _isfinite(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     graph, ty = tracer.graph, DTYPES[a.dtype]
     apply(tracer, out, lambda x: graph.node("lt", "b", graph.node("abs", ty, x), graph.constant(ty, math.inf)), a)
 
 
-@handles("where")
+@register_lowering("where")
 def _where(tracer: Tracer, out: Tensor, condition: Tensor, a: Any, b: Any) -> None:
     graph = tracer.graph
 
@@ -59,7 +59,7 @@ def _where(tracer: Tracer, out: Tensor, condition: Tensor, a: Any, b: Any) -> No
     apply(tracer, out, function, condition, a, b)
 
 
-@handles("masked_fill")
+@register_lowering("masked_fill")
 def masked_fill(tracer: Tracer, out: Tensor, a: Tensor, mask: Tensor, value: Any) -> None:
     """Another number where a mask holds."""
     _where(tracer, out, mask, value, a)
@@ -79,10 +79,10 @@ def _compare(op: str) -> Any:
 
 
 for _name in ("gt", "lt", "ge", "le", "eq", "ne"):
-    handles(_name)(_compare(_name))
+    register_lowering(_name)(_compare(_name))
 
 
-@handles("clamp", "clip")
+@register_lowering("clamp", "clip")
 def _clamp(tracer: Tracer, out: Tensor, a: Tensor, low: Any = None, high: Any = None) -> None:
     def function(x: int, *ends: int) -> int:
         graph, rest = tracer.graph, list(ends)
@@ -96,7 +96,7 @@ def _clamp(tracer: Tracer, out: Tensor, a: Tensor, low: Any = None, high: Any = 
     apply(tracer, out, function, a, *(end for end in (low, high) if end is not None))
 
 
-@handles("_to_copy", "to")
+@register_lowering("_to_copy", "to")
 def _to_copy(tracer: Tracer, out: Tensor, a: Tensor, *_: Any, **__: Any) -> None:
     def function(x: int) -> int:
         own, ty = tracer.graph.type(x), DTYPES[out.dtype]
@@ -114,10 +114,10 @@ def _like(value: float) -> Any:
     return handler
 
 
-handles("ones_like", "new_ones")(_like(1))
-handles("zeros_like", "new_zeros")(_like(0))
+register_lowering("ones_like", "new_ones")(_like(1))
+register_lowering("zeros_like", "new_zeros")(_like(0))
 
 
-@handles("full_like", "new_full")
+@register_lowering("full_like", "new_full")
 def _full_like(tracer: Tracer, out: Tensor, a: Tensor, *rest: Any, **_: Any) -> None:
     tracer.put(out, np.array(tracer.graph.constant(DTYPES[out.dtype], rest[-1]), object))

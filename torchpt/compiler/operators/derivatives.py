@@ -11,9 +11,9 @@ from torchpt.compiler.graph import DTYPES, Graph, Unsupported
 from torchpt.compiler.operators.arithmetic import binary
 from torchpt.compiler.operators.choices import masked_fill
 from torchpt.compiler.operators.nodes import apply, cast_all
-from torchpt.compiler.tracing import Tracer, handles
+from torchpt.compiler.tracing import Tracer, register_lowering
 
-__all__ = ["summands", "totals"]
+__all__ = ["sum_over_lanes", "summand_of"]
 
 
 def _zeros(tracer: Tracer, out: Tensor) -> tuple[Any, int | None]:
@@ -21,7 +21,7 @@ def _zeros(tracer: Tracer, out: Tensor) -> tuple[Any, int | None]:
     return np.full(tracer.inner(out.shape, lane), tracer.graph.constant(DTYPES[out.dtype], 0), object), lane
 
 
-@handles("select_backward")
+@register_lowering("select_backward")
 def _select_backward(tracer: Tracer, out: Tensor, given: Tensor, sizes: Any, axis: int, index: int) -> None:
     nodes, lane = _zeros(tracer, out)
     if axis % out.dim() == lane:
@@ -32,7 +32,7 @@ def _select_backward(tracer: Tracer, out: Tensor, given: Tensor, sizes: Any, axi
     tracer.put(out, nodes, lane)
 
 
-@handles("slice_backward")
+@register_lowering("slice_backward")
 def _slice_backward(
     tracer: Tracer, out: Tensor, given: Tensor, sizes: Any, axis: int, start: int, end: int, step: int
 ) -> None:
@@ -47,7 +47,7 @@ def _slice_backward(
     tracer.put(out, nodes, lane)
 
 
-@handles("logical_and_")
+@register_lowering("logical_and_")
 def _logical_and_(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor) -> None:
     """In place: what the derivative of a clamp makes of a comparison that nobody else reads."""
     binary("and")(tracer, out, a, b)
@@ -55,7 +55,7 @@ def _logical_and_(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor) -> None:
         tracer.alias(a, out)
 
 
-@handles("masked_fill_")
+@register_lowering("masked_fill_")
 def _masked_fill_(tracer: Tracer, out: Tensor, a: Tensor, mask: Tensor, value: Any) -> None:
     """In place: what the derivative of a maximum makes of a number that nobody else reads."""
     masked_fill(tracer, out, a, mask, value)
@@ -63,13 +63,13 @@ def _masked_fill_(tracer: Tracer, out: Tensor, a: Tensor, mask: Tensor, value: A
         tracer.alias(a, out)
 
 
-@handles("sgn")
+@register_lowering("sgn")
 def _sgn(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     ty = DTYPES[out.dtype]
     apply(tracer, out, lambda x: tracer.graph.node("sign", ty, tracer.graph.cast(x, ty)), a)
 
 
-@handles("threshold_backward")
+@register_lowering("threshold_backward")
 def _threshold_backward(tracer: Tracer, out: Tensor, given: Tensor, a: Tensor, threshold: float) -> None:
     graph, ty = tracer.graph, DTYPES[out.dtype]
 
@@ -80,7 +80,7 @@ def _threshold_backward(tracer: Tracer, out: Tensor, given: Tensor, a: Tensor, t
     apply(tracer, out, function, given, a)
 
 
-@handles("tanh_backward")
+@register_lowering("tanh_backward")
 def _tanh_backward(tracer: Tracer, out: Tensor, given: Tensor, y: Tensor) -> None:
     graph, ty = tracer.graph, DTYPES[out.dtype]
 
@@ -91,7 +91,7 @@ def _tanh_backward(tracer: Tracer, out: Tensor, given: Tensor, y: Tensor) -> Non
     apply(tracer, out, function, given, y)
 
 
-@handles("sigmoid_backward")
+@register_lowering("sigmoid_backward")
 def _sigmoid_backward(tracer: Tracer, out: Tensor, given: Tensor, y: Tensor) -> None:
     graph, ty = tracer.graph, DTYPES[out.dtype]
 
@@ -102,7 +102,7 @@ def _sigmoid_backward(tracer: Tracer, out: Tensor, given: Tensor, y: Tensor) -> 
     apply(tracer, out, function, given, y)
 
 
-def totals(tracer: Tracer, nodes: Any, axis: int, ty: str) -> Any:
+def sum_over_lanes(tracer: Tracer, nodes: Any, axis: int, ty: str) -> Any:
     """A sum over lanes: numbers that no lane knows, which kernels give away as rows of what they are sums of."""
     graph = tracer.graph
     nodes = cast_all(tracer, nodes, ty)
@@ -116,7 +116,7 @@ def totals(tracer: Tracer, nodes: Any, axis: int, ty: str) -> Any:
     return summed
 
 
-def summands(graph: Graph, node: int) -> int | None:
+def summand_of(graph: Graph, node: int) -> int | None:
     """The number of a lane whose sum over lanes the node is; None: 0.
 
     Raises:
@@ -128,24 +128,24 @@ def summands(graph: Graph, node: int) -> int | None:
     if op == "const" and graph.value(node) == 0:
         return None
     if op in ("add", "sub"):
-        a, b = (summands(graph, x) for x in arguments)
+        a, b = (summand_of(graph, x) for x in arguments)
         if b is None:
             return a
         b = graph.node("neg", ty, b) if op == "sub" else b
         return b if a is None else graph.binary("add", ty, a, b)
     if op == "neg":
-        a = summands(graph, arguments[0])
+        a = summand_of(graph, arguments[0])
         return None if a is None else graph.node("neg", ty, a)
     if op in ("mul", "div"):  # by what all lanes share
         whole = [_holds_total(graph, x) for x in arguments]
         if whole[0] and not whole[1]:
-            a = summands(graph, arguments[0])
+            a = summand_of(graph, arguments[0])
             return None if a is None else graph.binary(op, ty, a, arguments[1])
         if whole[1] and not whole[0] and op == "mul":
-            a = summands(graph, arguments[1])
+            a = summand_of(graph, arguments[1])
             return None if a is None else graph.binary(op, ty, arguments[0], a)
     if op == "select" and not _holds_total(graph, arguments[0]):
-        a, b = (summands(graph, x) for x in arguments[1:])
+        a, b = (summand_of(graph, x) for x in arguments[1:])
         zero = graph.constant(ty, 0)
         return graph.select(arguments[0], zero if a is None else a, zero if b is None else b)
     raise Unsupported("a derivative that is no sum over lanes")

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler.graph import DTYPES, Unsupported
-from torchpt.compiler.tracing import Tracer, handles
+from torchpt.compiler.tracing import Tracer, register_lowering
 
 __all__: list[str] = []
 
@@ -27,7 +27,7 @@ def _look_up(tracer: Tracer, table: Tensor, axis: int, index: int) -> np.ndarray
     return entries
 
 
-@handles("index_select")
+@register_lowering("index_select")
 def _index_select(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Tensor) -> None:
     axis %= table.dim()
     lanes = tracer.get(index)
@@ -51,7 +51,7 @@ def _from_lanes(tracer: Tracer, out: Tensor, table: Tensor, axis: int, rows: Any
     raise Unsupported("a look-up in other lanes")
 
 
-@handles("index")
+@register_lowering("index")
 def _index(tracer: Tracer, out: Tensor, table: Tensor, indices: Any) -> None:
     axes = [axis for axis, index in enumerate(indices) if index is not None]
     if len(axes) == 1:
@@ -86,7 +86,7 @@ def _index_one(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Ten
     tracer.put(out, nodes.reshape((*nodes.shape[:axis], *lanes.shape, *nodes.shape[axis + 1 :])))
 
 
-@handles("take")
+@register_lowering("take")
 def _take(tracer: Tracer, out: Tensor, table: Tensor, index: Tensor) -> None:
     if tracer.is_traced(table):
         raise Unsupported("a look-up in what depends on lanes")
@@ -98,7 +98,7 @@ def _take(tracer: Tracer, out: Tensor, table: Tensor, index: Tensor) -> None:
     tracer.put(out, nodes)
 
 
-@handles("gather")
+@register_lowering("gather")
 def _gather(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Tensor, sparse_grad: bool = False) -> None:
     """One of a few numbers that every lane has: a chain of selections."""
     value, rows, graph = tracer.get(table), tracer.get(index).nodes, tracer.graph
@@ -117,14 +117,14 @@ def _gather(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Tensor
     tracer.put(out, np.moveaxis(nodes, 0, axis))
 
 
-@handles("bucketize")
+@register_lowering("bucketize")
 def _bucketize(
     tracer: Tracer, out: Tensor, values: Tensor, table: Tensor, out_int32: bool = False, right: bool = False
 ) -> None:
     _searchsorted(tracer, out, table, values, right=right)
 
 
-@handles("searchsorted")
+@register_lowering("searchsorted")
 def _searchsorted(
     tracer: Tracer,
     out: Tensor,
@@ -172,12 +172,12 @@ def _product(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, start: Tensor | 
     tracer.put(out, nodes, lane)
 
 
-@handles("mm", "matmul")
+@register_lowering("mm", "matmul")
 def _mm(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor) -> None:
     _product(tracer, out, a, b, None)
 
 
-@handles("addmm")
+@register_lowering("addmm")
 def _addmm(tracer: Tracer, out: Tensor, start: Tensor, a: Tensor, b: Tensor, beta: float = 1, alpha: float = 1) -> None:
     if beta != 1 or alpha != 1:
         raise Unsupported("addmm with factors")

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torchpt.compiler.graph import DTYPES, Unsupported
 from torchpt.compiler.operators.arithmetic import binary
-from torchpt.compiler.operators.derivatives import totals
+from torchpt.compiler.operators.derivatives import sum_over_lanes
 from torchpt.compiler.operators.nodes import cast_all, type_of
-from torchpt.compiler.tracing import Tracer, handles
+from torchpt.compiler.tracing import Tracer, register_lowering
 
 __all__: list[str] = []
 
@@ -34,7 +34,7 @@ def _reduce(op: str, boolean: bool = False) -> Any:
             if k == value.lane:
                 if op != "add" or not tracer.graph.derivatives:
                     raise Unsupported("a reduction over lanes")
-                summed = totals(tracer, nodes, k, DTYPES[out.dtype])
+                summed = sum_over_lanes(tracer, nodes, k, DTYPES[out.dtype])
                 nodes = np.expand_dims(summed, k) if keepdim else summed
                 continue
             parts: list[Any] = [np.squeeze(np.take(nodes, [j], k), k) for j in range(nodes.shape[k])]
@@ -66,22 +66,22 @@ def _nothing(graph: Any, op: str, ty: str) -> int:
     return graph.constant(ty, 1 if op in ("mul", "and") else 0)
 
 
-handles("amax")(_reduce("max"))
-handles("amin")(_reduce("min"))
-handles("sum")(_reduce("add"))
-handles("prod")(_reduce("mul"))
-handles("all")(_reduce("and", boolean=True))
-handles("any")(_reduce("or", boolean=True))
+register_lowering("amax")(_reduce("max"))
+register_lowering("amin")(_reduce("min"))
+register_lowering("sum")(_reduce("add"))
+register_lowering("prod")(_reduce("mul"))
+register_lowering("all")(_reduce("and", boolean=True))
+register_lowering("any")(_reduce("or", boolean=True))
 
 
-@handles("mean")
+@register_lowering("mean")
 def _mean(tracer: Tracer, out: Tensor, a: Tensor, axis: Any = None, keepdim: bool = False, dtype: Any = None) -> None:
     _reduce("add")(tracer, out, a, axis, keepdim)
     count = math.prod(a.shape[k] for k in _axes(axis, a.dim()))
     binary("div")(tracer, out, out, count)
 
 
-@handles("cumsum")
+@register_lowering("cumsum")
 def _cumsum(tracer: Tracer, out: Tensor, a: Tensor, axis: int, dtype: Any = None) -> None:
     value, graph, ty = tracer.get(a), tracer.graph, _sums("add", out)
     axis %= a.dim()

@@ -10,17 +10,17 @@ from torch import Tensor
 
 from torchpt.compiler.graph import DTYPES, Unsupported
 from torchpt.compiler.operators.nodes import cast_all
-from torchpt.compiler.tracing import Tracer, handles
+from torchpt.compiler.tracing import Tracer, register_lowering
 
 __all__: list[str] = []
 
 
-@handles("detach", "alias", "clone", "contiguous", "lift_fresh")
+@register_lowering("detach", "alias", "clone", "contiguous", "lift_fresh")
 def _same(tracer: Tracer, out: Tensor, a: Tensor, *_: Any, **__: Any) -> None:
     tracer.alias(out, a)
 
 
-@handles("select")
+@register_lowering("select")
 def _select(tracer: Tracer, out: Tensor, a: Tensor, axis: int, index: int) -> None:
     value = tracer.get(a)
     if axis % a.dim() == value.lane:
@@ -28,13 +28,13 @@ def _select(tracer: Tracer, out: Tensor, a: Tensor, axis: int, index: int) -> No
     tracer.put(out, np.take(value.nodes, index, axis % a.dim()))
 
 
-@handles("narrow")
+@register_lowering("narrow")
 def _narrow(tracer: Tracer, out: Tensor, a: Tensor, axis: int, start: int, length: int) -> None:
     start %= max(a.shape[axis], 1)
     _slice(tracer, out, a, axis, start, start + length)
 
 
-@handles("slice")
+@register_lowering("slice")
 def _slice(
     tracer: Tracer, out: Tensor, a: Tensor, axis: int = 0, start: Any = None, end: Any = None, step: int = 1
 ) -> None:
@@ -48,13 +48,13 @@ def _slice(
     tracer.put(out, value.nodes[tuple(part)])
 
 
-@handles("unbind")
+@register_lowering("unbind")
 def _unbind(tracer: Tracer, out: Any, a: Tensor, axis: int = 0) -> None:
     for k, one in enumerate(out):
         _select(tracer, one, a, axis, k)
 
 
-@handles("split", "split_with_sizes", "chunk")
+@register_lowering("split", "split_with_sizes", "chunk")
 def _split(tracer: Tracer, out: Any, a: Tensor, sizes: Any, axis: int = 0) -> None:
     start = 0
     for one in out:
@@ -62,53 +62,53 @@ def _split(tracer: Tracer, out: Any, a: Tensor, sizes: Any, axis: int = 0) -> No
         start += one.shape[axis]
 
 
-@handles("unsqueeze")
+@register_lowering("unsqueeze")
 def _unsqueeze(tracer: Tracer, out: Tensor, a: Tensor, axis: int) -> None:
     tracer.put(out, np.expand_dims(tracer.get(a).nodes, axis % (a.dim() + 1)))
 
 
-@handles("squeeze")
+@register_lowering("squeeze")
 def _squeeze(tracer: Tracer, out: Tensor, a: Tensor, axis: Any = None) -> None:
     axes = range(a.dim()) if axis is None else [axis] if isinstance(axis, int) else axis
     gone = tuple(k % a.dim() for k in axes if a.shape[k] == 1)
     tracer.put(out, np.squeeze(tracer.get(a).nodes, gone) if gone else tracer.get(a).nodes)
 
 
-@handles("permute")
+@register_lowering("permute")
 def _permute(tracer: Tracer, out: Tensor, a: Tensor, axes: Any) -> None:
     tracer.put(out, np.transpose(tracer.get(a).nodes, [k % a.dim() for k in axes]))
 
 
-@handles("t", "numpy_T")
+@register_lowering("t", "numpy_T")
 def _t(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     tracer.put(out, tracer.get(a).nodes.T)
 
 
-@handles("transpose")
+@register_lowering("transpose")
 def _transpose(tracer: Tracer, out: Tensor, a: Tensor, i: int, j: int) -> None:
     tracer.put(out, np.swapaxes(tracer.get(a).nodes, i, j))
 
 
-@handles("flip")
+@register_lowering("flip")
 def _flip(tracer: Tracer, out: Tensor, a: Tensor, axes: Any) -> None:
     if tracer.get(a).lane in [k % a.dim() for k in axes]:
         raise Unsupported("lanes turned around")
     tracer.put(out, np.flip(tracer.get(a).nodes, axes))
 
 
-@handles("roll")
+@register_lowering("roll")
 def _roll(tracer: Tracer, out: Tensor, a: Tensor, shifts: Any, axes: Any = ()) -> None:
     if not axes or tracer.get(a).lane in [k % a.dim() for k in axes]:
         raise Unsupported("lanes rolled")
     tracer.put(out, np.roll(tracer.get(a).nodes, shifts, axes))
 
 
-@handles("expand")
+@register_lowering("expand")
 def _expand(tracer: Tracer, out: Tensor, a: Tensor, sizes: Any, implicit: bool = False) -> None:
     tracer.put(out, tracer.get(a).nodes)
 
 
-@handles("view", "_unsafe_view", "reshape")
+@register_lowering("view", "_unsafe_view", "reshape")
 def _view(tracer: Tracer, out: Tensor, a: Tensor, sizes: Any) -> None:
     value, lane = tracer.get(a), tracer.lane_axis(out.shape)
     if value.lane is not None and lane is not None:
@@ -123,13 +123,13 @@ def _cast(tracer: Tracer, tensor: Tensor, out: Tensor) -> np.ndarray:
     return cast_all(tracer, tracer.get(tensor).nodes, DTYPES[out.dtype])
 
 
-@handles("stack")
+@register_lowering("stack")
 def _stack(tracer: Tracer, out: Tensor, tensors: Any, axis: int = 0) -> None:
     parts = np.broadcast_arrays(*(_cast(tracer, tensor, out) for tensor in tensors))
     tracer.put(out, np.stack(parts, axis))
 
 
-@handles("cat", "concat")
+@register_lowering("cat", "concat")
 def _cat(tracer: Tracer, out: Tensor, tensors: Any, axis: int = 0) -> None:
     if tracer.lane_axis(out.shape) == axis % out.dim():
         raise Unsupported("lanes joined")

@@ -18,15 +18,15 @@ from torch import Tensor
 
 from torchpt.compiler.form import CAPACITY
 from torchpt.compiler.graph import Unsupported
-from torchpt.compiler.operators.derivatives import summands
+from torchpt.compiler.operators.derivatives import summand_of
 from torchpt.compiler.sinks import Scatter, Sinks
 from torchpt.compiler.tracing import Tracer
 from torchpt.core.memory import Span
-from torchpt.engines.kernels.engine import Chunk, Paths, Worker
+from torchpt.engines.kernels.engine import Chunk, KernelsEngine, Paths
 from torchpt.engines.kernels.layout import HIT, Fields, Layout, Memory, Rows, Trace, path_state
 from torchpt.engines.kernels.programs import Kernel, Kernels
 from torchpt.math.gathers import recording_gathers
-from torchpt.math.sums import ChunkSums
+from torchpt.math.sums import ChunkGradientSums
 from torchpt.paths import adjoint
 from torchpt.paths.adjoint import InputCotangents, Tape, VertexCotangents
 from torchpt.paths.integrators.path import follows_shape
@@ -43,9 +43,9 @@ __all__ = [
     "bounce_vjp",
     "emit_vjp",
     "escape_vjp",
-    "report",
     "slots_of",
     "slots_read",
+    "store_hits",
 ]
 
 
@@ -63,7 +63,7 @@ SLOTS: Fields = {
     **HIT,
 }
 #: With splats: how much of the light of the latest one got through.
-_SPLAT: Fields = {"splat_clear": ((), "f")}
+_SPLAT: Fields = {"splat_transmittance": ((), "f")}
 
 
 def slots_of(layout: Layout) -> Fields:
@@ -73,7 +73,7 @@ def slots_of(layout: Layout) -> Fields:
     return {**SLOTS, **extra, **(_SPLAT if layout.wave.integrator.splats else {})}
 
 
-class _Noted:
+class _RecordedGathers:
     """Look-ups of a trace in tables that are differentiated."""
 
     def __init__(self, tracer: Tracer, kernels: VjpKernels) -> None:
@@ -88,9 +88,9 @@ class _Noted:
             return None
         key = number, id(index)
         if key not in self._known:
-            plain = self.kernels.plain[number]
+            primals = self.kernels.primals[number]
             with torch.no_grad():
-                found = torch.index_select(plain, plain.dim() - 1, index)
+                found = torch.index_select(primals, primals.dim() - 1, index)
             self._known[key] = found.detach().requires_grad_()
             self.taken.append((number, index, self._known[key]))
         return self._known[key]
@@ -104,7 +104,7 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_shape: bool) ->
     """See :func:`torchpt.paths.adjoint.bounce`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
-    state, hit, rows = _given(trace)
+    state, hit, rows = _inputs(trace)
     extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
     cotangents = VertexCotangents(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
     next_hit = Hit(*(rows[name] for name in HIT)) if kernels.taped.plan.attached else None
@@ -115,44 +115,44 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_shape: bool) ->
     integrator, cotangent = trace.layout.wave.integrator, kernels.cotangent
 
     def landed(splat: Splat) -> tuple[Tensor, Tensor]:
-        return adjoint.splatted(integrator.clamp, cotangent, splat, rows["splat_clear"])
+        return adjoint.splatted(integrator.clamp, cotangent, splat, rows["splat_transmittance"])
 
-    noted = _Noted(tracer, kernels)
-    with tracer, recording_gathers(noted):
+    gathers = _RecordedGathers(tracer, kernels)
+    with tracer, recording_gathers(gathers):
         context = kernels.taped.at(salts, follow_shape, roulette)
         vertex = VertexInput(state, hit)
-        before = adjoint.bounce(
-            integrator.bounce, context, model, vertex, next_hit, clear, cotangents, noted.leaves, landed
+        input_cotangents = adjoint.bounce(
+            integrator.bounce, context, model, vertex, next_hit, clear, cotangents, gathers.leaves, landed
         )
-    return _ended(trace, noted, state, before, {})
+    return _stores(trace, gathers, state, input_cotangents, {})
 
 
 def emit_vjp(trace: Trace, follow_shape: bool) -> Sinks:
     """See :func:`torchpt.paths.adjoint.gather`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
-    state, hit, rows = _given(trace)
-    noted = _Noted(tracer, kernels)
-    with tracer, recording_gathers(noted):
+    state, hit, rows = _inputs(trace)
+    gathers = _RecordedGathers(tracer, kernels)
+    with tracer, recording_gathers(gathers):
         context = kernels.taped.at(salts, follow_shape)
         stage, vertex = trace.layout.wave.integrator.emit, VertexInput(state, hit)
-        before = adjoint.gather(stage, context, vertex, rows["radiance"], noted.leaves)
-    return _ended(trace, noted, state, before, rows)
+        input_cotangents = adjoint.gather(stage, context, vertex, rows["radiance"], gathers.leaves)
+    return _stores(trace, gathers, state, input_cotangents, rows)
 
 
 def escape_vjp(trace: Trace) -> Sinks:
     """See :func:`torchpt.paths.adjoint.gather`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
-    state, hit, rows = _given(trace)
-    noted = _Noted(tracer, kernels)
-    with tracer, recording_gathers(noted):
+    state, hit, rows = _inputs(trace)
+    gathers = _RecordedGathers(tracer, kernels)
+    with tracer, recording_gathers(gathers):
         stage, vertex = trace.layout.wave.integrator.escape, VertexInput(state, hit)
-        before = adjoint.gather(stage, kernels.taped.at(salts), vertex, rows["radiance"], noted.leaves)
-    return _ended(trace, noted, state, before, rows)
+        input_cotangents = adjoint.gather(stage, kernels.taped.at(salts), vertex, rows["radiance"], gathers.leaves)
+    return _stores(trace, gathers, state, input_cotangents, rows)
 
 
-def report(trace: Trace) -> Sinks:
+def store_hits(trace: Trace) -> Sinks:
     """Write what the rays and shadow rays of an arena met, for the vertex before."""
     layout, tracer = trace.layout, trace.tracer
     lane = layout.state.read(tracer, "lane")["lane"]
@@ -179,7 +179,7 @@ def _begun(trace: Trace) -> tuple[Any, Tracer]:
     return trace.layout, trace.tracer
 
 
-def _given(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
+def _inputs(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
     """State, hit, and what lies in the slots."""
     state, _ = trace.state()
     hit = trace.hit()
@@ -188,13 +188,19 @@ def _given(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
     return state, hit, slots.read(tracer, *slots_read(kernels), place=lane)
 
 
-def _ended(trace: Trace, noted: _Noted, state: PathState, before: InputCotangents, added: dict[str, Tensor]) -> Sinks:
+def _stores(
+    trace: Trace,
+    gathers: _RecordedGathers,
+    state: PathState,
+    input_cotangents: InputCotangents,
+    added: dict[str, Tensor],
+) -> Sinks:
     """Rows of derivatives by tables, and what is asked of the ray that came; ``added`` to what lies there."""
     kernels: Any = trace.layout
     tracer, graph = trace.tracer, trace.tracer.graph
     fields: dict[str, Tensor] = {}
     with tracer:
-        for name, found, like in before.of_rays(state, kernels.taped.plan.attached):
+        for name, found, like in input_cotangents.of_rays(state, kernels.taped.plan.attached):
             if found is None and added:
                 continue
             found = torch.zeros_like(like) if found is None else found
@@ -204,7 +210,7 @@ def _ended(trace: Trace, noted: _Noted, state: PathState, before: InputCotangent
         rows = tuple(Rows(slots_of(trace.layout)).nodes(tracer, **fields))
         sinks.scatter.append(Scatter(-1, trace.node(state.lane), rows, slots=True))
     columns: dict[tuple[int, int], list[int]] = {}
-    for (number, index, _), gradient in zip(noted.taken, before.others, strict=False):
+    for (number, index, _), gradient in zip(gathers.taken, input_cotangents.extra_leaves, strict=False):
         if gradient is None:
             continue
         places = tracer.get(index).nodes.reshape(-1)
@@ -230,11 +236,11 @@ def _ended(trace: Trace, noted: _Noted, state: PathState, before: InputCotangent
         if place not in places_of:
             places_of[place] = written([place])
         trace.sums.append((number, places_of[place], written(nodes), len(nodes)))
-    for number, gradient in enumerate(before.others[len(noted.taken) :]):
+    for number, gradient in enumerate(input_cotangents.extra_leaves[len(gathers.taken) :]):
         if gradient is None:
             continue
-        nodes = np.broadcast_to(tracer.get(gradient).nodes, tuple(kernels.plain[number].shape)).reshape(-1)
-        lanes = [summands(graph, int(node)) for node in nodes]
+        nodes = np.broadcast_to(tracer.get(gradient).nodes, tuple(kernels.primals[number].shape)).reshape(-1)
+        lanes = [summand_of(graph, int(node)) for node in nodes]
         if any(node is not None for node in lanes):
             if len(lanes) > 64:
                 raise Unsupported("a derivative by all of a table in every lane")
@@ -267,9 +273,9 @@ class VjpKernels(Kernels):
         super().__init__(with_detached_geometry(tape.wave), packets, False, cotangent=cotangent)
         self.tape, self.cotangent = tape, cotangent
         self.taped = tape.taped.context
-        self.plain = tape.plain
+        self.primals = tape.primals
         self.numbers_of = {id(leaf): number for number, leaf in enumerate(tape.leaves)}
-        paths = [self._leaves.ids[id(one)][0] if id(one) in self._leaves.ids else None for one in tape.plain]
+        paths = [self._leaves.ids[id(one)][0] if id(one) in self._leaves.ids else None for one in tape.primals]
         for path, leaf in zip(paths, tape.leaves, strict=True):
             if path is not None:
                 self._leaves.ids[id(leaf)] = path, leaf
@@ -290,9 +296,9 @@ class VjpKernels(Kernels):
             self.eager_vjps[key] = str(error)
             return None
 
-    def report(self) -> Kernel:
-        """See :func:`torchpt.engines.kernels.backward.report`."""
-        return self._get(False, report)
+    def store_hits(self) -> Kernel:
+        """See :func:`torchpt.engines.kernels.backward.store_hits`."""
+        return self._get(False, store_hits)
 
     def engine(self) -> KernelsBackward:
         """Return an engine for one more thread."""
@@ -314,7 +320,7 @@ class Mark:
     words: np.ndarray
 
 
-class KernelsBackward(Worker):
+class KernelsBackward(KernelsEngine):
     """See :class:`torchpt.engines.engine.Backward`: the way back from arena to arena.
 
     Lanes lie in an arena as they come; stages are gone back through in the order of samples, as :mod:`torchpt.math.sums` asks.
@@ -329,12 +335,12 @@ class KernelsBackward(Worker):
         super().__init__(kernels)
         self.back = kernels
         self._levels: list[Paths] = []
-        self._behind = Memory(kernels.slots.count)
+        self._sample_slots = Memory(kernels.slots.count)
         self._results = Memory(1)
         self._sorted = Memory(2), np.zeros(CAPACITY, np.uint8)  # slots of a list's lanes, and what sorting takes
         self._first = 1
 
-    def begin(self, span: Span, sums: ChunkSums) -> Paths:
+    def begin(self, span: Span, sums: ChunkGradientSums) -> Paths:
         """See :class:`torchpt.engines.engine.Backward`."""
         self.sums, self._chunk, self._first = sums, Chunk(*span), 1
         paths = self.spawn(self._chunk)
@@ -345,7 +351,7 @@ class KernelsBackward(Worker):
         return paths
 
     def room(self, depth: int) -> Paths:
-        """See :class:`Worker`: the first vertices of a part are all kept, of those behind two take turns."""
+        """See :class:`KernelsEngine`: the first vertices of a part are all kept, of those behind two take turns."""
         number = depth - self._first
         if number >= KEPT:
             return self._rooms[number % 2]
@@ -374,9 +380,9 @@ class KernelsBackward(Worker):
     def receive(self, cotangent: Tensor) -> None:
         """See :class:`torchpt.engines.engine.Backward`."""
         n, first = cotangent.shape[1], self.back.slots.first("radiance")
-        self._behind.words[:, :n] = 0
+        self._sample_slots.words[:, :n] = 0
         asked = cotangent if self._weight is None else cotangent * self._weight
-        self._behind.floats[first : first + 3, :n] = asked.numpy()
+        self._sample_slots.floats[first : first + 3, :n] = asked.numpy()
 
     def vjp(self, paths: Paths) -> None:
         """See :class:`torchpt.engines.engine.Backward`."""
@@ -396,7 +402,7 @@ class KernelsBackward(Worker):
             place = kernels.missed
             self._one(("escape",), paths, paths.lists[place], paths.places[place], True)
         if depth > 1:
-            calls.run(kernels.report(), paths.count, paths.arena, paths.arena, slots=self._behind)
+            calls.run(kernels.store_hits(), paths.count, paths.arena, paths.arena, slots=self._sample_slots)
 
     def _one(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
         """Back through one stage on the lanes of a list, by its kernel or by tensor operations."""
@@ -406,7 +412,7 @@ class KernelsBackward(Worker):
             self._eagerly(key, paths, places, count, added)
             return
         self._results = self._results_of(kernel)
-        self.calls.run(kernel, count, paths.arena, self._results, places, slots=self._behind)
+        self.calls.run(kernel, count, paths.arena, self._results, places, slots=self._sample_slots)
         if slots is None:
             return
         floats, words = self._results.floats, self._results.words
@@ -438,16 +444,16 @@ class KernelsBackward(Worker):
         state = path_state(kernels.state.take(paths.arena, lanes, kernels.state.state))
         vertex = VertexInput(state, Hit(**kernels.state.take(paths.arena, lanes, tuple(HIT))))
         lane = state.lane.numpy()
-        rows = kernels.slots.take(self._behind, lane, slots_read(kernels))
+        rows = kernels.slots.take(self._sample_slots, lane, slots_read(kernels))
 
         def clear(_: Shadow) -> Tensor:
             return rows["clear"]
 
         def landed(splat: Splat) -> tuple[Tensor, Tensor]:
             assert kernels.cotangent is not None
-            return adjoint.splatted(integrator.clamp, kernels.cotangent, splat, rows["splat_clear"])
+            return adjoint.splatted(integrator.clamp, kernels.cotangent, splat, rows["splat_transmittance"])
 
-        before: InputCotangents
+        input_cotangents: InputCotangents
         with recording_gathers(self.sums):
             if key[0] == "bounce":
                 extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
@@ -455,19 +461,21 @@ class KernelsBackward(Worker):
                 next_hit = Hit(*(rows[name] for name in HIT)) if plan.attached else None
                 _, model, roulette, follow_shape = key
                 context = kernels.taped.at(salt, follow_shape, roulette)
-                before = adjoint.bounce(
+                input_cotangents = adjoint.bounce(
                     integrator.bounce, context, model, vertex, next_hit, clear, cotangents, self._tables, landed
                 )
             else:
                 stage = integrator.emit if key[0] == "emit" else integrator.escape
-                before = adjoint.gather(stage, kernels.taped.at(salt, *key[1:]), vertex, rows["radiance"], self._tables)
-        for name, found, like in before.of_rays(state, plan.attached):
+                input_cotangents = adjoint.gather(
+                    stage, kernels.taped.at(salt, *key[1:]), vertex, rows["radiance"], self._tables
+                )
+        for name, found, like in input_cotangents.of_rays(state, plan.attached):
             first = kernels.slots.first(name)
             values = np.zeros(like.shape, np.float32) if found is None else found.numpy()
             values = values.reshape(-1, count)
-            held = self._behind.floats[first : first + len(values)]
+            held = self._sample_slots.floats[first : first + len(values)]
             held[:, lane] = values + held[:, lane] if added else values
-        self.sums.add_each(before.others)
+        self.sums.add_each(input_cotangents.extra_leaves)
 
     def _tables(self) -> Sequence[Tensor]:
         return self.back.tape.tables
@@ -482,6 +490,6 @@ class KernelsBackward(Worker):
             pairs = [(x, first(name)) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
             if not pairs:
                 return
-            asked = [torch.from_numpy(self._behind.floats[row : row + 3, :n].copy()) for _, row in pairs]
+            asked = [torch.from_numpy(self._sample_slots.floats[row : row + 3, :n].copy()) for _, row in pairs]
             found = torch.autograd.grad([x for x, _ in pairs], self._tables(), asked, allow_unused=True)
         self.sums.add_each(found)

@@ -3,7 +3,7 @@
 A chunk is some thousand samples, one path a lane. Paths lie in an *arena* (:mod:`~torchpt.engines.kernels.layout`); `scatter`
 takes them from one arena to the other, without those that ended. Where the search is inside of the stages (``fused``), lanes
 come with their hits and are listed by what they met: `intersect` and `occlude` have nothing to do, and `sort` reads counters.
-Else rays are searched between stages, and the kernel ``settle`` adds the light of the last shadow rays, lists lanes and ends
+Else rays are searched between stages, and the kernel ``sort_lanes`` adds the light of the last shadow rays, lists lanes and ends
 paths. A path that ends writes its radiance to the slot of its sample; :mod:`~torchpt.engines.kernels.threads` adds slots to
 the film.
 """
@@ -24,7 +24,7 @@ from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD
 from torchpt.engines.kernels.layout import HIT, Memory, Rows, path_state, state_values
 from torchpt.engines.kernels.programs import Kernel, Kernels
-from torchpt.engines.kernels.stages import PLACE
+from torchpt.engines.kernels.stages import CHUNK_FIELDS
 from torchpt.paths.integrators.base import check_output
 from torchpt.paths.layers import LAYERS
 from torchpt.paths.state import Shadow, Splat, VertexInput, no_shadow
@@ -35,7 +35,7 @@ from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.search import Accel
 
-__all__ = ["LANES", "Calls", "Chunk", "ChunkSearch", "Halted", "Paths", "Worker", "bounce_eagerly"]
+__all__ = ["LANES", "Calls", "Chunk", "ChunkSearch", "Halted", "KernelsEngine", "Paths", "bounce_eagerly"]
 
 
 # ---- How one thread calls kernels: counters, and arguments that are filled in once
@@ -57,27 +57,27 @@ class Calls:
 
     Attributes:
         counters: see :class:`torchpt.engines.kernels.layout.Layout`.
-        place: which samples the chunk holds, see :data:`torchpt.engines.kernels.stages.PLACE`.
+        place: which samples the chunk holds, see :data:`torchpt.engines.kernels.stages.CHUNK_FIELDS`.
         slots: radiance of the chunk's samples.
     """
 
     def __init__(self, kernels: Kernels, halt: threading.Event) -> None:
         self.kernels, self._halt = kernels, halt
         self.counters = np.zeros(kernels.models + 6, np.int64)
-        self.place = np.zeros(len(PLACE), np.int32)
+        self.place = np.zeros(len(CHUNK_FIELDS), np.int32)
         self.slots = Memory(3)
         self._prepared: dict[int, tuple[Any, Any, int, tuple[tuple[int, str], ...], range]] = {}
         self._keep: list[Kernel] = []
         self._salts: dict[tuple[int, int], Any] = {}
         self._uniforms = {"place": self.place.ctypes.data}
 
-    def leave(self) -> None:
+    def unbind(self) -> None:
         """Let go of the render and its kernels."""
         del self.kernels, self._halt
         self._prepared.clear()
         self._keep.clear()
 
-    def serve(self, kernels: Kernels, halt: threading.Event) -> None:
+    def rebind(self, kernels: Kernels, halt: threading.Event) -> None:
         """Go on with the kernels of another render of the same structure, whose memory looks the same."""
         self.kernels, self._halt = kernels, halt
 
@@ -219,8 +219,8 @@ class ChunkSearch:
 
     def __init__(self, calls: Calls) -> None:
         self.calls, self.kernels = calls, calls.kernels
-        self.passed = [Memory(self.kernels.passed.count) for _ in range(2)] if self.kernels.passing else []
-        self.sifted = Memory(1)
+        self.passed = [Memory(self.kernels.passed.count) for _ in range(2)] if self.kernels.has_transmission else []
+        self.transmitting = Memory(1)
 
     def nearest(self, arena: Memory, count: int) -> None:
         """Write the hits of the arena's rays beside them: the nearest surfaces, opaque or not."""
@@ -243,12 +243,12 @@ class ChunkSearch:
         source, target = self.passed[step % 2], self.passed[1 - step % 2]
         if step == 0:
             calls.clear()
-            calls.run(kernels.sift(), count, arena, arena, lists=[self.sifted])
+            calls.run(kernels.list_transmitting(), count, arena, arena, lists=[self.transmitting])
             some = int(calls.counters[0])
             if not some:
                 return 0
             calls.clear()
-            calls.run(kernels.transmit(False), some, arena, target, self.sifted, slots=arena)
+            calls.run(kernels.transmit(False), some, arena, target, self.transmitting, slots=arena)
         else:
             calls.clear()
             calls.run(kernels.transmit(True), count, source, target, slots=arena)
@@ -265,22 +265,22 @@ class ChunkSearch:
             blocked = _row(arena.words, rows, "blocked", 1)[0]
             kernels.wave.accel.blocked(o, d, t_max[0], count, blocked, kernels.non_opaque)
         elif not kernels.has_opacity:
-            calls.run(kernels.block(), count, arena, arena)
+            calls.run(kernels.search_occluded(), count, arena, arena)
         if not kernels.has_opacity:
             return
         source, target = self.passed
         calls.clear()
-        calls.run(kernels.begin(), count, arena, source, slots=arena)
+        calls.run(kernels.begin_shadow_rays(), count, arena, source, slots=arena)
         while left := int(calls.counters[0]):
             self._trace(source, kernels.passed, "pass_o", "pass_d", "pass_t", left)
             calls.clear()
-            calls.run(kernels.through(), left, source, target, slots=arena)
+            calls.run(kernels.attenuate_shadow_rays(), left, source, target, slots=arena)
             source, target = target, source
 
     def _trace(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: int) -> None:
         """The nearest surface of each ray, opaque or not."""
         if self.kernels.packets:
-            self.calls.run(self.kernels.find(rows is self.kernels.passed), count, memory, memory)
+            self.calls.run(self.kernels.search_nearest(rows is self.kernels.passed), count, memory, memory)
             return
         accel: Accel = self.kernels.wave.accel
         floats, words = memory.floats, memory.words
@@ -331,7 +331,7 @@ class Paths:
         arrived: whether their hits are in the arena already.
         listed: whether lanes are in the lists already.
         shadows: whether light from the vertex before is still pending.
-        flying: how many rays are on their way through what lets them pass.
+        in_transit: how many rays are on their way through what lets them pass.
         step: how many times they went on.
         groups: how many lanes each model has.
         places: how many lanes are in each list.
@@ -344,13 +344,13 @@ class Paths:
     arrived: bool = False
     listed: bool = False
     shadows: bool = False
-    flying: int = 0
+    in_transit: int = 0
     step: int = 0
     groups: Sequence[int] = ()
     places: Sequence[int] = ()
 
 
-class Worker:
+class KernelsEngine:
     """The engine of one thread: takes chunks through their paths.
 
     Args:
@@ -385,19 +385,24 @@ class Worker:
         """Return the memory of a vertex: two take turns."""
         return self._rooms[depth % 2]
 
-    def leave(self) -> int:
+    def unbind(self) -> int:
         """Let go of the render; return the bytes that are kept for another one of the same structure."""
-        held = [self.slots, *self.search.passed, self.search.sifted, *([] if self.shown is None else [self.shown])]
+        held = [
+            self.slots,
+            *self.search.passed,
+            self.search.transmitting,
+            *([] if self.shown is None else [self.shown]),
+        ]
         held += [memory for room in self._rooms for memory in (room.arena, *room.lists)]
-        self.calls.leave()
+        self.calls.unbind()
         self.splats, self._lost = [], []
         del self.kernels, self.wave, self.search.kernels
         return sum(memory.words.nbytes for memory in held)
 
-    def serve(self, kernels: Kernels, halt: threading.Event) -> None:
-        """Go on with another render of the same structure, after `leave`: fresh memory would cost time."""
+    def rebind(self, kernels: Kernels, halt: threading.Event) -> None:
+        """Go on with another render of the same structure, after `unbind`: fresh memory would cost time."""
         self.kernels, self.wave = kernels, kernels.wave
-        self.calls.serve(kernels, halt)
+        self.calls.rebind(kernels, halt)
         self.search.kernels = kernels
 
     def trace(self, chunk: Chunk) -> RayCounts:
@@ -468,7 +473,7 @@ class Worker:
     def _begin(self, paths: Paths, depth: int, count: int) -> Paths:
         """Take memory for the paths of a vertex."""
         paths.depth, paths.count, paths.shadows, paths.groups = depth, count, False, ()
-        paths.flying = paths.step = 0
+        paths.in_transit = paths.step = 0
         paths.arrived = paths.listed = self.kernels.fused
         return paths
 
@@ -480,30 +485,30 @@ class Worker:
             return False
         self.tally.rays += paths.count
         self.search.nearest(paths.arena, paths.count)
-        paths.flying = paths.count if self.kernels.passing else 0
-        return self.kernels.passing
+        paths.in_transit = paths.count if self.kernels.has_transmission else 0
+        return self.kernels.has_transmission
 
     def transmit(self, paths: Paths) -> bool:
         """See :class:`torchpt.paths.walk.Engine`."""
-        paths.flying = self.search.transmit(paths.arena, paths.flying, paths.depth, paths.step)
+        paths.in_transit = self.search.transmit(paths.arena, paths.in_transit, paths.depth, paths.step)
         paths.step += 1
-        return paths.flying > 0
+        return paths.in_transit > 0
 
     def sort(self, paths: Paths) -> Counts:
         """See :class:`torchpt.paths.walk.Engine`."""
         kernels, calls = self.kernels, self.calls
         if not paths.listed:
-            self._settle(paths)
+            self._sort_lanes(paths)
         live, places = calls.counted()
         paths.groups, paths.places = places[: kernels.models] if kernels.listed else [live], places
         emissive = places[kernels.emissive] if kernels.has_emitters else 0
         return Counts(paths.groups, emissive, places[kernels.missed] if kernels.has_environment else 0)
 
-    def _settle(self, paths: Paths) -> None:
+    def _sort_lanes(self, paths: Paths) -> None:
         """Add the light that was pending, list lanes by what they met, and end those that met nothing that shines."""
         calls = self.calls
         calls.clear()
-        calls.run(self.kernels.settle(paths.shadows), paths.count, paths.arena, paths.arena, lists=paths.lists)
+        calls.run(self.kernels.sort_lanes(paths.shadows), paths.count, paths.arena, paths.arena, lists=paths.lists)
 
     def emit(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -525,12 +530,12 @@ class Worker:
                 paths.count, _ = calls.counted()
             paths.arena.words[kernels.state.first("prim"), : paths.count] = -1
             paths.arena.floats[kernels.state.first("t_max"), : paths.count] = 0.0
-            self._settle(paths)
+            self._sort_lanes(paths)
             return
         for model, count in enumerate(paths.groups):
             if count:
                 lanes = paths.lists[model] if kernels.listed else None
-                calls.run(kernels.retire(), count, paths.arena, paths.arena, lanes)
+                calls.run(kernels.terminate(), count, paths.arena, paths.arena, lanes)
                 self.tally.truncated += count if truncated else 0
 
     def scatter(self, paths: Paths, roulette: float) -> Paths:
@@ -578,9 +583,9 @@ class Worker:
         self.search.light(paths.arena, n)
         words[shadow, :n] = own
         clear = floats[rows.first("clear"), :n] if "clear" in rows else words[rows.first("blocked"), :n] == 0
-        floats[rows.first("splat_clear"), :n] = clear
+        floats[rows.first("splat_transmittance"), :n] = clear
         pixel, first = words[rows.first("splat_pixel"), :n], rows.first("splat_radiance")
-        value = floats[first : first + 3, :n] * floats[rows.first("splat_clear"), :n]
+        value = floats[first : first + 3, :n] * floats[rows.first("splat_transmittance"), :n]
         comes, finite = (pixel >= 0) & (clear != 0), (np.abs(value) < LARGEST).all(0)
         lane, on = words[rows.first("lane"), :n].astype(np.int64), comes & finite
         if self.keeps_splats:
@@ -594,7 +599,7 @@ class Worker:
 class _Layers(Observer[Paths]):
     """Reads layers off first surfaces, and ends the walk there."""
 
-    def __init__(self, worker: Worker, names: tuple[str, ...]) -> None:
+    def __init__(self, worker: KernelsEngine, names: tuple[str, ...]) -> None:
         self.worker, self.names = worker, names
 
     def sorted(self, paths: Paths, counts: Counts) -> bool:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchpt.compiler.form import CAPACITY
 from torchpt.compiler.graph import DTYPES
-from torchpt.compiler.sinks import Note, Scatter, Sinks
+from torchpt.compiler.sinks import AppendIndex, Scatter, Sinks
 from torchpt.compiler.tracing import Tracer
 from torchpt.paths.state import EXTRA, PathState
 from torchpt.paths.wave import camera_state
@@ -59,7 +59,7 @@ SPLAT: Fields = {
     "splat_d": ((3,), "f"),
     "splat_t": ((), "f"),
     "splat_radiance": ((3,), "f"),
-    "splat_clear": ((), "f"),
+    "splat_transmittance": ((), "f"),
 }
 PASS: Fields = {
     "pass_o": ((3,), "f"),
@@ -207,7 +207,7 @@ class Layout:
         has_environment: whether something shines from outside.
         has_emitters: whether a ray may meet an emitter.
         has_opacity: whether a surface may let rays pass.
-        passing: whether rays may pass anything, surfaces or what the integrator has between them.
+        has_transmission: whether rays may pass anything, surfaces or what the integrator has between them.
         listed: whether lanes are taken by lists: else all lanes of the arena are of the one model.
         numbers: tensors of the sampler.
     """
@@ -221,7 +221,7 @@ class Layout:
         self.has_environment = table is not None and table.environment is not None
         self.has_emitters = table is not None and table.row_of_prim is not None
         self.has_opacity = self.world.materials.opacity is not None
-        self.passing = self.has_opacity or wave.integrator.own_transmit
+        self.has_transmission = self.has_opacity or wave.integrator.own_transmit
         self.listed = not fused or self.models > 1 or self.has_environment
         self.state = Rows(_path_fields(self))
         self.passed = Rows({**PASS, "clear": ((), "f"), **_key_field(wave), **HIT})
@@ -247,7 +247,7 @@ def _path_fields(layout: Layout) -> Fields:
     """Fields of a path's state, those that a path of this scene begins with, and what travels with them."""
     wave, world = layout.wave, layout.world
     d = torch.zeros(3, 1)
-    state = wave.begun(camera_state(d, d, torch.zeros(wave.sampler.points.rows, 1, dtype=torch.int32)))
+    state = wave.with_optional_fields(camera_state(d, d, torch.zeros(wave.sampler.points.rows, 1, dtype=torch.int32)))
     fields: Fields = {name: (tuple(x.shape[:-1]), DTYPES[x.dtype]) for name, x in state_values(state).items()}
     if wave.filter.signed:
         fields["weight"] = ((), "f")
@@ -319,19 +319,21 @@ class Trace:
         """The node of a result that has one number a lane."""
         return self.tracer.nodes(result)[0]
 
-    def kept(self, state: PathState, unseen: dict[str, Tensor]) -> list[tuple[int, int]]:
+    def kept(self, state: PathState, passthrough: dict[str, Tensor]) -> list[tuple[int, int]]:
         """The state as rows and nodes."""
-        return self.layout.state.nodes(self.tracer, **state_values(state), **unseen)
+        return self.layout.state.nodes(self.tracer, **state_values(state), **passthrough)
 
-    def ended(self, mask: int, lane: Tensor, radiance: Tensor, unseen: dict[str, Tensor]) -> Scatter:
+    def ended(self, mask: int, lane: Tensor, radiance: Tensor, passthrough: dict[str, Tensor]) -> Scatter:
         """Paths that end where the node ``mask`` holds (-1: all): their radiance goes to the slots of their samples."""
-        if "weight" in unseen:
+        if "weight" in passthrough:
             with self.tracer:
-                radiance = radiance * unseen["weight"]
+                radiance = radiance * passthrough["weight"]
         rows = tuple(enumerate(self.tracer.nodes(radiance)))
         return Scatter(mask, self.node(lane), rows, slots=True)
 
-    def sorted(self, sinks: Sinks, state: PathState, prim: Tensor, unseen: dict[str, Tensor]) -> tuple[int, list[Note]]:
+    def sorted(
+        self, sinks: Sinks, state: PathState, prim: Tensor, passthrough: dict[str, Tensor]
+    ) -> tuple[int, list[AppendIndex]]:
         """Sort the lanes by the surfaces that they met, and end those that do not go on.
 
         Returns:
@@ -351,6 +353,6 @@ class Trace:
             lists.append((layout.emissive, shining))
         if layout.has_environment:
             lists.append((layout.missed, out))
-        notes = [Note(self.node(mask), number, number + 1) for number, mask in lists]
-        sinks.scatter.append(self.ended(self.node(off), state.lane, state.radiance, unseen))
-        return self.node(on), notes
+        appends = [AppendIndex(self.node(mask), number, number + 1) for number, mask in lists]
+        sinks.scatter.append(self.ended(self.node(off), state.lane, state.radiance, passthrough))
+        return self.node(on), appends

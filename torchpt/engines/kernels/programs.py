@@ -19,10 +19,10 @@ from torch import Tensor
 
 from torchpt.compiler import cache, operators  # noqa: F401  (the operators register how they are lowered)
 from torchpt.compiler.graph import Unsupported
-from torchpt.compiler.program import Program, Tables, TracedStage, bound
-from torchpt.compiler.prologue import Name, pruned
+from torchpt.compiler.program import Program, Tables, TracedStage, bind_tables
+from torchpt.compiler.prologue import StepKey, without_unused_steps
 from torchpt.compiler.sinks import Sinks
-from torchpt.compiler.tracing import Tracer, lanes_for
+from torchpt.compiler.tracing import Tracer, choose_lane_count
 from torchpt.core.tree import fingerprint, named_leaves, signature
 from torchpt.engines.kernels import stages
 from torchpt.engines.kernels.layout import Layout, Trace
@@ -33,17 +33,17 @@ if TYPE_CHECKING:
     from torchpt.paths.wave import Wave
 
 
-__all__ = ["Kernel", "KernelCache", "Kernels", "Leaves", "State", "program_of"]
+__all__ = ["Kernel", "KernelCache", "Kernels", "NamedTensors", "TensorVersion", "program_of"]
 
 
 # ---- The tensors that a render's kernels read, by name, and which of them another render has read before
 
 
 #: A tensor, and which of the contents that it has had.
-State = tuple[Tensor, object]
+TensorVersion = tuple[Tensor, object]
 
 
-class Leaves:
+class NamedTensors:
     """The tensors of some records.
 
     Args:
@@ -56,7 +56,7 @@ class Leaves:
         states: by path, the tensor and which of its contents it has.
     """
 
-    def __init__(self, records: dict[str, Any], before: Leaves | None = None) -> None:
+    def __init__(self, records: dict[str, Any], before: NamedTensors | None = None) -> None:
         known = {} if before is None else before._walked
         self._walked: dict[str, tuple[Any, list[tuple[str, Tensor]]]] = {}
         for name, record in records.items():
@@ -65,12 +65,12 @@ class Leaves:
         self.tensors = dict(leaf for _, leaves in self._walked.values() for leaf in leaves)
         self.ids = {id(tensor): (path, tensor) for path, tensor in self.tensors.items()}
         # A tensor is the same one only as long as nobody wrote into it; of inference tensors that cannot be known.
-        self.states: dict[str, State] = {
+        self.states: dict[str, TensorVersion] = {
             path: (tensor, object() if tensor.is_inference() else tensor._version)
             for path, tensor in self.tensors.items()
         }
 
-    def has(self, path: str, state: State) -> bool:
+    def has(self, path: str, state: TensorVersion) -> bool:
         """Return True where a tensor is one that was read before, with the same numbers."""
         tensor, version = self.states[path]
         return tensor is state[0] and version == state[1]
@@ -86,27 +86,27 @@ class KernelCache:
     """
 
     def __init__(self) -> None:
-        self._kernels: dict[Any, tuple[Kernel, dict[str, State]]] = {}
-        self._tables: dict[tuple[str, Any], tuple[State, Tensor]] = {}
-        self._results: dict[frozenset[str], tuple[dict[str, State], dict[Name, Tensor]]] = {}
+        self._kernels: dict[Any, tuple[Kernel, dict[str, TensorVersion]]] = {}
+        self._tables: dict[tuple[str, Any], tuple[TensorVersion, Tensor]] = {}
+        self._results: dict[frozenset[str], tuple[dict[str, TensorVersion], dict[StepKey, Tensor]]] = {}
         self._lock = threading.Lock()
 
-    def kernel(self, key: Any, program: Program, leaves: Leaves) -> Kernel | None:
+    def kernel(self, key: Any, program: Program, leaves: NamedTensors) -> Kernel | None:
         """The kernel of a stage where it was made of the same program and tensors; None where there is none such."""
         found = self._kernels.get(key)
-        if found is None or found[0].program is not program or program.held:
+        if found is None or found[0].program is not program or program.constants:
             return None
         same = all(leaves.has(path, state) for path, state in found[1].items())
         return found[0] if same else None
 
-    def tables(self, leaves: Leaves) -> dict[Any, Tensor]:
+    def tables(self, leaves: NamedTensors) -> dict[Any, Tensor]:
         """Tables of a render's tensors as kernels read them, those that there are, by path and axis."""
         with self._lock:
             return {key: table for key, (state, table) in self._tables.items() if leaves.has(key[0], state)}
 
-    def results(self, leaves: Leaves) -> dict[Name, Tensor]:
+    def results(self, leaves: NamedTensors) -> dict[StepKey, Tensor]:
         """Return what steps of prologues came to on a render's tensors, those that were taken, by name."""
-        found: dict[Name, Tensor] = {}
+        found: dict[StepKey, Tensor] = {}
         with self._lock:
             for states, results in self._results.values():
                 if all(leaves.has(path, state) for path, state in states.items()):
@@ -118,11 +118,11 @@ class KernelCache:
         key: Any,
         kernel: Kernel,
         tables: dict[Any, Tensor],
-        results: dict[Name, Tensor],
-        leaves: Leaves,
+        results: dict[StepKey, Tensor],
+        leaves: NamedTensors,
     ) -> None:
         """Hand a kernel on, and all tables and results of steps of its render."""
-        groups: dict[frozenset[str], dict[Name, Tensor]] = {}
+        groups: dict[frozenset[str], dict[StepKey, Tensor]] = {}
         for name, result in results.items():
             groups.setdefault(name.leaves, {})[name] = result
         with self._lock:
@@ -136,7 +136,12 @@ class KernelCache:
 
 
 def program_of(
-    key: tuple[Any, ...], structure: Any, leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], listed: bool
+    key: tuple[Any, ...],
+    structure: Any,
+    leaves: NamedTensors,
+    layout: Layout,
+    build: Callable[[Trace], Sinks],
+    listed: bool,
 ) -> Program:
     """The program of a stage: of this process, from disk, or traced and compiled now.
 
@@ -151,19 +156,19 @@ def program_of(
     return cache.program_of((key, structure), leaves.tensors, lambda: _traced(leaves, layout, build, listed))
 
 
-def _traced(leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> TracedStage:
-    tracer = Tracer(lanes_for(leaves.tensors.values()), leaves.ids)
+def _traced(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> TracedStage:
+    tracer = Tracer(choose_lane_count(leaves.tensors.values()), leaves.ids)
     trace = Trace(tracer, layout)
     with torch.no_grad():
         sinks = build(trace)
-    tables, steps, guards = pruned(tracer.tables, tracer.steps, tracer.guards)
+    tables, steps, guards = without_unused_steps(tracer.tables, tracer.steps, tracer.guards)
     searches = any(op in ("nearest", "occluded") for op, *_ in tracer.graph.nodes)
     return TracedStage(
         graph=tracer.graph,
         sinks=sinks,
         tables=tables,
         steps=steps,
-        held=tuple(tracer.held),
+        constants=tuple(tracer.constants),
         guards=guards,
         uniforms=tuple(trace.uniforms),
         tensors=trace.tensors,
@@ -199,7 +204,7 @@ class Kernels(Layout):
         eager: models whose stage does what no kernel can, and what that is; they run as tensor operations.
         seconds: spent on making kernels.
         structure: what renders have in common that can share kernels, and threads their memory.
-        handed: what renders of the same structure share.
+        kernel_cache: what renders of the same structure share.
         search: what the search by packets reads; None where the search structure is called.
         non_opaque: for each primitive whether a ray may pass it, as uint8, for the search structure.
     """
@@ -214,7 +219,7 @@ class Kernels(Layout):
         cotangent: Tensor | None = None,
     ) -> None:
         super().__init__(wave, packets, fused)
-        self._leaves = Leaves(
+        self._leaves = NamedTensors(
             {
                 "world": self.world,
                 "camera": wave.camera,
@@ -233,9 +238,9 @@ class Kernels(Layout):
         asked = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, own, self._leaves.tensors)
         self.structure = (self._of_world, *map(signature, asked), packets, fused)
         alike = before is not None and before.structure == self.structure
-        self.handed = before.handed if alike else KernelCache()  # pyright: ignore[reportOptionalMemberAccess]
-        self._laid_out = self.handed.tables(self._leaves)
-        self._results = self.handed.results(self._leaves)
+        self.kernel_cache = before.kernel_cache if alike else KernelCache()  # pyright: ignore[reportOptionalMemberAccess]
+        self._laid_out = self.kernel_cache.tables(self._leaves)
+        self._results = self.kernel_cache.results(self._leaves)
         self._made: dict[tuple[Any, ...], Kernel] = {}
         self._lock = threading.Lock()
         self.search = stages.search_words(wave) if packets else None
@@ -267,9 +272,9 @@ class Kernels(Layout):
         """See :func:`torchpt.engines.kernels.stages.generate`."""
         return self._get(False, stages.generate, chosen, given)
 
-    def settle(self, shadow: bool) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.settle`."""
-        return self._get(False, stages.settle, shadow)
+    def sort_lanes(self, shadow: bool) -> Kernel:
+        """See :func:`torchpt.engines.kernels.stages.sort_lanes`."""
+        return self._get(False, stages.sort_lanes, shadow)
 
     def emit(self) -> Kernel:
         """See :func:`torchpt.engines.kernels.stages.emit`."""
@@ -283,37 +288,37 @@ class Kernels(Layout):
         """See :func:`torchpt.engines.kernels.stages.bounce`."""
         return self._get(self.listed, stages.bounce, model, roulette)
 
-    def retire(self) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.retire`."""
-        return self._get(self.listed, stages.retire)
+    def terminate(self) -> Kernel:
+        """See :func:`torchpt.engines.kernels.stages.terminate`."""
+        return self._get(self.listed, stages.terminate)
 
     # -- the search by packets
 
-    def find(self, passed: bool) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.find`."""
-        return self._get(False, stages.find, passed)
+    def search_nearest(self, passed: bool) -> Kernel:
+        """See :func:`torchpt.engines.kernels.stages.search_nearest`."""
+        return self._get(False, stages.search_nearest, passed)
 
-    def block(self) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.block`."""
-        return self._get(False, stages.block)
+    def search_occluded(self) -> Kernel:
+        """See :func:`torchpt.engines.kernels.stages.search_occluded`."""
+        return self._get(False, stages.search_occluded)
 
     # -- surfaces that are not opaque
 
-    def sift(self) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.sift`."""
-        return self._get(False, stages.sift)
+    def list_transmitting(self) -> Kernel:
+        """See :func:`torchpt.engines.kernels.stages.list_transmitting`."""
+        return self._get(False, stages.list_transmitting)
 
     def transmit(self, again: bool) -> Kernel:
         """See :func:`torchpt.engines.kernels.stages.transmit`."""
         return self._get(not again, stages.transmit, again)
 
-    def begin(self) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.begin`."""
-        return self._get(False, stages.begin)
+    def begin_shadow_rays(self) -> Kernel:
+        """See :func:`torchpt.engines.kernels.stages.begin_shadow_rays`."""
+        return self._get(False, stages.begin_shadow_rays)
 
-    def through(self) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.through`."""
-        return self._get(False, stages.through)
+    def attenuate_shadow_rays(self) -> Kernel:
+        """See :func:`torchpt.engines.kernels.stages.attenuate_shadow_rays`."""
+        return self._get(False, stages.attenuate_shadow_rays)
 
     # -- what leaves a chunk
 
@@ -321,9 +326,9 @@ class Kernels(Layout):
         """See :func:`torchpt.engines.kernels.stages.layers`."""
         return self._get(self.listed, stages.layers, model, names)
 
-    def deposit(self, channels: int, clamp: bool) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.deposit`."""
-        return self._get(False, stages.deposit, channels, clamp)
+    def accumulate(self, channels: int, clamp: bool) -> Kernel:
+        """See :func:`torchpt.engines.kernels.stages.accumulate`."""
+        return self._get(False, stages.accumulate, channels, clamp)
 
     # -- how they are made
 
@@ -336,9 +341,9 @@ class Kernels(Layout):
         with self._lock:
             made = self._made.get(key)
             if made is None:
-                begin = time.perf_counter()
+                begin_shadow_rays = time.perf_counter()
                 made = self._made[key] = self._make(key, listed, build, arguments)
-                self.seconds += time.perf_counter() - begin
+                self.seconds += time.perf_counter() - begin_shadow_rays
             return made
 
     def _make(
@@ -348,13 +353,13 @@ class Kernels(Layout):
             return build(trace, *arguments)
 
         program = program_of(key, self.structure, self._leaves, self, traced, listed)
-        old = self.handed.kernel(key, program, self._leaves)
+        old = self.kernel_cache.kernel(key, program, self._leaves)
         if old is not None:
             return old
         leaves = self._leaves.tensors
-        tables = bound(
-            program.tables, program.steps, program.held, leaves, self._laid_out, program.names, self._results
+        tables = bind_tables(
+            program.tables, program.steps, program.constants, leaves, self._laid_out, program.names, self._results
         )
         made = Kernel(program, tables)
-        self.handed.keep(key, made, self._laid_out, self._results, self._leaves)
+        self.kernel_cache.keep(key, made, self._laid_out, self._results, self._leaves)
         return made

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler.packet import KINDS
-from torchpt.compiler.sinks import Note, Pack, Scatter, Sinks, Store
+from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 from torchpt.compiler.tracing import Tracer
 from torchpt.engines.kernels.layout import Trace, path_state
 from torchpt.paths import layers as aov
@@ -30,24 +30,24 @@ if TYPE_CHECKING:
     from torchpt.paths.wave import Wave
 
 __all__ = [
-    "PLACE",
-    "begin",
-    "block",
+    "CHUNK_FIELDS",
+    "accumulate",
+    "attenuate_shadow_rays",
+    "begin_shadow_rays",
     "bounce",
-    "deposit",
     "emit",
     "escape",
-    "find",
     "generate",
     "kinds_of",
     "layers",
+    "list_transmitting",
     "nearest",
     "occluded",
-    "retire",
+    "search_nearest",
+    "search_occluded",
     "search_words",
-    "settle",
-    "sift",
-    "through",
+    "sort_lanes",
+    "terminate",
     "transmit",
 ]
 
@@ -81,7 +81,7 @@ def _ray(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> list[int]:
 # -- kernels that do nothing else
 
 
-def find(trace: Trace, passed: bool) -> Sinks:
+def search_nearest(trace: Trace, passed: bool) -> Sinks:
     """The nearest hits of all rays of an arena: of paths, or (``passed``) of rays that pass surfaces."""
     rows = trace.layout.passed if passed else trace.layout.state
     names = ("pass_o", "pass_d", "pass_t") if passed else ("o", "d", "t_max")
@@ -89,7 +89,7 @@ def find(trace: Trace, passed: bool) -> Sinks:
     return Sinks(write=rows.nodes(trace.tracer, t=hit.t, prim=hit.prim, u=hit.u, v=hit.v))
 
 
-def block(trace: Trace) -> Sinks:
+def search_occluded(trace: Trace) -> Sinks:
     """Write which shadow rays are blocked."""
     rows, tracer = trace.layout.state, trace.tracer
     blocked = occluded(tracer, *rows.read(tracer, "shadow_o", "shadow_d", "shadow_t").values())
@@ -119,7 +119,7 @@ def search_words(wave: Wave) -> Any:
 
 #: Numbers that say which samples a chunk holds: the first pixel of the picture and how many there are; the stream and point
 #: of the first sample, the first stream and how many share the samples; the crop's corner and width, the film's width.
-PLACE = ("first", "pixels", "turn", "point", "stream", "streams", "x", "y", "crop", "film")
+CHUNK_FIELDS = ("first", "pixels", "turn", "point", "stream", "streams", "x", "y", "crop", "film")
 
 
 def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
@@ -129,13 +129,13 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
     camera's.
     """
     layout, tracer, wave = trace.layout, trace.tracer, trace.layout.wave
-    place = trace.uniform("place", torch.ones(len(PLACE), dtype=torch.int32))
+    place = trace.uniform("place", torch.ones(len(CHUNK_FIELDS), dtype=torch.int32))
     salts = trace.salts()
     pixels = layout.state.read(tracer, "prim")["prim"] if chosen else torch.empty(0)
     rays = layout.state.read(tracer, "o", "d") if given else {}
-    unseen: dict[str, Tensor] = {}
+    passthrough: dict[str, Tensor] = {}
     with tracer:
-        chunk = dict(zip(PLACE, place.to(torch.int64).unbind(), strict=True))
+        chunk = dict(zip(CHUNK_FIELDS, place.to(torch.int64).unbind(), strict=True))
         # Lanes run over the chunk's pixels, then over its samples.
         lane = torch.arange(tracer.lanes)
         sample = torch.div(lane, chunk["pixels"], rounding_mode="floor")
@@ -153,20 +153,20 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
         else:
             state = vertex.generate(layout.plan, wave.camera, wave.filter, x, y, key, salts)
         if wave.filter.signed:
-            unseen["weight"] = wave.filter.weight(Draws(layout.plan.sampler, key, salts).two(Dimension.PIXEL))
-        state = wave.begun(state)
+            passthrough["weight"] = wave.filter.weight(Draws(layout.plan.sampler, key, salts).two(Dimension.PIXEL))
+        state = wave.with_optional_fields(state)
     sinks = Sinks()
     if layout.fused:
-        _searched(trace, sinks, state, unseen)
+        _searched(trace, sinks, state, passthrough)
     else:
-        sinks.write += trace.kept(state, unseen)
+        sinks.write += trace.kept(state, passthrough)
     return sinks
 
 
-def settle(trace: Trace, shadow: bool) -> Sinks:
+def sort_lanes(trace: Trace, shadow: bool) -> Sinks:
     """Settle what the lanes of the arena met: light of their shadow rays, lists of lanes by model, ends of paths."""
     tracer, rows = trace.tracer, trace.layout.state
-    state, unseen = trace.state()
+    state, passthrough = trace.state()
     prim = rows.read(tracer, "prim")["prim"]
     sinks = Sinks()
     if shadow:
@@ -179,8 +179,8 @@ def settle(trace: Trace, shadow: bool) -> Sinks:
                 radiance = state.radiance + torch.where(arrived["blocked"] != 0, 0.0, light)
         state = replace(state, radiance=radiance)
         sinks.write += rows.nodes(tracer, radiance=radiance)
-    _, notes = trace.sorted(sinks, state, prim, unseen)
-    sinks.notes += notes
+    _, appends = trace.sorted(sinks, state, prim, passthrough)
+    sinks.appends += appends
     return sinks
 
 
@@ -199,25 +199,25 @@ def emit(trace: Trace) -> Sinks:
 
 def escape(trace: Trace) -> Sinks:
     """Light from outside, and the ends of those paths."""
-    state, unseen = trace.state()
+    state, passthrough = trace.state()
     hit, wave = trace.hit(), trace.layout.wave
     context = wave.context.at(trace.salts())
     with trace.tracer:
         radiance = state.radiance + wave.integrator.escape(context, VertexInput(state, hit)).brought
-    return Sinks(scatter=[trace.ended(-1, state.lane, radiance, unseen)])
+    return Sinks(scatter=[trace.ended(-1, state.lane, radiance, passthrough)])
 
 
-def retire(trace: Trace) -> Sinks:
+def terminate(trace: Trace) -> Sinks:
     """Ends of paths that are cut."""
-    state, unseen = trace.state()
-    return Sinks(scatter=[trace.ended(-1, state.lane, state.radiance, unseen)])
+    state, passthrough = trace.state()
+    return Sinks(scatter=[trace.ended(-1, state.lane, state.radiance, passthrough)])
 
 
 def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
     """One vertex of the paths on surfaces of a model."""
     layout, tracer = trace.layout, trace.tracer
     salts = trace.salts()
-    state, unseen = trace.state()
+    state, passthrough = trace.state()
     hit = trace.hit()
     with tracer:
         context = layout.wave.context.at(salts, roulette=roulette)
@@ -225,35 +225,37 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
         check_output(layout.wave.integrator, output)
     after, shadow = output.leaving, output.shadow
     if not layout.fused:
-        return _with_shadow(trace, after, shadow, output.splat, unseen)
+        return _with_shadow(trace, after, shadow, output.splat, passthrough)
     sinks = Sinks(shadows=int(shadow is not None))
     if shadow is not None:
         blocked = occluded(tracer, shadow.o, shadow.d, shadow.t_max)
         with tracer:
             radiance = after.radiance + torch.where(blocked, 0.0, shadow.radiance)
         after = replace(after, radiance=radiance)
-    _searched(trace, sinks, after, unseen)
+    _searched(trace, sinks, after, passthrough)
     return sinks
 
 
 # -- the two ways in which lanes go on
 
 
-def _searched(trace: Trace, sinks: Sinks, state: PathState, unseen: dict[str, Tensor]) -> None:
+def _searched(trace: Trace, sinks: Sinks, state: PathState, passthrough: dict[str, Tensor]) -> None:
     """Search inside the kernel: the lanes that go on are packed together, the others end."""
     hit = nearest(trace.tracer, state.o, state.d, state.t_max)
-    on, notes = trace.sorted(sinks, state, hit.prim, unseen)
-    rows = trace.kept(state, unseen)
+    on, appends = trace.sorted(sinks, state, hit.prim, passthrough)
+    rows = trace.kept(state, passthrough)
     rows += trace.layout.state.nodes(trace.tracer, t=hit.t, prim=hit.prim, u=hit.u, v=hit.v)
-    sinks.pack.append(Pack(on, tuple(rows), 0, tuple(notes)))
+    sinks.compact.append(Compact(on, tuple(rows), 0, tuple(appends)))
 
 
 def _with_shadow(
-    trace: Trace, state: PathState, shadow: Shadow | None, splat: Splat | None, unseen: dict[str, Tensor]
+    trace: Trace, state: PathState, shadow: Shadow | None, splat: Splat | None, passthrough: dict[str, Tensor]
 ) -> Sinks:
     """Search later: all lanes are kept, with the shadow rays that are still to be searched."""
     tracer, rows = trace.tracer, trace.layout.state
-    sinks = Sinks(shift=0, write=trace.kept(state, unseen), shadows=int(shadow is not None) + int(splat is not None))
+    sinks = Sinks(
+        shift=0, write=trace.kept(state, passthrough), shadows=int(shadow is not None) + int(splat is not None)
+    )
     if "shadow_o" not in rows:
         return sinks
     with tracer:
@@ -283,13 +285,13 @@ def _with_shadow(
 
 # ---- Rays through what lets them pass, as kernels
 #
-# Rays of paths: ``sift`` lists those that something may let pass; ``transmit`` holds some up and sends the others on behind it,
+# Rays of paths: ``list_transmitting`` lists those that something may let pass; ``transmit`` holds some up and sends the others on behind it,
 # once from the paths' arena and then (``again``) from that of the rays on their way, until the walk has none left. Shadow rays:
-# ``begin`` and ``through`` do the same with the light that is left; the loop around them is in
+# ``begin_shadow_rays`` and ``attenuate_shadow_rays`` do the same with the light that is left; the loop around them is in
 # :mod:`torchpt.engines.kernels.engine`.
 
 
-def sift(trace: Trace) -> Sinks:
+def list_transmitting(trace: Trace) -> Sinks:
     """A list of the rays that the stage ``transmit`` is asked for."""
     rows, tracer, layout = trace.layout.state, trace.tracer, trace.layout
     given = rows.read(tracer, "prim", "t_max")
@@ -298,7 +300,7 @@ def sift(trace: Trace) -> Sinks:
             held_up = given["t_max"] > 0
         else:
             held_up = non_opaque(layout.world, given["prim"]) & (given["prim"] >= 0)
-    return Sinks(notes=[Note(trace.node(held_up), 0, 0)])
+    return Sinks(appends=[AppendIndex(trace.node(held_up), 0, 0)])
 
 
 def transmit(trace: Trace, again: bool) -> Sinks:
@@ -330,7 +332,7 @@ def transmit(trace: Trace, again: bool) -> Sinks:
     onward = layout.passed.nodes(
         tracer, pass_o=after.o, pass_d=after.d, pass_t=after.t_max, before=start, home=home, key=state.key
     )
-    sinks = Sinks(pack=[Pack(trace.node(on), tuple(onward), 0)])
+    sinks = Sinks(compact=[Compact(trace.node(on), tuple(onward), 0)])
     if again:
         stopped = layout.state.nodes(tracer, t=whole, prim=hit.prim, u=hit.u, v=hit.v)
         sinks.scatter.append(Scatter(trace.node(met), trace.node(home), tuple(stopped), slots=True))
@@ -341,7 +343,7 @@ def transmit(trace: Trace, again: bool) -> Sinks:
     return sinks
 
 
-def begin(trace: Trace) -> Sinks:
+def begin_shadow_rays(trace: Trace) -> Sinks:
     """Shadow rays that meet what may let light pass become rays that pass surfaces; what is known of the others."""
     layout, tracer = trace.layout, trace.tracer
     ray = layout.state.read(tracer, "shadow_o", "shadow_d", "shadow_t", "blocked")
@@ -358,7 +360,7 @@ def begin(trace: Trace) -> Sinks:
     return _passed(trace, on, onward, off, home, clear)
 
 
-def through(trace: Trace) -> Sinks:
+def attenuate_shadow_rays(trace: Trace) -> Sinks:
     """Let light through a surface in part, and send the shadow rays on that still carry some."""
     layout, tracer = trace.layout, trace.tracer
     hit = trace.hit(layout.passed)
@@ -378,7 +380,7 @@ def _passed(trace: Trace, on: Tensor, onward: list[tuple[int, int]], off: Tensor
     """Shadow rays that go on are packed; of those that do not, what is clear goes home to their paths."""
     known = tuple(trace.layout.state.nodes(trace.tracer, clear=clear))
     done = Scatter(trace.node(off), trace.node(home), known, slots=True)
-    return Sinks(pack=[Pack(trace.node(on), tuple(onward), 0)], scatter=[done])
+    return Sinks(compact=[Compact(trace.node(on), tuple(onward), 0)], scatter=[done])
 
 
 # ---- What leaves a chunk, as kernels: layers of first surfaces, and samples added to the film
@@ -387,17 +389,17 @@ def _passed(trace: Trace, on: Tensor, onward: list[tuple[int, int]], off: Tensor
 def layers(trace: Trace, model: int, names: tuple[str, ...]) -> Sinks:
     """Write what the first surfaces of a model are."""
     wave = trace.layout.wave
-    state, unseen = trace.state()
+    state, passthrough = trace.state()
     hit = trace.hit()
     with trace.tracer:
         values = aov.values(names, wave.context, model, state.o, state.d, hit, wave.centre)
-        if "weight" in unseen:
-            values = aov.weighted(values, unseen["weight"])
+        if "weight" in passthrough:
+            values = aov.weighted(values, passthrough["weight"])
     nodes = [node for name in names for node in trace.tracer.nodes(values[name])]
     return Sinks(scatter=[Scatter(-1, trace.node(state.lane), tuple(enumerate(nodes)), slots=True)])
 
 
-def deposit(trace: Trace, channels: int, clamp: bool) -> Sinks:
+def accumulate(trace: Trace, channels: int, clamp: bool) -> Sinks:
     """One sample of each pixel added to sums; those that are not finite are counted, and taken as black."""
     tracer, graph = trace.tracer, trace.tracer.graph
     trace.tensors = 2

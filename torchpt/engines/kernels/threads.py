@@ -14,39 +14,39 @@ import torch
 
 from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD
-from torchpt.core.memory import Budget, is_out_of_memory, needing, on_low_memory
-from torchpt.core.threads import deal
-from torchpt.engines.kernels.engine import LANES, Chunk, Halted, Worker
+from torchpt.core.memory import Budget, explain_out_of_memory, is_out_of_memory, on_low_memory
+from torchpt.core.threads import map_in_order
+from torchpt.engines.kernels.engine import LANES, Chunk, Halted, KernelsEngine
 from torchpt.engines.kernels.programs import Kernels
-from torchpt.engines.work import TASKS, Block, Share
+from torchpt.engines.work import TASKS, Block, TaskResult
 from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts, clamp_scale
 from torchpt.physics.film import Film
 
-__all__ = ["Loop", "keep", "taken"]
+__all__ = ["KernelsForward", "keep_worker", "reuse_worker"]
 
 
 # ---- Workers that no render has at the moment: the next one of the same structure takes them over, as fresh memory costs time
 
 
 #: Bytes of all that are kept; the oldest go first.
-MOST = 64 << 20
+MAX_KEPT_BYTES = 64 << 20
 
 _lock = threading.Lock()
-_kept: deque[tuple[Hashable, Worker, int]] = deque()
+_kept: deque[tuple[Hashable, KernelsEngine, int]] = deque()
 
 
-def keep(structure: Hashable, worker: Worker) -> None:
+def keep_worker(structure: Hashable, worker: KernelsEngine) -> None:
     """Keep a worker for renders of a structure; it lets go of the render that it was of."""
-    size = worker.leave()
+    size = worker.unbind()
     with _lock:
         _kept.append((structure, worker, size))
         total = sum(one[2] for one in _kept)
-        while total > MOST:
+        while total > MAX_KEPT_BYTES:
             total -= _kept.popleft()[2]
 
 
-def taken(structure: Hashable) -> Worker | None:
+def reuse_worker(structure: Hashable) -> KernelsEngine | None:
     """Return a worker for a render of a structure, the latest; None where there is none."""
     with _lock:
         for number in reversed(range(len(_kept))):
@@ -77,12 +77,12 @@ if hasattr(os, "register_at_fork"):
 
 
 #: Fewest lanes that repay a task.
-FEWEST = 1024
+MIN_TASK_LANES = 1024
 #: Pixels of a task, unless threads would be idle: a chunk of many samples of few pixels adds them up in as many steps.
-NARROW = 128
+MIN_TASK_PIXELS = 128
 
 
-class Loop:
+class KernelsForward:
     """A render's tasks over threads; see :class:`torchpt.engines.engine.Tasks`.
 
     A pixel's samples are summed in their order, whichever thread takes them.
@@ -109,7 +109,7 @@ class Loop:
             instead="one thread and fewer lanes",
             fewest=VECTORS.width,
         )
-        self._workers: list[Worker] = []
+        self._workers: list[KernelsEngine] = []
         self._halt = threading.Event()
 
     @property
@@ -121,7 +121,7 @@ class Loop:
         """Return how many 32-bit numbers a lane takes in a thread, where the picture has such layers."""
         return self.kernels.rows(layers)
 
-    def run(self, spans: Sequence[tuple[PixelSet, int, int]], each: Callable[[Share | None], bool]) -> bool:
+    def run(self, spans: Sequence[tuple[PixelSet, int, int]], each: Callable[[TaskResult | None], bool]) -> bool:
         """Take samples of every pixel of plates.
 
         Args:
@@ -142,7 +142,7 @@ class Loop:
             for start, size in self._cut(pixel_set, count, tasks)
         ]
 
-    def take(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> bool:
+    def take(self, blocks: list[Block], each: Callable[[TaskResult | None], bool]) -> bool:
         """Take blocks; ``each`` and what is returned are those of :meth:`run`."""
         while blocks and not self._halt.is_set():
             blocks = self._round(blocks, each)
@@ -150,20 +150,20 @@ class Loop:
                 blocks = self._smaller(blocks)
         return not self._halt.is_set()
 
-    def take_rest(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> bool:
+    def retry_blocks(self, blocks: list[Block], each: Callable[[TaskResult | None], bool]) -> bool:
         """Take blocks for which there was no memory, by fewer threads or lanes; else as :meth:`take`."""
         return self.take(self._smaller(blocks), each)
 
-    def _round(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> list[Block]:
+    def _round(self, blocks: list[Block], each: Callable[[TaskResult | None], bool]) -> list[Block]:
         """Take blocks on threads; return what of them memory did not suffice for."""
         rest: list[Block] = []
 
-        def told(share: Share | None) -> bool:
+        def told(share: TaskResult | None) -> bool:
             if share is not None:
                 rest.extend(share.rest)
             return each(share)
 
-        deal(blocks, self.task, self.budget.threads, told, self._halt)
+        map_in_order(blocks, self.task, self.budget.threads, told, self._halt)
         return rest
 
     def _smaller(self, blocks: list[Block]) -> list[Block]:
@@ -187,26 +187,26 @@ class Loop:
         size = pixels
         threads = self.budget.threads
         if tasks > 1 and threads > 1:
-            size = max(-(-pixels // tasks), -(-FEWEST // samples), min(NARROW, -(-pixels // threads)))
+            size = max(-(-pixels // tasks), -(-MIN_TASK_LANES // samples), min(MIN_TASK_PIXELS, -(-pixels // threads)))
         size = max(min(-(-size // VECTORS.width) * VECTORS.width, self.budget.lanes), 1)
         for start in range(0, pixels, size):
             yield start, min(size, pixels - start)
 
-    def dismiss(self, keeps: bool) -> None:
+    def release_workers(self, keeps: bool) -> None:
         """Give up this render's workers, or keep them for the next one of its structure."""
         while self._workers:
             worker = self._workers.pop()
             if keeps:
-                keep(self.kernels.structure, worker)
+                keep_worker(self.kernels.structure, worker)
 
     def halt(self) -> None:
         """End the render: tasks stop at their next kernel."""
         self._halt.set()
 
-    def task(self, block: Block) -> Share:
+    def task(self, block: Block) -> TaskResult:
         """Take a block, in a thread of its own."""
         pixel_set, start, size, first, count = block
-        share = Share(RayCounts())
+        share = TaskResult(RayCounts())
         sample = first
         try:
             worker = self._worker()
@@ -227,29 +227,29 @@ class Loop:
             share.rest = [(pixel_set, start, size, sample, first + count - sample)]
         return share
 
-    def _worker(self) -> Worker:
+    def _worker(self) -> KernelsEngine:
         try:
             return self._workers.pop()
         except IndexError:
-            worker = taken(self.kernels.structure)
+            worker = reuse_worker(self.kernels.structure)
         if worker is None:
-            return Worker(self.kernels, self._halt)
-        worker.serve(self.kernels, self._halt)
+            return KernelsEngine(self.kernels, self._halt)
+        worker.rebind(self.kernels, self._halt)
         return worker
 
-    def _chunk(self, worker: Worker, chunk: Chunk, pixel_set: PixelSet, share: Share) -> None:
+    def _chunk(self, worker: KernelsEngine, chunk: Chunk, pixel_set: PixelSet, share: TaskResult) -> None:
         """Add a chunk to the films: all of it, or nothing where memory runs out."""
         names, light = tuple(pixel_set.layers), self.kernels.wave.integrator.light
         rays = worker.layers(chunk, names) if names else 0
         for film in pixel_set.layers.values():
-            self.kernels.deposit(film.channels, False)
+            self.kernels.accumulate(film.channels, False)
         if light:
-            self.kernels.deposit(3, self.clamp is not None)
+            self.kernels.accumulate(3, self.clamp is not None)
             tally = worker.trace(chunk)
             share.tally.truncated += tally.truncated
             rays += tally.rays
         # From here on a failure would leave half a chunk: what little is allocated must be there, or the render ends.
-        with needing("the sums of a film"):
+        with explain_out_of_memory("the sums of a film"):
             if light:
                 self._radiance(worker, chunk, pixel_set, share)
                 self._splats(worker, chunk, pixel_set.film, share)
@@ -257,21 +257,21 @@ class Loop:
                 self._layers(worker, chunk, pixel_set)
         share.tally.rays += rays
 
-    def _radiance(self, worker: Worker, chunk: Chunk, pixel_set: PixelSet, share: Share) -> None:
+    def _radiance(self, worker: KernelsEngine, chunk: Chunk, pixel_set: PixelSet, share: TaskResult) -> None:
         values = worker.slots.floats
         used = values[:, : chunk.pixels * chunk.samples]
         if self.clamp is None:
-            if self._deposit(worker, values, chunk, pixel_set.film, 3, None):
+            if self._accumulate(worker, values, chunk, pixel_set.film, 3, None):
                 share.lost.add(self._lost(used, chunk))
             return
         finite = np.isfinite(used).all(0)
         if not finite.all():
             share.lost.add(self._lost(used, chunk))  # the clamp writes over them
         before = float(np.where(finite, used, 0.0).sum(dtype=np.float64))
-        self._deposit(worker, values, chunk, pixel_set.film, 3, self.clamp)
+        self._accumulate(worker, values, chunk, pixel_set.film, 3, self.clamp)
         share.light = share.light[0] + before, share.light[1] + float(np.ascontiguousarray(used).sum(dtype=np.float64))
 
-    def _splats(self, worker: Worker, chunk: Chunk, film: Film, share: Share) -> None:
+    def _splats(self, worker: KernelsEngine, chunk: Chunk, film: Film, share: TaskResult) -> None:
         """Add what a chunk's samples bring to other pixels."""
         before = after = 0.0
         for splats in worker.splats:
@@ -285,19 +285,19 @@ class Loop:
             film.splats.add(stream, splats.pixel, value)
         share.light = share.light[0] + before, share.light[1] + after
 
-    def _layers(self, worker: Worker, chunk: Chunk, pixel_set: PixelSet) -> None:
+    def _layers(self, worker: KernelsEngine, chunk: Chunk, pixel_set: PixelSet) -> None:
         assert worker.shown is not None
         first = 0
         for film in pixel_set.layers.values():
             values = worker.shown.floats[first : first + film.channels]
-            self._deposit(worker, values, chunk, film, film.channels, None)
+            self._accumulate(worker, values, chunk, film, film.channels, None)
             first += film.channels
 
-    def _deposit(
-        self, worker: Worker, values: np.ndarray, chunk: Chunk, film: Film, channels: int, clamp: float | None
+    def _accumulate(
+        self, worker: KernelsEngine, values: np.ndarray, chunk: Chunk, film: Film, channels: int, clamp: float | None
     ) -> int:
         """Add samples to a film in their order; return how many were not finite."""
-        made = self.kernels.deposit(channels, clamp is not None)
+        made = self.kernels.accumulate(channels, clamp is not None)
         kernel = made.program
         counters = np.zeros(1, np.int64)
         limit = np.array([clamp or 0.0], np.float32)

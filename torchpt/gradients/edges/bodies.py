@@ -18,7 +18,7 @@ from torch import Tensor
 from torchpt.math.vectors import affine, normalize, take
 from torchpt.math.vectors import rows as columns
 from torchpt.physics.cameras import Camera
-from torchpt.physics.shapes.geometry import Copies
+from torchpt.physics.shapes.geometry import Instances
 from torchpt.scene import Scene
 from torchpt.scene.settings import Film
 from torchpt.scene.world.primitives import copies_of, copy_maps, corners_of, primitives_of
@@ -52,7 +52,7 @@ class Bodies:
     e2: Tensor
     e3: Tensor
     counts: tuple[int, int, int, int, int]
-    copies: Copies | None
+    copies: Instances | None
     camera: Camera
     lights: Tensor
 
@@ -110,7 +110,7 @@ class Bodies:
         return replace(self, **own, copies=copies, camera=replace(self.camera, **of("camera.")))
 
 
-def _moved(table: Copies, w: Tensor) -> Tensor:
+def _moved(table: Instances, w: Tensor) -> Tensor:
     return affine(table.x * w[0], table.y, w[1], table.z, w[2])
 
 

@@ -15,7 +15,7 @@ from torchpt.engines.engine import seen
 from torchpt.gradients.edges.gradients import Boundary, boundary_of
 from torchpt.paths.layers import LAYERS, SurfaceLayer, surface_layer
 from torchpt.scene import Scene
-from torchpt.scene.prepare import make_wave, rebound
+from torchpt.scene.prepare import make_wave, rebuild_with_tape
 from torchpt.scene.settings import Settings
 
 __all__ = ["Asked", "differentiable", "followed"]
@@ -120,7 +120,9 @@ def _interior(asked: Asked, names: tuple[str, ...], params: dict[str, Tensor], w
             count = min(step, pixels - first)
             with torch.enable_grad():
                 leaves = [plain[name].clone().requires_grad_() for name in asked.wanted]
-                wave = rebound(still, scene, settings, {**plain, **dict(zip(asked.wanted, leaves, strict=True))})
+                wave = rebuild_with_tape(
+                    still, scene, settings, {**plain, **dict(zip(asked.wanted, leaves, strict=True))}
+                )
                 found = layers_of(wave, names, first, count, sample, many, follow_shape=True)
                 mean = torch.cat([found[name] for name in names]).sum(1) / spp
             if mean.requires_grad:

@@ -23,7 +23,7 @@ from torchpt.gradients.edges.curves import (
 )
 from torchpt.gradients.edges.film import Worth, film_places, slopes
 from torchpt.gradients.edges.traced import Traced, Use
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import cross, dot, rows, take
 from torchpt.scene import Scene
 
@@ -331,7 +331,7 @@ class Primary:
 
     bodies: Bodies
     pieces: Pieces
-    choice: Discrete
+    choice: Distribution1D
     traced: Traced
 
     @torch.no_grad()
@@ -398,4 +398,4 @@ class Primary:
 
 def primary_of(bodies: Bodies, pieces: Pieces, traced: Traced) -> Primary:
     """Return the estimator over ``pieces``."""
-    return Primary(bodies, pieces, Discrete.of(pieces.weight, torch.float64, even=0.0), traced)
+    return Primary(bodies, pieces, Distribution1D.of(pieces.weight, torch.float64, even=0.0), traced)

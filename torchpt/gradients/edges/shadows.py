@@ -25,11 +25,11 @@ from torchpt.gradients.edges.curves import (
 from torchpt.gradients.edges.film import Worth, film_places, slopes
 from torchpt.gradients.edges.traced import Traced, Use
 from torchpt.gradients.edges.vertices import Spot, met
-from torchpt.math.sampling import Discrete, concentric_disk, uniform_sphere, uniform_triangle
+from torchpt.math.sampling import Distribution1D, concentric_disk, uniform_sphere, uniform_triangle
 from torchpt.math.vectors import cross, dot, largest, luminance, rows, take
-from torchpt.paths.roulette import chance_of, survived
+from torchpt.paths.roulette import russian_roulette, survival_probability
 from torchpt.paths.vertex import light_radiance
-from torchpt.physics.lights import KINDS, SURFACES, fine
+from torchpt.physics.lights import KINDS, SURFACES, from_digits
 from torchpt.physics.lights.base import Environment, taken
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.samplers import Dimension, Draws
@@ -78,7 +78,7 @@ class Sources:
 
     bodies: Bodies
     world: World
-    choice: Discrete
+    choice: Distribution1D
     prim: Tensor
     surfaces: int
 
@@ -87,7 +87,7 @@ class Sources:
         lights = self.world.lights
         assert lights is not None
         u = draws.two(Dimension.LIGHT)
-        row, rest = self.choice.draw(fine(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS)))))
+        row, rest = self.choice.draw(from_digits(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS)))))
         chance, u = take(self.choice.pmf, row), torch.stack((rest, u[1].double()))
         a, e, w = torch.zeros(3, len(row), dtype=torch.float64, device=row.device), None, (row < self.surfaces).double()
         prim = take(self.prim, row)
@@ -203,7 +203,7 @@ def sources_of(bodies: Bodies, world: World, reach: float, met: bool) -> Sources
         weight = torch.where(mine, bright * factor, weight)
     if not bool((weight > 0).any()):
         return None
-    return Sources(bodies, world, Discrete.of(weight, torch.float64, even=0.05), prim, surfaces)
+    return Sources(bodies, world, Distribution1D.of(weight, torch.float64, even=0.05), prim, surfaces)
 
 
 # ---- The curves of a scene that may throw shadows, to be drawn from before it is known where the light comes from
@@ -254,7 +254,7 @@ class Occluders:
     folded: Tensor
     form: Tensor
     forms: list[Form]
-    choice: Discrete
+    choice: Distribution1D
 
     def draw(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return curves ``(N,)``, what is left of ``u``, and their chances."""
@@ -336,7 +336,7 @@ def occluders_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Occl
     if not curves or not bool((torch.cat(weights) > 0).any()):
         return None
     others = [Held(torch.cat([h.prim for h in x]), torch.cat([h.a for h in x], 1)) for x in (firsts, seconds)]
-    choice = Discrete.of(torch.cat(weights), torch.float64, even=0.0)
+    choice = Distribution1D.of(torch.cat(weights), torch.float64, even=0.0)
     return Occluders(bodies, joined(curves), (others[0], others[1]), torch.cat(folded), torch.cat(forms), kinds, choice)
 
 
@@ -620,7 +620,9 @@ class Shadows:
             alive = largest(carried) > 0
             if k > _ROULETTE:
                 draws = self.traced.draws(take(key, lane), k)
-                alive, carried = survived(chance_of(None, 1.0, largest(carried), None), draws, alive, carried)
+                alive, carried = russian_roulette(
+                    survival_probability(None, 1.0, largest(carried), None), draws, alive, carried
+                )
             on = alive.nonzero().squeeze(1)
             lane, carried = take(lane, on), take(carried, on)
             spot = met(self.traced, take(o, on), take(d, on))

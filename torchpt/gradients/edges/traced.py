@@ -11,12 +11,12 @@ from torch import Tensor
 
 from torchpt.compiler.graph import Unsupported
 from torchpt.engines.engine import Kernels, forward_kernels, trace
-from torchpt.paths.state import FOREVER, PathState
+from torchpt.paths.state import T_MAX, PathState
 from torchpt.paths.wave import PixelSet, Rays, Wave, clamp_scale
 from torchpt.physics.film import Film
 from torchpt.physics.samplers import Dimension, Draws, Sampler, salts
 from torchpt.scene import Scene
-from torchpt.scene.prepare import kernels_of, looped, make_wave
+from torchpt.scene.prepare import kernels_of, make_wave, uses_kernels
 from torchpt.scene.settings import SAMPLERS, Settings
 from torchpt.spec.schema import ParsedParams
 
@@ -38,7 +38,7 @@ class Along:
     def __init__(self, scene: Scene, settings: Settings, wave: Wave) -> None:
         self._scene, self._clamp = scene, wave.integrator.clamp
         # Kernels of a kind with stages of its own are made anew for each depth that is asked for.
-        compiled = looped(settings, scene.device, wave.context.plan.dtype) and not wave.integrator.own_stages
+        compiled = uses_kernels(settings, scene.device, wave.context.plan.dtype) and not wave.integrator.own_stages
         self._compiled = compiled
         self._kernels: Kernels | None = None
         self._keep = settings.render.max_memory is None
@@ -62,7 +62,7 @@ class Along:
         engine = forward_kernels(self._kernels)
         pixel_set = PixelSet(Film(wave.crop[2], 1, 1, wave.centre.device))
         engine.run([(pixel_set, sample, 1)], lambda _: False)
-        engine.dismiss(self._keep)
+        engine.release_workers(self._keep)
         return pixel_set.film.sums[0]
 
 
@@ -87,7 +87,7 @@ class Traced:
     """
 
     wave: Wave
-    along: Along
+    with_rays: Along
 
     @property
     def dtype(self) -> torch.dtype:
@@ -112,12 +112,12 @@ class Traced:
 
     def nearest(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """Return how far rays ``(3, N)`` go, in units of ``d``, and the primitives that they meet; -1 for none."""
-        t, prim, _, _ = self.wave.accel.intersect(o, d, torch.full_like(d[0], FOREVER, dtype=torch.float32))
+        t, prim, _, _ = self.wave.accel.intersect(o, d, torch.full_like(d[0], T_MAX, dtype=torch.float32))
         return t.double(), prim.long()
 
     def given(self, o: Tensor, d: Tensor, number: Tensor) -> Wave:
         """Return the wave along rays ``(3, N)``, ``d`` of any length, with the random numbers of samples ``number (N,)``."""
-        return self.wave.along(Rays(o.to(self.dtype), (d / (d * d).sum(0).sqrt()).to(self.dtype), number))
+        return self.wave.with_rays(Rays(o.to(self.dtype), (d / (d * d).sum(0).sqrt()).to(self.dtype), number))
 
     def state(self, o: Tensor, d: Tensor, number: Tensor) -> PathState:
         """Return paths that begin with rays, as of :meth:`given`."""
@@ -138,7 +138,7 @@ class Traced:
         wave = self.given(o, d, number)
         if depth is not None:
             wave = replace(wave, integrator=wave.integrator.but(max_depth=depth))
-        return self.along.radiance(wave, int(use))
+        return self.with_rays.radiance(wave, int(use))
 
 
 def traced_of(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Traced:

@@ -17,7 +17,7 @@ from torchpt.gradients.edges.traced import Traced
 from torchpt.math.vectors import dot, rows, take
 from torchpt.paths.integrators.path import partition
 from torchpt.paths.surface import surface_at
-from torchpt.paths.vertex import draw, shared
+from torchpt.paths.vertex import sample_bsdf, shading_weight
 from torchpt.physics.shapes import interact
 from torchpt.physics.shapes.geometry import Hit, Interaction
 
@@ -75,7 +75,7 @@ class Spot:
         surface = surface_at(world, model, -wo, at, self.traced.wave.context.pixel)
         local = surface.frame.to_local(wi)
         cosine = dot(wi, at.ng).abs()
-        weight, share = 1.0 / cosine.clamp_min(1e-6), shared(world, model, at, surface, wi, local)
+        weight, share = 1.0 / cosine.clamp_min(1e-6), shading_weight(world, model, at, surface, wi, local)
         weight = weight if share is None else weight * share
         return kind.eval(surface.parameters, surface.wo, local) * weight
 
@@ -90,7 +90,7 @@ class Spot:
             if kind.smooth:
                 return [torch.zeros_like(at.p), back, torch.zeros_like(back)]
             surface = surface_at(world, model, -back, at, context.pixel)
-            drawn = draw(context, model, at, surface, self.traced.draws(take(key, index), depth))
+            drawn = sample_bsdf(context, model, at, surface, self.traced.draws(take(key, index), depth))
             usable = (drawn.pdf > 0) & torch.isfinite(drawn.pdf)
             factor = dot(drawn.d, at.ng).abs() / torch.where(usable, drawn.pdf, 1.0)
             value = self._weighed(model, at, drawn.d, back) * factor

@@ -23,7 +23,7 @@ from torchpt.native.simd.lanes import (
     lane_numbers,
     lowest,
     mask,
-    population,
+    popcount,
     sort_descending,
     trailing_zeros,
 )
@@ -48,7 +48,7 @@ __all__ = [
     "minimum",
     "narrow",
     "pointer",
-    "population",
+    "popcount",
     "prefetch",
     "put",
     "select",

@@ -9,7 +9,7 @@ from numba.core import types
 
 from torchpt.native.simd.types import I32, Vector, intrinsic, lanes_of, numbers
 
-__all__ = ["bits", "highest", "lane_numbers", "lowest", "mask", "population", "sort_descending", "trailing_zeros"]
+__all__ = ["bits", "highest", "lane_numbers", "lowest", "mask", "popcount", "sort_descending", "trailing_zeros"]
 
 _I64 = ir.IntType(64)
 
@@ -51,7 +51,7 @@ def trailing_zeros(context, x):
 
 
 @intrinsic
-def population(context, x):
+def popcount(context, x):
     """How many bits of an int64 are set."""
     return types.int64(types.int64), lambda context, builder, signature, args: builder.ctpop(args[0])
 

@@ -14,8 +14,8 @@ from torchpt.paths import vertex as stages
 from torchpt.paths.roulette import DEEP, DEEP_CAP
 from torchpt.paths.state import Emission, Field, StageContext, Transmission, VertexInput, VertexOutput
 from torchpt.paths.vertex import STRATEGIES, Plan
-from torchpt.physics.lights import WAYS
-from torchpt.spec import Choice, Flag, Scalar, Spec, Valued, parameters_of
+from torchpt.physics.lights import LIGHT_SAMPLERS
+from torchpt.spec import Choice, Flag, FrozenConfig, Scalar, Spec, parameters_of
 
 if TYPE_CHECKING:
     from typing import Self
@@ -42,7 +42,7 @@ STRATEGY: dict[str, Spec] = {
 LIGHT_CHOICE: dict[str, Spec] = {
     "light_choice": Choice(
         "auto",
-        names=WAYS,
+        names=LIGHT_SAMPLERS,
         doc="which of many lights is sampled",
     ),
 }
@@ -83,7 +83,7 @@ class Limits:
         return DEEP_CAP if self.max_depth < 0 and depth > DEEP else 1.0
 
 
-class Integrator(Valued):
+class Integrator(FrozenConfig):
     """A kind of integrator; an instance holds the values of its parameters.
 
     Attributes:

@@ -21,7 +21,7 @@ from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.specs import Heights, Normals, fraction
 from torchpt.spec import Color, Flag, Refused, Scalar, Spec, parameters_of
 
-__all__ = ["Bsdf", "Parameters", "Table", "Values", "gather", "made", "matte", "stacked"]
+__all__ = ["Bsdf", "Parameters", "Table", "Values", "diffuse_split_sum", "gather", "made", "stacked"]
 
 #: By name: a tensor, ``(3, N)`` or ``(N,)``; a :class:`Table`; such a mapping again; None where it asks for nothing.
 Parameters = dict[str, Any]
@@ -126,7 +126,7 @@ class Bsdf:
         return {
             key: value
             for key, value in values.items()
-            if value is not None and key not in Bsdf.parameters and (key not in specs or specs[key].traced)
+            if value is not None and key not in Bsdf.parameters and (key not in specs or specs[key].differentiable)
         }
 
     @classmethod
@@ -180,7 +180,7 @@ class Bsdf:
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """What split-sum shading, the preview, takes the material for; by default diffuse, of the colour :meth:`albedo`."""
-        return matte(self.albedo(parameters))
+        return diffuse_split_sum(self.albedo(parameters))
 
     def preview(self, parameters: Parameters, shade: Callable[[SplitSumMaterial], Tensor]) -> Tensor:
         """Radiance ``(3, N)`` in the preview, where ``shade`` gives that of one material."""
@@ -207,7 +207,7 @@ def made(kind: Any, values: Values) -> tuple[Bsdf, dict[str, Any]]:
     return kind.of(values) if isinstance(kind, type) else (kind, kind.given(values))
 
 
-def matte(color: Tensor) -> SplitSumMaterial:
+def diffuse_split_sum(color: Tensor) -> SplitSumMaterial:
     """A diffuse surface ``(3, N)`` without a mirror."""
     none = torch.zeros_like(color[0])
     return SplitSumMaterial(color, none, none, torch.ones_like(none), None)

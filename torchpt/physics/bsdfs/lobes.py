@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math import microfacet
-from torchpt.math.microfacet import diffuse_passed, fresnel_dielectric
+from torchpt.math.microfacet import diffuse_transmittance, fresnel_dielectric
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
 from torchpt.physics.bsdfs.presets import INDICES
@@ -22,22 +22,22 @@ __all__ = [
     "Coat",
     "Glass",
     "Glossy",
-    "Power",
-    "above",
-    "added",
+    "PhongBase",
     "choose",
-    "clear",
-    "coated",
+    "coat_parameters",
+    "coated_split_sum",
     "cosine_power",
-    "drop_of_power",
+    "dielectric_parameters",
+    "dielectric_split_sum",
+    "in_upper_hemisphere",
+    "lobe_probability",
     "mean",
-    "over_base",
-    "passing",
+    "mixture_sample",
+    "phong_split_sum",
     "polished",
     "reflectance_at_normal",
-    "share",
+    "sample_cosine_power",
     "tinted",
-    "weighed",
     "with_delta",
 ]
 
@@ -45,7 +45,7 @@ __all__ = [
 # ---- What models of several lobes share: cosines to a power, choice among two, and the weight of a drawn direction
 
 
-def above(*directions: Tensor) -> Tensor:
+def in_upper_hemisphere(*directions: Tensor) -> Tensor:
     """1 where all directions ``(3, N)`` are above the surface, else 0: ``(N,)``."""
     least = directions[0][2]
     for w in directions[1:]:
@@ -53,16 +53,16 @@ def above(*directions: Tensor) -> Tensor:
     return (least > 0).to(least.dtype)
 
 
-def cosine_power(drop: Tensor, exponent: Tensor) -> Tensor:
-    """``cos^exponent`` of angles ``(N,)`` given as ``drop = 1 - cos``; 0 from a right angle on, also for exponent 0.
+def cosine_power(one_minus_cos: Tensor, exponent: Tensor) -> Tensor:
+    """``cos^exponent`` of angles ``(N,)`` given as ``one_minus_cos = 1 - cos``; 0 from a right angle on, also for exponent 0.
 
     An exponent of 1e5 multiplies the rounding of a cosine near 1 by as much; that of its difference from 1 it leaves small.
     """
-    inside = drop < 1.0
-    return torch.exp(exponent * torch.log1p(-torch.where(inside, drop, 0.0))) * inside
+    inside = one_minus_cos < 1.0
+    return torch.exp(exponent * torch.log1p(-torch.where(inside, one_minus_cos, 0.0))) * inside
 
 
-def drop_of_power(u: Tensor, exponent: Tensor) -> Tensor:
+def sample_cosine_power(u: Tensor, exponent: Tensor) -> Tensor:
     """``1 - cos`` of angles drawn from ``u (N,)`` with density ``(exponent + 1) / 2 pi cos^exponent`` in solid angle."""
     return -torch.expm1(torch.log1p(-u) / (exponent + 1.0))
 
@@ -78,14 +78,16 @@ def reflectance_at_normal(eta: Tensor) -> Tensor:
     return root * root
 
 
-def share(a: Tensor, b: Tensor) -> Tensor:
+def lobe_probability(a: Tensor, b: Tensor) -> Tensor:
     """Detached ``a / (a + b)``: how often to choose the first of two lobes; always, where both are 0."""
     a, b = a.detach(), b.detach()
     total = a + b
     return torch.where(total > 0, a / torch.where(total > 0, total, 1.0), 1.0)
 
 
-def weighed(model: Bsdf, parameters: Parameters, wo: Tensor, wi: Tensor, valid: Tensor | None = None) -> BsdfSample:
+def mixture_sample(
+    model: Bsdf, parameters: Parameters, wo: Tensor, wi: Tensor, valid: Tensor | None = None
+) -> BsdfSample:
     """The sample that drew ``wi (3, N)``: weighed by all lobes over the mixture of their densities.
 
     Direction and density are constants to derivatives: only what is reflected follows the parameters.
@@ -128,7 +130,7 @@ class Glass(Bsdf, part=True):
     }
 
 
-def clear(values: Parameters) -> Parameters:
+def dielectric_parameters(values: Parameters) -> Parameters:
     """What clear boundaries read: ``eta``, the index below over that above, and the factors, or None."""
     tints = {name: values.get(name) for name in ("specular_reflectance", "specular_transmittance")}
     return {"eta": values["int_ior"] / values["ext_ior"], **tints}
@@ -151,14 +153,14 @@ def choose(reflectance: Tensor, lobe: Tensor) -> tuple[Tensor, Tensor]:
 def polished(parameters: Parameters, wo: Tensor, lobe: Tensor) -> BsdfSample:
     """The mirror image, or the refracted ray, at a smooth boundary."""
     side = fresnel_dielectric(wo[2], parameters["eta"], torch.addcmul(wo[0] * wo[0], wo[1], wo[1]))
-    reflects, share = choose(side.reflectance, lobe)
+    reflects, lobe_probability = choose(side.reflectance, lobe)
     # Nothing is refracted under total internal reflection, where the reflectance is 1.
     sideways = torch.where(reflects, -1.0, -side.eta_ti)
     wi = torch.stack((wo[0] * sideways, wo[1] * sideways, torch.where(reflects, wo[2], side.cos_t)))
     weight = torch.where(
         reflects,
-        tinted(share, parameters["specular_reflectance"]),
-        tinted(share * side.eta_ti * side.eta_ti, parameters["specular_transmittance"]),
+        tinted(lobe_probability, parameters["specular_reflectance"]),
+        tinted(lobe_probability * side.eta_ti * side.eta_ti, parameters["specular_transmittance"]),
     )
     return BsdfSample(
         wi,
@@ -168,7 +170,7 @@ def polished(parameters: Parameters, wo: Tensor, lobe: Tensor) -> BsdfSample:
     )
 
 
-def passing(parameters: Parameters, roughness: Tensor, f0: Tensor, eta: Tensor | None) -> SplitSumMaterial:
+def dielectric_split_sum(parameters: Parameters, roughness: Tensor, f0: Tensor, eta: Tensor | None) -> SplitSumMaterial:
     """A clear boundary in the preview.
 
     Args:
@@ -205,7 +207,7 @@ class Coat(Bsdf, part=True):
     }
 
 
-def coated(values: Parameters, eta: Tensor, passed: Tensor, nonlinear: bool) -> Parameters:
+def coat_parameters(values: Parameters, eta: Tensor, passed: Tensor, nonlinear: bool) -> Parameters:
     """What the coats have in common.
 
     Args:
@@ -215,21 +217,23 @@ def coated(values: Parameters, eta: Tensor, passed: Tensor, nonlinear: bool) -> 
         nonlinear: whether light that the coat throws back takes the base's colour again, which saturates it.
     """
     diffuse, specular = values["diffuse_reflectance"], values.get("specular_reflectance")
-    often, again = mean(diffuse), diffuse if nonlinear else 1.0
+    diffuse_probability, again = mean(diffuse), diffuse if nonlinear else 1.0
     return {
         "eta": eta,
         "base": diffuse / ((1.0 - again + again * passed) * eta * eta),
         "diffuse_reflectance": diffuse,
         "specular_reflectance": specular,
-        "specular_share": share(torch.ones_like(often) if specular is None else mean(specular), often),
+        "specular_share": lobe_probability(
+            torch.ones_like(diffuse_probability) if specular is None else mean(specular), diffuse_probability
+        ),
     }
 
 
-def over_base(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
+def coated_split_sum(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
     """A coat in the preview, over a base which light enters by what the coat's mean reflectance leaves."""
     eta, factor = parameters["eta"], parameters["specular_reflectance"]
     one = torch.ones_like(eta)
-    base = parameters["base"] * diffuse_passed(eta)
+    base = parameters["base"] * diffuse_transmittance(eta)
     f0 = reflectance_at_normal(eta)
     return SplitSumMaterial(base, tinted(f0, factor), tinted(one, factor), roughness, f0)
 
@@ -237,11 +241,11 @@ def over_base(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
 # ---- What models of Lambert and a lobe of a cosine's power share: their parameters, and how much energy they may make
 
 
-class Power(Bsdf, part=True):
+class PhongBase(Bsdf, part=True):
     """A part of a model: a diffuse and a glossy reflectance, and how sharp the lobe is.
 
     Attributes:
-        most: energy that a unit of ``specular`` reflects at most.
+        max_albedo: energy that a unit of ``specular`` reflects at most.
     """
 
     parameters: ClassVar = {
@@ -250,7 +254,7 @@ class Power(Bsdf, part=True):
         "exponent": Scalar(30.0, high=1e5, texture=True, doc="how sharp the glossy one is: the power of its cosine"),
     }
     lobed = True
-    most: ClassVar[float] = 1.0
+    max_albedo: ClassVar[float] = 1.0
 
     @classmethod
     def energy(cls, values: Values) -> str:
@@ -258,14 +262,14 @@ class Power(Bsdf, part=True):
         diffuse, specular = values["diffuse"], values["specular"]
         if not isinstance(diffuse, tuple) or not isinstance(specular, tuple):
             return ""
-        most = max(kd + cls.most * ks for kd, ks in zip(diffuse, specular, strict=True))
-        if most <= 1.0 + 1e-6:
+        max_albedo = max(kd + cls.max_albedo * ks for kd, ks in zip(diffuse, specular, strict=True))
+        if max_albedo <= 1.0 + 1e-6:
             return ""
-        terms = "diffuse + specular" if cls.most == 1.0 else f"diffuse + {cls.most:g} specular"
-        return f"{terms} is {most:.4g}: above 1 it may reflect more light than it receives"
+        terms = "diffuse + specular" if cls.max_albedo == 1.0 else f"diffuse + {cls.max_albedo:g} specular"
+        return f"{terms} is {max_albedo:.4g}: above 1 it may reflect more light than it receives"
 
 
-def added(parameters: Parameters, alpha2: Tensor, peak: Tensor | float) -> SplitSumMaterial:
+def phong_split_sum(parameters: Parameters, alpha2: Tensor, peak: Tensor | float) -> SplitSumMaterial:
     """Both lobes in the preview, added.
 
     Args:
@@ -289,7 +293,7 @@ class Glossy(Bsdf):
     lobed = True
     delta = True
 
-    def amounts(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
+    def lobe_factors(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
         """Diffuse and specular factors ``(3, N)``."""
         raise NotImplementedError
 
@@ -313,8 +317,8 @@ class Glossy(Bsdf):
         """See :class:`Bsdf`."""
         alpha, k = parameters["alpha"], parameters["k"]
         rough = torch.logical_not(parameters["smooth"]).to(wo.dtype)
-        diffuse, specular = self.amounts(parameters, wo)
-        often = share(mean(diffuse), mean(specular))
+        diffuse, specular = self.lobe_factors(parameters, wo)
+        diffuse_probability = lobe_probability(mean(diffuse), mean(specular))
         cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].clamp_min(0.0)
         facets = microfacet.reflection(wo, wi, alpha, alpha, microfacet.BOUNDED)
         # The shortcut in place of Smith's masking.
@@ -322,20 +326,22 @@ class Glossy(Bsdf):
             cos_i + microfacet.stretched_length(wi, alpha, alpha)
         )
         peak = facets.value * rough * smith / (4.0 * (cos_o - cos_o * k + k) * (cos_i - cos_i * k + k))
-        cosine = cos_i * above(wo, wi) * (1.0 / math.pi)
-        return torch.addcmul(diffuse * cosine, specular, peak), often * cosine + (1.0 - often) * facets.pdf * rough
+        cosine = cos_i * in_upper_hemisphere(wo, wi) * (1.0 / math.pi)
+        return torch.addcmul(diffuse * cosine, specular, peak), diffuse_probability * cosine + (
+            1.0 - diffuse_probability
+        ) * facets.pdf * rough
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """One of the lobes by what they would reflect, the facets by visible normals."""
         assert lobe is not None
         alpha = parameters["alpha"]
-        diffuse, specular = self.amounts(parameters, wo)
-        often = share(mean(diffuse), mean(specular))
-        shiny = lobe >= often
+        diffuse, specular = self.lobe_factors(parameters, wo)
+        diffuse_probability = lobe_probability(mean(diffuse), mean(specular))
+        shiny = lobe >= diffuse_probability
         m = microfacet.sample_normal(wo, alpha, alpha, u, microfacet.BOUNDED)
         about = microfacet.reflect(wo, m, wo[0] * m[0] + wo[1] * m[1] + wo[2] * m[2])
-        drawn = weighed(self, parameters, wo, torch.where(shiny, about, cosine_hemisphere(u)))
+        drawn = mixture_sample(self, parameters, wo, torch.where(shiny, about, cosine_hemisphere(u)))
         mirror = torch.stack((-wo[0], -wo[1], wo[2]))
         masking = wo[2] / (wo[2] - wo[2] * parameters["k"] + parameters["k"])
-        weight = specular * (masking * masking / torch.where(shiny, 1.0 - often, 1.0))
+        weight = specular * (masking * masking / torch.where(shiny, 1.0 - diffuse_probability, 1.0))
         return with_delta(drawn, shiny & parameters["smooth"] & (wo[2] > 0), mirror, weight)

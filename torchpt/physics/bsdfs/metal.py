@@ -15,9 +15,9 @@ from torchpt.physics.bsdfs.presets import METALS
 from torchpt.physics.bsdfs.presets import metal as preset
 from torchpt.physics.bsdfs.records import SplitSumMaterial
 from torchpt.physics.bsdfs.specs import WHITE, reflectance
-from torchpt.spec import Color, Other, Refused
+from torchpt.spec import Color, Custom, Refused
 
-__all__ = ["Metal", "by_reflectance", "metal", "metal_colour", "mirrored"]
+__all__ = ["Metal", "by_reflectance", "metal", "metal_colour", "metal_split_sum"]
 
 _MIRROR = "none"  # Mitsuba's name of the metal that reflects everything
 _NAMES = f"{_MIRROR} (a perfect mirror) or one of {', '.join(METALS)}"
@@ -34,7 +34,7 @@ class Metal(Bsdf, part=True):
     """A part of a model: a metal by its name, by ``eta`` and ``k``, or by its reflectance at normal incidence."""
 
     parameters: ClassVar = {
-        "material": Other(
+        "material": Custom(
             None, reader=_name, words=f"{_MIRROR} (a perfect mirror), or a metal's name", doc="which metal"
         ),
         "eta": Color(None, texture=True, doc="the real part of its index, with `k`"),
@@ -89,7 +89,7 @@ def metal_colour(parameters: Parameters, cos: Tensor) -> Tensor:
     return fresnel_conductor(cos, parameters["eta"], parameters["k"])
 
 
-def mirrored(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
+def metal_split_sum(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
     """A metal in the preview, of some roughness ``(N,)``."""
     factor, one = parameters["specular_reflectance"], torch.ones_like(roughness)
     f0 = metal_colour(parameters, one)

@@ -17,11 +17,12 @@ from torchpt.math.vectors import luminance
 
 __all__ = [
     "Facet",
-    "Main",
+    "MainLobes",
     "Probabilities",
     "clearcoat_alpha",
     "clearcoat_masking",
     "fake_subsurface",
+    "flip_to_upper",
     "gtr1",
     "lerp",
     "or_zero",
@@ -30,7 +31,6 @@ __all__ = [
     "schlick_weight",
     "tint",
     "up",
-    "upward",
     "wide_ggx",
 ]
 
@@ -54,7 +54,7 @@ class Probabilities(NamedTuple):
     refract: Tensor | None
 
 
-class Main(NamedTuple):
+class MainLobes(NamedTuple):
     """The main lobes between ``wo`` and ``wi`` as if all were reflected, and all refracted; each ``(N,)``."""
 
     m: Tensor  # (3, N) half vector
@@ -157,7 +157,7 @@ def or_zero(value: Tensor | None, like: Tensor) -> Tensor:
     return torch.zeros_like(like) if value is None else value
 
 
-def upward(wo: Tensor, wi: Tensor, eta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def flip_to_upper(wo: Tensor, wi: Tensor, eta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The pair turned so that ``wo`` is above, the far side's index over the near one's, and 1 where nothing was turned."""
     side = torch.copysign(torch.ones_like(wo[2]), wo[2])
     front = (side > 0).to(side.dtype)

@@ -110,7 +110,7 @@ def energy_table(parameters: Parameters, etas: Sequence[Tensor | None]) -> Table
         # The edge of total internal reflection asks for more nodes, which many azimuths would make too many.
         nodes = 64 if isotropic and eta is not None else 32
         index = None if eta is None else eta.double()
-        blocks.append(microfacet.energy(wo, au, None if isotropic else av, index, nodes, nodes))
+        blocks.append(microfacet.directional_albedo(wo, au, None if isotropic else av, index, nodes, nodes))
     values = torch.cat(blocks).clamp_max(1.0).to(u.dtype)
     return Table(values, len(values))
 

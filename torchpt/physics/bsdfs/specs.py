@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from torchpt.physics.bsdfs.presets import INDICES
-from torchpt.spec import REQUIRED, Color, Index, Other, Refused, Scalar, Spec
+from torchpt.spec import REQUIRED, Color, Custom, Index, Refused, Scalar, Spec
 from torchpt.spec.schema import ParsedParams
 
 __all__ = ["GREY", "WHITE", "Heights", "Inner", "Normals", "fraction", "index", "reflectance", "smooth"]
@@ -30,7 +30,7 @@ def index(default: float, doc: str) -> Index:
     return Index(default, texture=True, media=INDICES, doc=doc)
 
 
-def smooth(rough: str) -> Other:
+def smooth(rough: str) -> Custom:
     """The roughness of a type that has none: 0, which says nothing; ``rough`` is the type to use instead."""
     words = f"0, as this type is smooth (use {rough})"
 
@@ -38,7 +38,7 @@ def smooth(rough: str) -> Other:
         if isinstance(value, bool | Mapping) or value != 0:
             raise Refused(words)
 
-    return Other(None, reader=read, words=words, doc="nothing: there so that rough and smooth types can be exchanged")
+    return Custom(None, reader=read, words=words, doc="nothing: there so that rough and smooth types can be exchanged")
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Normals(Color):
     high: float | None = field(default=1.0, kw_only=True)
     texture: bool = field(default=True, kw_only=True)
 
-    traced: ClassVar[bool] = False
+    differentiable: ClassVar[bool] = False
     linear: ClassVar[bool] = True
 
     @property
@@ -70,7 +70,7 @@ class Heights(Scalar):
     low: float | None = field(default=None, kw_only=True)
     texture: bool = field(default=True, kw_only=True)
 
-    traced: ClassVar[bool] = False
+    differentiable: ClassVar[bool] = False
 
     @property
     def expected(self) -> str:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.physics.cameras import opencv
 from torchpt.physics.cameras.base import Camera
-from torchpt.spec import Angle, Choice, Moves, Other, Refused, Scalar
+from torchpt.spec import Angle, Choice, Custom, Moves, Refused, Scalar
 
 __all__ = ["FOV_AXES", "Pinhole"]
 
@@ -54,13 +54,13 @@ class Pinhole(Camera):
         "pixel_aspect": Scalar(
             None, above=0.0, moves=Moves.SURFACES, doc="a pixel's width over its height, `fy / fx`; 1 by default"
         ),
-        "K": Other(
+        "K": Custom(
             None,
             reader=opencv.calibration,
             words=opencv.K_WORDS,
             doc="in place of these: OpenCV's calibration matrix of a picture of `size`",
         ),
-        "size": Other(
+        "size": Custom(
             None,
             reader=opencv.size,
             words="[width, height] in pixels",
@@ -130,9 +130,9 @@ class Pinhole(Camera):
 
     def film_of(self, p: Tensor) -> Tensor | None:
         """See :meth:`Camera.film_of`."""
-        return None if self.lens else self.placed(p - self.origin())
+        return None if self.lens else self.project_homogeneous(p - self.origin())
 
-    def placed(self, away: Tensor) -> Tensor:
+    def project_homogeneous(self, away: Tensor) -> Tensor:
         """:meth:`film_of` of points that lie ``away (3, N)`` from the origin."""
         right, up, depth = self.covectors() @ away
         half, (width, height) = self.half_width(), self.film

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torchpt.core.errors import SceneError
 from torchpt.math.transforms import affine, is_rigid, is_usable, look_at, tensor_of
 from torchpt.physics.cameras import opencv
-from torchpt.spec import Other, Point, Pose, Refused, Spec
+from torchpt.spec import Custom, Point, Pose, Refused, Spec
 
 __all__ = ["POSES", "UP", "pose_of", "posed"]
 
@@ -32,31 +32,33 @@ _REQUIRED = {
 }
 
 
-class _Told(Point):
+class _UntracedPoint(Point):
     """Three numbers that say where the camera stands: no tensor of the scene, the pose made of them is."""
 
-    traced: ClassVar[bool] = False
+    differentiable: ClassVar[bool] = False
     place: ClassVar[bool] = False
 
 
 #: What every camera declares.
 POSES: Mapping[str, Spec] = {
-    "origin": _Told(None, doc="where it stands"),
-    "target": _Told(None, doc="a point that it looks at"),
-    "up": _Told(None, doc="what is up in the picture, any direction but the viewing direction; [0, 1, 0] by default"),
+    "origin": _UntracedPoint(None, doc="where it stands"),
+    "target": _UntracedPoint(None, doc="a point that it looks at"),
+    "up": _UntracedPoint(
+        None, doc="what is up in the picture, any direction but the viewing direction; [0, 1, 0] by default"
+    ),
     "to_world": Pose(
         None,
         rigid=True,
         operations=False,
         doc="in place of these: from its own space (it looks along +z, +y is up, +x left in the picture) to the world",
     ),
-    "R": Other(
+    "R": Custom(
         None,
         reader=opencv.rotation,
         words="three rows of a rotation",
         doc="in place of these, with `t`: OpenCV's rotation from the world to the camera (+x right, +y down, +z ahead)",
     ),
-    "t": Other(
+    "t": Custom(
         None,
         reader=opencv.translation,
         words="three finite numbers [x, y, z]",

@@ -16,7 +16,7 @@ from torchpt.physics.film.error import ErrorEstimate, Pilots, pilots_of
 from torchpt.physics.film.filters import Filter
 from torchpt.physics.film.sums import Film
 from torchpt.spec import Kinds
-from torchpt.spec.schema import values_of
+from torchpt.spec.schema import read_params
 
 __all__ = [
     "FILTERS",
@@ -38,4 +38,4 @@ def filter_of(kind: str, device: torch.device, **given: Any) -> Filter:
     Raises:
         SceneError: a parameter that it does not have, or a bad value.
     """
-    return FILTERS[kind](values_of(FILTERS[kind], given, "film.filter", None).values, device)
+    return FILTERS[kind](read_params(FILTERS[kind], given, "film.filter", None).values, device)

@@ -16,22 +16,22 @@ from torchpt.math.hashing import as_int32, mix, mix_int, to_unit
 
 __all__ = [
     "BLOCK",
-    "FEWEST_OF_TAIL",
+    "MIN_TAIL_VALUES",
     "STREAMS",
-    "Again",
     "ErrorEstimate",
     "Pilots",
-    "again_counts",
+    "Resampled",
+    "allocate_samples",
     "around",
     "error_at",
     "error_by_pilots",
-    "foreseen",
+    "error_estimate",
+    "expected_errors",
     "heavy_tail",
-    "known_error",
-    "pilots_alone",
     "pilots_of",
-    "shared_out",
-    "to_look_at",
+    "pixels_to_resample",
+    "probe_estimate",
+    "resample_counts",
 ]
 
 
@@ -44,13 +44,13 @@ __all__ = [
 
 
 #: Fewest values whose tail a shape is fitted to.
-FEWEST_OF_TAIL = 25
+MIN_TAIL_VALUES = 25
 #: Weight of the prior, and the shape that it expects.
 _PRIOR, _EXPECTED = 10.0, 0.5
 
 
 def heavy_tail(values: Tensor) -> bool:
-    """Return True where the upper tail of ``values (n,)``, n >= ``FEWEST_OF_TAIL``, is too heavy for their mean to be trusted.
+    """Return True where the upper tail of ``values (n,)``, n >= ``MIN_TAIL_VALUES``, is too heavy for their mean to be trusted.
 
     That is, whether its shape exceeds the threshold by more than chance explains: by two standard errors ``(1 + k) / sqrt(m)``
     of a shape fitted to m values.
@@ -224,18 +224,18 @@ def error_by_pilots(pilots: Pilots, a: Tensor, b: Tensor) -> Tensor:
     return error_at(a, b, around(grid, known)[at]).mean(1)
 
 
-def pilots_alone(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> ErrorEstimate:
+def probe_estimate(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> ErrorEstimate:
     """By the pilots alone, so that no other pixel has a say: the relMSE that decisions are made by."""
     share = error_by_pilots(pilots, a, b) * _first_part(a, b, spare)
     pixels = float(sum_all(pilots.weight))
     part = 1.0 - 0.5 * len(pilots) / pixels if counted else 1.0
     mean = float(sum_all(share * pilots.weight)) / pixels
     parts = pilots.weight / pixels * (share - mean) * part
-    return _with_interval(mean * part, parts, 0.0, False, share)
+    return _estimate(mean * part, parts, 0.0, False, share)
 
 
 @dataclass(frozen=True)
-class Again:
+class Resampled:
     """Pixels that were looked at again.
 
     Attributes:
@@ -251,12 +251,12 @@ class Again:
     spare: Tensor
 
 
-def again_counts(pixels: int, pilots: int) -> tuple[int, int]:
+def resample_counts(pixels: int, pilots: int) -> tuple[int, int]:
     """Return how many suspects and how many doubtful pilots are looked at again, at most."""
     return max(pixels // SUSPECTS, 1), max(pilots // DOUBTFUL, 4)
 
 
-def to_look_at(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+def pixels_to_resample(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Which pixels are to be looked at again: suspects, and doubtful pilots; places ``(m,)`` on the picture.
 
     Args:
@@ -269,7 +269,7 @@ def to_look_at(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[T
     rest = ~torch.isin(pilots.places, suspects)
     low = torch.minimum(a, b).clamp_min(0.0)
     doubt = relative((a - b).square(), low).mean(1) * rest
-    count = min(again_counts(len(rest), len(pilots))[1], int(rest.sum()))
+    count = min(resample_counts(len(rest), len(pilots))[1], int(rest.sum()))
     return suspects, pilots.places[doubt.topk(count).indices.sort().values]
 
 
@@ -283,13 +283,13 @@ def _suspects(picture: Tensor) -> Tensor:
         for dx in range(3):
             brighter += padded[dy : dy + height, dx : dx + width] > bright
     few = (brighter.reshape(-1) <= 1).nonzero()[:, 0]
-    standing = _standing_out(picture.reshape(-1, picture.shape[2])[few], _neighbours(picture, few))
-    count, _ = again_counts(bright.numel(), 0)
+    standing = _excess(picture.reshape(-1, picture.shape[2])[few], _neighbours(picture, few))
+    count, _ = resample_counts(bright.numel(), 0)
     return few[standing.topk(min(count, len(few))).indices].sort().values
 
 
-def known_error(
-    picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool, again: Again | None
+def error_estimate(
+    picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool, again: Resampled | None
 ) -> ErrorEstimate | None:
     """The error that a picture knows.
 
@@ -315,11 +315,11 @@ def known_error(
     suspects = places[:0]
     if again is not None:
         suspects = again.places[: again.suspects]
-        sure, unsure = _really(flat[suspects], again.mean[: again.suspects], again.spare[: again.suspects])
+        sure, unsure = _actual_error(flat[suspects], again.mean[: again.suspects], again.spare[: again.suspects])
         rest = ~torch.isin(places, suspects)
         # A second value that would be a suspect itself tells of others like it, which are counted already.
-        least = _standing_out(flat[suspects], _neighbours(picture, suspects)).min() if len(suspects) else math.inf
-        b = torch.where((_standing_out(b, others) > least)[:, None], near, b)
+        least = _excess(flat[suspects], _neighbours(picture, suspects)).min() if len(suspects) else math.inf
+        b = torch.where((_excess(b, others) > least)[:, None], near, b)
     share = error_at(a, b, near)
     if again is not None:
         at = torch.isin(places, again.places[again.suspects :])  # in the order of the pilots, both
@@ -334,7 +334,7 @@ def known_error(
     mean = float(sum_all(weight * share))
     parts = weight * (share - mean) * part
     total = sure / pixels + mean * part
-    return _with_interval(total, parts, unsure / pixels**2, sure / pixels > FEW * total, share)
+    return _estimate(total, parts, unsure / pixels**2, sure / pixels > FEW * total, share)
 
 
 def _first_part(a: Tensor, b: Tensor, spare: Tensor | None) -> float:
@@ -359,13 +359,13 @@ def _neighbours(picture: Tensor, places: Tensor) -> Tensor:
     return picture.reshape(-1, channels)[torch.stack(at)]
 
 
-def _standing_out(values: Tensor, others: Tensor) -> Tensor:
+def _excess(values: Tensor, others: Tensor) -> Tensor:
     """By how much ``values (n, C)`` exceed the second brightest of ``others (8, n, C)``, relative to their mean ``(n,)``."""
     second = others.topk(2, 0).values[1]
     return relative((values - second).clamp_min(0.0).square(), others.mean(0)).mean(1)
 
 
-def _really(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
+def _actual_error(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
     """The squared error that pixels have, over ``r² + 0.01``, in all, and the variance of that.
 
     Args:
@@ -380,7 +380,7 @@ def _really(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
     return float(sum_all(share.mean(1))), float(sum_all((slope * spare.sqrt()).mean(1).square()))
 
 
-def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool, share: Tensor) -> ErrorEstimate:
+def _estimate(mean: float, parts: Tensor, unsure: float, few: bool, share: Tensor) -> ErrorEstimate:
     """The estimate with its interval.
 
     Args:
@@ -396,7 +396,7 @@ def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool, share: 
     if count < FEWEST:
         return ErrorEstimate(mean, None, True)
     deviation = math.sqrt(float(sum_all(parts.square())) + unsure)
-    heavy = few or deviation > VAGUE * mean or (count >= FEWEST_OF_TAIL and heavy_tail(share))
+    heavy = few or deviation > VAGUE * mean or (count >= MIN_TAIL_VALUES and heavy_tail(share))
     factor = math.exp(min(_quantile(count - 1) * deviation / mean, 300.0))
     return ErrorEstimate(mean, (mean / factor, mean * factor), heavy)
 
@@ -410,7 +410,7 @@ def _quantile(freedom: int) -> float:
 # ---- How adaptive sampling shares samples out: more for blocks of pixels whose error falls most by them
 #
 # A pixel of n samples whose relative variance is ``e`` has ``s = sqrt(e n)`` a sample; for so many samples in all the sum of
-# ``s² / n`` over pixels is least where n goes with s. What ``e`` is, pilots say, one a block (:func:`foreseen`).
+# ``s² / n`` over pixels is least where n goes with s. What ``e`` is, pilots say, one a block (:func:`expected_errors`).
 # Other pixels are not asked, so none of them owes its number of samples to its own value. Numbers are powers of two times the
 # first one, as Sobol' points are at their best there.
 
@@ -423,7 +423,7 @@ FLOOR = 0.05
 ORDINARY = 0.95
 
 
-def foreseen(errors: Tensor, known: Tensor) -> Tensor:
+def expected_errors(errors: Tensor, known: Tensor) -> Tensor:
     """What blocks are expected to have of an error ``(R, C)`` that single pilots tell, where blocks are ``known (R, C)``.
 
     Most pilots tell of the noise around them. The few large ones may be an edge, or rare samples that are as likely elsewhere:
@@ -467,7 +467,7 @@ def _smoothed(values: Tensor, known: Tensor, own: bool = True) -> Tensor:
     return torch.where(weight > 0, total / weight.clamp_min(1e-30), mean)
 
 
-def shared_out(error: Tensor, counts: Tensor, pixels: Tensor, mean: float, last: bool = False) -> Tensor:
+def allocate_samples(error: Tensor, counts: Tensor, pixels: Tensor, mean: float, last: bool = False) -> Tensor:
     """Samples a pixel that blocks are to have ``(B,)`` int64: those they have, twice or four times as many.
 
     In the ``last`` round what cannot double any more is filled up by halves, quarters, ... of what blocks have, so that less is

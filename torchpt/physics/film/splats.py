@@ -41,7 +41,7 @@ class SplatSums:
 
     Args:
         pixels: of the picture.
-        streams: that share the samples, see :class:`torchpt.physics.samplers.Streams`.
+        streams: that share the samples, see :class:`torchpt.physics.samplers.Randomizations`.
         device: where the sums live.
     """
 

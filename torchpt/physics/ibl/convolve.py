@@ -149,7 +149,7 @@ def _facets(alpha: float, n: int) -> Lobe:
 
 
 @dataclass(frozen=True)
-class _Rule:
+class _Convolve:
     """How a result of ``height x width`` is made of the texels of a pyramid and of suns, by a lobe."""
 
     pyramid: Pyramid
@@ -158,13 +158,13 @@ class _Rule:
     width: int
     lobe: Lobe
 
-    def bags(self) -> Iterator[tuple[Tensor, Tensor]]:
+    def taps(self) -> Iterator[tuple[Tensor, Tensor]]:
         """Indices and weights ``(n, 4 S)`` of texels for consecutive texels of the result, row by row."""
         columns = max(1, min(self.width, LANES // len(self.lobe.weight)))
         for row in range(self.height):
             place = self._places(math.pi * row / (self.height - 1))
             for start in range(0, self.width, columns):
-                yield self._bag(place, torch.arange(start, min(start + columns, self.width), device=place[0].device))
+                yield self._taps(place, torch.arange(start, min(start + columns, self.width), device=place[0].device))
 
     def _places(self, theta: float) -> tuple[Tensor, ...]:
         """Where the lobe about a direction at longitude 0 reads: column, columns there are, first texel, two weights."""
@@ -190,7 +190,7 @@ class _Rule:
         place = (u * width, width, first, lobe.weight * (1.0 - share), lobe.weight * share)
         return tuple(t.to(texels.device, dtype) for t, dtype in zip(place, dtypes, strict=True))
 
-    def _bag(self, place: tuple[Tensor, ...], column: Tensor) -> tuple[Tensor, Tensor]:
+    def _taps(self, place: tuple[Tensor, ...], column: Tensor) -> tuple[Tensor, Tensor]:
         x, width, first, low, high = place
         turn = (column[:, None] + 0.5) / self.width
         x = torch.addcmul(x - 0.5, turn.to(x.dtype), width.to(x.dtype))
@@ -204,7 +204,7 @@ class _Rule:
         a, b = low * share, high * share
         return torch.cat((left, right, left + width, right + width), 1), torch.cat((low - a, a, high - b, b), 1)
 
-    def sights(self) -> Iterator[Tensor]:
+    def sun_weights(self) -> Iterator[Tensor]:
         """Densities ``(n, K)`` of the suns for consecutive texels of the result."""
         n = directions(self.height, self.width).reshape(3, -1)
         for start in range(0, n.shape[1], max(1, LANES // self.suns.shape[1])):
@@ -216,15 +216,15 @@ class _Gather(torch.autograd.Function):
     """Weighted sums of texels and suns. Weights are made anew for the backward pass rather than kept."""
 
     @staticmethod
-    def forward(ctx: Any, texels: Tensor, light: Tensor, rule: _Rule) -> Tensor:
+    def forward(ctx: Any, texels: Tensor, light: Tensor, rule: _Convolve) -> Tensor:
         ctx.rule = rule
         sums = torch.cat(
             [
                 torch.nn.functional.embedding_bag(index, texels, mode="sum", per_sample_weights=weight)
-                for index, weight in rule.bags()
+                for index, weight in rule.taps()
             ]
         )
-        sums += torch.cat([sight @ light for sight in rule.sights()])
+        sums += torch.cat([sight @ light for sight in rule.sun_weights()])
         return sums.view(rule.height, rule.width, 3)
 
     @staticmethod
@@ -232,17 +232,17 @@ class _Gather(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]: the decorator hides names
         ctx: Any, *cotangents: Tensor
     ) -> tuple[Tensor, Tensor, None]:
-        rule: _Rule = ctx.rule
+        rule: _Convolve = ctx.rule
         flat = cotangents[0].reshape(-1, 3)
         # A channel at a time: several times faster than rows of three on a CPU.
         texels, first = rule.pyramid.texels.new_zeros(3, len(rule.pyramid.texels)), 0
-        for index, weight in rule.bags():
+        for index, weight in rule.taps():
             place, share = index.reshape(-1).to(torch.int64), flat[first : first + len(index)]
             for channel in range(3):
                 texels[channel].scatter_add_(0, place, (weight * share[:, channel, None]).reshape(-1))
             first += len(index)
         light, first = flat.new_zeros(rule.suns.shape[1], 3), 0
-        for sight in rule.sights():
+        for sight in rule.sun_weights():
             light += sight.T @ flat[first : first + len(sight)]
             first += len(sight)
         return texels.T, light, None
@@ -265,7 +265,7 @@ class _Convolution:
             if not isinstance(value, int) or value < least:
                 raise SceneError(key, value, f"an integer, at least {least}")
         pyramid, suns, light = self._ready(lobe.width)
-        out = _Gather.apply(pyramid.texels, light, _Rule(pyramid, suns, height, width, lobe))
+        out = _Gather.apply(pyramid.texels, light, _Convolve(pyramid, suns, height, width, lobe))
         assert isinstance(out, Tensor)
         return out
 
@@ -277,12 +277,12 @@ class _Convolution:
         points = math.ceil(5.0 * math.pi / (rows - 1) / width)
         points = points if points <= LATTICE else 0
         if (rows, points) not in self.parts:
-            rest, suns, light = _parted(resampled(self.map, rows, columns), points)
+            rest, suns, light = _extract_suns(resampled(self.map, rows, columns), points)
             self.parts[rows, points] = Pyramid.of(rest), suns, light
         return self.parts[rows, points]
 
 
-def _parted(map: Tensor, points: int) -> tuple[Tensor, Tensor, Tensor]:
+def _extract_suns(map: Tensor, points: int) -> tuple[Tensor, Tensor, Tensor]:
     """A map without what its brightest texels have above the others, and that as suns.
 
     Args:

@@ -10,14 +10,32 @@ by the light ``tree``.
 
 from __future__ import annotations
 
-from torchpt.physics.lights.base import COLUMNS, KINDS, Environment, Light, Row, Setting, Surroundings, order
-from torchpt.physics.lights.choice import WAYS, choice_of, local
+from torchpt.physics.lights.base import COLUMNS, KINDS, Environment, EnvironmentImage, Light, Row, Setting, sort_key
+from torchpt.physics.lights.choice import LIGHT_SAMPLERS, depends_on_point, light_sampler
 from torchpt.physics.lights.surface import SURFACES, Faces, Surface, emitter
-from torchpt.physics.lights.table import emitted, environment, sample, surroundings, without_environment
-from torchpt.physics.lights.tree import fine
+from torchpt.physics.lights.table import emitted, environment, environment_image, sample, without_environment
+from torchpt.physics.lights.tree import from_digits
 
 __all__ = [
-    "COLUMNS", "KINDS", "SURFACES", "WAYS", "Environment", "Faces", "Light", "Row", "Setting", "Surface", "Surroundings",
-    "choice_of", "emitted", "emitter", "environment", "fine", "local", "order", "sample", "surroundings",
+    "COLUMNS",
+    "KINDS",
+    "LIGHT_SAMPLERS",
+    "SURFACES",
+    "Environment",
+    "EnvironmentImage",
+    "Faces",
+    "Light",
+    "Row",
+    "Setting",
+    "Surface",
+    "depends_on_point",
+    "emitted",
+    "emitter",
+    "environment",
+    "environment_image",
+    "from_digits",
+    "light_sampler",
+    "sample",
+    "sort_key",
     "without_environment",
 ]  # fmt: skip

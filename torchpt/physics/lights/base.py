@@ -21,7 +21,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = [
-    "COLUMNS", "KINDS", "Cone", "Emitter", "Environment", "Light", "Row", "Setting", "Surroundings", "bright", "order",
+    "COLUMNS",
+    "KINDS",
+    "Cone",
+    "Emitter",
+    "Environment",
+    "EnvironmentImage",
+    "Light",
+    "Row",
+    "Setting",
+    "bright",
+    "sort_key",
     "taken",
 ]  # fmt: skip
 
@@ -209,7 +219,7 @@ class Light(Emitter):
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class EnvironmentImage:
     """An environment as a picture of all directions, laid out as :mod:`torchpt.physics.lights.kinds.envmap` says.
 
     Attributes:
@@ -230,12 +240,12 @@ class Environment(Light):
     environment = True
 
     @classmethod
-    def arriving(cls, around: Any, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
+    def radiance_pdf(cls, around: Any, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
         """Radiance ``(3, N)`` from unit directions ``d (3, N)``, and the density ``(N,)`` with which they are drawn."""
         raise NotImplementedError
 
     @classmethod
-    def surroundings(cls, around: Any) -> Surroundings:
+    def environment_image(cls, around: Any) -> EnvironmentImage:
         """The same as a picture; differentiable."""
         raise NotImplementedError
 
@@ -254,7 +264,7 @@ def bright(color: Tensor) -> Tensor:
 KINDS: Kinds[Light] = Kinds("torchpt.physics.lights.kinds", ("point", "spot", "directional", "constant", "envmap"))
 
 
-def order(name: str) -> tuple[bool, bool, str]:
+def sort_key(name: str) -> tuple[bool, bool, str]:
     """By which the rows of lights are sorted: those somewhere, those infinitely far, the environment last."""
     kind = KINDS[name]
     return kind.environment, kind.distant, name

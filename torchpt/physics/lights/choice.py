@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.threads import sum_all
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import take
 from torchpt.physics.lights import tree
 from torchpt.physics.lights.base import COLUMNS
@@ -18,15 +18,15 @@ from torchpt.physics.lights.surface import emitter
 from torchpt.physics.lights.tree import LightTree
 
 __all__ = [
+    "LIGHT_SAMPLERS",
     "MANY",
-    "WAYS",
     "Bounds",
-    "ByTree",
+    "TreeSampler",
     "bounds_of",
-    "choice_of",
+    "depends_on_point",
     "draw",
     "environment",
-    "local",
+    "light_sampler",
     "probability",
     "without_last",
 ]
@@ -74,13 +74,13 @@ def bounds_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor]) -> Bo
 
 # ---- Which light: by power where there are few, by the light tree where there are many
 #
-# Made with the table (:func:`choice_of`); :func:`draw` gives rows and their probabilities, and :func:`probability` tells the
+# Made with the table (:func:`light_sampler`); :func:`draw` gives rows and their probabilities, and :func:`probability` tells the
 # same to rays that meet a light by chance.
 
 
 #: Ways to choose: all lights alike, by power, by the tree, or by power below MANY lights that lie somewhere, by the tree from
 #: there on.
-WAYS = ("auto", "uniform", "power", "tree")
+LIGHT_SAMPLERS = ("auto", "uniform", "power", "tree")
 MANY = 3
 #: Share of the draws near by that is even among the lights, at most; among K of them EACH / K, and none beyond FEW. The tree
 #: knows of no lobe, and of a glossy surface may draw the wrong light nearly always. At 64 samples a pixel it halves the error
@@ -89,60 +89,62 @@ EVEN, EACH, FEW = 0.25, 2.0, 64
 
 
 @dataclass(frozen=True)
-class ByTree:
+class TreeSampler:
     """A tree over the rows that lie somewhere; beside it those infinitely far, by power."""
 
     tree: LightTree
-    beside: Discrete | None  # over the tree and the rows after its own; None where there are none
-    even: Discrete | None  # over the rows of the tree; None where all draws are the tree's own
+    beside: Distribution1D | None  # over the tree and the rows after its own; None where there are none
+    even: Distribution1D | None  # over the rows of the tree; None where all draws are the tree's own
     share: Tensor  # () float64, of the draws of a row of the tree that are taken from `even`
 
 
-def choice_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: str) -> Discrete | ByTree | None:
+def light_sampler(
+    lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: str
+) -> Distribution1D | TreeSampler | None:
     """How to choose among the rows of a table.
 
     Args:
         lights: the table; its own choice is not read.
         power: of its rows ``(K,)``, float64.
         boxes: lower and upper corners ``(3, E)`` of boxes about the E primitives that emit, which come first.
-        way: from :data:`WAYS`.
+        way: from :data:`LIGHT_SAMPLERS`.
     """
     dtype = lights.area.dtype
     if len(power) == 1:
         return None
     if way in ("uniform", "power") or (way == "auto" and len(power) < MANY):
-        return Discrete.of((power > 0).double() if way == "uniform" else power, dtype)
+        return Distribution1D.of((power > 0).double() if way == "uniform" else power, dtype)
     bounds = bounds_of(lights, power, boxes)
     count = len(bounds.intensity)
     if not count or (way == "auto" and count < MANY):
-        return Discrete.of(power, dtype)
+        return Distribution1D.of(power, dtype)
     beside = None
     if count < len(power):
-        beside = Discrete.of(torch.cat((sum_all(power[:count]).reshape(1), power[count:])), dtype)
+        beside = Distribution1D.of(torch.cat((sum_all(power[:count]).reshape(1), power[count:])), dtype)
     shining = (power[:count] > 0).double()
     few = count <= FEW
     share = min(EVEN, EACH / max(float(shining.sum()), 1.0)) if few else 0.0
     part = torch.tensor(share, dtype=torch.float64, device=power.device)
-    return ByTree(tree.build(*astuple(bounds)), beside, Discrete.of(shining, dtype) if few else None, part)
+    return TreeSampler(tree.build(*astuple(bounds)), beside, Distribution1D.of(shining, dtype) if few else None, part)
 
 
-def local(lights: Lights | None) -> bool:
+def depends_on_point(lights: Lights | None) -> bool:
     """Whether the choice asks where it is made, so that paths must keep that."""
-    return lights is not None and isinstance(lights.choice, ByTree)
+    return lights is not None and isinstance(lights.choice, TreeSampler)
 
 
-def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def draw(choice: Distribution1D | TreeSampler, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Rows ``(N,)``, their probabilities ``(N,)``, and what the choice leaves of ``u``: ``(N,)`` float64 in [0, 1].
 
     The rest is uniform whatever was chosen. Who goes on with it keeps the stratification of light and place together.
 
     Args:
         choice: the choice.
-        u: ``(N,)`` float64 in [0, 1) of 48 bits, see :func:`torchpt.physics.lights.tree.fine`.
+        u: ``(N,)`` float64 in [0, 1) of 48 bits, see :func:`torchpt.physics.lights.tree.from_digits`.
         x: reference points ``(3, N)``.
         n: normals ``(3, N)`` as :func:`torchpt.physics.lights.tree.sample` takes them, or None.
     """
-    if isinstance(choice, Discrete):
+    if isinstance(choice, Distribution1D):
         row, rest = choice.draw(u)
         return row, take(choice.pmf, row), rest
     if choice.beside is None:
@@ -156,7 +158,7 @@ def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> t
     return torch.where(near, row, outcome + (first - 1)), p, rest
 
 
-def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _near(choice: TreeSampler, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """:func:`draw` among the rows of the tree."""
     if choice.even is None:
         return tree.sample(choice.tree, x, n, u)
@@ -168,7 +170,7 @@ def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tenso
     return row, _chance(choice, row, x, n), rest
 
 
-def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
+def _chance(choice: TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """:func:`probability` among the rows of the tree."""
     p = tree.probability(choice.tree, row, x, n)
     if choice.even is None:
@@ -177,9 +179,9 @@ def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     return p * (1.0 - share) + take(choice.even.pmf, row) * share
 
 
-def probability(choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
+def probability(choice: Distribution1D | TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """``(N,)`` with which :func:`draw` gives ``row (N,)`` at ``x, n``."""
-    if isinstance(choice, Discrete):
+    if isinstance(choice, Distribution1D):
         return take(choice.pmf, row)
     if choice.beside is None:
         return _chance(choice, row, x, n)
@@ -188,23 +190,23 @@ def probability(choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | N
     return torch.where(row < first, p, 1.0) * take(choice.beside.pmf, (row - (first - 1)).clamp_min(0))
 
 
-def environment(choice: Discrete | ByTree | None) -> Tensor | float:
+def environment(choice: Distribution1D | TreeSampler | None) -> Tensor | float:
     """The probability of the last row, which is the environment's where there is one."""
     if choice is None:
         return 1.0
-    chosen = choice if isinstance(choice, Discrete) else choice.beside
+    chosen = choice if isinstance(choice, Distribution1D) else choice.beside
     assert chosen is not None
     return chosen.pmf[-1]
 
 
-def without_last(choice: Discrete | ByTree) -> Discrete | ByTree:
+def without_last(choice: Distribution1D | TreeSampler) -> Distribution1D | TreeSampler:
     """The choice among all rows but the last, which is infinitely far and not the only one left."""
-    if isinstance(choice, ByTree):
+    if isinstance(choice, TreeSampler):
         beside = choice.beside
         assert beside is not None  # what is infinitely far is not of the tree
         return replace(choice, beside=None if len(beside.pmf) == 2 else _fewer(beside))
     return _fewer(choice)
 
 
-def _fewer(choice: Discrete) -> Discrete:
-    return Discrete.of(choice.pmf[:-1], choice.pmf.dtype)
+def _fewer(choice: Distribution1D) -> Distribution1D:
+    return Distribution1D.of(choice.pmf[:-1], choice.pmf.dtype)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpt.math.sampling import Discrete
-    from torchpt.physics.lights.choice import ByTree
+    from torchpt.math.sampling import Distribution1D
+    from torchpt.physics.lights.choice import TreeSampler
     from torchpt.physics.shapes.geometry import Interaction, Quadrics
 
 __all__ = ["LightSample", "Lights"]
@@ -17,12 +17,12 @@ __all__ = ["LightSample", "Lights"]
 
 @dataclass(frozen=True)
 class Lights:
-    """The emitters: a row for each emissive primitive, then one for each other light, sorted as ``lights.order`` says.
+    """The emitters: a row for each emissive primitive, then one for each other light, sorted as ``lights.sort_key`` says.
 
     Columns are a primitive's own; what the others put there is said in their files in :mod:`torchpt.physics.lights.kinds`.
     """
 
-    choice: Discrete | ByTree | None  # over the rows; None where there is but one
+    choice: Distribution1D | TreeSampler | None  # over the rows; None where there is but one
     kinds: tuple[str, ...]  # kinds among the rows, in their order: of KINDS, then lights
     kind: Tensor | None  # (K,) index into `kinds`; None where there is but one
     p0: Tensor  # (3, K)

@@ -15,16 +15,16 @@ from torchpt.physics.shapes.geometry import KINDS as PRIMITIVES
 from torchpt.physics.shapes.geometry import Quadrics
 from torchpt.spec import Kinds
 
-__all__ = ["SURFACES", "Faces", "OnSurface", "Surface", "emitter", "flat_inverse_pdf", "flat_point"]
+__all__ = ["SURFACES", "Faces", "Surface", "SurfaceSample", "emitter", "flat_inverse_pdf", "flat_point"]
 
 
 @dataclass(frozen=True)
-class OnSurface:
+class SurfaceSample:
     """Points drawn on surfaces."""
 
     p: Tensor  # (3, N)
     normal: Tensor  # (3, N) unit, of the side that emits
-    place: Tensor | None = None  # (2, N) in the primitive's own parametrization; None where that has none
+    uv: Tensor | None = None  # (2, N) in the primitive's own parametrization; None where that has none
     own: Tensor | None = None  # (3, N) in a quadric's own space
 
 
@@ -64,12 +64,12 @@ class Surface(Emitter):
         name: from :data:`torchpt.physics.shapes.geometry.KINDS`.
         convex: whether it shines to all sides.
         share: area over the length of the cross product of the edges.
-        tabled: whether lanes need columns of :class:`~torchpt.physics.shapes.geometry.Quadrics`.
+        needs_quadrics: whether lanes need columns of :class:`~torchpt.physics.shapes.geometry.Quadrics`.
     """
 
     convex: ClassVar[bool] = False
     share: ClassVar[float] = 1.0
-    tabled: ClassVar[bool] = False
+    needs_quadrics: ClassVar[bool] = False
 
     @classmethod
     def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
@@ -85,7 +85,7 @@ class Surface(Emitter):
         return super().bounds(at, intensity) if cls.convex else Cone(1.0, 0.0, intensity)
 
     @classmethod
-    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
+    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
         """Points seen from ``x (3, N)``, for kinds that :mod:`torchpt.physics.lights.solid_angle` does not draw.
 
         Args:

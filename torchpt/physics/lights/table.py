@@ -15,12 +15,12 @@ from torch import Tensor
 
 from torchpt.math.vectors import dot, safe_reciprocal, take
 from torchpt.physics.lights import choice, solid_angle
-from torchpt.physics.lights.base import COLUMNS, KINDS, Environment, Surroundings, taken
+from torchpt.physics.lights.base import COLUMNS, KINDS, Environment, EnvironmentImage, taken
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.lights.surface import SURFACES, Surface, emitter, flat_inverse_pdf, flat_point
 from torchpt.physics.shapes.geometry import Interaction
 
-__all__ = ["emitted", "environment", "sample", "surroundings", "without_environment"]
+__all__ = ["emitted", "environment", "environment_image", "sample", "without_environment"]
 
 
 def _surfaces(lights: Lights) -> list[tuple[int, type[Surface]]]:
@@ -60,7 +60,7 @@ def sample(
         u: ``(2, N)`` in [0, 1), picks the point.
         offset: how far shadow rays stop off the light's surface, in units of ``Lights.bound``.
         n: normals ``(3, N)`` of surfaces that nothing lights from behind, zero for others; None: no such surface. Asked for
-            where the choice is local, see :func:`torchpt.physics.lights.choice.local`.
+            where the choice is local, see :func:`torchpt.physics.lights.choice.depends_on_point`.
         mis: whether BSDF sampling shares the work: an environment map then leaves it the dim directions.
     """
     row: Tensor | None = None
@@ -105,16 +105,16 @@ def _on_surfaces(
     target: Tensor | None = None
     normal: Tensor | None = None
     inside: Tensor | None = None
-    place, angle, kinds = torch.zeros_like(u), None, _surfaces(lights)
+    uv, angle, kinds = torch.zeros_like(u), None, _surfaces(lights)
     if lights.solid is not None:
-        place, angle = solid_angle.sample(lights.solid, row, x, u, lights.shapes)
-        target, normal = flat_point(at.p0, at.e1, at.e2, place), at.normal.expand_as(x)
+        uv, angle = solid_angle.sample(lights.solid, row, x, u, lights.shapes)
+        target, normal = flat_point(at.p0, at.e1, at.e2, uv), at.normal.expand_as(x)
     for k, kind in kinds:
         if kind.code != solid_angle.OTHER:
             continue
         own = kind.sample(at, x, u)
         target, normal = _pick(number, k, own.p, target), _pick(number, k, own.normal, normal)
-        place = place if own.place is None else _pick(number, k, own.place, place)
+        uv = uv if own.uv is None else _pick(number, k, own.uv, uv)
         inside = inside if own.own is None else own.own
     assert target is not None and normal is not None
     to = target - x
@@ -129,7 +129,7 @@ def _on_surfaces(
         inverse = inverse / probability
     # Where the light is not seen the weight is 0, and the density has no say.
     pdf = safe_reciprocal(inverse.detach())
-    point = None if lights.prim is None else _textured(lights, row, target, normal, place, inside)
+    point = None if lights.prim is None else _textured(lights, row, target, normal, uv, inside)
     target = torch.addcmul(target, normal, bound * offset)
     radiance = at.radiance if at.opacity is None else at.radiance * at.opacity
     return LightSample(wi, target, None, radiance.expand_as(wi), pdf, inverse, point)
@@ -160,12 +160,12 @@ def _inverse_pdf(
 
 
 def _textured(
-    lights: Lights, row: Tensor | None, p: Tensor, normal: Tensor, place: Tensor, own: Tensor | None
+    lights: Lights, row: Tensor | None, p: Tensor, normal: Tensor, uv: Tensor, own: Tensor | None
 ) -> Interaction:
     """The point on the light as textures ask for it."""
     assert lights.prim is not None
     prim = lights.prim.expand(p.shape[1]) if row is None else take(lights.prim, row)
-    return Interaction(p, normal, normal, None, None, prim, prim, None, place[0], place[1], own)
+    return Interaction(p, normal, normal, None, None, prim, prim, None, uv[0], uv[1], own)
 
 
 def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -206,15 +206,15 @@ def _environment(lights: Lights) -> type[Environment]:
 
 def environment(lights: Lights, d: Tensor) -> tuple[Tensor, Tensor]:
     """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them for MIS."""
-    radiance, pdf = _environment(lights).arriving(lights.environment, d, mis=True)
+    radiance, pdf = _environment(lights).radiance_pdf(lights.environment, d, mis=True)
     return radiance, pdf * choice.environment(lights.choice)
 
 
-def surroundings(lights: Lights | None) -> Surroundings | None:
+def environment_image(lights: Lights | None) -> EnvironmentImage | None:
     """The environment as a picture of all directions, differentiable; None where there is none."""
     if lights is None or lights.environment is None:
         return None
-    return _environment(lights).surroundings(lights.environment)
+    return _environment(lights).environment_image(lights.environment)
 
 
 def without_environment(lights: Lights | None) -> Lights | None:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchpt.core.dispatch import dispatched
 
-__all__ = ["FIELDS", "WIDTH", "LightTree", "build", "fine", "probability", "sample"]
+__all__ = ["FIELDS", "WIDTH", "LightTree", "build", "from_digits", "probability", "sample"]
 
 #: Children a node.
 WIDTH = 8
@@ -106,7 +106,7 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
     return LightTree(*parts, count=number, levels=levels)
 
 
-def fine(u: Tensor) -> Tensor:
+def from_digits(u: Tensor) -> Tensor:
     """``(2, N)`` in [0, 1) as ``(N,)`` float64: the second continues the digits of the first.
 
     A sampler's number has 24 bits; a light rarer than that would be drawn never, or too often.
@@ -124,7 +124,7 @@ def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Ten
         x: ``(3, N)``.
         n: unit normals ``(3, N)`` of surfaces that nothing lights from behind; zero where light comes from both sides. None:
             such everywhere.
-        u: ``(N,)`` in [0, 1), float64, see :func:`fine`.
+        u: ``(N,)`` in [0, 1), float64, see :func:`from_digits`.
 
     Returns:
         Rows ``(N,)`` int64, the probabilities ``(N,)`` with which they were drawn, always positive, and what is left of ``u``:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchpt.core.dispatch import dispatched
 from torchpt.math.hashing import as_int32, mix_int
-from torchpt.physics.samplers.base import ADAPTIVE, Numbers, Points
+from torchpt.physics.samplers.base import ADAPTIVE, Points, SamplerTensors
 from torchpt.physics.samplers.dimensions import Dimension, salt
 from torchpt.spec import Kinds
 
@@ -24,10 +24,10 @@ __all__ = [
     "KINDS",
     "Dimension",
     "Draws",
-    "Numbers",
     "Points",
+    "Randomizations",
     "Sampler",
-    "Streams",
+    "SamplerTensors",
     "draw_1d",
     "draw_2d",
     "draw_further",
@@ -52,7 +52,7 @@ def _plain(kind: str) -> Points:
 
 
 @dataclass(frozen=True)
-class Streams:
+class Randomizations:
     """Randomizations that share samples: ``count`` of them from number ``first`` on."""
 
     first: int = 0
@@ -92,17 +92,17 @@ class Sampler:
         return points_of(self.kind)
 
     @property
-    def streams(self) -> Streams:
+    def streams(self) -> Randomizations:
         """Those of the picture."""
-        return Streams(0, self.randomizations)
+        return Randomizations(0, self.randomizations)
 
-    def key(self, pixel: Tensor, sample: Tensor, streams: Streams | None = None) -> Tensor:
+    def key(self, pixel: Tensor, sample: Tensor, streams: Randomizations | None = None) -> Tensor:
         """:meth:`Points.key` for int64 pixel and sample indices ``(N,)``, by the picture's streams or others."""
         streams = streams or self.streams
         group, point = sample % streams.count + streams.first, sample // streams.count
         return self.points.key(self.numbers(pixel.device), pixel, group, point)
 
-    def numbers(self, device: torch.device) -> Numbers:
+    def numbers(self, device: torch.device) -> SamplerTensors:
         """Return what :meth:`Points.key` needs of the sampler."""
         seeds = [
             mix_int(mix_int(mix_int(self.seed) ^ as_int32(self.seed >> 32)) + g)
@@ -111,7 +111,7 @@ class Sampler:
         every, more = divmod(self.spp, self.randomizations)
         most = -(-self.spp // self.randomizations)
         bits = max(most - 1, 0).bit_length()
-        return Numbers(
+        return SamplerTensors(
             torch.tensor(seeds, dtype=torch.int32, device=device),
             *(torch.tensor(n, dtype=torch.int64, device=device) for n in (every, more, bits, self.width)),
         )
@@ -155,7 +155,7 @@ class Draws:
     def two(self, dimension: Dimension) -> Tensor:
         """``(2, N)`` float32 in ``[0, 1)``."""
         if dimension is Dimension.LIGHT and self._points.joint:
-            return draw_further(self._points, self._key, self._salts[int(Dimension.LED_HERE)])
+            return draw_further(self._points, self._key, self._salts[int(Dimension.PREVIOUS_DIRECTION)])
         return draw_2d(self._points, self._key, self._salts[int(dimension)])
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpt.math.hashing import mix
 from torchpt.spec import Flag, Spec
 
-__all__ = ["ADAPTIVE", "Numbers", "Points"]
+__all__ = ["ADAPTIVE", "Points", "SamplerTensors"]
 
 #: Of kinds whose points may be any number, so that pixels may have more or fewer.
 ADAPTIVE: dict[str, Spec] = {
@@ -22,7 +22,7 @@ ADAPTIVE: dict[str, Spec] = {
 
 
 @dataclass(frozen=True)
-class Numbers:
+class SamplerTensors:
     """A sampler under one seed as tensors, so that a kernel made for one serves all of its kind."""
 
     seeds: Tensor  # (R,) int32 of the streams
@@ -56,7 +56,7 @@ class Points(ABC):
     of_film: ClassVar[bool] = False
     joint: ClassVar[bool] = False
 
-    def key(self, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
+    def key(self, numbers: SamplerTensors, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
         """Return what tells a sample from all others, ``(rows, N)`` int32: a pixel's seed, a point's index, how many there are.
 
         The seed is a bijection of the pixel's index for each (seed, stream), so no two pixels share a sequence. The

@@ -20,7 +20,7 @@ class Dimension(IntEnum):
     BSDF = 5  # 2D, direction
     ROULETTE = 6  # 1D
     OPACITY = 7  # 1D, whether a surface is met
-    LED_HERE = 8  # no number of its own: by which the vertex was reached, BSDF of the one before or PIXEL
+    PREVIOUS_DIRECTION = 8  # no number of its own: by which the vertex was reached, BSDF of the one before or PIXEL
     DISTANCE = 9  # 1D, how far a ray comes in what lies between surfaces
     PHASE = 10  # 2D, where that scatters it to
     EDGE = 11  # 2D, which edge of the scene and the place on it; which of its two lines where it has two
@@ -43,6 +43,6 @@ def salt(dimension: Dimension, depth: int, step: int = 0) -> int:
         depth: of the path vertex; 0 is the camera.
         step: of the ray on its way to the vertex, through what lets rays pass.
     """
-    if dimension is Dimension.LED_HERE:
+    if dimension is Dimension.PREVIOUS_DIRECTION:
         dimension, depth = (Dimension.BSDF, depth - 1) if depth > 1 else (Dimension.PIXEL, 0)
     return mix_int(0x9E3779B9 * (1 + (depth + step * STEPS) * STREAMS + int(dimension)))

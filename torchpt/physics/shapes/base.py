@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchpt import spec
 from torchpt.math.transforms import affine, constant, tensor_of
-from torchpt.spec import Color, Flag, Other, Pose, Refused, Spec
+from torchpt.spec import Color, Custom, Flag, Pose, Refused, Spec
 
 __all__ = ["BOTTOM", "TOP", "UPRIGHT", "Place", "Shape", "Size", "Surface", "Triangles", "placed"]
 
@@ -27,14 +27,14 @@ Matrix = NDArray[np.float64]
 class Size(spec.Scalar):
     """A length of a shape before its transform: part of its ``to_world``, no tensor of its own."""
 
-    traced: ClassVar[bool] = False
+    differentiable: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
 class Place(spec.Point):
     """A point of a shape before its transform: part of its ``to_world``, no tensor of its own."""
 
-    traced: ClassVar[bool] = False
+    differentiable: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Shape:
 
     name: ClassVar[str] = ""
     parameters: ClassVar[Mapping[str, Spec]] = {
-        "material": Other(
+        "material": Custom(
             None,
             reader=_material,
             words="the name of a material, or a material",

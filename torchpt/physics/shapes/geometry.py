@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from torchpt.physics.shapes.primitive import Primitive
     from torchpt.physics.shapes.quadrics import Quadric
 
-__all__ = ["KINDS", "Copies", "Geometry", "Hit", "Interaction", "LaneGeometry", "QuadricTable", "Quadrics"]
+__all__ = ["KINDS", "Geometry", "Hit", "Instances", "Interaction", "LaneGeometry", "QuadricTable", "Quadrics"]
 
 
 #: Primitive kinds in the order in which a :class:`Geometry` stores them; each is a file in ``physics/shapes/primitives/``.
@@ -75,7 +75,7 @@ class Quadrics:
 
 
 @dataclass(frozen=True)
-class Copies:
+class Instances:
     """Instances of meshes: column 0 is the identity, that of all that is no copy; column k belongs to copy k - 1.
 
     What is kept by primitive splits in two: its place on a mesh, looked up by :attr:`Interaction.prim`, and what a copy has of
@@ -95,7 +95,7 @@ class Copies:
 
 @dataclass(frozen=True)
 class LaneGeometry:
-    """Places of surfaces, as the lanes gather them: P primitives, and I copies (see :class:`Copies`)."""
+    """Places of surfaces, as the lanes gather them: P primitives, and I copies (see :class:`Instances`)."""
 
     kinds: tuple[type[Primitive], ...]  # those that there are, in the order of KINDS; static
     counts: tuple[int, int, int, int, int]  # as in Geometry; static: lanes read `ends`
@@ -117,7 +117,7 @@ class LaneGeometry:
     colors: tuple[Tensor, Tensor, Tensor] | None  # (3, P) at the corners, where vertex colours are read
     object_id: Tensor  # (P + I,) int64, order of the shape in the scene
     quadrics: Quadrics | None = None  # None where there are none
-    copies: Copies | None = None  # None where there are no instances
+    copies: Instances | None = None  # None where there are no instances
 
     def slot(self, prim: Tensor) -> Tensor:
         """Rows ``(N,)`` of what copies have of their own, for ids of primitives as the search gives them; -1 stays."""

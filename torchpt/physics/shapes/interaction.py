@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import affine, cross, dot, largest, normalize, take
 from torchpt.physics.shapes.geometry import Hit, Interaction
-from torchpt.physics.shapes.primitive import Place, Primitive, Rays, place_of
+from torchpt.physics.shapes.primitive import LanePrimitives, Primitive, Rays, lane_primitives
 from torchpt.physics.world import World
 
 __all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
@@ -29,7 +29,7 @@ OFFSET = 2.0**-19
 NEAR = 2.0**-15
 
 
-def _slide(o: Tensor, d: Tensor, p0: Tensor, e1: Tensor, e2: Tensor) -> tuple[Tensor, Tensor]:
+def _plane_uv(o: Tensor, d: Tensor, p0: Tensor, e1: Tensor, e2: Tensor) -> tuple[Tensor, Tensor]:
     """``u, v`` of the ray with the primitive's plane (Moeller and Trumbore, 1997), differentiable in all arguments."""
     pvec = cross(d, e2)
     det = dot(e1, pvec)
@@ -53,11 +53,11 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_shape: bool = 
         hit: from the search.
         follow_shape: re-intersect the ray with the plane, so that the point follows ``o``, ``d`` and the geometry.
     """
-    geometry, place = world.geometry, place_of(world, hit.prim)
+    geometry, place = world.geometry, lane_primitives(world, hit.prim)
     prim, p0, e1, e2, u, v = place.prim, place.p0, place.e1, place.e2, hit.u, hit.v
     round_ = _round(world, prim)
     if follow_shape:
-        u, v = _slide(o, d, p0, e1, e2)
+        u, v = _plane_uv(o, d, p0, e1, e2)
     for _, mine in round_:
         u, v = torch.where(mine, 0.0, u), torch.where(mine, 0.0, v)
     p = affine(p0, e1, u, e2, v)
@@ -66,7 +66,7 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_shape: bool = 
     if place.copied is not None and place.reach is not None:
         bound = torch.where(place.copied, dot(ng.detach().abs(), place.reach), take(geometry.bound, prim))
     for kind, mine in round_:
-        met = kind.meet(world, place, Rays(o, d, hit, follow_shape), mine)
+        met = kind.hit_points(world, place, Rays(o, d, hit, follow_shape), mine)
         p, ng = torch.where(mine, met.p, p), torch.where(mine, met.ng, ng)
         if met.bound is not None:
             bound = torch.where(mine, met.bound, take(geometry.bound, prim) if bound is None else bound)
@@ -82,7 +82,7 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_shape: bool = 
     return _framed(world, place, Interaction(p, ng, ns, None, None, prim, geometry.slot(hit.prim), bound, u, v, own))
 
 
-def _framed(world: World, place: Place, at: Interaction) -> Interaction:
+def _framed(world: World, place: LanePrimitives, at: Interaction) -> Interaction:
     """Points with how they move with their texture coordinates, where anything asks."""
     geometry = world.geometry
     if geometry.tangents is None:
@@ -90,7 +90,7 @@ def _framed(world: World, place: Place, at: Interaction) -> Interaction:
     tangent = take(geometry.tangents, at.prim)
     bitangent = None if geometry.bitangents is None else take(geometry.bitangents, at.prim)
     at = replace(at, tangent=tangent, bitangent=bitangent)
-    for kind in (kind for kind in geometry.kinds if kind.charted):
+    for kind in (kind for kind in geometry.kinds if kind.has_own_uv):
         mine = geometry.of(kind, at.prim)
         along_u, along_v = kind.tangents(world, place, at, mine)
         tangent = torch.where(mine, along_u, tangent)
@@ -116,14 +116,14 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
         solid angle to the surface, ``|cos| dA / r^2``.
     """
     missed = hit.prim < 0
-    place = place_of(world, hit.prim.clamp_min(0))
+    place = lane_primitives(world, hit.prim.clamp_min(0))
     y = affine(place.p0, place.e1, hit.u, place.e2, hit.v)
     area = cross(place.e1, place.e2)
     round_ = _round(world, place.prim)
     if round_:
         rays = Rays(x, wi, replace(hit, t=torch.where(missed, 0.0, hit.t)))
         for kind, mine in round_:
-            held = kind.hold(world, place, rays, mine)
+            held = kind.fixed_points(world, place, rays, mine)
             y, area = torch.where(mine, held.p, y), torch.where(mine, held.area, area)
     offset = torch.where(missed, wi, y - x)
     square = dot(offset, offset)

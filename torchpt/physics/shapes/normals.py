@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.core.threads import in_pieces
+from torchpt.core.threads import map_in_pieces
 from torchpt.math.vectors import cross, dot, normalize
 
 __all__ = ["smooth_normals"]
@@ -31,6 +31,6 @@ def smooth_normals(vertices: Tensor, faces: Tensor, least: float = 0.0) -> Tenso
     for k in range(3):
         a = normalize(corner[(k + 1) % 3] - corner[k])
         b = normalize(corner[(k + 2) % 3] - corner[k])
-        angle = 2.0 * in_pieces(torch.atan2, _length(a - b), _length(a + b))
+        angle = 2.0 * map_in_pieces(torch.atan2, _length(a - b), _length(a + b))
         total = total.index_add(1, faces[:, k], normal * angle)
     return normalize(total if least == 0.0 else torch.where(_length(total) > least, total, 0.0))

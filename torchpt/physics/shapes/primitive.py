@@ -10,14 +10,23 @@ import torch
 from torch import Tensor
 
 from torchpt.math.vectors import affine, normalize, rows, take
-from torchpt.physics.shapes.geometry import KINDS, Copies, Hit, Interaction
+from torchpt.physics.shapes.geometry import KINDS, Hit, Instances, Interaction
 from torchpt.physics.world import World
 from torchpt.spec import Kinds
 
 if TYPE_CHECKING:
     from torchpt.physics.parts import Part
 
-__all__ = ["PRIMITIVES", "Corners", "Held", "Met", "Place", "Primitive", "Rays", "place_of"]
+__all__ = [
+    "PRIMITIVES",
+    "Corners",
+    "FixedPoints",
+    "HitPoints",
+    "LanePrimitives",
+    "Primitive",
+    "Rays",
+    "lane_primitives",
+]
 
 Triple = tuple[Tensor, Tensor, Tensor]
 
@@ -45,14 +54,14 @@ class Corners:
 
 
 @dataclass(frozen=True)
-class Place:
+class LanePrimitives:
     """Where primitives lie: what interactions need of them before a point is chosen."""
 
     prim: Tensor  # (N,) below P
     p0: Tensor  # (3, N)
     e1: Tensor  # (3, N)
     e2: Tensor  # (3, N)
-    copies: Copies | None = None  # columns (., N) where the scene has copies
+    copies: Instances | None = None  # columns (., N) where the scene has copies
     copied: Tensor | None = None  # (N,) bool: which are copies
     reach: Tensor | None = None  # (3, N) coordinate magnitudes that enter a point's sum, where the scene has copies
 
@@ -68,15 +77,15 @@ class Place:
         return torch.where(self.copied, normalize(turned), n)
 
 
-def _linear(copies: Copies, w: Tensor) -> Tensor:
+def _linear(copies: Instances, w: Tensor) -> Tensor:
     return affine(copies.x * w[0], copies.y, w[1], copies.z, w[2])
 
 
-def place_of(world: World, prim: Tensor) -> Place:
+def lane_primitives(world: World, prim: Tensor) -> LanePrimitives:
     """Places of primitives by ids as the search gives them, none of them a miss."""
     geometry = world.geometry
     if geometry.copies is None:
-        return Place(prim, take(geometry.p0, prim), take(geometry.e1, prim), take(geometry.e2, prim))
+        return LanePrimitives(prim, take(geometry.p0, prim), take(geometry.e1, prim), take(geometry.e2, prim))
     column = geometry.copy(prim)
     table = rows(geometry.copies, column)
     prim = prim - table.start + table.first
@@ -84,7 +93,7 @@ def place_of(world: World, prim: Tensor) -> Place:
     size = (p0.abs() + e1.abs() + e2.abs()).detach()
     reach = affine(table.x.abs() * size[0], table.y.abs(), size[1], table.z.abs(), size[2]) + table.move.abs()
     p0, e1, e2 = _linear(table, p0) + table.move, _linear(table, e1), _linear(table, e2)
-    return Place(prim, p0, e1, e2, table, column > 0, reach.detach())
+    return LanePrimitives(prim, p0, e1, e2, table, column > 0, reach.detach())
 
 
 @dataclass(frozen=True)
@@ -105,7 +114,7 @@ class Rays:
 
 
 @dataclass(frozen=True)
-class Met:
+class HitPoints:
     """Points of surfaces that are not flat; lanes of other kinds hold anything.
 
     Attributes:
@@ -122,7 +131,7 @@ class Met:
 
 
 @dataclass(frozen=True)
-class Held:
+class FixedPoints:
     """Points that stay where they are on their surfaces."""
 
     p: Tensor  # (3, N)
@@ -137,13 +146,13 @@ class Primitive:
     Attributes:
         name: one of :data:`torchpt.physics.shapes.geometry.KINDS`.
         flat: whether its point is that of its plane; those that are come first.
-        charted: whether its texture coordinates are not affine: then :meth:`tangents` and :meth:`uv` say them.
+        has_own_uv: whether its texture coordinates are not affine: then :meth:`tangents` and :meth:`uv` say them.
         angles: whether it stays what it is under maps that keep angles alone.
     """
 
     name: ClassVar[str] = ""
     flat: ClassVar[bool] = True
-    charted: ClassVar[bool] = False
+    has_own_uv: ClassVar[bool] = False
     angles: ClassVar[bool] = False
 
     # -- when a scene is assembled
@@ -187,17 +196,19 @@ class Primitive:
     # -- on lanes; what is given back where a lane is of another kind means nothing
 
     @classmethod
-    def meet(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Met:
+    def hit_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> HitPoints:
         """Points of hits; not of flat kinds. ``mine (N,)``: which lanes are of this kind."""
         raise NotImplementedError
 
     @classmethod
-    def hold(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Held:
+    def fixed_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> FixedPoints:
         """Points that stay on their surface where rays met it, as these and the surface move; not of flat kinds."""
         raise NotImplementedError
 
     @classmethod
-    def tangents(cls, world: World, place: Place, at: Interaction, mine: Tensor) -> tuple[Tensor, Tensor | None]:
+    def tangents(
+        cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
         """How points move with their texture coordinates, ``(3, N)`` each, the second where ``at`` has one; of charted kinds.
 
         Args:

@@ -258,13 +258,13 @@ def follow_shape(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, 
 
     f, e = own(o - p0), own(d)
     at = f + e * t.detach()
-    value = _each(table, (_excess(kind.form, at) for kind in table.kinds))
+    value = _each(table, (_residual(kind.form, at) for kind in table.kinds))
     slope = _each(table, (_slope(kind.form, at, e) for kind in table.kinds)).detach()
     moved = at - e.detach() * (value / torch.where(slope == 0, 1.0, slope))
     return moved if q.dtype == torch.float64 else q + (moved - moved.detach())
 
 
-def _excess(form: Form, q: Tensor) -> Tensor:
+def _residual(form: Form, q: Tensor) -> Tensor:
     """By how much points ``(3, N)`` are off the equation of a surface: ``(N,)``."""
     value = q[0] * q[0] + q[1] * q[1]
     if form.bend or form.half:
@@ -275,7 +275,7 @@ def _excess(form: Form, q: Tensor) -> Tensor:
 
 
 def _slope(form: Form, q: Tensor, e: Tensor) -> Tensor:
-    """How :func:`_excess` grows along ``e (3, N)``: ``(N,)``."""
+    """How :func:`_residual` grows along ``e (3, N)``: ``(N,)``."""
     half = q[0] * e[0] + q[1] * e[1]
     if form.bend or form.half:
         w = q[2] - form.shift if form.shift else q[2]

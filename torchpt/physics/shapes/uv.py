@@ -23,7 +23,7 @@ def surface_uv(world: World, at: Interaction) -> Tensor:
     a, b, c = (take(x, at.prim) for x in geometry.uvs)
     uv = torch.addcmul(torch.addcmul(a * (1.0 - at.u - at.v), b, at.u), c, at.v)
     for kind in geometry.kinds:
-        own = kind.uv(world, at) if kind.charted else None
+        own = kind.uv(world, at) if kind.has_own_uv else None
         if own is not None:
             uv = torch.where(geometry.of(kind, at.prim), own, uv)
     return uv

@@ -19,8 +19,8 @@ from torchpt.physics.textures.base import (
 from torchpt.physics.textures.bindings import (
     MaterialTextures,
     NodeMap,
+    NodePosition,
     OpacityMaps,
-    Place,
     TextureBinding,
     tables_of,
 )
@@ -33,9 +33,9 @@ __all__ = [
     "Named",
     "Node",
     "NodeMap",
+    "NodePosition",
     "OpacityMaps",
     "Opening",
-    "Place",
     "Table",
     "Texture",
     "TextureBinding",

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from torchpt.core.threads import mean_all
 from torchpt.math.vectors import luminance, take
-from torchpt.physics.textures.base import SAME, Matrix, Node, Table, TexturePoint, moved
+from torchpt.physics.textures.base import SAME, Matrix, Node, Table, TexturePoint, transform_uv
 
-__all__ = ["WRAPS", "Atlas", "ImageNode", "Pyramids", "atlas_of", "look_up", "slope"]
+__all__ = ["WRAPS", "Atlas", "ImageNode", "Mipmaps", "atlas_of", "look_up", "slope"]
 
 #: How an image goes on beyond its edges, in the order of the codes in :class:`Atlas`.
 WRAPS = ("repeat", "clamp", "mirror")
@@ -82,7 +82,7 @@ class ImageNode(Node):
 
 
 @dataclass(frozen=True)
-class Pyramids:
+class Mipmaps:
     """Which nodes read an image in smaller sizes; those sizes are nodes after the given ones, from large to small.
 
     Attributes:
@@ -106,7 +106,7 @@ class Atlas(Table):
         maps: ``(9, M)``: transform of the coordinates by rows, scale.
         wraps: the ways of wrapping in use; static.
         scaled: whether any node scales; static.
-        moved: whether any node transforms its coordinates; static.
+        transform_uv: whether any node transforms its coordinates; static.
         pyramids: of nodes that filter; None where none does.
     """
 
@@ -115,8 +115,8 @@ class Atlas(Table):
     maps: Tensor
     wraps: tuple[str, ...]
     scaled: bool
-    moved: bool
-    pyramids: Pyramids | None = None
+    transform_uv: bool
+    pyramids: Mipmaps | None = None
 
     @property
     def count(self) -> int:
@@ -171,7 +171,7 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
     pyramids = None
     if filtered:
         counts = torch.tensor([len(sizes) for sizes in smaller], dtype=torch.int64)
-        pyramids = Pyramids(
+        pyramids = Mipmaps(
             (len(nodes) - 1 + torch.cumsum(counts, 0) - counts).to(device),
             counts.to(device=device, dtype=dtype),
             torch.tensor(
@@ -284,12 +284,12 @@ def _slope(atlas: Atlas, node: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     along = (left + (right - left) * c.x) * (c.height * c.blend)
     if atlas.scaled:
         across, along = across * c.maps[6], along * c.maps[6]
-    if not atlas.moved:
+    if not atlas.transform_uv:
         return across, along
     return across * c.maps[0] + along * c.maps[3], across * c.maps[1] + along * c.maps[4]
 
 
-def _sizes(pyramids: Pyramids, node: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _sizes(pyramids: Mipmaps, node: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The two sizes of images between which footprints lie, as nodes, and how far between them: 0 up to one texel."""
     texels = take(pyramids.density, node) * footprint
     top = take(pyramids.top, node)
@@ -305,7 +305,7 @@ def _sizes(pyramids: Pyramids, node: Tensor, footprint: Tensor) -> tuple[Tensor,
 def _corners(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool) -> _Corners:
     place, maps = take(atlas.places, node), take(atlas.maps, node)
     first, stride, width, height, wrap, linear = (place[k] for k in range(6))
-    u, v = moved(maps, uv) if atlas.moved else (uv[0], uv[1])
+    u, v = transform_uv(maps, uv) if atlas.transform_uv else (uv[0], uv[1])
     blend = linear.to(uv.dtype)
     wide, tall = width.to(uv.dtype), height.to(uv.dtype)
     x = (u * wide - 0.5 * blend).clamp(-_FAR, _FAR)

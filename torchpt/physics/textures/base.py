@@ -17,16 +17,16 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError
 from torchpt.math.transforms import uv_matrix
-from torchpt.spec import Angle, Color, Moves, Other, Pair, Refused, Spec, parameters_of
-from torchpt.spec.reading import LARGEST, within
-from torchpt.spec.schema import ParsedParams, values_of
+from torchpt.spec import Angle, Color, Custom, Moves, Pair, Refused, Spec, parameters_of
+from torchpt.spec.reading import LARGEST, as_refused
+from torchpt.spec.schema import ParsedParams, read_params
 
 if TYPE_CHECKING:
     from torchpt.physics.parts import Parameters
 
 __all__ = [
     "CHANNELS", "SAME", "Mapped", "Matrix", "Named", "Node", "Opening", "Table", "Texture", "TextureInput", "TexturePoint",
-    "UvTransform", "moved",
+    "UvTransform", "transform_uv",
 ]  # fmt: skip
 
 #: What a number may be read from.
@@ -204,7 +204,7 @@ class Opening:
             SceneError: a colour that the slot does not accept.
         """
         for key, spec in parameters_of(kind).items():
-            if not spec.traced or values[key] is None:
+            if not spec.differentiable or values[key] is None:
                 continue
             name = f"{self.name}.{key}"
             if isinstance(spec, Color):
@@ -276,7 +276,7 @@ class Texture:
         """
 
     @classmethod
-    def film_space_applies(cls, values: Mapping[str, Any], coloured: bool) -> None:
+    def check_slot(cls, values: Mapping[str, Any], coloured: bool) -> None:
         """Refuse what a slot of a colour, or of a number, cannot read of a texture that is written in it.
 
         Raises:
@@ -322,16 +322,16 @@ def _uv_transform(value: Any) -> UvTransform:
     if not isinstance(value, Mapping):
         raise Refused("a mapping with scale, rotate, translate")
     try:
-        return UvTransform(**values_of(UvTransform, value, "", None, "uv_transform").values)
+        return UvTransform(**read_params(UvTransform, value, "", None, "uv_transform").values)
     except SceneError as error:
-        raise within(error) from None
+        raise as_refused(error) from None
 
 
 class Mapped(Texture):
     """A texture that is read by texture coordinates."""
 
     parameters: ClassVar = {
-        "uv_transform": Other(
+        "uv_transform": Custom(
             None,
             reader=_uv_transform,
             words="a mapping with scale, rotate, translate",
@@ -346,7 +346,7 @@ class Mapped(Texture):
         return (values["uv_transform"] or UvTransform()).matrix(repeats)
 
 
-def moved(maps: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+def transform_uv(maps: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Coordinates ``(N,)`` under affine maps: rows of ``maps (6 or more, N)`` are those of the transform."""
     u, v = uv[0], uv[1]
     return (

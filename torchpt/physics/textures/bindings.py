@@ -11,10 +11,10 @@ from torch import Tensor
 
 from torchpt.physics.textures.base import Node, Table
 
-__all__ = ["MaterialTextures", "NodeMap", "OpacityMaps", "Place", "TextureBinding", "tables_of"]
+__all__ = ["MaterialTextures", "NodeMap", "NodePosition", "OpacityMaps", "TextureBinding", "tables_of"]
 
 
-class Place(NamedTuple):
+class NodePosition(NamedTuple):
     """Where a node lies: which table, and which of its rows."""
 
     table: int
@@ -91,12 +91,12 @@ class OpacityMaps(NodeMap):
 
 def tables_of(
     nodes: Iterable[Node], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
-) -> tuple[tuple[Table, ...], dict[Node, Place]]:
+) -> tuple[tuple[Table, ...], dict[Node, NodePosition]]:
     """The tables of nodes, and where in them each lies; differentiable in the parameters."""
     groups: dict[Hashable, list[Node]] = {}
-    places: dict[Node, Place] = {}
+    places: dict[Node, NodePosition] = {}
     for node in dict.fromkeys(nodes):
         group = groups.setdefault(node.variant, [])
-        places[node] = Place(list(groups).index(node.variant), len(group))
+        places[node] = NodePosition(list(groups).index(node.variant), len(group))
         group.append(node)
     return tuple(group[0].table(group, parameters, dtype, device) for group in groups.values()), places

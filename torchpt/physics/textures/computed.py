@@ -23,7 +23,7 @@ from torchpt.physics.textures.base import (
     Opening,
     Table,
     TexturePoint,
-    moved,
+    transform_uv,
 )
 from torchpt.spec import Color, parameters_of
 
@@ -119,7 +119,7 @@ class ComputedNode(Node):
         """Its parameters ``()`` or ``(3,)`` by name, in float64; of a number's node colours as three times the channel."""
         found = {}
         for key, spec in parameters_of(type(self.texture)).items():
-            value = parameters.get(f"{self.name}.{key}") if spec.traced else None
+            value = parameters.get(f"{self.name}.{key}") if spec.differentiable else None
             if value is not None:
                 value = value.double()
                 if isinstance(spec, Color) and self.channel is not None:
@@ -197,7 +197,7 @@ class ComputedTable(Table):
         }
         x, y = point.uv[0], point.uv[1]
         if self.transform is not None:
-            x, y = moved(take(self.transform, nodes), point.uv)
+            x, y = transform_uv(take(self.transform, nodes), point.uv)
         area = None
         if self.areas is not None and point.footprint is not None:
             area = take(self.areas, nodes) * point.footprint.clamp_max(_WIDE)

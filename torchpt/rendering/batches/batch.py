@@ -12,20 +12,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import in_transform
+from torchpt.core.autograd import is_transformed
 from torchpt.core.errors import SceneError
 from torchpt.core.memory import check_limit, mb
-from torchpt.core.threads import lasting, limited_threads
+from torchpt.core.threads import limited_threads, outside_inference_mode
 from torchpt.engines.engine import TASKS
 from torchpt.paths.wave import Wave
-from torchpt.rendering import Entry, Rendering, Run, render_many
+from torchpt.rendering import QueuedRender, Rendering, Run, render_many
 from torchpt.rendering.batches.inputs import Cameras, Seeds, cameras_of, named, params_of, scenes_of, seeds_of
-from torchpt.rendering.requests import RenderRequest, ordered, rendered
+from torchpt.rendering.requests import RenderRequest, execute_request, prepare_request
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import Common, RenderOptions
+from torchpt.scene.settings import BatchOptions, RenderOptions
 from torchpt.scene.versions import check_unchanged
-from torchpt.spec.arguments import check_names, spelled
+from torchpt.spec.arguments import check_names, expand_signature
 
 __all__ = ["Renderings", "render_batch"]
 
@@ -64,7 +64,7 @@ class _Picture:
     scene: int
     camera: int
     name: str
-    order: RenderRequest
+    request: RenderRequest
 
 
 Pictures = Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]] | None
@@ -73,14 +73,14 @@ Pictures = Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]] | None
 @overload
 def render_batch(
     scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: Pictures = None, *, seed: Seeds = None,
-    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[False] = False, **wishes: Unpack[Common],
+    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[False] = False, **options: Unpack[BatchOptions],
 ) -> Tensor: ...  # fmt: skip
 @overload
 def render_batch(
     scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: Pictures = None, *, seed: Seeds = None,
-    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[True], **wishes: Unpack[Common],
+    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[True], **options: Unpack[BatchOptions],
 ) -> Renderings: ...  # fmt: skip
-@spelled
+@expand_signature
 def render_batch(
     scenes: Scene | Iterable[Scene],
     cameras: Cameras = None,
@@ -89,7 +89,7 @@ def render_batch(
     seed: Seeds = None,
     on_progress: Callable[[int, int | None], None] | None = None,
     full: bool = False,
-    **wishes: Unpack[Common],
+    **options: Unpack[BatchOptions],
 ) -> Tensor | Renderings:
     """Render S scenes by C cameras to linear RGB ``(S, C, H, W, 3)``; differentiable in ``params`` and poses.
 
@@ -109,7 +109,7 @@ def render_batch(
         seed: one for all pictures (by default the scenes' own), or a sequence of S of them or of S sequences of C.
         on_progress: called after each picture with how many are done, and of how many (None: scenes came from an iterator).
         full: True returns a :class:`Renderings`: pictures, layers, and each picture's own facts.
-        wishes: all other arguments of :func:`torchpt.render`, the same for all pictures. ``checkpoint`` is not taken;
+        options: all other arguments of :func:`torchpt.render`, the same for all pictures. ``checkpoint`` is not taken;
             ``max_memory`` holds for the batch, the pictures included.
 
     Raises:
@@ -117,11 +117,11 @@ def render_batch(
         RenderError: as :func:`torchpt.render`.
         TypeError: an argument that ``render`` does not know.
     """
-    check_names("render_batch", wishes, RenderOptions, ("cameras", "on_progress"))
+    check_names("render_batch", options, RenderOptions, ("cameras", "on_progress"))
     if on_progress is not None and not callable(on_progress):
         raise SceneError("on_progress", on_progress, "a function")
     scenes = scenes_of(scenes)
-    checkpoint = wishes.get("checkpoint")
+    checkpoint = options.get("checkpoint")
     if checkpoint is not None:
         raise SceneError("render.checkpoint", checkpoint, "null for a batch")
     sets = params_of(params, scenes)
@@ -129,15 +129,15 @@ def render_batch(
     size = len(sets or [None]) if isinstance(scenes, Scene) else len(scenes) if isinstance(scenes, Sequence) else None
     seeds = seeds_of(seed, size, len(views))
     several = isinstance(scenes, Scene)
-    pictures = _pictures(repeat(scenes, size or 1) if several else scenes, several, views, sets, seeds, full, wishes)
+    pictures = _pictures(repeat(scenes, size or 1) if several else scenes, several, views, sets, seeds, full, options)
     first = next(pictures, None)
     if first is None:
         raise SceneError("scenes", 0, "one scene at least")
     total = None if size is None else size * len(views)
     found: dict[tuple[int, int], tuple[RenderRequest | None, Rendering]] = {}
-    with limited_threads(first.order.settings.render.threads):
+    with limited_threads(first.request.settings.render.threads):
         tasks = 1 if total is None else -(-TASKS * torch.get_num_threads() // total)
-        _check_memory(first.order, total)
+        _check_memory(first.request, total)
         render_many(_entries(chain([first], pictures), found, on_progress, total), tasks)
     count = 1 + max(s for s, _ in found)
     for key, given in (("params", sets), ("seed", seed)):
@@ -154,14 +154,14 @@ def render_batch(
 
 
 def _stacked(rows: list[list[Tensor]]) -> Tensor:
-    with lasting():
+    with outside_inference_mode():
         return torch.stack([torch.stack(row) for row in rows])
 
 
 def _taped(found: tuple[RenderRequest | None, Rendering]) -> Rendering:
     """A rendering on the tape that its parameters are on; without an order there is none."""
-    order, rendering = found
-    return rendering if order is None else rendered(order, [rendering])
+    request, rendering = found
+    return rendering if request is None else execute_request(request, [rendering])
 
 
 def _pictures(
@@ -171,7 +171,7 @@ def _pictures(
     sets: Sequence[Mapping[str, Tensor]] | None,
     seeds: Any,
     full: bool,
-    wishes: Common,
+    options: BatchOptions,
 ) -> Iterator[_Picture]:
     """Return the orders, picture by picture, those of a scene together; ``several``: scenes are one under other parameters."""
     like: dict[str, Any] = {}
@@ -187,15 +187,15 @@ def _pictures(
         for c, camera in enumerate(cameras):
             name = ("" if sets is None else f"params[{s}]") if several else f"scenes[{s}]"
             with named(name, c if camera is not None else None):
-                order = _ordered(scene, camera, {} if sets is None else sets[s], seeds(s, c), full, wishes)
-                film = order.settings.film
+                request = _ordered(scene, camera, {} if sets is None else sets[s], seeds(s, c), full, options)
+                film = request.settings.film
                 _, _, *size = film.crop or (0, 0, film.width, film.height)
                 asked = {"width": size} | ({"aovs": list(film.aovs), "denoise": film.denoise} if full else {})
                 like = like or asked
                 for key, value in asked.items():
                     if value != like[key]:
                         raise SceneError(f"film.{key}", value, f"{like[key]}, as of the first picture")
-            yield _Picture(s, c, name, order)
+            yield _Picture(s, c, name, request)
 
 
 def _ordered(
@@ -204,7 +204,7 @@ def _ordered(
     params: Mapping[str, Tensor],
     seed: int | None,
     full: bool,
-    wishes: Common,
+    options: BatchOptions,
 ) -> RenderRequest:
     """Return the order of one picture."""
     if isinstance(camera, Tensor):
@@ -212,14 +212,14 @@ def _ordered(
             raise SceneError("params.camera.to_world", "a pose", "none where cameras are poses")
         params = {**params, "camera.to_world": camera}
     elif camera is not None:
-        scene = scene.seen_by(camera, wishes.get("film"))
-    order = ordered(scene, full, params=params, seed=seed, **wishes)
-    if any(map(in_transform, order.params.values())):
+        scene = scene.seen_by(camera, options.get("film"))
+    request = prepare_request(scene, full, params=params, seed=seed, **options)
+    if any(map(is_transformed, request.params.values())):
         raise SceneError(
             "params", "tensors under a transform of torch.func", "plain ones: transforms go through render"
         )
-    order.scene.check(order.params)
-    return order.noted()
+    request.scene.check(request.params)
+    return request.with_versions()
 
 
 def _entries(
@@ -227,25 +227,25 @@ def _entries(
     found: dict[tuple[int, int], tuple[RenderRequest | None, Rendering]],
     on_progress: Callable[[int, int | None], None] | None,
     total: int | None,
-) -> Iterator[Entry]:
+) -> Iterator[QueuedRender]:
     """Renders of pictures; what they come to is put into ``found``."""
     latest: list[tuple[int, Wave]] = []  # of the scene that is being rendered
 
-    def entry(picture: _Picture) -> Entry:
-        order, place = picture.order, (picture.scene, picture.camera)
-        taped = order.taped  # before gradients are off
+    def entry(picture: _Picture) -> QueuedRender:
+        request, place = picture.request, (picture.scene, picture.camera)
+        needs_gradients = request.needs_gradients  # before gradients are off
 
         def make(threads: int) -> Run:
             like = next((wave for scene, wave in latest if scene == picture.scene), None)
-            plain = {name: value.detach() for name, value in order.params.items()}
-            run = Run(order.scene, order.settings, plain, order.call.dtype, order.call.ranks, like, threads)
+            plain = {name: value.detach() for name, value in request.params.items()}
+            run = Run(request.scene, request.settings, plain, request.call.dtype, request.call.ranks, like, threads)
             latest[:] = [(picture.scene, run.wave)]
             return run
 
         def done(rendering: Rendering) -> None:
-            order.check_unchanged("while the batch has it")
+            request.check_unchanged("while the batch has it")
             # An order holds its scene, of which there may be many.
-            found[place] = (order, rendering) if taped else (None, rendered(order, [rendering]))
+            found[place] = (request, rendering) if needs_gradients else (None, execute_request(request, [rendering]))
             if on_progress is not None:
                 on_progress(len(found), total)
 
@@ -253,16 +253,16 @@ def _entries(
             with named(picture.name, None):
                 raise error
 
-        return Entry(order.scene.device, make, done, failed)
+        return QueuedRender(request.scene.device, make, done, failed)
 
     return map(entry, pictures)
 
 
-def _check_memory(order: RenderRequest, total: int | None) -> None:
+def _check_memory(request: RenderRequest, total: int | None) -> None:
     """Refuse a bound that the pictures of a batch alone would break."""
-    limit, film = order.settings.render.max_memory, order.settings.film
+    limit, film = request.settings.render.max_memory, request.settings.film
     _, _, width, height = film.crop or (0, 0, film.width, film.height)
-    bytes_each = torch.finfo(order.call.dtype).bits // 8
+    bytes_each = torch.finfo(request.call.dtype).bits // 8
     held = 2 * 3 * width * height * bytes_each * (total or 1)  # one by one, and then together
     if limit is not None:
         check_limit(limit, held, f"more than the {mb(held)} that the pictures alone take")

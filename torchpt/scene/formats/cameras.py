@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from torchpt.physics.cameras import KINDS
-from torchpt.spec.schema import ParsedParams, described, refuse_foreign
+from torchpt.spec.schema import ParsedParams, read_typed, refuse_unused_keys
 
 __all__ = ["read_camera"]
 
@@ -25,5 +25,5 @@ def read_camera(raw: Any, film: Mapping[str, Any], file: str | None) -> ParsedPa
     if isinstance(raw, Mapping) and raw.get("K") is not None and raw.get("size") is None:
         size = [film.get("width"), film.get("height")]
         raw = raw if None in size else {**raw, "size": size}
-    refuse_foreign("camera", KINDS, raw, KINDS.names[0], file)
-    return described("camera", KINDS, raw, "camera", file, KINDS.names[0])
+    refuse_unused_keys("camera", KINDS, raw, KINDS.names[0], file)
+    return read_typed("camera", KINDS, raw, "camera", file, KINDS.names[0])

@@ -26,7 +26,7 @@ from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.shapes import KINDS as SHAPES
 from torchpt.physics.textures import KINDS as TEXTURES
 from torchpt.scene.formats.yaml import plain, read_yaml
-from torchpt.scene.settings import BLOCKS, TYPED, shaped
+from torchpt.scene.settings import BLOCKS, TYPED_BLOCKS, keep_aspect
 from torchpt.spec.schema import parameters_of
 
 __all__ = [
@@ -45,9 +45,9 @@ MAX_FILES, MAX_LEVELS = 64, 8
 #: What has a type and keeps what another type reads too: its kinds, and its type where none is said.
 KEEPING: dict[tuple[str, ...], tuple[Mapping[str, Any], str]] = {
     ("camera",): (CAMERAS, CAMERAS.names[0]),
-    ("integrator",): TYPED["integrator"],
-    ("sampler",): TYPED["sampler"],
-    ("film", "filter"): TYPED["filter"],
+    ("integrator",): TYPED_BLOCKS["integrator"],
+    ("sampler",): TYPED_BLOCKS["sampler"],
+    ("film", "filter"): TYPED_BLOCKS["filter"],
 }
 TABLES: dict[str, Mapping[str, Any]] = {
     "textures": TEXTURES, "materials": MATERIALS, "shapes": SHAPES, "lights": LIGHTS,
@@ -265,7 +265,7 @@ def over(below: Any, above: Any, where: Parts) -> Any:
     if not isinstance(above, Mapping) or not isinstance(below, Mapping):
         return above
     if where == ("film",):
-        above = shaped(below, above)
+        above = keep_aspect(below, above)
     if where in KEEPING:
         table, default = KEEPING[where]
         below = kept(below, above.get("type") or below.get("type") or default, table, default)

@@ -22,9 +22,9 @@ from torchpt.scene.formats.materials import Kind, check_material, material_types
 from torchpt.scene.formats.overrides import overridden_by, told
 from torchpt.scene.formats.textures import check_texture, texture_of
 from torchpt.scene.formats.yaml import parse_yaml, plain, read_open, read_yaml
-from torchpt.scene.settings import BLOCKS, Settings, having
+from torchpt.scene.settings import BLOCKS, Settings, settings_with
 from torchpt.spec import Role
-from torchpt.spec.schema import ParsedParams, check_keys, described
+from torchpt.spec.schema import ParsedParams, check_keys, read_typed
 
 __all__ = [
     "ASSETS",
@@ -259,13 +259,13 @@ def _describe(
     blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
     camera = read_camera(raw["camera"], blocks["film"], file)
     run_settings.merge(blocks, {}, file)
-    textures = _named(raw, "textures", file, lambda item, key: described("texture", TEXTURES, item, key, file))
+    textures = _named(raw, "textures", file, lambda item, key: read_typed("texture", TEXTURES, item, key, file))
     materials = _named(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
     for name, material in materials.items():
         key = f"materials.{name}"
         check_material(material, key, materials, textures, layers.file_of(key, file))
     shapes = _named(raw, "shapes", file, lambda item, key: _shape(item, key, materials, textures, types, file))
-    lights = _named(raw, "lights", file, lambda item, key: described("light", LIGHTS, item, key, file))
+    lights = _named(raw, "lights", file, lambda item, key: read_typed("light", LIGHTS, item, key, file))
     film, integrator, sampler, render = (blocks[name] for name in BLOCKS)
     return Description(
         file,
@@ -290,7 +290,7 @@ def _settings_block(raw: Mapping[str, Any], name: str, file: str | None) -> dict
         return {}
     if not isinstance(block, dict):
         raise SceneError(name, block, "a mapping of settings", file)
-    for key in having(Role.FILES).get(name, ()):
+    for key in settings_with(Role.FILES).get(name, ()):
         if block.get(key) not in (None, False):
             expected = "null: which files are written is said on the command line or in Python, never by a scene"
             raise SceneError(f"{name}.{key}", block[key], expected, file)
@@ -320,7 +320,7 @@ def _shape(
         inline = read_material(item["material"], f"{key}.material", types, file)
         check_material(inline, f"{key}.material", materials, textures, file)
         item = {**item, "material": inline}
-    shape = described("shape", SHAPES, item, key, file, texture=texture_of)
+    shape = read_typed("shape", SHAPES, item, key, file, texture=texture_of)
     displacement = shape.values.get("displacement")
     if displacement is not None:
         where = f"{key}.displacement.texture"

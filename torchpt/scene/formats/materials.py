@@ -12,7 +12,7 @@ from torchpt.physics.bsdfs.base import made
 from torchpt.physics.bsdfs.specs import Inner
 from torchpt.scene.formats.textures import TextureInput, check_texture, texture_of
 from torchpt.spec import REQUIRED, Refused, Spec, parameters_of, spec_of
-from torchpt.spec.schema import ParsedParams, described, values_of
+from torchpt.spec.schema import ParsedParams, read_params, read_typed
 
 __all__ = [
     "MAX_BLENDS", "POINTS", "Kind", "check_material", "inner_of", "material_types", "model_of", "plain_material",
@@ -98,12 +98,12 @@ def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | Non
         inline = {side: raw[side] for side in sides if isinstance(raw.get(side), Mapping)}
         inner = {side: read_material(item, f"{key}.{side}", types, file, depth + 1) for side, item in inline.items()}
         raw = {**raw, **inner}
-    return described("material", types, raw, key, file, texture=texture_of)
+    return read_typed("material", types, raw, key, file, texture=texture_of)
 
 
 def plain_material() -> ParsedParams:
     """That of shapes which are given none: grey, diffuse."""
-    return values_of(KINDS["diffuse"], {}, "", None, texture=texture_of)
+    return read_params(KINDS["diffuse"], {}, "", None, texture=texture_of)
 
 
 def _inner_keys(kind: Kind) -> tuple[str, ...]:

@@ -34,7 +34,7 @@ from torchpt.scene.formats.compose import (
     with_size,
 )  # fmt: skip
 from torchpt.scene.formats.yaml import MAX_DEPTH, plain
-from torchpt.scene.settings import shaped
+from torchpt.scene.settings import keep_aspect
 from torchpt.spec.schema import dotted
 
 __all__ = ["overridden_by", "told", "words_of"]
@@ -83,7 +83,7 @@ def overridden_by(
         change.parts[1]: change.value for change in changes if change.parts in (("film", "width"), ("film", "height"))
     }
     if sides:
-        result["film"] |= shaped(raw.get("film") or {}, sides)
+        result["film"] |= keep_aspect(raw.get("film") or {}, sides)
     tree: dict[str, Any] = {}
     for change in changes:
         _note(tree, change.parts, change.value)

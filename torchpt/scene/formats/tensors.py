@@ -1,7 +1,7 @@
 """Tensors and arrays in a scene given as a dict: the numbers that are read, and where tensors that want gradients stood.
 
 Whatever reads a scene sees plain numbers, lists and arrays, so that ranges and errors are those of a file. What was written is
-kept beside them; :mod:`torchpt.scene.traced` makes the scene's parameters of it once more, on torch's tape.
+kept beside them; :mod:`torchpt.scene.dict_tensors` makes the scene's parameters of it once more, on torch's tape.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import in_transform
+from torchpt.core.autograd import is_transformed
 from torchpt.core.errors import SceneError
 
-__all__ = ["Key", "Tensors"]
+__all__ = ["DictTensors", "Key"]
 
 #: Where something stands: keys of mappings, and indices of lists.
 Key = tuple[str | int, ...]
@@ -26,7 +26,7 @@ _LISTED = 64
 _PLAIN = frozenset({int, float, str, bool, type(None)})
 
 
-class Tensors:
+class DictTensors:
     """What of one scene was written as tensors that require gradients.
 
     Attributes:
@@ -38,7 +38,7 @@ class Tensors:
         self.raw: dict[str, Any] = {}
         self.keys: list[Key] = []
 
-    def taken_from(self, raw: dict[str, Any]) -> dict[str, Any]:
+    def extract(self, raw: dict[str, Any]) -> dict[str, Any]:
         """The scene with numbers in place of tensors, once :func:`torchpt.scene.formats.yaml.plain` has bounded it.
 
         Raises:
@@ -79,7 +79,7 @@ class Tensors:
 
 def _numbers(tensor: Tensor, key: Key) -> np.ndarray:
     """A tensor's values, apart from it: what is done to the tensor later does not change them."""
-    if in_transform(tensor):
+    if is_transformed(tensor):
         expected = "plain numbers: hand tensors under torch.func to render(params=...)"
         raise SceneError(".".join(map(str, key)), "a tensor under a transform of torch.func", expected)
     try:

@@ -11,8 +11,8 @@ from typing import Any
 from torchpt.core.errors import SceneError
 from torchpt.physics.textures import CHANNELS, KINDS, Named, TextureInput
 from torchpt.spec import Moves, Refused, Spec, parameters_of
-from torchpt.spec.reading import within
-from torchpt.spec.schema import ParsedParams, check_keys, described, dotted
+from torchpt.spec.reading import as_refused
+from torchpt.spec.schema import ParsedParams, check_keys, dotted, read_typed
 
 __all__ = ["Named", "TextureInput", "check_texture", "read_texture", "texture_of"]
 
@@ -31,11 +31,11 @@ def read_texture(raw: Any, key: str, file: str | None) -> ParsedParams | Named:
         if channel is not None and channel not in CHANNELS:
             raise SceneError(dotted(key, "channel"), channel, f"one of {', '.join(CHANNELS)}", file)
         return Named(name, channel)
-    return described("texture", KINDS, raw, key, file)
+    return read_typed("texture", KINDS, raw, key, file)
 
 
 def texture_of(raw: Mapping[str, Any], spec: Spec) -> TextureInput:
-    """What stands in place of a number or a colour; :func:`torchpt.spec.schema.described` takes it as ``texture``.
+    """What stands in place of a number or a colour; :func:`torchpt.spec.schema.read_typed` takes it as ``texture``.
 
     Args:
         raw: the mapping as written.
@@ -52,12 +52,12 @@ def _input(raw: Any, coloured: bool, low: float, high: float, linear: bool, move
     try:
         texture = read_texture(raw, "", None)
     except SceneError as error:
-        raise within(error) from None
+        raise as_refused(error) from None
     channel = texture.channel if isinstance(texture, Named) else texture.values.get("channel")
     if coloured and channel is not None:
         raise Refused("no channel where a colour is wanted", channel, ("channel",))
     if isinstance(texture, ParsedParams):
-        texture.kind.film_space_applies(texture.values, coloured)
+        texture.kind.check_slot(texture.values, coloured)
     return TextureInput(texture, coloured, linear, low, high, moves)
 
 

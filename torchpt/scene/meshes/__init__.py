@@ -30,7 +30,7 @@ PARSERS: dict[str, tuple[str, ...]] = {
 #: File ending -> module here, whose ``load_<module>(path, data, materials)`` gives the parts.
 FORMATS = {
     **{".obj": "obj", ".ply": "ply", ".stl": "stl", ".glb": "gltf", ".gltf": "gltf"},
-    **dict.fromkeys(PARSERS, "others"),
+    **dict.fromkeys(PARSERS, "trimesh_formats"),
 }
 
 

@@ -17,7 +17,7 @@ from torchpt.core.errors import AssetError
 from torchpt.scene.meshes.gltf_document import Document
 from torchpt.scene.meshes.gltf_lights import PUNCTUAL, camera_at, light_at
 from torchpt.scene.meshes.gltf_material import MATERIAL_EXTENSIONS, Materials
-from torchpt.scene.meshes.mesh import MOST_PARTS, FileMaterial, MeshPart, too_many, transformed
+from torchpt.scene.meshes.mesh import MOST_PARTS, FileMaterial, MeshPart, too_many_parts, transformed
 
 __all__ = ["load_gltf"]
 
@@ -72,7 +72,7 @@ class _Scene:
                 raise AssetError(self.path, f"more than {self.most} vertices or faces once nodes are placed")
             count += len(self.document.item("meshes", node["mesh"])["primitives"])
             if count > MOST_PARTS:
-                raise too_many(self.path)
+                raise too_many_parts(self.path)
         parts = []
         for node, matrix in placed:
             mesh = self.document.item("meshes", node["mesh"])

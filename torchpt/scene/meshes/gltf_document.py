@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torchpt.core.errors import AssetError
 from torchpt.core.files import is_regular, read_regular
 
-__all__ = ["BLOCKS", "ROOT", "Document", "Rules", "Wrong", "check"]
+__all__ = ["BLOCKS", "ROOT", "Document", "NumberReader", "SchemaError", "check"]
 
 
 # ---- What each part of a glTF document must be for the reader to follow it: objects, lists, texts, numbers, by key
@@ -26,7 +26,7 @@ __all__ = ["BLOCKS", "ROOT", "Document", "Rules", "Wrong", "check"]
 # checked, when it is first asked for. Errors name the element, as ``meshes[0].primitives[1].attributes.POSITION``.
 
 
-class Wrong(ValueError):
+class SchemaError(ValueError):
     """An element that is not what it must be; its text names it and says what is accepted."""
 
 
@@ -139,14 +139,14 @@ def check(value: Any, kind: Any, where: str) -> None:
         where: the element's name; empty for the document itself.
 
     Raises:
-        Wrong: the first thing in it that is something else, or missing.
+        SchemaError: the first thing in it that is something else, or missing.
     """
     if isinstance(kind, _Object):
         if not isinstance(value, dict):
-            raise Wrong(f"{where}: expected an object, got {_brief(value)}")
+            raise SchemaError(f"{where}: expected an object, got {_brief(value)}")
         for key in kind.required:
             if key not in value:
-                raise Wrong(f"{where}: {key} is missing")
+                raise SchemaError(f"{where}: {key} is missing")
         for key, item in value.items():
             inner = kind.keys.get(key, kind.others)
             if inner is not None:
@@ -154,14 +154,14 @@ def check(value: Any, kind: Any, where: str) -> None:
     elif isinstance(kind, _List):
         if not isinstance(value, list) or (kind.length is not None and len(value) != kind.length):
             expected = "a list" if kind.length is None else f"a list of {kind.length} numbers"
-            raise Wrong(f"{where}: expected {expected}, got {_brief(value)}")
+            raise SchemaError(f"{where}: expected {expected}, got {_brief(value)}")
         if kind.items is not _ANY:
             for number, item in enumerate(value):
                 check(item, kind.items, f"{where}[{number}]")
     elif kind is not _ANY:
         fits = isinstance(value, _TYPES[kind]) and not isinstance(value, bool)
         if not fits or (kind is _NUMBER and not -_LARGEST <= value <= _LARGEST):
-            raise Wrong(f"{where}: expected {kind}, got {_brief(value)}")
+            raise SchemaError(f"{where}: expected {kind}, got {_brief(value)}")
 
 
 def _brief(value: Any) -> str:
@@ -227,7 +227,7 @@ class Document:
     def _check(self, value: Any, kind: Any, where: str) -> None:
         try:
             check(value, kind, where)
-        except Wrong as wrong:
+        except SchemaError as wrong:
             raise AssetError(self.path, f"malformed glTF: {wrong}") from None
 
     def resource(self, uri: Any, where: str) -> bytes:
@@ -338,7 +338,7 @@ class Document:
         values[at.astype(np.int64)] = found
 
 
-class Rules:
+class NumberReader:
     """What objects of a document come to: reads their numbers.
 
     Args:

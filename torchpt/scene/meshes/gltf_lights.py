@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
 from torchpt.physics.lights import KINDS as LIGHTS
-from torchpt.scene.meshes.gltf_document import Document, Rules
+from torchpt.scene.meshes.gltf_document import Document, NumberReader
 from torchpt.scene.meshes.mesh import FileCamera, FileLight
 from torchpt.spec import parameters_of
 
@@ -59,7 +59,7 @@ def light_at(document: Document, node: dict[str, Any], matrix: NDArray[np.float6
     return FileLight(name, rules.kind, position, direction / np.linalg.norm(direction), rules.values())
 
 
-class _Rules(Rules):
+class _Rules(NumberReader):
     """One light."""
 
     def __init__(self, document: Document, index: int, block: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torchpt.core.errors import AssetError
 from torchpt.images import EncodedImage, has_alpha
 from torchpt.scene.meshes.file_texture import image_texture, plain_scale
-from torchpt.scene.meshes.gltf_document import Document, Rules
+from torchpt.scene.meshes.gltf_document import Document, NumberReader
 from torchpt.scene.meshes.mesh import FileMaterial, Rgb
 from torchpt.scene.meshes.mtl_material import coat_gloss
 
@@ -83,7 +83,7 @@ class Materials:
         return self.images[number]
 
 
-class _Rules(Rules):
+class _Rules(NumberReader):
     """One material, and the names of what was left out."""
 
     def __init__(self, materials: Materials, block: dict[str, Any], number: Any) -> None:
@@ -110,9 +110,9 @@ class _Rules(Rules):
             material: dict[str, Any] = {"type": "diffuse", "reflectance": color}
         else:
             material = {"type": "principled", "base_color": color, **self.microfacets(pbr), **self.layers()}
-        self.cover(material, pbr, factor[3])
-        self.relief(material)
-        self.glow(material)
+        self.set_opacity(material, pbr, factor[3])
+        self.set_normals(material)
+        self.set_emission(material)
         self.ignored += ["occlusionTexture"] * ("occlusionTexture" in self.block)
         return material
 
@@ -167,7 +167,7 @@ class _Rules(Rules):
                 self.ignored.append("KHR_materials_sheen (its hue: that of the base colour)")
         return found
 
-    def cover(self, material: dict[str, Any], pbr: dict[str, Any], factor: float) -> None:
+    def set_opacity(self, material: dict[str, Any], pbr: dict[str, Any], factor: float) -> None:
         """alphaMode: the base colour's alpha is the opacity, above a threshold or as it is."""
         mode = self.block.get("alphaMode", "OPAQUE")
         if mode not in ("OPAQUE", "MASK", "BLEND"):
@@ -183,7 +183,7 @@ class _Rules(Rules):
         elif alpha != 1.0:
             material["opacity"] = alpha
 
-    def relief(self, material: dict[str, Any]) -> None:
+    def set_normals(self, material: dict[str, Any]) -> None:
         """The normal map."""
         normals = self.texture(self.block, "normalTexture", 1.0, None)
         if normals is None:
@@ -195,7 +195,7 @@ class _Rules(Rules):
         elif strength != 1.0:
             material["normal_strength"] = strength
 
-    def glow(self, material: dict[str, Any]) -> None:
+    def set_emission(self, material: dict[str, Any]) -> None:
         """EmissiveFactor times its picture times KHR_materials_emissive_strength."""
         color = self.numbers(self.block, "emissiveFactor", (0.0, 0.0, 0.0), 1e30)
         block = self.extension("emissive_strength", ("emissiveStrength",))

@@ -21,11 +21,11 @@ __all__ = [
     "FileMaterial",
     "MeshPart",
     "checked",
-    "corners_of_polygons",
     "displaced",
+    "polygon_fans",
     "smooth_normals",
     "subdivided",
-    "too_many",
+    "too_many_parts",
     "transformed",
 ]
 
@@ -150,13 +150,13 @@ def checked(parts: list[MeshPart], path: Path) -> list[MeshPart]:
             index out of range.
     """
     if len(parts) > MOST_PARTS:
-        raise too_many(path)
+        raise too_many_parts(path)
     if not parts or all(len(part.faces) == 0 for part in parts):
         raise AssetError(path, "the mesh is empty (no face)")
     return [_checked(part, path) for part in parts if len(part.faces)]
 
 
-def too_many(path: Path) -> AssetError:
+def too_many_parts(path: Path) -> AssetError:
     """What is said of a file of more than :data:`MOST_PARTS`."""
     return AssetError(path, f"has more than {MOST_PARTS} parts; at most so many are read")
 
@@ -191,7 +191,7 @@ def _checked(part: MeshPart, path: Path) -> MeshPart:
     return replace(part, normals=normals, uvs=uvs)
 
 
-def corners_of_polygons(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def polygon_fans(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Fans over polygons: ``(F, 3)`` positions into a flat list of corners, in polygon order.
 
     Args:
@@ -245,7 +245,7 @@ def displaced(piece: MeshPart, heights: Callable[[Rows], Rows], subdivisions: in
     for _ in range(subdivisions):
         mesh = subdivided(mesh)
     assert mesh.normals is not None and mesh.uvs is not None
-    place, group = _places(mesh.vertices)
+    place, group = _unique_positions(mesh.vertices)
     direction = _averaged(_unit(mesh.normals), group, len(place))
     height = _averaged(heights(mesh.uvs)[:, None], group, len(place))
     vertices = place + _unit(direction) * height
@@ -281,7 +281,7 @@ def subdivided(mesh: MeshPart) -> MeshPart:
     )
 
 
-def _places(vertices: Rows) -> tuple[Rows, NDArray[np.int64]]:
+def _unique_positions(vertices: Rows) -> tuple[Rows, NDArray[np.int64]]:
     """Distinct positions, and which of them each vertex has."""
     bits = (np.ascontiguousarray(vertices) + 0.0).view(np.uint64)  # + 0 makes -0 and 0 one
     mixed = bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)

@@ -11,7 +11,7 @@ from torchpt.core.files import is_regular, read_regular
 from torchpt.scene.meshes.mesh import FileMaterial, Rgb
 from torchpt.scene.meshes.mtl_material import COLORS, MAPS, NUMBERS, Map, Statements, material_of
 
-__all__ = ["beside", "decoded_lines", "read_mtl"]
+__all__ = ["decoded_lines", "find_file", "read_mtl"]
 
 # options of a map statement -> how many words follow, at most; numbers only where the option takes one to three
 _OPTIONS = {
@@ -46,7 +46,7 @@ def decoded_lines(data: bytes) -> list[str]:
     return lines
 
 
-def beside(path: Path, name: str) -> Path | None:
+def find_file(path: Path, name: str) -> Path | None:
     """The file that a statement of ``path`` names, or None: with backslashes too, and by its last part alone."""
     forward = name.replace("\\", "/")
     for form in dict.fromkeys((name, forward, forward.rpartition("/")[2])):
@@ -195,7 +195,7 @@ def _finished(name: str, statements: Statements, path: Path) -> FileMaterial:
     """The material of its statements; every picture has been found."""
     files: dict[str, str] = {}
     for kind, found in statements.maps.items():
-        file = beside(path, found.name) or beside(path, found.name.partition("#")[0].strip())
+        file = find_file(path, found.name) or find_file(path, found.name.partition("#")[0].strip())
         if file is None:
             raise AssetError(path, f"line {found.line}: the image file {found.name[:80]!r} is missing")
         files[kind] = str(file.resolve())

@@ -78,9 +78,9 @@ def material_of(statements: Statements, files: dict[str, str]) -> tuple[dict[str
     """
     rules = _Rules(statements, files)
     material = rules.surface()
-    rules.cover(material)
-    rules.relief(material)
-    rules.glow(material)
+    rules.set_opacity(material)
+    rules.set_normals(material)
+    rules.set_emission(material)
     return material, rules.ignored
 
 
@@ -194,7 +194,7 @@ class _Rules:
             return 0.5
         return math.sqrt(math.sqrt(2.0 / (max(self.numbers["ns"], 0.0) + 2.0)))
 
-    def cover(self, material: dict[str, Any]) -> None:
+    def set_opacity(self, material: dict[str, Any]) -> None:
         """How much of the surface is there at all: `d`, `Tr`, `map_d`."""
         found = self.maps.get("map_d")
         if found is not None:
@@ -209,7 +209,7 @@ class _Rules:
         if not glass and self._unit("tf", _WHITE) != _WHITE and self.illum not in (0, 1, 2):
             self.ignored.append("Tf")
 
-    def relief(self, material: dict[str, Any]) -> None:
+    def set_normals(self, material: dict[str, Any]) -> None:
         """`norm`, `bump`: where the latter's file is called a normal map, it is one."""
         kind = "norm" if "norm" in self.maps else "bump"
         if kind not in self.maps:
@@ -227,7 +227,7 @@ class _Rules:
         else:
             material["bump_map"] = self._image(kind, found.bump, found.channel or "luminance")
 
-    def glow(self, material: dict[str, Any]) -> None:
+    def set_emission(self, material: dict[str, Any]) -> None:
         """`Ke` times `map_Ke`."""
         light = self.colors.get("ke", (0.0, 0.0, 0.0))
         if "map_ke" in self.maps:

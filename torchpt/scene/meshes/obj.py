@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
-from torchpt.scene.meshes.mesh import MOST_PARTS, FileMaterial, MeshPart, corners_of_polygons, smooth_normals, too_many
-from torchpt.scene.meshes.mtl import beside, decoded_lines, read_mtl
+from torchpt.scene.meshes.mesh import MOST_PARTS, FileMaterial, MeshPart, polygon_fans, smooth_normals, too_many_parts
+from torchpt.scene.meshes.mtl import decoded_lines, find_file, read_mtl
 
 __all__ = ["load_obj"]
 
@@ -50,7 +50,7 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     if not text.f:
         return []
     combos, index, counts = _corners(text, path, (len(positions), len(uvs), len(normals)))
-    triangles = corners_of_polygons(np.cumsum(counts) - counts, counts)  # (F, 3) into the flat corners
+    triangles = polygon_fans(np.cumsum(counts) - counts, counts)  # (F, 3) into the flat corners
     owner = np.repeat(np.array(text.face_groups), counts - 2)
     uvs[:, 1] = 1.0 - uvs[:, 1]
     all_positions, all_faces = positions[combos[:, 0]], index[triangles]
@@ -58,7 +58,7 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     if all_normals is None and len(text.groups) > 1 and np.isfinite(positions).all():
         all_normals = smooth_normals(all_positions, all_faces)  # over the whole file: groups meet without a crease
     if len(text.groups) > MOST_PARTS:
-        raise too_many(path)
+        raise too_many_parts(path)
     parts = []
     order = np.argsort(owner, kind="stable")  # faces of a group stay in the order of the file
     ends = np.searchsorted(owner[order], np.arange(1, len(text.groups) + 1))
@@ -127,8 +127,8 @@ def _absolute(words: list[str], counts: tuple[int, int, int], path: Path, number
 def _libraries(text: _Text, path: Path) -> dict[str, FileMaterial]:
     known: dict[str, FileMaterial] = {}
     for name in text.libraries:
-        whole = beside(path, name)  # a name may hold blanks; else blanks separate several names
-        files = [whole] if whole is not None else [beside(path, word) for word in name.split()]
+        whole = find_file(path, name)  # a name may hold blanks; else blanks separate several names
+        files = [whole] if whole is not None else [find_file(path, word) for word in name.split()]
         if not files or None in files:  # often so with files that were sent around; the shape is there all the same
             text.ignored.append(f"mtllib {name} (no such file)")
         for file in files:

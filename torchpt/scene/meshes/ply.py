@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
-from torchpt.scene.meshes.mesh import FileMaterial, MeshPart, corners_of_polygons
-from torchpt.scene.meshes.ply_rows import misfit
+from torchpt.scene.meshes.mesh import FileMaterial, MeshPart, polygon_fans
+from torchpt.scene.meshes.ply_rows import find_mismatch
 
 __all__ = ["load_ply"]
 
@@ -105,7 +105,7 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], 
     colors = _colors(vertex, elements)
     own = FileMaterial("vertex colors", _COLORED) if materials and colors is not None else None
     starts = np.cumsum(counts) - counts
-    faces = items.astype(np.int64)[corners_of_polygons(starts, counts)] if len(counts) else np.zeros((0, 3), np.int64)
+    faces = items.astype(np.int64)[polygon_fans(starts, counts)] if len(counts) else np.zeros((0, 3), np.int64)
     return MeshPart("", vertices, faces, stack(("nx", "ny", "nz")), uvs, colors, own, tuple(ignored))
 
 
@@ -299,14 +299,14 @@ class _Ascii:
 
     def wrong(self, problem: str) -> AssetError:
         """The first row that is another than the header says; where all are as it says, the problem that was met."""
-        return AssetError(self.path, misfit(self.data, self.start, self.elements) or problem)
+        return AssetError(self.path, find_mismatch(self.data, self.start, self.elements) or problem)
 
     def end(self) -> None:
         """Refuse rows that came out even by chance: what is left over is not what the header says."""
         read = [element for element in self.elements if element.size and element.properties]
         last = next((number for number, element in enumerate(read) if element.name == "face"), len(read))
         if last >= len(read) - 1 and self.at < len(self.words):
-            found = misfit(self.data, self.start, self.elements)
+            found = find_mismatch(self.data, self.start, self.elements)
             if found is not None:
                 raise AssetError(self.path, found)
 

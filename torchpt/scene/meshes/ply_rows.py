@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
-__all__ = ["misfit"]
+__all__ = ["find_mismatch"]
 
 
 class _Property(Protocol):
@@ -24,7 +24,7 @@ class _Element(Protocol):
     def properties(self) -> Sequence[_Property]: ...
 
 
-def misfit(data: bytes, start: int, elements: Iterable[_Element]) -> str | None:
+def find_mismatch(data: bytes, start: int, elements: Iterable[_Element]) -> str | None:
     """What is wrong with the first row that its header does not describe; None where there is none.
 
     Args:

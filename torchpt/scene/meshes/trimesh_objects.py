@@ -28,12 +28,12 @@ from torchpt.scene.meshes.mesh import (
     MeshPart,
     checked,
     smooth_normals,
-    too_many,
+    too_many_parts,
     transformed,
 )
 from torchpt.scene.meshes.mtl_material import Map, Statements, material_of
 
-__all__ = ["Looks", "Placed", "lights_of", "mesh_parts_of", "parts_of", "placed_in"]
+__all__ = ["MaterialConverter", "Placed", "lights_of", "mesh_parts_of", "parts_of", "placed_in"]
 
 
 # ---- Materials of trimesh objects: by the rules of glTF (``PBRMaterial``) and MTL (``SimpleMaterial``), which they come from
@@ -46,10 +46,10 @@ _INNER = (*_FACTORS, "baseColorFactor", "baseColorTexture", "metallicRoughnessTe
 #: Pillow's modes that a PNG file holds.
 _MODES = ("1", "L", "LA", "RGB", "RGBA", "I;16", "I")
 #: What trimesh says where a file says nothing: of ``SimpleMaterial``, the grey of its colours and its exponent.
-_UNSAID, _UNSAID_EXPONENT = (102, 102, 102, 255), 1.0
+_DEFAULT_GREY, _DEFAULT_EXPONENT = (102, 102, 102, 255), 1.0
 
 
-class Looks:
+class MaterialConverter:
     """The materials of trimesh objects, each made once, and their pictures.
 
     Args:
@@ -116,12 +116,12 @@ class Looks:
         statements = Statements()
         files: dict[str, Any] = {}
         for key, value in (("kd", material.diffuse), ("ks", material.specular)):
-            if tuple(np.asarray(value).tolist()) != _UNSAID:
+            if tuple(np.asarray(value).tolist()) != _DEFAULT_GREY:
                 red, green, blue = (float(level) / 255.0 for level in value[:3])
                 statements.colors[key] = red, green, blue
         if material.diffuse[3] < 255:
             statements.numbers["d"] = float(material.diffuse[3]) / 255.0
-        if material.glossiness != _UNSAID_EXPONENT:
+        if material.glossiness != _DEFAULT_EXPONENT:
             statements.numbers["ns"] = float(material.glossiness)
         if material.image is not None:
             statements.maps["map_kd"] = Map("map_Kd", "", 0)
@@ -193,9 +193,9 @@ def mesh_parts_of(
     """
     import trimesh
 
-    looks = Looks(label, materials)
+    converter = MaterialConverter(label, materials)
     if isinstance(source, trimesh.Trimesh):
-        return checked(parts_of(source, "", looks), Path(label))
+        return checked(parts_of(source, "", converter), Path(label))
     if not isinstance(source, trimesh.Scene):
         raise AssetError(label, f"expected a trimesh.Trimesh or trimesh.Scene, got {type(source).__name__}")
     known: dict[str, list[MeshPart]] = {}
@@ -207,9 +207,9 @@ def mesh_parts_of(
         if total > most:
             raise AssetError(label, f"more than {most} vertices or faces once nodes are placed")
         if name not in known:
-            known[name] = parts_of(geometry, str(name)[:80] if len(source.geometry) > 1 else "", looks)
+            known[name] = parts_of(geometry, str(name)[:80] if len(source.geometry) > 1 else "", converter)
         if len(parts) > MOST_PARTS:
-            raise too_many(Path(label))
+            raise too_many_parts(Path(label))
         stays = np.array_equal(matrix, np.eye(4))
         parts += known[name] if stays else [transformed(part, matrix) for part in known[name]]
     parts = checked(parts, Path(label))
@@ -236,7 +236,7 @@ def _solid(geometry: Any) -> bool:
     return len(getattr(geometry, "faces", ())) > 0
 
 
-def parts_of(mesh: Any, name: str, looks: Looks) -> list[MeshPart]:
+def parts_of(mesh: Any, name: str, converter: MaterialConverter) -> list[MeshPart]:
     """A ``trimesh.Trimesh`` in its own space, one part for each material; unchecked.
 
     Raises:
@@ -244,7 +244,7 @@ def parts_of(mesh: Any, name: str, looks: Looks) -> list[MeshPart]:
     """
     vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
     if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):  # before anything is looked up by them
-        raise AssetError(looks.label, f"a face has an index outside 0..{len(vertices) - 1}")
+        raise AssetError(converter.label, f"a face has an index outside 0..{len(vertices) - 1}")
     visual = mesh.visual
     normals: Matrix | None = None
     if "vertex_normals" in mesh._cache.cache:  # as trimesh's exporters tell: else they are made up from the faces
@@ -255,12 +255,12 @@ def parts_of(mesh: Any, name: str, looks: Looks) -> list[MeshPart]:
         normals = smooth_normals(vertices, faces) if normals is None else normals
         corners = faces.reshape(-1)
         colors = np.repeat(_linear(visual.face_colors), 3, axis=0)
-        material, colors = looks.of(None, colors)
+        material, colors = converter.of(None, colors)
         faces = np.arange(len(corners)).reshape(-1, 3)
         return [MeshPart(name, vertices[corners], faces, normals[corners], None, colors, material)]
     if visual.kind != "texture":
         colors = _linear(visual.vertex_colors) if visual.kind == "vertex" else None
-        material, colors = looks.of(None, colors)
+        material, colors = converter.of(None, colors)
         return [MeshPart(name, vertices, faces, normals, None, colors, material)]
     uvs = visual.uv
     if uvs is not None and len(uvs) == len(vertices) and uvs.shape[1] >= 2:
@@ -271,12 +271,12 @@ def parts_of(mesh: Any, name: str, looks: Looks) -> list[MeshPart]:
     colors = _linear(colors) if colors is not None and np.shape(colors)[:1] == (len(vertices),) else None
     several = getattr(visual.material, "materials", None)
     if several is None:
-        material, colors = looks.of(visual.material, colors)
+        material, colors = converter.of(visual.material, colors)
         return [MeshPart(name, vertices, faces, normals, uvs, colors, material)]
     which = np.asarray(visual.face_materials)
     parts = []
     for number, each in enumerate(several):
-        material, tinted = looks.of(each, colors)
+        material, tinted = converter.of(each, colors)
         parts.append(MeshPart(f"{name}{number}", vertices, faces[which == number], normals, uvs, tinted, material))
     return parts
 

@@ -21,16 +21,16 @@ from torchpt.physics.shapes.primitive import Corners
 from torchpt.physics.textures import tables_of
 from torchpt.physics.textures.records import LaneTextures
 from torchpt.physics.world import World
-from torchpt.scene.space import FARTHEST, Space
+from torchpt.scene.space import MAX_COORDINATE, Space
 from torchpt.scene.world.emitters import lights_of
 from torchpt.scene.world.materials import (
     Groups,
-    charts_of,
     groups_of,
     lane_material,
     node_map_of,
     opacity_maps_of,
     opacity_of,
+    vertex_attributes_of,
 )
 from torchpt.scene.world.primitives import Primitives, copies_of, copy_maps, corners_of_all, primitives_of
 
@@ -52,12 +52,12 @@ def assemble(
     Args:
         parts: ordered by kind as ``records.KINDS``.
         parameters: every tensor by dotted name.
-        sources: lights that are no surfaces, ordered as ``lights.order`` says.
+        sources: lights that are no surfaces, ordered as ``lights.sort_key`` says.
         space: the lanes' coordinates.
         dtype: of the lanes.
         copies: instances of parts.
         uv: whether texture coordinates are wanted even if no texture reads them.
-        choice: how a light is chosen, from ``lights.WAYS``.
+        choice: how a light is chosen, from ``lights.LIGHT_SAMPLERS``.
 
     Raises:
         SceneError: parameters that put something further away than float32 can follow.
@@ -67,7 +67,7 @@ def assemble(
     primitives = primitives_of(parts, corners, dtype, device)
     _check_reach(parts, primitives, space)
     owners: list[Part | Copy] = [*parts, *copies]
-    materials = {owner.material.name: _in_units(owner.material, space.unit) for owner in owners}
+    materials = {owner.material.name: _with_scaled_bump(owner.material, space.unit) for owner in owners}
     made = {name: lane_material(material, parameters, dtype) for name, material in materials.items()}
     nodes = [node for material in materials.values() for node in material.readings()]
     tables, places = tables_of(nodes, parameters, dtype, device)
@@ -75,14 +75,14 @@ def assemble(
     wide = primitives.sizes + [1] * len(copies)
     opacity = opacity_of(owners, made, wide, dtype, device)
     dark = primitives.spread([int(part.emission is None) for part in parts] + [1] * len(copies))
-    glowing = [part.emission_texture for part in parts] + [None] * len(copies)
+    emission_textures = [part.emission_texture for part in parts] + [None] * len(copies)
     maps = copy_maps(parts, primitives.sizes, copies, parameters, space) if copies else None
     geometry = primitives.geometry(maps)
     opacity_mapped = any(part.emission is not None and made[part.material.name].opacity_texture for part in parts)
     lights = lights_of(
         parts,
         sources,
-        _lit_by(parts, corners, primitives),
+        _emitter_primitives(parts, corners, primitives),
         geometry,
         parameters,
         space,
@@ -103,7 +103,7 @@ def assemble(
             bound=primitives.bound,
             flip=primitives.sign if primitives.counts[3] else None,
             normals=primitives.normals,
-            **charts_of(parts, corners, primitives.sizes, parameters, materials, groups.models, uv),
+            **vertex_attributes_of(parts, corners, primitives.sizes, parameters, materials, groups.models, uv),
             object_id=primitives.spread([owner.object_id for owner in owners]),
             quadrics=primitives.quadrics,
             copies=None if maps is None else copies_of(maps, copies, dtype),
@@ -112,20 +112,20 @@ def assemble(
         textures=LaneTextures(
             tables=tables,
             opacity=opacity_maps_of(owners, made, places, wide, dtype, device),
-            emission=node_map_of(glowing, places, wide, device),
+            emission=node_map_of(emission_textures, places, wide, device),
         ),
         lights=lights,
     )
     return world, geometry
 
 
-def _lit_by(parts: Sequence[Part], corners: Sequence[Corners], primitives: Primitives) -> Primitives:
+def _emitter_primitives(parts: Sequence[Part], corners: Sequence[Corners], primitives: Primitives) -> Primitives:
     """The primitives, without derivatives where no part that emits has any: what is cut out of the whole would seem to."""
     moving = any(
         part.emission is not None and any(x.requires_grad for x in leaves(own))
         for part, own in zip(parts, corners, strict=True)
     )
-    return primitives if moving else primitives.still()
+    return primitives if moving else primitives.detached()
 
 
 def _materials(
@@ -147,7 +147,7 @@ def _materials(
     )
 
 
-def _in_units(material: ResolvedMaterial, unit: float) -> ResolvedMaterial:
+def _with_scaled_bump(material: ResolvedMaterial, unit: float) -> ResolvedMaterial:
     """A material where lengths are counted in ``unit``: the heights of a bump map are lengths."""
     if unit == 1.0 or material.bump_map is None:
         return material
@@ -157,8 +157,10 @@ def _in_units(material: ResolvedMaterial, unit: float) -> ResolvedMaterial:
 def _check_reach(parts: Sequence[Part], primitives: Primitives, space: Space) -> None:
     """Refuse parameters that make a part too large, or lay it too far off."""
     reach = torch.stack([x.detach().abs().amax(0) for x in (primitives.p0, primitives.e1, primitives.e2)]).amax(0)
-    if len(reach) and not bool(reach.max() <= FARTHEST):
+    if len(reach) and not bool(reach.max() <= MAX_COORDINATE):
         farthest = int(torch.nan_to_num(reach, nan=torch.inf).argmax())
         part = parts[int(primitives.spread(range(len(parts)))[farthest])]
-        expected = f"places and sizes up to {FARTHEST * space.unit:.3g} from the middle of this scene as it was loaded"
+        expected = (
+            f"places and sizes up to {MAX_COORDINATE * space.unit:.3g} from the middle of this scene as it was loaded"
+        )
         raise SceneError(f"params.{part.name}", float(reach[farthest]) * space.unit, expected)

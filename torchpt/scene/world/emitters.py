@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.vectors import luminance
-from torchpt.physics.lights import COLUMNS, SURFACES, Faces, Setting, choice_of, emitter
+from torchpt.physics.lights import COLUMNS, SURFACES, Faces, Setting, emitter, light_sampler
 from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.lights.records import Lights
 from torchpt.physics.lights.solid_angle import shapes_of, table_of
@@ -19,9 +19,9 @@ from torchpt.physics.parts import Part, Source
 from torchpt.physics.shapes.geometry import KINDS, Geometry
 from torchpt.scene.space import Space
 from torchpt.scene.world.primitives import Primitives
-from torchpt.search.bounds import chosen, primitive_bounds
+from torchpt.search.bounds import primitive_bounds, select_primitives
 from torchpt.spec import Refused
-from torchpt.spec.schema import refused
+from torchpt.spec.schema import scene_error
 
 __all__ = ["lights_of"]
 
@@ -73,7 +73,7 @@ def lights_of(
 
     Args:
         parts: ordered by kind.
-        sources: lights that are no surfaces, in the order of ``lights.order``.
+        sources: lights that are no surfaces, in the order of ``lights.sort_key``.
         primitives: of ``parts``.
         geometry: of them, as the search sees it.
         parameters: every tensor by dotted name.
@@ -81,7 +81,7 @@ def lights_of(
         opacity: ``(P + I,)``, or None.
         emissive: ``(P + I,)`` bool, which primitives emit.
         opacity_mapped: whether opacity textures opacity_texture any of them.
-        choice: how one of them is chosen, from ``lights.WAYS``.
+        choice: how one of them is chosen, from ``lights.LIGHT_SAMPLERS``.
     """
     prim = emissive.nonzero().squeeze(1)
     if not len(prim) and not sources:
@@ -127,8 +127,8 @@ def lights_of(
         solid=solid,
         shapes=shapes_of(solid),
     )
-    low, high = (box.double() for box in primitive_bounds(chosen(geometry, prim)))
-    return replace(lights, choice=choice_of(lights, power, (low, high), choice))
+    low, high = (box.double() for box in primitive_bounds(select_primitives(geometry, prim)))
+    return replace(lights, choice=light_sampler(lights, power, (low, high), choice))
 
 
 def _reach(geometry: Geometry) -> Tensor:
@@ -148,7 +148,7 @@ def _surfaces(
         x.index_select(1, prim)
         for x in (primitives.p0, primitives.e1, primitives.e2, primitives.face, primitives.normal)
     )
-    areas, wholes, columns, tabled, start = [], [], [], False, 0
+    areas, wholes, columns, needs_quadrics, start = [], [], [], False, 0
     for number, name in enumerate(KINDS):  # in whose order the primitives are
         stop = start + names.count(name)
         if start == stop:
@@ -158,8 +158,8 @@ def _surfaces(
         area, whole = kind.areas(Faces(e1[:, span], face[:, span], column, primitives.quadrics, primitives.frame))
         areas.append(area)
         wholes.append(whole)
-        columns.append(column if kind.tabled else torch.zeros_like(column))
-        tabled, start = tabled or kind.tabled, stop
+        columns.append(column if kind.needs_quadrics else torch.zeros_like(column))
+        needs_quadrics, start = needs_quadrics or kind.needs_quadrics, stop
     radiance = torch.cat([_emission(part, parameters, dtype)[:, None].expand(3, n) for part, n in emitting], 1)
     power = math.pi * luminance(radiance.detach().double().abs()) * torch.cat(wholes)
     if any(part.emission_texture is not None for part, _ in emitting):
@@ -167,7 +167,7 @@ def _surfaces(
         power = power * torch.repeat_interleave(torch.tensor(shares, dtype=torch.float64, device=device), counts)
     flip, bound = (x.index_select(0, prim) for x in (primitives.sign, primitives.bound))
     made = _Rows(names, p0, e1, e2, normal, flip, torch.cat(areas).to(dtype), bound, radiance, power)
-    return made, torch.cat(columns) if tabled else None
+    return made, torch.cat(columns) if needs_quadrics else None
 
 
 def _source(
@@ -189,7 +189,7 @@ def _source(
     try:
         row = LIGHTS[source.kind].row(Setting(given, source.values, space.point, space.unit, reach, dtype))
     except Refused as error:
-        raise refused(error, source.name, None, None) from None
+        raise scene_error(error, source.name, None, None) from None
     blank = torch.zeros(3, dtype=torch.float64, device=space.centre.device)
     columns = (blank if x is None else x for x in (row.p0, row.e1, row.e2, row.normal, row.radiance))
     p0, e1, e2, normal, light = (x[:, None].to(dtype) for x in columns)

@@ -14,26 +14,26 @@ from torchpt.physics.bsdfs import KINDS, Bsdf, Parameters, stacked
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Copy, Part
 from torchpt.physics.shapes.primitive import PRIMITIVES, Corners
-from torchpt.physics.textures import MaterialTextures, Node, NodeMap, OpacityMaps, Place, TextureBinding
+from torchpt.physics.textures import MaterialTextures, Node, NodeMap, NodePosition, OpacityMaps, TextureBinding
 
 __all__ = [
     "MOST_MODELS",
     "Groups",
     "LaneMaterial",
     "OpacityTexture",
-    "charts_of",
     "groups_of",
     "lane_material",
     "node_map_of",
     "opacity_maps_of",
     "opacity_of",
+    "vertex_attributes_of",
 ]
 
 
 # ---- Where a point lies on its surface: texture coordinates, tangents, vertex colours; each only where something reads it
 
 
-def charts_of(
+def vertex_attributes_of(
     parts: Sequence[Part],
     corners: Sequence[Corners],
     sizes: list[int],
@@ -211,7 +211,7 @@ class Groups:
 def groups_of(
     materials: Mapping[str, ResolvedMaterial],
     made: Mapping[str, LaneMaterial],
-    places: Mapping[Node, Place],
+    places: Mapping[Node, NodePosition],
     parameters: Mapping[str, Tensor],
     dtype: torch.dtype,
     device: torch.device,
@@ -223,7 +223,7 @@ def groups_of(
     """
     members: dict[Kind, list[str]] = {}
     for name, material in made.items():
-        members.setdefault(_kind(materials[name], material), []).append(name)
+        members.setdefault(_group_key(materials[name], material), []).append(name)
     if not members:
         members[KINDS["diffuse"](), None] = []
     if len(members) > MOST_MODELS:
@@ -259,7 +259,7 @@ def _tabulated(model: Bsdf, values: Parameters) -> Parameters:
     return merged(values, model.tabulate(values))
 
 
-def _kind(material: ResolvedMaterial, made: LaneMaterial) -> Kind:
+def _group_key(material: ResolvedMaterial, made: LaneMaterial) -> Kind:
     """The group of a material; materials without textures share that of their model."""
     if not made.readings and material.normal_map is None and material.bump_map is None:
         return made.model, None
@@ -276,7 +276,7 @@ def _kind(material: ResolvedMaterial, made: LaneMaterial) -> Kind:
 def _textures(
     materials: Sequence[ResolvedMaterial],
     made: Sequence[LaneMaterial],
-    places: Mapping[Node, Place],
+    places: Mapping[Node, NodePosition],
     device: torch.device,
 ) -> MaterialTextures:
     """The textures of materials of one form."""
@@ -286,7 +286,7 @@ def _textures(
         table, first = places[column[0]].table, column[0]
         return TextureBinding(table, rows, first.channel, any(node.filtered for node in column))
 
-    def relief(column: list[Node | None]) -> TextureBinding | None:
+    def map_binding(column: list[Node | None]) -> TextureBinding | None:
         nodes = [node for node in column if node is not None]
         return binding(nodes) if nodes else None
 
@@ -300,15 +300,15 @@ def _textures(
     readings = bound([one.readings for one in made])
     return MaterialTextures(
         readings,
-        relief([material.normal_map for material in materials]),
-        relief([material.bump_map for material in materials]),
+        map_binding([material.normal_map for material in materials]),
+        map_binding([material.bump_map for material in materials]),
         filtered=any(node.filtered for node in every),
         reads=tuple(sorted({node.reads for node in every})),
     )
 
 
 def node_map_of(
-    nodes: Sequence[Node | None], places: Mapping[Node, Place], sizes: list[int], device: torch.device
+    nodes: Sequence[Node | None], places: Mapping[Node, NodePosition], sizes: list[int], device: torch.device
 ) -> NodeMap | None:
     """Textures by primitive, from those of parts of ``sizes``; None where there are none."""
     if all(node is None for node in nodes):
@@ -328,7 +328,7 @@ def node_map_of(
 def opacity_maps_of(
     parts: Sequence[Part | Copy],
     made: Mapping[str, LaneMaterial],
-    places: Mapping[Node, Place],
+    places: Mapping[Node, NodePosition],
     sizes: list[int],
     dtype: torch.dtype,
     device: torch.device,

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchpt.core.errors import SceneError
 from torchpt.math.vectors import cross, dot, normalize
 from torchpt.physics.parts import Copy, Part
-from torchpt.physics.shapes.geometry import KINDS, Copies, Geometry, Quadrics
+from torchpt.physics.shapes.geometry import KINDS, Geometry, Instances, Quadrics
 from torchpt.physics.shapes.primitive import PRIMITIVES, Corners, Primitive
 from torchpt.physics.shapes.quadrics import quadrics_of, table_of
 from torchpt.scene.space import Space
@@ -94,7 +94,7 @@ def copy_maps(
     return torch.stack(columns, 1)
 
 
-def copies_of(maps: Tensor, copies: Sequence[Copy], dtype: torch.dtype) -> Copies:
+def copies_of(maps: Tensor, copies: Sequence[Copy], dtype: torch.dtype) -> Instances:
     """What lanes need of copies, the identity first."""
     same = torch.eye(3, 4, dtype=torch.float64, device=maps.device).reshape(-1)
     maps = torch.cat((torch.cat((same, same.new_zeros(3)))[:, None], maps), 1)
@@ -105,7 +105,7 @@ def copies_of(maps: Tensor, copies: Sequence[Copy], dtype: torch.dtype) -> Copie
     scale = torch.stack(faces).detach().abs().amax((0, 1))
     nx, ny, nz = ((n * (front / scale)).to(dtype) for n in faces)
     first, start = maps[12].detach().to(torch.int64), maps[14].detach().to(torch.int64)
-    return Copies(start, first, x.to(dtype), y.to(dtype), z.to(dtype), move.to(dtype), nx, ny, nz)
+    return Instances(start, first, x.to(dtype), y.to(dtype), z.to(dtype), move.to(dtype), nx, ny, nz)
 
 
 # ---- All primitives of a scene in one table, from the corners of its parts
@@ -131,7 +131,7 @@ class Primitives:
     frame: Tensor | None  # (12, Q) float64: p0 e1 e2 e3 of the quadrics
     quadrics: Quadrics | None
 
-    def still(self) -> Primitives:
+    def detached(self) -> Primitives:
         """The same without derivatives."""
         own = {name: getattr(self, name) for name in ("p0", "p1", "p2", "e1", "e2", "face", "sign", "normal", "bound")}
         return replace(self, **{name: value.detach() for name, value in own.items()})

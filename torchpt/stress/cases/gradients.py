@@ -13,16 +13,16 @@ from torch import Tensor
 from torchpt.core.errors import EdgeWarning
 from torchpt.rendering.api import render
 from torchpt.scene import load
-from torchpt.stress.bench import Bench
 from torchpt.stress.case import Case, powers
 from torchpt.stress.cases._scenes import SKY, facing, floor_seen, furnace
+from torchpt.stress.harness import Harness
 
 __all__ = ["CASES"]
 
 
 def slope(
-    bench: Bench,
-    described: Mapping[str, Any],
+    harness: Harness,
+    read_typed: Mapping[str, Any],
     name: str,
     value: Any = None,
     spp: int = 64,
@@ -30,7 +30,7 @@ def slope(
     seed: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """The mean of a picture, and its derivatives by a parameter, in float64."""
-    scene = load(described, device=bench.device)
+    scene = load(read_typed, device=harness.device)
     given = scene.params[name] if value is None else torch.as_tensor(value).expand(scene.params[name].shape)
     wanted = given.detach().clone().to(scene.device, scene.params[name].dtype).requires_grad_()
     with warnings.catch_warnings():
@@ -42,8 +42,8 @@ def slope(
             seed=seed,
             integrator={"type": "path", "max_depth": depth},
             film={"width": 8, "height": 8, "filter": "box"},
-            accel=bench.accel,
-            compile=bench.compile,
+            accel=harness.accel,
+            compile=harness.compile,
             edges=False,
         )
     picture.mean().backward()
@@ -58,55 +58,57 @@ def off(found: Tensor, expected: float) -> float:
     return abs(float(found.sum()) - expected) / (abs(expected) or 1.0)
 
 
-def by_albedo(bench: Bench, value: float) -> float:
+def by_albedo(harness: Harness, value: float) -> float:
     """A ball that gives back its albedo: 1."""
     scene = furnace({"type": "diffuse", "reflectance": value})
-    _, found = slope(bench, scene, "shapes.ball.material.reflectance", spp=256)
+    _, found = slope(harness, scene, "shapes.ball.material.reflectance", spp=256)
     return off(found, 1.0)
 
 
-def by_emission(bench: Bench, value: float) -> float:
+def by_emission(harness: Harness, value: float) -> float:
     """A disk of light one radius above a grey floor: a quarter."""
     turn = [{"rotate": {"axis": [1, 0, 0], "angle": 180}}, {"translate": [0, 0, 1]}]
     scene = floor_seen(None, {"lamp": {"type": "disk", "emission": value, "transform": turn}})
-    _, found = slope(bench, scene, "shapes.lamp.emission", spp=256)
+    _, found = slope(harness, scene, "shapes.lamp.emission", spp=256)
     return off(found, 0.25)
 
 
-def by_sky(bench: Bench, value: float) -> float:
+def by_sky(harness: Harness, value: float) -> float:
     """Light from everywhere on a grey ball: a half."""
     scene = {
         **furnace({"type": "diffuse", "reflectance": 0.5}),
         "lights": {"sky": {"type": "constant", "radiance": value}},
     }
-    _, found = slope(bench, scene, "lights.sky.radiance", spp=256)
+    _, found = slope(harness, scene, "lights.sky.radiance", spp=256)
     return off(found, 0.5)
 
 
-def by_roughness(bench: Bench, alpha: float) -> float:
+def by_roughness(harness: Harness, alpha: float) -> float:
     """A metal ball: no number is lost, and what is found is what differences of the same samples give."""
     scene, name = furnace({"type": "roughconductor", "reflectance": 1.0, "alpha": alpha}), "shapes.ball.material.alpha"
-    _, found = slope(bench, scene, name)
+    _, found = slope(harness, scene, name)
     step = alpha * 2.0**-8
-    low, high = (slope(bench, scene, name, alpha + d, spp=64)[0] for d in (-step, step))
+    low, high = (slope(harness, scene, name, alpha + d, spp=64)[0] for d in (-step, step))
     expected = float(high - low) / (2 * step)
     return off(found, expected)
 
 
-def by_little_roughness(bench: Bench, alpha: float) -> float:
+def by_little_roughness(harness: Harness, alpha: float) -> float:
     """Where a metal is nearly smooth its derivative is all noise, but made of numbers."""
     scene = furnace({"type": "roughconductor", "reflectance": 1.0, "alpha": alpha})
-    _, found = slope(bench, scene, "shapes.ball.material.alpha")
+    _, found = slope(harness, scene, "shapes.ball.material.alpha")
     return 0.0 if bool(torch.isfinite(found).all()) else math.inf
 
 
-def by_index(bench: Bench, index: float) -> float:
+def by_index(harness: Harness, index: float) -> float:
     """Smooth glass under even light gives back 1 whatever its index: 0."""
-    _, found = slope(bench, furnace({"type": "dielectric", "int_ior": index}), "shapes.ball.material.int_ior", depth=16)
+    _, found = slope(
+        harness, furnace({"type": "dielectric", "int_ior": index}), "shapes.ball.material.int_ior", depth=16
+    )
     return off(found, 0.0)
 
 
-def by_a_vertex(bench: Bench, size: float) -> float:
+def by_a_vertex(harness: Harness, size: float) -> float:
     """A triangle without area among others: its corners have derivatives, and they are numbers."""
     points = [
         [-1.0, -1.0, 0.0],
@@ -119,7 +121,7 @@ def by_a_vertex(bench: Bench, size: float) -> float:
     mesh = {"type": "mesh", "vertices": points, "faces": [[0, 1, 2], [3, 4, 5]], "material": {"type": "diffuse"}}
     sun = {"sun": {"type": "directional", "direction": [0, 0.6, -0.8], "irradiance": 1.0}}
     scene = {"camera": facing(0.2), "shapes": {"it": mesh}, "lights": {**SKY, **sun}}
-    _, found = slope(bench, scene, "shapes.it.vertices")
+    _, found = slope(harness, scene, "shapes.it.vertices")
     return 0.0 if bool(torch.isfinite(found).all()) else math.inf
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 
 from torchpt.images import write_image
-from torchpt.stress.bench import Bench, relative
 from torchpt.stress.case import Case, powers
 from torchpt.stress.cases._scenes import SKY, facing, floor_seen, furnace, room
+from torchpt.stress.harness import Harness, relative
 
 __all__ = ["CASES"]
 
@@ -25,61 +25,63 @@ def lamp(kind: str, height: float, **keys: Any) -> dict[str, Any]:
     return {"lamp": {"type": kind, "emission": 1.0, "transform": [*turn, {"translate": [0, 0, height]}], **keys}}
 
 
-def disk_above(bench: Bench, height: float) -> float:
+def disk_above(harness: Harness, height: float) -> float:
     """A disk of radius 1, one-sided: E = π / (1 + h²)."""
     expected = ALBEDO / (1.0 + height**2)
     scene = floor_seen(None, lamp("disk", height), near=min(1e-3, height / 2))
-    return relative(bench.render(scene, spp=256, max_depth=2), expected)
+    return relative(harness.render(scene, spp=256, max_depth=2), expected)
 
 
-def ball_above(bench: Bench, height: float) -> float:
+def ball_above(harness: Harness, height: float) -> float:
     """A ball of radius 1 whose lowest point is so far up: E = π / (1 + h)²."""
     expected = ALBEDO / (1.0 + height) ** 2
     scene = floor_seen(None, lamp("sphere", 1.0 + height), near=min(1e-3, height / 2))
-    return relative(bench.render(scene, spp=256, max_depth=2), expected)
+    return relative(harness.render(scene, spp=256, max_depth=2), expected)
 
 
-def point_above(bench: Bench, height: float) -> float:
+def point_above(harness: Harness, height: float) -> float:
     """A point: E = I / h²."""
     light = {"it": {"type": "point", "position": [0, 0, height], "intensity": 1.0}}
-    return relative(bench.render(floor_seen(light), max_depth=2), ALBEDO / math.pi / height**2)
+    return relative(harness.render(floor_seen(light), max_depth=2), ALBEDO / math.pi / height**2)
 
 
-def inside_a_light(bench: Bench, radius: float) -> float:
+def inside_a_light(harness: Harness, radius: float) -> float:
     """A floor within a ball that shines inwards receives π."""
     ball = {"type": "sphere", "radius": radius, "emission": 1.0, "flip_normals": True}
-    return relative(bench.render(floor_seen(None, {"ball": ball}), spp=256, max_depth=2), ALBEDO)
+    return relative(harness.render(floor_seen(None, {"ball": ball}), spp=256, max_depth=2), ALBEDO)
 
 
-def radiance(bench: Bench, value: float) -> float:
+def radiance(harness: Harness, value: float) -> float:
     """Light from everywhere of any strength: so many times the picture of strength 1."""
     scene = furnace({"type": "diffuse", "reflectance": ALBEDO})
-    one = bench.render(scene)
+    one = harness.render(scene)
     return relative(
-        bench.render({**scene, "lights": {"sky": {"type": "constant", "radiance": value}}}), one.mean() * value
+        harness.render({**scene, "lights": {"sky": {"type": "constant", "radiance": value}}}), one.mean() * value
     )
 
 
-def area_radiance(bench: Bench, value: float) -> float:
+def area_radiance(harness: Harness, value: float) -> float:
     """The same of a disk."""
-    return relative(bench.render(floor_seen(None, lamp("disk", 1.0, emission=value)), max_depth=2), ALBEDO * value / 2)
+    return relative(
+        harness.render(floor_seen(None, lamp("disk", 1.0, emission=value)), max_depth=2), ALBEDO * value / 2
+    )
 
 
-def many(bench: Bench, number: float) -> float:
+def many(harness: Harness, number: float) -> float:
     """So many points that share the power of one."""
     lights = {f"p{k}": {"type": "point", "position": [0, 0, 2], "intensity": 1.0 / number} for k in range(int(number))}
-    return relative(bench.render(floor_seen(lights), max_depth=2), ALBEDO / math.pi / 4)
+    return relative(harness.render(floor_seen(lights), max_depth=2), ALBEDO / math.pi / 4)
 
 
-def one_of_many(bench: Bench, number: float) -> float:
+def one_of_many(harness: Harness, number: float) -> float:
     """So many points of which one is a million times brighter."""
     lights = {f"p{k}": {"type": "point", "position": [0, 0, 2], "intensity": 1e-6} for k in range(int(number) - 1)}
     lights["bright"] = {"type": "point", "position": [0, 0, 2], "intensity": 1.0}
     expected = (1.0 + 1e-6 * (number - 1)) * ALBEDO / math.pi / 4
-    return relative(bench.render(floor_seen(lights), max_depth=2, spp=256), expected)
+    return relative(harness.render(floor_seen(lights), max_depth=2, spp=256), expected)
 
 
-def sun(bench: Bench, value: float) -> float:
+def sun(harness: Harness, value: float) -> float:
     """A map with one texel of this radiance straight above, else 1: half of its power, by its cosine and solid angle."""
     height, width = 64, 128
     texels = torch.ones(height, width, 3)
@@ -91,12 +93,12 @@ def sun(bench: Bench, value: float) -> float:
         scene = furnace({"type": "diffuse", "reflectance": 1.0})
         scene["lights"] = {"sky": {"type": "envmap", "path": str(file)}}
         scene["camera"] = facing(1e-3)
-        found = bench.render(scene, spp=256, max_depth=2)
-        exact = bench.exact().render(scene, spp=256, max_depth=2)
+        found = harness.render(scene, spp=256, max_depth=2)
+        exact = harness.exact().render(scene, spp=256, max_depth=2)
     return relative(found, exact)
 
 
-def black_map(bench: Bench, lit: float) -> float:
+def black_map(harness: Harness, lit: float) -> float:
     """A map that is black but for so many rows."""
     texels = torch.zeros(16, 32, 3)
     texels[: int(lit)] = 1.0
@@ -105,27 +107,27 @@ def black_map(bench: Bench, lit: float) -> float:
         write_image(file, texels)
         scene = furnace({"type": "diffuse", "reflectance": 1.0})
         scene["lights"] = {"sky": {"type": "envmap", "path": str(file)}}
-        found, exact = (b.render(scene, max_depth=2) for b in (bench, bench.exact()))
+        found, exact = (b.render(scene, max_depth=2) for b in (harness, harness.exact()))
     return relative(found, exact)
 
 
-def closed_room(bench: Bench, depth: float) -> float:
+def closed_room(harness: Harness, depth: float) -> float:
     """A room of albedo .9: the series of so many terms."""
     expected = (1 - 0.9**depth) / 0.1
-    return relative(bench.render(room(0.9), spp=256, max_depth=int(depth)), expected)
+    return relative(harness.render(room(0.9), spp=256, max_depth=int(depth)), expected)
 
 
-def bright_room(bench: Bench, absorbed: float) -> float:
+def bright_room(harness: Harness, absorbed: float) -> float:
     """A room whose walls absorb so little, paths without end: 1 over that."""
-    return relative(bench.render(room(1.0 - absorbed), spp=64, max_depth=-1), 1.0 / absorbed)
+    return relative(harness.render(room(1.0 - absorbed), spp=64, max_depth=-1), 1.0 / absorbed)
 
 
-def white_room(bench: Bench, depth: float) -> float:
+def white_room(harness: Harness, depth: float) -> float:
     """A room of albedo 1: as many as there are edges."""
-    return relative(bench.render(room(1.0), spp=16, max_depth=int(depth)), depth)
+    return relative(harness.render(room(1.0), spp=16, max_depth=int(depth)), depth)
 
 
-def nothing(bench: Bench, which: float) -> float:
+def nothing(harness: Harness, which: float) -> float:
     """Scenes without shapes, without light, and a camera in a solid: black or the sky, to the bit."""
     black = {"type": "diffuse", "reflectance": 0.0}
     scenes = (
@@ -136,7 +138,7 @@ def nothing(bench: Bench, which: float) -> float:
         ({**furnace(black, radius=50.0)}, 0.0),
     )
     scene, expected = scenes[int(which)]
-    return float((bench.render(scene) - expected).abs().max())
+    return float((harness.render(scene) - expected).abs().max())
 
 
 CASES = (

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from torchpt.stress.bench import Bench, relative
 from torchpt.stress.case import Case, powers
 from torchpt.stress.cases._scenes import facing, furnace
+from torchpt.stress.harness import Harness, relative
 
 __all__ = ["CASES"]
 
@@ -15,16 +15,16 @@ ALPHA = tuple(10.0 ** (-5 + k / 4) for k in range(21))
 INDEX = tuple(10.0 ** (k / 4) for k in range(-12, 13))
 
 
-def gain(bench: Bench, material: dict[str, Any]) -> float:
+def gain(harness: Harness, material: dict[str, Any]) -> float:
     """By how much a ball gives back more than it receives; infinite where it gives back nothing at all."""
-    mean = float(bench.render(furnace(material), spp=256, max_depth=-1).mean())
+    mean = float(harness.render(furnace(material), spp=256, max_depth=-1).mean())
     return max(mean - 1.0, 0.0) if mean > 0.0 else math.inf
 
 
-def beside_float64(bench: Bench, material: dict[str, Any], spp: int = 16) -> float:
+def beside_float64(harness: Harness, material: dict[str, Any], spp: int = 16) -> float:
     """How far a ball's reflectance is from that of float64, by the same random numbers."""
     scene = furnace(material)
-    return relative(bench.render(scene, spp=spp, max_depth=8), bench.exact().render(scene, spp=spp, max_depth=8))
+    return relative(harness.render(scene, spp=spp, max_depth=8), harness.exact().render(scene, spp=spp, max_depth=8))
 
 
 def rough(kind: str, **more: Any):
@@ -38,29 +38,29 @@ GLASS = rough("roughdielectric", int_ior=1.5)
 PLASTIC = rough("roughplastic", diffuse_reflectance=1.0)
 
 
-def one_direction(bench: Bench, alpha: float) -> float:
+def one_direction(harness: Harness, alpha: float) -> float:
     """A pair of roughnesses of which one is 0."""
     pairs = ({"alpha_u": 0.0, "alpha_v": alpha}, {"alpha_u": alpha, "alpha_v": 0.0})
-    return max(gain(bench, {"type": "roughconductor", "reflectance": 1.0, **pair}) for pair in pairs)
+    return max(gain(harness, {"type": "roughconductor", "reflectance": 1.0, **pair}) for pair in pairs)
 
 
-def glass_in_a_furnace(bench: Bench, index: float) -> float:
+def glass_in_a_furnace(harness: Harness, index: float) -> float:
     """Smooth glass neither takes nor gives."""
-    return relative(bench.render(furnace({"type": "dielectric", "int_ior": index}), max_depth=-1), 1.0)
+    return relative(harness.render(furnace({"type": "dielectric", "int_ior": index}), max_depth=-1), 1.0)
 
 
-def plastic(bench: Bench, index: float) -> float:
+def plastic(harness: Harness, index: float) -> float:
     """A coat over white keeps nothing."""
     material = {"type": "plastic", "diffuse_reflectance": 1.0, "int_ior": index, "nonlinear": True}
-    return relative(bench.render(furnace(material), spp=256, max_depth=-1), 1.0)
+    return relative(harness.render(furnace(material), spp=256, max_depth=-1), 1.0)
 
 
-def thin_glass(bench: Bench, index: float) -> float:
+def thin_glass(harness: Harness, index: float) -> float:
     """A pane."""
-    return relative(bench.render(furnace({"type": "thindielectric", "int_ior": index}), max_depth=-1), 1.0)
+    return relative(harness.render(furnace({"type": "thindielectric", "int_ior": index}), max_depth=-1), 1.0)
 
 
-def grazing(bench: Bench, height: float) -> float:
+def grazing(harness: Harness, height: float) -> float:
     """A square seen at so small an angle, under light from everywhere: no more than one comes back."""
     angle = math.asin(height)
     camera = {
@@ -82,17 +82,17 @@ def grazing(bench: Bench, height: float) -> float:
             "shapes": {"it": {"type": "rectangle", "material": material}},
             "lights": furnace({})["lights"],
         }
-        worst = max(worst, float(bench.render(scene).mean()) - 1.0)
+        worst = max(worst, float(harness.render(scene).mean()) - 1.0)
     return worst
 
 
-def albedo(bench: Bench, value: float) -> float:
+def albedo(harness: Harness, value: float) -> float:
     """A ball of this albedo gives back so many times what a white one does."""
-    some, white = (bench.render(furnace({"type": "diffuse", "reflectance": r}), max_depth=2) for r in (value, 1.0))
+    some, white = (harness.render(furnace({"type": "diffuse", "reflectance": r}), max_depth=2) for r in (value, 1.0))
     return relative(some, white.mean() * value)
 
 
-def backs(bench: Bench, alpha: float) -> float:
+def backs(harness: Harness, alpha: float) -> float:
     """The back of a two-sided metal is its front."""
     scenes = []
     for turn in (0, 180):
@@ -102,7 +102,7 @@ def backs(bench: Bench, alpha: float) -> float:
             "transform": [{"rotate": {"axis": [0, 1, 0], "angle": turn}}],
         }
         scenes.append({"camera": facing(), "shapes": {"it": shape}, "lights": furnace({})["lights"]})
-    front, back = (bench.render(scene, spp=256) for scene in scenes)
+    front, back = (harness.render(scene, spp=256) for scene in scenes)
     return relative(front, back)
 
 

@@ -9,13 +9,13 @@ import torch
 from torchpt.math.sampling import power_heuristic
 from torchpt.physics.film import Film
 from torchpt.physics.samplers import KINDS, Dimension, Draws, Sampler, salts
-from torchpt.stress.bench import Bench
 from torchpt.stress.case import Case, powers
+from torchpt.stress.harness import Harness
 
 __all__ = ["CASES"]
 
 
-def sums(bench: Bench, number: float) -> float:
+def sums(harness: Harness, number: float) -> float:
     """The mean of so many samples of 0.1."""
     film = Film(4, 4, 1, torch.device("cpu"))
     chunk = torch.full((3, 1000, 16), 0.1)
@@ -24,7 +24,7 @@ def sums(bench: Bench, number: float) -> float:
     return float((film.mean() / torch.tensor(0.1).double() - 1.0).abs().max())
 
 
-def late_samples(bench: Bench, first: float) -> float:
+def late_samples(harness: Harness, first: float) -> float:
     """Numbers of 2^12 samples from this one on: off the mean of a half, in standard deviations over 4."""
     worst = 0.0
     for kind in KINDS:
@@ -40,7 +40,7 @@ def late_samples(bench: Bench, first: float) -> float:
     return worst
 
 
-def weights(bench: Bench, density: float) -> float:
+def weights(harness: Harness, density: float) -> float:
     """Both weights of a pair of densities make one."""
     a = torch.tensor([density, density, 1.0, math.inf, density]).float()
     b = torch.tensor([1.0, density, density, 1.0, 0.0]).float()

@@ -8,9 +8,9 @@ import numpy as np
 
 from torchpt.rendering.api import render
 from torchpt.scene import load
-from torchpt.stress.bench import Bench, apart, relative
 from torchpt.stress.case import Case, powers
 from torchpt.stress.cases._scenes import SKY, ball, facing, furnace
+from torchpt.stress.harness import Harness, relative, relative_difference
 
 __all__ = ["CASES"]
 
@@ -50,23 +50,29 @@ def still_life(scale: float = 1.0, shift: float = 0.0, turn: float = 0.0) -> dic
     }
 
 
-def at_scale(bench: Bench, scale: float) -> float:
+def at_scale(harness: Harness, scale: float) -> float:
     """The picture of a scene of another size."""
-    return apart(bench.render(still_life(scale), size=24, spp=16), bench.render(still_life(), size=24, spp=16))
+    return relative_difference(
+        harness.render(still_life(scale), size=24, spp=16), harness.render(still_life(), size=24, spp=16)
+    )
 
 
-def far_away(bench: Bench, shift: float) -> float:
+def far_away(harness: Harness, shift: float) -> float:
     """The picture of a scene far from the origin."""
-    return apart(bench.render(still_life(shift=shift), size=24, spp=16), bench.render(still_life(), size=24, spp=16))
+    return relative_difference(
+        harness.render(still_life(shift=shift), size=24, spp=16), harness.render(still_life(), size=24, spp=16)
+    )
 
 
-def turned(bench: Bench, angle: float) -> float:
+def turned(harness: Harness, angle: float) -> float:
     """The picture of a scene that is turned with its camera. Its frames, and so its noise, are others."""
-    plain, other = (bench.render(still_life(), size=24, spp=64, seed=seed) for seed in (1, 2))
-    return apart(bench.render(still_life(turn=angle), size=24, spp=64), plain) / apart(other, plain)
+    plain, other = (harness.render(still_life(), size=24, spp=64, seed=seed) for seed in (1, 2))
+    return relative_difference(harness.render(still_life(turn=angle), size=24, spp=64), plain) / relative_difference(
+        other, plain
+    )
 
 
-def little_on_large(bench: Bench, radius: float) -> float:
+def little_on_large(harness: Harness, radius: float) -> float:
     """A white ball on a white floor of 1e3 under white light: a ray that starts inside of what it left darkens it."""
     scene = {
         "camera": {"type": "perspective", "origin": [0, 6 * radius, 3 * radius], "target": [0, 0, radius], "up": [0, 0, 1],
@@ -75,10 +81,10 @@ def little_on_large(bench: Bench, radius: float) -> float:
                    "ball": ball(radius, (0.0, 0.0, radius), material=WHITE)},
         "lights": SKY,
     }  # fmt: skip
-    return relative(bench.render(scene, spp=64, max_depth=-1), 1.0)
+    return relative(harness.render(scene, spp=64, max_depth=-1), 1.0)
 
 
-def flat_room(bench: Bench, height: float) -> float:
+def flat_room(harness: Harness, height: float) -> float:
     """A closed room so low, whose walls shine 1 and give back half: 2 wherever one looks, or something leaked."""
     walls = {"type": "cube", "flip_normals": True, "emission": 1.0, "material": {"type": "diffuse", "reflectance": 0.5}}
     scene = {
@@ -91,7 +97,7 @@ def flat_room(bench: Bench, height: float) -> float:
         },
         "shapes": {"room": {**walls, "transform": [{"scale": [1, 1, height]}]}},
     }
-    return relative(bench.render(scene, spp=256, max_depth=-1), 2.0)
+    return relative(harness.render(scene, spp=256, max_depth=-1), 2.0)
 
 
 def grid(number: int, material: dict[str, Any] = WHITE, **keys: Any) -> dict[str, Any]:
@@ -103,33 +109,33 @@ def grid(number: int, material: dict[str, Any] = WHITE, **keys: Any) -> dict[str
     return {"type": "mesh", "vertices": points.tolist(), "faces": corners.tolist(), "material": material, **keys}
 
 
-def seams(bench: Bench, number: float) -> float:
+def seams(harness: Harness, number: float) -> float:
     """Black light passes where a square of many triangles leaks at an edge that they share."""
     scene = {"camera": facing(1.9), "shapes": {"square": grid(int(number), emission=1.0)}}
-    return float((bench.render(scene, size=64, spp=16, max_depth=1) - 1.0).abs().max())
+    return float((harness.render(scene, size=64, spp=16, max_depth=1) - 1.0).abs().max())
 
 
-def degenerate(bench: Bench, _: float) -> float:
+def degenerate(harness: Harness, _: float) -> float:
     """Slivers and triangles of no area among the others change nothing."""
     plain = grid(8)
     bad = {**plain, "vertices": [*plain["vertices"], [0, 0, 0], [1, 1, 0], [0.5, 0.5, 0], [0, 0, 1e-30], [1e-38, 0, 0]]}
     n = len(plain["vertices"])
     bad["faces"] = [*plain["faces"], [n, n + 1, n + 2], [n, n, n], [n, n + 3, n + 4], [0, 0, 1]]
-    pictures = [bench.render({"camera": facing(), "shapes": {"it": it}, "lights": SKY}) for it in (bad, plain)]
-    return apart(*pictures)
+    pictures = [harness.render({"camera": facing(), "shapes": {"it": it}, "lights": SKY}) for it in (bad, plain)]
+    return relative_difference(*pictures)
 
 
-def all_in_one_place(bench: Bench, number: float) -> float:
+def all_in_one_place(harness: Harness, number: float) -> float:
     """So many triangles with one centroid: all Morton codes are equal, and the first of them is met."""
     three = [[-3.0, -3.0, 0.0], [3.0, -3.0, 0.0], [0.0, 6.0, 0.0]]
     mesh = {"type": "mesh", "vertices": three, "faces": [[0, 1, 2]] * int(number), "material": WHITE}
     one = {**mesh, "faces": [[0, 1, 2]]}
-    return apart(
-        *(bench.render({"camera": facing(), "shapes": {"it": it}, "lights": SKY}, spp=4) for it in (mesh, one))
+    return relative_difference(
+        *(harness.render({"camera": facing(), "shapes": {"it": it}, "lights": SKY}, spp=4) for it in (mesh, one))
     )
 
 
-def along_the_axes(bench: Bench, axis: float) -> float:
+def along_the_axes(harness: Harness, axis: float) -> float:
     """Rays that are parallel to an axis and lie in planes of boxes."""
     way = [0.0, 0.0, 0.0]
     way[int(axis) % 3] = 4.0 if axis < 3 else -4.0
@@ -137,10 +143,10 @@ def along_the_axes(bench: Bench, axis: float) -> float:
     camera = {"type": "orthographic", "origin": way, "target": [0, 0, 0], "up": up, "width": 2.0}
     cubes = {f"c{k}": {"type": "cube", "emission": 1.0, "transform": [{"scale": 0.5}, {"translate": p}]}
              for k, p in enumerate(([-0.5, -0.5, 0.5], [0.5, -0.5, -0.5], [-0.5, 0.5, -0.5], [0.5, 0.5, 0.5]))}  # fmt: skip
-    return float((bench.render({"camera": camera, "shapes": cubes}, size=16, spp=16, max_depth=1) - 1.0).abs().max())
+    return float((harness.render({"camera": camera, "shapes": cubes}, size=16, spp=16, max_depth=1) - 1.0).abs().max())
 
 
-def small_far_sphere(bench: Bench, distance: float) -> float:
+def small_far_sphere(harness: Harness, distance: float) -> float:
     """A ball lit from the eye, so far away: its discriminant is a small difference of large numbers."""
     half = np.arctan(1.0 / distance) / 2
     scene = {
@@ -158,15 +164,15 @@ def small_far_sphere(bench: Bench, distance: float) -> float:
     # Along (x, y, -1): the nearer root, in a form without a difference of large numbers.
     a, outside = x * x + y * y + 1, (distance - 1) * (distance + 1)
     z = distance - outside / (distance + np.sqrt(distance * distance - a * outside))
-    return relative(bench.render(scene, spp=256, max_depth=2), float(z.mean()))
+    return relative(harness.render(scene, spp=256, max_depth=2), float(z.mean()))
 
 
-def one_pixel_wide(bench: Bench, width: float) -> float:
+def one_pixel_wide(harness: Harness, width: float) -> float:
     """A film of so many pixels by one."""
-    scene = load(furnace({"type": "diffuse"}, emission=0.5), device=bench.device)
+    scene = load(furnace({"type": "diffuse"}, emission=0.5), device=harness.device)
     film = {"width": int(width), "height": 1, "filter": "box"}
     only = {"type": "path", "max_depth": 1}
-    picture = render(scene, film=film, spp=1, integrator=only, accel=bench.accel, compile=bench.compile)
+    picture = render(scene, film=film, spp=1, integrator=only, accel=harness.accel, compile=harness.compile)
     return float(picture.shape != (1, int(width), 3)) + relative(picture.double()[:, int(width) // 2], 0.5)
 
 

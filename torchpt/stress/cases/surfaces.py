@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from torchpt.stress.bench import Bench, apart, relative
 from torchpt.stress.case import Case, powers
 from torchpt.stress.cases._scenes import SKY, facing, furnace
+from torchpt.stress.harness import Harness, relative, relative_difference
 
 __all__ = ["CASES"]
 
@@ -37,16 +37,16 @@ def round_mesh(rings: int, **keys: Any) -> dict[str, Any]:
     }
 
 
-def shaded_round(bench: Bench, rings: float) -> float:
+def shaded_round(harness: Harness, rings: float) -> float:
     """Normals that lean off the surface bring no light of their own."""
     worst = 0.0
     for material in (WHITE, {"type": "roughconductor", "reflectance": 1.0, "alpha": 0.3}, {"type": "conductor"}):
         scene = {"camera": facing(2.2), "shapes": {"it": round_mesh(int(rings), material=material)}, "lights": SKY}
-        worst = max(worst, float(bench.render(scene, spp=256, max_depth=-1).mean()) - 1.0)
+        worst = max(worst, float(harness.render(scene, spp=256, max_depth=-1).mean()) - 1.0)
     return max(worst, 0.0)
 
 
-def touching(bench: Bench, size: float) -> float:
+def touching(harness: Harness, size: float) -> float:
     """White boxes side by side on a white floor, under white light: a ray that is lost where they touch darkens them."""
     boxes = {
         f"b{k}": {
@@ -65,35 +65,35 @@ def touching(bench: Bench, size: float) -> float:
         "fov": 30,
     }
     scene = {"camera": camera, "shapes": {**boxes, "floor": floor}, "lights": SKY}
-    return relative(bench.render(scene, spp=256, max_depth=-1), 1.0)
+    return relative(harness.render(scene, spp=256, max_depth=-1), 1.0)
 
 
-def mirrored(bench: Bench, scale: float) -> float:
+def mirrored(harness: Harness, scale: float) -> float:
     """The front of what is mirrored stays its front."""
     pictures = []
     for z in (scale, -scale):
         shape = round_mesh(8, emission=1.0, transform=[{"scale": [1, 1, z]}])
         cube = {"type": "cube", "emission": 0.5, "transform": [{"scale": [0.3, 0.3, z]}, {"translate": [2, 0, 0]}]}
         pictures.append(
-            bench.render({"camera": facing(6.0), "shapes": {"it": shape, "cube": cube}}, max_depth=1, size=16)
+            harness.render({"camera": facing(6.0), "shapes": {"it": shape, "cube": cube}}, max_depth=1, size=16)
         )
-    return apart(*pictures)
+    return relative_difference(*pictures)
 
 
-def checks(bench: Bench, scale: float) -> float:
+def checks(harness: Harness, scale: float) -> float:
     """Squares of black and white however small: their mean, and black where the first is larger than the ball."""
     board = {"type": "checkerboard", "color0": 0.0, "color1": 1.0, "scale": [scale, scale]}
-    found = float(bench.render(furnace({"type": "diffuse", "reflectance": board}), spp=256, max_depth=2).mean())
+    found = float(harness.render(furnace({"type": "diffuse", "reflectance": board}), spp=256, max_depth=2).mean())
     if scale > 1e6:  # one square and the next have the same float32 coordinates
         return max(found - 1.0, -found, 0.0)
     return abs(found) if scale < 1e-3 else max(found - 0.75, 0.25 - found, 0.0)
 
 
-def no_room_for_uv(bench: Bench, span: float) -> float:
+def no_room_for_uv(harness: Harness, span: float) -> float:
     """An anisotropic metal on a mesh whose texture coordinates span this: where they give no frame the normal does."""
     mesh = round_mesh(6, material={"type": "roughconductor", "alpha_u": 0.05, "alpha_v": 0.4, "reflectance": 1.0})
     mesh["uvs"] = (np.asarray(mesh["vertices"])[:, :2] * span).tolist()
-    found = bench.render({"camera": facing(1.0), "shapes": {"it": mesh}, "lights": SKY}, max_depth=2)
+    found = harness.render({"camera": facing(1.0), "shapes": {"it": mesh}, "lights": SKY}, max_depth=2)
     return max(float(found.mean()) - 1.0, 0.0) if float(found.mean()) > 0.5 else 1.0
 
 

@@ -54,7 +54,7 @@ class Preview(FirstSurface):
     @staticmethod
     def of(world: World) -> Preview:
         """Of a scene's environment; differentiable in it."""
-        around = lights.surroundings(world.lights)
+        around = lights.environment_image(world.lights)
         if around is None:
             return Preview(None)
         if around.even:
@@ -83,6 +83,6 @@ class Preview(FirstSurface):
         if self.sky is not None:
             n, v = self.turned(surface.frame.n), self.turned(-state.d)
             radiance = throughput * under(self.sky, world.materials.models[model], surface.parameters, n, v)
-            if surface.shown is not None:
-                radiance = radiance * surface.shown
+            if surface.front_mask is not None:
+                radiance = radiance * surface.front_mask
         return VertexOutput(replace(state, radiance=state.radiance + radiance), None, shadow, at, surface, direct)

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from torchpt.paths.integrators.base import LIGHT_CHOICE, SAMPLES, STRATEGY, Limits
 from torchpt.paths.integrators.path import PathIntegrator
-from torchpt.spec import Refused, Scalar, Whole
+from torchpt.spec import Integer, Refused, Scalar
 
 __all__ = ["Path"]
 
@@ -17,12 +17,12 @@ class Path(PathIntegrator):
 
     name = "path"
     parameters: ClassVar = {
-        "max_depth": Whole(
+        "max_depth": Integer(
             16,
             low=-1,
             doc="longest path in edges: 1 emission only, 2 direct light, -1 until roulette ends it",
         ),
-        "rr_depth": Whole(5, low=1, doc="roulette may end paths from this depth on"),
+        "rr_depth": Integer(5, low=1, doc="roulette may end paths from this depth on"),
         "rr_prob": Scalar(
             None,
             above=0.0,
@@ -42,7 +42,7 @@ class Path(PathIntegrator):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`Valued`."""
+        """See :class:`FrozenConfig`."""
         if values["max_depth"] == -1 and values["rr_prob"] == 1.0:
             expected = "a survival probability below 1 where max_depth is -1 (paths would not end)"
             raise Refused(expected, 1.0, ("rr_prob",))

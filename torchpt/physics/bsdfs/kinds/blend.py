@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
-from torchpt.physics.bsdfs.lobes import weighed, with_delta
+from torchpt.physics.bsdfs.lobes import mixture_sample, with_delta
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.specs import Inner, fraction
 from torchpt.spec import REQUIRED
@@ -87,15 +87,18 @@ class Blend(Bsdf):
         """One of the two by the weight; the other counts too, but for deltas."""
         assert lobe is not None
         weight = parameters["weight"].clamp(0.0, 1.0)
-        often = weight.detach()
-        second = lobe < often
+        second_probability = weight.detach()
+        second = lobe < second_probability
         # What is left of the number after the choice is uniform again.
-        low, width = torch.where(second, 0.0, often), torch.where(second, often, 1.0 - often)
+        low, width = (
+            torch.where(second, 0.0, second_probability),
+            torch.where(second, second_probability, 1.0 - second_probability),
+        )
         lobe = ((lobe - low) / width).clamp(0.0, 1.0 - 2.0**-24)
         a = self._facing(self.a).sample(parameters["a"], wo, lobe if self.a.lobed else None, u)
         b = self._facing(self.b).sample(parameters["b"], wo, lobe if self.b.lobed else None, u)
         wi, pdf = torch.where(second, b.wi, a.wi), torch.where(second, b.pdf, a.pdf).detach()
-        drawn = weighed(self, parameters, wo, wi, (pdf > 0).to(pdf.dtype))
+        drawn = mixture_sample(self, parameters, wo, wi, (pdf > 0).to(pdf.dtype))
         if self.delta:
             amount = torch.where(second, weight, 1.0 - weight) / width
             drawn = with_delta(drawn, torch.isinf(pdf), wi, torch.where(second, b.weight, a.weight) * amount)

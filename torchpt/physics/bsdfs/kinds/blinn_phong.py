@@ -16,7 +16,16 @@ from torch import Tensor
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.math.vectors import dot
 from torchpt.physics.bsdfs.base import Parameters
-from torchpt.physics.bsdfs.lobes import Power, above, added, cosine_power, drop_of_power, mean, share, weighed
+from torchpt.physics.bsdfs.lobes import (
+    PhongBase,
+    cosine_power,
+    in_upper_hemisphere,
+    lobe_probability,
+    mean,
+    mixture_sample,
+    phong_split_sum,
+    sample_cosine_power,
+)
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.specs import reflectance
 
@@ -24,14 +33,14 @@ __all__ = ["BlinnPhong"]
 
 
 @dataclass(frozen=True)
-class BlinnPhong(Power):
+class BlinnPhong(PhongBase):
     """Lambert and a lobe about the half vector, as published: it reflects up to `diffuse + 4 specular`."""
 
     name = "blinn_phong"
     parameters: ClassVar = {
         "specular": reflectance((0.1, 0.1, 0.1), "reflectance of the glossy one: where it is sharp, four times as much")
     }
-    most = 4.0
+    max_albedo = 4.0
     conserves = False
 
     def prepare(self, values: Parameters) -> Parameters:
@@ -41,12 +50,15 @@ class BlinnPhong(Power):
         """
         n = values["exponent"]
         peak = 4.0 * (n + torch.exp(-0.5 * math.log(2.0) * n)) / (n + 4.0)
-        return {**values, "share": share(mean(values["diffuse"]), mean(values["specular"]) * peak)}
+        return {
+            **values,
+            "lobe_probability": lobe_probability(mean(values["diffuse"]), mean(values["specular"]) * peak),
+        }
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """See :class:`Bsdf`."""
-        exponent, often = parameters["exponent"], parameters["share"]
-        seen = above(wo, wi)
+        exponent, diffuse_probability = parameters["exponent"], parameters["lobe_probability"]
+        seen = in_upper_hemisphere(wo, wi)
         cosine = wi[2] * seen
         s = wo + wi  # along the half vector, 2 cos(wo, h) long
         square = dot(s, s)
@@ -57,18 +69,20 @@ class BlinnPhong(Power):
         value = torch.addcmul(
             parameters["diffuse"] * (cosine * (1.0 / math.pi)), parameters["specular"], (exponent + 2.0) * peak * cosine
         )
-        pdf = often * cosine * (1.0 / math.pi) + (1.0 - often) * (exponent + 1.0) * peak * seen / (2.0 * square.sqrt())
+        pdf = diffuse_probability * cosine * (1.0 / math.pi) + (1.0 - diffuse_probability) * (
+            exponent + 1.0
+        ) * peak * seen / (2.0 * square.sqrt())
         return value, pdf
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """One of the lobes; the half vector has density ``(n + 1) / (2 pi) (h . n)^n``. Below the surface it fails."""
         assert lobe is not None
-        drop = drop_of_power(u[0], parameters["exponent"])
-        r = (drop * (2.0 - drop)).clamp_min(0.0).sqrt()
+        one_minus_cos = sample_cosine_power(u[0], parameters["exponent"])
+        r = (one_minus_cos * (2.0 - one_minus_cos)).clamp_min(0.0).sqrt()
         phi = (2.0 * math.pi) * u[1]
-        h = torch.stack((r * torch.cos(phi), r * torch.sin(phi), 1.0 - drop))
-        wi = torch.where(lobe < parameters["share"], cosine_hemisphere(u), h * (2.0 * dot(wo, h)) - wo)
-        return weighed(self, parameters, wo, wi)
+        h = torch.stack((r * torch.cos(phi), r * torch.sin(phi), 1.0 - one_minus_cos))
+        wi = torch.where(lobe < parameters["lobe_probability"], cosine_hemisphere(u), h * (2.0 * dot(wo, h)) - wo)
+        return mixture_sample(self, parameters, wo, wi)
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Both reflectances; where they create energy, no more than 1."""
@@ -77,4 +91,4 @@ class BlinnPhong(Power):
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Facets as wide, and as bright as the lobe is at normal incidence."""
         n = parameters["exponent"]
-        return added(parameters, 2.0 / (n + 2.0), 4.0 * (n + torch.exp(-0.34657359 * n)) / (n + 4.0))
+        return phong_split_sum(parameters, 2.0 / (n + 2.0), 4.0 * (n + torch.exp(-0.34657359 * n)) / (n + 4.0))

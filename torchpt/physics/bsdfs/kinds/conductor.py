@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
-from torchpt.physics.bsdfs.metal import Metal, by_reflectance, metal, metal_colour, mirrored
+from torchpt.physics.bsdfs.metal import Metal, by_reflectance, metal, metal_colour, metal_split_sum
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.specs import smooth
 
@@ -67,4 +67,4 @@ class Conductor(Metal):
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """A mirror."""
         like = next(parameters[key] for key in ("reflectance", "eta") if parameters[key] is not None)
-        return mirrored(parameters, torch.zeros_like(like[0]))
+        return metal_split_sum(parameters, torch.zeros_like(like[0]))

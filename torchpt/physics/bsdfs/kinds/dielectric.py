@@ -9,7 +9,13 @@ import torch
 from torch import Tensor
 
 from torchpt.physics.bsdfs.base import Parameters
-from torchpt.physics.bsdfs.lobes import Glass, clear, passing, polished, reflectance_at_normal
+from torchpt.physics.bsdfs.lobes import (
+    Glass,
+    dielectric_parameters,
+    dielectric_split_sum,
+    polished,
+    reflectance_at_normal,
+)
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.specs import smooth
 
@@ -30,7 +36,7 @@ class Dielectric(Glass):
 
     def prepare(self, values: Parameters) -> Parameters:
         """See :class:`Bsdf`."""
-        return clear(values)
+        return dielectric_parameters(values)
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """Nothing: a delta is not seen."""
@@ -48,4 +54,4 @@ class Dielectric(Glass):
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """A smooth boundary."""
         eta = parameters["eta"]
-        return passing(parameters, torch.zeros_like(eta), reflectance_at_normal(eta), eta)
+        return dielectric_split_sum(parameters, torch.zeros_like(eta), reflectance_at_normal(eta), eta)

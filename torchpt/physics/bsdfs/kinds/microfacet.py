@@ -35,7 +35,7 @@ class Microfacet(Glossy):
     }
     reciprocal = False
 
-    def amounts(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
+    def lobe_factors(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
         """See :class:`Glossy`."""
         f = fresnel_dielectric(wo[2].clamp_min(0.0), parameters["ior"]).reflectance
         return (1.0 - f) * parameters["diffuse"], f * parameters["specular"]

@@ -26,14 +26,14 @@ class Nonmetal(Glossy):
         "roughness": fraction(0.5, "of its facets: the square root of GGX's alpha"),
     }
 
-    def amounts(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
+    def lobe_factors(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
         """See :class:`Glossy`."""
         s = parameters["specular"]
         return (1.0 - s) * parameters["base_color"], s.expand_as(parameters["base_color"])
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Both lobes."""
-        diffuse, specular = self.amounts(parameters, parameters["base_color"])
+        diffuse, specular = self.lobe_factors(parameters, parameters["base_color"])
         return diffuse + specular
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:

@@ -14,45 +14,57 @@ from torch import Tensor
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.math.vectors import Frame, dot
 from torchpt.physics.bsdfs.base import Parameters
-from torchpt.physics.bsdfs.lobes import Power, above, added, cosine_power, drop_of_power, mean, share, weighed
+from torchpt.physics.bsdfs.lobes import (
+    PhongBase,
+    cosine_power,
+    in_upper_hemisphere,
+    lobe_probability,
+    mean,
+    mixture_sample,
+    phong_split_sum,
+    sample_cosine_power,
+)
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 
 __all__ = ["Phong"]
 
 
 @dataclass(frozen=True)
-class Phong(Power):
+class Phong(PhongBase):
     """Lambert and a lobe about the mirror direction; it conserves energy where `diffuse + specular <= 1`."""
 
     name = "phong"
 
     def prepare(self, values: Parameters) -> Parameters:
         """Adds how often the diffuse lobe is drawn."""
-        return {**values, "share": share(mean(values["diffuse"]), mean(values["specular"]))}
+        return {**values, "lobe_probability": lobe_probability(mean(values["diffuse"]), mean(values["specular"]))}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """See :class:`Bsdf`."""
-        exponent, often = parameters["exponent"], parameters["share"]
-        seen = above(wo, wi)
+        exponent, diffuse_probability = parameters["exponent"], parameters["lobe_probability"]
+        seen = in_upper_hemisphere(wo, wi)
         cosine = wi[2] * seen
         off = torch.stack((wo[0] + wi[0], wo[1] + wi[1], wo[2] - wi[2]))  # from the mirror direction to wi
         peak = cosine_power(0.5 * dot(off, off), exponent) * (0.5 / math.pi)
         value = torch.addcmul(
             parameters["diffuse"] * (cosine * (1.0 / math.pi)), parameters["specular"], (exponent + 2.0) * peak * cosine
         )
-        pdf = often * cosine * (1.0 / math.pi) + (1.0 - often) * (exponent + 1.0) * peak * seen
+        pdf = (
+            diffuse_probability * cosine * (1.0 / math.pi)
+            + (1.0 - diffuse_probability) * (exponent + 1.0) * peak * seen
+        )
         return value, pdf
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """One of the lobes by their mean reflectances; what falls below the surface fails."""
         assert lobe is not None
-        drop = drop_of_power(u[0], parameters["exponent"])
-        r = (drop * (2.0 - drop)).clamp_min(0.0).sqrt()
+        one_minus_cos = sample_cosine_power(u[0], parameters["exponent"])
+        r = (one_minus_cos * (2.0 - one_minus_cos)).clamp_min(0.0).sqrt()
         phi = (2.0 * math.pi) * u[1]
         frame = Frame.about(torch.stack((-wo[0], -wo[1], wo[2])))
-        about = frame.to_world(torch.stack((r * torch.cos(phi), r * torch.sin(phi), 1.0 - drop)))
-        wi = torch.where(lobe < parameters["share"], cosine_hemisphere(u), about)
-        return weighed(self, parameters, wo, wi)
+        about = frame.to_world(torch.stack((r * torch.cos(phi), r * torch.sin(phi), 1.0 - one_minus_cos)))
+        wi = torch.where(lobe < parameters["lobe_probability"], cosine_hemisphere(u), about)
+        return mixture_sample(self, parameters, wo, wi)
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Both reflectances."""
@@ -60,4 +72,4 @@ class Phong(Power):
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """The lobe about the mirror direction is as narrow as one about half vectors of four times the exponent."""
-        return added(parameters, 2.0 / (4.0 * parameters["exponent"] + 2.0), 1.0)
+        return phong_split_sum(parameters, 2.0 / (4.0 * parameters["exponent"] + 2.0), 1.0)

@@ -9,10 +9,18 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchpt.math.microfacet import diffuse_passed, fresnel_dielectric
+from torchpt.math.microfacet import diffuse_transmittance, fresnel_dielectric
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
-from torchpt.physics.bsdfs.lobes import Coat, coated, over_base, share, tinted, weighed, with_delta
+from torchpt.physics.bsdfs.lobes import (
+    Coat,
+    coat_parameters,
+    coated_split_sum,
+    lobe_probability,
+    mixture_sample,
+    tinted,
+    with_delta,
+)
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.specs import smooth
 
@@ -23,7 +31,7 @@ __all__ = ["Plastic"]
 class Plastic(Coat):
     """A polished coat over a diffuse base.
 
-    Its fit of the coat's mean reflectance (see ``diffuse_passed``) conserves energy to 0.02 %.
+    Its fit of the coat's mean reflectance (see ``diffuse_transmittance``) conserves energy to 0.02 %.
 
     Attributes:
         nonlinear: light that the coat throws back takes the base's colour again.
@@ -49,7 +57,7 @@ class Plastic(Coat):
     def prepare(self, values: Parameters) -> Parameters:
         """See :class:`Bsdf`."""
         eta = values["int_ior"] / values["ext_ior"]
-        return coated(values, eta, diffuse_passed(1.0 / eta), self.nonlinear)
+        return coat_parameters(values, eta, diffuse_transmittance(1.0 / eta), self.nonlinear)
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """The base, seen through the coat both ways."""
@@ -64,11 +72,11 @@ class Plastic(Coat):
         assert lobe is not None
         f_o = fresnel_dielectric(wo[2], parameters["eta"]).reflectance
         specular = self._specular(parameters, f_o)
-        drawn = weighed(self, parameters, wo, cosine_hemisphere(u))
+        drawn = mixture_sample(self, parameters, wo, cosine_hemisphere(u))
         chosen = (lobe < specular) & (wo[2] > 0)
-        mirrored = torch.stack((-wo[0], -wo[1], wo[2]))
+        metal_split_sum = torch.stack((-wo[0], -wo[1], wo[2]))
         weight = tinted(f_o / torch.where(specular > 0, specular, 1.0), parameters["specular_reflectance"])
-        return with_delta(drawn, chosen, mirrored, weight)
+        return with_delta(drawn, chosen, metal_split_sum, weight)
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """That of the base."""
@@ -76,9 +84,9 @@ class Plastic(Coat):
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """A mirror over the base."""
-        return over_base(parameters, torch.zeros_like(parameters["eta"]))
+        return coated_split_sum(parameters, torch.zeros_like(parameters["eta"]))
 
     def _specular(self, parameters: Parameters, f_o: Tensor) -> Tensor:
         """How often the coat is chosen."""
         weight = parameters["specular_share"]
-        return share(f_o * weight, (1.0 - f_o) * (1.0 - weight))
+        return lobe_probability(f_o * weight, (1.0 - f_o) * (1.0 - weight))

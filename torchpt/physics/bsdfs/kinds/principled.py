@@ -19,14 +19,15 @@ from torchpt.math.microfacet import INDEX_MATCHED, fresnel_dielectric, refract
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.math.vectors import dot, luminance
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
-from torchpt.physics.bsdfs.lobes import reflectance_at_normal, weighed
+from torchpt.physics.bsdfs.lobes import mixture_sample, reflectance_at_normal
 from torchpt.physics.bsdfs.principled_lobes import (
     Facet,
-    Main,
+    MainLobes,
     Probabilities,
     clearcoat_alpha,
     clearcoat_masking,
     fake_subsurface,
+    flip_to_upper,
     gtr1,
     lerp,
     or_zero,
@@ -35,7 +36,6 @@ from torchpt.physics.bsdfs.principled_lobes import (
     schlick_weight,
     tint,
     up,
-    upward,
     wide_ggx,
 )
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
@@ -157,23 +157,23 @@ class Principled(Bsdf):
         eta = parameters["eta"]
         front = None
         if self.transmissive:
-            wo, wi, eta, front = upward(wo, wi, eta)
+            wo, wi, eta, front = flip_to_upper(wo, wi, eta)
         main = self._main(parameters, wo, wi, eta)
         facet = self._facet(parameters, wo, main.m, main.cos, eta, front)
-        chance = self.probabilities(parameters, wo, facet, front)
+        probability = self.probabilities(parameters, wo, facet, front)
         value = facet.reflected * main.reflection
-        pdf = chance.reflect * main.reflection_pdf
-        if facet.refracted is not None and chance.refract is not None:
+        pdf = probability.reflect * main.reflection_pdf
+        if facet.refracted is not None and probability.refract is not None:
             value = torch.addcmul(value, facet.refracted, main.refraction)
-            pdf = torch.addcmul(pdf, chance.refract, main.refraction_pdf)
+            pdf = torch.addcmul(pdf, probability.refract, main.refraction_pdf)
         cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].clamp_min(0.0)
         seen = ((cos_o > 0) & (cos_i > 0)).to(cos_i.dtype)
         if front is not None:
             seen = seen * front
         shown = cos_i * seen
         value = torch.addcmul(value, self._diffuse(parameters, cos_o, cos_i, main.cos), shown)
-        pdf = pdf + chance.diffuse * (cos_i * seen * (1.0 / math.pi))
-        if chance.clearcoat is not None:
+        pdf = pdf + probability.diffuse * (cos_i * seen * (1.0 / math.pi))
+        if probability.clearcoat is not None:
             m = torch.where(seen > 0, main.m, up(main.m))
             d = gtr1(m, clearcoat_alpha(or_zero(parameters["clearcoat_gloss"], cos_o)))
             f = lerp(0.04, 1.0, facet.schlick)
@@ -181,7 +181,7 @@ class Principled(Bsdf):
             g = clearcoat_masking(wo, wi, cos_o, cos_i)
             value = value + (0.25 * parameters["clearcoat"]) * (f * d * g * shown)
             cos = torch.where(main.cos > 0, main.cos, 1.0)
-            pdf = pdf + chance.clearcoat * seen * (d * m[2] / (4.0 * cos))
+            pdf = pdf + probability.clearcoat * seen * (d * m[2] / (4.0 * cos))
         return value, pdf
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
@@ -190,27 +190,27 @@ class Principled(Bsdf):
         eta, above, front, side = parameters["eta"], wo, None, None
         if self.transmissive:
             side = torch.copysign(torch.ones_like(wo[2]), wo[2])
-            above, _, eta, front = upward(wo, wo, eta)
+            above, _, eta, front = flip_to_upper(wo, wo, eta)
         alpha_u, alpha_v = alphas(parameters)
         m = microfacet.sample_normal(above, alpha_u, alpha_v, u, self._bounded)
         cos = dot(above, m)
         facet = self._facet(parameters, above, m, cos.clamp_min(0.0), eta, front)
-        chance = self.probabilities(parameters, above, facet, front)
+        probability = self.probabilities(parameters, above, facet, front)
         wi = microfacet.reflect(above, m, cos)
-        threshold = chance.diffuse
+        threshold = probability.diffuse
         wi = torch.where(lobe < threshold, cosine_hemisphere(u), wi)
-        if chance.clearcoat is not None:
+        if probability.clearcoat is not None:
             coat = sample_gtr1(clearcoat_alpha(or_zero(parameters["clearcoat_gloss"], lobe)), u)
-            coated = (lobe >= threshold) & (lobe < threshold + chance.clearcoat)
+            coated = (lobe >= threshold) & (lobe < threshold + probability.clearcoat)
             wi = torch.where(coated, microfacet.reflect(above, coat, dot(above, coat)), wi)
-            threshold = threshold + chance.clearcoat
-        if chance.refract is None or side is None:
-            return weighed(self, parameters, wo, wi)
-        bent = (lobe >= threshold) & (lobe < threshold + chance.refract)
+            threshold = threshold + probability.clearcoat
+        if probability.refract is None or side is None:
+            return mixture_sample(self, parameters, wo, wi)
+        bent = (lobe >= threshold) & (lobe < threshold + probability.refract)
         wi = torch.where(bent, refract(above, m, cos, facet.interface), wi)
         # A direction that fell on the wrong side of its own lobe may not pass for one of the other.
         valid = ((wi[2] < 0) == bent).to(wi.dtype)
-        drawn = weighed(self, parameters, wo, torch.stack((wi[0], wi[1], wi[2] * side)), valid)
+        drawn = mixture_sample(self, parameters, wo, torch.stack((wi[0], wi[1], wi[2] * side)), valid)
         return BsdfSample(drawn.wi, drawn.pdf, drawn.weight, torch.where(bent, eta, 1.0).detach())
 
     def albedo(self, parameters: Parameters) -> Tensor:
@@ -293,12 +293,12 @@ class Principled(Bsdf):
     def _bounded(self) -> bool:
         return microfacet.BOUNDED and not (self.transmissive or self.anisotropic)
 
-    def _main(self, parameters: Parameters, wo: Tensor, wi: Tensor, eta: Tensor) -> Main:
+    def _main(self, parameters: Parameters, wo: Tensor, wi: Tensor, eta: Tensor) -> MainLobes:
         """Both main lobes; with the half vector ``s = wo + wi`` or ``wo + eta wi``, ``s . m = |s|``: nothing cancels."""
         alpha_u, alpha_v = alphas(parameters)
         if not (self.transmissive or self.anisotropic):
             r = microfacet.reflection(wo, wi, alpha_u, alpha_v, self._bounded)
-            return Main(r.m, r.cos_m.clamp_min(0.0), r.value, r.pdf, r.value, r.pdf)
+            return MainLobes(r.m, r.cos_m.clamp_min(0.0), r.value, r.pdf, r.value, r.pdf)
         below = wi[2] < 0
         s = torch.where(below, wo + wi * eta, wo + wi) if self.transmissive else wo + wi
         square = dot(s, s)
@@ -315,7 +315,7 @@ class Principled(Bsdf):
         d = 2.0 * d / (cos_o + s_o)
         g = 2.0 * cos_i / (cos_i + s_i)
         jacobian = cos * far.abs() / square
-        return Main(
+        return MainLobes(
             m,
             torch.where(meets, cos, 0.0),
             torch.where(reflects, 0.25 * d * g, 0.0),

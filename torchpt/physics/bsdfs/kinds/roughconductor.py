@@ -11,8 +11,8 @@ from torch import Tensor
 from torchpt.math import microfacet
 from torchpt.math.vectors import dot
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
-from torchpt.physics.bsdfs.lobes import weighed, with_delta
-from torchpt.physics.bsdfs.metal import Metal, by_reflectance, metal, metal_colour, mirrored
+from torchpt.physics.bsdfs.lobes import mixture_sample, with_delta
+from torchpt.physics.bsdfs.metal import Metal, by_reflectance, metal, metal_colour, metal_split_sum
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.rough import Anisotropic, alphas, energy_at, energy_table, mean_roughness, rough
 
@@ -79,9 +79,9 @@ class RoughConductor(Anisotropic, Metal):
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """Reflect at a visible normal; at the surface's own where it is smooth."""
         m = microfacet.sample_normal(wo, *alphas(parameters), u, microfacet.BOUNDED)
-        drawn = weighed(self, parameters, wo, microfacet.reflect(wo, m, dot(wo, m)))
-        mirrored = torch.stack((-wo[0], -wo[1], wo[2]))
-        return with_delta(drawn, parameters["smooth"] & (wo[2] > 0), mirrored, self._colour(parameters, wo[2]))
+        drawn = mixture_sample(self, parameters, wo, microfacet.reflect(wo, m, dot(wo, m)))
+        metal_split_sum = torch.stack((-wo[0], -wo[1], wo[2]))
+        return with_delta(drawn, parameters["smooth"] & (wo[2] > 0), metal_split_sum, self._colour(parameters, wo[2]))
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """The colour at normal incidence."""
@@ -89,7 +89,7 @@ class RoughConductor(Anisotropic, Metal):
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """A rough mirror."""
-        return mirrored(parameters, mean_roughness(parameters))
+        return metal_split_sum(parameters, mean_roughness(parameters))
 
     def _colour(self, parameters: Parameters, cos: Tensor) -> Tensor:
         colour = metal_colour(parameters, cos)

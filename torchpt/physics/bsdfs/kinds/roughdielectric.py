@@ -15,7 +15,15 @@ from torchpt.math import microfacet
 from torchpt.math.microfacet import INDEX_MATCHED, fresnel_dielectric, refract
 from torchpt.math.vectors import dot, normalize
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
-from torchpt.physics.bsdfs.lobes import Glass, clear, passing, polished, reflectance_at_normal, tinted, weighed
+from torchpt.physics.bsdfs.lobes import (
+    Glass,
+    dielectric_parameters,
+    dielectric_split_sum,
+    mixture_sample,
+    polished,
+    reflectance_at_normal,
+    tinted,
+)
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.rough import Anisotropic, alphas, energy_at, energy_table, mean_roughness, rough
 
@@ -68,7 +76,7 @@ class RoughDielectric(Anisotropic, Glass):
         return {**self._surface(values), **({"energy": tables["energy"]} if self.energy_compensation else {})}
 
     def _surface(self, values: Parameters) -> Parameters:
-        out = {**clear(values), **rough(values, self.anisotropic)}
+        out = {**dielectric_parameters(values), **rough(values, self.anisotropic)}
         # Facets between equal indices bend nothing, however they lie.
         out["smooth"] = out["smooth"] | ((out["eta"] - 1.0).abs() < INDEX_MATCHED)
         return out
@@ -97,7 +105,7 @@ class RoughDielectric(Anisotropic, Glass):
         r = side.reflectance
         if self.energy_compensation:
             energy = energy_at(parameters["energy"], parameters, wo, (wo[2] < 0).to(wo.dtype))
-            value = visible * microfacet.correlated(cos_o, s_o, cos_i, s_i) / energy
+            value = visible * microfacet.height_correlated_masking(cos_o, s_o, cos_i, s_i) / energy
         else:
             value = visible * microfacet.masking(cos_i, s_i)
         colour = torch.where(
@@ -119,7 +127,7 @@ class RoughDielectric(Anisotropic, Glass):
         wi = torch.where(reflects, microfacet.reflect(wo, m, o), normalize(refract(wo, m, o, side)))
         # A facet may send the ray to the other side of the surface than is meant: no pair of directions is drawn so.
         kept = ((wi[2] * wo[2] > 0) == reflects).to(wo.dtype)
-        drawn = weighed(self, parameters, wo, wi, kept)
+        drawn = mixture_sample(self, parameters, wo, wi, kept)
         clean = polished(parameters, wo, lobe)
         assert clean.eta is not None
         return BsdfSample(
@@ -136,7 +144,7 @@ class RoughDielectric(Anisotropic, Glass):
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """A rough boundary."""
         eta = parameters["eta"]
-        return passing(parameters, mean_roughness(parameters), reflectance_at_normal(eta), eta)
+        return dielectric_split_sum(parameters, mean_roughness(parameters), reflectance_at_normal(eta), eta)
 
 
 _TINY = 1e-30

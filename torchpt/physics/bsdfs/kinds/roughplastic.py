@@ -14,7 +14,15 @@ from torchpt.math.microfacet import fresnel_dielectric
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.math.vectors import dot
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Table, Values
-from torchpt.physics.bsdfs.lobes import Coat, coated, over_base, share, tinted, weighed, with_delta
+from torchpt.physics.bsdfs.lobes import (
+    Coat,
+    coat_parameters,
+    coated_split_sum,
+    lobe_probability,
+    mixture_sample,
+    tinted,
+    with_delta,
+)
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.rough import Rough, mean_roughness, rough
 
@@ -66,7 +74,7 @@ class RoughPlastic(Rough, Coat):
         """See :class:`Bsdf`."""
         tables = values if "transmittance" in values else self.tabulate(values)
         return {
-            **coated(values, values["int_ior"] / values["ext_ior"], 1.0 - tables["inner"], self.nonlinear),
+            **coat_parameters(values, values["int_ior"] / values["ext_ior"], 1.0 - tables["inner"], self.nonlinear),
             **rough(values, False),
             "transmittance": tables["transmittance"],
         }
@@ -93,12 +101,12 @@ class RoughPlastic(Rough, Coat):
         chosen = lobe < specular
         m = microfacet.sample_normal(wo, alpha, alpha, u, microfacet.BOUNDED)
         wi = torch.where(chosen, microfacet.reflect(wo, m, dot(wo, m)), cosine_hemisphere(u))
-        drawn = weighed(self, parameters, wo, wi)
+        drawn = mixture_sample(self, parameters, wo, wi)
         # Under a mirror, what the table says is let through is not reflected as well.
         f_o = torch.minimum(fresnel_dielectric(wo[2], parameters["eta"]).reflectance, 1.0 - through)
-        mirrored = torch.stack((-wo[0], -wo[1], wo[2]))
+        metal_split_sum = torch.stack((-wo[0], -wo[1], wo[2]))
         weight = tinted(f_o / torch.where(specular > 0, specular, 1.0), parameters["specular_reflectance"])
-        return with_delta(drawn, chosen & smooth & (wo[2] > 0), mirrored, weight)
+        return with_delta(drawn, chosen & smooth & (wo[2] > 0), metal_split_sum, weight)
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """That of the base."""
@@ -106,9 +114,9 @@ class RoughPlastic(Rough, Coat):
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """A rough mirror over the base."""
-        return over_base(parameters, mean_roughness(parameters))
+        return coated_split_sum(parameters, mean_roughness(parameters))
 
     def _specular(self, parameters: Parameters, t_o: Tensor) -> Tensor:
         """How often the coat is chosen."""
         weight = parameters["specular_share"]
-        return share((1.0 - t_o) * weight, t_o * (1.0 - weight))
+        return lobe_probability((1.0 - t_o) * weight, t_o * (1.0 - weight))

@@ -11,7 +11,14 @@ from torch import Tensor
 
 from torchpt.math.microfacet import fresnel_dielectric
 from torchpt.physics.bsdfs.base import Parameters
-from torchpt.physics.bsdfs.lobes import Glass, choose, clear, passing, reflectance_at_normal, tinted
+from torchpt.physics.bsdfs.lobes import (
+    Glass,
+    choose,
+    dielectric_parameters,
+    dielectric_split_sum,
+    reflectance_at_normal,
+    tinted,
+)
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.specs import smooth
 
@@ -34,7 +41,7 @@ class ThinDielectric(Glass):
 
     def prepare(self, values: Parameters) -> Parameters:
         """See :class:`Bsdf`."""
-        return clear(values)
+        return dielectric_parameters(values)
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """Nothing: a delta is not seen."""
@@ -45,12 +52,12 @@ class ThinDielectric(Glass):
         assert lobe is not None
         sin2 = torch.addcmul(wo[0] * wo[0], wo[1], wo[1])
         r = fresnel_dielectric(wo[2].abs(), parameters["eta"], sin2).reflectance
-        reflects, share = choose(2.0 * r / (1.0 + r), lobe)  # R + T R T + T R^3 T + ...
+        reflects, lobe_probability = choose(2.0 * r / (1.0 + r), lobe)  # R + T R T + T R^3 T + ...
         up = torch.where(reflects, wo[2], -wo[2])
         weight = torch.where(
             reflects,
-            tinted(share, parameters["specular_reflectance"]),
-            tinted(share, parameters["specular_transmittance"]),
+            tinted(lobe_probability, parameters["specular_reflectance"]),
+            tinted(lobe_probability, parameters["specular_transmittance"]),
         )
         pdf = torch.where(wo[2] != 0, math.inf, 0.0).to(wo.dtype)
         return BsdfSample(torch.stack((-wo[0], -wo[1], up)), pdf, weight)
@@ -62,4 +69,4 @@ class ThinDielectric(Glass):
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """What both boundaries reflect, and the rest straight on."""
         f0 = reflectance_at_normal(parameters["eta"])
-        return passing(parameters, torch.zeros_like(f0), 2.0 * f0 / (1.0 + f0), None)
+        return dielectric_split_sum(parameters, torch.zeros_like(f0), 2.0 * f0 / (1.0 + f0), None)

@@ -29,7 +29,7 @@ class Perspective(Pinhole):
 
     def project(self, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See :meth:`Camera.project`."""
-        x, y, depth, _ = self.placed(offset)
+        x, y, depth, _ = self.project_homogeneous(offset)
         scale = (0.5 * self.film[0] / self.half_width()) ** 2 / depth.abs() ** 3
         scale = scale * torch.linalg.det(self.covectors()).abs()
         return x / depth, y / depth, scale if self.pixel_aspect is None else scale * self.pixel_aspect

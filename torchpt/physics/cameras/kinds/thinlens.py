@@ -11,7 +11,7 @@ from torch import Tensor
 from torchpt.math.sampling import concentric_disk, uniform_polygon
 from torchpt.math.vectors import normalize
 from torchpt.physics.cameras.pinhole import Pinhole
-from torchpt.spec import Moves, Scalar, Whole
+from torchpt.spec import Integer, Moves, Scalar
 
 __all__ = ["ThinLens"]
 
@@ -35,7 +35,9 @@ class ThinLens(Pinhole):
         "focus_distance": Scalar(
             above=0.0, length=True, moves=Moves.SURFACES, doc="depth of the plane in focus, along the viewing direction"
         ),
-        "blades": Whole(0, low=3, high=64, also=(0,), doc="corners of the aperture, the first of them up; 0 is a disk"),
+        "blades": Integer(
+            0, low=3, high=64, also=(0,), doc="corners of the aperture, the first of them up; 0 is a disk"
+        ),
     }
     lens: ClassVar[bool] = True
     reaches: ClassVar[tuple[str, ...]] = ("aperture_radius",)

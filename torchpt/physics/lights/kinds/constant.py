@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.sampling import uniform_sphere
-from torchpt.physics.lights.base import Environment, Row, Setting, Surroundings, bright
+from torchpt.physics.lights.base import Environment, EnvironmentImage, Row, Setting, bright
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.spec import Color
 
@@ -38,11 +38,11 @@ class Constant(Environment):
         return LightSample(wi, wi, None, at.radiance.expand_as(wi), pdf, weight)
 
     @classmethod
-    def arriving(cls, around: Tensor, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
+    def radiance_pdf(cls, around: Tensor, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
         """See :class:`Environment`."""
         return around[:, None].expand_as(d), torch.full_like(d[0], 1.0 / _INVERSE_PDF)
 
     @classmethod
-    def surroundings(cls, around: Tensor) -> Surroundings:
+    def environment_image(cls, around: Tensor) -> EnvironmentImage:
         """See :class:`Environment`."""
-        return Surroundings(around.expand(2, 1, 3), even=True)
+        return EnvironmentImage(around.expand(2, 1, 3), even=True)

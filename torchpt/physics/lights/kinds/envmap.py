@@ -30,13 +30,13 @@ import torch
 from torch import Tensor
 
 from torchpt.core.threads import sum_all
-from torchpt.images.texels import TEXELS, check_source, radiance_of, read_texels, texels_of
-from torchpt.math.sampling import Cells, invert_linear
+from torchpt.images.texels import TEXELS, check_source, read_texels, texels_from_array, texels_to_radiance
+from torchpt.math.sampling import Distribution2D, invert_linear
 from torchpt.math.vectors import azimuth, dot, luminance, safe_reciprocal, take
 from torchpt.physics.ibl.equirect import Cell, angles
-from torchpt.physics.lights.base import Environment, Row, Setting, Surroundings, bright
+from torchpt.physics.lights.base import Environment, EnvironmentImage, Row, Setting, bright
 from torchpt.physics.lights.records import Lights, LightSample
-from torchpt.spec import Moves, Other, Path, Pose, Scalar, Spec, Texels
+from torchpt.spec import Custom, Moves, Path, Pose, Scalar, Spec, Texels
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,7 +58,7 @@ class Grid:
         factor: ``()`` from the interpolated difference to the density in solid angle.
     """
 
-    cells: Cells
+    cells: Distribution2D
     floor: Tensor
     factor: Tensor
 
@@ -163,7 +163,7 @@ def _uneven(weights: Tensor, mean: Tensor, heights: Tensor) -> bool:
 
 def _grid(weights: Tensor, floor: Tensor) -> Grid:
     """From integrals over the cells; the sphere counts as 1 in them, and as 4 pi in the density."""
-    return Grid(Cells.of(weights), floor, (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype))
+    return Grid(Distribution2D.of(weights), floor, (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype))
 
 
 def _place(map: EnvironmentMap, d: Tensor) -> Cell:
@@ -266,9 +266,9 @@ class Envmap(Environment):
     name = "envmap"
     parameters: ClassVar = {
         "path": Path(None, doc="the picture: `.exr`, `.hdr` or 8-bit; of several the first that is there"),
-        "data": Other(
+        "data": Custom(
             None,
-            reader=texels_of,
+            reader=texels_from_array,
             words=TEXELS,
             doc="in place of a file: an array, a tensor or rows of numbers, the first at the top; linear, but for uint8",
         ),
@@ -293,9 +293,9 @@ class Envmap(Environment):
         """See :class:`Light`."""
         spec = Texels(doc="radiance `(H, W, 3)`, before `scale`")
         if values["data"] is not None:
-            return {"texels": (radiance_of(values["data"], "data", "data"), spec)}
+            return {"texels": (texels_to_radiance(values["data"], "data", "data"), spec)}
         file = find("path")
-        return {"texels": (radiance_of(read_texels(file), str(file), "path"), spec)}
+        return {"texels": (texels_to_radiance(read_texels(file), str(file), "path"), spec)}
 
     @classmethod
     def row(cls, scene: Setting) -> Row:
@@ -315,15 +315,15 @@ class Envmap(Environment):
         return LightSample(wi, wi, None, light, density, weight)
 
     @classmethod
-    def arriving(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
+    def radiance_pdf(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
         """See :class:`Environment`."""
         return environment(around, d, mis)
 
     @classmethod
-    def surroundings(cls, around: EnvironmentMap) -> Surroundings:
+    def environment_image(cls, around: EnvironmentMap) -> EnvironmentImage:
         """See :class:`Environment`."""
         texels = (around.texels * around.scale).T.reshape(around.height, around.width, 3)
-        return Surroundings(texels, around.turn)
+        return EnvironmentImage(texels, around.turn)
 
     @classmethod
     def info(cls, around: EnvironmentMap) -> dict[str, Any]:

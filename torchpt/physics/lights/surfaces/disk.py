@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchpt.math.sampling import concentric_disk
 from torchpt.physics.lights.records import Lights
-from torchpt.physics.lights.surface import OnSurface, Surface, flat_point
+from torchpt.physics.lights.surface import Surface, SurfaceSample, flat_point
 
 __all__ = ["Disk"]
 
@@ -20,7 +20,7 @@ class Disk(Surface):
     share = math.pi
 
     @classmethod
-    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
+    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
         """See :class:`Surface`."""
-        place = concentric_disk(u)
-        return OnSurface(flat_point(at.p0, at.e1, at.e2, place), at.normal, place)
+        uv = concentric_disk(u)
+        return SurfaceSample(flat_point(at.p0, at.e1, at.e2, uv), at.normal, uv)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import affine, dot
 from torchpt.physics.lights.records import Lights
-from torchpt.physics.lights.surface import Faces, OnSurface, Surface
+from torchpt.physics.lights.surface import Faces, Surface, SurfaceSample
 from torchpt.physics.shapes import quadrics
 
 __all__ = ["Quadric", "world_area"]
@@ -37,7 +37,7 @@ class Quadric(Surface):
 
     name = "quadric"
     convex = True
-    tabled = True
+    needs_quadrics = True
 
     @classmethod
     def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
@@ -47,12 +47,12 @@ class Quadric(Surface):
         return area.index_select(0, faces.column), whole.index_select(0, faces.column)
 
     @classmethod
-    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
+    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
         """See :class:`Surface`."""
         assert at.quadrics is not None
         own = quadrics.sample(at.quadrics, u)
         p = affine(at.p0 + at.e1 * own[0], at.e2, own[1], at.quadrics.e3, own[2])
-        return OnSurface(p, quadrics.outward(at.quadrics, own), own=own)
+        return SurfaceSample(p, quadrics.outward(at.quadrics, own), own=own)
 
     @classmethod
     def size(cls, at: Lights, normal: Tensor) -> Tensor | None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchpt.math.sampling import one_minus_cos, uniform_cone, uniform_sphere
 from torchpt.math.vectors import Frame, dot, normalize, safe_reciprocal
 from torchpt.physics.lights.records import Lights
-from torchpt.physics.lights.surface import Faces, OnSurface, Surface
+from torchpt.physics.lights.surface import Faces, Surface, SurfaceSample
 
 __all__ = ["Sphere", "inverse_pdf", "sample"]
 
@@ -63,13 +63,13 @@ class Sphere(Surface):
         return area, area.detach()
 
     @classmethod
-    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
+    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
         """See :class:`Surface`."""
         # Detached: from a moving reference point the same spot on the light is held, as on planar lights.
         radius = at.e1[0]
         p, normal = sample(x.detach(), at.p0.detach(), radius.detach(), at.flip, u)
         grown = radius / torch.where(radius == 0, 1.0, radius).detach()  # 1; rows of other kinds may have a 0 there
-        return OnSurface(at.p0 + (p - at.p0).detach() * grown, normal)
+        return SurfaceSample(at.p0 + (p - at.p0).detach() * grown, normal)
 
     @classmethod
     def inverse_pdf(

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.hashing import logical_shift, mix, to_unit
-from torchpt.physics.samplers.base import Numbers, Points
+from torchpt.physics.samplers.base import Points, SamplerTensors
 from torchpt.physics.samplers.bits import X, Y, reverse_bits, scramble, second_dimension
 
 __all__ = ["ZSobol"]
@@ -56,7 +56,7 @@ class ZSobol(Points):
     needs_count = True
     of_film = True
 
-    def key(self, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
+    def key(self, numbers: SamplerTensors, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
         """``(2, N)`` int32: the seed of the block, and the place of the point on the curve within it.
 
         The place has ``DIGITS`` digits of two bits above one single bit. Where ``numbers.bits`` is odd, the single bit is the

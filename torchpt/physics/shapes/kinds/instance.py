@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from torchpt.physics.shapes.base import Shape
-from torchpt.spec import REQUIRED, Other, Refused
+from torchpt.spec import REQUIRED, Custom, Refused
 
 __all__ = ["Instance"]
 
@@ -22,7 +22,7 @@ class Instance(Shape):
 
     name = "instance"
     parameters: ClassVar = {
-        "of": Other(
+        "of": Custom(
             REQUIRED,
             reader=_of,
             words="the name of a mesh among the shapes",

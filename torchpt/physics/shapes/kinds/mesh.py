@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from torchpt.physics.shapes.base import Shape, Triangles
-from torchpt.spec import REQUIRED, Block, Flag, Map, Other, Path, Refused, Scalar, Vertices, Whole, reading
+from torchpt.spec import REQUIRED, Block, Custom, Flag, Integer, Map, Path, Refused, Scalar, Vertices, reading
 
 __all__ = ["Displacement", "Mesh"]
 
@@ -19,7 +19,7 @@ class Displacement:
     parameters: ClassVar = {
         "texture": Map(REQUIRED, doc="a number texture, or the name of one: how far, in units of scale"),
         "scale": Scalar(1.0, low=None, length=True, doc="factor of the texture"),
-        "subdivisions": Whole(0, high=12, doc="how often each triangle is cut in four before"),
+        "subdivisions": Integer(0, high=12, doc="how often each triangle is cut in four before"),
     }
 
 
@@ -38,26 +38,26 @@ class Mesh(Shape):
     name = "mesh"
     parameters: ClassVar = {
         "path": Path(None, doc="the file: OBJ, PLY, STL, glTF, or one that trimesh reads"),
-        "mesh": Other(
+        "mesh": Custom(
             None,
             reader=_object,
             words="a trimesh.Trimesh or trimesh.Scene",
             doc="an object of Python, read when the scene is loaded",
         ),
         "vertices": Vertices(None, doc="points in its own space"),
-        "faces": Other(
+        "faces": Custom(
             None,
             reader=reading.faces,
             words="a list of faces, each three or more vertex indices (whole numbers >= 0)",
             doc="corners, counted from 0; polygons are split into fans",
         ),
-        "normals": Other(
+        "normals": Custom(
             None,
             reader=lambda value: reading.rows(value, 3, "[x, y, z]"),
             words="a list of [x, y, z], finite numbers each",
             doc="one a vertex; none: computed, smooth",
         ),
-        "uvs": Other(
+        "uvs": Custom(
             None,
             reader=lambda value: reading.rows(value, 2, "[u, v]"),
             words="a list of [u, v], finite numbers each",

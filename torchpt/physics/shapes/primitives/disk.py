@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import take
 from torchpt.physics.shapes.geometry import Interaction
-from torchpt.physics.shapes.primitive import Corners, Place, Primitive
+from torchpt.physics.shapes.primitive import Corners, LanePrimitives, Primitive
 from torchpt.physics.shapes.primitives._affine import axes_of
 from torchpt.physics.shapes.quadrics import polar
 from torchpt.physics.world import World
@@ -26,7 +26,7 @@ class Disk(Primitive):
     """An ellipse about its centre ``p0``."""
 
     name = "disk"
-    charted = True
+    has_own_uv = True
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
@@ -36,7 +36,9 @@ class Disk(Primitive):
         return Corners(move.to(dtype), p1.to(dtype), p2.to(dtype), mirrored=mirrored)
 
     @classmethod
-    def tangents(cls, world: World, place: Place, at: Interaction, mine: Tensor) -> tuple[Tensor, Tensor | None]:
+    def tangents(
+        cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
         """See :class:`Primitive`: outward, and around."""
         u, v, e1, e2 = at.u, at.v, place.e1, place.e2
         away = torch.addcmul(e1 * u, e2, v)

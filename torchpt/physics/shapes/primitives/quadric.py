@@ -11,7 +11,7 @@ from torch import Tensor
 from torchpt.math.vectors import affine, dot
 from torchpt.physics.shapes import quadrics
 from torchpt.physics.shapes.geometry import Interaction, Quadrics
-from torchpt.physics.shapes.primitive import Corners, Held, Met, Place, Primitive, Rays
+from torchpt.physics.shapes.primitive import Corners, FixedPoints, HitPoints, LanePrimitives, Primitive, Rays
 from torchpt.physics.world import World
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ class Quadric(Primitive):
 
     name = "quadric"
     flat = False
-    charted = True
+    has_own_uv = True
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
@@ -36,26 +36,28 @@ class Quadric(Primitive):
         return Corners(move.to(dtype), x.to(dtype), y.to(dtype), frame=frame)
 
     @classmethod
-    def meet(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Met:
+    def hit_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> HitPoints:
         """See :class:`Primitive`."""
         table = quadrics.rows(world, place.prim)
-        own = _told(table, rays, mine)
+        own = _object_point(table, rays, mine)
         if rays.follow_shape:
             moved = quadrics.follow_shape(table, place.p0, place.e1, rays.o, rays.d, rays.hit.t, own)
             own = torch.where(mine, moved, own)
         ng = quadrics.outward(table, own)
         # At the point itself: a needle is far thinner than it is long.
-        return Met(_point(table, place, own), ng, dot(ng.detach().abs(), table.reach), own)
+        return HitPoints(_point(table, place, own), ng, dot(ng.detach().abs(), table.reach), own)
 
     @classmethod
-    def hold(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Held:
+    def fixed_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> FixedPoints:
         """See :class:`Primitive`: at its place in its own space."""
         table = quadrics.rows(world, place.prim)
-        own = _told(table, rays, mine)
-        return Held(_point(table, place, own), quadrics.direction(table, quadrics.normal(table, own)))
+        own = _object_point(table, rays, mine)
+        return FixedPoints(_point(table, place, own), quadrics.direction(table, quadrics.normal(table, own)))
 
     @classmethod
-    def tangents(cls, world: World, place: Place, at: Interaction, mine: Tensor) -> tuple[Tensor, Tensor | None]:
+    def tangents(
+        cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
         """See :class:`Primitive`."""
         assert at.own is not None
         tangent = quadrics.tangent(place.e1, place.e2, at.own)
@@ -71,10 +73,10 @@ class Quadric(Primitive):
         return quadrics.surface_uv(quadrics.rows(world, at.prim), at.own)
 
 
-def _told(table: Quadrics, rays: Rays, mine: Tensor) -> Tensor:
+def _object_point(table: Quadrics, rays: Rays, mine: Tensor) -> Tensor:
     """Points ``(3, N)`` in their own space as the search tells them."""
     return quadrics.place(table, torch.where(mine, rays.hit.u, 0.0), torch.where(mine, rays.hit.v, 0.0))
 
 
-def _point(table: Quadrics, place: Place, own: Tensor) -> Tensor:
+def _point(table: Quadrics, place: LanePrimitives, own: Tensor) -> Tensor:
     return affine(place.p0 + place.e1 * own[0], place.e2, own[1], table.e3, own[2])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import azimuth, cross, dot, normalize, take
 from torchpt.physics.shapes.geometry import Interaction
-from torchpt.physics.shapes.primitive import Corners, Held, Met, Place, Primitive, Rays, Triple
+from torchpt.physics.shapes.primitive import Corners, FixedPoints, HitPoints, LanePrimitives, Primitive, Rays, Triple
 from torchpt.physics.shapes.quadrics import polar
 from torchpt.physics.world import World
 
@@ -25,7 +25,7 @@ class Sphere(Primitive):
     """A sphere."""
 
     name = "sphere"
-    charted = True
+    has_own_uv = True
     flat = False
     angles = True
 
@@ -49,7 +49,7 @@ class Sphere(Primitive):
         return around, torch.stack((math.pi * radius * handed, zero, zero))
 
     @classmethod
-    def meet(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Met:
+    def hit_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> HitPoints:
         """See :class:`Primitive`."""
         assert world.geometry.flip is not None
         o, d, p0 = rays.o, rays.d, place.p0
@@ -58,17 +58,19 @@ class Sphere(Primitive):
         t = torch.where(mine, t, 0.0)
         away = o + d * t - p0
         outward = normalize(torch.where(mine, away, torch.ones_like(away)))
-        return Met(p0 + outward * radius, outward * take(world.geometry.flip, place.prim))
+        return HitPoints(p0 + outward * radius, outward * take(world.geometry.flip, place.prim))
 
     @classmethod
-    def hold(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Held:
+    def fixed_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> FixedPoints:
         """See :class:`Primitive`: at its normal."""
         radius = torch.where(mine, place.e1[0], 1.0)
         outward = normalize((rays.o + rays.d * rays.hit.t - place.p0).detach())
-        return Held(place.p0 + outward * radius, outward * (radius * radius))
+        return FixedPoints(place.p0 + outward * radius, outward * (radius * radius))
 
     @classmethod
-    def tangents(cls, world: World, place: Place, at: Interaction, mine: Tensor) -> tuple[Tensor, Tensor | None]:
+    def tangents(
+        cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
         """See :class:`Primitive`: around, and down."""
         assert at.tangent is not None
         around = cross(at.tangent, at.ng)

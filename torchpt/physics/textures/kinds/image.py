@@ -12,10 +12,10 @@ from torchpt.core.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, Texels, read_texels
 from torchpt.images.colour import srgb_to_linear
 from torchpt.images.decode import MAX_PIXELS
-from torchpt.images.texels import TEXELS, check_source, texels_of
+from torchpt.images.texels import TEXELS, check_source, texels_from_array
 from torchpt.physics.textures.atlas import WRAPS, ImageNode
 from torchpt.physics.textures.base import CHANNELS, Mapped, Node, Opening
-from torchpt.spec import Choice, Color, Other, Path, Refused, Whole
+from torchpt.spec import Choice, Color, Custom, Integer, Path, Refused
 from torchpt.spec import Texels as TexelsSpec
 
 __all__ = ["MOST_PIXELS", "Image"]
@@ -33,15 +33,15 @@ class Image(Mapped):
 
     name = "image"
     parameters: ClassVar = {
-        "path": Other(
+        "path": Custom(
             None,
             reader=_source,
             words=Path().accepted,
             doc="PNG, JPEG, TGA, BMP, PPM, EXR or HDR; 8 or 16 bits, half or float",
         ),
-        "data": Other(
+        "data": Custom(
             None,
-            reader=texels_of,
+            reader=texels_from_array,
             words=TEXELS,
             doc="in place of a file: an array, a tensor or rows of numbers, the first at the top; linear, but for uint8",
         ),
@@ -58,7 +58,7 @@ class Image(Mapped):
         ),
         "scale": Color((1.0, 1.0, 1.0), low=None, doc="multiplies the values"),
         "channel": Choice(None, names=CHANNELS, doc="what a number takes: luminance where nothing is said"),
-        "max_pixels": Whole(
+        "max_pixels": Integer(
             None, low=1, high=MOST_PIXELS, also=(None,), doc="larger images are refused; null: 64 Mpixel"
         ),
     }
@@ -78,7 +78,7 @@ class Image(Mapped):
             raise Refused("no max_pixels beside data: it is of files", values["max_pixels"], ("max_pixels",))
 
     @classmethod
-    def film_space_applies(cls, values: Mapping[str, Any], coloured: bool) -> None:
+    def check_slot(cls, values: Mapping[str, Any], coloured: bool) -> None:
         """See :class:`Texture`."""
         if not coloured and len(set(values["scale"])) > 1:
             raise Refused("one number as scale where a number is wanted", list(values["scale"]), ("scale",))

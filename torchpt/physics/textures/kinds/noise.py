@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchpt.math.hashing import as_int32, logical_shift, mix, mix_int
 from torchpt.physics.textures.computed import Computed
-from torchpt.spec import Choice, Color, Scalar, Whole
+from torchpt.spec import Choice, Color, Integer, Scalar
 
 __all__ = ["Noise"]
 
@@ -47,10 +47,10 @@ class Noise(Computed):
         "color0": Color((0.0, 0.0, 0.0), low=None, doc="where the noise is least"),
         "color1": Color((1.0, 1.0, 1.0), low=None, doc="where it is greatest; their mean is the mean of all"),
         "scale": Scalar(8.0, low=1e-6, high=1e6, doc="cells of the first octave in a unit of u and of v"),
-        "octaves": Whole(4, low=1, high=16, doc="how many are added, each finer than the one before"),
+        "octaves": Integer(4, low=1, high=16, doc="how many are added, each finer than the one before"),
         "persistence": Scalar(0.5, low=0.0, high=1.0, doc="height of an octave over that of the one before"),
         "lacunarity": Scalar(2.0, low=1.0, high=16.0, doc="cells of an octave over those of the one before"),
-        "seed": Whole(0, low=0, high=2**31 - 1, doc="another one gives another noise of the same look"),
+        "seed": Integer(0, low=0, high=2**31 - 1, doc="another one gives another noise of the same look"),
         "filter": Choice(
             "none", names=("none", "fade"), doc="fade: octaves whose cells a pixel covers go over into their mean"
         ),

@@ -16,10 +16,10 @@ from torchpt.physics.shapes.base import Triangles
 from torchpt.scene.formats.description import Description
 from torchpt.scene.meshes import FileCamera, MeshPart, load_mesh
 from torchpt.scene.meshes.mesh import displaced
-from torchpt.scene.texels import Opener
+from torchpt.scene.texture_loader import TextureLoader
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["MOST_FACES", "Mesh", "ignored", "mesh_of", "solid", "warn_of_touching"]
+__all__ = ["MOST_FACES", "Mesh", "ignored", "mesh_of", "solid", "warn_of_coplanar_refraction"]
 
 
 # ---- Meshes of a description: read, displaced, and without what has no area
@@ -44,14 +44,16 @@ class Mesh:
     flat: bool
 
 
-def mesh_of(triangles: Triangles, key: str, description: Description, opener: Opener, *, materials: bool) -> Mesh:
+def mesh_of(
+    triangles: Triangles, key: str, description: Description, texture_loader: TextureLoader, *, materials: bool
+) -> Mesh:
     """The triangles of a shape.
 
     Args:
         triangles: what the shape comes to.
         key: its dotted key.
         description: of the scene.
-        opener: of textures.
+        texture_loader: of textures.
         materials: whether to read the file's own materials.
 
     Raises:
@@ -72,11 +74,13 @@ def mesh_of(triangles: Triangles, key: str, description: Description, opener: Op
         arrays = (triangles.vertices, triangles.faces, triangles.normals, triangles.uvs)
         pieces, source = [MeshPart("", *arrays, None)], ""
     if triangles.displacement is not None:
-        pieces = [_displaced(piece, triangles.displacement, key, opener, source) for piece in pieces]
+        pieces = [_displaced(piece, triangles.displacement, key, texture_loader, source) for piece in pieces]
     return Mesh(pieces, source, triangles.flat)
 
 
-def _displaced(piece: MeshPart, wish: ParsedParams, prefix: str, opener: Opener, source: str) -> MeshPart:
+def _displaced(
+    piece: MeshPart, wish: ParsedParams, prefix: str, texture_loader: TextureLoader, source: str
+) -> MeshPart:
     """A piece of a mesh under its displacement map."""
     key = f"{prefix}.displacement"
     if piece.uvs is None:
@@ -84,13 +88,13 @@ def _displaced(piece: MeshPart, wish: ParsedParams, prefix: str, opener: Opener,
         raise (
             AssetError(source, problem)
             if source
-            else SceneError(key, "a mesh without uvs", "uvs beside it", opener.file)
+            else SceneError(key, "a mesh without uvs", "uvs beside it", texture_loader.file)
         )
     faces = len(piece.faces) * 4 ** wish["subdivisions"]
     if faces > MOST_FACES:
         expected = f"at most {MOST_FACES:,} faces ({faces:,} are asked for)"
-        raise SceneError(f"{key}.subdivisions", wish["subdivisions"], expected, opener.file)
-    heights = opener.values(wish["texture"], f"{key}.texture")
+        raise SceneError(f"{key}.subdivisions", wish["subdivisions"], expected, texture_loader.file)
+    heights = texture_loader.values(wish["texture"], f"{key}.texture")
     return displaced(piece, lambda uvs: wish["scale"] * heights(uvs), wish["subdivisions"])
 
 
@@ -130,7 +134,7 @@ def solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 Array = NDArray[np.float64]
-Whole = NDArray[np.int64]
+Integer = NDArray[np.int64]
 
 #: How far two planes may lie apart and count as one, as a share of the scene's extent; and how far their normals may differ.
 NEAR, ALIKE = 1e-6, 1e-5
@@ -152,7 +156,7 @@ class _Faces:
     corners: Array
 
 
-def warn_of_touching(parts: Sequence[Part], copies: Sequence[Copy], file: str | None) -> None:
+def warn_of_coplanar_refraction(parts: Sequence[Part], copies: Sequence[Copy], file: str | None) -> None:
     """Look for flat faces of two refracting shapes that share a plane and overlap in it.
 
     Warns:

@@ -18,14 +18,14 @@ from torchpt.math.transforms import tensor_of
 from torchpt.physics.cameras.opencv import USUAL, angles, numbers_of
 from torchpt.physics.cameras.poses import POSES, posed
 from torchpt.physics.shapes.base import Place, Size
-from torchpt.scene.build import Built
+from torchpt.scene.build import SceneBuild
 from torchpt.scene.formats.description import Description
-from torchpt.scene.formats.tensors import Key, Tensors
+from torchpt.scene.formats.tensors import DictTensors, Key
 from torchpt.spec import parameters_of
 from torchpt.spec.reading import transform
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["corners_in", "traced", "widened"]
+__all__ = ["traced", "vertex_attributes_in", "with_all_intrinsics"]
 
 _EXPECTED = (
     "numbers without gradients (detach() them): no parameter of the scene is made of them, or none with the value that they "
@@ -38,7 +38,7 @@ _CORNERS = ("normals", "uvs")
 Params = Mapping[str, Tensor]
 
 
-def widened(description: Description, tensors: Tensors) -> Description:
+def with_all_intrinsics(description: Description, tensors: DictTensors) -> Description:
     """The description with all that tensors may change: a ``K`` in the middle of its picture may be moved from there."""
     camera = description.camera
     if not any(key[0] == "K" for key in tensors.under("camera")):
@@ -48,12 +48,12 @@ def widened(description: Description, tensors: Tensors) -> Description:
     return replace(description, camera=ParsedParams(camera.kind, values, camera.given))
 
 
-def corners_in(tensors: Tensors) -> set[str]:
+def vertex_attributes_in(tensors: DictTensors) -> set[str]:
     """Names of meshes' normals and texture coordinates whose gradients are wanted: parameters of no other scene."""
     return {_dotted(("shapes", *key[:2])) for key in tensors.under("shapes") if len(key) > 1 and key[1] in _CORNERS}
 
 
-def traced(tensors: Tensors, description: Description, built: Built, params: Params) -> dict[str, Tensor]:
+def traced(tensors: DictTensors, description: Description, built: SceneBuild, params: Params) -> dict[str, Tensor]:
     """The parameters that tensors of the dict give, by name, on their tape.
 
     Args:
@@ -79,9 +79,9 @@ def traced(tensors: Tensors, description: Description, built: Built, params: Par
 class _Reading:
     """What was written, and what it came to."""
 
-    tensors: Tensors
+    tensors: DictTensors
     description: Description
-    built: Built
+    built: SceneBuild
     params: Params
     device: torch.device
 

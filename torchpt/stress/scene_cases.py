@@ -18,10 +18,10 @@ from torchpt.scene.devices import device_of
 from torchpt.scene.formats.description import Description, overridden, read_description
 from torchpt.scene.scene import Scene
 from torchpt.scene.settings import Settings
-from torchpt.scene.space import extent_of
+from torchpt.scene.space import bounds_extent
 from torchpt.spec import Role
-from torchpt.stress.bench import Bench, apart
 from torchpt.stress.case import Case, powers
+from torchpt.stress.harness import Harness, relative_difference
 
 __all__ = ["cases_of", "moved"]
 
@@ -53,32 +53,32 @@ def cases_of(
     wishes = _small(settings)
     own = Scene(description, torch.device("cpu"))
     extent, pose = (
-        extent_of(own.built.parts, own.built.copies),
+        bounds_extent(own.built.parts, own.built.copies),
         np.asarray(own.built.parameters["camera.to_world"], np.float64),
     )
-    known: dict[Bench, tuple[Tensor, Tensor]] = {}
+    known: dict[Harness, tuple[Tensor, Tensor]] = {}
 
-    def picture(bench: Bench, description: Description = description, seed: int = wishes.render.seed) -> Tensor:
-        compiled = "off" if bench.dtype == torch.float64 else bench.compile
-        given = replace(wishes, render=wishes.render.but(accel=bench.accel, compile=compiled, seed=seed))
-        found = render_scene(Scene(description, device_of(bench.device)), given, dtype=bench.dtype)
+    def picture(harness: Harness, description: Description = description, seed: int = wishes.render.seed) -> Tensor:
+        compiled = "off" if harness.dtype == torch.float64 else harness.compile
+        given = replace(wishes, render=wishes.render.but(accel=harness.accel, compile=compiled, seed=seed))
+        found = render_scene(Scene(description, device_of(harness.device)), given, dtype=harness.dtype)
         if found.nonfinite_samples:
             raise RenderError(f"{found.nonfinite_samples} samples are not finite; the first is {found.nonfinite_first}")
         return found.image.double().cpu()
 
-    def beside(bench: Bench, found: Callable[[], Tensor]) -> float:
-        if bench not in known:
-            known[bench] = picture(bench), picture(bench, seed=wishes.render.seed + 1)
-        plain, other = known[bench]
-        noise = apart(other, plain)
-        return apart(found(), plain) / (noise or 1.0)
+    def beside(harness: Harness, found: Callable[[], Tensor]) -> float:
+        if harness not in known:
+            known[harness] = picture(harness), picture(harness, seed=wishes.render.seed + 1)
+        plain, other = known[harness]
+        noise = relative_difference(other, plain)
+        return relative_difference(found(), plain) / (noise or 1.0)
 
-    def by(bench: Bench, **other: Any) -> float:
-        return beside(bench, lambda: picture(replace(bench, **other)))
+    def by(harness: Harness, **other: Any) -> float:
+        return beside(harness, lambda: picture(replace(harness, **other)))
 
-    def elsewhere(bench: Bench, way: Array) -> float:
+    def elsewhere(harness: Harness, way: Array) -> float:
         changed = read_description(source, change=lambda raw: moved(raw, way, pose), overrides=changes)
-        return beside(bench, lambda: picture(bench, changed))
+        return beside(harness, lambda: picture(harness, changed))
 
     few = sum(len(part.faces) if part.faces is not None else 1 for part in own.built.parts) <= FEW
     searches = ("numba", "torch", *(("brute",) if few else ()))

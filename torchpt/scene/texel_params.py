@@ -10,26 +10,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import in_transform, outside_transforms
+from torchpt.core.autograd import is_transformed, outside_transforms
 from torchpt.core.errors import NotBuiltError, SceneError
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Parameters
 from torchpt.physics.textures import Node
-from torchpt.scene.build import Built
+from torchpt.scene.build import SceneBuild
 from torchpt.scene.formats.textures import texture_of
 from torchpt.scene.scene import Scene
 from torchpt.scene.sources import check_coordinates
-from torchpt.scene.texels import Opener
+from torchpt.scene.texture_loader import TextureLoader
 from torchpt.spec import Refused
 
-__all__ = ["renew", "with_texels"]
+__all__ = ["update_texels", "with_texel_params"]
 
 
 #: Scenes with texels that are kept beside one, the latest.
 KEPT = 4
 
 
-def with_texels(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
+def with_texel_params(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
     """The scene itself, or where texels are given for numbers and colours of its materials one that reads them there.
 
     The second one shares the tensors, meshes and pictures of the first; its search structures are its own.
@@ -47,8 +47,8 @@ def with_texels(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
         return _reading(scene, texels) if texels else scene
 
 
-def renew(made: Scene, scene: Scene, params: Mapping[str, Tensor]) -> None:
-    """Bring what :func:`with_texels` made of a scene up to date, as other renders may have put their texels in since.
+def update_texels(made: Scene, scene: Scene, params: Mapping[str, Tensor]) -> None:
+    """Bring what :func:`with_texel_params` made of a scene up to date, as other renders may have put their texels in since.
 
     Args:
         made: it, or the scene itself where no texels were given.
@@ -57,7 +57,7 @@ def renew(made: Scene, scene: Scene, params: Mapping[str, Tensor]) -> None:
     """
     if made is not scene:
         with outside_transforms():
-            _bring(made, scene, _texels(scene, params))
+            _copy_params(made, scene, _texels(scene, params))
 
 
 def _texels(scene: Scene, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -76,21 +76,21 @@ def _reading(scene: Scene, texels: Mapping[str, Tensor]) -> Scene:
     made = scene.textured.get(key)
     if made is None:
         made = copy.copy(scene)
-        made.use(_built(scene, texels))
+        made.replace_build(_built(scene, texels))
         for oldest in list(scene.textured)[: max(0, len(scene.textured) + 1 - KEPT)]:
             scene.textured.pop(oldest, None)
         scene.textured[key] = made
-    _bring(made, scene, texels)
+    _copy_params(made, scene, texels)
     return made
 
 
-def _bring(made: Scene, scene: Scene, texels: Mapping[str, Tensor]) -> None:
+def _copy_params(made: Scene, scene: Scene, texels: Mapping[str, Tensor]) -> None:
     """Put the tensors of a scene, and texels in place of some, into the one that reads texels."""
     for name, value in scene.params.items():
         new = texels.get(name, value)
         if name not in texels or not _same_memory(made.params[name], new):
             made.params[name] = new
-    made.trust(scene)
+    made.mark_checked(scene)
 
 
 def _same_memory(one: Tensor, other: Tensor) -> bool:
@@ -107,19 +107,19 @@ def _is_texels(value: object, dimensions: int) -> bool:
 
 def _plain(value: Tensor, loaded: np.ndarray) -> Tensor:
     """Texels apart from their tape; where transforms of ``torch.func`` hide them, others of their shape stand for them."""
-    if in_transform(value):
+    if is_transformed(value):
         return torch.full(value.shape, float(loaded.mean()), dtype=value.dtype, device=value.device)
     return value.detach()
 
 
-def _built(scene: Scene, texels: Mapping[str, Tensor]) -> Built:
+def _built(scene: Scene, texels: Mapping[str, Tensor]) -> SceneBuild:
     """What the scene came to, with nodes in place of numbers."""
     before, file = scene.built, scene.description.file
     parameters = Parameters()
     parameters |= before.parameters
     parameters.specs |= before.parameters.specs
     parameters.stated |= before.parameters.stated | texels.keys()
-    opener = Opener({}, scene.description.resolve, parameters, file)
+    texture_loader = TextureLoader({}, scene.description.resolve, parameters, file)
     materials = {m.name: m for owner in (*before.parts, *before.copies) for m in owner.material.all()}
     nodes: dict[str, dict[str, Node]] = {}
     for name, value in texels.items():
@@ -139,7 +139,7 @@ def _built(scene: Scene, texels: Mapping[str, Tensor]) -> Built:
             texture = texture_of({"type": "image", "data": array}, spec)
         except Refused as error:
             raise SceneError(f"params.{name}", error.value, error.expected) from None
-        nodes.setdefault(stem, {})[slot] = opener(texture, name)
+        nodes.setdefault(stem, {})[slot] = texture_loader(texture, name)
     parts = tuple(replace(part, material=_material(part.material, nodes)) for part in before.parts)
     copies = tuple(replace(copied, material=_material(copied.material, nodes)) for copied in before.copies)
     check_coordinates([*parts], texels, file)

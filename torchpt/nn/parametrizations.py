@@ -4,9 +4,9 @@
 kind           of                                      parameter
 =============  ======================================  =============================================================
 ``Bounded``    two ends: albedos, roughnesses, angles  ``low + (high - low) ((1 + 2 e) sigmoid(x) - e)``, held at the ends
-``Above``      one end: radiances, radii, indices      ``low + s (softplus(x) - e)``, held at the end; ``s`` as below
-``Free``       none: points, directions, vertices      ``x``
-``Rigid``      poses                                   ``exp(w)`` times the pose at first, at ``l t``; ``x = (w, t)``
+``LowerBounded``      one end: radiances, radii, indices      ``low + s (softplus(x) - e)``, held at the end; ``s`` as below
+``Unbounded``       none: points, directions, vertices      ``x``
+``RigidMotion``      poses                                   ``exp(w)`` times the pose at first, at ``l t``; ``x = (w, t)``
 =============  ======================================  =============================================================
 
 A plain sigmoid reaches neither 0 nor 1, and has no slope near them: an albedo of 0 would be minus infinity, and stay there.
@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from torchpt.spec import Pose, Spec
 
-__all__ = ["Above", "Bounded", "Free", "Range", "Rigid", "range_of"]
+__all__ = ["Bounded", "LowerBounded", "Parametrization", "RigidMotion", "Unbounded", "parametrization_of"]
 
 #: By how much an end that belongs to the range is overshot, as a share.
 STRETCH = 0.05
@@ -36,7 +36,7 @@ CLOSEST = 1e-6
 WIDE = 100.0
 
 
-class _Held(torch.autograd.Function):
+class _ProjectedClamp(torch.autograd.Function):
     """``clamp`` whose derivative passes beyond an end too, where a step against it leads back."""
 
     generate_vmap_rule = True
@@ -57,7 +57,7 @@ class _Held(torch.autograd.Function):
         return torch.where(outward, 0.0, cotangent), None, None
 
 
-class Range(nn.Module):
+class Parametrization(nn.Module):
     """One parameter: ``forward`` makes it of the numbers ``x`` that are optimized, ``inverse`` finds these.
 
     Both keep the device and the type of what they are given. Buffers hold what depends on the parameter at first.
@@ -68,19 +68,19 @@ class Range(nn.Module):
         raise NotImplementedError
 
 
-class Free(Range):
+class Unbounded(Parametrization):
     """The numbers themselves."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """See :class:`Range`."""
+        """See :class:`Parametrization`."""
         return x
 
     def inverse(self, value: Tensor) -> Tensor:
-        """See :class:`Range`."""
+        """See :class:`Parametrization`."""
         return value
 
 
-class Bounded(Range):
+class Bounded(Parametrization):
     """Between two ends; ``open_low`` and ``open_high``: whether they do not belong to the range."""
 
     def __init__(self, low: float, high: float, open_low: bool, open_high: bool) -> None:
@@ -90,17 +90,19 @@ class Bounded(Range):
         self.least, self.most = (CLOSEST if open_low else 0.0), 1.0 - (CLOSEST if open_high else 0.0)
 
     def forward(self, x: Tensor) -> Tensor:
-        """See :class:`Range`."""
-        share: Any = _Held.apply((1.0 + self.below + self.over) * x.sigmoid() - self.below, self.least, self.most)
+        """See :class:`Parametrization`."""
+        share: Any = _ProjectedClamp.apply(
+            (1.0 + self.below + self.over) * x.sigmoid() - self.below, self.least, self.most
+        )
         return self.low + (self.high - self.low) * share
 
     def inverse(self, value: Tensor) -> Tensor:
-        """See :class:`Range`."""
+        """See :class:`Parametrization`."""
         share = ((value.double() - self.low) / (self.high - self.low)).clamp(self.least, self.most)
         return ((share + self.below) / (1.0 + self.below + self.over)).logit().to(value)
 
 
-class Above(Range):
+class LowerBounded(Parametrization):
     """Above an end, and up to another one that lies far away; ``start``: the parameter at first."""
 
     scale: Tensor
@@ -113,18 +115,18 @@ class Above(Range):
         self.register_buffer("scale", (scale if scale > 0 else torch.ones_like(scale)).to(start))
 
     def forward(self, x: Tensor) -> Tensor:
-        """See :class:`Range`."""
-        above: Any = _Held.apply(nn.functional.softplus(x) - self.below, self.least, math.inf)
-        value: Any = _Held.apply(self.low + self.scale * above, -math.inf, self.high)
+        """See :class:`Parametrization`."""
+        above: Any = _ProjectedClamp.apply(nn.functional.softplus(x) - self.below, self.least, math.inf)
+        value: Any = _ProjectedClamp.apply(self.low + self.scale * above, -math.inf, self.high)
         return value
 
     def inverse(self, value: Tensor) -> Tensor:
-        """See :class:`Range`."""
+        """See :class:`Parametrization`."""
         y = ((value.double() - self.low) / self.scale.double()).clamp(min=self.least) + self.below
         return (y + torch.log(-torch.expm1(-y))).to(value)
 
 
-class Rigid(Range):
+class RigidMotion(Parametrization):
     """A pose: turned about the axes of the world around its own origin, and moved; its scales and shears stay.
 
     ``x`` is ``(6,)``: the rotation from the pose at first as axis times angle in radians, and the place of its origin in
@@ -139,7 +141,7 @@ class Rigid(Range):
         self.register_buffer("frame", start.detach()[:3, :3].clone())
 
     def forward(self, x: Tensor) -> Tensor:
-        """See :class:`Range`."""
+        """See :class:`Parametrization`."""
         a, b, c = x[:3].double().unbind()  # angles of many turns have no digits left in float32
         zero = torch.zeros_like(a)
         across = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).reshape(3, 3)  # of the cross product
@@ -148,7 +150,7 @@ class Rigid(Range):
         return torch.cat((torch.cat((turned, self.length * x[3:, None]), 1), last))
 
     def inverse(self, value: Tensor) -> Tensor:
-        """See :class:`Range`.
+        """See :class:`Parametrization`.
 
         Raises:
             ValueError: the pose is not one of this one's, turned and moved.
@@ -161,13 +163,13 @@ class Rigid(Range):
         return torch.cat((rotation_matrix_to_axis_angle(turn[None])[0].to(value), value[:3, 3] / self.length))
 
 
-def range_of(spec: Spec, start: Tensor, rigid: bool = True, length: float = 1.0) -> Range:
+def parametrization_of(spec: Spec, start: Tensor, rigid: bool = True, length: float = 1.0) -> Parametrization:
     """The range of a parameter that is ``start`` at first.
 
     ``rigid``: whether poses are turned and moved alone; ``length``: how large the scene is.
     """
     if isinstance(spec, Pose):
-        return Rigid(start, length) if rigid or spec.angles or spec.rigid else Free()
+        return RigidMotion(start, length) if rigid or spec.angles or spec.rigid else Unbounded()
     low, high = getattr(spec, "low", None), getattr(spec, "high", None)
     above, below = getattr(spec, "above", None), getattr(spec, "below", None)
     # Of an end that belongs to the range and one that does not, the tighter one counts.
@@ -175,8 +177,8 @@ def range_of(spec: Spec, start: Tensor, rigid: bool = True, length: float = 1.0)
     open_high = below is not None and (high is None or below <= high)
     low, high = above if open_low else low, below if open_high else high
     if low is None:
-        return Free()
+        return Unbounded()
     largest = float((start.double() - low).abs().max()) if start.numel() else 0.0
     if high is None or high - low > WIDE * max(largest, 1.0):
-        return Above(low, math.inf if high is None else high, open_low, start)
+        return LowerBounded(low, math.inf if high is None else high, open_low, start)
     return Bounded(low, high, open_low, open_high)

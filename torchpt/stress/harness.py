@@ -13,11 +13,11 @@ from torchpt.core.errors import RenderError
 from torchpt.rendering.api import render
 from torchpt.scene import load
 
-__all__ = ["Bench", "apart", "relative"]
+__all__ = ["Harness", "relative", "relative_difference"]
 
 
 @dataclass(frozen=True)
-class Bench:
+class Harness:
     """How cases are rendered.
 
     Attributes:
@@ -62,7 +62,7 @@ class Bench:
             raise RenderError(f"{found.nonfinite_samples} samples are not finite; the first is {found.nonfinite_first}")
         return found.image.double().cpu()
 
-    def exact(self) -> Bench:
+    def exact(self) -> Harness:
         """The same in float64."""
         return replace(self, dtype=torch.float64)
 
@@ -73,6 +73,6 @@ def relative(found: Tensor | float, expected: Tensor | float) -> float:
     return abs(found - expected) / abs(expected) if expected else abs(found)
 
 
-def apart(a: Tensor, b: Tensor) -> float:
+def relative_difference(a: Tensor, b: Tensor) -> float:
     """How far two pictures of the same numbers are apart: mean difference over mean value."""
     return float((a - b).abs().mean() / b.abs().mean())

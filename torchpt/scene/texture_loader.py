@@ -14,10 +14,10 @@ from torchpt.physics.parts import Parameters
 from torchpt.physics.textures import Named, Node, Opening, TextureInput, TexturePoint
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["Opener"]
+__all__ = ["TextureLoader"]
 
 
-class Opener:
+class TextureLoader:
     """Opens the textures of one scene.
 
     Args:

@@ -22,7 +22,7 @@ from torchpt.scene.meshes.gltf import MOST_PLACED
 from torchpt.scene.meshes.mesh import MeshPart
 from torchpt.scene.meshes.trimesh_objects import Notes, mesh_parts_of
 
-__all__ = ["load_others"]
+__all__ = ["load_trimesh_formats"]
 
 _BEGINS = re.compile(rb"(?:\xef\xbb\xbf|\xff\xfe|\xfe\xff)?\s*<")
 _ENCODING = re.compile(rb"<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)")
@@ -39,10 +39,10 @@ _ENCODINGS = (
 )
 
 #: Bytes that an archive may unfold to.
-MOST_UNFOLDED = 2**30
+MAX_UNPACKED = 2**30
 
 
-def load_others(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
+def load_trimesh_formats(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     """The meshes of a file as trimesh reads it, moved by its nodes.
 
     Raises:
@@ -55,7 +55,7 @@ def load_others(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
         how = "pip install '.[formats]' in the checkout of torchpt"
         raise AssetError(path, f"reading {kind} needs {needs}{' and '.join(missing)}: {how}")
     try:
-        _screen(path, data)
+        _check_safe(path, data)
         with Notes() as notes, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of NumPy and of readers about themselves
             scene, lost = _read(path, data)
@@ -97,14 +97,14 @@ def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
     return scene, lost
 
 
-def _screen(path: Path, data: bytes) -> None:
+def _check_safe(path: Path, data: bytes) -> None:
     """Refuse archives that unfold to too much, and XML that declares entities."""
     texts = [data] if path.suffix.lower() == ".dae" else []
     if data.startswith(b"PK"):
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(info.file_size for info in archive.infolist())
-            if size > MOST_UNFOLDED:
-                raise AssetError(path, f"unfolds to {size} bytes, more than {MOST_UNFOLDED} are not read")
+            if size > MAX_UNPACKED:
+                raise AssetError(path, f"unfolds to {size} bytes, more than {MAX_UNPACKED} are not read")
             texts += [archive.read(info) for info in archive.infolist() if info.filename.lower().endswith(".dae")]
     for text in texts:
         plain = text.replace(b"\0", b"")  # of UTF-16
