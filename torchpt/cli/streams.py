@@ -14,10 +14,10 @@ from typing import Any
 
 from torchpt.core.errors import OutputError
 
-__all__ = ["ready", "speaking"]
+__all__ = ["flushed_stdout", "open_streams"]
 
 
-def ready() -> None:
+def open_streams() -> None:
     """Make all three streams usable, for a process that is the command's own.
 
     A closed one would give its number to the next file that is opened, and what is meant for a terminal would end up there.
@@ -55,7 +55,7 @@ class _Lenient:
 
 
 @contextmanager
-def speaking() -> Iterator[None]:
+def flushed_stdout() -> Iterator[None]:
     """Context in which a command prints to standard output what it is asked for.
 
     Raises:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torchpt.ranks import Group
     from torchpt.ranks.launch import LaunchedProcess
 
-__all__ = ["group", "main_of_ranks", "say", "several"]
+__all__ = ["group", "is_distributed", "run_on_ranks", "say"]
 
 #: Words that ask for more than one render, or for something else.
 _SWEEPS, _SHOWN = ("-m", "--multirun"), ("-h", "--help", "help", "--version")
@@ -29,7 +29,7 @@ _started: LaunchedProcess | None = None
 _stderr: Any = None
 
 
-def several() -> bool:
+def is_distributed() -> bool:
     """Whether this process was started as one of several."""
     return os.environ.get("WORLD_SIZE", "1").strip() not in ("", "0", "1")
 
@@ -45,7 +45,7 @@ def say(line: str, about: str = "") -> None:
         print(line, file=_stderr or sys.stderr, flush=True)
 
 
-def parted(error: LostRankError | OtherRankError) -> int:
+def report_lost_rank(error: LostRankError | OtherRankError) -> int:
     """What there is to say where ranks do not end together; returns the exit code."""
     if isinstance(error, OtherRankError):
         return error.code  # that rank says what happened
@@ -53,7 +53,7 @@ def parted(error: LostRankError | OtherRankError) -> int:
     return 2
 
 
-def main_of_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
+def run_on_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
     """Run a command line as one rank of several, and return the exit code, which all have in common.
 
     Args:
@@ -69,7 +69,7 @@ def main_of_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
             _started = LaunchedProcess()
             _started.connect(interrupt.check)
     except LostRankError as error:
-        _leave(parted(error))
+        _leave(report_lost_rank(error))
     except TorchptError as error:  # of the environment, which is the same for all
         if first:
             print(f"torchpt: {error}", file=sys.stderr)
@@ -104,7 +104,7 @@ def _ended(main: Callable[[list[str]], int], words: list[str]) -> int:
             _started.disconnect()
             return code
         except LostRankError as error:  # while it wrote the picture, say
-            code = parted(error)
+            code = report_lost_rank(error)
     _leave(code)
 
 
