@@ -107,7 +107,7 @@ def _as_albedos(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
 
 
 def _twisted(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
-    """Return the fields of a task: the camera is moved by three lengths and rotated by three angles about its own axes."""
+    """Return the parameter of a camera moved by three lengths and rotated by three angles, about its own axes."""
     x, y, z, a, b, c = numbers
     o = torch.zeros_like(x)
     rows = [torch.stack(row) for row in ((o, -c, b, x), (c, o, -a, y), (-b, a, o, z), (o, o, o, o))]
@@ -115,7 +115,7 @@ def _twisted(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
 
 
 def _ball(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
-    """Return fields of a task: a ball is moved in the image plane, and its radius multiplied by an exponential."""
+    """Return the parameter of a ball moved in the image plane, with its radius multiplied by an exponential."""
     base = scene.params["shapes.ball.to_world"]
     x, y, grown = numbers
     o = torch.zeros_like(x)
