@@ -10,11 +10,11 @@ import sys
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from torchpt.cli import collector
+from torchpt.cli import gc_pause
 from torchpt.cli.arguments import UsageError
 from torchpt.cli.interrupt import Interrupt
 from torchpt.cli.render import plain
-from torchpt.cli.streams import speaking
+from torchpt.cli.streams import flushed_stdout
 from torchpt.core.errors import AssetError, OutputError, SceneError
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ _UP_TO_ONE = ("smape", "ssim", "flip")
 
 
 @dataclass
-class Wishes:
+class CompareOptions:
     """The parsed arguments of ``torchpt compare``.
 
     Attributes:
@@ -63,34 +63,34 @@ class Wishes:
     json: bool = False
 
     @classmethod
-    def read(cls, words: list[str]) -> Wishes:
+    def read(cls, words: list[str]) -> CompareOptions:
         """Parse the words after ``torchpt compare``; a file name may contain any characters.
 
         Raises:
             UsageError: an unknown option or key, a key given twice or without a value, ``metric=`` or ``range=`` without
                 ``map=``, or not exactly two pictures.
         """
-        wishes = cls()
+        options = cls()
         end = words.index("--") if "--" in words else len(words)
         for word in words[:end]:
             if word == "--json":
-                wishes.json = True
+                options.json = True
             elif word.startswith("-"):
                 raise UsageError(f"{word}: unknown option; known: --json, --help, -- (before names of files)")
             elif match := _KEY.match(word):
                 key, value = match.groups()
-                if key in wishes.given:
-                    raise UsageError(f"{key}: given twice, as {wishes.given[key]!r} and {value!r}")
+                if key in options.given:
+                    raise UsageError(f"{key}: given twice, as {options.given[key]!r} and {value!r}")
                 if not value:
                     raise UsageError(f"{key}: expected a value, got nothing")
-                wishes.given[key] = value
+                options.given[key] = value
             elif re.match(r"[\w.]+=", word) and not os.path.exists(word):
                 raise UsageError(f"{word}: unknown key, and no file of this name; known: {', '.join(_KEYS)}")
             else:
-                wishes.pictures.append(word)
-        wishes.pictures += words[end + 1 :]
-        wishes._check()
-        return wishes
+                options.pictures.append(word)
+        options.pictures += words[end + 1 :]
+        options._check()
+        return options
 
     def _check(self) -> None:
         if len(self.pictures) != 2:
@@ -116,21 +116,21 @@ def run(words: list[str], interrupt: Interrupt) -> int:
     Raises:
         TorchptError: bad input.
     """
-    wishes = Wishes.read(words)
+    options = CompareOptions.read(words)
     from torchpt.images.comparison import compare as measure
 
-    collector.resume()
-    shown, chart = _shown(wishes.given), _map(wishes)
-    layer = wishes.given.get("layer")
-    (name, first), (_, second) = (_picture(path, layer) for path in wishes.pictures)
-    _agree(wishes.pictures, first, second)
+    gc_pause.resume()
+    shown, chart = _shown(options.given), _map(options)
+    layer = options.given.get("layer")
+    (name, first), (_, second) = (_picture(path, layer) for path in options.pictures)
+    _agree(options.pictures, first, second)
     height, width, channels = first.shape
     colours = _is_colour(name, channels)
     if not colours:
-        _refuse_colour_keys(wishes, name)
+        _refuse_colour_keys(options, name)
     (image, alpha), (reference, other) = (_apart(picture, colours) for picture in (first, second))
     found = measure(image, reference, shown, colours)
-    facts: dict[str, Any] = {"test": wishes.pictures[0], "reference": wishes.pictures[1], "layer": name}
+    facts: dict[str, Any] = {"test": options.pictures[0], "reference": options.pictures[1], "layer": name}
     facts |= {"width": width, "height": height, "channels": channels, "metrics": found.metrics}
     facts |= {"reasons": found.reasons, "mean": dict(zip(("test", "reference"), found.means, strict=True))}
     facts["mean_ratio"] = found.ratio
@@ -141,8 +141,8 @@ def run(words: list[str], interrupt: Interrupt) -> int:
         facts["largest_alpha_difference"] = float((alpha.double() - other.double()).abs().max())
     if chart is not None:
         facts["map"] = _write_map(chart, image, reference, shown)
-    with speaking():
-        if wishes.json:
+    with flushed_stdout():
+        if options.json:
             print(json.dumps(plain(facts), allow_nan=False))
         else:
             _print(facts, found)
@@ -177,7 +177,7 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def _map(wishes: Wishes) -> _Map | None:
+def _map(options: CompareOptions) -> _Map | None:
     """Return the error map to write, checked before the pictures are read; None without ``map=``.
 
     Raises:
@@ -186,14 +186,14 @@ def _map(wishes: Wishes) -> _Map | None:
     from torchpt.images import check_writable
     from torchpt.images.metrics import MAPS
 
-    given = wishes.given
+    given = options.given
     if "map" not in given:
         return None
     metric = given.get("metric", "relmse")
     if metric not in MAPS:
         raise SceneError("metric", metric, f"one of {', '.join(MAPS)}")
     place = check_writable(given["map"], _MAPS)
-    if str(place) in map(os.path.realpath, wishes.pictures):
+    if str(place) in map(os.path.realpath, options.pictures):
         raise OutputError(given["map"], "is one of the pictures that are compared; give map= another name")
     if "range" not in given:
         return _Map(given["map"], metric, None)
@@ -245,13 +245,13 @@ def _is_colour(layer: str, channels: int) -> bool:
     return [name.rpartition(".")[2] for name in channel_names(layer, channels)][:3] == ["R", "G", "B"]
 
 
-def _refuse_colour_keys(wishes: Wishes, layer: str) -> None:
+def _refuse_colour_keys(options: CompareOptions, layer: str) -> None:
     from torchpt.images.comparison import OF_COLOURS
 
     for key in _SHOWN:
-        if key in wishes.given:
+        if key in options.given:
             raise UsageError(f"{key}: the layer {layer} holds no colours, so it is not shown on a screen")
-    if wishes.given.get("metric") in OF_COLOURS:
+    if options.given.get("metric") in OF_COLOURS:
         raise UsageError(f"metric: the layer {layer} holds no colours; expected relmse, mse or smape")
 
 

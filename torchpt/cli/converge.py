@@ -10,12 +10,12 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from torchpt.cli import collector, keys
+from torchpt.cli import gc_pause, keys
 from torchpt.cli.arguments import UsageError, parse_study
 from torchpt.cli.interrupt import Interrupt, Interrupted
 from torchpt.cli.notices import notices
 from torchpt.cli.progress import Bar
-from torchpt.cli.streams import speaking
+from torchpt.cli.streams import flushed_stdout
 from torchpt.core.errors import OutputError, SceneError
 
 __all__ = ["HELP", "converge", "raw_study", "run"]
@@ -157,7 +157,7 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
     from torchpt.reports.runs import Stopped, Store, measure, prepare, write_whole
     from torchpt.reports.study import study_of
 
-    collector.resume()
+    gc_pause.resume()
     start = time.perf_counter()
     raw, file = raw_study({key: text for key, text in words.items() if key != "out"}, changes)
     with notices():
@@ -209,7 +209,7 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
             for topic in topics
         ],
     }
-    with speaking():
+    with flushed_stdout():
         print(json.dumps(plain(facts), allow_nan=False))
     return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
 

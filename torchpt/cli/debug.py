@@ -9,24 +9,24 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from torchpt.cli import collector
+from torchpt.cli import gc_pause
 from torchpt.cli.arguments import UsageError
 from torchpt.cli.interrupt import Interrupt
 from torchpt.cli.notices import notices
-from torchpt.cli.render import Job, described
-from torchpt.cli.streams import speaking
+from torchpt.cli.render import Job, scene_and_settings
+from torchpt.cli.streams import flushed_stdout
 
 if TYPE_CHECKING:
     from torchpt.rendering.one_path import Chosen, Emission, Path, Scattered, Vertex
 
-__all__ = ["Wish", "debug", "lines"]
+__all__ = ["PathRequest", "debug", "lines"]
 
 _PIXEL = re.compile(r"\[?\s*(\d{1,9})\s*,\s*(\d{1,9})\s*\]?\Z")
 _SAMPLE = re.compile(r"\d{1,18}\Z")
 
 
 @dataclass(frozen=True)
-class Wish:
+class PathRequest:
     """The pixel and sample of the path to print.
 
     Attributes:
@@ -38,7 +38,7 @@ class Wish:
     sample: int = 0
 
     @staticmethod
-    def read(words: Mapping[str, str]) -> Wish:
+    def read(words: Mapping[str, str]) -> PathRequest:
         """Parse the values of the keys in ``arguments.DEBUG_KEYS``.
 
         Raises:
@@ -49,10 +49,10 @@ class Wish:
             raise UsageError(f"debug.pixel: expected [x,y], two whole numbers from 0, got {words['debug.pixel']!r}")
         if not _SAMPLE.match(sample):
             raise UsageError(f"debug.sample: expected a whole number from 0, got {sample!r}")
-        return Wish((int(pixel[1]), int(pixel[2])), int(sample))
+        return PathRequest((int(pixel[1]), int(pixel[2])), int(sample))
 
 
-def debug(job: Job, wish: Wish, interrupt: Interrupt, as_json: bool = False) -> int:
+def debug(job: Job, request: PathRequest, interrupt: Interrupt, as_json: bool = False) -> int:
     """Load the scene, trace the path, print it and return the exit code.
 
     Raises:
@@ -63,13 +63,13 @@ def debug(job: Job, wish: Wish, interrupt: Interrupt, as_json: bool = False) -> 
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
 
-    collector.resume()
+    gc_pause.resume()
     with notices():
-        description, wishes = described(job)
-        scene = Scene(description, device_of(wishes.render.device))
-        path = one_path(scene, wishes, wish.pixel, wish.sample)
+        description, settings = scene_and_settings(job)
+        scene = Scene(description, device_of(settings.render.device))
+        path = one_path(scene, settings, request.pixel, request.sample)
     interrupt.check()
-    with speaking():
+    with flushed_stdout():
         print(json.dumps(_plain(asdict(path)), allow_nan=False) if as_json else "\n".join(lines(path)))
     return 0
 

@@ -8,12 +8,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from torchpt.cli import collector
+from torchpt.cli import gc_pause
 from torchpt.cli.arguments import Arguments
 from torchpt.cli.interrupt import Interrupt
 from torchpt.cli.notices import notices, which_job
-from torchpt.cli.render import Job, described, knowing, plain
-from torchpt.cli.streams import speaking
+from torchpt.cli.render import Job, plain, scene_and_settings, with_error_pilots
+from torchpt.cli.streams import flushed_stdout
 from torchpt.core.errors import TorchptError
 
 __all__ = ["HELP", "info", "lines", "run"]
@@ -45,20 +45,20 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
 
-    collector.resume()
+    gc_pause.resume()
     with notices():
-        description, wishes = described(job)
-        scene = Scene(description, device_of(wishes.render.device))
-        facts = scene.info(wishes)
-        facts["built"]["loop"] = loop_facts(scene, wishes)
+        description, settings = scene_and_settings(job)
+        scene = Scene(description, device_of(settings.render.device))
+        facts = scene.info(settings)
+        facts["built"]["loop"] = loop_facts(scene, settings)
         facts = {**job.facts(), **facts}
-        if wishes.render.max_memory is not None:
-            facts["memory"] = _memory(scene, wishes)
+        if settings.render.max_memory is not None:
+            facts["memory"] = _memory(scene, settings)
     which_job(job)
     interrupt.check()
     if "refused" in facts.get("memory", ()):
         print(f"torchpt: warning: no render could run: {facts['memory']['refused']}", file=sys.stderr)
-    with speaking():
+    with flushed_stdout():
         if as_json:
             print(json.dumps(plain(facts), allow_nan=False))
         elif not sys.stdout.isatty():
@@ -72,17 +72,17 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
     return 0
 
 
-def _memory(scene: Any, wishes: Any) -> dict[str, Any]:
+def _memory(scene: Any, settings: Any) -> dict[str, Any]:
     """Return whether ``render.max_memory`` suffices for a render, and the error message if it does not."""
     import torch
 
     from torchpt.rendering import Run
 
-    wishes = knowing(wishes)  # as `torchpt render`
-    wishes = replace(wishes, render=wishes.render.but(checkpoint=None, resume=False))
+    settings = with_error_pilots(settings)  # as `torchpt render`
+    settings = replace(settings, render=settings.render.but(checkpoint=None, resume=False))
     try:
         with torch.no_grad():
-            Run(scene, wishes, None, torch.float32)
+            Run(scene, settings, None, torch.float32)
     except TorchptError as error:
         return {"enough": False, "refused": str(error)}
     return {"enough": True}

@@ -17,12 +17,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchpt.cli import collector, compare, converge, info, keys, orbit, ranked, render, stress
+from torchpt.cli import compare, converge, distributed, gc_pause, info, keys, orbit, render, stress
 from torchpt.cli.arguments import GROUPS, Arguments, UsageError, parse
 from torchpt.cli.hydra_process import hydra_process
 from torchpt.cli.interrupt import Interrupt, Interrupted, interruption
 from torchpt.cli.render import Job
-from torchpt.cli.streams import ready, speaking
+from torchpt.cli.streams import flushed_stdout, open_streams
 from torchpt.cli.sweep_folder import sweep_folder
 from torchpt.cli.sweep_table import tell_jobs
 from torchpt.core.errors import LostRankError, OtherRankError, TorchptError
@@ -68,9 +68,9 @@ class Command:
 
 def run() -> None:
     """Run the console script."""
-    collector.pause()
-    ready()
-    sys.exit(ranked.main_of_ranks(main, sys.argv[1:]) if ranked.several() else main())
+    gc_pause.pause()
+    open_streams()
+    sys.exit(distributed.run_on_ranks(main, sys.argv[1:]) if distributed.is_distributed() else main())
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -138,13 +138,13 @@ def _check_place() -> None:
 
 
 def _say(text: str) -> int:
-    with speaking():
+    with flushed_stdout():
         print(text, end="")
     return 0
 
 
 def _refuse(line: str) -> int:
-    ranked.say("torchpt: " + " ".join(line.split("\n")))
+    distributed.say("torchpt: " + " ".join(line.split("\n")))
     return 2
 
 
@@ -185,7 +185,7 @@ class _Task:
             try:
                 return self.job(self._job(cfg), self.arguments, interrupt)
             except (LostRankError, OtherRankError) as error:
-                return ranked.parted(error)
+                return distributed.report_lost_rank(error)
             except TorchptError as error:
                 return _refuse(str(error))
             except Interrupted as interrupted:

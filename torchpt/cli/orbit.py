@@ -17,13 +17,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchpt.cli import collector
+from torchpt.cli import gc_pause
 from torchpt.cli.arguments import Arguments
 from torchpt.cli.interrupt import Interrupt, Interrupted
 from torchpt.cli.notices import notices, which_job
 from torchpt.cli.progress import Bar
-from torchpt.cli.render import Job, check_distinct, described, knowing, numbered, plain
-from torchpt.cli.streams import speaking
+from torchpt.cli.render import Job, check_distinct, numbered, plain, scene_and_settings, with_error_pilots
+from torchpt.cli.streams import flushed_stdout
 from torchpt.cli.sweep_table import note_job
 from torchpt.core.errors import OutputError, SceneError
 from torchpt.core.version import __version__
@@ -147,10 +147,10 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     from torchpt.scene.scene import Scene
     from torchpt.scene.settings import MOST_SEED
 
-    collector.resume()
+    gc_pause.resume()
     start = time.perf_counter()
     with notices():
-        description, wishes = described(job)
+        description, run_settings = scene_and_settings(job)
         for group, key in (
             ("render", "preview"),
             ("render", "checkpoint"),
@@ -162,15 +162,15 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
                 if key == "denoise":
                     what = "false: torchpt orbit writes frames as rendered (denoised one by one they flicker)"
                 raise SceneError(f"{group}.{key}", job.overrides[group][key], what)
-        if wishes.render.seed > (last := MOST_SEED - turn.frames + 1):
+        if run_settings.render.seed > (last := MOST_SEED - turn.frames + 1):
             expected = f"a whole number 0..{last} where frames={turn.frames} (frame k has the seed render.seed + k)"
-            raise SceneError("render.seed", wishes.render.seed, expected)
+            raise SceneError("render.seed", run_settings.render.seed, expected)
         outs = _outputs(job)
         check_distinct([("out", path) for path in outs])
         for path in outs:
             check_movie(path, turn.fps)
-        scene = Scene(description, device_of(wishes.render.device))
-        frames = Frames(Path(f"{outs[0]}.frames"), _facts(scene, wishes, turn))
+        scene = Scene(description, device_of(run_settings.render.device))
+        frames = Frames(Path(f"{outs[0]}.frames"), _facts(scene, run_settings, turn))
         before = frames.count(turn.frames)
     load_seconds = time.perf_counter() - start
     which_job(job, outs)
@@ -193,7 +193,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     else:
         facts["complete"] = False
     facts["seconds"] = round(time.perf_counter() - start, 4)
-    with speaking():
+    with flushed_stdout():
         print(json.dumps(plain(facts), allow_nan=False))
     note_job(job, facts)
     if interrupt.signum is None:
@@ -235,15 +235,15 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
             if frames.has(number):
                 continue
             once = {**job.overrides, "render": {**job.overrides.get("render", {}), "seed": seed + number}}
-            wishes = knowing(settings(scene.description, once))  # a frame equals the picture of `torchpt render`
+            run_settings = with_error_pilots(settings(scene.description, once))  # as `torchpt render`
             # In a scene file these settings are meant for `torchpt render`.
-            film, render = wishes.film.but(denoise=False), wishes.render.but(checkpoint=None, resume=False)
-            wishes = replace(wishes, film=film, render=render)
+            film, render = run_settings.film.but(denoise=False), run_settings.render.but(checkpoint=None, resume=False)
+            run_settings = replace(run_settings, film=film, render=render)
             scene.params["camera.to_world"] = torch.from_numpy(pose.copy()).to(place)
-            rendering = render_scene(scene, wishes, on_progress=partial(on_progress, number, totals["rays"]))
+            rendering = render_scene(scene, run_settings, on_progress=partial(on_progress, number, totals["rays"]))
             if not rendering.complete:
                 break
-            frames.write(number, rendering.image, wishes.film)
+            frames.write(number, rendering.image, run_settings.film)
             summary = rendering.summary()
             totals = {name: count + summary[name] for name, count in totals.items()}
             causes.update(summary.get("nonfinite_causes", {}))
@@ -321,7 +321,7 @@ class Frames:
             self.folder.rmdir()
 
 
-def _facts(scene: Scene, wishes: Settings, turn: Turn) -> dict[str, Any]:
+def _facts(scene: Scene, run_settings: Settings, turn: Turn) -> dict[str, Any]:
     """Return everything that frames depend on, by dotted name: the turn, the settings, a hash of the scene."""
     from torchpt.scene.fingerprint import fingerprint
     from torchpt.scene.settings import having
@@ -329,7 +329,7 @@ def _facts(scene: Scene, wishes: Settings, turn: Turn) -> dict[str, Any]:
 
     facts = {"torchpt": __version__, "frames": turn.frames, "degrees": turn.degrees}
     free = {"render": having(Role.FREE, but=Role.ENDS)["render"]}  # settings that do not change a frame
-    return {**facts, **dict(_dotted(wishes.plain(free))), "scene": fingerprint(scene)}
+    return {**facts, **dict(_dotted(run_settings.plain(free))), "scene": fingerprint(scene)}
 
 
 def _dotted(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -15,16 +15,27 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from torchpt.cli import collector, ranked
+from torchpt.cli import distributed, gc_pause
 from torchpt.cli.arguments import Arguments
 from torchpt.cli.interrupt import Interrupt, Interrupted
 from torchpt.cli.notices import not_finite, notices, unknown_error, which_job
 from torchpt.cli.progress import Bar
-from torchpt.cli.streams import speaking
+from torchpt.cli.streams import flushed_stdout
 from torchpt.cli.sweep_table import brief, error_of, note_job
 from torchpt.core.errors import OutputError, RenderError, SceneError, TorchptError
 
-__all__ = ["HELP", "Job", "check_distinct", "described", "knowing", "numbered", "plain", "render", "run", "sentence"]
+__all__ = [
+    "HELP",
+    "Job",
+    "check_distinct",
+    "numbered",
+    "plain",
+    "render",
+    "run",
+    "scene_and_settings",
+    "sentence",
+    "with_error_pilots",
+]
 
 HELP = """\
 torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
@@ -96,9 +107,9 @@ def run(job: Job, arguments: Arguments, interrupt: Interrupt) -> int:
     """Render a picture, or print one path of it, and return the exit code."""
     if not arguments.debug:
         return render(job, interrupt)
-    from torchpt.cli.debug import Wish, debug
+    from torchpt.cli.debug import PathRequest, debug
 
-    return debug(job, Wish.read(arguments.debug), interrupt, arguments.json)
+    return debug(job, PathRequest.read(arguments.debug), interrupt, arguments.json)
 
 
 def render(job: Job, interrupt: Interrupt) -> int:
@@ -115,18 +126,18 @@ def render(job: Job, interrupt: Interrupt) -> int:
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
 
-    collector.resume()
+    gc_pause.resume()
     start = time.perf_counter()
-    group = ranked.group()
+    group = distributed.group()
     first = group is None or group.rank == 0  # only rank 0 writes files
     with notices():
-        description, wishes = described(job)
-        wishes = knowing(wishes)
-        outs = _outputs(job, wishes)
-        preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
+        description, settings = scene_and_settings(job)
+        settings = with_error_pilots(settings)
+        outs = _outputs(job, settings)
+        preview = settings.render.preview and numbered(str(Path(settings.render.preview).expanduser()), job.number)
         previews = _preview_files(preview) if preview else []
-        denoised = _denoised_files(wishes, outs)
-        kept = wishes.render.checkpoint and numbered(str(Path(wishes.render.checkpoint).expanduser()), job.number)
+        denoised = _denoised_files(settings, outs)
+        kept = settings.render.checkpoint and numbered(str(Path(settings.render.checkpoint).expanduser()), job.number)
         check_distinct(
             [
                 *(("out", path) for path in outs),
@@ -138,15 +149,15 @@ def render(job: Job, interrupt: Interrupt) -> int:
         for path in (*outs, *previews, *denoised) if first else ():
             check_writable(path)
         if kept is not None:
-            wishes = replace(wishes, render=wishes.render.but(checkpoint=kept))
+            settings = replace(settings, render=settings.render.but(checkpoint=kept))
             if first:
-                Keeper(kept).check(wishes.render.resume)
-        scene = Scene(description, device_of(wishes.render.device))
+                Keeper(kept).check(settings.render.resume)
+        scene = Scene(description, device_of(settings.render.device))
     scene.load_seconds = time.perf_counter() - start
     if first:
         which_job(job, outs)
     if preview and first:
-        hits = first_hit(scene, wishes)
+        hits = first_hit(scene, settings)
         for path, name in zip(previews, ("albedo", "normal"), strict=False):
             _write_layer(path, name, hits[name])
 
@@ -156,15 +167,15 @@ def render(job: Job, interrupt: Interrupt) -> int:
         def on_progress(state: Any) -> bool:
             bar.update(state.done, state.total, state.rays, state.seconds)
             if preview and first and state.pass_finished and state.done < state.total:
-                write_rendered(preview, state.snapshot(), wishes.film)
+                write_rendered(preview, state.snapshot(), settings.film)
             return interrupt.signum is not None
 
-        rendering = _keeping(interrupt, lambda: render_scene(scene, wishes, on_progress=on_progress, **shared))
+        rendering = _keeping(interrupt, lambda: render_scene(scene, settings, on_progress=on_progress, **shared))
     if group is not None:  # a signal to one rank stops all
         interrupt.signum = int(max(group.agree("signals", interrupt.signum or 0))[0]) or None
     if not first:
         return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
-    facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, wishes)
+    facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, settings)
     summary = {"out": _names(outs), **job.facts(), **facts, **rendering.summary()}
     if not rendering.complete:
         summary["complete"] = False
@@ -172,17 +183,17 @@ def render(job: Job, interrupt: Interrupt) -> int:
     unknown_error(summary)
     summary = plain(summary, digits=6)
     height, width = rendering.image.shape[:2]
-    with speaking():  # one print, as the jobs of a sweep may share stdout; the last line is the summary
+    with flushed_stdout():  # one print, as the jobs of a sweep may share stdout; the last line is the summary
         print(f"{sentence(summary, width, height)}\n{json.dumps(summary, allow_nan=False)}")
     note_job(job, summary)
     if interrupt.signum is None:
         return 0
-    again = "" if wishes.render.checkpoint is None else "; render.resume=true goes on"
+    again = "" if settings.render.checkpoint is None else "; render.resume=true goes on"
     print(f"torchpt: stopped by a signal; {outs[0]} holds the picture so far{again}", file=sys.stderr)
     return Interrupted(interrupt.signum).exit_code
 
 
-def described(job: Job) -> tuple[Any, Any]:
+def scene_and_settings(job: Job) -> tuple[Any, Any]:
     """Return the scene description and the complete settings of a job; null on the command line unsets the scene's value.
 
     Raises:
@@ -194,11 +205,11 @@ def described(job: Job) -> tuple[Any, Any]:
     return overridden(read_description(job.scene, overrides=job.changes, places=places), job.overrides)
 
 
-def knowing(wishes: Any) -> Any:
+def with_error_pilots(settings: Any) -> Any:
     """Replace ``render.pilots: auto`` by true where the integrator allows it: the summary reports the error."""
-    render = wishes.render
-    able = render.pilots == "auto" and not wishes.integrator.splats
-    return replace(wishes, render=render.but(pilots=True)) if able else wishes
+    render = settings.render
+    able = render.pilots == "auto" and not settings.integrator.splats
+    return replace(settings, render=render.but(pilots=True)) if able else settings
 
 
 def _keeping(interrupt: Interrupt, work: Callable[[], Any]) -> Any:
@@ -213,9 +224,9 @@ def _name(scene: str) -> str:
     return path.stem if path.suffix in (".yaml", ".yml") else path.name
 
 
-def _outputs(job: Job, wishes: Any) -> list[str]:
+def _outputs(job: Job, settings: Any) -> list[str]:
     """Return the files to write; refuse ``film.aovs`` of the command line if no file can hold layers."""
-    layers = [name for name in wishes.film.aovs or ()]
+    layers = [name for name in settings.film.aovs or ()]
     outs = [str(Path(path).expanduser()) for path in job.outs]
     if not outs:
         outs = [_name(job.scene) + (".exr" if layers else ".png")]
@@ -247,13 +258,13 @@ def _is_exr(path: str) -> bool:
     return Path(path).suffix.lower() == ".exr"
 
 
-def _denoised_files(wishes: Any, outs: list[str]) -> list[str]:
+def _denoised_files(settings: Any, outs: list[str]) -> list[str]:
     """Return the paths of the denoised pictures, one for each of ``outs``; empty without ``film.denoise``.
 
     Raises:
         RenderError: the denoiser is not installed.
     """
-    if not wishes.film.denoise:
+    if not settings.film.denoise:
         return []
     from torchpt.images.denoiser import check_denoiser
     from torchpt.rendering.result import beside
@@ -268,7 +279,7 @@ def _preview_files(preview: str) -> list[str]:
     return [*(str(path.with_name(f"{path.stem}.{name}{path.suffix}")) for name in ("albedo", "normal")), preview]
 
 
-def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: Any) -> dict[str, Any]:
+def _write_all(paths: list[str], denoised: list[str], rendering: Any, settings: Any) -> dict[str, Any]:
     """Write all pictures, then raise the errors of those that failed; return the facts about denoising."""
     from torchpt.rendering.result import denoise_rendering, write_denoised, write_rendered
 
@@ -276,18 +287,18 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: An
     facts: dict[str, Any] = {}
     for path in paths:
         try:
-            write_rendered(path, rendering, wishes.film)
+            write_rendered(path, rendering, settings.film)
         except OutputError as error:
-            elsewhere = _written_elsewhere(path, rendering, wishes)
+            elsewhere = _written_elsewhere(path, rendering, settings)
             if elsewhere is not None:
                 error = OutputError(path, f"{error.problem}; the picture is in {elsewhere}")
             failed.append(error)
     try:
         if denoised:  # after the rendered pictures are on disk
-            facts = {"denoised": _names(denoised), "denoise_seconds": round(denoise_rendering(rendering, wishes), 4)}
+            facts = {"denoised": _names(denoised), "denoise_seconds": round(denoise_rendering(rendering, settings), 4)}
             for path in denoised:
                 try:
-                    write_denoised(path, rendering, wishes.film)
+                    write_denoised(path, rendering, settings.film)
                 except OutputError as error:
                     failed.append(error)
     except RenderError as error:
@@ -299,7 +310,7 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: An
     return facts
 
 
-def _written_elsewhere(path: str, rendering: Any, wishes: Any) -> str | None:
+def _written_elsewhere(path: str, rendering: Any, settings: Any) -> str | None:
     """Write a picture to the home or temporary folder under a new name and return its path, or None if that fails too."""
     from torchpt.rendering.result import write_rendered
 
@@ -308,7 +319,7 @@ def _written_elsewhere(path: str, rendering: Any, wishes: Any) -> str | None:
         spare = Path(place) / f"{name.stem}-{secrets.token_hex(3)}{name.suffix}"
         if Path(place).is_dir():
             with suppress(OutputError):
-                write_rendered(spare, rendering, wishes.film)
+                write_rendered(spare, rendering, settings.film)
                 return str(spare)
     return None
 

@@ -14,10 +14,10 @@ from typing import Any
 
 from torchpt.core.errors import OutputError
 
-__all__ = ["ready", "speaking"]
+__all__ = ["flushed_stdout", "open_streams"]
 
 
-def ready() -> None:
+def open_streams() -> None:
     """Open closed standard streams, and ignore write errors on stderr. Only for a process that runs nothing but the command.
 
     The next file that is opened would get the number of a closed stream, and messages for a terminal would go into that file.
@@ -55,7 +55,7 @@ class _Lenient:
 
 
 @contextmanager
-def speaking() -> Iterator[None]:
+def flushed_stdout() -> Iterator[None]:
     """Flush standard output at the end of the context, and handle its write errors.
 
     Raises:

@@ -10,10 +10,10 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchpt.cli import collector
+from torchpt.cli import gc_pause
 from torchpt.cli.arguments import GROUPS, UsageError, is_scene_word
 from torchpt.cli.interrupt import Interrupt
-from torchpt.cli.streams import speaking
+from torchpt.cli.streams import flushed_stdout
 from torchpt.core.errors import OutputError, SceneError
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ _KEYS = ("quick", "case", "device", "accel", "compile", "dtype", "out", "scene")
 
 
 @dataclass
-class Wishes:
+class StressOptions:
     """The parsed arguments of ``torchpt stress``.
 
     Attributes:
@@ -66,7 +66,7 @@ class Wishes:
     json: bool = False
 
     @classmethod
-    def read(cls, words: list[str]) -> Wishes:
+    def read(cls, words: list[str]) -> StressOptions:
         """Parse the words after ``stress``.
 
         Raises:
@@ -124,23 +124,23 @@ def run(words: list[str], interrupt: Interrupt) -> int:
     Raises:
         TorchptError: bad input.
     """
-    wishes = Wishes.read(words)
+    options = StressOptions.read(words)
     from torchpt.stress.outcome import outcome_of
     from torchpt.stress.table import facts, heading, line
 
-    collector.resume()
-    topics, benches, folder = _topics(wishes), _benches(wishes), _folder(wishes)
-    quick, begun = wishes.given.get("quick") == "true", time.perf_counter()
+    gc_pause.resume()
+    topics, benches, folder = _topics(options), _benches(options), _folder(options)
+    quick, begun = options.given.get("quick") == "true", time.perf_counter()
     found: dict[str, dict[str, list[Outcome]]] = {}
     for number, (label, bench) in enumerate(benches.items()):
-        _tell(wishes, f"{label}\n{heading()}")
+        _tell(options, f"{label}\n{heading()}")
         for topic, cases in topics.items():
             for case in cases:
                 if number and not case.backend:
                     continue  # does not depend on the backend
                 outcome = outcome_of(case, bench, quick)
                 found.setdefault(label, {}).setdefault(topic, []).append(outcome)
-                _tell(wishes, line(outcome))
+                _tell(options, line(outcome))
     every = [one for by_topic in found.values() for row in by_topic.values() for one in row]
     failed, refused = sum(not one.passed for one in every), sum(one.refused > 0 for one in every)
     told = {
@@ -153,46 +153,46 @@ def run(words: list[str], interrupt: Interrupt) -> int:
     if folder is not None:
         _keep(folder, told, found)
     beside = f", {refused} refused wholly or in part by the search" if refused else ""
-    _tell(wishes, f"{len(every)} cases, {failed} failed{beside}")
-    if wishes.json:
-        with speaking():
+    _tell(options, f"{len(every)} cases, {failed} failed{beside}")
+    if options.json:
+        with flushed_stdout():
             print(json.dumps(told, allow_nan=False))
     return 1 if failed else 0
 
 
-def _tell(wishes: Wishes, text: str) -> None:
-    if not wishes.json:
-        with speaking():
+def _tell(options: StressOptions, text: str) -> None:
+    if not options.json:
+        with flushed_stdout():
             print(text)
 
 
-def _benches(wishes: Wishes) -> dict[str, Bench]:
+def _benches(options: StressOptions) -> dict[str, Bench]:
     """Return a bench for each combination of ``accel=`` and ``compile=``, by label."""
     import torch
 
     from torchpt.scene.devices import device_of
     from torchpt.stress import Bench
 
-    device, dtype = wishes.given.get("device", "cpu"), wishes.given.get("dtype", "float32")
+    device, dtype = options.given.get("device", "cpu"), options.given.get("dtype", "float32")
     if not (device in ("cpu", "cuda") or (device.startswith("cuda:") and device[5:].isdigit())):
         raise SceneError("device", device, "cpu, cuda or cuda:N")
     device_of(device)
-    if "on" in wishes.list("compile", "auto") and (device, dtype) != ("cpu", "float32"):
+    if "on" in options.list("compile", "auto") and (device, dtype) != ("cpu", "float32"):
         raise SceneError("compile", "on", f"auto or off (there are no kernels for {dtype} on {device})")
     return {
         f"accel {accel}, compile {compiled}, {dtype} on {device}": Bench(device, accel, compiled, getattr(torch, dtype))
-        for accel, compiled in product(wishes.list("accel", "auto"), wishes.list("compile", "auto"))
+        for accel, compiled in product(options.list("accel", "auto"), options.list("compile", "auto"))
     }
 
 
-def _topics(wishes: Wishes) -> dict[str, tuple[Case, ...]]:
+def _topics(options: StressOptions) -> dict[str, tuple[Case, ...]]:
     """Return the selected cases by topic."""
     from torchpt.stress.cases import all_cases
     from torchpt.stress.own_scene import cases_of
 
-    scene = wishes.given.get("scene")
-    every = all_cases() if scene is None else {"scene": cases_of(scene, wishes.settings, wishes.changes)}
-    pattern = wishes.given.get("case", "*")
+    scene = options.given.get("scene")
+    every = all_cases() if scene is None else {"scene": cases_of(scene, options.settings, options.changes)}
+    pattern = options.given.get("case", "*")
     found = {
         topic: tuple(one for one in cases if fnmatch.fnmatch(one.name, pattern) or fnmatch.fnmatch(topic, pattern))
         for topic, cases in every.items()
@@ -202,10 +202,10 @@ def _topics(wishes: Wishes) -> dict[str, tuple[Case, ...]]:
     return found
 
 
-def _folder(wishes: Wishes) -> Path | None:
-    if "out" not in wishes.given:
+def _folder(options: StressOptions) -> Path | None:
+    if "out" not in options.given:
         return None
-    folder = Path(wishes.given["out"]).expanduser()
+    folder = Path(options.given["out"]).expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torchpt.ranks import Group
     from torchpt.ranks.launch import Started
 
-__all__ = ["group", "main_of_ranks", "say", "several"]
+__all__ = ["group", "is_distributed", "run_on_ranks", "say"]
 
 #: Words that ask for a sweep, and those that only print a help or a version.
 _SWEEPS, _SHOWN = ("-m", "--multirun"), ("-h", "--help", "help", "--version")
@@ -29,7 +29,7 @@ _started: Started | None = None
 _stderr: Any = None
 
 
-def several() -> bool:
+def is_distributed() -> bool:
     """Return True if this process is one of several ranks (WORLD_SIZE > 1)."""
     return os.environ.get("WORLD_SIZE", "1").strip() not in ("", "0", "1")
 
@@ -45,7 +45,7 @@ def say(line: str, about: str = "") -> None:
         print(line, file=_stderr or sys.stderr, flush=True)
 
 
-def parted(error: LostRankError | OtherRankError) -> int:
+def report_lost_rank(error: LostRankError | OtherRankError) -> int:
     """Report that a rank was lost, unless another rank has reported its own error; return the exit code."""
     if isinstance(error, OtherRankError):
         return error.code  # that rank says what happened
@@ -53,7 +53,7 @@ def parted(error: LostRankError | OtherRankError) -> int:
     return 2
 
 
-def main_of_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
+def run_on_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
     """Run a command line as one of several ranks and return the exit code, which is the same on all ranks.
 
     Args:
@@ -69,7 +69,7 @@ def main_of_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
             _started = Started()
             _started.meet(interrupt.check)
     except LostRankError as error:
-        _leave(parted(error))
+        _leave(report_lost_rank(error))
     except TorchptError as error:  # a bad environment variable, the same on all ranks
         if first:
             print(f"torchpt: {error}", file=sys.stderr)
@@ -104,7 +104,7 @@ def _ended(main: Callable[[list[str]], int], words: list[str]) -> int:
             _started.leave()
             return code
         except LostRankError as error:  # for example while rank 0 wrote the picture
-            code = parted(error)
+            code = report_lost_rank(error)
     _leave(code)
 
 
