@@ -55,7 +55,7 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
   --config-dir DIR, -cd
                       groups, scenes and configurations of your own: render=quick is DIR/render/quick.yaml, scene=room is
                       DIR/scene/room.yaml; --config-name NAME, -cn: DIR/NAME.yaml in place of configs/config.yaml
-  --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
+  --cfg job           print the composed settings and stop (null: the scene's value, else the built-in default)
 
   torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/guides/ranks.md)
 
