@@ -1,4 +1,4 @@
-"""Search speed of every backend, build times and tree quality.
+"""Measure search speed, build times and tree quality of every search backend.
 
 Run: ``python scripts/bench_accel.py [--rays 262144] [--threads 2] [--million]``. The large mesh is
 ``$TORCHPT_ASSETS/bunny.ply`` where that is set, else a displaced sphere. Coherent rays come from a pinhole camera in
@@ -22,13 +22,13 @@ from torchpt.search.base import Accel
 
 
 def mesh_geometry(vertices: np.ndarray, faces: np.ndarray) -> Geometry:
-    """Triangles of a mesh, ``(V, 3)`` and ``(F, 3)``."""
+    """Build a geometry from a mesh, ``(V, 3)`` and ``(F, 3)``."""
     corners = [torch.from_numpy(np.ascontiguousarray(vertices[faces[:, k]].T, np.float32)) for k in range(3)]
     return Geometry(corners[0], corners[1], corners[2], (len(faces), 0, 0, 0, 0))
 
 
 def box() -> Geometry:
-    """A room with two boxes in it: 36 triangles."""
+    """Return the triangles of a room with two boxes: 36 triangles."""
     corners = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
@@ -38,7 +38,7 @@ def box() -> Geometry:
 
 
 def bumpy_sphere(n: int) -> Geometry:
-    """A closed, displaced sphere with about ``4 n^2`` triangles."""
+    """Return a closed, displaced sphere with about ``4 n^2`` triangles."""
     theta, phi = np.meshgrid(np.linspace(1e-3, np.pi - 1e-3, n), np.linspace(0, 2 * np.pi, 2 * n), indexing="ij")
     r = 1 + 0.05 * np.sin(9 * theta) * np.cos(11 * phi)
     x = np.stack([r * np.sin(theta) * np.cos(phi), r * np.cos(theta), r * np.sin(theta) * np.sin(phi)], -1)
@@ -49,7 +49,7 @@ def bumpy_sphere(n: int) -> Geometry:
 
 
 def large_mesh() -> tuple[str, Geometry]:
-    """The bunny, or a sphere of its size."""
+    """Return the bunny if its file is there, else a displaced sphere of its size."""
     path = Path(os.environ.get("TORCHPT_ASSETS", "")) / "bunny.ply"
     if not os.environ.get("TORCHPT_ASSETS") or not path.exists():
         return "bumpy sphere", bumpy_sphere(132)
@@ -60,7 +60,7 @@ def large_mesh() -> tuple[str, Geometry]:
 
 
 def coherent(g: Geometry, n: int, inside: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rays of a square pinhole camera, in front of the scene or within it."""
+    """Return the rays of a square pinhole camera, in front of the scene or within it."""
     low, high = g.p0.amin(1, keepdim=True), g.p0.amax(1, keepdim=True)
     side = round(n**0.5)
     y, x = torch.meshgrid(*[torch.linspace(-0.4, 0.4, side)] * 2, indexing="ij")
@@ -70,7 +70,7 @@ def coherent(g: Geometry, n: int, inside: bool) -> tuple[torch.Tensor, torch.Ten
 
 
 def incoherent(g: Geometry, n: int, inside: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """Uniform directions from random places on the surface (or in the room)."""
+    """Return rays in uniform directions from random points of the surface (or of the room)."""
     gen = torch.Generator().manual_seed(1)
     d = torch.randn(3, n, generator=gen)
     if inside:
@@ -80,7 +80,7 @@ def incoherent(g: Geometry, n: int, inside: bool) -> tuple[torch.Tensor, torch.T
 
 
 def rate(call: Callable[[], object], n: int, repeats: int) -> float:
-    """Millions of rays a second, best of several runs after one to warm up."""
+    """Measure millions of rays a second: the best of several runs after a warm-up run."""
     call()
     best = float("inf")
     for _ in range(repeats):
@@ -91,7 +91,7 @@ def rate(call: Callable[[], object], n: int, repeats: int) -> float:
 
 
 def report(title: str, g: Geometry, accel: Accel, n: int, repeats: int, inside: bool) -> None:
-    """One line a backend."""
+    """Print a line for each backend."""
     cells = []
     for name, make in (("coherent", coherent), ("incoherent", incoherent)):
         o, d = make(g, n, inside)
@@ -103,7 +103,7 @@ def report(title: str, g: Geometry, accel: Accel, n: int, repeats: int, inside: 
 
 
 def quality(title: str, g: Geometry, kind: str) -> None:
-    """Build twice (the first may compile) and say how long the second took, and how good the tree is."""
+    """Print the seconds of a second build (the first may compile) and the quality of the tree."""
     build(g, kind)
     info = build(g, kind).describe()
     megabytes = info["bytes"] / 2**20
@@ -115,7 +115,7 @@ def quality(title: str, g: Geometry, kind: str) -> None:
 
 
 def main() -> None:
-    """Prints everything."""
+    """Run the benchmark and print its tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rays", type=int, default=1 << 18)
     parser.add_argument("--threads", type=int, default=0)

@@ -1,15 +1,15 @@
-"""Many small pictures: torchpt's batches beside loops over Mitsuba's ``llvm_ad_rgb``.
+"""Compare torchpt's batches of many small pictures with loops over Mitsuba's ``llvm_ad_rgb``.
 
     python scripts/bench_batches.py [--rounds 5] [--threads 2] [--json figures.json]
 
 Scenes: a closed room of 30 rectangles in which a ball and a bumpy mesh of 5,000 triangles move from picture to picture. Each is
-loaded and its trees are built each time: by ``torchpt.load`` of a mapping, by ``mitsuba.load_dict`` of one whose mesh is a
-``mitsuba.Mesh`` of arrays. ``moved`` is one torchpt scene under moved parameters, which a loop over pictures would take.
-Cameras: one such scene from as many places.
+loaded and its trees are built each time: by ``torchpt.load`` from a mapping, by ``mitsuba.load_dict`` from a dict whose mesh is
+a ``mitsuba.Mesh`` of arrays. ``moved`` renders one loaded torchpt scene with changed parameters. Cameras: one such scene
+from several poses.
 
-All share a process and take turns; figures are medians over rounds, of pictures a second by wall time and by the process's CPU
-time (all threads); ratios are medians of those within a round. Both sides are handed mappings that are there already, and give
-pictures as arrays. What compiles does so before the first round.
+All contenders share a process and take turns. Figures are medians over rounds, of pictures a second by wall time and by the
+process's CPU time (all threads); ratios are medians of the ratios within a round. Both sides start from mappings in memory and
+return pictures as arrays. Kernels compile before the first round.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ COLOURS = {"white": [0.7, 0.7, 0.7], "red": [0.6, 0.06, 0.05], "green": [0.1, 0.
 
 
 def bumpy_ball(rows: int = 50, columns: int = 51) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh of about 5,000 triangles: vertices ``(V, 3)`` float32 and faces ``(F, 3)``."""
+    """Return a mesh of about 5,000 triangles: vertices ``(V, 3)`` float32 and faces ``(F, 3)``."""
     theta = np.linspace(0.0, np.pi, rows + 1)[:, None]
     phi = np.linspace(0.0, 2.0 * np.pi, columns, endpoint=False)[None]
     r = 1.0 + 0.1 * np.sin(5.0 * theta) * np.sin(4.0 * phi)
@@ -46,18 +46,18 @@ def bumpy_ball(rows: int = 50, columns: int = 51) -> tuple[np.ndarray, np.ndarra
 
 
 def turned(axis: list[int], degrees: float) -> dict[str, Any]:
-    """A rotation as scene files have it."""
+    """Return a rotation in the form that scene files use."""
     return {"rotate": {"axis": axis, "angle": degrees}}
 
 
 def places(k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where ball and mesh are in scene ``k``."""
+    """Return the positions of ball and mesh in scene ``k``."""
     t = 0.1 * k
     return np.array([0.8 * np.cos(t), -0.6, 0.8 * np.sin(t)]), np.array([-0.8 * np.cos(t), -0.2, -0.8 * np.sin(t)])
 
 
 def room(k: int, size: int, spp: int, mesh: tuple[np.ndarray, np.ndarray]) -> dict[str, Any]:
-    """Scene ``k`` as ``torchpt.load`` takes it."""
+    """Return scene ``k`` as a mapping for ``torchpt.load``."""
     shapes: dict[str, Any] = {}
 
     def rectangle(name: str, turns: list[Any], move: list[float], scale: float, **more: Any) -> None:
@@ -89,7 +89,7 @@ def room(k: int, size: int, spp: int, mesh: tuple[np.ndarray, np.ndarray]) -> di
 
 
 def poses(count: int) -> list[np.ndarray]:
-    """Places of the camera, ``(4, 4)``: from x to the left, y up and z ahead to the scene."""
+    """Return camera poses ``(4, 4)``: x to the left, y up and z ahead to the scene."""
     found = []
     for k in range(count):
         origin = np.array([0.6 * np.sin(0.2 * k), 0.3, 1.5 + 0.2 * np.cos(0.2 * k)])
@@ -104,14 +104,14 @@ def poses(count: int) -> list[np.ndarray]:
 
 
 def matrix(steps: list[dict[str, Any]]) -> np.ndarray:
-    """What a list of transforms comes to."""
+    """Return the matrix of a list of transforms."""
     from torchpt.math.transforms import compose
 
     return compose(steps)
 
 
 def theirs(mi: Any, given: dict[str, Any]) -> dict[str, Any]:
-    """A scene as Mitsuba takes it, but for its mesh."""
+    """Return a scene as Mitsuba's dict, without its mesh."""
     camera, film = given["camera"], given["film"]
     look = mi.ScalarTransform4f().look_at(camera["origin"], camera["target"], [0, 1, 0])
     made: dict[str, Any] = {
@@ -148,12 +148,12 @@ def theirs(mi: Any, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def two_sided(rgb: list[float]) -> dict[str, Any]:
-    """A diffuse material."""
+    """Return a two-sided diffuse material."""
     return {"type": "twosided", "own": {"type": "diffuse", "reflectance": {"type": "rgb", "value": rgb}}}
 
 
 def mitsuba(arguments: argparse.Namespace, scenes: list[dict[str, Any]]) -> dict[str, Callable[[], np.ndarray]]:
-    """Its loops over scenes and over cameras; each gives all pictures."""
+    """Return Mitsuba's loops over scenes and over cameras; each renders all pictures."""
     from mitsuba_scene import load_mitsuba
 
     mi = load_mitsuba(THEIRS)
@@ -190,7 +190,7 @@ def mitsuba(arguments: argparse.Namespace, scenes: list[dict[str, Any]]) -> dict
 def ours(
     arguments: argparse.Namespace, scenes: list[dict[str, Any]], mesh: tuple[np.ndarray, np.ndarray]
 ) -> dict[str, dict[str, Callable[[], np.ndarray]]]:
-    """Batches over scenes that are loaded, over parameters, and over cameras; each gives all pictures."""
+    """Return torchpt's batches over loaded scenes, over parameters and over cameras; each renders all pictures."""
     one, wishes, count = torchpt.load(scenes[0]), {"threads": arguments.threads}, len(scenes)
     pose = one.params["shapes.ball.to_world"]
 
@@ -220,7 +220,7 @@ def ours(
 def measured(
     contenders: dict[str, Callable[[], np.ndarray]], rounds: int, count: int
 ) -> dict[str, list[dict[str, float]]]:
-    """Pictures a second of each in each round, by wall and CPU time; the first one of a round takes turns."""
+    """Measure pictures a second in each round, by wall and CPU time; the order of the contenders rotates."""
     found: dict[str, list[dict[str, float]]] = {name: [] for name in contenders}
     for shoot in contenders.values():
         shoot()
@@ -235,7 +235,7 @@ def measured(
 
 
 def main() -> None:
-    """Prints a table of each of both, and writes every figure."""
+    """Print both tables, and write all figures to the JSON file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--count", type=int, default=64, help="pictures of a batch")

@@ -1,4 +1,4 @@
-"""Throughput of one device: ``python scripts/bench_device.py [cpu|cuda]``; Mpaths/s and Mrays/s, by tensors and kernels."""
+"""Measure one device in Mpaths/s and Mrays/s, by tensors and by kernels: ``python scripts/bench_device.py [cpu|cuda]``."""
 
 from __future__ import annotations
 

@@ -1,26 +1,26 @@
-"""Error at equal time beside Mitsuba 3: ``python scripts/bench_mitsuba.py --error [scenes] [--json FILE] [--plot FILE]``.
+"""Compare error at equal time with Mitsuba 3: ``python scripts/bench_mitsuba.py --error [scenes] [--json FILE] [--plot FILE]``.
 
-What is compared: the relMSE of a picture that takes 1, 4 or 16 seconds of wall time, of torchpt with its defaults and of
-Mitsuba's ``llvm_ad_rgb`` with ``independent`` and ``multijitter``. The ratio is ours to the better of the two at that time.
-Scenes, size, depths and filter are those of the throughput race; nobody clamps, guides or denoises.
+Compared is the relMSE of pictures that take 1, 4 or 16 seconds of wall time, by torchpt with its defaults and by
+Mitsuba's ``llvm_ad_rgb`` with ``independent`` and ``multijitter``. The ratio is ours to the better of Mitsuba's two at that
+time. Scenes, size, depths and filter are those of ``bench_mitsuba.py``; no contender clamps, guides or denoises.
 
-How: every contender is a process that has loaded and warmed up. Its speed tells how many samples a pixel take a quarter of the
-first time, and each time a little more than it; these are rendered in turn by all, round after round, with another seed each.
-The seconds of a number of samples are the median over rounds, its error the mean over them; the error at exactly the time lies
-on the straight line in logarithms between the two numbers that bracket it. ``multijitter`` rounds samples up: those that it
-takes are what is timed and scored. The first turn of a number is left out of its seconds, as Mitsuba may compile for it.
+Method: every contender is a process that has loaded and warmed up. Its speed gives the numbers of samples a pixel to measure:
+one takes a quarter of the first time, and one for each time takes a little longer than it. All contenders render them in turn,
+round after round, with a new seed each. The seconds of a number of samples are the median over rounds, its error is the mean;
+the error at exactly the time is interpolated linearly in logarithms between the two numbers that bracket it. ``multijitter``
+rounds samples up: the samples that it really takes are timed and scored. The first turn of a number of samples is not timed, as
+Mitsuba may compile for it.
 
-The reference: each renderer has its own, the mean of its pictures of the longest time (Mitsuba's by ``multijitter``), and the
-variance of that mean is subtracted. Each of these pictures is held against the mean of the others. So it is noise that is
-compared, and divided by the same on both sides: the square of the mean of both references, plus 0.01. A common reference
-would add what the renderers differ by to the error of one of them: light that passes an opacity or ``null`` is a bounce in
-Mitsuba only, which makes its ``material_row`` 0.3 % darker, and its Cornell box is 0.05 to 0.09 % darker for a reason not
-known. How far the two references are apart, both variances subtracted, stands below the errors, so that it is seen where it
-matters.
+Reference: each renderer has its own, the mean of its pictures of the longest time (Mitsuba's by ``multijitter``), and the
+variance of that mean is subtracted. Each of these pictures is compared with the mean of the others. So only noise is compared,
+divided by the same on both sides: the square of the mean of both references, plus 0.01. A common reference
+would add the difference between the renderers to the error of one of them: light that passes an opacity or ``null`` is a
+bounce in Mitsuba only, which makes its ``material_row`` 0.3 % darker, and its Cornell box is 0.05 to 0.09 % darker for an
+unknown reason. The difference of the two references, both variances subtracted, is printed below the errors.
 
-A long run: a scene takes 3 contenders x rounds x 23 s, ten scenes some 90 minutes at 7 rounds and 65 at 5.
-``--json FILE`` keeps each scene as it is done, and the next run with the same file goes on from there, or only prints and
-draws; ``--again`` measures scenes anew, as after a change of the program. ``--quick`` only shows that it works.
+A scene takes 3 contenders x rounds x 23 s, ten scenes some 90 minutes at 7 rounds and 65 at 5. ``--json FILE`` saves each
+scene when it is done; the next run with the same file resumes there, or only prints and plots. ``--again`` measures scenes
+anew, as after a change of the program. ``--quick`` only shows that it works.
 """
 
 from __future__ import annotations
@@ -50,28 +50,28 @@ from bench_workers import DEPTH, LLVM, OURS, Contender, Turn, Workers, ask, repl
 
 THEIRS = ("independent", "multijitter")
 RIVALS = tuple(f"{LLVM} {sampler}" for sampler in THEIRS)
-#: Whose seeds make Mitsuba's reference: the one that converges faster.
+#: The contender whose pictures make Mitsuba's reference: the one that converges faster.
 REFEREE = RIVALS[1]
 BUDGETS = (1.0, 4.0, 16.0)
-#: Times as long as this are aimed at, so that the point lies beyond the time and brackets it.
+#: Factor on each time, so that the measured point lies beyond the time and brackets it.
 AIM = 1.08
-#: What the speed is measured by, at most: more is foretold, as it takes as long as a round.
+#: Longest time, in seconds, that is rendered to measure the speed; longer times are extrapolated.
 CALIBRATION = 5.0
-#: Seeds are apart: of the calibration and of rounds.
+#: First seeds of the calibration and of the rounds, far enough apart not to overlap.
 CALIBRATED, ROUNDS = 1, 1_000_000
-#: Rounds it takes at least: each picture is held against two others.
+#: Fewest rounds: each picture is compared with the mean of at least two others.
 FEWEST = 3
 
 
 def add_arguments(group: Any) -> None:
-    """Those that only this benchmark has."""
+    """Add the options that only this benchmark has."""
     group.add_argument("--budgets", type=float, nargs="+", default=BUDGETS, metavar="SECONDS", help="1 4 16 by default")
     group.add_argument("--again", action="store_true", help="measure anew what the file of --json holds")
     group.add_argument("--plot", type=Path, metavar="FILE", help="draw error against time (.svg, .png)")
 
 
 def contest(arguments: argparse.Namespace) -> None:
-    """All scenes, or those that are named; prints, keeps and draws."""
+    """Measure all scenes, or the named ones; print, save and plot the figures."""
     if arguments.quick:
         arguments.rounds, arguments.size = FEWEST, 48
         arguments.budgets = [budget / 16.0 for budget in arguments.budgets]
@@ -114,7 +114,7 @@ def contest(arguments: argparse.Namespace) -> None:
 
 
 def measured(name: str, budgets: list[float], arguments: argparse.Namespace) -> dict[str, Any]:
-    """All figures of a scene."""
+    """Measure all figures of a scene."""
     contenders = [Contender(OURS, arguments.threads, arguments.sampler)]
     contenders += [Contender(LLVM, arguments.threads, sampler) for sampler in THEIRS]
     with tempfile.TemporaryDirectory() as folder, started(name, contenders, arguments) as started_workers:
@@ -142,9 +142,9 @@ def measured(name: str, budgets: list[float], arguments: argparse.Namespace) -> 
 
 
 def calibrated(worker: Any, budgets: list[float], spp: int) -> list[int]:
-    """Samples a pixel that take a quarter of the first time, and a little more than each time."""
+    """Find samples a pixel that take a quarter of the first time, and a little more than each time."""
     turn = ask(worker, spp, CALIBRATED)
-    turn = warmed(worker, samples_in(budgets[0], turn.spp, turn.seconds))  # a few samples tell little
+    turn = warmed(worker, samples_in(budgets[0], turn.spp, turn.seconds))  # a few samples are too short to time
     found: list[int] = []
     for budget in budgets:
         if budget <= CALIBRATION:
@@ -156,32 +156,32 @@ def calibrated(worker: Any, budgets: list[float], spp: int) -> list[int]:
 
 
 def warmed(worker: Any, spp: int) -> Turn:
-    """A turn that is not the first with as many samples."""
+    """Return a turn that is not a worker's first with this number of samples."""
     turn = ask(worker, spp, CALIBRATED)
     return ask(worker, spp, CALIBRATED) if turn.cold else turn
 
 
 def shot(worker: Any, spp: int, seed: int, file: Path) -> tuple[Turn, np.ndarray]:
-    """A turn and its picture ``(H, W, 3)``."""
+    """Return a turn and its picture ``(H, W, 3)``."""
     turn = ask(worker, spp, seed, file)
     return turn, np.load(file, allow_pickle=False)
 
 
-#: Turns by contender and by samples that were asked for: seconds, samples that were taken, whether it was cold, :func:`judged`.
+#: Turns by contender and requested samples: seconds, samples taken, whether the turn was cold, result of :func:`judged`.
 Turns = dict[str, dict[int, list[dict[str, Any]]]]
-#: Pictures ``(H, W, 3)`` by contender and by samples that were asked for.
+#: Pictures ``(H, W, 3)`` by contender and requested samples.
 Pictures = dict[str, dict[int, list[np.ndarray]]]
 
 
 def judged(reference: Reference, scale: np.ndarray, pictures: list[np.ndarray], part: bool) -> list[dict[str, Any]]:
-    """The relMSE of pictures, and what it would be without each of the reference's pictures.
+    """Return the relMSE of pictures, against the reference and against it without each of its pictures in turn.
 
     Args:
-        reference: of the renderer.
-        scale: what squared errors are divided by.
-        pictures: to be judged.
-        part: whether they are those that the reference is made of. Each is then held against the others; as one that errs
-            much hardly moves these errors, their spread alone tells how sure their mean is.
+        reference: the renderer's reference.
+        scale: divisor of squared errors.
+        pictures: the pictures to score.
+        part: True if the reference is the mean of these pictures. Each is then compared with the mean of the others; an outlier
+            hardly moves these errors, so their spread alone gives the standard error of their mean.
     """
     if part:
         pairs = zip(reference.without, pictures, strict=True)
@@ -196,7 +196,7 @@ def judged(reference: Reference, scale: np.ndarray, pictures: list[np.ndarray], 
 
 
 def rounds(workers: Workers, counts: dict[str, list[int]], number: int, picture: Path) -> tuple[Turns, Pictures]:
-    """Rounds in which all contenders take their turn at each time, with another seed each."""
+    """Run rounds in which each contender takes its turn at each time, each round with another seed."""
     turns: Turns = {who: {spp: [] for spp in row} for who, row in counts.items()}
     pictures: Pictures = {who: {spp: [] for spp in row} for who, row in counts.items()}
     steps = len(next(iter(counts.values())))
@@ -211,7 +211,7 @@ def rounds(workers: Workers, counts: dict[str, list[int]], number: int, picture:
 
 
 def point_of(turns: list[dict[str, Any]]) -> Point:
-    """What the turns of a number of samples come to; cold ones are timed only where there are no others."""
+    """Combine the turns with a number of samples to a point; cold turns are timed only if there are no others."""
     warm = [turn["seconds"] for turn in turns if not turn["cold"]]
     seconds = warm or [turn["seconds"] for turn in turns]
     errors, without = ([turn[key] for turn in turns] for key in ("relmse", "without"))
@@ -219,7 +219,7 @@ def point_of(turns: list[dict[str, Any]]) -> Point:
 
 
 def compared(points: dict[str, list[Point]], budget: float) -> dict[str, Any]:
-    """Everyone's error at a time, and the ratio of ours to the better of theirs."""
+    """Compare errors at a time: that of each contender, and the ratio of ours to the better of Mitsuba's."""
     estimates = {who: at_time(line, budget) for who, line in points.items()}
     best = better({who: estimates[who].relmse for who in RIVALS})
     ratio = estimates[OURS].relmse / estimates[best].relmse
@@ -227,7 +227,7 @@ def compared(points: dict[str, list[Point]], budget: float) -> dict[str, Any]:
 
 
 def overall(found: dict[str, Any], budgets: list[float]) -> dict[str, Any]:
-    """Geometric means of the groups that are complete, by time and over all times, and the worst ratio."""
+    """Return geometric means of the complete groups, by time and over all times, and the worst ratio."""
     ratios = {f"{b:g}": {name: row["at"][f"{b:g}"]["ratio"] for name, row in found.items()} for b in budgets}
     means = {budget: geometric_means(row) for budget, row in ratios.items()}
     every = {
@@ -238,14 +238,14 @@ def overall(found: dict[str, Any], budgets: list[float]) -> dict[str, Any]:
 
 
 def heading(budgets: list[float]) -> str:
-    """Of :func:`lines`."""
+    """Return the heading of the table of :func:`lines`."""
     times = ", ".join(f"{budget:g}" for budget in budgets)
     columns = f"{OURS:>20s}" + "".join(f"{sampler:>20s}" for sampler in THEIRS)
     return f"relMSE x 1e3 of pictures of {times} s, ± standard error\n{'':22s}{'s':>6s}{columns}   ratio"
 
 
 def lines(name: str, row: dict[str, Any]) -> list[str]:
-    """Of a scene: one for each time, and how far references are apart."""
+    """Return the table rows of a scene: one for each time, and how far the references are apart."""
     made = []
     for budget, at in row["at"].items():
         cells = ""
@@ -262,7 +262,7 @@ def lines(name: str, row: dict[str, Any]) -> list[str]:
 
 
 def conclusions(facts: dict[str, Any]) -> list[str]:
-    """The geometric means, and the worst ratio."""
+    """Return lines with the geometric means and the worst ratio."""
     made = []
     for group in GROUPS:
         cells = [f"{time} {row[group]:.3f}" for time, row in facts["geometric_means"].items() if group in row]
@@ -275,7 +275,7 @@ def conclusions(facts: dict[str, Any]) -> list[str]:
 
 
 def markdown(found: dict[str, Any], budgets: list[float]) -> str:
-    """The table for the documentation: errors x 1000 of ours and of the better of theirs, and their ratio."""
+    """Return the table for the documentation: errors x 1000 of ours and of the better of Mitsuba's, and their ratio."""
     times = [f"{budget:g}" for budget in budgets]
     made = ["| scene |" + "".join(f" {t} s: torchpt | Mitsuba | ratio |" for t in times) + " references apart |"]
     made.append("|---|" + "---|---|---|" * len(times) + "---|")
@@ -294,6 +294,6 @@ def markdown(found: dict[str, Any], budgets: list[float]) -> str:
 
 
 def with_spread(estimate: dict[str, Any]) -> str:
-    """An error x 1000, with its standard error where that is known."""
+    """Format an error x 1000, with its standard error if it is known."""
     error = f"{1e3 * estimate['relmse']:.3g}"
     return error if estimate["deviation"] is None else f"{error} ± {1e3 * estimate['deviation']:.2g}"

@@ -1,4 +1,4 @@
-"""The arithmetic of ``bench_mitsuba.py``: errors against a reference that is noisy itself, and at a given time."""
+"""Arithmetic for ``bench_mitsuba.py``: errors against a noisy reference, and errors at a given time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCENES = GROUPS["all"]
 
 
 def geometric_means(figures: Mapping[str, float]) -> dict[str, float]:
-    """Of the groups that are complete; figures by scene."""
+    """Return the geometric means of the complete groups; `figures` are by scene."""
     return {
         group: math.exp(statistics.fmean(math.log(figures[name]) for name in names))
         for group, names in GROUPS.items()
@@ -30,12 +30,12 @@ def geometric_means(figures: Mapping[str, float]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Reference:
-    """A mean over pictures.
+    """The mean of several pictures, used as a reference.
 
     Attributes:
         mean: ``(H, W, 3)``.
-        variance: of that mean, ``(H, W, 3)``, as the pictures' spread tells.
-        without: the references that each lack one of the pictures; none of fewer than three pictures.
+        variance: variance of that mean, ``(H, W, 3)``, estimated from the spread of the pictures.
+        without: one reference per picture that leaves that picture out; empty for fewer than three pictures.
     """
 
     mean: np.ndarray
@@ -44,7 +44,7 @@ class Reference:
 
     @staticmethod
     def of(pictures: Sequence[np.ndarray]) -> Reference:
-        """Of two pictures ``(H, W, 3)`` or more, of independent seeds."""
+        """Build the reference from two or more pictures ``(H, W, 3)`` of independent seeds."""
         if len(pictures) < 2:
             raise ValueError(f"a reference takes two pictures or more to know its own variance, got {len(pictures)}")
         stack = np.stack([np.asarray(picture, np.float64) for picture in pictures])
@@ -62,36 +62,36 @@ class Reference:
         return Reference(mean, total / (number * (number - 1)), tuple(without))
 
     def relmse(self, picture: np.ndarray, scale: np.ndarray) -> float:
-        """Of a picture that has no part in the reference, without bias by the reference's noise.
+        """Return the relMSE of a picture that is not part of the reference, unbiased by the reference's noise.
 
         Args:
             picture: ``(H, W, 3)``.
-            scale: what squared errors are divided by, ``(H, W, 3)``.
+            scale: divisor of squared errors, ``(H, W, 3)``.
         """
         squares = (np.asarray(picture, np.float64) - self.mean) ** 2
         return float(((squares - self.variance) / scale).mean())
 
 
 def scale_of(a: Reference, b: Reference) -> np.ndarray:
-    """What squared errors of both are divided by: the same for both, and less noisy than one of them alone."""
+    """Return the divisor of squared errors: the same for both references, and less noisy than one of them alone."""
     return (0.5 * (a.mean + b.mean)) ** 2 + FLOOR
 
 
 def between(a: Reference, b: Reference) -> float:
-    """The relMSE that two references would have without noise: 0 but for chance where both tell the same, also below 0."""
+    """Estimate the relMSE between two references without their noise; for equal ones it scatters about 0."""
     squares = (a.mean - b.mean) ** 2 - a.variance - b.variance
     return float((squares / scale_of(a, b)).mean())
 
 
 @dataclass(frozen=True)
 class Point:
-    """What a number of samples costs and gives.
+    """Cost and error of a number of samples.
 
     Attributes:
         spp: samples a pixel.
-        seconds: a picture takes, the median over rounds.
-        relmse: of one picture, the mean over seeds.
-        deviation: standard error of ``relmse``, by its seeds and the reference's; None where there was one seed.
+        seconds: time of a picture, the median over rounds.
+        relmse: error of one picture, the mean over seeds.
+        deviation: standard error of ``relmse``, from its seeds and the reference's; None for a single seed.
     """
 
     spp: int
@@ -101,18 +101,18 @@ class Point:
 
     @staticmethod
     def of(spp: int, seconds: Sequence[float], errors: Sequence[float], without: Sequence[Sequence[float]]) -> Point:
-        """Of the turns with this number of samples.
+        """Build a point from the turns with a number of samples.
 
         Args:
             spp: samples a pixel.
-            seconds: of the turns.
-            errors: their relMSE.
-            without: by turn, the relMSE against each of :attr:`Reference.without`.
+            seconds: seconds of each turn.
+            errors: relMSE of each turn.
+            without: for each turn, the relMSE against each of :attr:`Reference.without`.
         """
         deviation = None
         if len(errors) > 1:
             means = np.asarray(without, np.float64).reshape(len(errors), -1).mean(0)
-            # The jackknife: how much each picture of the reference matters. It errs upwards (Efron and Stein, 1981).
+            # Jackknife variance over the pictures of the reference; it is biased upwards (Efron and Stein, 1981).
             reference = (len(means) - 1) * float(means.var()) if len(means) else 0.0
             deviation = math.sqrt(statistics.variance(errors) / len(errors) + reference)
         return Point(spp, statistics.median(seconds), statistics.fmean(errors), deviation)
@@ -120,13 +120,13 @@ class Point:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A relMSE at a time.
+    """A relMSE estimated at a time.
 
     Attributes:
         relmse: the error.
-        deviation: its standard error; None where there was one seed.
-        spp: samples a pixel that fit, by the same line.
-        within: whether times were measured on both sides.
+        deviation: its standard error; None for a single seed.
+        spp: samples a pixel that fit into the time, by the same interpolation.
+        within: True if the time lies between two measured points.
     """
 
     relmse: float
@@ -136,12 +136,12 @@ class Estimate:
 
 
 def at_time(points: Sequence[Point], seconds: float) -> Estimate:
-    """The error at a time, on the straight line in logarithms through the two nearest points that bracket it.
+    """Interpolate the error at a time, linearly in logarithms between the two nearest points that bracket it.
 
-    Beyond the first or last point the error goes on from there as one over the time, as that of independent samples does.
+    Beyond the first or last point the error is extrapolated as one over the time, as for independent samples.
 
     Raises:
-        ValueError: fewer than two points, or an error that is not positive: its reference was too noisy.
+        ValueError: fewer than two points, or an error that is not positive (the reference was too noisy).
     """
     if len(points) < 2:
         raise ValueError(f"a line takes two points, got {len(points)}")
@@ -167,10 +167,10 @@ def at_time(points: Sequence[Point], seconds: float) -> Estimate:
 
 
 def better(errors: Mapping[str, float]) -> str:
-    """Whose error is least; the first where several have it."""
+    """Return the name with the least error; the first of equal ones."""
     return min(errors, key=lambda name: errors[name])
 
 
 def samples_in(seconds: float, taken: int, took: float) -> int:
-    """How many samples a pixel fit in a time where ``taken`` of them took ``took`` seconds: one at least."""
+    """Return how many samples a pixel fit in a time if ``taken`` of them took ``took`` seconds; at least one."""
     return max(1, round(taken * seconds / took))

@@ -1,4 +1,4 @@
-"""The JSON files of benchmarks: how the figures came about, and what an earlier run has left."""
+"""Read and write the JSON files of benchmarks, with the facts about machine and versions."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from typing import Any
 
 
 def machine() -> dict[str, Any]:
-    """What the figures depend on."""
+    """Return the facts about machine and versions that the figures depend on."""
     versions = {name: importlib.metadata.version(name) for name in ("torch", "mitsuba")}
     return {"cores": os.cpu_count(), "architecture": platform.machine(), **versions}
 
 
 def write(file: Path, facts: dict[str, Any]) -> None:
-    """Beside it first, so that whoever is interrupted keeps what was there."""
+    """Write a JSON file atomically: an interrupted write leaves the old file."""
     beside = file.with_name(f"{file.name}.part")
     beside.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     os.replace(beside, file)
 
 
 def resumed(file: Path | None, settings: dict[str, Any], again: bool) -> dict[str, Any]:
-    """The scenes of an earlier run with the same settings and programs; none where there was no such run.
+    """Return the scenes of an earlier run with the same settings and programs; empty without such a run.
 
     Args:
-        file: of that run.
-        settings: of this one.
-        again: whether a file of another run may be lost.
+        file: JSON file of the earlier run.
+        settings: settings of this run.
+        again: True if a file of another run may be overwritten.
 
     Raises:
-        SystemExit: a file that another benchmark wrote, or this one with other settings.
+        SystemExit: a file of another benchmark, or of this one with other settings.
     """
     if file is None or not file.exists():
         return {}

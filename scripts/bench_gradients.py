@@ -1,21 +1,23 @@
-"""Gradients beside Mitsuba 3: ``python scripts/bench_gradients.py [cases] [--size 256 --spp 16] [--json FILE] [--markdown]``.
+"""Compare gradients with Mitsuba 3.
+
+    python scripts/bench_gradients.py [cases] [--size 256 --spp 16] [--json FILE] [--markdown]
 
 Forward and backward of one loss, a fixed random weight times the picture, by torchpt and by Mitsuba's ``prb``
 (llvm_ad_rgb), on the same scenes: albedo of a room, texels of its floor, the index of a glass ball, the vertices of a
-mesh; max_depth 8, rr_depth 5, box filter. Each contender is a process of its own that has loaded and warmed up; they
-take turns, round after round, each time with another seed. Medians are shown, the median of the ratios within a
-round, their geometric mean over cases, and the peak of resident memory above what it was after the imports
-(``--rounds 7``).
+mesh; max_depth 8, rr_depth 5, box filter. Each contender is a separate process that has loaded and warmed up; they
+take turns, round after round, each time with a new seed (``--rounds 7``). The table shows medians, the median of the
+ratios within a round, their geometric mean over cases, and the peak of resident memory above its value after the
+imports.
 
 ``--texture`` times the backward pass through 8 x 8 and 4096 x 4096 texels beside the forward pass of the same
-picture, ours alone.
+picture, with torchpt only.
 
-``--agree`` compares gradients number by number: three cases with ``prb``, and three where edges move with
-``prb_projective``. Of each the mean over ``--seeds`` renders of both sides, and its z-scores: root of their mean
-square (1 where only noise differs; a parameter that neither touches counts in neither), the largest, and the
-difference of the sums along a few directions in per cent.
+``--agree`` compares gradients number by number: three cases with ``prb``, and three with moving edges with
+``prb_projective``. For each it prints z-scores of the difference of the means over ``--seeds`` renders: their root mean square
+(1 if only noise differs; numbers that both sides leave at 0 are not counted), the largest, and the difference of the
+sums along a few directions in per cent.
 
-``--wish KEY=VALUE`` hands arguments to ``torchpt.render``, values as JSON: ``--wish edges=true``. Needs the extra
+``--wish KEY=VALUE`` passes arguments to ``torchpt.render``, values as JSON: ``--wish edges=true``. Needs the extra
 ``bench``.
 """
 
@@ -47,15 +49,15 @@ TEXELS = 128
 
 @dataclass(frozen=True)
 class Case:
-    """A scene and what is differentiated.
+    """A scene and the parameter to differentiate by.
 
     Attributes:
-        scene: makes a description; ``$FILES`` in a path is the folder of ``paint.exr`` and ``sky.exr``.
-        parameter: its name in ``scene.params``.
-        theirs: the shape whose parameter it is in Mitsuba's scene, and how the name ends there.
-        depth: of the paths.
-        projective: samples of edges of Mitsuba's ``prb_projective`` are asked for.
-        texels: of ``paint.exr``, on a side.
+        scene: function that returns a description; ``$FILES`` in a path is the folder of ``paint.exr`` and ``sky.exr``.
+        parameter: name of the parameter in ``scene.params``.
+        theirs: the shape that owns the parameter in Mitsuba's scene, and the suffix of the parameter's name.
+        depth: largest path depth.
+        projective: use ``prb_projective`` in Mitsuba, with samples of edges.
+        texels: width and height of ``paint.exr``.
     """
 
     scene: Callable[[], Mapping[str, Any]]
@@ -91,7 +93,7 @@ def _glass() -> dict[str, Any]:
 
 
 def _bumpy(rows: int = 48, columns: int = 96) -> dict[str, Any]:
-    """A ball of triangles, a little uneven, without doubled vertices but at its seam."""
+    """Return a slightly uneven ball of triangles; only the vertices of its seam are doubled."""
     t, p = np.meshgrid(
         np.linspace(0.02, math.pi - 0.02, rows), np.arange(columns) * (2 * math.pi / columns), indexing="ij"
     )
@@ -151,7 +153,7 @@ CASES: dict[str, Case] = {
     "glass_index": Case(_glass, "materials.glass.int_ior", ("ball", "bsdf.eta")),
     "vertices": Case(lambda: _room(it=_bumpy()), "shapes.it.vertices", ("it", "vertex_positions")),
 }
-#: Compared number by number, at their own depth.
+#: Cases of ``--agree``, each with its own depth.
 AGREE: dict[str, Case] = {
     "albedo": Case(_room, "materials.red.reflectance", ("left", VALUE), 4),
     "texels": Case(
@@ -165,7 +167,7 @@ AGREE: dict[str, Case] = {
 
 
 def main() -> None:
-    """Run what is asked for."""
+    """Run the chosen benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="*", help=f"of {', '.join(CASES)}; with --agree of {', '.join(AGREE)}")
     parser.add_argument("--size", type=int, default=256)
@@ -192,7 +194,7 @@ def main() -> None:
 
 
 def race(arguments: argparse.Namespace) -> None:
-    """All cases, ours beside Mitsuba's."""
+    """Time all cases, torchpt beside Mitsuba."""
     found: dict[str, Any] = {}
     print(
         f"{'forward + backward':20s}{OURS + ' s':>12s}{'prb s':>10s}{'ratio':>8s}{'MB':>9s}{'prb MB':>9s}{'ratio':>8s}"
@@ -229,7 +231,7 @@ def race(arguments: argparse.Namespace) -> None:
 
 
 def texture(arguments: argparse.Namespace) -> None:
-    """Backward over forward for few texels and for many."""
+    """Time backward over forward passes, for few texels and for many."""
     found: dict[str, Any] = {}
     print(f"{'texels':20s}{'forward s':>12s}{'backward s':>12s}{'ratio':>8s}{'MB':>9s}")
     for texels in (8, 4096):
@@ -246,7 +248,7 @@ def texture(arguments: argparse.Namespace) -> None:
 
 
 def agree(arguments: argparse.Namespace) -> None:
-    """Gradients of both sides, number by number."""
+    """Compare the gradients of both renderers number by number."""
     found: dict[str, Any] = {}
     print(f"{'gradient':16s}{'numbers':>8s}{'rms z':>8s}{'largest':>9s}   sums along directions: ours, theirs (off, z)")
     for name in arguments.cases or AGREE:
@@ -268,7 +270,7 @@ def agree(arguments: argparse.Namespace) -> None:
 
 
 def compared(ours: np.ndarray, theirs: np.ndarray, vertices: bool) -> dict[str, Any]:
-    """Means and errors of gradients ``(seeds, numbers)``: z-scores, and sums of all, or of vertices by their axis."""
+    """Compare gradients ``(seeds, numbers)``: z-scores, and sums over all numbers, or over vertices by axis."""
     z = scores(ours, theirs)
     z = z[np.isfinite(z)]
     columns = {axis: slice(k, None, 3) for k, axis in enumerate("xyz")} if vertices else {"all": slice(None)}
@@ -284,14 +286,14 @@ def compared(ours: np.ndarray, theirs: np.ndarray, vertices: bool) -> dict[str, 
 
 
 def scores(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """z-scores ``(numbers,)`` of the difference of means; NaN where neither side has ever differed from 0."""
+    """Return z-scores ``(numbers,)`` of the difference of means; NaN where both sides are always 0."""
     square = ours.var(0, ddof=1) / len(ours) + theirs.var(0, ddof=1) / len(theirs)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(square > 0, (ours.mean(0) - theirs.mean(0)) / np.sqrt(square), np.nan)
 
 
 def save(arguments: argparse.Namespace, facts: dict[str, Any]) -> None:
-    """Write what is known so far, and how it came about."""
+    """Write the figures measured so far, with the settings of the run."""
     if arguments.json is None:
         return
     import bench_files
@@ -301,7 +303,7 @@ def save(arguments: argparse.Namespace, facts: dict[str, Any]) -> None:
 
 
 class _Worker:
-    """A process that has loaded and warmed up, and takes gradients."""
+    """A process that has loaded and warmed up, and computes gradients."""
 
     def __init__(self, case: str, engine: str, arguments: argparse.Namespace, more: list[str] | None = None) -> None:
         keys = ("size", "spp", "threads")
@@ -320,7 +322,7 @@ class _Worker:
         self._process.wait()
 
     def ask(self, wish: dict[str, Any]) -> dict[str, Any]:
-        """One turn."""
+        """Let the worker compute one gradient."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(wish) + "\n")
         self._process.stdin.flush()
@@ -334,12 +336,12 @@ class _Worker:
         raise SystemExit(f"{self._case} ended before its turn")
 
 
-#: A gradient by seed, with the seconds of the forward and of the backward pass.
+#: Computes a gradient from a seed; also returns the seconds of the forward and of the backward pass.
 Take = Callable[[int], tuple[Any, float, float]]
 
 
 def work(arguments: argparse.Namespace) -> None:
-    """The worker: warm up, then answer each line on stdin with the JSON of a turn."""
+    """Run a worker: warm up, then answer each line on stdin with the JSON of a turn."""
     (name,) = arguments.cases
     case = (AGREE if arguments.agree else CASES)[name]
     case = replace(case, texels=arguments.texels or case.texels)
@@ -356,12 +358,12 @@ def work(arguments: argparse.Namespace) -> None:
 
 
 def resident() -> float:
-    """The most memory that this process has held, in MB."""
+    """Return the peak of this process's resident memory in MB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def opened(case: Case, arguments: argparse.Namespace) -> Any:
-    """The scene of a case, by torchpt."""
+    """Load the scene of a case with torchpt."""
     import known_gradients as known
     import torch
 
@@ -380,14 +382,14 @@ def opened(case: Case, arguments: argparse.Namespace) -> Any:
 
 
 def weight(size: int) -> np.ndarray:
-    """What the loss weighs the picture with ``(size, size, 3)``."""
+    """Return the weights of the picture in the loss, ``(size, size, 3)``."""
     at = (np.arange(size, dtype=np.float32) + 0.5) / size
     x, y = at[None, :, None], at[:, None, None]
     return (0.2 + 2.0 * x * x + 0.7 * y * y) * np.array([1.0, 0.8, 0.6], np.float32) / (3 * size * size)
 
 
 def ours(case: Case, arguments: argparse.Namespace) -> Take:
-    """Gradients by torchpt."""
+    """Compute gradients with torchpt."""
     import known_gradients  # noqa: F401  (with torchpt and all that it imports)
     import torch
 
@@ -413,7 +415,7 @@ def ours(case: Case, arguments: argparse.Namespace) -> Take:
 
 
 def theirs(case: Case, arguments: argparse.Namespace) -> Take:
-    """Gradients by Mitsuba."""
+    """Compute gradients with Mitsuba."""
     import importlib
 
     from mitsuba_scene import convert, load_mitsuba
@@ -430,7 +432,7 @@ def theirs(case: Case, arguments: argparse.Namespace) -> Take:
         kind = "prb_projective" if case.projective else "prb"
         given["integrator"] = {"type": kind, "max_depth": case.depth, "rr_depth": RR_DEPTH}
         wanted = their_name(case, scene)
-        for optimize in (True, False):  # meshes that Mitsuba made one of have no names of their own
+        for optimize in (True, False):  # meshes that Mitsuba merged have no names of their own
             scene_ = mi.load_dict(given, optimize=optimize)
             params = mi.traverse(scene_)
             names = [key for key in params.keys() if key.startswith(wanted[0]) and key.endswith(wanted[1])]
@@ -473,7 +475,7 @@ def theirs(case: Case, arguments: argparse.Namespace) -> Take:
 
 
 def their_name(case: Case, scene: Any) -> tuple[str, str]:
-    """How the name of a case's parameter begins and ends in Mitsuba's scene."""
+    """Return prefix and suffix of the parameter's name in Mitsuba's scene."""
     shape, ending = case.theirs
     number = next(k for k, part in enumerate(scene.built.parts) if part.shape == shape)
     return f"part{number}.", ending

@@ -1,7 +1,7 @@
-"""What each way to choose a light costs and brings: `python scripts/bench_lights.py [scene ...]`, or `--emitters 10 100 ...`.
+"""Compare cost and error of the light samplers: `python scripts/bench_lights.py [scene ...]`, or `--emitters 10 100 ...`.
 
-The error is that of one picture of `--spp` samples a pixel, from the spread of several seeds, relative to the squared mean of
-the pictures by the tree (relMSE with the usual 0.01).
+The error is the relMSE (with the usual 0.01) of one picture of `--spp` samples a pixel, estimated from the spread of several
+seeds; the reference is the mean of the pictures by the light tree.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ WAYS = ("uniform", "power", "tree")
 
 
 def emitters(count: int) -> dict[str, Any]:
-    """Spheres of any power over a floor; all together they shine alike whatever their number."""
+    """Return a scene of emissive spheres of different powers over a floor; the total power is the same for any number."""
     g = torch.Generator().manual_seed(7)
     place = torch.rand(count, 3, generator=g) * torch.tensor([16.0, 1.8, 16.0]) + torch.tensor([-8.0, 0.2, -8.0])
     power = torch.exp(1.5 * torch.randn(count, generator=g))
@@ -42,7 +42,7 @@ def emitters(count: int) -> dict[str, Any]:
 def pictures(
     scene: Scene, way: str, spp: int, seeds: int, size: tuple[int, int], depth: int
 ) -> tuple[list[Tensor], float]:
-    """Pictures of several seeds, and the least processor time of one, in seconds."""
+    """Render pictures of several seeds; return them and the least CPU time of one, in seconds."""
     found, seconds = [], []
     for seed in range(seeds):
         wishes = {
@@ -58,7 +58,7 @@ def pictures(
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", nargs="*", default=["many_lights"])
     parser.add_argument("--emitters", type=int, nargs="*", help="numbers of spheres instead of scenes")

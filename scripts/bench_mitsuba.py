@@ -1,17 +1,19 @@
-"""Throughput or error beside Mitsuba 3: ``python scripts/bench_mitsuba.py [scenes] [--error] [--json FILE] [--markdown]``.
+"""Compare throughput or error with Mitsuba 3.
+
+    python scripts/bench_mitsuba.py [scenes] [--error] [--json FILE] [--markdown]
 
 Both render the same ten scenes, those of ``configs/scene`` under :func:`mitsuba_scene.nearest`: 256 x 256, 64 samples a pixel,
-max_depth 8, rr_depth 5, box filter. Every contender is a process of its own that has loaded and warmed up; they render in
-turn, round after round, each time with another seed. Medians are shown, and the median of the ratios within a round, which a
-machine that is busy now and then disturbs least. The means of both pictures stand beside them, with how many standard errors
-they are apart (from five rounds on); ``compare_mitsuba.py`` looks closer.
+max_depth 8, rr_depth 5, box filter. Every contender is a separate process that has loaded and warmed up; they render in
+turn, round after round, each time with a new seed. The table shows medians, and the median of the ratios within a round, which
+is robust on a machine with varying load. It also shows the means of both pictures, and their difference in standard
+errors (from five rounds on); ``compare_mitsuba.py`` compares pictures in detail.
 
 Light that passes an opacity or ``null`` counts as a bounce in Mitsuba only, and Mitsuba's shadow rays stop there. At equal
 max_depth it traces less in such scenes, and less light arrives: 0.3 % in ``material_row``, next to nothing in the others.
 
-``--error`` compares the error of pictures that take as long: see ``bench_error.py``.
+``--error`` compares errors at equal time, see ``bench_error.py``.
 
-``--busy`` compares a quiet machine with one where two other processes are busy, ``--scaling`` one thread with two (or
+``--busy`` compares an idle machine with one where two other processes are busy, ``--scaling`` one thread with two (or
 ``--threads``), both on the Cornell box. Needs the extra ``bench``; the bunny and the teapot need ``$TORCHPT_ASSETS``, else
 their stand-ins are rendered.
 """
@@ -36,19 +38,19 @@ import bench_files
 from bench_figures import GROUPS, SCENES, geometric_means
 from bench_workers import DEPTH, LLVM, OURS, SCALAR, Contender, Turn, Workers, ask, replaced, started
 
-#: Processes that disturb.
+#: Number of busy processes.
 BUSY = 2
-#: Rounds from which on they tell how much means vary.
+#: Fewest rounds from which the variance of the means is estimated.
 ENOUGH = 5
 
 
 @dataclass
 class Record:
-    """What a contender's turns came to.
+    """The turns of a contender.
 
     Attributes:
         rates: millions of camera paths a second.
-        means: of the pictures, by channel.
+        means: means of the pictures, by channel.
     """
 
     rates: list[float] = field(default_factory=list)
@@ -56,17 +58,17 @@ class Record:
 
     @property
     def rate(self) -> float:
-        """The median."""
+        """Return the median rate."""
         return statistics.median(self.rates)
 
     @property
     def mean(self) -> float:
-        """Of all pictures and channels."""
+        """Return the mean over all pictures and channels."""
         return statistics.fmean(statistics.fmean(mean) for mean in self.means)
 
 
 def main() -> None:
-    """Run what is asked for."""
+    """Run the chosen benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", help=f"of {', '.join(SCENES)}")
     parser.add_argument("--rounds", "--seeds", type=int, default=7, help="each with another seed")
@@ -97,7 +99,7 @@ def main() -> None:
 
 
 def race(arguments: argparse.Namespace) -> None:
-    """All scenes, ours beside Mitsuba's."""
+    """Time all scenes, torchpt beside Mitsuba."""
     rivals = (LLVM, SCALAR) if arguments.scalar else (LLVM,)
     contenders = entered((OURS, *rivals), arguments)
     found: dict[str, Any] = {}
@@ -131,14 +133,14 @@ def race(arguments: argparse.Namespace) -> None:
 
 
 def beside(ours: Record, theirs: Record) -> dict[str, Any]:
-    """A rival's figures: rates and means, and the ratio of ours to them within rounds."""
+    """Return a contender's figures: rate and mean, and the ratio of ours to it within rounds."""
     ratios = [a / b for a, b in zip(ours.rates, theirs.rates, strict=True)]
     facts = {"rate": theirs.rate, "ratio": statistics.median(ratios), "ratios": ratios}
     return {**vars(theirs), **facts, "z": deviate(ours.means, theirs.means)}
 
 
 def deviate(ours: list[list[float]], theirs: list[list[float]]) -> float | None:
-    """How many standard errors the means of pictures are apart, in the channel where it is most."""
+    """Return by how many standard errors the means of pictures differ, in the channel where they differ most."""
     if len(ours) < ENOUGH:
         return None
     found = []
@@ -149,7 +151,7 @@ def deviate(ours: list[list[float]], theirs: list[list[float]]) -> float | None:
 
 
 def markdown(found: dict[str, Any], rivals: tuple[str, ...]) -> str:
-    """The table for the documentation, with geometric means of the groups that are complete."""
+    """Return the table for the documentation, with geometric means of the complete groups."""
     lines = ["| scene | torchpt |" + "".join(f" `{rival}` | ratio |" for rival in rivals)]
     lines.append("|---|---|" + "---|---|" * len(rivals))
     columns = [(OURS, "rate"), *((rival, key) for rival in rivals for key in ("rate", "ratio"))]
@@ -163,7 +165,7 @@ def markdown(found: dict[str, Any], rivals: tuple[str, ...]) -> str:
 
 
 def busy(arguments: argparse.Namespace) -> None:
-    """How much slower everyone is beside busy processes."""
+    """Measure how much busy processes slow each contender down."""
     contenders = entered((OURS, LLVM), arguments)
     found: dict[str, Any] = {}
     for scene in arguments.scenes or ("cornell_box",):
@@ -185,7 +187,7 @@ def busy(arguments: argparse.Namespace) -> None:
 
 
 def scaling(arguments: argparse.Namespace) -> None:
-    """One thread beside several."""
+    """Time one thread beside several."""
     several = arguments.threads or 2
     pairs = [(engine, threads) for engine in (OURS, LLVM) for threads in (1, several)]
     contenders = [entered((engine,), arguments, threads)[0] for engine, threads in pairs]
@@ -203,7 +205,7 @@ def scaling(arguments: argparse.Namespace) -> None:
 
 
 def save(arguments: argparse.Namespace, facts: dict[str, Any]) -> None:
-    """Write what is known so far, and how it came about."""
+    """Write the figures measured so far, with the settings of the run."""
     if arguments.json is None:
         return
     names = ("rounds", "size", "spp", "threads", "sampler", "compile")
@@ -213,7 +215,7 @@ def save(arguments: argparse.Namespace, facts: dict[str, Any]) -> None:
 
 @contextmanager
 def spinning(number: int) -> Iterator[None]:
-    """Other processes that are busy meanwhile."""
+    """Run busy processes inside the context."""
     others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(number)]
     try:
         time.sleep(0.2)  # they have to start
@@ -225,13 +227,13 @@ def spinning(number: int) -> Iterator[None]:
 
 
 def entered(engines: tuple[str, ...], arguments: argparse.Namespace, threads: int | None = None) -> list[Contender]:
-    """Contenders with the threads and the sampler that are asked for."""
+    """Return the contenders with the chosen threads and sampler."""
     samplers = {OURS: arguments.sampler}
     return [Contender(engine, threads or arguments.threads, samplers.get(engine)) for engine in engines]
 
 
 def compete(workers: Workers, arguments: argparse.Namespace) -> dict[str, Record]:
-    """Rounds in which all take their turn."""
+    """Run rounds in which each contender takes its turn."""
     records = {name: Record() for name in workers}
     for seed in range(1, 1 + arguments.rounds):
         for name, worker in workers.items():

@@ -1,9 +1,11 @@
-"""Noise at equal samples beside Mitsuba 3: ``python scripts/bench_noise.py [scenes] [--spp 64] [--seeds 5] [--size 128]``.
+"""Compare noise at equal samples with Mitsuba 3.
 
-For each scene the relMSE of single pictures, mean and standard error over seeds, of torchpt's samplers and of Mitsuba's
-``independent`` and ``multijitter``; box filter on both sides. The reference is torchpt's own mean over many more seeds, whose
-variance is subtracted: an estimate without bias, where ours is unbiased (``tests/integrators/test_mitsuba.py``). The ratio
-is that of ``sobol``, the default, to the better of Mitsuba's two. Needs the extra ``bench``.
+    python scripts/bench_noise.py [scenes] [--spp 64] [--seeds 5] [--size 128]
+
+For each scene the table shows the relMSE of single pictures, mean and standard error over seeds, for torchpt's samplers and for
+Mitsuba's ``independent`` and ``multijitter``; box filter on both sides. The reference is torchpt's own mean over many more
+seeds, whose variance is subtracted: an unbiased estimate if torchpt is unbiased (``tests/integrators/test_mitsuba.py``). The
+ratio is that of ``sobol``, the default, to the better of Mitsuba's two. Needs the extra ``bench``.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from torchpt.scene.formats.description import settings
 
 FLOOR = {"type": "rectangle", "transform": [{"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"scale": 4}]}
 BUNNY = ["$TORCHPT_ASSETS/bunny.ply", str(Path(__file__).parent.parent / "scenes" / "standin.ply")]
-#: Scenes that do not ship: a bunny under an environment map, and a lamp close to what it lights.
+#: Scenes that are not shipped: a bunny under an environment map, and a lamp close to a surface.
 OWN: dict[str, dict[str, Any]] = {
     "env_bunny": {
         "camera": {"origin": [0, 0.2, 0.35], "target": [-0.02, 0.1, 0], "fov": 35},
@@ -88,7 +90,7 @@ def main() -> None:
 
 
 def compare(mitsuba: Any, name: str, arguments: argparse.Namespace) -> dict[str, tuple[float, float]]:
-    """Mean relMSE and its standard error of every contender."""
+    """Return the mean relMSE of every contender and its standard error."""
     scene = torchpt.load(OWN[name], device="cpu") if name in OWN else comparable(name)
     film = {"width": arguments.size, "height": arguments.size, "filter": {"type": "box"}}
     wishes = settings(scene.description, {"film": film, "integrator": KEYS, "render": {"spp": arguments.spp}})
@@ -111,7 +113,7 @@ def compare(mitsuba: Any, name: str, arguments: argparse.Namespace) -> dict[str,
 
 
 def own(scene: Scene, film: dict[str, Any], spp: int, sampler: str) -> Shoot:
-    """Pictures by torchpt, by seed."""
+    """Render pictures with torchpt, by seed."""
 
     def shoot(seed: int) -> Tensor:
         drawn = {"spp": spp, "seed": seed, "compile": "off"}
@@ -122,7 +124,7 @@ def own(scene: Scene, film: dict[str, Any], spp: int, sampler: str) -> Shoot:
 
 
 def other(mitsuba: Any, scene: Any, spp: int) -> Shoot:
-    """Pictures by Mitsuba, by seed."""
+    """Render pictures with Mitsuba, by seed."""
     return lambda seed: torch.tensor(mitsuba.render(scene, spp=spp, seed=seed).numpy(), dtype=torch.float64)
 
 

@@ -1,4 +1,4 @@
-"""The curves of ``bench_mitsuba.py --error``: a small panel for each scene, error against time, both in logarithms."""
+"""Plot the curves of ``bench_mitsuba.py --error``: a panel for each scene, error against time, both logarithmic."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def plot(found: dict[str, Any], budgets: list[float], file: Path) -> None:
     """Draw the scenes of a contest.
 
     Args:
-        found: by scene, as ``bench_error.measured`` gives them.
-        budgets: seconds, marked by lines.
-        file: ending in what matplotlib writes, such as ``.svg`` or ``.png``.
+        found: results of ``bench_error.measured`` by scene.
+        budgets: times in seconds, marked by lines.
+        file: path with an extension that matplotlib can write, such as ``.svg`` or ``.png``.
 
     Raises:
         SystemExit: no scenes, or a file that cannot be written.

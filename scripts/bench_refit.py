@@ -1,9 +1,9 @@
-"""What a refit costs beside a build, and how searches slow down in a tree whose triangles have moved.
+"""Compare the cost of a refit with that of a build, and measure how searches slow down in a refitted tree.
 
-Run: ``python scripts/bench_refit.py [--rounds 5] [--json file]``; ``$TORCHPT_ASSETS/bunny.ply`` must be there. One thread, by
-its CPU time. Of each way of moving the bunny's vertices a line tells how often its tree's cost has multiplied since it was
-built (what ``torchpt.search.tree.REBUILD_THRESHOLD`` bounds), what it costs beside a tree built anew, and how much longer
-searches take than there.
+Run: ``python scripts/bench_refit.py [--rounds 5] [--json file]``; needs ``$TORCHPT_ASSETS/bunny.ply``. Times are CPU times of
+one thread. For each way to move the bunny's vertices a line shows the growth of the tree's cost since it was built
+(which ``torchpt.search.tree.REBUILD_THRESHOLD`` bounds), its cost relative to a rebuilt tree, and how much longer searches
+take than in the rebuilt tree.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from torchpt.search.tree import WideBvh
 
 
 def noise(x: np.ndarray, amount: float) -> np.ndarray:
-    """Each vertex on its own; 1 is an edge's mean length."""
+    """Move each vertex independently; 1 is the mean length of an edge."""
     _, place = np.unique(x, axis=0, return_inverse=True)
     return x + amount * 0.00856 * np.random.default_rng(0).normal(size=(len(x), 3))[place]
 
 
 def wave(x: np.ndarray, amount: float) -> np.ndarray:
-    """Four waves along each axis; 1 is the mesh's size."""
+    """Move vertices by four waves along each axis; 1 is the size of the mesh."""
     return x + amount * np.sin(8 * np.pi * x[:, [1, 2, 0]])
 
 
 def twist(x: np.ndarray, amount: float) -> np.ndarray:
-    """About the upward axis; 1 is a turn from bottom to top."""
+    """Twist the mesh about the upward axis; 1 is a turn from bottom to top."""
     t = amount * 2 * np.pi * x[:, 1]
     return np.stack([x[:, 0] * np.cos(t) - x[:, 2] * np.sin(t), x[:, 1], x[:, 0] * np.sin(t) + x[:, 2] * np.cos(t)], 1)
 
 
 def turn(x: np.ndarray, amount: float) -> np.ndarray:
-    """As a whole, about two axes; 1 is a turn."""
+    """Rotate the mesh about two axes; 1 is a turn."""
     t = amount * 2 * np.pi
     c, s = np.cos(t), np.sin(t)
     return x @ (np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])).T
@@ -59,7 +59,7 @@ MOVES: dict[str, tuple[Callable[[np.ndarray, float], np.ndarray], tuple[float, .
 
 
 def moved(g: Geometry, how: Callable[[np.ndarray, float], np.ndarray], amount: float) -> Geometry:
-    """Triangles with their corners elsewhere, about the mesh's centre and in units of its size."""
+    """Move the corners of triangles, about the mesh's centre and in units of its size."""
     _, centre, size = extent(g)
     x = torch.cat((g.p0, g.p1, g.p2), 1).numpy().T.astype(np.float64)
     x = how((x - centre) / size, amount) * size + centre
@@ -68,14 +68,14 @@ def moved(g: Geometry, how: Callable[[np.ndarray, float], np.ndarray], amount: f
 
 
 def refit(accel: WideBvh, g: Geometry) -> WideBvh:
-    """The refitted tree, whatever it costs."""
+    """Return the refitted tree, whatever it costs."""
     tree = accel.refit(g)
     assert tree is not None
     return tree
 
 
 def seconds(rounds: int, rows: list[dict[str, Any]]) -> None:
-    """Builds and refits from a thousand triangles to a million."""
+    """Time builds and refits from a thousand triangles to a million."""
     for n in (16, 50, 144, 501):
         g = bumpy_sphere(n)
         accel, build = built(g)
@@ -90,7 +90,7 @@ def seconds(rounds: int, rows: list[dict[str, Any]]) -> None:
 
 
 def slowdown(rounds: int, rows: list[dict[str, Any]]) -> None:
-    """How much longer searches take in a refitted tree."""
+    """Measure how much longer searches take in a refitted tree."""
     first = bunny()
     accel = WideBvh(first, 1)
     for name, (how, amounts) in MOVES.items():
@@ -115,7 +115,7 @@ def slowdown(rounds: int, rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """Prints both tables."""
+    """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--json", type=Path)

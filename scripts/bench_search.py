@@ -1,9 +1,9 @@
-"""Rays a second of the CPU's tree on one thread, with Embree beside it where ``embreex`` is installed.
+"""Measure rays a second of the CPU's tree on one thread, beside Embree if ``embreex`` is installed.
 
 Run: ``python scripts/bench_search.py [--sets bunny room lamp sphere82k sphere1M clutter growth] [--rounds 7] [--json file]``.
-``$TORCHPT_ASSETS/bunny.ply`` must be there for the first three. Times are CPU times of the thread, medians of rounds in which
-the contenders take turns. Camera rays are four a pixel in scan order; shadow rays go from what they hit to a point or to a
-square light, second and fourth are the bounces of diffuse paths. A line tells Mrays/s, and the ratio to Embree.
+The first three need ``$TORCHPT_ASSETS/bunny.ply``. Times are CPU times of the thread, medians of rounds in which
+the contenders take turns. Camera rays are four a pixel in scan order; shadow rays go from their hits to a point light or a
+square light; ``second`` and ``fourth`` are the bounces of diffuse paths. Each line shows Mrays/s and the ratio to Embree.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ RAYS = 1 << 18
 
 
 def bunny() -> Geometry:
-    """69,451 triangles."""
+    """Load the bunny: 69,451 triangles."""
     import trimesh
 
     mesh = trimesh.load_mesh(Path(os.environ["TORCHPT_ASSETS"]) / "bunny.ply", process=False)
@@ -38,20 +38,20 @@ def bunny() -> Geometry:
 
 
 def joined(first: Geometry, second: Geometry) -> Geometry:
-    """Both, in one."""
+    """Join two sets of triangles."""
     parts = [torch.cat([getattr(first, p), getattr(second, p)], 1) for p in ("p0", "p1", "p2")]
     a, b = first.counts, second.counts
     return Geometry(parts[0], parts[1], parts[2], (a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4]))
 
 
 def extent(g: Geometry) -> tuple[np.ndarray, np.ndarray, float]:
-    """Low corner, centre, and longest side of the triangles' box."""
+    """Return low corner, centre and longest side of the triangles' box."""
     low, high = (x.numpy().astype(np.float64) for x in (g.p0.amin(1), g.p0.amax(1)))
     return low, (low + high) / 2, float((high - low).max())
 
 
 def room(g: Geometry) -> Geometry:
-    """A mesh on the floor of a box of twelve triangles."""
+    """Put a mesh on the floor of a box of twelve triangles."""
     low, centre, size = extent(g)
     a, b = centre - 1.2 * size, centre + 1.2 * size
     a[1] = low[1]
@@ -61,7 +61,7 @@ def room(g: Geometry) -> Geometry:
 
 
 def lamp(g: Geometry) -> Geometry:
-    """A mesh with a rectangle above it."""
+    """Put a rectangle above a mesh."""
     _, centre, size = extent(g)
     corners = [centre + size * np.array(x) for x in ((-0.2, 0.8, -0.2), (0.2, 0.8, -0.2), (-0.2, 0.8, 0.2))]
     p = [torch.tensor(x, dtype=torch.float32)[:, None] for x in corners]
@@ -69,7 +69,7 @@ def lamp(g: Geometry) -> Geometry:
 
 
 def clutter() -> Geometry:
-    """The triangles of the shipped scene, 900,000 of them."""
+    """Return the 900,000 triangles of the shipped scene."""
     import torchpt
 
     with torch.no_grad():
@@ -80,7 +80,7 @@ def clutter() -> Geometry:
 
 
 def camera(eye: np.ndarray, target: np.ndarray, fov: float, n: int = RAYS) -> Rays:
-    """A pinhole camera's rays, four a pixel, pixel after pixel."""
+    """Return the rays of a pinhole camera, four a pixel, pixel after pixel."""
     side = round((n / 4) ** 0.5)
     w = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(w, (0, 1, 0))
@@ -94,13 +94,13 @@ def camera(eye: np.ndarray, target: np.ndarray, fov: float, n: int = RAYS) -> Ra
 
 
 def rays(o: np.ndarray, d: np.ndarray, t_max: np.ndarray | float = np.inf) -> Rays:
-    """Contiguous float32 arrays."""
+    """Convert rays to contiguous float32 arrays."""
     end = np.broadcast_to(np.asarray(t_max, np.float32), o.shape[1:])
     return tuple(np.array(x, np.float32, order="C") for x in (o, d, end))  # type: ignore[return-value]
 
 
 def surface(g: Geometry, ray: Rays, t: np.ndarray, prim: np.ndarray, offset: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points ``(3, K)`` that were hit, off the surface on the ray's side, and normals there."""
+    """Return the points ``(3, K)`` that rays hit, moved off the surface to the ray's side, and the normals there."""
     hit = (prim >= 0) & (prim < g.counts[0])
     p0, p1, p2 = (x.numpy()[:, prim[hit]].astype(np.float64) for x in (g.p0, g.p1, g.p2))
     n = np.cross(p1 - p0, p2 - p0, axis=0)
@@ -111,14 +111,14 @@ def surface(g: Geometry, ray: Rays, t: np.ndarray, prim: np.ndarray, offset: flo
 
 
 def cosine(n: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Directions of a diffuse surface about normals ``(3, K)``."""
+    """Sample directions of a diffuse surface about normals ``(3, K)``."""
     d = rng.normal(size=n.shape)
     d = n + d / np.linalg.norm(d, axis=0)
     return d / np.maximum(np.linalg.norm(d, axis=0), 1e-9)
 
 
 def ray_sets(g: Geometry, accel: WideBvh, first: Rays, light: np.ndarray, size: float) -> dict[str, Rays]:
-    """Camera rays, shadow rays from what they hit, and bounces."""
+    """Return camera rays, shadow rays from their hits, and bounces."""
     sets, ray, rng = {"camera": first}, first, np.random.default_rng(1)
     for depth in range(2, 5):
         n = ray[0].shape[1]
@@ -140,7 +140,7 @@ def ray_sets(g: Geometry, accel: WideBvh, first: Rays, light: np.ndarray, size: 
 
 
 def embree(g: Geometry) -> Any:
-    """Embree over the triangles, or None where it is not installed."""
+    """Build Embree's tree of the triangles; return None if Embree is not installed."""
     try:
         mesh_construction: Any = importlib.import_module("embreex.mesh_construction")
         rtcore_scene: Any = importlib.import_module("embreex.rtcore_scene")
@@ -151,11 +151,11 @@ def embree(g: Geometry) -> Any:
     scene = rtcore_scene.EmbreeScene()
     vertices = np.ascontiguousarray(corners.numpy())
     mesh = mesh_construction.TriangleMesh(scene, vertices, np.arange(3 * n, dtype=np.int32).reshape(-1, 3))
-    return scene, vertices, mesh  # the scene reads the vertices where they are
+    return scene, vertices, mesh  # Embree shares the memory of the vertices
 
 
 def contenders(accel: WideBvh, other: Any, ray: Rays, any_hit: bool) -> dict[str, Callable[[], object]]:
-    """What is measured: calls by name."""
+    """Return the searches to measure, by name."""
     n = ray[0].shape[1]
     t, u, v = np.empty((3, n), np.float32)
     prim = np.empty(n, np.int32)
@@ -173,7 +173,7 @@ def contenders(accel: WideBvh, other: Any, ray: Rays, any_hit: bool) -> dict[str
 
 
 def measure(calls: dict[str, Callable[[], object]], n: int, rounds: int) -> dict[str, float]:
-    """Mrays/s by name."""
+    """Measure Mrays/s by name."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for call in calls.values():
         call()
@@ -186,7 +186,7 @@ def measure(calls: dict[str, Callable[[], object]], n: int, rounds: int) -> dict
 
 
 def built(g: Geometry) -> tuple[WideBvh, float]:
-    """The tree, and the least CPU time of three builds."""
+    """Build the tree three times; return it and the least CPU time."""
     accel, best = WideBvh(g, 1), np.inf
     for _ in range(3):
         start = time.process_time()
@@ -196,7 +196,7 @@ def built(g: Geometry) -> tuple[WideBvh, float]:
 
 
 def report(rows: list[dict[str, Any]], row: dict[str, Any]) -> None:
-    """Prints a row and keeps it."""
+    """Print a row and keep it."""
     rows.append(row)
     ratio = f"  {row['torchpt'] / row['embreex']:5.2f}" if "embreex" in row else ""
     speeds = "  ".join(f"{name} {row[name]:6.2f}" for name in ("torchpt", "embreex") if name in row)
@@ -204,7 +204,7 @@ def report(rows: list[dict[str, Any]], row: dict[str, Any]) -> None:
 
 
 def one(name: str, rounds: int, rows: list[dict[str, Any]]) -> None:
-    """All ray sets of one scene."""
+    """Measure all ray sets of one scene."""
     if name in ("bunny", "room", "lamp"):
         mesh = bunny()
         g = {"bunny": lambda x: x, "room": room, "lamp": lamp}[name](mesh)
@@ -226,7 +226,7 @@ def one(name: str, rounds: int, rows: list[dict[str, Any]]) -> None:
 
 
 def growth(rounds: int, rows: list[dict[str, Any]]) -> None:
-    """Build time, memory and random rays from inside, from a thousand triangles to a million."""
+    """Measure build time, memory and random rays from inside, from a thousand triangles to a million."""
     rng = np.random.default_rng(0)
     for n in (16, 50, 158, 501):
         g = bumpy_sphere(n)
@@ -240,7 +240,7 @@ def growth(rounds: int, rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "--sets", nargs="+", default=["bunny", "room", "lamp", "sphere82k", "sphere1M", "clutter", "growth"]

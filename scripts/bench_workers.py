@@ -1,8 +1,8 @@
-"""Renderers as processes that stay warm: what ``bench_mitsuba.py`` lets race.
+"""Run a renderer as a process that stays warm, for ``bench_mitsuba.py``.
 
 ``python scripts/bench_workers.py SCENE ENGINE --size=256 ...`` loads a scene, warms up, writes a line of JSON, and then renders
 once for every line of JSON that it reads: ``{"spp": 64, "seed": 1, "out": "picture.npy"}``, where ``out`` may be missing. It
-answers with the samples that it really took, the wall time from the call to the picture in memory, and the picture's mean.
+answers with the number of samples taken, the wall time from the call to the picture in memory, and the picture's mean.
 Mitsuba's ``multijitter`` takes full rows of as many samples as the root, rounded down: 7 samples are 2 x 4, 128 are 11 x 12.
 """
 
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 DEPTH = 8
 OURS, LLVM, SCALAR = "torchpt", "llvm_ad_rgb", "scalar_rgb"
 
-#: A picture ``(H, W, 3)`` by samples a pixel and seed, with the samples that were really taken.
+#: Renders a picture ``(H, W, 3)`` from samples a pixel and seed; also returns the number of samples taken.
 Shoot = Callable[[int, int], tuple[Any, int]]
 Workers = dict[str, "subprocess.Popen[str]"]
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A renderer, how many threads it may use (None: as many as it likes), and its sampler (None: its default)."""
+    """A renderer with its number of threads (None: no limit) and its sampler (None: its default)."""
 
     engine: str
     threads: int | None = None
@@ -48,14 +48,14 @@ class Contender:
 
 @dataclass(frozen=True)
 class Turn:
-    """What a contender answered.
+    """The answer of a worker.
 
     Attributes:
-        spp: samples a pixel that it took.
+        spp: samples a pixel taken.
         seconds: wall time, from the call to the picture in memory.
         rate: millions of camera paths a second.
-        mean: of the picture, by channel.
-        cold: whether it is the first turn of a worker with as many samples; Mitsuba may have to compile for it.
+        mean: mean of the picture, by channel.
+        cold: True for a worker's first turn with this number of samples; Mitsuba may have to compile for it.
     """
 
     spp: int
@@ -67,7 +67,7 @@ class Turn:
 
 @contextmanager
 def started(scene: str, contenders: Iterable[Contender], arguments: argparse.Namespace) -> Iterator[Workers]:
-    """Processes by name that have loaded and warmed up, and wait for :func:`ask`."""
+    """Start the workers by name; inside the context they are warm and wait for :func:`ask`."""
     workers: Workers = {}
     try:
         for contender in contenders:
@@ -88,7 +88,7 @@ def started(scene: str, contenders: Iterable[Contender], arguments: argparse.Nam
 
 
 def ask(worker: subprocess.Popen[str], spp: int, seed: int, out: Path | None = None) -> Turn:
-    """One turn of a worker; ``out`` is where the picture goes, as ``.npy``."""
+    """Let a worker take one turn; ``out`` is the file for the picture, as ``.npy``."""
     assert worker.stdin is not None
     wish = {"spp": spp, "seed": seed, "out": None if out is None else str(out)}
     worker.stdin.write(json.dumps(wish) + "\n")
@@ -100,13 +100,13 @@ def ask(worker: subprocess.Popen[str], spp: int, seed: int, out: Path | None = N
 
 
 def _answer(worker: subprocess.Popen[str]) -> dict[str, Any] | None:
-    """The next JSON of a worker; libraries may write lines of their own in between."""
+    """Read the worker's next line of JSON; libraries may print lines of their own in between."""
     assert worker.stdout is not None
     return next((json.loads(line) for line in worker.stdout if line.startswith("{")), None)
 
 
 def main() -> None:
-    """The worker: warm up, then answer each line on stdin with the JSON of a turn."""
+    """Run a worker: warm up, then answer each line on stdin with the JSON of a turn."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene")
     parser.add_argument("engine", choices=(OURS, LLVM, SCALAR))
@@ -128,7 +128,7 @@ def main() -> None:
 
 
 def timed(shoot: Shoot, size: int, spp: int, seed: int, out: str | None = None) -> dict[str, Any]:
-    """The fields of a :class:`Turn`, but for ``cold``."""
+    """Return the fields of a :class:`Turn` except ``cold``."""
     import numpy as np
 
     begin = time.perf_counter()
@@ -141,7 +141,7 @@ def timed(shoot: Shoot, size: int, spp: int, seed: int, out: str | None = None) 
 
 
 def wishes(scene: Scene, arguments: argparse.Namespace) -> Settings:
-    """Complete settings of a render."""
+    """Return the complete settings of a render."""
     from torchpt.scene.formats.description import settings
 
     blocks = {
@@ -154,14 +154,14 @@ def wishes(scene: Scene, arguments: argparse.Namespace) -> Settings:
 
 
 def replaced(name: str) -> dict[str, str]:
-    """What stands in place of something that Mitsuba lacks."""
+    """Return what replaces the parts of a scene that Mitsuba lacks."""
     from mitsuba_scene import replacements
 
     return replacements(name)
 
 
 def mitsuba(arguments: argparse.Namespace) -> Shoot:
-    """Pictures by Mitsuba."""
+    """Render pictures with Mitsuba."""
     drjit: Any = importlib.import_module("drjit")
     import numpy as np
     from mitsuba_scene import convert, load_mitsuba, nearest
@@ -184,7 +184,7 @@ def mitsuba(arguments: argparse.Namespace) -> Shoot:
 
 
 def torchpt(arguments: argparse.Namespace) -> Shoot:
-    """Pictures by torchpt."""
+    """Render pictures with torchpt."""
     from mitsuba_scene import nearest
 
     from torchpt.rendering.api import render_scene

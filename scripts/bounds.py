@@ -1,4 +1,4 @@
-"""What a scene and its files may ask for at most: the table of docs/guides/stability.md, from the constants themselves.
+"""Build the table of limits on scenes and files in docs/guides/stability.md from the constants in the code.
 
 ``python scripts/make_tables.py`` writes it.
 """
@@ -9,7 +9,7 @@ from importlib import import_module
 
 __all__ = ["BOUNDS", "table"]
 
-#: Of what, where the constant is, its unit.
+#: Subject of the limit, where its constant is, its unit.
 BOUNDS: list[tuple[str, str, str]] = [
     ("a scene file", "torchpt.scene.formats.yaml:MAX_BYTES", "bytes"),
     ("levels of nesting in it", "torchpt.scene.formats.yaml:MAX_DEPTH", ""),
@@ -42,7 +42,7 @@ BOUNDS: list[tuple[str, str, str]] = [
 
 
 def table() -> str:
-    """The bounds as a table of Markdown."""
+    """Return the bounds as a Markdown table."""
     rows = [f"| {what} | {_shown(place, unit)} |\n" for what, place, unit in BOUNDS]
     return "| what | at most |\n|---|---|\n" + "".join(rows)
 

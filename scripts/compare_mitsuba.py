@@ -1,8 +1,8 @@
-"""Whether Mitsuba 3 shows the same picture: ``python scripts/compare_mitsuba.py [scenes] [--size 128] [--pictures FOLDER]``.
+"""Compare pictures with Mitsuba 3: ``python scripts/compare_mitsuba.py [scenes] [--size 128] [--pictures FOLDER]``.
 
-Scenes of ``configs/scene`` under :func:`mitsuba_scene.nearest`, rendered by both with as many seeds; box filter, rr_depth 5.
-For each the means, and deviates ``z = (ours - theirs) / sqrt(variances)`` of the means and of blocks of 8 x 8 pixels.
-Where light passes surfaces, which only Mitsuba counts as a bounce, both go on to depth 64, unless ``--depth`` says otherwise.
+Scenes of ``configs/scene`` under :func:`mitsuba_scene.nearest`, rendered by both with the same number of seeds; box filter,
+rr_depth 5. A line shows the means, and z-scores ``z = (ours - theirs) / sqrt(variances)`` of the means and of blocks of 8 x 8
+pixels. In scenes where light passes surfaces, which only Mitsuba counts as a bounce, the depth is 64 without ``--depth``.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from torchpt.scene import Scene
 from torchpt.scene.formats.description import settings
 
 BLOCK = 8
-#: Where Mitsuba counts surfaces that light passes.
+#: Depth for scenes in which light passes surfaces, which Mitsuba counts as bounces.
 DEEP = 64
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two pictures ``(H, W, 3)`` and how far they are apart, in standard errors.
+    """Two pictures ``(H, W, 3)`` and their difference in standard errors.
 
     Attributes:
-        ours: mean over seeds.
-        theirs: the same by Mitsuba.
-        whole: ``(3,)`` deviates of the means.
-        blocks: ``(H / 8, W / 8, 3)`` deviates of blocks, 0 where neither has noise.
+        ours: torchpt's mean over seeds.
+        theirs: Mitsuba's mean over seeds.
+        whole: ``(3,)`` z-scores of the means.
+        blocks: ``(H / 8, W / 8, 3)`` z-scores of blocks, 0 where both have no noise.
     """
 
     ours: Tensor
@@ -48,7 +48,7 @@ class Comparison:
 
 
 def main() -> None:
-    """Print a line a scene, and write both pictures side by side where a folder is given."""
+    """Print a line for each scene; with ``--pictures`` write both pictures side by side."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", default=SCENES)
     parser.add_argument("--size", type=int, default=128, help="a multiple of 8")
@@ -77,21 +77,21 @@ def main() -> None:
 
 
 def worst(deviates: Tensor) -> float:
-    """The one furthest from 0."""
+    """Return the value furthest from 0."""
     flat = deviates.flatten()
     return float(flat[flat.abs().argmax()])
 
 
 def compare(mitsuba: Any, scene: Scene, size: int, spp: int, seeds: int, depth: int = DEPTH) -> Comparison:
-    """Render a scene by both, with ``seeds`` pictures each, and compare them.
+    """Render a scene with both renderers, ``seeds`` pictures each, and compare them.
 
     Args:
         mitsuba: the module, with its variant set.
-        scene: one that Mitsuba can express.
-        size: pixels a side, a multiple of 8.
+        scene: a scene that Mitsuba can express.
+        size: width and height in pixels, a multiple of 8.
         spp: samples a pixel of each picture.
-        seeds: pictures.
-        depth: longest path.
+        seeds: number of pictures.
+        depth: largest path depth.
     """
 
     def wishes(seed: int) -> Any:

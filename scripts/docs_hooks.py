@@ -1,4 +1,4 @@
-"""Hooks of mkdocs: CHANGELOG and CONTRIBUTING of the repository as pages, and what GitHub writes otherwise than mkdocs."""
+"""Hooks of mkdocs: add CHANGELOG and CONTRIBUTING as pages, and adapt Markdown that mkdocs renders differently from GitHub."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def as_page(text: str) -> str:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages that stand outside ``docs/``."""
+    """Add the pages that lie outside ``docs/``."""
     from mkdocs.structure.files import File  # pyright: ignore[reportMissingImports]  # of the extra `docs`
 
     for page, name in PAGES.items():
@@ -30,6 +30,6 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
-    """Leave out the roles of docstrings (``:func:`` and others) before code, and backslashes before bars in cells of tables."""
+    """Remove roles of docstrings (``:func:`` and others) before code, and backslashes before bars in table cells."""
     html = re.sub(r":(?:func|class|meth|mod|attr|data|exc|ref):(?=<code|`)", "", html)
     return re.sub(r"<td.*?</td>", lambda cell: cell[0].replace("\\|", "|"), html, flags=re.DOTALL)

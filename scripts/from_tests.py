@@ -1,4 +1,4 @@
-"""Importing this lets scripts import what they share with tests: the modules of ``tests/references``."""
+"""Put ``tests/references`` on the import path, so that scripts can import modules that they share with tests."""
 
 from __future__ import annotations
 

@@ -1,20 +1,21 @@
-"""Gradients against known ones: ``python scripts/gradient_pairs.py [pairs] [--wish edges=true] [--json FILE] [--markdown]``.
+"""Compare gradients with true values.
+
+    python scripts/gradient_pairs.py [pairs] [--wish edges=true] [--json FILE] [--markdown]
 
 The pairs of a scene and a parameter are those of ``tests/references/known_gradients.py``, their true derivatives
-those of ``known_gradients.json`` beside it. Each gradient is taken from rounds of independent seeds: at first
-``--seeds``, then twice as many, up to ``--most`` or until ``--seconds`` are spent, until its standard error is at
-most 2 % of the truth. A pair passes where the mean is off by at most 2 % of the truth + 3 standard errors (its own
-and the truth's together) and the standard error is at most 3 %.
+those of ``known_gradients.json`` beside it. Each gradient is the mean over independent seeds: ``--seeds`` of them at
+first, then twice as many, until its standard error is at most 2 % of the true value, ``--most`` is reached or ``--seconds``
+are spent. A pair passes if the mean is off by at most 2 % of the true value + 3 standard errors (of both combined)
+and the standard error is at most 3 %.
 
-``--wish KEY=VALUE`` hands arguments to ``torchpt.render``, values as JSON: ``--wish edges=false --wish
+``--wish KEY=VALUE`` passes arguments to ``torchpt.render``, values as JSON: ``--wish edges=false --wish
 adjoint=autograd``.
 
-``python scripts/gradient_pairs.py --truths`` makes the file of truths anew, twelve minutes on one core: central
+``python scripts/gradient_pairs.py --truths`` computes the true values, in twelve minutes on one core: central
 differences of compiled float32 renders with common random numbers, ``--truth-spp`` samples a pixel, at two steps,
-``h`` and ``2 h``. The truth is Richardson's ``(4 D(h) - D(2 h)) / 3`` of each seed, and the mean over seeds, as many
-as bring its standard error to 0.5 % (at least 8, at most 256). Sums over the picture are float64. Steps are a
-fraction of a pixel: edges that lie along the border of two pixels put kinks into the loss, which differences over
-them would miss.
+``h`` and ``2 h``. The true value is Richardson's ``(4 D(h) - D(2 h)) / 3``, averaged over as many seeds as bring
+its standard error to 0.5 % (at least 8, at most 256). Sums over the picture are float64. Steps are a fraction of a
+pixel: edges along the border of two pixels put kinks into the loss, which larger steps would miss.
 """
 
 from __future__ import annotations
@@ -40,12 +41,12 @@ PAIRS = known_gradients.PAIRS
 TRUTHS = Path(known_gradients.__file__).with_name("known_gradients.json")
 #: How far a gradient may be off beside 3 standard errors, and how large its standard error may be, as fractions of the truth.
 OFF, KNOWN = 0.02, 0.03
-#: Standard errors, as fractions: where no more rounds are taken, and where a truth is good enough.
+#: Standard errors, as fractions, at which the rounds stop: of a gradient, and of a true value.
 ENOUGH, TRUE = 0.02, 0.005
 
 
 def main() -> None:
-    """Judge gradients, or make the truths."""
+    """Compare gradients with the true values, or compute these."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pairs", nargs="*", help=f"of {', '.join(PAIRS)}")
     parser.add_argument("--truths", action="store_true", help="make the file of truths anew, or some of it")
@@ -71,11 +72,11 @@ def main() -> None:
 
 
 def make_truths(names: Iterable[str], arguments: argparse.Namespace) -> None:
-    """Central differences, kept in the file pair by pair."""
+    """Compute central differences and save them pair by pair."""
     for name in names:
         begin = time.perf_counter()
         found = difference(name, arguments.truth_spp, arguments.threads)
-        # Others may be at work on other pairs.
+        # Other processes may be computing other pairs.
         kept = truths() if TRUTHS.exists() else {}
         kept[name] = found
         TRUTHS.write_text(json.dumps({key: kept[key] for key in PAIRS if key in kept}, indent=1) + "\n")
@@ -89,7 +90,7 @@ def make_truths(names: Iterable[str], arguments: argparse.Namespace) -> None:
 
 
 def difference(name: str, spp: int, threads: int) -> dict[str, Any]:
-    """The true derivative of a pair, with what it rests on."""
+    """Return the true derivative of a pair, with its standard error and what it was computed from."""
     pair = PAIRS[name]
     scene = known_gradients.loaded(pair)
     base = scene.params[pair.parameter]
@@ -119,12 +120,12 @@ def difference(name: str, spp: int, threads: int) -> dict[str, Any]:
 
 
 def truths() -> dict[str, Any]:
-    """True derivatives by name of the pair."""
+    """Return the true derivatives by name of the pair."""
     return json.loads(TRUTHS.read_text())
 
 
 def judge(names: Sequence[str], arguments: argparse.Namespace) -> None:
-    """Gradients of all pairs beside the truth."""
+    """Compare the gradients of all pairs with the true values."""
     wishes = {key: json.loads(value) for key, value in (wish.split("=", 1) for wish in arguments.wish)}
     true, found = truths(), {}
     print(f"{'pair':26s}{'truth':>12s}{'gradient':>12s}{'off':>9s}{'SE':>8s}{'seeds':>7s}{'s':>8s}")
@@ -163,7 +164,7 @@ def measured(
     seconds: float = 60.0,
     threads: int = 1,
 ) -> dict[str, Any]:
-    """A gradient of a pair beside the truth; ``off`` and ``error`` are fractions of it."""
+    """Measure the gradient of a pair; ``off`` and ``error`` are fractions of the true value."""
     pair = PAIRS[name]
     scene = known_gradients.loaded(pair)
     base = scene.params[pair.parameter]
@@ -200,21 +201,21 @@ def measured(
 
 
 def verdict(row: dict[str, Any]) -> str:
-    """In words."""
+    """Return the verdict as text."""
     if row["not_finite"]:
         return f"fails: {row['not_finite']} gradients are not finite"
     return "ok" if row["passes"] else "fails"
 
 
 def mean_of(values: Sequence[float]) -> tuple[float, float]:
-    """Mean and its standard error; NaN of fewer than two values."""
+    """Return the mean and its standard error, which is NaN for fewer than two values."""
     if len(values) < 2:
         return math.nan, math.nan
     return statistics.fmean(values), statistics.stdev(values) / math.sqrt(len(values))
 
 
 def markdown(found: dict[str, Any]) -> str:
-    """The table for the documentation."""
+    """Return the table for the documentation."""
     lines = ["| pair | truth | gradient | off | SE | samples | s | |", "|---|---:|---:|---:|---:|---:|---:|---|"]
     for name, row in found.items():
         lines.append(

@@ -1,15 +1,17 @@
-"""Nine inverse problems by Adam: ``python scripts/gradient_tasks.py [--only albedo camera] [--json FILE] [--markdown]``.
+"""Solve nine inverse problems with Adam.
+
+    python scripts/gradient_tasks.py [--only albedo camera] [--json FILE] [--markdown]
 
 The problems are those of ``tests/references/inverse_tasks.py``: albedo, texture, roughness, environment map, a free
 light, a light behind an occluder, a camera, the silhouette of a black ball, a lit ball on a textured floor. Each
-starts at a fixed place, and is to make the error of its numbers at least tenfold smaller (the map: fivefold).
+starts from fixed values, and must make the error of its numbers at least ten times smaller (the map: five times).
 
-The loss is the squared difference to the target, of the picture and of the same pictures at 1/2, 1/4 and 1/8 of their
-size, so that what does not overlap the target yet is drawn there. Its gradient has no bias, since a backward pass
-draws samples of its own: it is the product of two independent renders. The target is rendered with another seed,
-``--target-spp`` samples a pixel.
+The loss is the squared difference from the target at full size and at 1/2, 1/4 and 1/8 of it: the small sizes pull
+objects towards targets that they do not overlap yet. Its gradient is unbiased, since a backward pass draws its own
+samples: it is the product of two independent renders. The target is rendered with another seed and ``--target-spp``
+samples a pixel.
 
-``--wish KEY=VALUE`` hands arguments to ``torchpt.render``, values as JSON: ``--wish edges=true --wish edge_spp=4``.
+``--wish KEY=VALUE`` passes arguments to ``torchpt.render``, values as JSON: ``--wish edges=true --wish edge_spp=4``.
 """
 
 from __future__ import annotations
@@ -30,14 +32,14 @@ from torch import Tensor
 
 import torchpt
 
-#: Seeds of the target, and of the first step; a step's own backward pass draws others.
+#: Seeds of the target and of the first step; the backward pass of a step uses another seed.
 TARGET, FIRST = 1_000_003, 17
-#: By which Adam's rate has fallen at the end.
+#: Factor by which Adam's learning rate has fallen at the end.
 FALL = 0.01
 
 
 def main() -> None:
-    """Solve what is asked for."""
+    """Solve the chosen problems."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", choices=TASKS, help="these tasks; by default all")
     parser.add_argument("--steps", type=int, help="in place of each task's own")
@@ -70,7 +72,7 @@ def main() -> None:
 def solved(
     name: str, wishes: dict[str, Any], steps: int | None = None, spp: int | None = None, target_spp: int = 1024
 ) -> dict[str, Any]:
-    """A task from its starting point to its last step."""
+    """Optimise a problem from its starting point to its last step."""
     task = TASKS[name]
     steps, spp = steps or task.steps, spp or task.spp
     scene = described(task)
@@ -110,13 +112,13 @@ def solved(
 
 
 def loss(picture: Tensor, target: Tensor) -> Tensor:
-    """Squared difference of two pictures ``(H, W, 3)``, and of their means over squares of 2, 4 and 8 pixels."""
+    """Return the squared difference of two pictures ``(H, W, 3)``, and of their means over squares of 2, 4 and 8 pixels."""
     off = (picture - target).permute(2, 0, 1)
     return torch.stack([torch.nn.functional.avg_pool2d(off, size).square().mean() for size in (1, 2, 4, 8)]).sum()
 
 
 def markdown(found: dict[str, Any]) -> str:
-    """The table for the documentation."""
+    """Return the table for the documentation."""
     lines = [
         "| task | error before | after | times less | bar | steps | s | |",
         "|---|---:|---:|---:|---:|---:|---:|---|",

@@ -1,4 +1,4 @@
-"""Hashes of pictures and gradients: whether a change to the code left every bit as it was.
+"""Hash pictures and gradients, to check that a change to the code keeps every bit.
 
     python scripts/hash_pictures.py before.json
     python scripts/hash_pictures.py after.json --against before.json     # exit code 1 where any differs
@@ -32,12 +32,12 @@ GRADIENTS = ("shapes_and_maps", "material_row", "cornell_transmissive", "many_li
 
 
 def digest(x: torch.Tensor) -> str:
-    """Of a tensor's bytes."""
+    """Hash the bytes of a tensor."""
     return hashlib.sha256(x.detach().cpu().contiguous().numpy().tobytes()).hexdigest()[:24]
 
 
 def variants() -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Scene, name and settings of the small pictures."""
+    """Yield scene, name and settings of the small pictures."""
     for scene in SCENES:
         for integrator in ("path", "direct", "ibl"):
             yield scene, integrator, {"integrator": integrator}
@@ -57,7 +57,7 @@ def variants() -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 
 def picture(scene: Any, compiled: bool, settings: dict[str, Any]) -> str:
-    """Digest of a picture, or the error that takes its place."""
+    """Return the hash of a picture, or the error message if it cannot be rendered."""
     keys: dict[str, Any] = {"spp": 4, "seed": 7, **settings}
     try:
         return digest(torchpt.render(scene, compile=compiled, **keys))
@@ -66,7 +66,7 @@ def picture(scene: Any, compiled: bool, settings: dict[str, Any]) -> str:
 
 
 def gradients(scene: Any) -> dict[str, str]:
-    """Digests of the derivatives of a picture's mean by all parameters."""
+    """Return hashes of the gradients of a picture's mean by all parameters."""
     given = {name: value.clone().requires_grad_() for name, value in scene.params.items()}
     image = torchpt.render(scene, spp=2, seed=3, params=given, film={"width": 24, "height": 20}, threads=1)
     found = torch.autograd.grad(image.mean(), list(given.values()), allow_unused=True)
@@ -74,7 +74,7 @@ def gradients(scene: Any) -> dict[str, str]:
 
 
 def record() -> dict[str, str]:
-    """All digests by name."""
+    """Return all hashes by name."""
     found: dict[str, str] = {}
     scenes = {name: torchpt.load(name, device="cpu") for name in SCENES}
     for name, scene in scenes.items():
@@ -90,7 +90,7 @@ def record() -> dict[str, str]:
 
 
 def main() -> int:
-    """Record, and compare where asked to."""
+    """Write the hashes, and compare them if asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="where the hashes go, as JSON")
     parser.add_argument("--against", type=Path, help="an earlier record that must be equal")

@@ -1,10 +1,10 @@
-"""Makes the meshes in `scenes/`: `python scripts/make_assets.py` writes them again, byte for byte.
+"""Make the meshes in `scenes/`: `python scripts/make_assets.py` writes them again, byte for byte.
 
-- `standin.ply` stands where the Stanford bunny would: a smooth closed figure (an icosphere pushed out along its own
+- `standin.ply` replaces the Stanford bunny: a smooth closed figure (an icosphere pushed out along its own
   directions: body, head, two ears, tail, feet) with the bunny's bounding box, pose and no vertex normals.
 - `statue.ply`: a draped figure on a plinth that holds up a sphere, of height 1 from y = 0, facing +z; closed.
 - `cup.ply`: a cup with a handle, of height 1 from y = 0; two closed pieces.
-- `pot.ply` stands where the Utah teapot would: of its size and pose (z up, spout toward +x); four closed pieces.
+- `pot.ply` replaces the Utah teapot: of its size and pose (z up, spout toward +x); four closed pieces.
 - `curved_wall.ply`: an upright sheet along an arc of radius 1 about the y axis, of height 1, facing the axis.
 - `toy_duck.glb`: a bath duck with a painted texture, facing +x, with the bounding box of Khronos' sample duck; closed.
 """
@@ -38,7 +38,7 @@ LOBES = (
 
 
 def icosphere(levels: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Unit directions ``(V, 3)`` and triangles ``(20 * 4^levels, 3)``, counter-clockwise from outside."""
+    """Return unit directions ``(V, 3)`` and triangles ``(20 * 4^levels, 3)``, counter-clockwise from outside."""
     golden = (1.0 + 5.0**0.5) / 2.0
     corners = [(0.0, s, t * golden) for s in (-1, 1) for t in (-1, 1)]
     points = np.array(corners + [(y, z, x) for x, y, z in corners] + [(z, x, y) for x, y, z in corners])
@@ -69,7 +69,7 @@ def _cross(points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.
 
 
 def standin() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Vertices ``(10242, 3)`` and triangles ``(20480, 3)`` of the stand-in."""
+    """Return vertices ``(10242, 3)`` and triangles ``(20480, 3)`` of the stand-in."""
     directions, faces = icosphere(5)
     radius = np.ones(len(directions))
     for axis, reach, narrow in LOBES:
@@ -138,13 +138,13 @@ def surface_nets(
 def _newton(
     field: Callable[[NDArray[np.float64]], NDArray[np.float64]], points: NDArray[np.float64], step: float
 ) -> NDArray[np.float64]:
-    """How far points ``(V, 3)`` are from the zero of a field, along its gradient."""
+    """Return the Newton correction to subtract from points ``(V, 3)`` near the zero of a field, along its gradient."""
     gradient = np.stack([field(points + e) - field(points - e) for e in step * np.eye(3)], axis=-1) / (2.0 * step)
     return field(points)[:, None] * gradient / np.maximum((gradient**2).sum(axis=-1, keepdims=True), 1e-6)
 
 
 def curve(keys: tuple[tuple[float, float], ...], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A smooth curve through ``(x, y)`` keys: cubic pieces with the slopes of Catmull and Rom, constant beyond the ends."""
+    """Return a smooth curve through ``(x, y)`` keys: Catmull-Rom cubics, constant beyond the ends."""
     at, value = np.array(keys).T
     slope = np.gradient(value, at)
     k = np.clip(np.searchsorted(at, x) - 1, 0, len(at) - 2)
@@ -156,19 +156,19 @@ def curve(keys: tuple[tuple[float, float], ...], x: NDArray[np.float64]) -> NDAr
 
 
 def _join(a: NDArray[np.float64], b: NDArray[np.float64], soft: float) -> NDArray[np.float64]:
-    """Union of two fields with a fillet of about ``soft``."""
+    """Return the union of two fields with a fillet of about ``soft``."""
     return np.minimum(a, b) - np.maximum(soft - np.abs(a - b), 0.0) ** 2 / (4.0 * soft)
 
 
 def _ball(p: NDArray[np.float64], centre: tuple[float, ...], radii: tuple[float, ...]) -> NDArray[np.float64]:
-    """About the distance from an ellipsoid."""
+    """Return the approximate distance from an ellipsoid."""
     return (np.linalg.norm((p - centre) / radii, axis=-1) - 1.0) * min(radii)
 
 
 def _limb(
     p: NDArray[np.float64], a: tuple[float, ...], b: tuple[float, ...], thick: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Distance from a rod of changing thickness."""
+    """Return the distance from a rod of changing thickness."""
     start, along = np.array(a), np.array(b) - np.array(a)
     t = np.clip((p - start) @ along / (along @ along), 0.0, 1.0)
     return np.linalg.norm(p - start - t[..., None] * along, axis=-1) - (thick[0] + (thick[1] - thick[0]) * t)
@@ -206,7 +206,7 @@ LIFTED = (
 
 
 def figure(p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The statue's field at ``(..., 3)``: a robed figure with one arm raised, height 1 with plinth and sphere."""
+    """Evaluate the statue's field at ``(..., 3)``: a robed figure with one arm raised, height 1 with plinth and sphere."""
     body = _join(_robe(p), _rods(p, SHOULDERS, 0.02), 0.035)
     # One arm hangs and gathers the robe at the hip, the other lifts a sphere.
     body = _join(
@@ -227,18 +227,18 @@ def _rods(
     rods: tuple[tuple[tuple[float, ...], tuple[float, ...], tuple[float, float]], ...],
     soft: float,
 ) -> NDArray[np.float64]:
-    """Two rods that meet."""
+    """Return the field of two rods that meet."""
     return _join(_limb(p, *rods[0]), _limb(p, *rods[1]), soft)
 
 
 def _disc(p: NDArray[np.float64], radius: float, height: float, half: float) -> NDArray[np.float64]:
-    """An upright drum about the y axis with rounded edges."""
+    """Return the field of an upright drum about the y axis with rounded edges."""
     flat = np.hypot(p[..., 0], p[..., 2])
     return np.hypot(np.maximum(flat - radius, 0.0), np.maximum(np.abs(p[..., 1] - height) - half, 0.0)) - 0.005
 
 
 def _robe(p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cloth about a swaying column of elliptical section, in folds that do not fall straight."""
+    """Return the field of the robe: cloth about a swaying column of elliptical section, with slanting folds."""
     x, y, z = np.moveaxis(p, -1, 0)
     wide, deep = curve(WIDTH, y), curve(DEPTH, y)
     side, front = (x - curve(SWAY, y)) / wide, (z - curve(LEAN, y)) / deep
@@ -263,7 +263,7 @@ def _robe(p: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _head(p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Skull, jaw, nose, brow, mouth, and hair in a knot, turned toward the sphere."""
+    """Return the field of skull, jaw, nose, brow, mouth, and hair in a knot, turned toward the sphere."""
     x, y, z = np.moveaxis(p - (0.004, 0.925, 0.008), -1, 0)
     cos, sin = np.cos(0.45), np.sin(0.45)
     head = np.stack([cos * x - sin * z, y, sin * x + cos * z], axis=-1)
@@ -280,20 +280,20 @@ def _head(p: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def statue() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Vertices and triangles of the statue."""
+    """Return vertices and triangles of the statue."""
     points, faces = surface_nets(figure, np.array([-0.21, -0.02, -0.18]), np.array([0.24, 1.02, 0.18]), 0.0074)
     points[:, 1] -= points[:, 1].min()
     return (points / points[:, 1].max()).astype("<f4"), faces.astype("<i4")
 
 
 def _grid(index: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Triangles of a grid of vertices: rows step to the right of columns, seen from outside."""
+    """Return the triangles of a grid of vertices; seen from outside, rows go to the right of columns."""
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
     return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
 
 
 def lathe(outline: NDArray[np.float64], segments: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """A closed solid of revolution about y; ``outline (K, 2)`` (radius, height) runs counter-clockwise from axis to axis."""
+    """Return a closed solid of revolution about y; ``outline (K, 2)`` (radius, height) is counter-clockwise."""
     angle = np.linspace(0.0, 2.0 * np.pi, segments, endpoint=False)[:, None]
     radius, height = outline[1:-1].T
     rings = np.stack([radius * np.sin(angle), height + 0.0 * angle, radius * np.cos(angle)], axis=-1)
@@ -309,7 +309,7 @@ def lathe(outline: NDArray[np.float64], segments: int) -> tuple[NDArray[np.float
 
 
 def cup() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """A cup of height 1, turned on a lathe, and its handle."""
+    """Return a cup of height 1 (a solid of revolution) and its handle."""
     outline = np.array(
         [(0.0, 0.0), (0.24, 0.0), (0.3, 0.004), (0.325, 0.03), (0.37, 0.09), (0.42, 0.2), (0.445, 0.35), (0.455, 0.6),
          (0.465, 0.9), (0.472, 0.98), (0.46, 1.0), (0.445, 0.985), (0.435, 0.9), (0.425, 0.6), (0.415, 0.36),
@@ -333,7 +333,7 @@ def cup() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
 
 
 def _tube(path: NDArray[np.float64], radius: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """A closed tube about ``path (K, 2)`` in the plane of x and z, of ``radius (K,)``."""
+    """Return a closed tube about ``path (K, 2)`` in the plane of x and z, of ``radius (K,)``."""
     along = np.gradient(path, axis=0)
     side = np.stack([-along[:, 1], along[:, 0]], -1) / np.linalg.norm(along, axis=1, keepdims=True)
     around = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
@@ -354,7 +354,7 @@ def _tube(path: NDArray[np.float64], radius: NDArray[np.float64]) -> tuple[NDArr
 
 
 def pot() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """A teapot: body and lid turned on a lathe, a spout and a handle."""
+    """Return a teapot: body and lid are solids of revolution, with a spout and a handle."""
     body = ((0.0, 0.0), (1.3, 0.0), (1.5, 0.06), (1.75, 0.3), (1.95, 0.7), (2.0, 1.05), (1.93, 1.5), (1.75, 2.0),
             (1.55, 2.35), (1.45, 2.45), (1.38, 2.4), (0.0, 2.4))  # fmt: skip
     lid = ((0.0, 2.38), (1.3, 2.38), (1.32, 2.44), (1.1, 2.55), (0.6, 2.66), (0.2, 2.74), (0.17, 2.82), (0.3, 2.94),
@@ -375,7 +375,7 @@ def pot() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
 
 
 def _smoothed(keys: tuple[tuple[float, float], ...], number: int) -> NDArray[np.float64]:
-    """Points ``(about number, 2)`` of a curve through ``keys``, which are among them."""
+    """Return points ``(about number, 2)`` of a curve through ``keys``, which are among them."""
     given = np.array(keys)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(given, axis=0), axis=1))])
     at = np.unique(np.concatenate([np.linspace(0.0, length[-1], number), length]))
@@ -384,7 +384,7 @@ def _smoothed(keys: tuple[tuple[float, float], ...], number: int) -> NDArray[np.
 
 
 def curved_wall() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """A sheet of height 1 along 150 degrees of the unit circle about y, its middle toward -z, facing the axis."""
+    """Return a sheet of height 1 along 150 degrees of the unit circle about y, its middle toward -z, facing the axis."""
     angle = np.radians(np.linspace(-75.0, 75.0, 193))[:, None]
     height = np.linspace(0.0, 1.0, 9)
     points = np.stack([np.sin(angle) + 0.0 * height, height + 0.0 * angle, -np.cos(angle) + 0.0 * height], axis=-1)
@@ -397,7 +397,7 @@ EYE = (0.655, 1.33)
 
 
 def duck_field(p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The duck's field at ``(..., 3)``, symmetric about z = 0."""
+    """Evaluate the duck's field at ``(..., 3)``, symmetric about z = 0."""
     x, y, z = np.moveaxis(p, -1, 0)
     body = _ball(p, (0.02, 0.52, 0.0), (0.66, 0.42, 0.52))
     body = _join(body, _limb(p, (-0.4, 0.6, 0.0), (-0.68, 0.93, 0.0), (0.2, 0.03)), 0.15)
@@ -408,7 +408,7 @@ def duck_field(p: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def duck_paint(size: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """The duck's colours as seen from its side: indices ``(size, size)``, row 0 at the top, and their palette ``(K, 3)``."""
+    """Return the duck's colours seen from its side: indices ``(size, size)``, row 0 at the top, and the palette ``(K, 3)``."""
     low, high = np.array(DUCK_BOX)
     step = (np.arange(size) + 0.5) / size
     x, y = np.meshgrid(low[0] + (high[0] - low[0]) * step, high[1] - (high[1] - low[1]) * step)
@@ -437,7 +437,7 @@ def duck_paint(size: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 
 
 def png(index: NDArray[np.uint8], palette: NDArray[np.uint8]) -> bytes:
-    """A PNG with a palette; not compressed, so that its bytes are the same everywhere."""
+    """Encode a PNG with a palette, uncompressed so that its bytes are the same everywhere."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -454,7 +454,7 @@ def png(index: NDArray[np.uint8], palette: NDArray[np.uint8]) -> bytes:
 
 
 def write_toy_duck(path: Path) -> None:
-    """The duck as a GLB file; its texture is projected from the side."""
+    """Write the duck as a GLB file; its texture is projected from the side."""
     points, faces = surface_nets(duck_field, np.array([-0.82, 0.0, -0.7]), np.array([1.15, 1.75, 0.7]), 0.0575)
     low, high = np.array(DUCK_BOX)
     # In the field's own coordinates the paint fits; after that the box is made exact.
@@ -498,7 +498,7 @@ def write_toy_duck(path: Path) -> None:
 
 
 def write_ply(path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
-    """A binary little-endian PLY without normals."""
+    """Write a binary little-endian PLY without normals."""
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment made by scripts/make_assets.py\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
@@ -521,7 +521,7 @@ PAPER = {
 
 
 def write_lanterns(path: Path) -> None:
-    """110 octahedra that shine, 880 triangles, hung over a square about the origin: an OBJ and its MTL.
+    """Write an OBJ and its MTL: 110 emissive octahedra, 880 triangles, hung over a square about the origin.
 
     Sizes and radiances vary, each by a factor of several, so that the brightest have a hundred times the power
     of the faintest.
@@ -553,7 +553,7 @@ def write_lanterns(path: Path) -> None:
 
 
 def main() -> None:
-    """Writes every asset."""
+    """Write every asset."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=SCENES, help="folder to write to")
     folder = parser.parse_args().out

@@ -1,9 +1,9 @@
-"""Write the groups of settings in configs/ (film, integrator, sampler, render) from what their kinds declare.
+"""Write the config groups in configs/ (film, integrator, sampler, render) from the parameters that their types declare.
 
     python scripts/make_configs.py            # writes configs/*/*.yaml, and removes groups' files of kinds that are gone
     python scripts/make_configs.py --check    # exit code 1 where a file is not what would be written
 
-``default.yaml`` of a group has the keys of all its types, and a file of a type has its own. A null leaves the scene its wish.
+``default.yaml`` of a group has the keys of all its types, the file of a type has its own keys. null keeps the scene's value.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torchpt.scene.settings import BLOCKS, TYPED_BLOCKS, UNTYPED_BLOCKS
 from torchpt.spec import Choice, Spec, parameters_of, unsupported
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-#: What the command on a file's first line sets, where it is not the first key with a default.
+#: Key that the example command in a file's first line sets, where it is not the first key with a default.
 EXAMPLES = {
     "film": {"width": "512", "height": "512", "aovs": "[albedo,normal]"},
     "render": {"spp": "256", "seed": "1", "preview": "preview.png"},
@@ -26,19 +26,19 @@ EXAMPLES = {
 
 
 def accepted(spec: Spec) -> str:
-    """The words that a parameter takes, where they are few."""
+    """Return the words that a parameter accepts, if they are few."""
     return ", ".join(spec.names) if isinstance(spec, Choice) else spec.words
 
 
 def comment(spec: Spec, owners: Iterable[str] = ()) -> str:
-    """What a parameter is, and which types have it where not all do."""
+    """Describe a parameter, and name the types that have it if not all do."""
     words, of = accepted(spec), ", ".join(owners)
     text = f"{spec.doc} ({words})" if words else spec.doc
     return (f"of {of}: {text}" if of else text).replace("`", "")
 
 
 def first_line(group: str, kind: str | None, specs: Mapping[str, Spec]) -> str:
-    """The command that a file opens with."""
+    """Return the example command in the first line of a file."""
     chosen = {key: spec.default for key, spec in specs.items() if spec.default is not None}
     example = EXAMPLES.get(group) or {key: str(value).lower() for key, value in list(chosen.items())[:1]}
     words = [f"{group}={kind}"] if kind else [f"{group}.type={TYPED_BLOCKS[group][1]}"] if group in TYPED_BLOCKS else []
@@ -47,13 +47,13 @@ def first_line(group: str, kind: str | None, specs: Mapping[str, Spec]) -> str:
 
 
 def summary(kind: Any) -> str:
-    """The first sentence about a kind."""
+    """Return the first sentence of a type's docstring."""
     text = " ".join((kind.__doc__ or "").strip().split("\n\n")[0].split())
     return text.removesuffix(".").replace("`", "")
 
 
 def every(table: Mapping[str, Any]) -> dict[str, tuple[Spec, tuple[str, ...]]]:
-    """All parameters of a table's kinds, each with the kinds that have it: none where all do."""
+    """Return all parameters of a table's types, each with the types that have it; an empty list if all do."""
     found: dict[str, tuple[Spec, tuple[str, ...]]] = {}
     for name in table:
         for key, spec in parameters_of(table[name]).items():
@@ -66,7 +66,7 @@ Rows = list[tuple[str, str, str]]
 
 
 def rows_of(table: Mapping[str, Any], kind: str | None) -> Rows:
-    """Lines ``key, value, comment`` of a thing with a type: of one type, or of all."""
+    """Return lines ``key, value, comment`` of a block with types, for one type or for all."""
     if kind is not None:
         own = [(key, "null", comment(spec)) for key, spec in parameters_of(table[kind]).items()]
         return [("type", kind, summary(table[kind])), *own]
@@ -75,26 +75,26 @@ def rows_of(table: Mapping[str, Any], kind: str | None) -> Rows:
 
 
 def block(rows: Rows, indent: str = "") -> str:
-    """Lines with their comments in a column."""
+    """Format lines with their comments aligned in a column."""
     wide = max(len(f"{key}: {value}".rstrip()) for key, value, _ in rows)
     lines = [(f"{key}: {value}".rstrip(), says) for key, value, says in rows]
     return "".join(f"{indent}{line:{wide}}{f'  # {says}' if says else ''}".rstrip() + "\n" for line, says in lines)
 
 
 def later(group: str) -> Rows:
-    """Keys that are known and not built."""
+    """Return the keys that are reserved but not implemented."""
     return [(key, "null", "not built yet") for key in unsupported.KEYS.get(group, {})]
 
 
 def typed(group: str, kind: str | None) -> str:
-    """The file of a type, or of all types of a group."""
+    """Return the file of a type, or of all types of a group."""
     table, default = TYPED_BLOCKS[group]
     head = first_line(group, kind, parameters_of(table[kind or default]))
     return head + block(rows_of(table, kind) + later(group))
 
 
 def plain(group: str, record: Any) -> str:
-    """The file of a group without types."""
+    """Return the file of a group without types."""
     specs = parameters_of(record)
     text = first_line(group, None, specs)
     rows: Rows = []
@@ -108,7 +108,7 @@ def plain(group: str, record: Any) -> str:
 
 
 def written() -> dict[str, str]:
-    """The text of each file by its path below configs/."""
+    """Return the text of each file by its path below configs/."""
     files = {f"{group}/default.yaml": plain(group, record) for group, record in UNTYPED_BLOCKS.items()}
     for group in BLOCKS:
         if group in TYPED_BLOCKS:
@@ -119,7 +119,7 @@ def written() -> dict[str, str]:
 
 
 def main() -> int:
-    """Write, or check."""
+    """Write the files, or check them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing")
     check = parser.parse_args().check

@@ -1,4 +1,4 @@
-"""The convergence pictures of the docs: what samplers and strategies do at equal numbers of samples.
+"""Make the convergence pictures of the docs, which compare samplers and strategies at equal numbers of samples.
 
 python scripts/make_convergence.py [--out docs/images] [--only samplers points veach blue_noise]
 """
@@ -38,7 +38,7 @@ SHADOWS: dict[str, Any] = {
 
 
 def beside(pictures: list[Tensor], magnify: int = 1, gap: int = 4) -> Tensor:
-    """Display values ``(H, W, 3)`` of linear pictures in a row, white between them; each pixel ``magnify`` wide."""
+    """Place pictures in a row: display values ``(H, W, 3)``, white between them; each pixel ``magnify`` wide."""
     shown = [display(p).repeat_interleave(magnify, 0).repeat_interleave(magnify, 1) for p in pictures]
     between = torch.ones(shown[0].shape[0], gap, 3)
     row = [part for picture in shown for part in (picture, between)]
@@ -46,13 +46,13 @@ def beside(pictures: list[Tensor], magnify: int = 1, gap: int = 4) -> Tensor:
 
 
 def save(out: Path, name: str, picture: Tensor) -> None:
-    """Write values that are encoded already."""
+    """Write display values (already encoded)."""
     torchpt.write_image(out / name, picture, gamma=1.0)
     print(f"{out / name}: {(out / name).stat().st_size / 1000:.0f} kB")
 
 
 def samplers(out: Path) -> None:
-    """Sobol' and independent points at 128 samples a pixel: part of a soft shadow."""
+    """Render part of a soft shadow with Sobol' and independent points at 128 samples a pixel."""
     scene = torchpt.load(SHADOWS, device="cpu")
     film = {"width": 320, "height": 320, "filter": "box", "crop": [130, 165, 110, 85]}
     pictures = [torchpt.render(scene, spp=128, film=film, sampler=kind) for kind in ("sobol", "independent")]
@@ -60,7 +60,7 @@ def samplers(out: Path) -> None:
 
 
 def blue_noise(out: Path) -> None:
-    """Sobol' points pixel by pixel and zsobol, one sample a pixel."""
+    """Render with sobol and zsobol at one sample a pixel."""
     scene = torchpt.load(SHADOWS, device="cpu")
     film = {"width": 256, "height": 256, "filter": "box", "crop": [10, 60, 200, 150]}
     keys = {"film": film, "integrator": "direct", "spp": 1}
@@ -72,7 +72,7 @@ def blue_noise(out: Path) -> None:
 
 
 def veach(out: Path) -> None:
-    """Veach's plates by BSDF sampling, light sampling, and both."""
+    """Render Veach's plates with BSDF sampling, light sampling, and both."""
     scene = torchpt.load("veach_mis", device="cpu")
     pictures = [
         torchpt.render(scene, spp=32, film={"width": 240, "height": 160, "filter": "box"}, sampler="independent",
@@ -83,7 +83,7 @@ def veach(out: Path) -> None:
 
 
 def points(out: Path) -> None:
-    """Scatter plots of 128 points: random, stratified, Hammersley, Sobol'."""
+    """Draw scatter plots of 128 points: random, stratified, Hammersley, Sobol'."""
     import matplotlib  # pyright: ignore[reportMissingImports]  (extra `bench`)
 
     matplotlib.use("Agg")
@@ -110,7 +110,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
 
 
 def main() -> None:
-    """Make the pictures that were asked for, or all."""
+    """Make the chosen pictures, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent.parent / "docs" / "images")
     parser.add_argument("--only", nargs="+", choices=list(PICTURES), default=list(PICTURES))

@@ -1,4 +1,4 @@
-"""Make the references of the tests with Mitsuba 3: means of independent seeds, and the variance of each mean.
+"""Render the reference pictures of the tests with Mitsuba 3: means over independent seeds, and the variance of each mean.
 
     python scripts/make_references.py [NAME ...]
 
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def reference(mitsuba: Any, name: str, seeds: int, spp: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean ``(H, W, 3)`` over ``seeds`` pictures and the variance of that mean."""
+    """Render ``seeds`` pictures; return their mean ``(H, W, 3)`` and the variance of that mean."""
     scene = torchpt.load(name, device="cpu") if name.startswith("cornell") else comparable(name)
     width, height, depth = SCENES[name]
     film = {"width": width, "height": height, "filter": "box"}

@@ -1,11 +1,11 @@
-"""Write the tables of the docs from what kinds declare, between ``<!-- generated: NAME -->`` and ``<!-- end -->``.
+"""Write the tables of the docs from declared parameters, between ``<!-- generated: NAME -->`` and ``<!-- end -->``.
 
     python scripts/make_tables.py            # writes pages of docs/
     python scripts/make_tables.py --check    # exit code 1 where a page is not what would be written
 
-A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), ``common.lights``: what all kinds
-of it have, or ``summary.lights``: a row a kind. ``bounds`` is the table of :mod:`bounds`, ``arguments`` that of ``render``'s,
-``help`` and ``help.render`` what the command line says of itself, ``public.cameras`` the names of ``torchpt.cameras``.
+A NAME is a table of types (``lights``, ``materials``, ...), one type of it (``lights.spot``), ``common.lights`` (the parameters
+of all its types), or ``summary.lights`` (a row for each type). ``bounds`` is the table of :mod:`bounds`, ``arguments`` that of
+``render``'s arguments, ``help`` and ``help.render`` are help texts, ``public.cameras`` lists the names of ``torchpt.cameras``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from torchpt.spec.arguments import arguments_of
 
 DOCS = Path(__file__).parents[1] / "docs"
 MARKED = re.compile(r"(<!-- generated: ([\w.]+) -->\n).*?(<!-- end -->)", re.DOTALL)
-#: NAME -> where the table of kinds is.
+#: NAME -> module and attribute of the table of types.
 TABLES = {
     "materials": ("torchpt.physics.bsdfs", "KINDS"),
     "lights": ("torchpt.physics.lights", "KINDS"),
@@ -44,20 +44,20 @@ TABLES = {
 
 @cache
 def kinds(name: str) -> Mapping[str, Any]:
-    """A table of kinds."""
+    """Return the classes of a table by name."""
     module, attribute = TABLES[name]
     return getattr(import_module(module), attribute)
 
 
 def common(table: Mapping[str, Any]) -> dict[str, Spec]:
-    """What the base of a table's kinds declares for all of them."""
+    """Return the parameters that the base class of a table declares for all types."""
     every = [table[name] for name in table]
     roots = [base for base in every[0].__mro__ if all(issubclass(kind, base) for kind in every)]
     return parameters_of(roots[0]) if len(every) > 1 else {}
 
 
 def shown(value: Any) -> str:
-    """A default as one would write it."""
+    """Format a default value as a user would write it."""
     if value is REQUIRED:
         return "required"
     if value is None:
@@ -72,7 +72,7 @@ def shown(value: Any) -> str:
 
 
 def accepted(spec: Spec) -> str:
-    """What a parameter accepts, in few words."""
+    """Describe in few words what a parameter accepts."""
     if isinstance(spec, Index):
         words = "an index, or a medium's name"
     elif isinstance(spec, Color | Scalar) and not spec.words:
@@ -87,12 +87,12 @@ def accepted(spec: Spec) -> str:
     return words + (", or a texture" if spec.texture else "")
 
 
-#: Characters of a cell that lists what is accepted.
+#: Largest width of a cell that lists the accepted values, in characters.
 LONGEST = 110
 
 
 def row(key: str, spec: Spec) -> str:
-    """One parameter."""
+    """Return the table row of a parameter."""
     cells = (f"`{key}`", shown(spec.default), accepted(spec), spec.doc)
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
@@ -101,12 +101,12 @@ HEAD = "| key | default | accepted | what it is |\n|---|---|---|---|\n"
 
 
 def rows(specs: Mapping[str, Spec]) -> str:
-    """Parameters as a table."""
+    """Return parameters as a table."""
     return HEAD + "".join(row(key, spec) + "\n" for key, spec in specs.items())
 
 
 def arguments(form: Any) -> str:
-    """Keyword arguments as a table: what they are by default in Python, and what None stands for."""
+    """Return keyword arguments as a table: their Python defaults, and the meaning of None."""
     text = "| argument | what it is | accepted | default |\n|---|---|---|---|\n"
     for name, item in arguments_of(form).items():
         default = item.stands_for.replace("None", "`None`") or f"`{item.default}`"
@@ -115,12 +115,12 @@ def arguments(form: Any) -> str:
 
 
 def about(kind: Any) -> str:
-    """The first paragraph of a kind's docstring, as Markdown."""
+    """Return the first paragraph of a type's docstring, as Markdown."""
     return " ".join((kind.__doc__ or "").strip().split("\n\n")[0].split()).replace("``", "`")
 
 
 def summary(table: Mapping[str, Any]) -> str:
-    """A row a kind: its keys with their defaults."""
+    """Return a table with a row for each type: its keys with their defaults."""
     shared: dict[str, Spec] = common(table)
     lines: list[tuple[str, str, str]] = []
     for name in table:
@@ -138,14 +138,14 @@ def _plain(spec: Spec) -> bool:
 
 
 def said(command: str) -> str:
-    """The help of a command, or of ``torchpt`` itself, as a block."""
+    """Return the help of a command, or of ``torchpt`` itself, as a code block."""
     from torchpt.cli.main import help_of
 
     return f"```text\n{help_of(command).rstrip()}\n```\n"
 
 
 def public(module: str) -> str:
-    """The names that a public module exports, with the first lines of their docstrings."""
+    """List the names that a public module exports, with the first lines of their docstrings."""
     room = import_module(f"torchpt.{module}")
     lines = []
     for name in room.__all__:
@@ -158,7 +158,7 @@ def public(module: str) -> str:
 
 
 def written(name: str) -> str:
-    """What stands between the marks of NAME."""
+    """Return the generated text for NAME."""
     first, _, second = name.partition(".")
     if name == "bounds":
         return bounds.table()
@@ -183,12 +183,12 @@ def written(name: str) -> str:
 
 
 def page(text: str, make: Callable[[str], str] = written) -> str:
-    """A page with its tables as they should be."""
+    """Return a page with its tables up to date."""
     return MARKED.sub(lambda match: match[1] + make(match[2]) + match[3], text)
 
 
 def main() -> int:
-    """Write, or check."""
+    """Write the pages, or check them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing")
     check = parser.parse_args().check

@@ -1,9 +1,9 @@
-"""Makes the textures in `scenes/` and the mesh that wears one: `python scripts/make_textures.py` writes them again.
+"""Make the textures in `scenes/` and a textured mesh: `python scripts/make_textures.py` writes them again.
 
 - `bricks.png`, `bricks_normal.png`: a brick wall's colours and normals, 4 bricks by 8 courses, tiling.
 - `dents_normal.png`: normals of a hammered sheet, tiling.
 - `weave.png`: heights of a plain weave in grey, tiling.
-- `leaf.png`: a leaf in colour on nothing (alpha).
+- `leaf.png`: a coloured leaf on a transparent background.
 - `sky.exr`: an evening sky with a low sun over brown ground, an environment map of half floats.
 - `cushion.ply`: a square cushion of half-width 1 with texture coordinates.
 """
@@ -22,14 +22,14 @@ Grid = NDArray[np.float64]
 
 
 def _pixels(size: int) -> tuple[Grid, Grid]:
-    """Texture coordinates of texel centres, rows first."""
+    """Return texture coordinates of texel centres, rows first."""
     centres = (np.arange(size) + 0.5) / size
     v, u = np.meshgrid(centres, centres, indexing="ij")
     return u, v
 
 
 def _noise(size: int, cells: int, seed: int) -> Grid:
-    """Smooth tiling noise in 0..1: random values on a lattice, joined by cosines."""
+    """Return smooth tiling noise in 0..1: random values on a lattice, interpolated with cosines."""
     lattice = np.random.default_rng(seed).random((cells, cells))
     u, v = _pixels(size)
     x, y = u * cells, v * cells
@@ -40,7 +40,7 @@ def _noise(size: int, cells: int, seed: int) -> Grid:
 
 
 def _normals(height: Grid, steep: float) -> NDArray[np.uint8]:
-    """Normals of tiling heights as 8-bit colours; ``steep`` scales the slope."""
+    """Convert tiling heights to normals as 8-bit colours; ``steep`` scales the slope."""
     du = (np.roll(height, -1, 1) - np.roll(height, 1, 1)) * 0.5 * steep
     dv = (np.roll(height, -1, 0) - np.roll(height, 1, 0)) * 0.5 * steep
     n = np.stack([-du, -dv, np.ones_like(du)], -1)
@@ -49,7 +49,7 @@ def _normals(height: Grid, steep: float) -> NDArray[np.uint8]:
 
 
 def bricks(size: int = 256) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Colours and normals of a wall."""
+    """Return colours and normals of a brick wall."""
     u, v = _pixels(size)
     course = np.floor(v * 8).astype(int)
     x = (u * 4 + 0.5 * (course % 2)) % 4
@@ -66,7 +66,7 @@ def bricks(size: int = 256) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 
 
 def dents(size: int = 128) -> NDArray[np.uint8]:
-    """Normals of round dents, as a hammer leaves them."""
+    """Return normals of round dents, like those of a hammer."""
     rng = np.random.default_rng(5)
     u, v = _pixels(size)
     height = np.zeros((size, size))
@@ -79,7 +79,7 @@ def dents(size: int = 128) -> NDArray[np.uint8]:
 
 
 def weave(size: int = 128, threads: int = 8) -> NDArray[np.uint8]:
-    """Heights of threads that go over and under each other."""
+    """Return heights of threads that go over and under each other."""
     u, v = _pixels(size)
     x, y = u * threads, v * threads
     over = np.where((np.floor(x) + np.floor(y)) % 2 == 0, 1.0, -1.0)
@@ -89,7 +89,7 @@ def weave(size: int = 128, threads: int = 8) -> NDArray[np.uint8]:
 
 
 def leaf(size: int = 256) -> NDArray[np.uint8]:
-    """A leaf upright in the middle: colour and alpha."""
+    """Return an upright leaf in the middle: colour and alpha."""
     u, v = _pixels(size)
     x, y = 2 * u - 1, 1 - v  # row 0 is the tip
     half = 0.62 * np.sin(np.pi * np.clip(y, 0, 1) ** 0.8) ** 0.9 * (1 - 0.05 * np.abs(np.sin(34 * y)))
@@ -105,7 +105,7 @@ def leaf(size: int = 256) -> NDArray[np.uint8]:
 
 
 def sky(height: int = 128) -> NDArray[np.float16]:
-    """An environment map: zenith at the top, rows at the poles and columns at half texels, as the format has them."""
+    """Return an environment map: zenith at the top, rows at the poles and columns at half texels, as the format defines."""
     width = 2 * height
     theta = np.linspace(0, np.pi, height)[:, None]
     phi = (np.arange(width) + 0.5)[None] * (2 * np.pi / width)
@@ -126,7 +126,7 @@ def sky(height: int = 128) -> NDArray[np.float16]:
 
 
 def write_exr(path: Path, texels: NDArray[np.float16]) -> None:
-    """Half floats, compressed without loss."""
+    """Write half floats, compressed without loss."""
     import OpenImageIO as oiio
 
     height, width, _ = texels.shape
@@ -139,7 +139,7 @@ def write_exr(path: Path, texels: NDArray[np.float16]) -> None:
 
 
 def write_cushion(path: Path, cells: int = 24) -> None:
-    """Two bulging squares that share their rim, with the same texture on both."""
+    """Write two bulging squares that share their rim, with the same texture on both."""
     side = np.linspace(-1, 1, cells + 1)
     y, x = np.meshgrid(side, side, indexing="ij")
     bulge = np.clip((1 - x**2) * (1 - y**2), 0, None) ** 0.45
@@ -163,7 +163,7 @@ def write_cushion(path: Path, cells: int = 24) -> None:
 
 
 def main() -> None:
-    """Write all of them."""
+    """Write all files."""
     colour, normals = bricks()
     for name, image in {
         "bricks": colour,

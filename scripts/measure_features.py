@@ -1,4 +1,4 @@
-"""What a feature costs where a scene has it, and where it does not: nodes of its files in kernels, rows, tables, time.
+"""Measure the cost of a feature in a scene with it and in one without: kernel nodes, rows, tables, time.
 
 Print a table in Markdown for ``docs/benchmarks/performance.md``: ``python scripts/measure_features.py``. A plain scene of three
 rectangles (``tests/references/features.py``) gets one feature at a time. Times are of one thread, the least of several renders.
@@ -20,7 +20,7 @@ REPEATS = 15
 
 
 def _counts(made: Kernels, feature: Feature | None) -> tuple[int, int, int, int]:
-    """All nodes, those of the feature's files, rows of a path, tables."""
+    """Return the numbers of nodes in all kernels, nodes from the feature's files, rows of a path, and tables."""
     programs = [kernel.program for kernel in made._made.values()]
     mine = () if feature is None else feature.files
     nodes = sum(program.nodes.get(file, 0) for program in programs for file in mine)
@@ -30,7 +30,7 @@ def _counts(made: Kernels, feature: Feature | None) -> tuple[int, int, int, int]
 
 
 def _time(scene: torchpt.Scene) -> float:
-    """Nanoseconds a camera sample."""
+    """Return nanoseconds per camera sample."""
     wish = settings(scene.description, {"render": {"spp": 64, "threads": 1, "compile": "on"}})
     best = float("inf")
     for _ in range(REPEATS):

@@ -1,10 +1,10 @@
-"""A torchpt scene as Mitsuba 3 sees it: the same description, so that numbers match. For references and benchmarks.
+"""Convert a torchpt scene to Mitsuba 3 such that both render the same picture. For references and benchmarks.
 
-Rough models are built with GGX, opaque materials as ``twosided``, meshes with torchpt's own shading normals. In Mitsuba light
-that passes an opacity or ``null`` counts as a bounce and here it does not: scenes with such need a large ``max_depth``.
+Rough models use GGX, opaque materials are ``twosided``, meshes have torchpt's own shading normals. Mitsuba counts light that
+passes an opacity or ``null`` as a bounce, torchpt does not: scenes with such surfaces need a large ``max_depth``.
 
-What Mitsuba cannot express is left out by :func:`comparable`, and by :func:`nearest` replaced in the description, which both
-then render.
+:func:`comparable` leaves out what Mitsuba cannot express; :func:`nearest` replaces it in the description, which both
+renderers then use.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ __all__ = [
     "replacements", "sensor",
 ]  # fmt: skip
 
-#: Models with the same parameters on both sides; those with microfacets become the smooth one where alpha is next to nothing.
+#: Models with the same parameters in both renderers; microfacet models become smooth below ``LEAST_ALPHA``.
 SHARED = ("diffuse", "conductor", "dielectric", "thindielectric", "plastic", "principled", "null")
 SMOOTH = {"roughconductor": "conductor", "roughdielectric": "dielectric", "roughplastic": "plastic"}
 #: Below this alpha torchpt's rough models are mirrors.
 LEAST_ALPHA = 1e-4
-#: Sides of the mesh that stands for a cone.
+#: Number of sides of the mesh that replaces a cone.
 SIDES = 128
-#: Reflectance at normal incidence up to which an index or a metal is found for it.
+#: Largest reflectance at normal incidence for which an index or a metal is computed.
 MOST_REFLECTANCE = 0.98
 
 
@@ -61,7 +61,7 @@ class NoCounterpartError(ValueError):
 
 
 def find_llvm() -> str | None:
-    """The LLVM library for ``llvm_ad_rgb``: ``$DRJIT_LIBLLVM_PATH``, else the system's newest, 16 or later."""
+    """Find the LLVM library for ``llvm_ad_rgb``: ``$DRJIT_LIBLLVM_PATH``, else the system's newest, 16 or later."""
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         return given
@@ -78,7 +78,7 @@ def find_llvm() -> str | None:
 
 
 def load_mitsuba(variant: str) -> Any:
-    """The module ``mitsuba`` under a variant such as ``scalar_rgb`` or ``llvm_ad_rgb``."""
+    """Import ``mitsuba`` and set its variant, such as ``scalar_rgb`` or ``llvm_ad_rgb``."""
     if variant.startswith("llvm"):
         library = find_llvm()
         if library is None:
@@ -91,13 +91,13 @@ def load_mitsuba(variant: str) -> Any:
 
 
 def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dict[str, Any]:
-    """Mitsuba's dict of a scene.
+    """Convert a scene to Mitsuba's dict.
 
     Args:
         mitsuba: the module, with its variant set.
-        scene: what.
+        scene: the scene to convert.
         settings: film size, filter and integrator; the sampler is ``independent``.
-        folder: where meshes are put as PLY files.
+        folder: folder in which meshes are written as PLY files.
 
     Raises:
         NoCounterpartError: a material or camera that Mitsuba cannot express.
@@ -123,7 +123,7 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
 
 
 def _source(mitsuba: Any, scene: Scene, source: Source) -> dict[str, Any]:
-    """Mitsuba's dict of a light that is no surface."""
+    """Return Mitsuba's dict of a light that is not a surface."""
     if source.kind == "envmap":
         texels, scale, pose = (scene.params[f"{source.name}.{key}"] for key in ("texels", "scale", "to_world"))
         linear = pose[:3, :3].double().cpu().numpy()
@@ -150,10 +150,10 @@ def _source(mitsuba: Any, scene: Scene, source: Source) -> dict[str, Any]:
 
 
 def sensor(mitsuba: Any, camera: ParsedParams) -> dict[str, Any]:
-    """Mitsuba's dict of a camera, without film and sampler.
+    """Return Mitsuba's dict of a camera, without film and sampler.
 
     Raises:
-        NoCounterpartError: an aperture with blades, pixels that are no squares, a lens that is shifted.
+        NoCounterpartError: an aperture with blades, pixels that are not square, or a shifted lens.
     """
     given = {key: value for key, value in camera.values.items() if value is not None}
     pose = given["to_world"]
@@ -170,7 +170,7 @@ def sensor(mitsuba: Any, camera: ParsedParams) -> dict[str, Any]:
 
 
 def comparable(name: str) -> Scene:
-    """A scene of ``configs/scene`` without what Mitsuba cannot express, and without meshes that not every machine has."""
+    """Load a scene of ``configs/scene`` without what Mitsuba cannot express, and without optional meshes."""
     scene = torchpt.load(name, device="cpu")
     lacking = {shape for shape, value in scene.description.shapes.items() if len(value.values.get("path") or ()) > 1}
     for part in scene.built.parts:
@@ -186,9 +186,9 @@ def comparable(name: str) -> Scene:
 
 
 def nearest(scene: Scene | str) -> Scene:
-    """A scene, or one of ``configs/scene``, with the nearest that both can render for what Mitsuba cannot express.
+    """Load a scene with the nearest equivalent, for both renderers, of everything that Mitsuba cannot express.
 
-    Of :func:`replacements`; what is not among them still raises :class:`NoCounterpartError` in :func:`convert`.
+    :func:`replacements` lists them; anything else still raises :class:`NoCounterpartError` in :func:`convert`.
     """
     loaded = torchpt.load(scene, device="cpu") if isinstance(scene, str) else scene
     changed, said = _replaced(loaded.description)
@@ -196,7 +196,7 @@ def nearest(scene: Scene | str) -> Scene:
 
 
 def replacements(scene: Scene | str) -> dict[str, str]:
-    """Return what :func:`nearest` replaces, by dotted name: what stands there instead."""
+    """Return the replacements that :func:`nearest` makes, as text by dotted name."""
     return _replaced(read_description(scene) if isinstance(scene, str) else scene.description)[1]
 
 
@@ -212,23 +212,23 @@ def _replaced(description: Description) -> tuple[Description, dict[str, str]]:
 
 
 def lets_pass(scene: Scene) -> bool:
-    """Return True where light passes some surface as if it were not there: in Mitsuba that is a bounce."""
+    """Return True if light passes a surface of the scene undeflected, which Mitsuba counts as a bounce."""
     slots = [slot for part in scene.built.parts for slot in part.material.all()]
     return any(slot.model.name == "null" or slot.opacity != 1.0 for slot in slots)
 
 
 class _Nearest:
-    """Replaces what Mitsuba lacks.
+    """Replaces the parts of a description that Mitsuba lacks.
 
     Attributes:
-        said: what was replaced, by dotted name.
+        said: the replacements as text, by dotted name.
     """
 
     def __init__(self) -> None:
         self.said: dict[str, str] = {}
 
     def camera(self, camera: ParsedParams) -> ParsedParams:
-        """A round aperture for one of blades."""
+        """Replace an aperture with blades by a round one."""
         blades = camera.values.get("blades")
         if not blades:
             return camera
@@ -236,7 +236,7 @@ class _Nearest:
         return replace(camera, values={**camera.values, "blades": 0})
 
     def shape(self, name: str, shape: ParsedParams, shapes: Mapping[str, ParsedParams]) -> ParsedParams:
-        """A mesh for a cone, and for an instance."""
+        """Replace a cone, or an instance, by a mesh."""
         if shape.name == "cone":
             self.said[name] = f"cone is a mesh of {SIDES} sides with smooth normals"
             shape = _cone(shape)
@@ -251,7 +251,7 @@ class _Nearest:
         return shape
 
     def material(self, name: str, material: ParsedParams) -> ParsedParams:
-        """A material whose model Mitsuba has, of the same highlight and base."""
+        """Replace a material whose model Mitsuba lacks by one with the same highlight and base."""
         inner = {
             side: self.material(f"{name}.{side}", item) if isinstance(item, ParsedParams) else item
             for side, item in inner_of(material).items()
@@ -280,7 +280,7 @@ class _Nearest:
         return _with(plastic, **common, diffuse_reflectance=base, specular_reflectance=tint)
 
     def _metal(self, name: str, material: ParsedParams, reflectance: tuple[float, ...]) -> ParsedParams:
-        """The index 1 with the absorption that reflects as much at normal incidence."""
+        """Return index 1 and the absorption that gives the same reflectance at normal incidence."""
         if reflectance == (1.0, 1.0, 1.0):
             return material
         self.said[name] = "metal by its reflectance has eta 1 and k of the same reflectance"
@@ -289,12 +289,12 @@ class _Nearest:
 
 
 def _with(read_typed: ParsedParams, /, **values: Any) -> ParsedParams:
-    """The same with other values."""
+    """Return a copy with other values."""
     return replace(read_typed, values={**read_typed.values, **values})
 
 
 def _coat(name: str, material: ParsedParams) -> tuple[Any, float, float, Any] | None:
-    """Base, reflectance at normal incidence, alpha and tint of a coated model that Mitsuba lacks; of others None.
+    """Return base, normal reflectance, alpha and tint of a coated model that Mitsuba lacks; None for other models.
 
     ``(h . n)^n`` is as wide as GGX with ``alpha^2 = 2 / (n + 2)`` (Walter et al. 2007); the lobe about the mirror direction
     is as wide as one of four times its exponent about the half vector.
@@ -322,7 +322,7 @@ def _numbers(name: str, value: Any) -> tuple[float, ...]:
 
 
 def _cone(cone: ParsedParams) -> ParsedParams:
-    """A mesh in place of a cone: its side with the cone's own normals, and its base."""
+    """Return a mesh of a cone: its side with the cone's own normals, and its base."""
     angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
     none, one = np.zeros(SIDES), np.ones(SIDES)
     ring, tips = np.stack((np.cos(angles), np.sin(angles), none)), np.stack((none, none, one))
@@ -400,7 +400,7 @@ def _shape(mitsuba: Any, scene: Scene, part: Part, file: Path) -> dict[str, Any]
 
 
 def _kind(part: Part) -> str:
-    """Mitsuba's name of a part's kind."""
+    """Return Mitsuba's name for the shape type of a part."""
     name = part.kind if part.quadric is None else part.quadric.name
     if part.quadric is not None and name != "cylinder":
         raise NoCounterpartError(f"{part.name}: Mitsuba has no {name}")
@@ -408,7 +408,7 @@ def _kind(part: Part) -> str:
 
 
 def _bitmap(mitsuba: Any, scene: Scene, node: Node) -> dict[str, Any]:
-    """Mitsuba's dict of a texture."""
+    """Return Mitsuba's dict of a texture."""
     if not isinstance(node, ImageNode):
         raise NoCounterpartError("a texture that is no image is not converted")
     if node.filtered:
@@ -438,14 +438,14 @@ Opened = Callable[[Node], dict[str, Any]]
 
 
 def bsdf(slot: ResolvedMaterial, opened: Opened = _refuse) -> dict[str, Any]:
-    """Mitsuba's dict of a material.
+    """Return Mitsuba's dict of a material.
 
     Args:
         slot: the material.
-        opened: makes Mitsuba's textures.
+        opened: returns Mitsuba's texture for a texture.
 
     Raises:
-        NoCounterpartError: what Mitsuba lacks, by the material's name.
+        NoCounterpartError: a material that Mitsuba lacks; the message has its name.
     """
     opacity = _passing(slot)
     if slot.inner and (slot.model.transmits or any(_passing(inner) != 1.0 for inner in slot.inner)):
@@ -466,14 +466,14 @@ def bsdf(slot: ResolvedMaterial, opened: Opened = _refuse) -> dict[str, Any]:
 
 
 def _value(value: Any, opened: Opened) -> Any:
-    """A parameter as Mitsuba's dict has it."""
+    """Convert a parameter to a value for Mitsuba's dict."""
     if isinstance(value, Node):
         return opened(value)
     return _rgb(value) if isinstance(value, tuple) else value
 
 
 def _passing(slot: ResolvedMaterial) -> float | Node:
-    """Opacity of a material itself."""
+    """Return the opacity of a material itself."""
     if isinstance(slot.opacity, Node):
         if slot.alpha_cutoff is not None:
             raise NoCounterpartError(f"{slot.name}: a cutoff of an opacity texture has no counterpart in Mitsuba")
@@ -482,7 +482,7 @@ def _passing(slot: ResolvedMaterial) -> float | Node:
 
 
 def _bare(slot: ResolvedMaterial, opened: Opened) -> dict[str, Any]:
-    """A material as seen from its front, with nothing around it."""
+    """Return Mitsuba's dict of a material seen from its front, without wrappers."""
     model, values = slot.model, dict(slot.values)
     if slot.inner:
         a, b = (_bare(inner, opened) for inner in slot.inner)
@@ -514,9 +514,9 @@ def _bare(slot: ResolvedMaterial, opened: Opened) -> dict[str, Any]:
 
 
 def _write_part(file: Path, scene: Scene, part: Part) -> None:
-    """A mesh in the world, with the normals that are interpolated here; corners that are alike are one vertex.
+    """Write a mesh in world space with torchpt's interpolated normals; equal corners become one vertex.
 
-    Mitsuba takes an edge whose triangles share no vertices for two borders, and counts its silhouette twice.
+    Mitsuba takes an edge whose triangles do not share vertices for two borders, and counts its silhouette twice.
     """
     own = Space(torch.zeros(3, dtype=torch.float64), 1.0)
     corners = corners_of(part, scene.params, own, torch.float64)
@@ -543,7 +543,7 @@ def _write_part(file: Path, scene: Scene, part: Part) -> None:
 
 
 def write_ply(file: Path, vertices: np.ndarray, faces: np.ndarray, names: Sequence[str] = "xyz") -> None:
-    """A binary PLY of vertices ``(V, C)`` with properties ``names`` and triangles ``(F, 3)``."""
+    """Write a binary PLY of vertices ``(V, C)`` with properties ``names`` and triangles ``(F, 3)``."""
     properties = "".join(f"property float {name}\n" for name in names)
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}"

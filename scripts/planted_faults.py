@@ -1,20 +1,20 @@
-"""Plants sixty faults in copies of the package, one at a time, and tells which test catches each.
+"""Plant sixty faults in copies of the package, one at a time, and report which test catches each.
 
     python scripts/planted_faults.py --check                        # all faults still apply; a few seconds
     python scripts/planted_faults.py --list                         # what they are
     python scripts/planted_faults.py --jobs 2 --out report.json     # all of them; up to two minutes each
     python scripts/planted_faults.py --only obj_upside_down --limit 300
 
-Each copy runs the tests of ``make test`` (not slow, not long, not gpu): first those of the fault's own room, then those that
-concern it too, then all others, until the first failure or for ``--limit`` seconds. A test that fails is run once more
-without the fault: where it fails there too it says nothing, and the copy goes on without it. Verdicts:
+Each copy runs the tests of ``make test`` (not slow, not long, not gpu): first the tests of the fault's own room, then tests of
+related rooms, then all others, until the first failure or for ``--limit`` seconds. A failing test is run once more
+without the fault: if it fails there too it is ignored, and the copy continues without it. Verdicts:
 
     caught     a test failed, or its process died, because of the fault
     survived   all tests passed
     time       nothing failed within the limit
-    broken     the tests cannot even be collected: the fault is not one that a test can tell
+    broken     the tests cannot be collected, so no test can find the fault
 
-Exit code 0 where at least ``--least`` faults (57; of fewer chosen ones all) were caught. The faults stand in
+Exit code 0 if at least ``--least`` faults (57, or all if fewer are chosen) were caught. The faults are in
 ``planted_faults_table.py``.
 """
 
@@ -44,13 +44,13 @@ from planted_faults_table import FAULTS, Fault
 
 TREE = Path(__file__).resolve().parents[1]
 MARKERS = "not slow and not long and not gpu"
-#: Faults of the whole table that the tests are to catch.
+#: Number of faults of the table that the tests must catch.
 LEAST = 57
-#: In a copy its anchor is gone: that test says nothing of what users see.
+#: Test of the table itself: it fails in every copy, as the anchor of the fault is gone.
 IGNORED = "test_planted_faults.py"
-#: What tests need of a tree that is no git checkout.
+#: Folders copied from a tree that is not a git checkout.
 COPIED = ("torchpt", "tests", "configs", "scenes", "scripts", "docs", ".ci", ".github")
-#: Notes the test that runs, and the first that fails, beside the copy.
+#: Plugin that notes the running test, and the first failing one, beside the copy.
 PLUGIN = """
 import json, os
 
@@ -82,7 +82,7 @@ class MissingError(Exception):
 
 @dataclass(frozen=True)
 class Site:
-    """Where a fault goes: a file, the expression in it, and the statement of the module which that is part of."""
+    """The target of a fault: a file, the expression in it, and the top-level statement that contains it."""
 
     path: Path
     source: str
@@ -93,7 +93,7 @@ class Site:
         """Return the source with another expression in place of this one; all else stays as it is.
 
         Raises:
-            MissingError: the result is not the tree that is meant.
+            MissingError: the result differs from the intended syntax tree.
         """
         lines = self.source.encode().splitlines(keepends=True)
         row, column, last_row, last_column = _extent(self.node)
@@ -109,7 +109,7 @@ class Site:
 
 
 class _Replaced(ast.NodeTransformer):
-    """A tree with another expression in the place of one."""
+    """A node transformer that replaces one expression."""
 
     def __init__(self, node: ast.expr, after: str) -> None:
         self._kind, self._at, self._after = type(node), _extent(node), ast.parse(after, mode="eval").body
@@ -120,18 +120,18 @@ class _Replaced(ast.NodeTransformer):
 
 
 def _first_line(node: ast.stmt) -> int:
-    """Of a statement with its decorators."""
+    """Return the first line of a statement with its decorators."""
     return min([node.lineno, *(decorator.lineno for decorator in getattr(node, "decorator_list", ()))])
 
 
 def _extent(node: ast.expr) -> tuple[int, int, int, int]:
-    """First line and column, last line and column, these in bytes of UTF-8."""
+    """Return first line and column, last line and column; columns in bytes of UTF-8."""
     assert node.end_lineno is not None and node.end_col_offset is not None
     return node.lineno, node.col_offset, node.end_lineno, node.end_col_offset
 
 
 class Tree:
-    """The package of a checkout, read once."""
+    """The parsed package of a checkout."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -139,10 +139,10 @@ class Tree:
         self._scopes: dict[Path, dict[str, list[tuple[ast.AST, ast.stmt]]]] = {}
 
     def site(self, fault: Fault) -> Site:
-        """Find where a fault goes, wherever its function has moved to.
+        """Find the target of a fault, whichever file its function is in.
 
         Raises:
-            MissingError: there is no such function with that expression, or more than one.
+            MissingError: no function with that name and expression, or more than one.
         """
         wanted = ast.dump(ast.parse(fault.before, mode="eval").body)
         last, functions, found = fault.function.rpartition(".")[2], 0, []
@@ -181,7 +181,7 @@ def _scopes_of(node: ast.AST, prefix: str = "") -> Iterator[tuple[str, ast.AST]]
 
 
 def problems(tree: Path, faults: Sequence[Fault] = FAULTS) -> list[str]:
-    """Return what is wrong with faults that do not apply to a tree; nothing where all do."""
+    """Return the reasons why faults do not apply to a tree; empty if all apply."""
     package, found = Tree(tree), []
     for fault in faults:
         try:
@@ -201,7 +201,7 @@ def problems(tree: Path, faults: Sequence[Fault] = FAULTS) -> list[str]:
 
 @dataclass
 class Result:
-    """What became of a fault."""
+    """The result of a fault."""
 
     name: str
     file: str
@@ -224,7 +224,7 @@ class Campaign:
     Args:
         tree: the checkout.
         scratch: folder for copies.
-        limit: seconds that the tests of a fault may take.
+        limit: time limit for the tests of a fault, in seconds.
     """
 
     def __init__(self, tree: Path, scratch: Path, limit: float) -> None:
@@ -262,7 +262,7 @@ class Campaign:
             _kill(process)
 
     def _stage(self, folder: Path, targets: list[str], result: Result) -> bool:
-        """Run some tests; returns whether there is nothing more to learn from them."""
+        """Run some tests; return True if their result is final."""
         left = self.limit - result.seconds
         begun = time.monotonic()
         code, note = self._pytest(folder, targets, result.invalid, left)
@@ -282,7 +282,7 @@ class Campaign:
         return True
 
     def _is_valid(self, test: str) -> bool:
-        """Whether a test passes without any fault."""
+        """Return True if a test passes without any fault."""
         with self._lock:
             known = self._valid.get(test)
         if known is None:
@@ -295,7 +295,7 @@ class Campaign:
     def _pytest(
         self, folder: Path, targets: Sequence[str], without: Sequence[str], limit: float
     ) -> tuple[int | None, dict[str, str]]:
-        """Exit code of pytest, None where time was up, and what was noted last."""
+        """Run pytest; return its exit code (None after a timeout) and the last noted test."""
         with tempfile.NamedTemporaryFile("r", dir=self.scratch, suffix=".json") as note:
             environment = {
                 **os.environ,
@@ -327,9 +327,9 @@ class Campaign:
         return code, json.loads(text) if text else {}
 
     def _stages(self, fault: Fault, file: Path) -> list[list[list[str]]]:
-        """Files of tests: of the fault's room, of those that concern it too, and all others.
+        """Return groups of test files: of the fault's room, of related rooms, and all others.
 
-        In each, those come first that are named after the module ``file``, then those that import it.
+        In each group, tests named after the module ``file`` come first, then tests that import it.
         """
         own, *others = fault.tests.split()
         *_, stem = module = file.with_suffix("").parts
@@ -347,14 +347,14 @@ class Campaign:
 
 
 def _apart(files: Sequence[Path]) -> list[list[str]]:
-    """Files for each process: those of ranks fork, and so want one in which nothing else has worked before."""
+    """Split test files among processes: files that fork ranks get a process of their own."""
     ranks = [file.as_posix() for file in files if file.parent.name == "ranks"]
     others = [file.as_posix() for file in files if file.parent.name != "ranks"]
     return [names for names in (ranks, others) if names]
 
 
 def _copy(tree: Path, to: Path) -> None:
-    """Copy what git tracks or would track of a checkout, as the tests may need any of it."""
+    """Copy all files of a checkout that git tracks or would track."""
     listed = subprocess.run(
         ["git", "-C", str(tree), "ls-files", "-coz", "--exclude-standard"], capture_output=True, check=False
     )
@@ -370,7 +370,7 @@ def _copy(tree: Path, to: Path) -> None:
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End a process and all that it started."""
+    """End a process and all its children."""
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
@@ -380,7 +380,7 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def run(tree: Path, faults: Sequence[Fault], jobs: int, limit: float, out: Path | None) -> list[Result]:
-    """Take all faults, a line each as it is known, and write the report as it grows."""
+    """Run all faults, print a line for each as its result is known, and update the report."""
     results: dict[str, Result] = {}
     with tempfile.TemporaryDirectory(prefix="planted-faults-") as folder:
         campaign = Campaign(tree, Path(folder), limit)
@@ -400,7 +400,7 @@ def run(tree: Path, faults: Sequence[Fault], jobs: int, limit: float, out: Path 
 
 
 def report(tree: Path, limit: float, results: Sequence[Result]) -> dict[str, object]:
-    """Return what ``--out`` gets."""
+    """Return the report that ``--out`` writes."""
     commit = subprocess.run(["git", "-C", str(tree), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
     return {
         "commit": commit.stdout.strip(),
@@ -412,7 +412,7 @@ def report(tree: Path, limit: float, results: Sequence[Result]) -> dict[str, obj
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
+    """Run the command and return its exit code."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--list", action="store_true", help="print the faults and what a user would notice of them")
     parser.add_argument("--check", action="store_true", help="see that all faults apply, and run no test")

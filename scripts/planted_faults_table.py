@@ -591,7 +591,7 @@ FAULTS = (
         "debug_other_pixel",
         "cli/debug.py",
         "cli",
-        "Wish.read",
+        "PathRequest.read",
         "(int(pixel[1]), int(pixel[2]))",
         "(int(pixel[2]), int(pixel[1]))",
         "swapped arguments: `debug.pixel=[x,y]` explains the pixel (y, x)",

@@ -152,7 +152,7 @@ def run(words: list[str], _: Interrupt) -> int:
 #: In torchpt/cli/main.py: what stands there, and what does with the row.
 ROW = {
     "COMMANDS = (\n": 'COMMANDS = (\n    Command("shapes", "cornell_box", "names of shapes", shapes.HELP, shapes.run),\n',
-    "from torchpt.cli import collector,": "from torchpt.cli import shapes\nfrom torchpt.cli import collector,",
+    "from torchpt.cli import compare,": "from torchpt.cli import shapes\nfrom torchpt.cli import compare,",
 }
 
 

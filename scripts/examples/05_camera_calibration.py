@@ -26,7 +26,7 @@ AHEAD = 3.0
 
 
 def box(size: list[float], angle: float, place: list[float], colour: list[float]) -> dict:
-    """A box of half-widths ``size``, turned about y."""
+    """Return a box of half-widths ``size``, turned about y."""
     transform = [{"scale": size}, {"rotate": {"axis": [0, 1, 0], "angle": angle}}, {"translate": place}]
     return {"type": "cube", "transform": transform, "material": {"type": "diffuse", "reflectance": colour}}
 

@@ -67,7 +67,7 @@ class Learned(torchpt.Bsdf):
 
 
 def lit(material: dict, size: int, **models: torchpt.Bsdf) -> torchpt.Scene:
-    """A ball over a floor of the same material."""
+    """Return a ball over a floor of the same material."""
     flat = [{"scale": 6}, {"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"translate": [0, -1, 0]}]
     return torchpt.load(
         {

@@ -24,7 +24,7 @@ VALIDATION, BATCH, SPP = 32, 4, 8
 
 
 def room(size: int, index: int) -> dict:
-    """The description of a room with three boxes and two balls at random places, of random colours."""
+    """Return the description of a room with three boxes and two balls at random places, of random colours."""
     draw = Random(index)
 
     def paint() -> dict:

@@ -28,7 +28,7 @@ def arguments(about: str | None, steps: int, size: int, argv: Sequence[str] | No
 
 
 def pose(turn: Tensor, shift: Tensor) -> Tensor:
-    """A rigid motion ``(4, 4)``: a rotation by ``|turn|`` radians about the axis ``turn (3,)``, then a translation ``(3,)``.
+    """Return a rigid motion ``(4, 4)``: a rotation by ``|turn|`` radians about the axis ``turn (3,)``, then a translation ``(3,)``.
 
     The exponential of a skew matrix is a rotation whatever its three numbers are (Rodrigues), so Adam may move them
     freely; sixteen free entries of a matrix would soon shear and stretch what they place.
@@ -41,7 +41,7 @@ def pose(turn: Tensor, shift: Tensor) -> Tensor:
 
 
 def turned_by(a: Tensor, b: Tensor) -> float:
-    """The angle between the rotations of two poses ``(4, 4)``, in degrees."""
+    """Return the angle between the rotations of two poses ``(4, 4)``, in degrees."""
     cosine = (torch.trace(a[:3, :3].detach().T @ b[:3, :3].detach()) - 1) / 2
     return float(torch.rad2deg(torch.arccos(cosine.double().clamp(-1, 1))))
 

@@ -6,7 +6,7 @@ import torch
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.physics.shapes.quadrics import quadrics_of, table_of
 
-#: How many of each kind packets are tried on: triangles, rectangles, disks, spheres.
+#: Numbers of primitives in the packets of the tests: triangles, rectangles, disks, spheres.
 SCENES = {
     "triangles": (20, 0, 0, 0),
     "rectangles": (0, 12, 0, 0),
@@ -20,25 +20,25 @@ SCENES = {
 
 
 def geometry(p0, p1, p2, counts):
-    """A Geometry from (P, 3) arrays."""
+    """Build a `Geometry` from ``(P, 3)`` arrays."""
     a, b, c = (torch.tensor(np.asarray(p, np.float32).reshape(-1, 3).T.copy()) for p in (p0, p1, p2))
     n = [*counts, 0][:5]
     return Geometry(a, b, c, (n[0], n[1], n[2], n[3], n[4]))
 
 
 def quadric_table(kinds, frames):
-    """Quadrics of these kinds under maps ``(12, Q)`` float64, as the search sees them."""
+    """Return quadrics of these types with transforms ``(12, Q)`` float64, in the form that the search takes."""
     return table_of(quadrics_of(kinds, [False] * len(kinds), frames, torch.float64), frames)
 
 
 def triangles(vertices, faces):
-    """A Geometry of a mesh."""
+    """Build the `Geometry` of a mesh."""
     v, f = np.asarray(vertices, np.float32), np.asarray(faces)
     return geometry(v[f[:, 0]], v[f[:, 1]], v[f[:, 2]], (len(f), 0, 0, 0))
 
 
 def soup(seed, counts=(20, 8, 6, 6), spread=1.0, size=0.5):
-    """Random primitives of all kinds."""
+    """Return random primitives of all types."""
     rng = np.random.default_rng(seed)
     n = sum(counts)
     p0 = rng.uniform(-spread, spread, (n, 3))
@@ -51,7 +51,7 @@ def soup(seed, counts=(20, 8, 6, 6), spread=1.0, size=0.5):
 
 
 def rays(seed, n, spread=2.0):
-    """Random rays, not of unit length: o, d, t_max."""
+    """Return random rays o, d, t_max; directions are not unit vectors."""
     g = torch.Generator().manual_seed(seed)
     o = (torch.rand(3, n, generator=g) * 2 - 1) * spread
     d = torch.randn(3, n, generator=g)
@@ -59,7 +59,7 @@ def rays(seed, n, spread=2.0):
 
 
 def sphere_mesh(n, bumps=0.1, seed=0):
-    """A displaced, closed sphere with about 2 n^2 triangles: vertices, faces."""
+    """Return vertices and faces of a displaced, closed sphere with about 2 n^2 triangles."""
     rng = np.random.default_rng(seed)
     theta = np.linspace(0, np.pi, n + 1)[1:-1]
     phi = np.linspace(0, 2 * np.pi, 2 * n, endpoint=False)
@@ -79,7 +79,7 @@ def sphere_mesh(n, bumps=0.1, seed=0):
 
 
 def search(g, o, d, t_max):
-    """Every ray against every primitive in float64: t, prim, margin (how far the decision was from an edge)."""
+    """Test every ray against every primitive in float64; return t, prim and margin (how far the decision was from an edge)."""
     p0, p1, p2 = (p.double().numpy() for p in (g.p0, g.p1, g.p2))
     o, d, t_max = o.double().numpy(), d.double().numpy(), t_max.double().numpy()
     n_tri, n_rect, n_disk, *_ = g.counts

@@ -1,4 +1,4 @@
-"""The unit cube as a part of a mesh."""
+"""The triangles of the unit cube."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["unit_cube"]
 
 
 def unit_cube() -> MeshPart:
-    """The triangles of the shape ``cube``."""
+    """Return the triangles of the shape ``cube``."""
     cube = KINDS["cube"].triangles({})
     assert cube is not None and cube.vertices is not None and cube.faces is not None
     return MeshPart("", cube.vertices, cube.faces, cube.normals, cube.uvs)

@@ -1,4 +1,4 @@
-"""Damage from a seed: to bytes, and to documents of JSON and YAML."""
+"""Random damage, by seed, to bytes and to JSON and YAML documents."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ VALUES: list[Any] = [
 
 
 def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
-    """One kind of damage to bytes."""
+    """Damage bytes in one random way."""
     data, size = bytearray(whole), len(whole)
     kind = rng.integers(0, 6)
     if kind == 0:
@@ -57,7 +57,7 @@ def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
 
 
 def damaged_json(document: Any, rng: np.random.Generator) -> Any:
-    """A document with one value replaced, taken out or repeated."""
+    """Replace, remove or repeat one random value of a document."""
     document = json.loads(json.dumps(document))
     places: list[tuple[Any, Any]] = []
 

@@ -1,4 +1,4 @@
-"""A plain scene, and the same with one feature more: what a feature costs where it is, and where it is not."""
+"""A plain scene, and the same scene with one more feature, to compare their costs."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ PLAIN: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Feature:
-    """A feature of scenes.
+    """A feature that a scene may use.
 
     Attributes:
-        files: of the package that nothing else needs, relative to it.
-        add: puts it into a scene.
-        leaves: how the names of its tables begin.
-        rows: fields of a path's state that it brings.
-        module: what a scene without it does not import; None where modules of its kind are imported together.
+        files: files of the package that only this feature needs, relative to it.
+        add: function that adds the feature to a scene.
+        leaves: prefixes of the names of its tables.
+        rows: fields that it adds to the path state.
+        module: module that a scene without it does not import; None if such modules are always imported together.
     """
 
     files: tuple[str, ...]
@@ -167,7 +167,7 @@ FEATURES: dict[str, Feature] = {
 
 
 def with_feature(name: str | None) -> dict[str, Any]:
-    """The plain scene, with a feature where there is a name."""
+    """Return the plain scene, with a feature if a name is given."""
     scene = copy.deepcopy(PLAIN)
     if name is not None:
         FEATURES[name].add(scene)
@@ -175,9 +175,9 @@ def with_feature(name: str | None) -> dict[str, Any]:
 
 
 def kernels(described: Mapping[str, Any]) -> tuple[Kernels, torchpt.Scene]:
-    """A scene's kernels, all that a render of it asks for made."""
+    """Build and return all kernels that a render of a scene needs."""
     scene = torchpt.load(described, "cpu")
-    torchpt.render(scene, spp=8, compile="on", full=True)  # with the layers that its file asks for
+    torchpt.render(scene, spp=8, compile="on", full=True)  # with the layers of the scene file
     made = scene_cache(scene).kernels
     assert made is not None
     return made, scene

@@ -1,4 +1,4 @@
-"""Renders by waves and chunks of a few lanes, as they are where memory is short."""
+"""Force waves and chunks of a few lanes, as when memory is short."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["few_lanes"]
 
 @contextmanager
 def few_lanes(lanes: int | None) -> Iterator[None]:
-    """Context in which a wave of tensor operations, or a chunk of the compiled loop, has so many lanes at most."""
+    """Limit waves of tensor operations and chunks of the compiled loop to a few lanes inside the context."""
     with pytest.MonkeyPatch.context() as patched:
         if lanes is not None:
             for device in LANES:

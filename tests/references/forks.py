@@ -1,4 +1,4 @@
-"""Ranks as children of the process that tests: they start at once, with all that is imported and compiled."""
+"""Ranks as forked children of the test process: they start at once, with all modules imported and kernels compiled."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _context = multiprocessing.get_context("fork")
 
 
 def in_ranks(size: int, work: Callable[[Any], Any], folder: Path, timeout: float = 60.0) -> list[Any]:
-    """What ``work(group)`` returns, in plain values and arrays, on each of ``size`` ranks; an exception is returned too."""
+    """Run ``work(group)`` on each of ``size`` ranks; return the results (plain values and arrays) or exceptions."""
     place = f"file://{folder}/store_{size}_{len(list(folder.iterdir()))}"
 
     def child(rank: int, pipe: Connection) -> None:
@@ -56,7 +56,7 @@ def in_ranks(size: int, work: Callable[[Any], Any], folder: Path, timeout: float
         try:
             found.append(pipe.recv() if pipe.poll(PATIENCE) else TimeoutError("a rank does not end"))
         except EOFError:
-            found.append(None)  # it was killed
+            found.append(None)  # the child was killed
         if process.is_alive():
             process.join(5.0)
         if process.is_alive():
@@ -67,13 +67,13 @@ def in_ranks(size: int, work: Callable[[Any], Any], folder: Path, timeout: float
 
 @dataclass
 class Command:
-    """A command line that runs by ranks.
+    """A command line that runs on several ranks.
 
     Attributes:
         children: processes, by rank.
-        errors: what they write to stderr.
-        output: and to stdout.
-        store: by which they find each other.
+        errors: file of their stderr.
+        output: file of their stdout.
+        store: store through which they find each other.
     """
 
     children: list[Any]
@@ -82,7 +82,7 @@ class Command:
     store: Any
 
     def codes(self) -> list[int | None]:
-        """Exit codes, once all have ended; those that do not end are killed."""
+        """Wait for all ranks and return their exit codes; ranks that do not end are killed."""
         for process in self.children:
             process.join(PATIENCE)
             if process.is_alive():
@@ -91,7 +91,7 @@ class Command:
         return [process.exitcode for process in self.children]
 
     def lines(self) -> list[str]:
-        """What was said on stderr, but for notes that kernels compile, and what torch itself has to say."""
+        """Return the lines on stderr, without notes about compiled kernels and messages of torch itself."""
         every = self.errors.read_text().splitlines()
         own = [line for line in every if not re.match(r"\[Gloo\] |\[W\d+ .* \[c10d\] ", line)]
         return [line for line in own if "compiling the search kernels" not in line]
@@ -105,7 +105,7 @@ def command(
 
     number = len(list(folder.iterdir()))
     errors, output = folder / f"stderr_{number}", folder / f"stdout_{number}"
-    # As torchrun has it: the store is nobody's of the ranks.
+    # As with torchrun, no rank owns the store.
     store = dist.TCPStore("127.0.0.1", 0, None, True, wait_for_workers=False)  # pyright: ignore[reportPrivateImportUsage]
 
     def child(rank: int) -> None:

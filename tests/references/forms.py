@@ -1,4 +1,4 @@
-"""The same kernels on one lane at a time, and comparison by bits."""
+"""Kernels that take one lane at a time, and bitwise comparison of tensors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def one_lane() -> Target:
 
 
 def differing(a: Tensor, b: Tensor) -> Tensor:
-    """Return where two tensors of one shape differ in any bit; any NaN is as good as any other."""
+    """Return where two tensors of one shape differ in any bit; all NaNs count as equal."""
     assert a.shape == b.shape and a.dtype == b.dtype
     bits = _BITS[a.element_size()]
     return (a.contiguous().view(bits) != b.contiguous().view(bits)) & ~((a != a) & (b != b))

@@ -14,7 +14,7 @@ __all__ = ["gradient_of", "room"]
 
 
 def room(plate: dict[str, Any], shapes: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
-    """A plate of a material between two grey walls and a lamp."""
+    """Return a quad of a material between two grey walls and a lamp."""
     wall = {"type": "rectangle", "material": "grey"}
     return {
         "camera": {"origin": [0.1, 0.2, 2], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 40},
@@ -42,7 +42,7 @@ def room(plate: dict[str, Any], shapes: dict[str, Any] | None = None, **more: An
 
 
 def gradient_of(scene: torchpt.Scene, name: str, **wish: Any) -> Tensor:
-    """Of a weighted sum of the picture by a parameter, with fixed samples; float64."""
+    """Return the gradient of a weighted sum of the picture by a parameter, with fixed samples, in float64."""
     wish = {"spp": 4, "seed": 3, "seed_grad": 3, "threads": 1, **wish}
     leaf = scene.params[name].clone().requires_grad_()
     image = torchpt.render(scene, params={name: leaf}, **wish)

@@ -1,6 +1,6 @@
-"""Nine inverse problems with fixed starting points: what is to be found again from one picture of it.
+"""Nine inverse problems with fixed starting points: recover parameters of a scene from one picture.
 
-Each is a scene, the numbers that Adam moves, what parameters they come to, and how far off they are. Targets are
+Each has a scene, the numbers that Adam optimises, and functions from these to parameters and to their error. Targets are
 rendered from the true numbers with another seed and many samples.
 """
 
@@ -27,17 +27,17 @@ class Task:
     """An inverse problem.
 
     Attributes:
-        scene: of a description; ``$FILES`` in a path is the folder of :attr:`files`.
-        start: from the true scene to the numbers that Adam starts from.
-        true: to those that it is to find.
-        params: from the scene and the numbers to parameters of ``torchpt.render``.
-        rate: Adam's first step; it falls to a hundredth along a cosine.
-        steps: how many.
+        scene: function that returns a description; ``$FILES`` in a path is the folder of :attr:`files`.
+        start: returns the numbers that Adam starts from, given the true scene.
+        true: returns the true numbers, given the true scene.
+        params: returns parameters of ``torchpt.render``, given the scene and the numbers.
+        rate: Adam's initial learning rate; it falls to a hundredth along a cosine.
+        steps: number of steps.
         spp: samples a pixel of each picture and each gradient.
-        depth: of the paths.
-        bar: how many times smaller the error is to become.
-        weight: what errors are weighed with; None: all alike.
-        bounds: of the numbers, to which they are clamped after each step.
+        depth: largest path depth.
+        bar: factor by which the error must shrink.
+        weight: weights of the errors; None: equal weights.
+        bounds: range to which the numbers are clamped after each step.
         files: pictures ``(H, W, 3)`` by file name.
     """
 
@@ -55,7 +55,7 @@ class Task:
     files: Mapping[str, Callable[[], Tensor]] = field(default_factory=dict)
 
     def error(self, scene: Scene, numbers: Tensor) -> float:
-        """Root of the mean square of how far the numbers are off."""
+        """Return the root mean square of the errors of the numbers."""
         off = (numbers.detach() - self.true(scene)).double() ** 2
         if self.weight is None:
             return float(off.mean().sqrt())
@@ -64,12 +64,12 @@ class Task:
 
 
 def described(task: Task) -> Scene:
-    """The true scene of a task."""
+    """Return the true scene of a task."""
     return known.opened(task.scene, task.files, SIZE, task.depth)
 
 
 def plain(name: str, start: float, rate: float, **more: Any) -> dict[str, Any]:
-    """A parameter that is found as it is, from the same number everywhere."""
+    """Return fields of a task: a parameter is optimised directly, from one start value for all entries."""
     return {
         "start": lambda scene: torch.full_like(scene.params[name], start),
         "true": lambda scene: scene.params[name].clone(),
@@ -80,7 +80,7 @@ def plain(name: str, start: float, rate: float, **more: Any) -> dict[str, Any]:
 
 
 def shifted(name: str, axes: tuple[int, ...], start: tuple[float, ...], rate: float, **more: Any) -> dict[str, Any]:
-    """A pose that is found along some axes, from so far off."""
+    """Return fields of a task: the position of a pose is optimised along some axes, from a given offset."""
 
     def params(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
         base = scene.params[name]
@@ -107,7 +107,7 @@ def _as_albedos(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
 
 
 def _twisted(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
-    """The camera moved by three lengths and turned by three angles, about its own axes."""
+    """Return the parameter of a camera moved by three lengths and rotated by three angles, about its own axes."""
     x, y, z, a, b, c = numbers
     o = torch.zeros_like(x)
     rows = [torch.stack(row) for row in ((o, -c, b, x), (c, o, -a, y), (-b, a, o, z), (o, o, o, o))]
@@ -115,7 +115,7 @@ def _twisted(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
 
 
 def _ball(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
-    """A ball moved in the picture's plane, and its radius multiplied by an exponential."""
+    """Return the parameter of a ball moved in the image plane, with its radius multiplied by an exponential."""
     base = scene.params["shapes.ball.to_world"]
     x, y, grown = numbers
     o = torch.zeros_like(x)
@@ -142,7 +142,7 @@ HUNG = {
         },
     },
 }  # fmt: skip
-#: A lamp above a plate with a hole: on the floor there is a spot of light, whose edges alone tell where the lamp is.
+#: A lamp above a plate with a hole: only the edges of the light spot on the floor depend on the lamp's position.
 PLATE = {
     f"plate_{name}": known.quad(*([x, 1.2, z] for x, z in corners), material=known.WHITE)
     for name, corners in {
@@ -158,7 +158,7 @@ UNDER_PLATE = {
     "camera": {"origin": [0, 1, 3.2], "target": [0, 0.1, 0], "fov": 48},
     "shapes": {"floor": known.FLOOR, "lamp": HIDDEN, **PLATE},
 }
-#: A room that fills the view, with a lamp as wide as the ceiling almost, which outshines nothing that is seen.
+#: A room that fills the view, with a lamp almost as wide as the ceiling, so that nothing in view is overexposed.
 BRIGHT = {
     "type": "rectangle",
     "emission": [2, 1.9, 1.7],

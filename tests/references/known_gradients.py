@@ -1,13 +1,13 @@
-"""Scenes with one parameter that moves each, whose derivative is known: what gradients are judged by.
+"""Scenes with one moving parameter each, whose derivative is known, to test gradients against.
 
-The loss is linear in the picture, a fixed smooth weight times each number, so that a gradient has a mean that does
-not depend on the forward pass. The derivative goes along one direction in the parameter's space. True values lie in
-``known_gradients.json``, central differences of many samples with common random numbers: ``python
-scripts/gradient_pairs.py --truths`` makes them.
+The loss is linear in the picture (a fixed smooth weight times each value), so the mean of a gradient does not depend on
+the forward pass. The derivative is taken along one direction in the parameter's space. The true values in
+``known_gradients.json`` are central differences of many samples with common random numbers, computed by ``python
+scripts/gradient_pairs.py --truths``.
 
-Lengths are about 1, lamps are soft where nothing else is said, and paths are no longer than the pair needs: at depth
-2 only edges seen by the camera and those of direct shadows move, a pair called ``..._indirect`` has those of indirect
-shadows too.
+Lengths are about 1, lamps cast soft shadows unless a comment says otherwise, and paths are as short as the pair allows: at
+depth 2 only edges seen by the camera and edges of direct shadows move; pairs named ``..._indirect`` also have edges of
+indirect shadows.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ SIZE = 24
 
 @dataclass(frozen=True)
 class Pair:
-    """A scene and a way to move in one of its parameters.
+    """A scene and a direction in the space of one parameter.
 
     Attributes:
-        scene: of a description; ``$FILES`` in a path is the folder of :attr:`files`.
-        parameter: its name in ``scene.params``.
-        direction: of the parameter's shape, as ``{index: value}`` or as a function of the parameter.
-        step: of the finer difference; the other one is twice as wide.
+        scene: function that returns a description; ``$FILES`` in a path is the folder of :attr:`files`.
+        parameter: name of the parameter in ``scene.params``.
+        direction: direction of the parameter's shape, as ``{index: value}`` or as a function of the parameter.
+        step: step of the finer difference; the coarser step is twice as wide.
         spp: samples a pixel of one gradient.
-        depth: of the paths.
+        depth: largest path depth.
         files: pictures ``(H, W, 3)`` by file name.
-        turns: whether the direction turns a pose, which then stays rigid.
+        turns: True if the direction rotates a pose, which then stays rigid.
     """
 
     scene: Mapping[str, Any]
@@ -57,7 +57,7 @@ class Pair:
     turns: bool = False
 
     def along(self, base: Tensor) -> Tensor:
-        """The direction, as a tensor like the parameter ``base``."""
+        """Return the direction as a tensor of the shape of ``base``."""
         if callable(self.direction):
             return self.direction(base)
         direction = torch.zeros_like(base)
@@ -66,19 +66,19 @@ class Pair:
         return direction
 
     def at(self, base: Tensor, step: float) -> Tensor:
-        """The parameter ``step`` away from ``base``."""
+        """Return the parameter ``step`` away from ``base``."""
         if not self.turns:
             return base + step * self.along(base)
         return (torch.matrix_exp(step * self.along(base).double() @ base.double().inverse()) @ base.double()).to(base)
 
 
 def loaded(pair: Pair) -> Scene:
-    """The scene of a pair."""
+    """Load the scene of a pair."""
     return opened(pair.scene, pair.files, SIZE, pair.depth)
 
 
 def opened(scene: Mapping[str, Any], files: Mapping[str, Callable[[], Tensor]], size: int, depth: int) -> Scene:
-    """A scene whose pictures are made for it, on a square film, without roulette."""
+    """Load a scene after writing its pictures; square film, no Russian roulette."""
     with tempfile.TemporaryDirectory() as folder:
         for name, made in files.items():
             torchpt.write_image(str(Path(folder) / name), made())
@@ -98,7 +98,7 @@ def in_folder(value: Any, folder: str) -> Any:
 
 @cache
 def weights() -> Tensor:
-    """What the loss weighs the picture with, ``(SIZE, SIZE, 3)`` float64: smooth, and alike in no two places."""
+    """Return the weights of the loss, ``(SIZE, SIZE, 3)`` float64: smooth, and different at every pixel."""
     at = (torch.arange(SIZE, dtype=torch.float64) + 0.5) / SIZE
     x, y = at[None, :, None], at[:, None, None]
     colour = torch.tensor([1.0, 0.8, 0.6], dtype=torch.float64)
@@ -106,12 +106,12 @@ def weights() -> Tensor:
 
 
 def loss_of(picture: Tensor) -> Tensor:
-    """The loss of a picture ``(SIZE, SIZE, 3)``, a number in float64."""
+    """Return the loss of a picture ``(SIZE, SIZE, 3)``, a float64 number."""
     return (picture.double() * weights()).sum()
 
 
 def quad(*corners: list[float], **more: Any) -> dict[str, Any]:
-    """A flat mesh of four corners, counterclockwise seen from its front."""
+    """Return a flat mesh of four corners, counterclockwise seen from its front."""
     return {"type": "mesh", "vertices": list(corners), "faces": [[0, 1, 2], [0, 2, 3]], "face_normals": True, **more}
 
 
@@ -128,7 +128,7 @@ def diffuse(*colour: float) -> dict[str, Any]:
 
 
 def without(scene: Mapping[str, Any], *names: str, **more: Any) -> dict[str, Any]:
-    """A scene without some of its shapes, and with others."""
+    """Return a scene without some of its shapes, and with other ones."""
     shapes = {name: shape for name, shape in scene["shapes"].items() if name not in names}
     return {**scene, "shapes": {**shapes, **more}}
 
@@ -158,7 +158,7 @@ ROOM: dict[str, Any] = {
         "lamp": LAMP,
     },
 }
-#: A floor under a lamp, wide enough to fill the view; what is judged stands on it.
+#: A floor under a lamp, wide enough to fill the view; the tested shapes stand on it.
 FLOOR = quad([-6, 0, 6], [6, 0, 6], [6, 0, -9], [-6, 0, -9], material=WHITE)
 OVERHEAD = {
     "type": "rectangle",
@@ -173,13 +173,13 @@ ORANGE = diffuse(0.8, 0.5, 0.2)
 BLUE = diffuse(0.05, 0.1, 0.3)
 BALL = {"type": "sphere", "center": [0.1, 0.65, 0], "radius": 0.5, "material": BLUE}
 CANVAS = {"floor": FLOOR}
-#: The same without the lamp, for lights that are points or directions.
+#: The same without the lamp, for point and directional lights.
 DARK = {**TABLE, "shapes": CANVAS}
 SCREEN = quad([-0.5, 1.1, 0.4], [0.6, 1.1, 0.3], [0.5, 1.2, -0.5], [-0.4, 1.2, -0.6], material=BLUE)
 
 
 def fan() -> dict[str, Any]:
-    """A small bent mesh with smooth normals."""
+    """Return a small bent mesh with smooth normals."""
     count, ring = 6, []
     for k in range(count):
         angle = 2 * math.pi * k / count
@@ -189,38 +189,38 @@ def fan() -> dict[str, Any]:
 
 
 def painted() -> Tensor:
-    """A picture of 8 x 8 texels."""
+    """Return a picture of 8 x 8 texels."""
     return 0.2 + 0.6 * torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(3))
 
 
 def sky() -> Tensor:
-    """A map of all directions, 8 x 16 texels, brighter above and to one side."""
+    """Return an environment map of 8 x 16 texels, brighter above and to one side."""
     rows, columns = torch.arange(8.0)[:, None, None], torch.arange(16.0)[None, :, None]
     level = 0.3 + 1.2 * torch.exp(-0.5 * ((rows - 2) / 1.2) ** 2 - 0.5 * ((columns - 10) / 2.0) ** 2)
     return (level * torch.tensor([1.0, 0.9, 0.7])).float().contiguous()
 
 
 def noise(base: Tensor) -> Tensor:
-    """Another weight for each entry, all positive."""
+    """Return positive random weights, one for each entry."""
     return torch.rand(base.shape, generator=torch.Generator().manual_seed(11)).to(base)
 
 
 def turn(base: Tensor) -> Tensor:
-    """A pose turned about the world's y axis, by radians."""
+    """Rotate a pose about the world's y axis by an angle in radians."""
     about = torch.zeros_like(base)
     about[0, 2], about[2, 0] = 1.0, -1.0
     return about @ base
 
 
 def about_own_y(base: Tensor) -> Tensor:
-    """A pose turned about its own y axis, by radians."""
+    """Rotate a pose about its own y axis by an angle in radians."""
     about = torch.zeros_like(base)
     about[0, 2], about[2, 0] = 1.0, -1.0
     return base @ about
 
 
 def grown(base: Tensor) -> Tensor:
-    """A sphere whose radius grows, by its pose: its middle stays."""
+    """Scale a sphere's radius through its pose; the centre stays."""
     direction = torch.zeros_like(base)
     direction[:3, :3] = base[:3, :3] / base[:3, 0].norm()
     return direction
@@ -237,7 +237,7 @@ SKY = {"sky": {"type": "envmap", "path": "$FILES/sky.exr"}}
 ALONE: dict[str, Any] = {"camera": {"origin": [0, 0, 4], "target": [0.1, 0.05, 0], "fov": 30}}
 BUST = {"type": "sphere", "center": [0.1, 0.1, 0], "radius": 0.7}
 UNDER_SKY = {**ALONE, "shapes": {"ball": {**BUST, "material": BRUSHED}}, "lights": SKY}
-#: Glass over the whole view; behind it a wall, under a lamp to the side that shines on it alone.
+#: Glass over the whole view, and behind it a wall, lit by a lamp at the side that lights only the wall.
 GLASS: dict[str, Any] = {
     "camera": {"origin": [0.6, 0.4, 5], "target": [0.45, 0.3, 0], "fov": 6},
     "materials": {"glass": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}},
@@ -265,7 +265,7 @@ COPY = {"type": "instance", "of": "block", "material": RED, "transform": [{"scal
 COPY |= {"transform": [*COPY["transform"], moved(0.6, 0.5, 0.5)]}
 SMALL_BOX = {"type": "cube", "material": BLUE, "transform": [{"scale": 0.25}, moved(-0.6, 0.3, -0.3)]}
 TILTED = [{"scale": 0.6}, turned([1, 0, 0], -65), moved(0.1, 0.8, 0)]
-#: A lamp that nothing hides, which does not come into view.
+#: A lamp that is never occluded and never in view.
 FREE = {**DARK, "shapes": {"floor": FLOOR, "lamp": {**OVERHEAD, "transform": [{"scale": 0.3}, DOWN, moved(0.8, 3, 1)]}}}
 
 PAIRS: dict[str, Pair] = {

@@ -1,12 +1,12 @@
-"""Kernels of the compiled loop beside the eager stages that they were traced from, lane by lane on the same input.
+"""Compare the kernels of the compiled loop with the eager stages that they were traced from, lane by lane on the same input.
 
-A wave is traced eagerly and the input of every stage kept. Each kernel then runs on that very input, so a path that goes
-elsewhere for its rounding does not spoil the vertices behind.
+A wave is traced eagerly and the input of every stage is recorded. Each kernel then runs on that input, so that a path that
+diverges by rounding does not affect later vertices.
 
-Counting: a *value* is one number of one lane (a vector has three). It is off where it differs by more than ``TOLERANCE`` of
-the eager lane's own magnitude: that of the number, or of a vector's largest component, since a component near zero says
-nothing. Where a kernel decides otherwise (a path lives on or not, a ray is blocked or not, another surface is met) all values
-of the lane that follow from it are off.
+Counting: a *value* is one number of one lane (a vector has three). It is off if it differs by more than ``TOLERANCE`` times
+the eager lane's magnitude: that of the number, or of a vector's largest component, since components near zero have large
+relative errors. Where a kernel decides differently (a path survives or not, a ray is blocked or not, another surface is hit)
+all values of the lane that depend on the decision are off.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from torchpt.scene.formats.description import settings
 __all__ = ["ALLOWED", "TOLERANCE", "Differences", "compare", "loaded", "prepared", "run_bounce", "waves"]
 
 TOLERANCE = 1e-3
-#: Share of values that may be off. Kernels fuse products and sums and round otherwise: a comparison whose two sides are equal
-#: to a few 1e-7 may then fall the other way, and conditions as bad as 1e4 turn 1e-7 into 1e-3.
+#: Share of values that may be off. Kernels fuse products and sums, so they round differently: a comparison whose two sides
+#: agree to a few 1e-7 may go the other way, and a condition number of 1e4 turns 1e-7 into 1e-3.
 ALLOWED = 1e-4
 
 _STATE = tuple(f.name for f in fields(PathState) if f.name != "extra")
@@ -50,7 +50,7 @@ _WHOLE = {"lane", "key", "prim"}  # equal or not
 
 @dataclass
 class Differences:
-    """Numbers of values that were compared, and of those that are off, by kernel and field."""
+    """Counts of compared values and of those that are off, by kernel and field."""
 
     values: dict[tuple[str, str], int] = field(default_factory=dict)
     off: dict[tuple[str, str], int] = field(default_factory=dict)
@@ -69,7 +69,7 @@ class Differences:
         self.off[key] = self.off.get(key, 0) + int(wrong.sum())
 
     def share(self, kernel: str | None = None) -> float:
-        """The share of values that are off."""
+        """Return the share of values that are off."""
         chosen = [key for key in self.values if kernel in (None, key[0])]
         return sum(self.off[key] for key in chosen) / max(sum(self.values[key] for key in chosen), 1)
 
@@ -82,7 +82,7 @@ class Differences:
 
 
 class _Recorder(TensorsEngine):
-    """The engine by tensors, which keeps what its stages were given."""
+    """The tensor engine, recording the inputs of its stages."""
 
     def __init__(self, wave: Wave, lanes: int) -> None:
         super().__init__(wave, lanes)
@@ -112,14 +112,14 @@ def loaded(name: str | Mapping[str, Any]) -> torchpt.Scene:
 
 
 def prepared(scene: torchpt.Scene, wishes: Mapping[str, Any]) -> tuple[Wave, Any]:
-    """The wave of a render, and its settings."""
+    """Return the wave of a render, and its settings."""
     wish = settings(scene.description, wishes)
     with torch.no_grad():
         return make_wave(scene, wish, None, torch.float32), wish
 
 
 def waves(wave: Wave, pixels: int, samples: int) -> _Recorder:
-    """Return what the stages of a wave were given."""
+    """Return the inputs of the stages of a wave."""
     recorder = _Recorder(wave, pixels * samples)
     with torch.no_grad():
         walk(recorder, recorder.spawn(wave.rays(0, pixels, 0, samples)), wave.integrator.limits)
@@ -127,7 +127,7 @@ def waves(wave: Wave, pixels: int, samples: int) -> _Recorder:
 
 
 def compare(scene: torchpt.Scene, wishes: Mapping[str, Any], pixels: int, samples: int) -> Differences:
-    """All kernels of a scene, as the loop takes them and, where it searches inside of stages, also without that."""
+    """Compare all kernels of a scene, as the loop builds them and, if they search inside stages, also without that."""
     found = Differences()
     wave, _ = prepared(scene, wishes)
     with torch.no_grad():
@@ -144,9 +144,9 @@ def compare(scene: torchpt.Scene, wishes: Mapping[str, Any], pixels: int, sample
 
 
 def arena(kernels: Kernels, **values: Tensor | None) -> Memory:
-    """Memory with the given fields in its first lanes."""
+    """Return an arena with the given fields in its first lanes."""
     memory = Memory(kernels.state.count)
-    memory.words[:] = 0x7FC00000  # NaN: what is read though it was not written shows
+    memory.words[:] = 0x7FC00000  # NaN reveals reads of rows that were not written
     kernels.state.put(memory, 0, values)
     return memory
 
@@ -182,7 +182,7 @@ def _generate(found: Differences, wave: Wave, kernels: Kernels, pixels: int, sam
 def run_bounce(
     worker: KernelsEngine, model: int, roulette: bool, state: PathState, hit: Hit, index: Tensor, depth: int
 ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-    """One kernel on some lanes of a wave.
+    """Run one kernel on some lanes of a wave.
 
     Returns:
         The rows that it wrote, in the order of ``index``; which lanes go on; the radiance of those that do not.
@@ -216,7 +216,7 @@ def run_bounce(
 
 
 def _routes(worker: KernelsEngine, taken: dict[str, Tensor], lists: list[Memory], counts: list[int]) -> None:
-    """Check that the lists name each lane where it belongs: exactly, for the hits that the kernel itself found."""
+    """Check that each lane is on the right list, exactly, for the hits that the kernel itself found."""
     kernels = worker.kernels
     hit = Hit(*(taken[name] for name in HIT))
     ends, groups = partition(kernels.world, hit)
@@ -322,12 +322,12 @@ def _compare_fused(
 
 
 def _floor(name: str) -> float:
-    # Places, and the parameters of a surface, are as exact as what they lie on is large.
+    # The error of positions and surface parameters is relative to the size of the surface.
     return {"o": 1e-5, "p": 1e-5, "u": 1e-4, "v": 1e-4}.get(name, 0.0)
 
 
 def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorder) -> None:
-    """Rays from vertices on, and light: the search with the surfaces that let rays through."""
+    """Compare the search for rays from vertices and for shadow rays, through surfaces that let light pass."""
     worker, engine = KernelsEngine(kernels), TensorsEngine(wave, 0)
     for depth, state in enumerate(recorder.states, 1):
         hit = engine.hits(state, depth)
@@ -362,7 +362,7 @@ def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorde
 
 
 def _first_hits(found: Differences, wave: Wave, kernels: Kernels, pixels: int, samples: int) -> None:
-    """The preview has no vertices beyond the first: samples are compared whole."""
+    """Compare whole samples of the first-hit preview, which has no later vertices."""
     tally = RayCounts()
     eager = tensors.weighted_radiance(wave, wave.rays(0, pixels, 0, samples), tally)
     worker = KernelsEngine(kernels)

@@ -1,7 +1,6 @@
-"""An integrator of a user's own whose light goes to other pixels than a sample's own.
+"""A user-defined integrator that contributes to other pixels than the sample's own.
 
-Nothing of the package is edited for it. The light that is sampled at surfaces goes to the pixel on the other side of the
-picture.
+It needs no change to the package. Contributions of light samples go to the mirrored pixel on the other side of the picture.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from torchpt.paths.state import Field, Shadow, Splat, StageContext, VertexInput,
 
 
 class Mirrored(Path):
-    """Path tracing whose light by light samples goes to the mirrored pixel."""
+    """A path tracer whose light samples contribute to the mirrored pixel."""
 
     name = "mirrored"
     fields = (Field("pixel", start=-1, whole=True),)
@@ -42,7 +41,7 @@ class Mirrored(Path):
 
 
 def room(opacity: float = 1.0) -> dict[str, Any]:
-    """A room with a lamp that the camera does not see, and a ball that shades its right side."""
+    """Return a room with a lamp outside the camera's view, and a ball that shades the right side."""
     return {
         "camera": {"type": "perspective", "origin": [0, 0, -0.5], "target": [0, 0, 1], "fov": 60.0},
         "materials": {

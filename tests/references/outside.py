@@ -1,4 +1,4 @@
-"""Values that a parameter must refuse, made of what it declares."""
+"""Values that a parameter must refuse, derived from its declaration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["numbers_outside", "values_outside"]
 
 
 def numbers_outside(spec: Spec) -> list[float]:
-    """Numbers beyond each end of a traced number's range, and those that are none."""
+    """Return numbers beyond each end of a differentiable number's range, and values that are not finite."""
     found = [math.nan, math.inf, -math.inf]
     for end, by, open_end in (("low", -1.0, "above"), ("high", 1.0, "below")):
         bound, limit = getattr(spec, end, None), getattr(spec, open_end, None)
@@ -23,7 +23,7 @@ def numbers_outside(spec: Spec) -> list[float]:
 
 
 def values_outside(spec: Spec) -> list[Any]:
-    """What a file may not give."""
+    """Return values that a scene file must not give to a parameter."""
     if hasattr(spec, "low") and not isinstance(spec, Integer):
         return [*numbers_outside(spec), True, "much", [1, 2]]
     if isinstance(spec, Integer):

@@ -1,4 +1,4 @@
-"""Scenes by index, as functions of a module: spawned workers must be able to import them."""
+"""Functions that return a scene by index; they are in a module so that spawned workers can import them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FILM = {"width": 10, "height": 8, "filter": "box"}
 
 
 def room(index: int) -> dict[str, Any]:
-    """A wall whose colour depends on the index, a ball before it, a lamp."""
+    """Return a wall whose colour depends on the index, a ball in front of it, and a lamp."""
     colour = torch.rand(3, generator=torch.Generator().manual_seed(index)).tolist()
     return {
         "camera": {"type": "perspective", "origin": [0, 0, 4], "target": [0, 0, 0], "fov": 40},
@@ -30,10 +30,10 @@ def room(index: int) -> dict[str, Any]:
 
 
 def dim(index: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The same with settings of its own."""
+    """Return the scene of :func:`room` with settings of its own."""
     return room(index), {"spp": 2, "params": {"shapes.lamp.emission": [1.0, 1.0, 1.0]}}
 
 
 def flat(index: int) -> dict[str, Any]:
-    """The same by an orthographic camera, which has no matrix K."""
+    """Return the scene of :func:`room` with an orthographic camera, which has no matrix K."""
     return {**room(index), "camera": {"type": "orthographic", "origin": [0, 0, 4], "target": [0, 0, 0], "width": 3}}

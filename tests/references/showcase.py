@@ -1,4 +1,4 @@
-"""A scene with a ball of every material in every variant, for tests that must hold whatever a scene is made of."""
+"""A scene with a ball of every material in every variant, for tests that must hold for any scene."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ MATERIALS |= {kind: {"type": kind} for kind in KINDS if kind not in _TYPES}
 
 
 def showcase(*names: str) -> dict[str, Any]:
-    """Balls of ``names`` (all materials by default) in rows on a floor, under a lamp and a dim sky."""
+    """Return balls of the materials ``names`` (default: all) in rows on a floor, under a lamp and a dim sky."""
     chosen = names or tuple(MATERIALS)
     side = max(int(len(chosen) ** 0.5), 1)
     shapes: dict[str, Any] = {

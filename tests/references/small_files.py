@@ -1,4 +1,4 @@
-"""One small sound file of every kind that torchpt reads, as bytes: what tests damage."""
+"""One small valid file of every format that torchpt reads, as bytes, for tests that damage files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of a quad whose texture is placed by its mesh file alone."""
+"""Files of a quad whose texture is named only in its mesh file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ f 1/1 2/2 3/3 4/4
 
 
 def textured_quad(folder: Path) -> Path:
-    """The scene file, with what it names beside it."""
+    """Write the scene file and the files that it names; return the path of the scene file."""
     texels = " ".join(str((37 * k) % 256) for k in range(16 * 16 * 3))
     (folder / "quad.ppm").write_text(f"P3\n16 16\n255\n{texels}\n")
     (folder / "quad.obj").write_text(OBJ)
@@ -38,5 +38,5 @@ def textured_quad(folder: Path) -> Path:
 
 
 def repeated(folder: Path, times: int) -> None:
-    """Let the material file repeat the texture so often."""
+    """Write the material file, which repeats the texture `times` times along each axis."""
     (folder / "quad.mtl").write_text(f"newmtl a\nmap_Kd -s {times} {times} 1 quad.ppm\n")

@@ -56,24 +56,24 @@ def film_of(size: int, height: int | None = None) -> dict[str, Any]:
 
 
 def estimate(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean ``(C,)`` of a picture whose pixels are independent estimates of one value, and its standard error."""
+    """Return the mean ``(C,)`` of a picture whose pixels are independent estimates of one value, and its standard error."""
     pixels = image.double().reshape(-1, image.shape[-1])
     return pixels.mean(0), pixels.std(0) / math.sqrt(len(pixels))
 
 
 def spread(images: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Mean of independent pictures and the variance of that mean."""
+    """Return the mean of independent pictures and the variance of that mean."""
     stack = torch.stack([image.double() for image in images])
     return stack.mean(0), stack.var(0) / len(stack)
 
 
 def coarse(picture: Tensor, side: int) -> Tensor:
-    """Means ``(H / side, W / side, C)`` over squares of pixels of a picture ``(H, W, C)``."""
+    """Return means ``(H / side, W / side, C)`` over squares of pixels of a picture ``(H, W, C)``."""
     return torch.nn.functional.avg_pool2d(picture.double().permute(2, 0, 1)[None], side)[0].permute(1, 2, 0)
 
 
 def uniform_p(cells: Tensor, number: int) -> float:
-    """p-value of the hypothesis that cell indices ``(N,)`` are uniform over ``number`` cells."""
+    """Return the p-value of the hypothesis that cell indices ``(N,)`` are uniform over ``number`` cells."""
     counts = torch.bincount(cells.reshape(-1), minlength=number).double()
     assert len(counts) == number
     expected = counts.sum() / number
@@ -81,7 +81,7 @@ def uniform_p(cells: Tensor, number: int) -> float:
 
 
 def grid_cells(u: Tensor, side: int) -> Tensor:
-    """Index of the cell of a ``side^d`` grid that points ``(d, N)`` in [0, 1) fall into."""
+    """Return the cell of a ``side^d`` grid that each of the points ``(d, N)`` in [0, 1) falls into."""
     cells = (u.double() * side).long().clamp_max(side - 1)
     index = torch.zeros_like(cells[0])
     for row in cells:

@@ -1,7 +1,7 @@
-"""The command line: what each command of ``torchpt`` does, its arguments being plain values.
+"""The commands of ``torchpt``.
 
-``main.py`` has the table of commands and is all that imports Hydra: start there. One command a file: ``render.py``,
-``converge.py``, ``compare.py``, ``info.py``, ``stress.py``, ``orbit.py``, ``debug.py``; the others serve them all.
+Start with ``main.py``: it holds the table of commands and runs Hydra. Each command has a file: ``render.py``, ``converge.py``,
+``compare.py``, ``info.py``, ``stress.py``, ``orbit.py``, ``debug.py``. The other files are shared by several commands.
 
-May import: all that lies below.
+May import: every other room.
 """

@@ -1,7 +1,7 @@
-"""Take a command line apart: what belongs to torchpt itself, and what is left for Hydra.
+"""Parse a command line: separate torchpt's own words from the overrides that Hydra parses.
 
-File names never enter Hydra's grammar, in which blanks, brackets, commas and ``=`` mean something: ``scene=``, ``out=``
-and the settings that are files (:func:`path_keys`) are taken out here, as they are written.
+File names may hold blanks, brackets, commas and ``=``, which have a meaning in Hydra's grammar. So ``scene=``, ``out=``
+and the settings that are file names (:func:`path_keys`) are parsed here and kept as written.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ __all__ = [
 ]
 
 GROUPS = ("film", "integrator", "sampler", "render")
-#: Blocks of a scene that are no run settings: what their keys are is for the scene to say.
+#: Blocks of a scene file that are not run settings; their keys depend on the scene.
 SCENE_BLOCKS = ("version", "camera", "textures", "materials", "shapes", "lights")
-#: Keys of `torchpt orbit` alone.
+#: Keys of `torchpt orbit` only.
 TURN_KEYS = ("frames", "degrees", "fps", "keep")
 _TURN = re.compile(rf"({'|'.join(TURN_KEYS)})=(.*)\Z", re.DOTALL)
-#: Keys of `torchpt render` alone: one path in place of a picture. No scene file has them.
+#: Keys of `torchpt render` only: print one path instead of rendering a picture.
 DEBUG_KEYS = ("debug.pixel", "debug.sample")
 _DEBUG = re.compile(r"\+{0,2}(debug\.[^=]*)=(.*)\Z", re.DOTALL)
 _TAKEN = re.compile(r"\+{0,2}([\w.]+)=(.*)\Z", re.DOTALL)
 _SCENE_WORD = re.compile(rf"(?:\+\+|\+|~|)(?:{'|'.join(SCENE_BLOCKS)})(?:[.=]|\Z)")
-#: A line of a group's file, as ``scripts/make_configs.py`` writes it of a setting that is a file.
+#: A line of a config file that ``scripts/make_configs.py`` writes for a setting that is a file name.
 _PATH = re.compile(r"^(\w+): .*\(null or a file path\)$", re.MULTILINE)
 
 # option -> (its other name, whether a value follows)
@@ -51,7 +51,7 @@ _OPTIONS = {
     "--config-name": ("-cn", True),
     "--resolve": ("", False),
     "--json": ("", False),
-    "--help": ("-h", False),  # which main knows
+    "--help": ("-h", False),  # handled in main.py
     "--hydra-help": ("", False),
 }
 _CHOICE = re.compile(r"[A-Za-z_][\w,-]*\Z|\[[\w,-]+\]\Z|\{")
@@ -59,7 +59,7 @@ _CONFIGS = ("job", "hydra", "all")
 
 
 class UsageError(TorchptError):
-    """A command line that cannot be understood."""
+    """An invalid command line."""
 
     def __init__(self, text: str) -> None:
         super().__init__("".join(letter if letter.isprintable() else " " for letter in text))
@@ -67,22 +67,22 @@ class UsageError(TorchptError):
 
 @dataclass
 class Arguments:
-    """A command line in parts.
+    """A parsed command line.
 
     Attributes:
-        command: its name.
-        scenes: names or paths; several only with ``multirun``.
-        outs: pictures to write, as given; empty where nothing was said.
-        paths: values of the settings that are files.
+        command: name of the command.
+        scenes: names or paths of scenes; several only with ``multirun``.
+        outs: files to write, as given; empty without ``out=``.
+        paths: values of the settings that are file names, by key.
         turn: values of the keys in `TURN_KEYS`, as written.
         debug: values of the keys in `DEBUG_KEYS`, as written.
         scene_keys: overrides of scene keys in the order given: key and its values, several only with ``multirun``.
-        overrides: what Hydra gets: ``key=value``; for a sweep over scenes also ``+scene_number=0,1``, into ``scenes``, and for
-            each of ``scene_keys`` ``+scene_key_K=0,1``, into its values.
-        options: what Hydra gets besides, such as ``--multirun`` or ``--cfg job``.
-        config_dir: a folder with groups, scenes and configurations of the caller's own.
-        multirun: whether this is a sweep.
-        json: print `info`, or the path of `render debug.pixel=...`, as JSON.
+        overrides: ``key=value`` overrides for Hydra. A sweep over scenes adds ``+scene_number=0,1``, indices into ``scenes``;
+            entry K of ``scene_keys`` adds ``+scene_key_K=0,1``, indices into its values.
+        options: options for Hydra, such as ``--multirun`` or ``--cfg job``.
+        config_dir: the user's folder of config groups, scenes and configurations.
+        multirun: True for a sweep.
+        json: print the result of `info`, or the path of `render debug.pixel=...`, as JSON.
     """
 
     command: str
@@ -100,22 +100,22 @@ class Arguments:
 
     @property
     def only_shows(self) -> bool:
-        """Hydra prints something and no job runs."""
+        """True if Hydra only prints settings or its help, and no job runs."""
         return any(option in ("--cfg", "--hydra-help") for option in self.options)
 
 
 @cache
 def path_keys() -> tuple[str, ...]:
-    """Return the settings that are files, by the groups' files: importing what declares them would take seconds."""
+    """Return the dotted keys of the settings that are file names, read from the config files as in `torchpt.cli.keys`."""
     files = [(group, configs() / group / "default.yaml") for group in GROUPS]
     return tuple(f"{group}.{key}" for group, file in files for key in _PATH.findall(file.read_text(encoding="utf-8")))
 
 
 def parse(command: str, words: list[str]) -> Arguments:
-    """Take the words after the name of a command apart.
+    """Parse the words after the name of a command.
 
     Raises:
-        UsageError: an unknown option, a word that is no ``key=value``, a key that is given twice.
+        UsageError: an unknown option, a word that is not ``key=value``, or a key given twice.
     """
     arguments = Arguments(command)
     taken: dict[str, str] = {}
@@ -141,7 +141,7 @@ def parse(command: str, words: list[str]) -> Arguments:
             raise UsageError(f"{key}: expected a name, got nothing")
         taken[key] = value
         if key == "scene":
-            arguments.overrides.append("scene")  # keeps its place among the sweeps
+            arguments.overrides.append("scene")  # placeholder: the order of overrides is the order of the sweep
     arguments.multirun |= any(word.replace(" ", "") == "hydra.mode=MULTIRUN" for word in arguments.overrides)
     if swept and not arguments.multirun:
         raise UsageError(f"{swept[0]}: expected one value or a list [..,..] (--multirun sweeps over several)")
@@ -161,7 +161,7 @@ def parse(command: str, words: list[str]) -> Arguments:
     arguments.turn = {key: taken[key] for key in TURN_KEYS if key in taken}
     sweep = f"+scene_number={','.join(map(str, range(len(arguments.scenes))))}"
     arguments.overrides = [sweep if word == "scene" else word for word in arguments.overrides]
-    if arguments.only_shows:  # no scene is a part of what is shown
+    if arguments.only_shows:  # Hydra does not show scenes
         arguments.overrides = [word for word in arguments.overrides if not word.startswith("+scene_key_")]
     if len(arguments.scenes) < 2:
         arguments.overrides = [word for word in arguments.overrides if word != sweep]
@@ -169,7 +169,7 @@ def parse(command: str, words: list[str]) -> Arguments:
 
 
 def _scene_word(arguments: Arguments, word: str) -> list[str]:
-    """Take an override of a scene key; returns it where it sweeps."""
+    """Add an override of a scene key to `arguments`; return ``[word]`` if it sweeps, else ``[]``."""
     from torchpt.cli.grammar import read_word
 
     key, values, sweeps = read_word(word)
@@ -182,12 +182,12 @@ def _scene_word(arguments: Arguments, word: str) -> list[str]:
 
 
 def is_scene_word(word: str) -> bool:
-    """Return True for an override of a scene's key that is no run setting."""
+    """Return True if `word` overrides a key of a block in `SCENE_BLOCKS`."""
     return _SCENE_WORD.match(word) is not None
 
 
 def _debug(arguments: Arguments, taken: dict[str, str]) -> dict[str, str]:
-    """The words about one path."""
+    """Return the ``debug.*`` values among `taken`, after a check that they fit the other words."""
     found = {key: value for key, value in taken.items() if key.startswith("debug.")}
     for key in found:
         if key not in DEBUG_KEYS:
@@ -202,12 +202,12 @@ def _debug(arguments: Arguments, taken: dict[str, str]) -> dict[str, str]:
 
 
 def parse_study(words: list[str]) -> tuple[dict[str, str], list[str]]:
-    """Return the words of `torchpt converge` by key, as written, and overrides of scene keys.
+    """Return the settings of `torchpt converge` by key, as written, and its overrides of scene keys.
 
-    Its lists are axes, which Hydra has no part in.
+    `torchpt converge` does not use Hydra: a list of values is an axis of the study.
 
     Raises:
-        UsageError: an option, a word that is no ``key=value``, a key that is given twice.
+        UsageError: an option, a word that is not ``key=value``, or a key given twice.
     """
     study: dict[str, str] = {}
     changes: list[str] = []
@@ -267,7 +267,7 @@ def _override(arguments: Arguments, word: str) -> None:
     key, _, value = word.lstrip("+~").partition("=")
     if not key.strip() or key == "out" or re.match(r"scene(\b|_number|_key_)", key):
         raise UsageError(f"{word}: expected key=value")
-    if key in GROUPS and (value == "null" or not _CHOICE.match(value)):  # nor a way out of the group's folder
+    if key in GROUPS and (value == "null" or not _CHOICE.match(value)):  # no path out of the group's folder
         raise UsageError(f"{key}: expected the name of a file in configs/{key}, got {value!r}")
     arguments.overrides.append(word)
 
@@ -281,7 +281,7 @@ def _scenes(value: str | None, multirun: bool) -> list[str]:
 
 
 def _names(key: str, value: str | None) -> list[str]:
-    """``a b.exr`` is one name; ``[a.exr, 'b,c.png']`` is a list, whose names are quoted where they hold a comma."""
+    """Split a value into names: ``a b.exr`` is one, ``[a.exr, 'b,c.png']`` is a list; names with commas are quoted."""
     if value is None:
         return []
     if not (value.startswith("[") and value.endswith("]")):
@@ -289,7 +289,7 @@ def _names(key: str, value: str | None) -> list[str]:
     parts = re.findall(r"""\s*("[^"]*"|'[^']*'|[^,]*?)\s*(?:,|\Z)""", value[1:-1])
     names = [part[1:-1] if part[:1] in "'\"" and part[:1] == part[-1:] and len(part) > 1 else part for part in parts]
     if len(names) > 1 and not names[-1]:
-        names.pop()  # what the pattern finds at the very end
+        names.pop()  # the pattern also matches the empty end of the text
     if not all(names):
         raise UsageError(f"{key}: expected names between commas, got {value!r}")
     return names

@@ -1,4 +1,4 @@
-"""`torchpt compare`: how far a picture is from its reference, in numbers and as a map."""
+"""`torchpt compare`: measure the error of a picture against a reference, and write an error map."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ _KEYS = ("map", "metric", "range", "layer", "exposure", "tonemap", "gamma")
 _KEY = re.compile(rf"({'|'.join(_KEYS)})=(.*)\Z", re.DOTALL)
 _MAPS = (".exr", ".png")
 _SHOWN = ("exposure", "tonemap", "gamma")
-#: Measures whose map ends at 1.
+#: Metrics whose values are at most 1.
 _UP_TO_ONE = ("smape", "ssim", "flip")
 
 
 @dataclass
 class CompareOptions:
-    """The words after ``torchpt compare``.
+    """The parsed arguments of ``torchpt compare``.
 
     Attributes:
-        pictures: the picture and its reference, as written.
-        given: key to value, as written.
+        pictures: paths of the picture and of its reference, as written.
+        given: values by key, as written.
         json: print JSON.
     """
 
@@ -64,11 +64,11 @@ class CompareOptions:
 
     @classmethod
     def read(cls, words: list[str]) -> CompareOptions:
-        """Take the words apart; a name of a file may hold whatever it likes.
+        """Parse the words after ``torchpt compare``; a file name may contain any characters.
 
         Raises:
-            UsageError: an unknown option or key, a key given twice or without a value or without ``map=``, other than
-                two pictures.
+            UsageError: an unknown option or key, a key given twice or without a value, ``metric=`` or ``range=`` without
+                ``map=``, or not exactly two pictures.
         """
         options = cls()
         end = words.index("--") if "--" in words else len(words)
@@ -103,7 +103,7 @@ class CompareOptions:
 
 @dataclass(frozen=True)
 class _Map:
-    """The error map that is asked for: file, measure, and the value of the brightest colour where one is given."""
+    """The error map to write: file, metric, and the error that gets the brightest colour (None: automatic)."""
 
     file: str
     metric: str
@@ -111,7 +111,7 @@ class _Map:
 
 
 def run(words: list[str], interrupt: Interrupt) -> int:
-    """Compare two files, print what came of it, write the map; returns the exit code.
+    """Compare two pictures, print the metrics, write the error map and return the exit code.
 
     Raises:
         TorchptError: bad input.
@@ -150,10 +150,10 @@ def run(words: list[str], interrupt: Interrupt) -> int:
 
 
 def _shown(given: dict[str, str]) -> DisplayTransform:
-    """How a screen shows the pictures; the values are those of ``film``.
+    """Parse ``exposure=``, ``tonemap=`` and ``gamma=``, which take the same values as ``film.*``.
 
     Raises:
-        SceneError: a value that is not accepted.
+        SceneError: an invalid value.
     """
     from torchpt.images.comparison import DisplayTransform
     from torchpt.scene.settings import Film
@@ -178,10 +178,10 @@ def _number(text: str) -> float:
 
 
 def _map(options: CompareOptions) -> _Map | None:
-    """The map that is asked for, found out to be possible before the pictures are read.
+    """Return the error map to write, checked before the pictures are read; None without ``map=``.
 
     Raises:
-        TorchptError: a map that cannot be written, an unknown measure, a range that is none.
+        TorchptError: a file that cannot be written, an unknown metric, or an invalid range.
     """
     from torchpt.images import check_writable
     from torchpt.images.metrics import MAPS
@@ -206,10 +206,10 @@ def _map(options: CompareOptions) -> _Map | None:
 
 
 def _picture(path: str, layer: str | None) -> tuple[str, Tensor]:
-    """A layer ``(H, W, C)`` of a file and its name; by default the picture, or the one layer that there is.
+    """Read a layer of a file: return its name and values ``(H, W, C)``. Default: the picture, or the only layer.
 
     Raises:
-        AssetError: a file that cannot be read or has no such layer.
+        AssetError: a file that cannot be read, or that has no such layer.
     """
     import torch
 
@@ -237,7 +237,7 @@ def _agree(paths: list[str], first: Tensor, second: Tensor) -> None:
 
 
 def _is_colour(layer: str, channels: int) -> bool:
-    """Whether a layer holds colours, and not normals, distances or other numbers: its channels are R G B [A], or grey."""
+    """Return True if a layer holds colours (channels R G B [A], or grey), and not normals, distances or other numbers."""
     from torchpt.images.layers import channel_names
 
     if layer == "image":
@@ -256,17 +256,17 @@ def _refuse_colour_keys(options: CompareOptions, layer: str) -> None:
 
 
 def _apart(picture: Tensor, colours: bool) -> tuple[Tensor, Tensor | None]:
-    """The colours and the alpha channel, where there is one."""
+    """Split a picture into its colours and its alpha channel (None if it has none)."""
     if colours and picture.shape[2] in (2, 4):
         return picture[..., :-1], picture[..., -1]
     return picture, None
 
 
 def _write_map(chart: _Map, image: Tensor, reference: Tensor, shown: DisplayTransform) -> dict[str, Any]:
-    """Write the map whole or not at all; returns what it shows.
+    """Write the error map and return its facts: file, metric, largest error, range of the colours.
 
     Raises:
-        OutputError: a measure that has no map of these pictures, a file that cannot be written.
+        OutputError: a metric that has no map for these pictures, or a file that cannot be written.
     """
     import torch
 
@@ -290,7 +290,7 @@ def _write_map(chart: _Map, image: Tensor, reference: Tensor, shown: DisplayTran
 
 
 def _most_of(values: Tensor) -> float:
-    """What 99 % of the values do not exceed; their largest where that is 0, and 1 where all are."""
+    """Return the 99th percentile of the values; if it is 0 their maximum, and 1 if that is 0 too."""
     if not values.numel():
         return 1.0
     ordered = values.sort().values
@@ -298,20 +298,20 @@ def _most_of(values: Tensor) -> float:
 
 
 def _print(facts: dict[str, Any], found: Comparison) -> None:
-    """The same for people: a table of measures, a table of means, and what is to be said about them."""
+    """Print a table of the metrics, a table of the means, and notes about them."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     class Piped(Console):
-        def on_broken_pipe(self) -> None:  # rich itself would end the process
+        def on_broken_pipe(self) -> None:  # rich's own version exits the process
             raise BrokenPipeError
 
     console = Piped(highlight=False, width=None if sys.stdout.isatty() else 120)
 
     def say(text: str) -> None:
-        code = console.encoding  # a name of a file may hold what it does not
+        code = console.encoding  # a file name may contain characters that the encoding lacks
         console.print(Text(text.encode(code, "backslashreplace").decode(code)), soft_wrap=True)
 
     def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
@@ -345,7 +345,7 @@ def _print(facts: dict[str, Any], found: Comparison) -> None:
 
 
 def _means(facts: dict[str, Any], found: Comparison) -> list[tuple[str, ...]]:
-    """Rows: the mean of each channel and of all, and how many pixels are in none of them."""
+    """Return table rows: the mean over all channels, the mean of each, and the number of pixels that are not finite."""
     one, two = found.means
     names = ("red", "green", "blue") if len(one) == 3 and "display" in facts else [str(k) for k in range(len(one))]
     rows = [

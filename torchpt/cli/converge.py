@@ -1,4 +1,4 @@
-"""`torchpt converge`: words to a study, a bar over all of it, its files, one line of JSON."""
+"""`torchpt converge`: run a convergence study, write its report and print a summary in JSON."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ summary in JSON. Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGT
 
 
 def run(words: list[str], interrupt: Interrupt) -> int:
-    """Run a study of the words after ``converge``; returns the exit code."""
+    """Run the study that the words after ``converge`` describe and return the exit code."""
     study, changes = parse_study(words)
     if not {"scene", "study"} & study.keys():
         ship = ", ".join(keys.options("scene"))
@@ -66,11 +66,11 @@ def run(words: list[str], interrupt: Interrupt) -> int:
 
 
 def raw_study(words: Mapping[str, str], changes: Sequence[str] = ()) -> tuple[dict[str, Any], str | None]:
-    """Return the keys of a study and its file, from the words of the command line by key.
+    """Merge a study file and the command line: return the values by key, and the file (None without ``study=``).
 
     Args:
-        words: by key.
-        changes: overrides of scene keys, several values of which are axes.
+        words: values of the command line by key; they win over the file's.
+        changes: overrides of scene keys; several values of one are an axis of the study.
 
     Raises:
         TorchptError: a file or value that cannot be read.
@@ -84,7 +84,7 @@ def raw_study(words: Mapping[str, str], changes: Sequence[str] = ()) -> tuple[di
         if key == "scene":
             value: Any = _names(text)
         elif key == "title" or (key == "reference" and not text.startswith("{")):
-            value = text  # a file's name may hold whatever YAML gives a meaning
+            value = text  # a file name may contain characters that YAML interprets
         else:
             value = _value(key, text)
         head, _, name = key.partition(".")
@@ -99,7 +99,7 @@ def raw_study(words: Mapping[str, str], changes: Sequence[str] = ()) -> tuple[di
 
 
 def _changes(written: Any, file: str | None) -> dict[str, list[Any]]:
-    """Return the overrides of a study file by key: text is read as on the command line, where ``a,b`` are several values."""
+    """Return the values of a study file's ``overrides`` by key; text is parsed as on the command line (``a,b``: two values)."""
     from torchpt.cli.grammar import read_value
 
     if not isinstance(written, Mapping):
@@ -111,7 +111,7 @@ def _changes(written: Any, file: str | None) -> dict[str, list[Any]]:
 
 
 def _read(words: Sequence[str]) -> dict[str, list[Any]]:
-    """Return overrides of the command line by key."""
+    """Parse overrides of the command line: values by key."""
     found: dict[str, list[Any]] = {}
     for word in words:
         from torchpt.cli.grammar import read_word
@@ -124,7 +124,7 @@ def _read(words: Sequence[str]) -> dict[str, list[Any]]:
 
 
 def _value(key: str, text: str) -> Any:
-    """A value as YAML has it."""
+    """Parse a value as YAML."""
     from torchpt.scene.formats.yaml import parse_yaml, plain
 
     try:
@@ -141,16 +141,16 @@ def _names(text: str) -> list[str]:
 
 
 def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interrupt) -> int:
-    """Run what is missing, write the report, print the summary; returns the exit code.
+    """Render the missing runs of a study, write the report, print the summary and return the exit code.
 
     Args:
-        words: by key.
+        words: values of the command line by key.
         changes: overrides of scene keys.
-        interrupt: signals that came.
+        interrupt: the signal handler.
 
     Raises:
         TorchptError: bad input, found before anything is rendered.
-        Interrupted: a signal came before the first run.
+        Interrupted: a signal arrived before the first run.
     """
     from torchpt.reports.analysis import check_files
     from torchpt.reports.report import plain, write_report
@@ -215,15 +215,15 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
 
 
 def _folder(out: str | None, name: str, told: dict[str, Any]) -> tuple[Path, str]:
-    """Return the folder of a study, and what is to be said of it: where it holds another study, that.
+    """Return the output folder of a study, and a message if that or the default folder holds another study.
 
     Args:
-        out: the folder that was asked for.
-        name: where none was; ``NAME_2``, ``NAME_3``, ... where those before hold other studies.
-        told: of :func:`_told`.
+        out: value of ``out=``, or None.
+        name: default folder; if it holds another study, ``NAME_2``, ``NAME_3``, ... are tried.
+        told: result of :func:`_told`.
 
     Raises:
-        OutputError: a file is there.
+        OutputError: the path is a file.
     """
     first = Path(name if out is None else out).expanduser()
     if first.exists() and not first.is_dir():
@@ -238,24 +238,24 @@ def _folder(out: str | None, name: str, told: dict[str, Any]) -> tuple[Path, str
 
 
 def _holds_another(folder: Path, told: dict[str, Any]) -> bool:
-    """Return whether a folder holds what this study would write over; one that only grew by runs is the same study."""
+    """Return True if a folder holds another study. A study with fewer steps or seeds, else equal, is the same one."""
     note = folder / _STUDY
     if not note.exists():
         return (folder / "report.html").exists() or (folder.exists() and not folder.is_dir())
     try:
         known = json.loads(note.read_text(encoding="utf-8"))
         grown = set(known["spp"]) <= set(told["spp"]) and known["seeds"] <= told["seeds"]
-    except (OSError, ValueError, KeyError, TypeError):  # somebody else's file
+    except (OSError, ValueError, KeyError, TypeError):  # not written by torchpt
         return True
     return {**known, "spp": 0, "seeds": 0} != {**told, "spp": 0, "seeds": 0} or not grown
 
 
 def _told(raw: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all that the runs of a study depend on, as JSON has it.
+    """Return everything that the runs of a study depend on, as values for JSON.
 
     Args:
-        raw: its keys as written.
-        options: its own keys as read, see :class:`torchpt.reports.study.Study`.
+        raw: keys of the study as written.
+        options: parsed keys of the study, see :class:`torchpt.reports.study.Study`.
     """
     from torchpt.reports.report import plain
 

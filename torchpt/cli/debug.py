@@ -1,4 +1,4 @@
-"""`torchpt render ... debug.pixel=[x,y] debug.sample=k`: one path of the picture, vertex by vertex, as text or as JSON."""
+"""`torchpt render ... debug.pixel=[x,y] debug.sample=k`: print one path vertex by vertex, as text or as JSON."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _SAMPLE = re.compile(r"\d{1,18}\Z")
 
 @dataclass(frozen=True)
 class PathRequest:
-    """Which path.
+    """The pixel and sample of the path to print.
 
     Attributes:
-        pixel: ``(x, y)`` on the whole film.
-        sample: its number in the pixel.
+        pixel: ``(x, y)`` on the whole film, from the upper left.
+        sample: index of the sample in the pixel.
     """
 
     pixel: tuple[int, int]
@@ -39,10 +39,10 @@ class PathRequest:
 
     @staticmethod
     def read(words: Mapping[str, str]) -> PathRequest:
-        """From the values of ``arguments.DEBUG_KEYS``.
+        """Parse the values of the keys in ``arguments.DEBUG_KEYS``.
 
         Raises:
-            UsageError: something that is no pixel, or no sample.
+            UsageError: an invalid pixel or sample.
         """
         pixel, sample = _PIXEL.match(words["debug.pixel"]), words.get("debug.sample", "0")
         if pixel is None:
@@ -53,11 +53,11 @@ class PathRequest:
 
 
 def debug(job: Job, request: PathRequest, interrupt: Interrupt, as_json: bool = False) -> int:
-    """Load the scene, trace the path, print it; returns the exit code.
+    """Load the scene, trace the path, print it and return the exit code.
 
     Raises:
         TorchptError: bad input.
-        Interrupted: a signal came.
+        Interrupted: a signal arrived.
     """
     from torchpt.rendering.one_path import one_path
     from torchpt.scene.devices import device_of
@@ -75,7 +75,7 @@ def debug(job: Job, request: PathRequest, interrupt: Interrupt, as_json: bool = 
 
 
 def _plain(value: Any) -> Any:
-    """JSON has no word for what is not finite, which matters here: it is told as text."""
+    """Convert a value for JSON, which has no NaN and no infinity: they become text."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -86,7 +86,7 @@ def _plain(value: Any) -> Any:
 
 
 def lines(path: Path) -> Iterator[str]:
-    """A path as text."""
+    """Yield the lines that describe a path."""
     x, y = path.pixel
     yield f"scene {path.scene}, pixel ({x}, {y}), sample {path.sample}, seed {path.seed}"
     yield f"camera at {_three(path.origin)}, looking along {_three(path.direction)}"
@@ -148,7 +148,7 @@ def _density(pdf: float) -> str:
 
 
 def _number(value: float, digits: int = 6) -> str:
-    return f"{value + 0.0:.{digits}g}"  # -0 is told as 0
+    return f"{value + 0.0:.{digits}g}"  # prints -0 as 0
 
 
 def _three(values: Sequence[float], digits: int = 6) -> str:

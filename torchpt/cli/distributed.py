@@ -1,8 +1,8 @@
-"""`torchpt render` by several processes: who speaks, and with which exit code all of them end.
+"""Run `torchpt render` on several ranks: start-up, messages and a common exit code.
 
-torchrun starts them, or whatever else sets RANK, WORLD_SIZE, MASTER_ADDR and MASTER_PORT. The first rank does all that one
-process would do; the others help it to sample, and say nothing. What goes wrong is said once, by the first that says it. One
-process never imports anything of this.
+torchrun starts the processes, or any launcher that sets RANK, WORLD_SIZE, MASTER_ADDR and MASTER_PORT. Rank 0 does the work of
+a single process; the other ranks trace samples for it and print nothing. An error is printed once, by the first rank that
+reports it. A run in one process does not import `torchpt.ranks`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["group", "is_distributed", "run_on_ranks", "say"]
 
-#: Words that ask for more than one render, or for something else.
+#: Words that ask for a sweep, and those that only print a help or a version.
 _SWEEPS, _SHOWN = ("-m", "--multirun"), ("-h", "--help", "help", "--version")
 
 _started: LaunchedProcess | None = None
@@ -30,23 +30,23 @@ _stderr: Any = None
 
 
 def is_distributed() -> bool:
-    """Whether this process was started as one of several."""
+    """Return True if this process is one of several ranks (WORLD_SIZE > 1)."""
     return os.environ.get("WORLD_SIZE", "1").strip() not in ("", "0", "1")
 
 
 def group() -> Group | None:
-    """The ranks of this process; None where it is alone."""
+    """Return the process group, or None in a run of one process."""
     return None if _started is None else _started.group
 
 
 def say(line: str, about: str = "") -> None:
-    """A line on stderr, by one rank only; of several lines ``about`` one matter the first."""
+    """Print a line on stderr from one rank only: the first rank that reports on the topic ``about`` (default: the line)."""
     if _started is None or _started.first_to_say(about or line):
         print(line, file=_stderr or sys.stderr, flush=True)
 
 
 def report_lost_rank(error: LostRankError | OtherRankError) -> int:
-    """What there is to say where ranks do not end together; returns the exit code."""
+    """Report that a rank was lost, unless another rank has reported its own error; return the exit code."""
     if isinstance(error, OtherRankError):
         return error.code  # that rank says what happened
     say(f"torchpt: {error}", about="lost")
@@ -54,11 +54,11 @@ def report_lost_rank(error: LostRankError | OtherRankError) -> int:
 
 
 def run_on_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
-    """Run a command line as one rank of several, and return the exit code, which all have in common.
+    """Run a command line as one of several ranks and return the exit code, which is the same on all ranks.
 
     Args:
-        main: the command line.
-        words: its words.
+        main: runs a command line and returns its exit code.
+        words: the command line.
     """
     global _started, _stderr
     first = os.environ.get("RANK", "0") == "0"
@@ -70,7 +70,7 @@ def run_on_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
             _started.connect(interrupt.check)
     except LostRankError as error:
         _leave(report_lost_rank(error))
-    except TorchptError as error:  # of the environment, which is the same for all
+    except TorchptError as error:  # a bad environment variable, the same on all ranks
         if first:
             print(f"torchpt: {error}", file=sys.stderr)
         return 2
@@ -91,7 +91,7 @@ def run_on_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
 
 
 def _ended(main: Callable[[list[str]], int], words: list[str]) -> int:
-    """The exit code of all ranks, once they are done."""
+    """Run the command line, wait for all ranks and return their common exit code."""
     assert _started is not None
     problem = _not_for_ranks(words)
     if problem is not None:
@@ -103,13 +103,13 @@ def _ended(main: Callable[[list[str]], int], words: list[str]) -> int:
             code = own.end(code)
             _started.disconnect()
             return code
-        except LostRankError as error:  # while it wrote the picture, say
+        except LostRankError as error:  # for example while rank 0 wrote the picture
             code = report_lost_rank(error)
     _leave(code)
 
 
 def _leave(code: int) -> NoReturn:
-    """End the process at once: threads of connections that are broken might keep it."""
+    """Exit the process at once: threads of broken connections could keep it alive."""
     for stream in (sys.stdout, sys.stderr, _stderr):
         if stream is not None:
             stream.flush()
@@ -117,7 +117,7 @@ def _leave(code: int) -> NoReturn:
 
 
 def _not_for_ranks(words: list[str]) -> str | None:
-    """Why several processes cannot do what is asked for."""
+    """Return why a command line cannot run on several ranks, or None if it can."""
     if words[:1] != ["render"] and words[:1] and words[0] not in _SHOWN:
         return f"{words[0]}: runs in one process; `torchpt render` alone is shared by several"
     for word in words:

@@ -1,7 +1,7 @@
-"""Overrides of scene keys in Hydra's grammar. Its parser alone is used: scenes never enter Hydra or OmegaConf.
+"""Parse overrides of scene keys with Hydra's override parser. Scenes themselves never enter Hydra or OmegaConf.
 
-``camera.fov=20``, ``+shapes.ball='{type: sphere}'``, ``~lights.sky``; ``20,40``, ``choice(a,b)`` and ``range(1,4)`` sweep. What
-the words do is said in :mod:`torchpt.scene.formats.overrides`.
+Examples: ``camera.fov=20``, ``+shapes.ball='{type: sphere}'``, ``~lights.sky``. Values ``20,40``, ``choice(a,b)`` and
+``range(1,4)`` sweep. :mod:`torchpt.scene.formats.overrides` applies the overrides to a scene.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from torchpt.cli.arguments import UsageError
 
 __all__ = ["MAX_VALUES", "read_value", "read_word", "reason"]
 
-#: Values that one word may sweep over.
+#: Largest number of values that one override may sweep over.
 MAX_VALUES = 10_000
 _WORD = re.compile(r"(\+\+|\+|~|)([^=]*)(?:=(.*))?\Z", re.DOTALL)
 
 
 def read_word(word: str) -> tuple[str, list[Any], bool]:
-    """Return the key of an override with its sign, its values, and whether it sweeps over them.
+    """Return the key of an override with its sign (``+``, ``++``, ``~``), its values, and whether it is a sweep.
 
     Raises:
-        UsageError: a word that the grammar does not know.
+        UsageError: a word that Hydra's grammar does not accept.
     """
     match = _WORD.match(word)
     assert match is not None
@@ -40,11 +40,11 @@ def read_value(key: str, text: str) -> tuple[list[Any], bool]:
     """Return the values of the text after ``=``, and whether it is a sweep.
 
     Args:
-        key: for errors.
-        text: in Hydra's grammar.
+        key: key of the override, for error messages.
+        text: value in Hydra's grammar.
 
     Raises:
-        UsageError: the grammar does not know it, or it has no place in a scene.
+        UsageError: a value that Hydra's grammar does not accept, or that a scene file cannot hold.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
@@ -73,13 +73,13 @@ def read_value(key: str, text: str) -> tuple[list[Any], bool]:
 
 
 def reason(error: Exception) -> str:
-    """Return why Hydra cannot read a word, in a line."""
+    """Return in one line why Hydra cannot parse a word."""
     found = next((line for line in str(error).splitlines() if "evaluating" in line), "")
     return found.partition(": ")[2] or "quote what holds blanks, brackets or commas, as in key='a b'"
 
 
 def _check(key: str, value: Any, text: str) -> None:
-    """Refuse what a scene file cannot say either: interpolation, and keys that are no text."""
+    """Refuse values that a scene file cannot hold: interpolations, and mappings whose keys are not text."""
     if isinstance(value, str) and "${" in value:
         raise UsageError(f"{key}: expected a value, got {text!r} (scenes know no interpolation)")
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""What Hydra takes from the process that it runs in. Hydra itself is imported by :mod:`torchpt.cli.main` alone."""
+"""Set up the process-wide state that Hydra reads: ``sys.argv``, the environment and argparse."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ __all__ = ["hydra_process"]
 
 @contextmanager
 def hydra_process(words: list[str]) -> Iterator[None]:
-    """Hydra reads ``sys.argv``, and hands its errors over (rather than print them) only under HYDRA_FULL_ERROR.
+    """Set ``sys.argv`` and HYDRA_FULL_ERROR inside the context; with HYDRA_FULL_ERROR Hydra raises its errors.
 
-    From Python 3.14 on an option's help text is checked when it is declared, and that of one of Hydra's options is no text
-    (facebookresearch/hydra#3121, open at 1.3.8): the check rests.
+    Python 3.14 checks the help text of an option when it is declared, and one of Hydra's options has a help that is not text
+    (facebookresearch/hydra#3121, open at 1.3.8): the check is off inside the context.
     """
     argv, before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     parser: Any = argparse.ArgumentParser

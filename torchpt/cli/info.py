@@ -1,4 +1,4 @@
-"""`torchpt info`: what a scene holds, what was built for it, what was left out and why."""
+"""`torchpt info`: print what a scene holds, which tables were built for it, and what was left out and why."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ torchpt info scene=NAME|FILE.yaml [--json] [key=value ...]
 
 
 def run(job: Job, arguments: Arguments, interrupt: Interrupt) -> int:
-    """Print what a scene holds; returns the exit code."""
+    """Run `torchpt info` for one job and return the exit code."""
     return info(job, interrupt, arguments.json)
 
 
 def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
-    """Load and build the scene, print what came of it; returns the exit code.
+    """Load and build a scene, print its facts and return the exit code.
 
     Raises:
         TorchptError: bad input.
-        Interrupted: a signal came.
+        Interrupted: a signal arrived.
     """
     from torchpt.rendering import describe_engine
     from torchpt.scene.devices import device_of
@@ -73,7 +73,7 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
 
 
 def _memory(scene: Any, settings: Any) -> dict[str, Any]:
-    """Return whether ``render.max_memory`` is enough for a render, and what a render would say where it is not."""
+    """Return whether ``render.max_memory`` suffices for a render, and the error message if it does not."""
     import torch
 
     from torchpt.rendering import Run
@@ -89,7 +89,7 @@ def _memory(scene: Any, settings: Any) -> dict[str, Any]:
 
 
 def lines(facts: dict[str, Any], depth: int = 0) -> Iterator[tuple[str, str]]:
-    """A nested dict as indented lines: ``("  key:", " value")`` each."""
+    """Yield a nested dict as indented lines, each a pair ``("  key:", " value")``."""
     pad = "  " * depth
     for key, value in facts.items():
         if isinstance(value, dict) and value:

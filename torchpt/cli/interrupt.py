@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: a render ends with its chunk and keeps what it has; a second signal ends the process at once."""
+"""Handle Ctrl-C and SIGTERM: the first signal ends a render after its chunk, the second ends the process at once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["Interrupt", "Interrupted", "interruption"]
 
 
 class Interrupted(BaseException):
-    """The first signal, where there is no picture to keep yet. Not an `Exception`: nothing handles it on the way."""
+    """A signal that arrived before there is a picture to keep. Not an `Exception`, so that no handler swallows it."""
 
     def __init__(self, signum: int) -> None:
         self.signum = signum
@@ -20,15 +20,15 @@ class Interrupted(BaseException):
 
     @property
     def exit_code(self) -> int:
-        """130 for Ctrl-C, 143 for SIGTERM: the shell's convention."""
+        """Exit code by the shell's convention: 130 for Ctrl-C, 143 for SIGTERM."""
         return 128 + self.signum
 
 
 def interruption(error: BaseException) -> Interrupted | None:
-    """Return the signal that an error comes from; None where it comes from none.
+    """Return the `Interrupted` that caused an error, or None.
 
-    Where a signal arrives while Python itself calls a method, it is wrapped in an error of Python's own: in 3.11 one in
-    ``__set_name__`` becomes a ``RuntimeError``, as where a module with dataclasses is imported.
+    Python wraps an exception that is raised inside some of its own calls: 3.11 turns one in ``__set_name__`` (which importing
+    a module with dataclasses calls) into a ``RuntimeError``.
     """
     seen: BaseException | None = error
     while seen is not None:
@@ -39,10 +39,10 @@ def interruption(error: BaseException) -> Interrupted | None:
 
 
 class Interrupt:
-    """Context in which SIGINT and SIGTERM ask instead of kill.
+    """Context manager that catches SIGINT and SIGTERM.
 
     Attributes:
-        signum: the signal that came, or None.
+        signum: the signal that arrived, or None.
         deferred: while True the first signal only sets ``signum``; while False it raises `Interrupted`.
     """
 
@@ -52,14 +52,14 @@ class Interrupt:
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Interrupt:
-        """Install the handlers, where Python allows it: in the main thread."""
+        """Install the signal handlers, if this is the main thread (Python allows them nowhere else)."""
         if threading.current_thread() is threading.main_thread():
             for signum in (signal.SIGINT, signal.SIGTERM):
                 self._previous[signum] = signal.signal(signum, self._arrived)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Restore the handlers that were there."""
+        """Restore the previous handlers."""
         for signum, handler in self._previous.items():
             signal.signal(signum, handler)
         self._previous.clear()
@@ -72,6 +72,6 @@ class Interrupt:
             raise Interrupted(signum)
 
     def check(self) -> None:
-        """Raise `Interrupted` where a signal has come."""
+        """Raise `Interrupted` if a signal has arrived."""
         if self.signum is not None:
             raise Interrupted(self.signum)

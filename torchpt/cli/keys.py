@@ -1,6 +1,7 @@
-"""The keys of the settings, for help and errors, from the groups' files: importing what they are made of would take seconds.
+"""Names of settings and of their config files, for help texts and error messages.
 
-``scripts/make_configs.py`` writes those files from what the kinds declare.
+They are read from the files in ``configs/``, which ``scripts/make_configs.py`` writes from the declared parameters: importing
+the classes that declare them would take seconds.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ __all__ = ["known_keys", "listed", "options", "scenes", "types", "unknown"]
 
 
 def options(group: str) -> list[str]:
-    """The files of a group, or of the scenes, by name."""
+    """Return the names of the files of a config group, or of the shipped scenes (``scene``), sorted."""
     return sorted(path.stem for path in (configs() / group).glob("*.yaml"))
 
 
 @cache
 def known_keys(group: str, name: str = "default") -> tuple[str, ...]:
-    """The keys in a group's file, nested ones dotted; by default those of all its types."""
+    """Return the keys in a file of a config group, nested keys dotted; ``default`` has the keys of all types."""
     import yaml
 
     block: dict[str, Any] = yaml.safe_load((configs() / group / f"{name}.yaml").read_text(encoding="utf-8"))
@@ -33,12 +34,12 @@ def known_keys(group: str, name: str = "default") -> tuple[str, ...]:
 
 
 def types(group: str) -> list[str]:
-    """The types that a group's files are named by."""
+    """Return the types of a config group that have a file: ``path``, ``direct``, ... of ``integrator``."""
     return [name for name in options(group) if name != "default"]
 
 
 def listed() -> str:
-    """All keys, a group after the other; of a group whose types have different ones, type by type."""
+    """List all keys for the help, group by group; where types have different keys, a line for each type."""
     lines: list[str] = []
     for group in GROUPS:
         own = {name: " ".join(known_keys(group, name)[1:]) for name in types(group)}
@@ -52,11 +53,11 @@ def listed() -> str:
 
 
 def unknown(key: str, words: Iterable[str] = ()) -> str:
-    """The line for a key that does not exist, or not where the words of the command line choose a type.
+    """Return the error message for a key that is unknown, or unknown to the type that the command line chooses.
 
     Args:
-        key: dotted.
-        words: of the command line.
+        key: dotted key.
+        words: words of the command line, which may choose types.
     """
     group, _, name = key.partition(".")
     if group in GROUPS:
@@ -84,6 +85,6 @@ def unknown(key: str, words: Iterable[str] = ()) -> str:
 
 
 def scenes() -> str:
-    """The scenes that ship, as lines of the help."""
+    """Return the names of the shipped scenes, wrapped for the help."""
     names = ", ".join(options("scene"))
     return textwrap.fill(names, 110, initial_indent=" " * 11, subsequent_indent=" " * 11, break_on_hyphens=False)

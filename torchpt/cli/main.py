@@ -1,8 +1,8 @@
-"""The command line: words to a Hydra composition, to jobs, to an exit code. With `torchpt.cli.grammar` all that imports Hydra.
+"""Entry point of ``torchpt``: parse the command line, compose the settings with Hydra, run the jobs, return the exit code.
 
 Hydra composes the *run* settings (groups ``film integrator sampler render``), sweeps over them (``--multirun``), shows
-them (``--cfg job``) and launches the jobs. Scenes and file names stay outside (`torchpt.cli.arguments`). Whatever is
-wrong with the input ends as one line on stderr and exit code 2.
+them (``--cfg job``) and launches the jobs. Scenes and file names never enter Hydra (see `torchpt.cli.arguments`). Bad input
+prints one line on stderr and exits with code 2. Hydra is imported here and in `torchpt.cli.grammar` only.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ torchpt: a wavefront path tracer that is a PyTorch program
 torchpt COMMAND --help says more. Scenes that ship:
 {scenes}
 """
-#: What the help of commands says of a scene's own keys.
+#: Help text about overrides of scene keys.
 CHANGES = """\
 camera.fov=20 materials.red.reflectance=[0,0,1] shapes.lamp.material=white
                       any key of the scene; + adds, ~ removes: +shapes.ball='{type: sphere, radius: .2}' ~lights.sky"""
@@ -49,14 +49,14 @@ camera.fov=20 materials.red.reflectance=[0,0,1] shapes.lamp.material=white
 
 @dataclass(frozen=True)
 class Command:
-    """A row of the table of commands.
+    """A command of ``torchpt``.
 
     Attributes:
-        name: the first word.
-        example: words after it, for the list of commands.
-        line: what it does, in a line.
-        help: what ``--help`` prints; ``{scenes}``, ``{keys}`` and ``{changes}`` stand for what they are.
-        run: called with the words after the name and the signals that came; returns the exit code.
+        name: first word of the command line.
+        example: example arguments, for the list of commands.
+        line: one-line description.
+        help: text of ``--help``; ``{scenes}``, ``{keys}`` and ``{changes}`` are filled in.
+        run: takes the arguments after the name and the signal handler, returns the exit code.
     """
 
     name: str
@@ -67,14 +67,14 @@ class Command:
 
 
 def run() -> None:
-    """The console script."""
+    """Run the console script."""
     gc_pause.pause()
     open_streams()
     sys.exit(distributed.run_on_ranks(main, sys.argv[1:]) if distributed.is_distributed() else main())
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run ``torchpt`` with these words (default: those of the process) and return the exit code."""
+    """Run ``torchpt`` with the arguments `argv` (default: ``sys.argv[1:]``) and return the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     with Interrupt() as interrupt:
         try:
@@ -97,7 +97,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _out_of_memory(error: Exception) -> int:
-    """Refuse where memory ran out; any other error goes on its way."""
+    """Return exit code 2 for an out-of-memory error, and raise any other error again."""
     from torchpt.core.memory import is_out_of_memory
 
     if not is_out_of_memory(error):
@@ -106,10 +106,10 @@ def _out_of_memory(error: Exception) -> int:
 
 
 def _command(argv: list[str]) -> Command:
-    """Return the command of a command line.
+    """Return the command that a command line names.
 
     Raises:
-        UsageError: there is no such one.
+        UsageError: no such command.
     """
     for command in COMMANDS:
         if argv[:1] == [command.name]:
@@ -126,10 +126,10 @@ def _asks_for_help(words: list[str]) -> bool:
 
 
 def _check_place() -> None:
-    """Names on the command line begin at the working folder.
+    """Check that the working folder exists: relative paths start there.
 
     Raises:
-        UsageError: it is gone.
+        UsageError: the working folder was deleted.
     """
     try:
         os.getcwd()
@@ -149,7 +149,7 @@ def _refuse(line: str) -> int:
 
 
 class JobFailedError(Exception):
-    """A job of a sweep that did not end well, in a process of its own which said why; ``code`` is what that is to exit with."""
+    """A sweep job that failed in a launcher's worker process, which has printed the reason; ``code`` is the exit code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(code)
@@ -158,13 +158,13 @@ class JobFailedError(Exception):
 
 @dataclass
 class _Task:
-    """What Hydra calls with every composed configuration. Plain data, so that launchers may send it elsewhere.
+    """The task function that Hydra calls with each composed configuration. It holds plain data, so launchers can pickle it.
 
     Attributes:
-        job: of the command, called with what the configuration came to.
-        arguments: the command line.
-        folder: where jobs of a sweep leave what came of them; None outside one.
-        process: that made this.
+        job: function of the command that runs a job.
+        arguments: the parsed command line.
+        folder: folder in which the jobs of a sweep write their results; None outside a sweep.
+        process: id of the process that created the task.
     """
 
     job: Callable[[Job, Arguments, Interrupt], int]
@@ -173,14 +173,14 @@ class _Task:
     process: int = field(default_factory=os.getpid)
 
     def __call__(self, cfg: DictConfig) -> int:
-        """Do one job. Where it does not end well it ends this process, or, in a launcher's own, lets jobs beside it finish."""
+        """Run one job. A failed job exits this process; in a launcher's worker it raises, so that other jobs can finish."""
         code = self._run(cfg)
         if code:
             raise SystemExit(code) if os.getpid() == self.process else JobFailedError(code)
         return code
 
     def _run(self, cfg: DictConfig) -> int:
-        """Run the job of a composed configuration and return the exit code."""
+        """Run one job, print its errors and return the exit code."""
         with Interrupt() as interrupt:
             try:
                 return self.job(self._job(cfg), self.arguments, interrupt)
@@ -194,10 +194,10 @@ class _Task:
                 return _out_of_memory(error)
 
     def _job(self, cfg: DictConfig) -> Job:
-        """Return the job of a composed configuration.
+        """Convert a composed configuration to a job.
 
         Raises:
-            UsageError: a value that cannot be resolved, a block that does not exist.
+            UsageError: a value that cannot be resolved, or an unknown block.
         """
         from hydra.core.hydra_config import HydraConfig
         from hydra.types import RunMode
@@ -238,10 +238,10 @@ class _Task:
 
 
 def _given(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, Any]]:
-    """The settings that somebody set: not null, or null by an explicit word of the command line.
+    """Return the settings that are not null, or that the command line sets to null explicitly.
 
     Raises:
-        UsageError: a block that does not exist, or ``_target_`` anywhere.
+        UsageError: an unknown block, or a key ``_target_``.
     """
     unset = {word.lstrip("+").removesuffix("=null") for word in words if word.endswith("=null")}
     _refuse_targets(composed, "")
@@ -259,7 +259,7 @@ def _given(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, An
 
 
 def _pruned(value: Any) -> Any:
-    """A nested block without its nulls; None where nothing is left."""
+    """Return a nested block without its nulls, or None if nothing is left."""
     if not isinstance(value, dict):
         return value
     return {key: item for key, item in value.items() if item is not None} or None
@@ -279,7 +279,7 @@ def _refuse_targets(value: Any, where: str) -> None:
 def _compose_and_run(
     job: Callable[[Job, Arguments, Interrupt], int], arguments: Arguments, interrupt: Interrupt
 ) -> int:
-    """Hand the words over to Hydra, which calls a task with each composition; returns the exit code."""
+    """Let Hydra compose the settings and run each job; return the exit code."""
     import hydra
     from hydra.core.global_hydra import GlobalHydra
 
@@ -315,7 +315,7 @@ def _compose_and_run(
 
 @contextmanager
 def _composed_once() -> Iterator[None]:
-    """Context in which Hydra is told that this is no sweep: to find out it composes all settings once more."""
+    """Skip Hydra's test for a sweep inside the context: it would compose all settings a second time."""
     from hydra._internal.hydra import Hydra
     from hydra.types import RunMode
 
@@ -327,7 +327,7 @@ def _composed_once() -> Iterator[None]:
         Hydra.get_mode = before
 
 
-#: What configs/config.yaml says of Hydra itself: a configuration of the caller's own need not say it again.
+#: Hydra's own settings in configs/config.yaml, also applied to a user's configuration.
 _QUIET = (
     "hydra.run.dir=.", "hydra.output_subdir=null", "hydra.job.chdir=false",
     "hydra/job_logging=none", "hydra/hydra_logging=none",
@@ -336,7 +336,7 @@ _QUIET = (
 
 @contextmanager
 def _checked() -> Iterator[None]:
-    """Context in which Hydra calls nobody back: files of the caller's own name no Python objects either."""
+    """Refuse Hydra callbacks inside the context: a user's configuration must not name Python objects to call."""
     from hydra._internal.callbacks import Callbacks
 
     before: Any = Callbacks.__init__
@@ -354,10 +354,10 @@ def _checked() -> Iterator[None]:
 
 
 def _check_grammar(words: list[str]) -> None:
-    """Name the word that Hydra cannot read: its own message shows a fragment of it.
+    """Find the word that Hydra cannot parse: Hydra's own message shows only a fragment of it.
 
     Raises:
-        UsageError: a word that is no ``key=value`` of Hydra's grammar.
+        UsageError: a word that is not ``key=value`` in Hydra's grammar.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
@@ -377,7 +377,7 @@ def _quoted(text: str) -> str:
 
 
 def _came_from_job(error: BaseException) -> bool:
-    """Whether an error is a defect inside a job, whose trace must not be lost, rather than a word Hydra refused."""
+    """Return True if an error was raised by a job (its traceback must be kept), and not by Hydra's parser."""
     if "RemoteTraceback" in type(error.__cause__).__name__:  # from a launcher's worker process
         return True
     trace = error.__traceback__
@@ -389,7 +389,7 @@ def _came_from_job(error: BaseException) -> bool:
 
 
 def _one_line(error: Exception, words: list[str]) -> str:
-    """Hydra's and OmegaConf's errors, shortened to what was given and what is accepted."""
+    """Shorten an error of Hydra or OmegaConf to one line: the key, its value and what is accepted."""
     text = str(error)
     if match := re.search(r"Could not override '([^']+)'", text):
         return keys.unknown(match[1], words)
@@ -420,7 +420,7 @@ def _configs() -> Path:
 
 
 def help_of(name: str) -> str:
-    """Return the help of a command, or of ``torchpt`` itself where the name is empty."""
+    """Return the help of a command, or of ``torchpt`` itself if `name` is empty."""
     return _help(next(command.help for command in COMMANDS if command.name == name) if name else HELP)
 
 
@@ -433,7 +433,7 @@ def _help(text: str) -> str:
 
 
 def _composed(name: str, job: Callable[[Job, Arguments, Interrupt], int]) -> Callable[[list[str], Interrupt], int]:
-    """Return a command whose words are settings: Hydra composes them, and ``job`` is called with what each job came to."""
+    """Return the ``run`` of a command whose settings Hydra composes; `job` runs each composed job."""
 
     def command(words: list[str], interrupt: Interrupt) -> int:
         arguments = parse(name, words)
@@ -445,7 +445,7 @@ def _composed(name: str, job: Callable[[Job, Arguments, Interrupt], int]) -> Cal
     return command
 
 
-#: All commands, in the order of the help: a new one is a file in this folder and a row here.
+#: All commands, in the order of the help. To add one, add a file to this folder and a row here.
 COMMANDS = (
     Command(
         "render",

@@ -1,4 +1,4 @@
-"""Warnings on the command line: one line each on stderr, once it is certain that no error line takes their place."""
+"""Print warnings on stderr, one line each."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ __all__ = ["not_finite", "notices", "unknown_error", "which_job"]
 
 @contextmanager
 def notices() -> Iterator[None]:
-    """Context whose warnings about the scene are printed where it ends well; other warnings are Python's as before."""
+    """Collect scene warnings (`EnergyWarning`) inside the context and print them at its end, unless it raised.
+
+    Other warnings are shown by Python as usual.
+    """
     lines: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("always", EnergyWarning)
@@ -44,17 +47,17 @@ def notices() -> Iterator[None]:
 
 
 def which_job(job: Job, outs: Sequence[str] = ()) -> None:
-    """Say on stderr which files are of which settings: of a job of a sweep its number, overrides and pictures."""
+    """Print the number, overrides and output files of a sweep job on stderr; nothing outside a sweep."""
     if job.number is not None:
         files = f" -> {', '.join(outs)}" if outs else ""
         print(f"torchpt: job {job.number}: {' '.join(job.words)}{files}", file=sys.stderr)
 
 
 def not_finite(facts: Mapping[str, Any]) -> None:
-    """Say on stderr that samples of a picture are not finite, why, and where to look; nothing where all are.
+    """Warn on stderr about samples that are not finite: how many, their causes, and where the first is.
 
     Args:
-        facts: of :meth:`torchpt.Rendering.summary`.
+        facts: result of :meth:`torchpt.Rendering.summary`.
     """
     causes = facts.get("nonfinite_causes")
     if not causes:
@@ -68,10 +71,10 @@ def not_finite(facts: Mapping[str, Any]) -> None:
 
 
 def unknown_error(facts: Mapping[str, Any]) -> None:
-    """Say on stderr why a picture's error is not known; nothing where it is, or where nobody asked.
+    """Warn on stderr that the error of a picture was requested but is not known, and why.
 
     Args:
-        facts: of :meth:`torchpt.Rendering.summary`.
+        facts: result of :meth:`torchpt.Rendering.summary`.
     """
     if facts.get("relmse_unknown"):
         print(f"torchpt: warning: the picture's error is not known: {facts['relmse_unknown']}", file=sys.stderr)

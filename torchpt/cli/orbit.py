@@ -1,7 +1,6 @@
-"""`torchpt orbit`: the camera goes round the scene, and the frames become a moving picture.
+"""`torchpt orbit`: render a movie in which the camera circles the scene.
 
-Frames are kept as pictures in a folder beside the first `out` until that is written, so that a run which was stopped goes
-on where it was.
+Frames are stored in the folder ``OUT.frames`` until the movie is written, so that an interrupted run can resume.
 """
 
 from __future__ import annotations
@@ -63,13 +62,13 @@ _MANIFEST = "orbit.json"
 
 @dataclass(frozen=True)
 class Turn:
-    """How the camera goes round.
+    """Settings of the turn.
 
     Attributes:
-        frames: how many.
-        degrees: of the whole turn.
-        fps: frames a second.
-        keep: whether the frames stay as pictures.
+        frames: number of frames.
+        degrees: angle of the whole turn, counter-clockwise seen from above.
+        fps: frames per second.
+        keep: keep the frames as pictures after the movie is written.
     """
 
     frames: int = 48
@@ -79,10 +78,10 @@ class Turn:
 
     @classmethod
     def read(cls, words: Mapping[str, str]) -> Turn:
-        """From the words of the command line, by key.
+        """Parse the values of the command line, given by key.
 
         Raises:
-            SceneError: a value that is not accepted.
+            SceneError: an invalid value.
         """
         numbers: dict[str, Any] = {}
         for key, kind, expected, accept in (
@@ -103,7 +102,7 @@ class Turn:
 
 
 def poses(scene: Scene, turn: Turn) -> Iterator[NDArray[np.float64]]:
-    """Camera to world ``(4, 4)`` of every frame; the first is the scene's own."""
+    """Yield the camera-to-world matrix ``(4, 4)`` of every frame; the first is the scene's own."""
     import numpy as np
 
     from torchpt.math.transforms import look_at, rotate
@@ -132,16 +131,16 @@ def poses(scene: Scene, turn: Turn) -> Iterator[NDArray[np.float64]]:
 
 
 def run(job: Job, arguments: Arguments, interrupt: Interrupt) -> int:
-    """Turn the camera about a scene; returns the exit code."""
+    """Run `torchpt orbit` for one job and return the exit code."""
     return orbit(job, Turn.read(arguments.turn), interrupt)
 
 
 def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
-    """Render the frames that are missing, write the moving picture, print the summary; returns the exit code.
+    """Render the missing frames, write the movie, print the summary and return the exit code.
 
     Raises:
-        TorchptError: bad input, a folder of frames of other settings, a file that cannot be written.
-        Interrupted: a signal came before the first frame.
+        TorchptError: bad input, a folder with frames of other settings, or a file that cannot be written.
+        Interrupted: a signal arrived before the first frame.
     """
     from torchpt.images.movie import check_movie, write_movie
     from torchpt.scene.devices import device_of
@@ -213,7 +212,7 @@ def _outputs(job: Job) -> list[str]:
 
 
 def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Interrupt) -> dict[str, Any]:
-    """Render the frames that are not there, until a signal comes; what they came to."""
+    """Render the missing frames until a signal arrives; return their total rays and non-finite samples."""
     import torch
 
     from torchpt.rendering.api import render_scene
@@ -236,10 +235,8 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
             if frames.has(number):
                 continue
             once = {**job.overrides, "render": {**job.overrides.get("render", {}), "seed": seed + number}}
-            run_settings = with_error_pilots(
-                settings(scene.description, once)
-            )  # a frame is what `torchpt render` gives
-            # A scene file's wishes of these are about `torchpt render`.
+            run_settings = with_error_pilots(settings(scene.description, once))  # as `torchpt render`
+            # In a scene file these settings are meant for `torchpt render`.
             film, render = run_settings.film.but(denoise=False), run_settings.render.but(checkpoint=None, resume=False)
             run_settings = replace(run_settings, film=film, render=render)
             scene.params["camera.to_world"] = torch.from_numpy(pose.copy()).to(place)
@@ -254,14 +251,14 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
 
 
 class Frames:
-    """The folder of the frames, with a note of what they are frames of.
+    """The folder of the frames, with a manifest of the settings that they were rendered with.
 
     Args:
-        folder: made where it is not there.
-        facts: by dotted name, what frames depend on.
+        folder: the folder; it is created if missing.
+        facts: everything that the frames depend on, by dotted name.
 
     Raises:
-        OutputError: it holds something else, frames of other settings, or cannot be made.
+        OutputError: the folder holds other files or frames of other settings, or cannot be created.
     """
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
@@ -290,25 +287,25 @@ class Frames:
             raise OutputError(folder, f"holds frames of other settings ({other}); {how}")
 
     def file(self, number: int) -> Path:
-        """Where a frame lies."""
+        """Return the path of a frame."""
         return self.folder / f"{number:06d}.png"
 
     def has(self, number: int) -> bool:
-        """Whether a frame is there; they are written whole."""
+        """Return True if a frame exists. Frames are written atomically, so it is complete."""
         return self.file(number).exists()
 
     def count(self, frames: int) -> int:
-        """How many of so many are there."""
+        """Count the existing frames among the first `frames`."""
         return sum(map(self.has, range(frames)))
 
     def write(self, number: int, image: Any, film: Any) -> None:
-        """Keep a frame as a screen shows it."""
+        """Write a frame with the display settings of `film`."""
         from torchpt.images import write_image
 
         write_image(self.file(number), image, exposure=film.exposure, tonemap=film.tonemap, gamma=film.gamma)
 
     def pictures(self, frames: int) -> Iterator[Any]:
-        """The frames ``(H, W, 3)`` uint8, in order."""
+        """Yield the frames ``(H, W, 3)`` uint8 in order."""
         from torchpt.images import read_texels
 
         for number in range(frames):
@@ -316,7 +313,7 @@ class Frames:
             yield (values[..., :3] * 255.0 + 0.5).astype("uint8")
 
     def remove(self, frames: int) -> None:
-        """Remove what was written here, and the folder where nothing else is in it."""
+        """Delete the frames and the manifest, and the folder if it is empty then."""
         with suppress(OSError):
             for number in range(frames):
                 self.file(number).unlink(missing_ok=True)
@@ -325,13 +322,13 @@ class Frames:
 
 
 def _facts(scene: Scene, run_settings: Settings, turn: Turn) -> dict[str, Any]:
-    """Return what frames depend on, by dotted name: the turn, the settings, and a hash of the scene."""
+    """Return everything that frames depend on, by dotted name: the turn, the settings, a hash of the scene."""
     from torchpt.scene.fingerprint import fingerprint
     from torchpt.scene.settings import settings_with
     from torchpt.spec import Role
 
     facts = {"torchpt": __version__, "frames": turn.frames, "degrees": turn.degrees}
-    free = {"render": settings_with(Role.FREE, but=Role.ENDS)["render"]}  # which leave a frame as it is
+    free = {"render": settings_with(Role.FREE, but=Role.ENDS)["render"]}  # settings that do not change a frame
     return {**facts, **dict(_dotted(run_settings.plain(free))), "scene": fingerprint(scene)}
 
 

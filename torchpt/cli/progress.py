@@ -1,4 +1,4 @@
-"""The bar of a long render: samples, rays a second, time left. On stderr; where that is no terminal lines, if any."""
+"""Show the progress of a render on stderr: samples, rays per second, time left."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Bar"]
 
-#: Seconds between two lines.
+#: Seconds between two progress lines.
 EVERY = 10.0
 
 
@@ -24,11 +24,11 @@ def _short(count: float) -> str:
 
 
 class Bar:
-    """A progress bar; where stderr is no terminal nothing at all.
+    """A progress bar on stderr, shown only if stderr is a terminal.
 
     Args:
-        name: what is rendered.
-        lines: whether there is a line every ten seconds where stderr is no terminal, as of work of many minutes.
+        name: label of the bar.
+        lines: if stderr is not a terminal, print a line every ten seconds instead (for work that takes many minutes).
     """
 
     def __init__(self, name: str, lines: bool = False) -> None:
@@ -56,12 +56,12 @@ class Bar:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave the terminal as it was."""
+        """Remove the bar and restore the terminal."""
         if self._progress is not None:
             self._progress.stop()
 
     def update(self, done: int, total: int, rays: int, seconds: float) -> None:
-        """Show so many of so many camera samples, so many rays in so many seconds."""
+        """Show the progress: `done` of `total` camera samples, `rays` traced in `seconds`."""
         if self._progress is None or self._task is None:
             now = time.monotonic()
             if self.lines and now - self.told >= EVERY:

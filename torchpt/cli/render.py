@@ -1,4 +1,4 @@
-"""`torchpt render`: from a scene's name to files on disk and one line of JSON."""
+"""`torchpt render`: load a scene, render it, write the pictures and print a summary in JSON."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
   --config-dir DIR, -cd
                       groups, scenes and configurations of your own: render=quick is DIR/render/quick.yaml, scene=room is
                       DIR/scene/room.yaml; --config-name NAME, -cn: DIR/NAME.yaml in place of configs/config.yaml
-  --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
+  --cfg job           print the composed settings and stop (null: the scene's value, else the built-in default)
 
   torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/guides/ranks.md)
 
@@ -67,17 +67,17 @@ Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the par
 
 @dataclass(frozen=True)
 class Job:
-    """One render, in plain values.
+    """One render, described by plain values.
 
     Attributes:
-        scene: a name, or the path of a scene file.
-        overrides: block (``film integrator sampler render``) to the keys given on the command line.
-        outs: pictures to write; ``<scene>.png`` in the current folder where empty.
-        number: of the job in a sweep, which enters the file names; None outside one.
-        words: what the command line says of this job, ``key=value`` each.
+        scene: name of a shipped scene, or path of a scene file.
+        overrides: settings of the command line, by block (``film integrator sampler render``) and key.
+        outs: files to write; if empty, ``<scene>.png`` in the working folder.
+        number: index of the job in a sweep, part of the file names; None outside a sweep.
+        words: overrides of this job as ``key=value``, for messages and the summary.
         changes: overrides of scene keys, as :func:`torchpt.load` takes them.
-        config_dir: a folder of the caller's own, in whose folder ``scene`` defaults of scenes are looked for too.
-        folder: where jobs of a sweep leave what came of them; None outside one.
+        config_dir: the user's config folder; ``defaults`` of scenes are also looked for in its subfolder ``scene``.
+        folder: folder in which the jobs of a sweep write their results; None outside a sweep.
     """
 
     scene: str
@@ -90,13 +90,13 @@ class Job:
     config_dir: str | None = None
 
     def facts(self) -> dict[str, Any]:
-        """Return what a summary says of the words of a job, and of one of a sweep its number."""
+        """Return the overrides of the job, and in a sweep its number, for the summary."""
         told = {"overrides": list(self.words)} if self.words or self.number is not None else {}
         return told if self.number is None else {"job": self.number, **told}
 
 
 def numbered(path: str, number: int | None) -> str:
-    """``a.exr`` as ``a_3.exr``: the number of a job in a sweep enters its file names."""
+    """Append the number of a sweep's job to a file name: ``a.exr`` becomes ``a_3.exr``; None leaves it as it is."""
     if number is None:
         return path
     file = Path(path)
@@ -104,7 +104,7 @@ def numbered(path: str, number: int | None) -> str:
 
 
 def run(job: Job, arguments: Arguments, interrupt: Interrupt) -> int:
-    """Render a picture, or print one path of it; returns the exit code."""
+    """Render a picture, or print one path of it, and return the exit code."""
     if not arguments.debug:
         return render(job, interrupt)
     from torchpt.cli.debug import PathRequest, debug
@@ -113,11 +113,11 @@ def run(job: Job, arguments: Arguments, interrupt: Interrupt) -> int:
 
 
 def render(job: Job, interrupt: Interrupt) -> int:
-    """Render, write, print the summary; returns the exit code (0, or 128 + signal with the partial picture saved).
+    """Render, write the pictures, print the summary; return 0, or 128 + signal with the partial picture saved.
 
     Raises:
-        TorchptError: bad input, found before anything is rendered wherever that is possible.
-        Interrupted: a signal came while there was no picture to keep.
+        TorchptError: bad input, found before rendering where possible.
+        Interrupted: a signal arrived before there was a picture to keep.
     """
     from torchpt.images import check_writable
     from torchpt.rendering.api import first_hit, render_scene
@@ -129,7 +129,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     gc_pause.resume()
     start = time.perf_counter()
     group = distributed.group()
-    first = group is None or group.rank == 0  # which alone writes
+    first = group is None or group.rank == 0  # only rank 0 writes files
     with notices():
         description, settings = scene_and_settings(job)
         settings = with_error_pilots(settings)
@@ -171,7 +171,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
             return interrupt.signum is not None
 
         rendering = _keeping(interrupt, lambda: render_scene(scene, settings, on_progress=on_progress, **shared))
-    if group is not None:  # a signal that any of them heard
+    if group is not None:  # a signal to one rank stops all
         interrupt.signum = int(max(group.all_gather_numbers("signals", interrupt.signum or 0))[0]) or None
     if not first:
         return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
@@ -183,7 +183,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     unknown_error(summary)
     summary = plain(summary, digits=6)
     height, width = rendering.image.shape[:2]
-    with flushed_stdout():  # in one piece, as jobs of a sweep may share stdout; the last line is the summary
+    with flushed_stdout():  # one print, as the jobs of a sweep may share stdout; the last line is the summary
         print(f"{sentence(summary, width, height)}\n{json.dumps(summary, allow_nan=False)}")
     note_job(job, summary)
     if interrupt.signum is None:
@@ -194,10 +194,10 @@ def render(job: Job, interrupt: Interrupt) -> int:
 
 
 def scene_and_settings(job: Job) -> tuple[Any, Any]:
-    """The description and the complete settings of a job; a null given on the command line unsets the scene's own wish.
+    """Return the scene description and the complete settings of a job; null on the command line unsets the scene's value.
 
     Raises:
-        TorchptError: a scene or setting that cannot be used.
+        TorchptError: an invalid scene or setting.
     """
     from torchpt.scene.formats.description import overridden, read_description
 
@@ -206,14 +206,14 @@ def scene_and_settings(job: Job) -> tuple[Any, Any]:
 
 
 def with_error_pilots(settings: Any) -> Any:
-    """Settings of a picture that a command writes: ``render.pilots: auto`` is true there, as its summary tells the error."""
+    """Replace ``render.pilots: auto`` by true where the integrator allows it: the summary reports the error."""
     render = settings.render
     able = render.pilots == "auto" and not settings.integrator.splats
     return replace(settings, render=render.but(pilots=True)) if able else settings
 
 
 def _keeping(interrupt: Interrupt, work: Callable[[], Any]) -> Any:
-    """Do the work whose result is kept: a signal only ends it early."""
+    """Return the result of `work`; from now on a signal does not raise but ends the work early."""
     interrupt.check()
     interrupt.deferred = True
     return work()
@@ -225,7 +225,7 @@ def _name(scene: str) -> str:
 
 
 def _outputs(job: Job, settings: Any) -> list[str]:
-    """Where the picture goes; layers that no file would keep are an error."""
+    """Return the files to write; refuse ``film.aovs`` of the command line if no file can hold layers."""
     layers = [name for name in settings.film.aovs or ()]
     outs = [str(Path(path).expanduser()) for path in job.outs]
     if not outs:
@@ -236,17 +236,17 @@ def _outputs(job: Job, settings: Any) -> list[str]:
 
 
 def check_distinct(files: Sequence[tuple[str, str]]) -> None:
-    """Refuse two files to write that are one, however their paths are spelled.
+    """Check that no two output paths name the same file, however they are spelled.
 
     Args:
-        files: key and path of each.
+        files: key and path of each output.
 
     Raises:
-        SceneError: names the later one's key and path, and the file that it would replace.
+        SceneError: two are the same; names the key and path of the later one, and the file that it would replace.
     """
     seen: dict[str, tuple[str, str]] = {}
     for key, path in files:
-        with suppress(OSError, ValueError):  # of a path that cannot be, which is told where it is tried
+        with suppress(OSError, ValueError):  # an invalid path is reported when it is written
             place = os.path.normcase(os.path.realpath(path))
             if place in seen:
                 other, before = seen[place]
@@ -259,10 +259,10 @@ def _is_exr(path: str) -> bool:
 
 
 def _denoised_files(settings: Any, outs: list[str]) -> list[str]:
-    """Return where the denoised pictures go, one for each of ``outs``; none where none is wanted.
+    """Return the paths of the denoised pictures, one for each of ``outs``; empty without ``film.denoise``.
 
     Raises:
-        RenderError: there is no denoiser.
+        RenderError: the denoiser is not installed.
     """
     if not settings.film.denoise:
         return []
@@ -274,13 +274,13 @@ def _denoised_files(settings: Any, outs: list[str]) -> list[str]:
 
 
 def _preview_files(preview: str) -> list[str]:
-    """Albedo, normal, and the picture itself."""
+    """Return the files of a preview: albedo, normal and picture."""
     path = Path(preview)
     return [*(str(path.with_name(f"{path.stem}.{name}{path.suffix}")) for name in ("albedo", "normal")), preview]
 
 
 def _write_all(paths: list[str], denoised: list[str], rendering: Any, settings: Any) -> dict[str, Any]:
-    """Write every picture that can be written before complaining of one that cannot; returns what there is to tell."""
+    """Write all pictures, then raise the errors of those that failed; return the facts about denoising."""
     from torchpt.rendering.result import denoise_rendering, write_denoised, write_rendered
 
     failed: list[TorchptError] = []
@@ -294,7 +294,7 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, settings: 
                 error = OutputError(path, f"{error.problem}; the picture is in {elsewhere}")
             failed.append(error)
     try:
-        if denoised:  # only now: what was rendered is safe
+        if denoised:  # after the rendered pictures are on disk
             facts = {"denoised": _names(denoised), "denoise_seconds": round(denoise_rendering(rendering, settings), 4)}
             for path in denoised:
                 try:
@@ -311,7 +311,7 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, settings: 
 
 
 def _written_elsewhere(path: str, rendering: Any, settings: Any) -> str | None:
-    """Save a picture whose place went away while it was rendered; returns where it is, under a name that nothing had."""
+    """Write a picture to the home or temporary folder under a new name and return its path, or None if that fails too."""
     from torchpt.rendering.result import write_rendered
 
     name = Path(path)
@@ -325,7 +325,7 @@ def _written_elsewhere(path: str, rendering: Any, settings: Any) -> str | None:
 
 
 def _write_layer(path: str, name: str, layer: Any) -> None:
-    """A layer as a picture of its own; in 8 bits, a normal's -1..1 is shown as 0..1."""
+    """Write a layer as a picture; in 8-bit formats normals are mapped from -1..1 to 0..1."""
     from torchpt.images import write_image
 
     shown = 0.5 * layer + 0.5 if name == "normal" and not _is_exr(path) else layer
@@ -337,12 +337,12 @@ def _names(paths: list[str]) -> str | list[str]:
 
 
 def sentence(facts: Mapping[str, Any], width: int, height: int) -> str:
-    """Return the summary of a render in a sentence for people.
+    """Return a sentence that sums up a render.
 
     Args:
-        facts: the summary, as JSON has it.
-        width: of the picture in pixels.
-        height: of the picture in pixels.
+        facts: the summary, as printed in JSON.
+        width: width of the picture in pixels.
+        height: height of the picture in pixels.
     """
     out, spp = facts["out"], facts["spp"]
     text = f"{out if isinstance(out, str) else ', '.join(out)}: {width} x {height} pixels, "
@@ -357,7 +357,7 @@ def sentence(facts: Mapping[str, Any], width: int, height: int) -> str:
 
 
 def plain(value: Any, digits: int = 17) -> Any:
-    """Return a value as JSON has it, which knows neither NaN nor tensors; floats to so many significant digits."""
+    """Convert a value for JSON: tensors become lists, NaN and infinity None, floats keep `digits` significant digits."""
     if isinstance(value, dict):
         return {str(key): plain(item, digits) for key, item in value.items()}
     if hasattr(value, "tolist"):

@@ -1,7 +1,7 @@
-"""Standard output and standard error, whatever stands at their other end.
+"""Write to standard output and standard error, also if they are closed, full or no longer read.
 
-A reader that has enough (``| head``) is no error. A full disk under ``> FILE`` is one, told in a line. What stderr says is for
-people and never worth a picture: where it cannot be written it is left unsaid.
+A closed pipe (``| head``) is not an error. A full disk under ``> FILE`` is one, reported in one line. Messages on stderr that
+cannot be written are dropped: they must not cost a picture.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ __all__ = ["flushed_stdout", "open_streams"]
 
 
 def open_streams() -> None:
-    """Make all three streams usable, for a process that is the command's own.
+    """Open closed standard streams, and ignore write errors on stderr. Only for a process that runs nothing but the command.
 
-    A closed one would give its number to the next file that is opened, and what is meant for a terminal would end up there.
+    The next file that is opened would get the number of a closed stream, and messages for a terminal would go into that file.
     """
     for number in range(3):
         try:
@@ -34,19 +34,19 @@ def open_streams() -> None:
 
 
 class _Lenient:
-    """A stream to which nothing is written where that is not possible."""
+    """A text stream that ignores write errors."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """As a stream's."""
+        """Write `text`; see :meth:`io.TextIOBase.write`."""
         with suppress(OSError):
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """As a stream's."""
+        """Flush the stream; see :meth:`io.IOBase.flush`."""
         with suppress(OSError):
             self._stream.flush()
 
@@ -56,10 +56,10 @@ class _Lenient:
 
 @contextmanager
 def flushed_stdout() -> Iterator[None]:
-    """Context in which a command prints to standard output what it is asked for.
+    """Flush standard output at the end of the context, and handle its write errors.
 
     Raises:
-        OutputError: it cannot be written, though somebody would read it.
+        OutputError: standard output cannot be written, for another reason than a closed pipe.
     """
     try:
         yield
@@ -72,7 +72,7 @@ def flushed_stdout() -> Iterator[None]:
 
 
 def _mute() -> None:
-    """Send to nowhere what is still to be written, or Python complains of it when it ends."""
+    """Redirect standard output to the null device: Python would report the failed flush at exit."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)

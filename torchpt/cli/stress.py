@@ -1,4 +1,4 @@
-"""`torchpt stress`: stiff and extreme cases, measured; a table, figures as JSON, and pictures of the sweeps."""
+"""`torchpt stress`: run extreme cases, print their errors as a table or JSON, and plot the sweeps."""
 
 from __future__ import annotations
 
@@ -51,7 +51,14 @@ _KEYS = ("quick", "case", "device", "accel", "compile", "dtype", "out", "scene")
 
 @dataclass
 class StressOptions:
-    """A command line, read."""
+    """The parsed arguments of ``torchpt stress``.
+
+    Attributes:
+        given: values by key, as written.
+        settings: settings of the scene, by block and key.
+        changes: overrides of scene keys.
+        json: print JSON.
+    """
 
     given: dict[str, str] = field(default_factory=dict)
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -60,10 +67,11 @@ class StressOptions:
 
     @classmethod
     def read(cls, words: list[str]) -> StressOptions:
-        """From the words after ``stress``.
+        """Parse the words after ``stress``.
 
         Raises:
             UsageError: an unknown word.
+            SceneError: an invalid value.
         """
         import yaml
 
@@ -96,7 +104,7 @@ class StressOptions:
         return found
 
     def change(self, word: str) -> None:
-        """Take an override of a scene key."""
+        """Add an override of a scene key."""
         from torchpt.cli.grammar import read_word
 
         key, values, sweeps = read_word(word)
@@ -105,13 +113,13 @@ class StressOptions:
         self.changes[key] = values[0]
 
     def list(self, key: str, default: str) -> list[str]:
-        """A value, or the values of a list."""
+        """Return the values of a key: those of a list ``[a,b]``, or the single value."""
         text = self.given.get(key, default)
         return [part.strip() for part in text[1:-1].split(",")] if text[:1] == "[" and text[-1:] == "]" else [text]
 
 
 def run(words: list[str], interrupt: Interrupt) -> int:
-    """Run the cases that are asked for, print what came of each; returns the exit code.
+    """Run the selected cases, print the result of each and return the exit code.
 
     Raises:
         TorchptError: bad input.
@@ -129,7 +137,7 @@ def run(words: list[str], interrupt: Interrupt) -> int:
         for topic, cases in topics.items():
             for case in cases:
                 if number and not case.backend:
-                    continue  # the first run tells for all
+                    continue  # does not depend on the backend
                 outcome = outcome_of(case, harness, quick)
                 found.setdefault(label, {}).setdefault(topic, []).append(outcome)
                 _tell(options, line(outcome))
@@ -159,7 +167,7 @@ def _tell(options: StressOptions, text: str) -> None:
 
 
 def _benches(options: StressOptions) -> dict[str, Harness]:
-    """One for each combination of what is asked for, by what it is called."""
+    """Return a bench for each combination of ``accel=`` and ``compile=``, by label."""
     import torch
 
     from torchpt.scene.devices import device_of
@@ -180,7 +188,7 @@ def _benches(options: StressOptions) -> dict[str, Harness]:
 
 
 def _topics(options: StressOptions) -> dict[str, tuple[Case, ...]]:
-    """The cases that are asked for."""
+    """Return the selected cases by topic."""
     from torchpt.stress.cases import all_cases
     from torchpt.stress.scene_cases import cases_of
 

@@ -1,4 +1,4 @@
-"""Where Hydra's sweeper leaves its notes, not beside the pictures; and away with those of sweeps that were killed."""
+"""Create a temporary folder for the files of Hydra's sweeper, and delete the folders of sweeps that were killed."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from pathlib import Path
 
 __all__ = ["sweep_folder"]
 
-#: Name of such a folder: whose it is, so that the next sweep knows which are nobody's any more.
+#: Name of the folder. It holds the process id, by which a later sweep recognises the folders of dead processes.
 _NAME = re.compile(r"torchpt-sweep-(\d+)-\w+")
 
 
 @contextmanager
 def sweep_folder() -> Iterator[str]:
-    """Context with a folder that goes when it ends; folders that killed sweeps left behind go first."""
+    """Yield a folder that is deleted at the end of the context; first delete the folders of dead processes."""
     _clear()
     with tempfile.TemporaryDirectory(prefix=f"torchpt-sweep-{os.getpid()}-", ignore_cleanup_errors=True) as folder:
         yield folder
 
 
 def _clear() -> None:
-    if os.name != "posix":  # elsewhere nobody can be asked whether a process lives without harm to it
+    if os.name != "posix":  # elsewhere os.kill with signal 0 would end the process
         return
     for folder in Path(tempfile.gettempdir()).glob("torchpt-sweep-*"):
         match = _NAME.fullmatch(folder.name)
         try:
             gone = match is not None and folder.lstat().st_uid == os.getuid() and not _lives(int(match[1]))
-        except OSError:  # somebody else was quicker
+        except OSError:  # another process deleted it first
             continue
         if gone and not folder.is_symlink():
             shutil.rmtree(folder, ignore_errors=True)

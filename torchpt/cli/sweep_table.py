@@ -1,4 +1,4 @@
-"""What came of the jobs of a sweep, as a table: each job leaves a note in the sweep's folder, whichever process it runs in."""
+"""Print the results of the jobs of a sweep as a table. Each job writes its results to a file in the sweep's folder."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _HEADING = ("job", "overrides", "out", "error", "seconds")
 
 
 def note_job(job: Job, facts: Mapping[str, Any]) -> None:
-    """Leave a note of a job; outside a sweep, or where its folder cannot be reached, nothing.
+    """Write the results of a job to the sweep's folder; do nothing outside a sweep or if the folder cannot be reached.
 
     Args:
-        job: of a sweep.
+        job: the job.
         facts: its summary.
     """
     if job.folder is not None:
@@ -32,19 +32,19 @@ def note_job(job: Job, facts: Mapping[str, Any]) -> None:
             if name in facts
         }
         told |= {"job": job.number, "overrides": list(job.words)}
-        with suppress(OSError):  # another machine, say
+        with suppress(OSError):  # the job may run on another machine
             (Path(job.folder) / f"torchpt-job-{job.number}.json").write_text(json.dumps(told))
 
 
 def tell_jobs(folder: str) -> None:
-    """Print the table of a sweep on stderr; nothing where fewer than two jobs left a note."""
+    """Print the table of a sweep on stderr, if at least two jobs wrote results."""
     found = [json.loads(path.read_text()) for path in Path(folder).glob("torchpt-job-*.json")]
     if len(found) > 1:
         print("\n".join(table(found)), file=sys.stderr)
 
 
 def table(jobs: list[dict[str, Any]]) -> list[str]:
-    """Return the lines of a table of jobs; of their overrides those that not all have in common."""
+    """Return the lines of a table of jobs; overrides that all jobs share are left out."""
     jobs = sorted(jobs, key=lambda job: job["job"])
     common = set.intersection(*(set(job["overrides"]) for job in jobs))
     rows: list[tuple[str, ...]] = [_HEADING]
@@ -58,7 +58,7 @@ def table(jobs: list[dict[str, Any]]) -> list[str]:
 
 
 def error_of(facts: Mapping[str, Any]) -> str:
-    """Return the relative error of a summary in words; nothing where it is not known."""
+    """Return the relative error of a summary as text, or an empty string if it is not known."""
     if facts.get("relmse") is None:
         return ""
     text = f"{_percent(facts['relmse'])} %"
@@ -74,5 +74,5 @@ def _percent(relmse: float) -> str:
 
 
 def brief(value: float) -> str:
-    """Return two digits, or all before the point."""
+    """Format a number to two significant digits, or as a whole number from 10 on."""
     return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"
