@@ -28,7 +28,7 @@ def arguments(about: str | None, steps: int, size: int, argv: Sequence[str] | No
 
 
 def pose(turn: Tensor, shift: Tensor) -> Tensor:
-    """Return a rigid motion ``(4, 4)``: a rotation by ``|turn|`` radians about the axis ``turn (3,)``, then a translation ``(3,)``.
+    """Return a rigid motion ``(4, 4)``: a rotation by ``|turn|`` radians about ``turn (3,)``, then a translation ``(3,)``.
 
     The exponential of a skew matrix is a rotation whatever its three numbers are (Rodrigues), so Adam may move them
     freely; sixteen free entries of a matrix would soon shear and stretch what they place.
