@@ -45,7 +45,7 @@ class Absorbing(Path):
     def emit(self, context: StageContext, vertex: VertexInput) -> Emission:
         light, state = super().emit(context, vertex), vertex.state
         # The distance of a hit has no derivative; that of the point has.
-        at = interact(context.world, state.o, state.d, vertex.hit, context.follow_shape)
+        at = interact(context.world, state.o, state.d, vertex.hit, context.follow_ray)
         whole = state.extra["length"] + length(at.p - state.o)
         return replace(light, brought=light.brought * torch.exp(-self.density * whole))
 

@@ -112,9 +112,9 @@ def test_points_lie_on_the_shape_and_normals_are_its_slopes(name: str, placed: s
     o, d, hit = found(scene, *rays(matrix))
     assert len(hit.t) > N // 10
     world, _ = scene.world(torch.float64)
-    for follow_shape in (False, True):
+    for follow_ray in (False, True):
         real = Hit(hit.t.double(), hit.prim, hit.u.double(), hit.v.double())
-        at = interact(world, o.double(), d.double(), real, follow_shape=follow_shape)
+        at = interact(world, o.double(), d.double(), real, follow_ray=follow_ray)
         off, apart = level(row, matrix, at.p.numpy())
         sure = apart > CREASE
         assert np.abs(off[sure]).max() < 2e-6 and sure.mean() > 0.9
@@ -289,7 +289,7 @@ def test_points_follow_transforms_and_vertices(name: str, placed: str):
             continue  # it must stay a sphere: below
 
         def point(value: torch.Tensor, key: str = key) -> tuple[torch.Tensor, torch.Tensor]:
-            at = interact(scene.world(torch.float64, {key: value})[0], o, d, hit, follow_shape=True)
+            at = interact(scene.world(torch.float64, {key: value})[0], o, d, hit, follow_ray=True)
             return at.p, at.ng
 
         given = scene.params[key].double().clone().requires_grad_()
@@ -299,7 +299,7 @@ def test_points_follow_transforms_and_vertices(name: str, placed: str):
         def moved(by: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             grown = torch.cat((pose[:3, :3] * (1 + by[3]), pose[:3, 3:] + by[:3, None]), 1)
             world, _ = scene.world(torch.float64, {"shapes.s.to_world": torch.cat((grown, pose[3:]))})
-            at = interact(world, o, d, hit, follow_shape=True)
+            at = interact(world, o, d, hit, follow_ray=True)
             return at.p, at.ng
 
         pose = scene.params["shapes.s.to_world"].double()

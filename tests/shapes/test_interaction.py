@@ -63,7 +63,7 @@ def test_points_lie_on_the_ray_and_normals_are_unit(name, dtype):
     for n in (at.ng, at.ns):
         assert (n.norm(dim=0) - 1).abs().max() < 1e-6
     assert (dot(at.ng, at.ns) > 0).all()
-    slid = interact(world, o, d, found, follow_shape=True)
+    slid = interact(world, o, d, found, follow_ray=True)
     assert ((slid.p - at.p).norm(dim=0) * dot(d, at.ng).abs()).quantile(0.999) < 2e-6
 
 

@@ -198,7 +198,7 @@ def test_points_follow_their_rays_and_transforms(name):
 
     def point(o: torch.Tensor, d: torch.Tensor, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         world, _ = scene.world(torch.float64, {"shapes.s.to_world": pose})
-        at = interact(world, o, d, hit, follow_shape=True)
+        at = interact(world, o, d, hit, follow_ray=True)
         return at.p, at.ng
 
     pose = scene.params["shapes.s.to_world"].double()

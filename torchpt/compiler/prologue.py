@@ -133,6 +133,7 @@ def step_keys(steps: Sequence[Step]) -> tuple[StepKey | None, ...]:
             return "step", name.number, value.item
         if isinstance(value, list | tuple):
             return type(value), tuple(content_of(x) for x in value)
+        # As text 0.0 and -0.0 differ, and NaN equals itself.
         return type(value), repr(value) if isinstance(value, float) else value
 
     for step in steps:

@@ -80,7 +80,7 @@ def tracer_of(tensor: Tensor) -> Tracer | None:
 
 @dataclass(frozen=True)
 class Value:
-    """The nodes of a traced tensor: an array in which the lanes' axis has length 1."""
+    """The nodes of a traced tensor: an array whose lanes' axis is shorter by the number of lanes."""
 
     nodes: Any  # numpy array of objects; numpy's types cannot express that its elements are int
     lane: int | None

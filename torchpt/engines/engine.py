@@ -1,4 +1,4 @@
-"""Interfaces of engines for the rooms above, and the functions that make an engine for a wave."""
+"""Interfaces of engines for the packages above, and the functions that make an engine for a wave."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from torchpt.core.tree import map_leaves
 from torchpt.math.vectors import concatenate_lanes, rows, take
 from torchpt.paths import layers as aov
 from torchpt.paths.integrators.base import check_fields, check_output
-from torchpt.paths.integrators.path import Ends, follows_shape, partition
+from torchpt.paths.integrators.path import Ends, follows_ray, partition
 from torchpt.paths.layers import LAYERS
 from torchpt.paths.state import Emission, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
 from torchpt.paths.transmission import beyond, non_opaque, opacity_at
@@ -222,11 +222,11 @@ class TensorsEngine:
 
     def _context(self, paths: Paths, roulette: float = 0.0) -> StageContext:
         """Return the stage context of a vertex."""
-        follow_shape, salt = (
-            follows_shape(self.plan, self.world, paths.depth),
+        follow_ray, salt = (
+            follows_ray(self.plan, self.world, paths.depth),
             salts(paths.depth, paths.state.lane.device),
         )
-        return self.context.at(salt, follow_shape, roulette, partial(self.hits, depth=paths.depth + 1))
+        return self.context.at(salt, follow_ray, roulette, partial(self.hits, depth=paths.depth + 1))
 
     def _input(self, paths: Paths, index: Tensor) -> VertexInput:
         return VertexInput(rows(paths.state, index), rows(paths.met, index))
@@ -395,8 +395,8 @@ def radiance(
 class _Layers(Observer[Paths]):
     """Evaluates layers of first surfaces, and ends the walk there."""
 
-    def __init__(self, wave: Wave, names: tuple[str, ...], follow_shape: bool) -> None:
-        self.names, self.context, self.centre = names, replace(wave.context, follow_shape=follow_shape), wave.centre
+    def __init__(self, wave: Wave, names: tuple[str, ...], follow_ray: bool) -> None:
+        self.names, self.context, self.centre = names, replace(wave.context, follow_ray=follow_ray), wave.centre
         self.found: dict[str, Tensor] = {}
 
     def sorted(self, paths: Paths, counts: Counts) -> bool:
@@ -411,12 +411,12 @@ class _Layers(Observer[Paths]):
         return True
 
 
-def seen(wave: Wave, names: tuple[str, ...], state: PathState, follow_shape: bool = False) -> dict[str, Tensor]:
+def seen(wave: Wave, names: tuple[str, ...], state: PathState, follow_ray: bool = False) -> dict[str, Tensor]:
     """Return the layers ``names`` of the first hits of camera rays, each ``(C, N)``; 0 where a ray hits nothing.
 
-    They are not weighted by the filter. ``follow_shape``: True: points are intersected anew along their rays, for derivatives.
+    They are not weighted by the filter. ``follow_ray``: True: points are intersected anew along their rays, for derivatives.
     """
-    engine, layer = TensorsEngine(wave, len(state.lane)), _Layers(wave, names, follow_shape)
+    engine, layer = TensorsEngine(wave, len(state.lane)), _Layers(wave, names, follow_ray)
     walk(engine, engine.spawn(state), wave.integrator.limits, layer)
     return layer.found
 
@@ -429,11 +429,11 @@ def layers(
     first_sample: int,
     samples: int,
     pixel_set: PixelSet | None = None,
-    follow_shape: bool = False,
+    follow_ray: bool = False,
 ) -> dict[str, Tensor]:
     """Return the layers ``names`` of consecutive pixels, each ``(C, samples, pixels)``, weighted by the filter."""
     state = wave.rays(first_pixel, pixels, first_sample, samples, pixel_set)
-    found = seen(wave, names, state, follow_shape)
+    found = seen(wave, names, state, follow_ray)
     if wave.filter.signed:
         found = aov.weighted(found, wave.weight(state))
     return {name: value.view(-1, samples, pixels) for name, value in found.items()}

@@ -19,7 +19,7 @@ from torchpt.math.sums import GradientSums
 from torchpt.math.vectors import rows, take
 from torchpt.paths import adjoint
 from torchpt.paths.adjoint import Tape, VertexCotangents
-from torchpt.paths.integrators.path import Ends, follows_shape
+from torchpt.paths.integrators.path import Ends, follows_ray
 from torchpt.paths.state import EXTRA, Emission, PathState, Shadow, Splat, StageContext, VertexInput
 from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Hit
@@ -115,8 +115,8 @@ class TensorsBackward(TensorsEngine):
         return chance, torch.zeros_like(chance)
 
     def _at(self, depth: int, lanes: Tensor, roulette: float = 0.0) -> StageContext:
-        follow_shape = follows_shape(self.plan, self.taped.context.world, depth)
-        return self.taped.context.at(salts(depth, lanes.device), follow_shape, roulette)
+        follow_ray = follows_ray(self.plan, self.taped.context.world, depth)
+        return self.taped.context.at(salts(depth, lanes.device), follow_ray, roulette)
 
     def _bounce(
         self,

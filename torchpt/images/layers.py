@@ -19,7 +19,7 @@ def channel_names(layer: str, components: int) -> tuple[str, ...]:
     if layer == "image":
         known = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
         return known.get(components) or tuple(f"image.{i}" for i in range(components))
-    # Imported by name, and only when a layer is written: the room `paths` lies above this one.
+    # Imported by name, and only when a layer is written: package `paths` imports this one.
     own = import_module("torchpt.paths.layers").LAYERS.get(layer)
     if own is not None and len(own.channels) == components:
         return own.channels

@@ -2,7 +2,7 @@
 
 ``jit.py`` has the decorators: start there. ``content.py`` computes digests of code, by which ``cache.py`` caches kernels;
 ``compile_time.py`` measures the time of compilation; ``simd/`` has the vector type. ``jit.py`` and ``simd/`` import numba, so
-other rooms import them only when a kernel is needed.
+other packages import them only when a kernel is needed.
 
 May import: ``core``.
 """

@@ -16,5 +16,5 @@
 ``nonfinite.py``          samples that are NaN or infinite
 ========================  ==============================================================================
 
-An engine (:mod:`torchpt.engines`) runs the stages. May import: ``physics``, ``search`` and the rooms below them.
+An engine (:mod:`torchpt.engines`) runs the stages. May import: ``physics``, ``search`` and the packages below them.
 """

@@ -243,8 +243,8 @@ def values(
     ``centre``: see :class:`torchpt.paths.wave.Wave`.
     """
     world = context.world
-    at = interact(world, o, d, hit, context.follow_shape)
-    if context.follow_shape:
+    at = interact(world, o, d, hit, context.follow_ray)
+    if context.follow_ray:
         hit = replace(hit, t=dot(at.p - o, d))
     point = texture_point_at(world, model, at, context.pixel)
     seen = Seen(world, model, d, hit, at, point, centre, context.plan.dtype)

@@ -159,7 +159,7 @@ class StageContext:
         world: the scene's tensors.
         pixel: ``(5,)`` pixel footprint, see :func:`torchpt.paths.surface.texture_point_at`; None: textures are not filtered.
         salts: hashed random dimensions of this vertex, see :func:`torchpt.physics.samplers.salts`.
-        follow_shape: True: hit points are intersected anew along their rays, see :func:`torchpt.physics.shapes.interact`.
+        follow_ray: True: hit points are intersected anew along their rays, see :func:`torchpt.physics.shapes.interact`.
         roulette: upper bound of the survival probability; 0: no roulette at this vertex.
         search: returns the hits of rays that leave; called only where ``plan.attached``.
         camera: the camera of the picture; None for an integrator without splats.
@@ -170,7 +170,7 @@ class StageContext:
     world: World
     pixel: Tensor | None = None
     salts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int32))
-    follow_shape: bool = False
+    follow_ray: bool = False
     roulette: float = 0.0
     search: Callable[[PathState], Hit] = no_search
     camera: Camera | None = None
@@ -179,12 +179,12 @@ class StageContext:
     def at(
         self,
         salts: Tensor,
-        follow_shape: bool = False,
+        follow_ray: bool = False,
         roulette: float = 0.0,
         search: Callable[[PathState], Hit] = no_search,
     ) -> StageContext:
         """Return the context of one vertex: a copy with its dimensions, bound of roulette and search."""
-        return replace(self, salts=salts, follow_shape=follow_shape, roulette=roulette, search=search)
+        return replace(self, salts=salts, follow_ray=follow_ray, roulette=roulette, search=search)
 
 
 @dataclass(frozen=True)

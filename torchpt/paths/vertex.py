@@ -362,7 +362,7 @@ def emit(context: StageContext, vertex: VertexInput) -> Emission:
     """Return the emission of the emitters that paths hit, weighted by MIS."""
     world, state = context.world, vertex.state
     assert world.lights is not None
-    at = interact(world, state.o, state.d, vertex.hit, context.follow_shape)
+    at = interact(world, state.o, state.d, vertex.hit, context.follow_ray)
     # Where the light sampler depends on the point, its pdf is that at the vertex itself, which differs from the ray's origin.
     x = state.o if state.p is None else state.p
     radiance, pdf = lights.emitted(world.lights, x, at, state.d, state.n)
@@ -389,7 +389,7 @@ def _gathered(vertex: VertexInput, radiance: Tensor, light_pdf: Tensor) -> Emiss
 def bounce(context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
     """Return the outputs of a vertex on surfaces of one BSDF model: light sample, next ray, roulette."""
     world, state, hit = context.world, vertex.state, vertex.hit
-    at = interact(world, state.o, state.d, hit, context.follow_shape)
+    at = interact(world, state.o, state.d, hit, context.follow_ray)
     if hit.chance is not None:
         state = replace(state, throughput=state.throughput * hit.chance)
     surface, direct, shadow = shade(context, model, state, at)

@@ -94,7 +94,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class Wave:
-    """The tensors and settings that all waves of one render share.
+    """A render's job: the tensors and settings that all its waves share.
 
     Attributes:
         context: inputs of stages that are the same for all lanes.
@@ -202,4 +202,13 @@ def camera_state(o: Tensor, d: Tensor, key: Tensor) -> PathState:
     n = d.shape[1]
     forever = torch.full((n,), math.inf, dtype=d.dtype, device=d.device)
     lane, nothing = torch.arange(n, device=d.device), torch.zeros_like(d)
-    return PathState(o.clone(), d, forever, torch.ones_like(d), nothing, forever.clone(), lane, key)
+    return PathState(
+        o=o.clone(),
+        d=d,
+        t_max=forever,
+        throughput=torch.ones_like(d),
+        radiance=nothing,
+        pdf=forever.clone(),
+        lane=lane,
+        key=key,
+    )

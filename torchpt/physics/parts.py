@@ -40,7 +40,7 @@ class Parameters(dict[str, np.ndarray]):
         self.specs[name] = spec
 
     def declare_all(self, prefix: str, kind: Any, values: Mapping[str, Any]) -> None:
-        """Add the traced parameters of a kind that have a value; ``transform`` becomes ``to_world``."""
+        """Add the differentiable parameters of a kind that have a value; ``transform`` becomes ``to_world``."""
         for key, spec in parameters_of(kind).items():
             if not spec.differentiable:
                 continue

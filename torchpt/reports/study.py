@@ -68,7 +68,7 @@ class Variant:
     Attributes:
         label: the settings that differ from other variants, in words.
         settings: values by dotted key or name of a group, as written.
-        axes: keys for which the grid has a list.
+        axes: keys that have more than one value in the grid.
         changes: overrides of the scene's keys, as :func:`torchpt.load` takes them.
     """
 
@@ -160,7 +160,7 @@ def blocks_of(settings: Mapping[str, Any], file: str | None) -> dict[str, dict[s
     """Return overrides by block, as :func:`torchpt.scene.formats.description.settings` takes them; nulls are kept.
 
     Raises:
-        SceneError: a group has no such file, or a key lies below a value that is no block.
+        SceneError: a group has no such file, or a setting that a study refuses.
     """
     blocks: dict[str, dict[str, Any]] = {}
     for key, value in sorted(settings.items(), key=lambda item: item[0] not in BLOCKS):  # a group first
@@ -173,6 +173,7 @@ def blocks_of(settings: Mapping[str, Any], file: str | None) -> dict[str, dict[s
         place = blocks.setdefault(block, {})
         for name in inner:
             below = place.get(name)
+            # A bare value is short for a block with this type.
             place[name] = dict(below) if isinstance(below, Mapping) else {} if below is None else {"type": below}
             place = place[name]
         place[last] = value
@@ -200,9 +201,9 @@ def _set(block: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 # The same keys stand on the command line and in a study file; any other key there is a setting of the renderer.
 
 
-#: What a curve can show, in the order of tables. `relmse_trimmed` is of this room until all measures have it.
+#: What a curve can show, in the order of tables. Other measures have no trimmed form: `relmse_trimmed` is of this package.
 MEASURES = tuple(dict.fromkeys(("relmse", "relmse_trimmed", *METRICS)))
-#: Of them, those that fall toward 0: what slopes and times to an error are of.
+#: Those that fall toward 0: slopes, and times to an error, are computed for these.
 ERRORS = tuple(name for name in MEASURES if name not in ("psnr", "ssim"))
 _MOST_STEPS = 64
 

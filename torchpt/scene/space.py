@@ -24,7 +24,7 @@ __all__ = ["MAX_COORDINATE", "Space", "bounds_center", "bounds_extent", "centre_
 
 #: A scene is moved to the origin where its distance from it is more than this many times its size.
 RECENTRE_DISTANCE = 8.0
-#: Scenes with all lengths between 1 / ORDINARY and ORDINARY keep their unit.
+#: Scenes with all lengths between 1 / UNSCALED_RANGE and UNSCALED_RANGE keep their unit.
 UNSCALED_RANGE = 2.0**30
 #: Largest ratio of the longest length to the smallest shape: with their geometric mean as unit, float32 holds both cubes.
 MAX_RATIO = 2.0**80

@@ -10,7 +10,7 @@ One interface (:class:`~torchpt.search.base.Accel`: start there), three backends
 Instances of meshes are a second level above the last two (``instances.py``, ``tree_instances.py``). numba is imported only when
 a numba backend is built.
 
-May import: ``compiler`` and the rooms below it; of ``physics`` only ``shapes.geometry``.
+May import: ``compiler`` and the packages below it; of ``physics`` only ``shapes.geometry``.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from torchpt.math.gathers import recording_gathers
 from torchpt.math.sums import ChunkGradientSums
 from torchpt.paths import adjoint
 from torchpt.paths.adjoint import InputCotangents, Tape, VertexCotangents
-from torchpt.paths.integrators.path import follows_shape
+from torchpt.paths.integrators.path import follows_ray
 from torchpt.paths.state import EXTRA, PathState, Shadow, Splat, VertexInput
 from torchpt.paths.walk import KEPT
 from torchpt.paths.wave import with_detached_geometry
@@ -99,7 +99,7 @@ class _RecordedGathers:
         return [*(leaf for _, _, leaf in self.taken), *self.kernels.tape.leaves]
 
 
-def bounce_vjp(trace: Trace, model: int, roulette: float, follow_shape: bool) -> Sinks:
+def bounce_vjp(trace: Trace, model: int, roulette: float, follow_ray: bool) -> Sinks:
     """See :func:`torchpt.paths.adjoint.bounce`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
@@ -118,7 +118,7 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_shape: bool) ->
 
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
-        context = kernels.taped.at(salts, follow_shape, roulette)
+        context = kernels.taped.at(salts, follow_ray, roulette)
         vertex = VertexInput(state, hit)
         input_cotangents = adjoint.bounce(
             integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, gathers.leaves, landed
@@ -126,14 +126,14 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_shape: bool) ->
     return _stores(trace, gathers, state, input_cotangents, {})
 
 
-def emit_vjp(trace: Trace, follow_shape: bool) -> Sinks:
+def emit_vjp(trace: Trace, follow_ray: bool) -> Sinks:
     """See :func:`torchpt.paths.adjoint.gather`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
     state, hit, rows = _inputs(trace)
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
-        context = kernels.taped.at(salts, follow_shape)
+        context = kernels.taped.at(salts, follow_ray)
         stage, vertex = trace.layout.wave.integrator.emit, VertexInput(state, hit)
         input_cotangents = adjoint.gather(stage, context, vertex, rows["radiance"], gathers.leaves)
     return _stores(trace, gathers, state, input_cotangents, rows)
@@ -285,7 +285,7 @@ class VjpKernels(Kernels):
     def vjp_kernel(self, key: tuple[Any, ...]) -> Kernel | None:
         """Return the kernel of a stage's VJP; None if it cannot be compiled, see :attr:`eager_vjps`.
 
-        ``key``: ``("bounce", model, roulette, follow_shape)``, ``("emit", follow_shape)`` or ``("escape",)``.
+        ``key``: ``("bounce", model, roulette, follow_ray)``, ``("emit", follow_ray)`` or ``("escape",)``.
         """
         if key in self.eager_vjps:
             return None
@@ -390,16 +390,16 @@ class KernelsBackward(KernelsEngine):
         """See :class:`torchpt.engines.engine.Backward`."""
         kernels, calls, depth = self.back, self.calls, paths.depth
         limits = self.wave.integrator.limits
-        follow_shape = follows_shape(kernels.taped.plan, kernels.world, depth)
+        follow_ray = follows_ray(kernels.taped.plan, kernels.world, depth)
         calls.set_dimensions(depth)
         if depth < limits.last:
             for model, count in enumerate(paths.groups):
                 if count:
-                    key = ("bounce", model, limits.roulette(depth), follow_shape)
+                    key = ("bounce", model, limits.roulette(depth), follow_ray)
                     self._one(key, paths, paths.lists[model], count, False)
         if kernels.has_emitters and paths.places[kernels.emissive]:
             place = kernels.emissive
-            self._one(("emit", follow_shape), paths, paths.lists[place], paths.places[place], True)
+            self._one(("emit", follow_ray), paths, paths.lists[place], paths.places[place], True)
         if kernels.has_environment and paths.places[kernels.missed]:
             place = kernels.missed
             self._one(("escape",), paths, paths.lists[place], paths.places[place], True)
@@ -461,8 +461,8 @@ class KernelsBackward(KernelsEngine):
                 extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
                 cotangents = VertexCotangents(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
                 next_hit = Hit(*(rows[name] for name in HIT)) if plan.attached else None
-                _, model, roulette, follow_shape = key
-                context = kernels.taped.at(salt, follow_shape, roulette)
+                _, model, roulette, follow_ray = key
+                context = kernels.taped.at(salt, follow_ray, roulette)
                 input_cotangents = adjoint.bounce(
                     integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, self._tables, landed
                 )

@@ -123,7 +123,7 @@ def _interior(asked: Asked, names: tuple[str, ...], params: dict[str, Tensor], w
                 wave = rebuild_with_tape(
                     still, scene, settings, {**plain, **dict(zip(asked.wanted, leaves, strict=True))}
                 )
-                found = layers_of(wave, names, first, count, sample, many, follow_shape=True)
+                found = layers_of(wave, names, first, count, sample, many, follow_ray=True)
                 mean = torch.cat([found[name] for name in names]).sum(1) / spp
             if mean.requires_grad:
                 grads = torch.autograd.grad(mean, leaves, flat[:, first : first + count], allow_unused=True)

@@ -16,14 +16,14 @@ from torchpt.paths.state import Plan
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.physics.world import World
 
-__all__ = ["Ends", "PathIntegrator", "follows_shape", "partition"]
+__all__ = ["Ends", "PathIntegrator", "follows_ray", "partition"]
 
 
 class PathIntegrator(Integrator):
     """Base class of integrators that trace paths to their :attr:`limits`, vertex by vertex."""
 
 
-def follows_shape(plan: Plan, world: World, depth: int) -> bool:
+def follows_ray(plan: Plan, world: World, depth: int) -> bool:
     """Return True where hit points are intersected anew along their rays; see :func:`torchpt.physics.shapes.interact`.
 
     Where geometry is differentiated, the first hit follows the camera ray, and so do hits behind delta lobes; all others keep

@@ -87,7 +87,7 @@ class Film:
         return sample % self.randomizations
 
     def taken(self, places: Tensor) -> Film:
-        """Return some of the pixels as a separate film, without splats."""
+        """Return some of the pixels as a separate film, whose sums of splats are empty."""
         part = self.part(len(places))
         part._first, part._sums = self._first[:, places].contiguous(), self._sums[:, :, places].contiguous()
         part._counts = self._counts[:, places].contiguous()

@@ -3,7 +3,7 @@
 The search has no gradients. Computing the point from the corners of its primitive is more accurate than ``o + t d`` and
 makes any search differentiable. The derivative can be taken in two parametrizations, with the same values:
 
-- a camera ray stays fixed in its pixel and the point slides along it: ``follow_shape``;
+- a camera ray stays fixed in its pixel and the point slides along it: ``follow_ray``;
 - at later vertices the point stays fixed on its surface and the direction follows it: :func:`reattach` (the material form of
   Zhang, Miller, Yan, Gkioulekas, Zhao, *Path-Space Differentiable Rendering*, 2020; its interior term).
 """
@@ -22,8 +22,8 @@ from torchpt.physics.world import World
 
 __all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
 
-#: Rays leave a surface ``OFFSET * LaneGeometry.bound`` off its plane. Re-deriving a point and evaluating its plane in the
-#: search each round by less than ``4 * 2^-24 * 2 bound``; this is two and a half times their sum, and free of world units.
+#: Rays leave a surface ``OFFSET * world.geometry.bound`` off its plane. Re-deriving a point and evaluating its plane in the
+#: search each round by less than ``4 * 2^-24 * 2 bound``; this is twice their sum, and scales with the scene.
 OFFSET = 2.0**-19
 #: Distances below this fraction of the coordinates count as 0 and have no derivative.
 NEAR = 2.0**-15
@@ -43,7 +43,7 @@ def _round(world: World, prim: Tensor) -> list[tuple[type[Primitive], Tensor]]:
     return [(kind, world.geometry.of(kind, prim)) for kind in world.geometry.kinds if not kind.flat]
 
 
-def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_shape: bool = False) -> Interaction:
+def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_ray: bool = False) -> Interaction:
     """Return the surface interactions of hits ``(N,)``, none of them a miss.
 
     Args:
@@ -51,12 +51,12 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_shape: bool = 
         o: ray origins ``(3, N)``.
         d: ray directions ``(3, N)``.
         hit: hits of the search.
-        follow_shape: re-intersect the ray with the plane, so that the point follows ``o``, ``d`` and the geometry.
+        follow_ray: re-intersect the ray with the plane, so that the point follows ``o``, ``d`` and the geometry.
     """
     geometry, place = world.geometry, lane_primitives(world, hit.prim)
     prim, p0, e1, e2, u, v = place.prim, place.p0, place.e1, place.e2, hit.u, hit.v
     round_ = _round(world, prim)
-    if follow_shape:
+    if follow_ray:
         u, v = _plane_uv(o, d, p0, e1, e2)
     for _, mine in round_:
         u, v = torch.where(mine, 0.0, u), torch.where(mine, 0.0, v)
@@ -66,7 +66,7 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_shape: bool = 
     if place.copied is not None and place.reach is not None:
         bound = torch.where(place.copied, dot(ng.detach().abs(), place.reach), take(geometry.bound, prim))
     for kind, mine in round_:
-        met = kind.hit_points(world, place, Rays(o, d, hit, follow_shape), mine)
+        met = kind.hit_points(world, place, Rays(o, d, hit, follow_ray), mine)
         p, ng = torch.where(mine, met.p, p), torch.where(mine, met.ng, ng)
         if met.bound is not None:
             bound = torch.where(mine, met.bound, take(geometry.bound, prim) if bound is None else bound)

@@ -104,13 +104,13 @@ class Rays:
         o: origins ``(3, N)``.
         d: directions ``(3, N)``.
         hit: hits of the search.
-        follow_shape: whether points follow ``o``, ``d`` and the geometry.
+        follow_ray: whether points follow ``o``, ``d`` and the geometry.
     """
 
     o: Tensor
     d: Tensor
     hit: Hit
-    follow_shape: bool = False
+    follow_ray: bool = False
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ __all__ = [
     "areas",
     "bitangent",
     "direction",
-    "follow_shape",
+    "follow_ray",
     "normal",
     "octahedral",
     "outward",
@@ -244,7 +244,7 @@ def surface_uv(table: Quadrics, q: Tensor) -> Tensor:
     return torch.stack((turn, _each(table, (kind.v(q, across) for kind in table.kinds))))
 
 
-def follow_shape(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, t: Tensor, q: Tensor) -> Tensor:
+def follow_ray(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, t: Tensor, q: Tensor) -> Tensor:
     """Return the points ``q (3, N)`` with the derivative of the intersection of ``o + t d``, in all arguments but ``t``.
 
     One Newton step on the surface's equation, with a detached slope. In float64 the value is its result too, more accurate than

@@ -198,7 +198,7 @@ class Opening:
         self.parameters.declare(name, value, spec if known is None else _both(known, spec))
 
     def declare_all(self, kind: Any, values: Mapping[str, Any]) -> None:
-        """Add the traced parameters of a kind; colours are restricted to the range of the slot.
+        """Add the differentiable parameters of a kind; colours are restricted to the range of the slot.
 
         Raises:
             SceneError: a colour that the slot does not accept.
@@ -257,7 +257,8 @@ class Texture:
 
     Attributes:
         name: the ``type`` in a scene file.
-        parameters: specs of the parameters. Traced ones become parameters of the scene; traced colours are values of the slot.
+        parameters: specs of the parameters. Differentiable ones become parameters of the scene; their colours are values
+            of the slot.
         reads: input from the surface: ``uv`` or ``colors``.
         filters: values of the parameter ``filter`` for which look-ups average over footprints.
     """

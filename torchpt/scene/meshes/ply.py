@@ -54,7 +54,7 @@ def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     """Return the faces of a PLY file as one part; the format has no materials, but vertices may have colours.
 
     Raises:
-        AssetError: a truncated or malformed file, or one without vertices and faces.
+        AssetError: a truncated or malformed file, or one without vertices.
     """
     layout, elements, start = _header(path, data)
     reader = _Ascii(path, data, start, elements) if layout == "ascii" else _Binary(path, data, start, layout)
@@ -302,7 +302,7 @@ class _Ascii:
         return AssetError(self.path, find_mismatch(self.data, self.start, self.elements) or problem)
 
     def end(self) -> None:
-        """Raise where words remain: rows do not match the header, though their total happened to suffice."""
+        """Raise if words are left behind the last faces: then rows were misaligned, although there were enough words."""
         read = [element for element in self.elements if element.size and element.properties]
         last = next((number for number, element in enumerate(read) if element.name == "face"), len(read))
         if last >= len(read) - 1 and self.at < len(self.words):

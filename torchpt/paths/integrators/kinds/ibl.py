@@ -77,7 +77,7 @@ class Preview(FirstSurface):
         local = replace(context, world=replace(world, lights=lights.without_environment(world.lights)))
         throughput = state.throughput if hit.chance is None else state.throughput * hit.chance
         arriving = replace(state, throughput=throughput)
-        at = interact(world, state.o, state.d, hit, context.follow_shape)
+        at = interact(world, state.o, state.d, hit, context.follow_ray)
         surface, direct, shadow = pure.shade(local, model, arriving, at)
         radiance = torch.zeros_like(state.radiance)
         if self.sky is not None:

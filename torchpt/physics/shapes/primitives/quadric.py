@@ -40,8 +40,8 @@ class Quadric(Primitive):
         """See :meth:`Primitive.hit_points`."""
         table = quadrics.rows(world, place.prim)
         own = _object_point(table, rays, mine)
-        if rays.follow_shape:
-            moved = quadrics.follow_shape(table, place.p0, place.e1, rays.o, rays.d, rays.hit.t, own)
+        if rays.follow_ray:
+            moved = quadrics.follow_ray(table, place.p0, place.e1, rays.o, rays.d, rays.hit.t, own)
             own = torch.where(mine, moved, own)
         ng = quadrics.outward(table, own)
         # The bound at the point, not of the whole primitive: a needle is far thinner than it is long.

@@ -54,7 +54,7 @@ class Sphere(Primitive):
         assert world.geometry.flip is not None
         o, d, p0 = rays.o, rays.d, place.p0
         radius = torch.where(mine, place.e1[0], 1.0)
-        t = _distance(o, d, p0, radius, rays.hit.t) if rays.follow_shape else rays.hit.t
+        t = _distance(o, d, p0, radius, rays.hit.t) if rays.follow_ray else rays.hit.t
         t = torch.where(mine, t, 0.0)
         away = o + d * t - p0
         outward = normalize(torch.where(mine, away, torch.ones_like(away)))
