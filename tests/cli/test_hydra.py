@@ -199,6 +199,12 @@ def test_info_says_that_no_render_could_run_in_so_little_memory(
     assert "memory:\n  enough: yes" in captured.out and captured.err == ""
 
 
+def test_no_words_print_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == "" and all(f"torchpt {name} " in printed.out for name in ("render", "info", "compare"))
+
+
 def test_info(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", "scene=s.yaml"]) == 0
     plain = capsys.readouterr()
@@ -206,6 +212,7 @@ def test_info(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", "scene=s.yaml", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert isinstance(facts, dict) and all(f"{key}:" in plain.out for key in facts)
+    assert f"left_out: {len(facts['left_out'])} features" in plain.out and len(facts["left_out"]) > 20
     assert os.listdir(folder) == ["s.yaml"]
 
 

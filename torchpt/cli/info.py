@@ -59,6 +59,8 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
     if "refused" in facts.get("memory", ()):
         print(f"torchpt: warning: no render could run: {facts['memory']['refused']}", file=sys.stderr)
     with flushed_stdout():
+        if not as_json:
+            facts["left_out"] = f"{len(facts['left_out'])} features that this scene does not need (--json lists them)"
         if as_json:
             print(json.dumps(plain(facts), allow_nan=False))
         elif not sys.stdout.isatty():

@@ -78,7 +78,7 @@ def main(argv: list[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     with Interrupt() as interrupt:
         try:
-            if argv[:1] in (["-h"], ["--help"], ["help"]):
+            if argv[:1] in ([], ["-h"], ["--help"], ["help"]):
                 return _say(_help(HELP))
             if argv == ["--version"]:
                 return _say(f"torchpt {__version__}\n")
@@ -115,9 +115,9 @@ def _command(argv: list[str]) -> Command:
         if argv[:1] == [command.name]:
             return command
     names = [command.name for command in COMMANDS]
-    close = difflib.get_close_matches(argv[0], names, 1) if argv else []
+    close = difflib.get_close_matches(argv[0], names, 1)
     hint = f" (did you mean {close[0]}?)" if close else ""
-    raise UsageError(f"{argv[0] if argv else 'no command'}: expected one of the commands {', '.join(names)}{hint}")
+    raise UsageError(f"{argv[0]}: expected one of the commands {', '.join(names)}{hint}")
 
 
 def _asks_for_help(words: list[str]) -> bool:
