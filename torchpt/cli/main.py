@@ -7,7 +7,6 @@ prints one line on stderr and exits with code 2. Hydra is imported here and in `
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import sys
@@ -25,7 +24,7 @@ from torchpt.cli.render import Job
 from torchpt.cli.streams import flushed_stdout, open_streams
 from torchpt.cli.sweep_folder import sweep_folder
 from torchpt.cli.sweep_table import tell_jobs
-from torchpt.core.errors import LostRankError, OtherRankError, TorchptError
+from torchpt.core.errors import LostRankError, OtherRankError, TorchptError, did_you_mean
 from torchpt.core.version import __version__
 
 if TYPE_CHECKING:
@@ -115,8 +114,7 @@ def _command(argv: list[str]) -> Command:
         if argv[:1] == [command.name]:
             return command
     names = [command.name for command in COMMANDS]
-    close = difflib.get_close_matches(argv[0], names, 1)
-    hint = f" (did you mean {close[0]}?)" if close else ""
+    hint = did_you_mean(argv[0], names)
     raise UsageError(f"{argv[0]}: expected one of the commands {', '.join(names)}{hint}")
 
 

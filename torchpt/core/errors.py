@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Iterable
 from functools import cache
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "RenderError",
     "SceneError",
     "TorchptError",
+    "did_you_mean",
     "warn_caller",
     "warn_once",
 ]
@@ -143,3 +145,11 @@ def warn_caller(message: str, category: type[Warning]) -> None:
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("torchpt", "torch"):
         frame, level = frame.f_back, level + 1
     warnings.warn(message, category, stacklevel=level)
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """Return `` (did you mean X?)`` with the known name closest to ``name``; "" if none is close."""
+    import difflib
+
+    close = difflib.get_close_matches(name, list(known), 1) if isinstance(name, str) else []
+    return f" (did you mean {close[0]}?)" if close else ""

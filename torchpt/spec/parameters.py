@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import enum
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from torchpt.core.errors import did_you_mean
 from torchpt.math.transforms import WITHIN, is_rigid, is_usable, similarity_scale
 from torchpt.spec import reading
 from torchpt.spec.reading import LARGEST, Refused
@@ -303,8 +303,7 @@ class Index(Scalar):
             return super().read(value)
         found = self.media.get(value.lower())
         if found is None:
-            close = difflib.get_close_matches(value, self.media, 1)
-            raise Refused(f"{self.expected}{f' (did you mean {close[0]}?)' if close else ''}")
+            raise Refused(f"{self.expected}{did_you_mean(value, self.media)}")
         return found
 
 

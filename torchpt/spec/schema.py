@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from torchpt.core.errors import NotBuiltError, SceneError
+from torchpt.core.errors import NotBuiltError, SceneError, did_you_mean
 from torchpt.core.tree import NOT_FINGERPRINTED
 from torchpt.spec import Map, Refused, unsupported
 from torchpt.spec.parameters import REQUIRED, Spec, spec_of
@@ -275,8 +274,7 @@ def check_keys(raw: Mapping[str, Any], known: Iterable[str], key: str, what: str
     names = list(known)
     for name in raw:
         if name not in names:
-            close = difflib.get_close_matches(str(name), names, 1)
-            hint = f" (did you mean {close[0]}?)" if close else ""
+            hint = did_you_mean(str(name), names)
             raise SceneError(dotted(key, name), name, f"a known key of {what}{hint}: {', '.join(names)}", file)
 
 
@@ -364,8 +362,7 @@ def read_typed(
         raise SceneError(key, raw, f"a mapping with a type of {types}", file)
     name = raw.get("type", default or None)
     if not isinstance(name, str) or (name not in table and name not in planned):
-        close = difflib.get_close_matches(name, [*table, *planned], 1) if isinstance(name, str) else []
-        hint = f" (did you mean {close[0]}?)" if close else ""
+        hint = did_you_mean(name, [*table, *planned])
         raise SceneError(dotted(key, "type"), name, f"a known {what} type{hint}: {types}", file)
     words = f"{what} type {name}"
     if name in planned:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from torchpt.core.errors import did_you_mean
 from torchpt.math.microfacet import fresnel_conductor, schlick
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
 from torchpt.physics.bsdfs.lobes import tinted
@@ -25,8 +25,7 @@ _NAMES = f"{_MIRROR} (a perfect mirror) or one of {', '.join(METALS)}"
 
 def _name(value: Any) -> str:
     if value != _MIRROR and (not isinstance(value, str) or preset(value) is None):
-        close = difflib.get_close_matches(value, METALS, 1) if isinstance(value, str) else []
-        raise Refused(f"{_NAMES}{f' (did you mean {close[0]}?)' if close else ''}")
+        raise Refused(f"{_NAMES}{did_you_mean(value, METALS)}")
     return value
 
 

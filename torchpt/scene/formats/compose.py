@@ -11,14 +11,13 @@ Layers are merged as written, before validation:
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchpt.core.errors import SceneError
+from torchpt.core.errors import SceneError, did_you_mean
 from torchpt.core.files import configs, is_regular
 from torchpt.physics.bsdfs import KINDS as MATERIALS
 from torchpt.physics.cameras import KINDS as CAMERAS
@@ -177,8 +176,7 @@ class _Reader:
             if is_regular(path) and not own:
                 return path
         known = sorted({path.stem for place in (folder, *self.places) for path in place.glob("*.yaml")})
-        close = difflib.get_close_matches(name, known, 1)
-        hint = f" (did you mean {close[0]}?)" if close else ""
+        hint = did_you_mean(name, known)
         where = str(places[0]) if exact else f"{places[0]} or a scene that ships"
         raise SceneError(key, name, f"a file that is there: {where}{hint}", file)
 
@@ -309,7 +307,6 @@ def with_size(below: Mapping[str, Any], above: Mapping[str, Any]) -> Mapping[str
 
 def one_of(block: str, name: str, known: Sequence[str]) -> str:
     """Return the phrase of what is accepted in place of an unknown name."""
-    close = difflib.get_close_matches(name, known, 1)
-    hint = f" (did you mean {close[0]}?)" if close else ""
+    hint = did_you_mean(name, known)
     shown = [*known[:20], "..."] if len(known) > 20 else known
     return f"the name of a {NAMED[block]} that is there{hint}: {', '.join(shown) or 'there is none'}"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-from torchpt.core.errors import AssetError, SceneError
+from torchpt.core.errors import AssetError, SceneError, did_you_mean
 from torchpt.core.files import MAX_BYTES, check_regular, configs, is_regular
 from torchpt.physics.bsdfs import Bsdf
 from torchpt.physics.lights import KINDS as LIGHTS
@@ -205,8 +204,7 @@ def _named_scene(name: str, places: Sequence[Path]) -> Path:
         path.stem: path for place in (configs() / "scene", *reversed(places)) for path in sorted(place.glob("*.yaml"))
     }
     if name not in files:
-        close = difflib.get_close_matches(name, files, 1)
-        hint = f" (did you mean {close[0]}?)" if close else ""
+        hint = did_you_mean(name, files)
         raise SceneError("scene", name, f"one of {', '.join(sorted(files))}{hint}, or a path ending in .yaml")
     return files[name]
 
@@ -329,7 +327,8 @@ def _shape(
     if isinstance(material, str):
         if material not in materials:
             known = ", ".join(materials) or "none is defined"
-            raise SceneError(where, material, f"the name of a material ({known}) or a material", file)
+            hint = did_you_mean(material, materials)
+            raise SceneError(where, material, f"the name of a material ({known}){hint} or a material", file)
         material, where = materials[material], f"materials.{material}"
     if emission is not None and material is not None and material["emission"] is not None:
         expected = f"no emission where the material emits as well ({where}.emission)"

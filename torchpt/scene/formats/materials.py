@@ -6,7 +6,7 @@ from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from torchpt.core.errors import EnergyWarning, NotBuiltError, SceneError, warn_caller
+from torchpt.core.errors import EnergyWarning, NotBuiltError, SceneError, did_you_mean, warn_caller
 from torchpt.physics.bsdfs import KINDS, Bsdf
 from torchpt.physics.bsdfs.base import made
 from torchpt.physics.bsdfs.specs import Inner
@@ -194,7 +194,8 @@ def _check_blend(
         if isinstance(item, str):
             if item not in materials:
                 known = ", ".join(materials) or "none is defined"
-                raise SceneError(at, item, f"the name of a material ({known}) or a material", file)
+                hint = did_you_mean(item, materials)
+                raise SceneError(at, item, f"the name of a material ({known}){hint} or a material", file)
             if item in trail:
                 circle = " -> ".join((*trail[trail.index(item) :], item))
                 raise SceneError(at, item, f"a blend that does not contain itself ({circle})", file)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from torchpt.core.errors import SceneError
+from torchpt.core.errors import SceneError, did_you_mean
 from torchpt.physics.textures import CHANNELS, KINDS, Named, TextureInput
 from torchpt.spec import Moves, Refused, Spec, parameters_of
 from torchpt.spec.reading import as_refused
@@ -89,7 +89,8 @@ def check_texture(
         if texture.texture not in textures:
             known = ", ".join(textures) or "none is defined"
             where = key if key.endswith(".texture") else f"{key}.texture"
-            raise SceneError(where, texture.texture, f"the name of a texture ({known})", file)
+            hint = did_you_mean(texture.texture, textures)
+            raise SceneError(where, texture.texture, f"the name of a texture ({known}){hint}", file)
         texture = textures[texture.texture]
     if coordinates and texture.kind.reads != "uv":
         raise SceneError(key, texture.name, "an image, or another texture that is read by coordinates", file)
