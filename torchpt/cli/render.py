@@ -72,7 +72,7 @@ class Job:
     Attributes:
         scene: name of a shipped scene, or path of a scene file.
         overrides: settings of the command line, by block (``film integrator sampler render``) and key.
-        outs: files to write; if empty, ``<scene>.png`` in the working folder.
+        outs: files to write; if empty, ``<scene>.png`` in the working folder, or ``.exr`` with ``film.aovs``.
         number: index of the job in a sweep, part of the file names; None outside a sweep.
         words: overrides of this job as ``key=value``, for messages and the summary.
         changes: overrides of scene keys, as :func:`torchpt.load` takes them.
@@ -91,8 +91,8 @@ class Job:
 
     def facts(self) -> dict[str, Any]:
         """Return the overrides of the job, and in a sweep its number, for the summary."""
-        told = {"overrides": list(self.words)} if self.words or self.number is not None else {}
-        return told if self.number is None else {"job": self.number, **told}
+        overrides = {"overrides": list(self.words)} if self.words or self.number is not None else {}
+        return overrides if self.number is None else {"job": self.number, **overrides}
 
 
 def numbered(path: str, number: int | None) -> str:
@@ -126,10 +126,10 @@ def render(job: Job, interrupt: Interrupt) -> int:
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
 
-    gc_pause.resume()
+    gc_pause.resume()  # it was paused at the start of the program, for faster imports
     start = time.perf_counter()
     group = distributed.group()
-    first = group is None or group.rank == 0  # only rank 0 writes files
+    writes_files = group is None or group.rank == 0
     with notices():
         description, settings = scene_and_settings(job)
         settings = with_error_pilots(settings)
@@ -137,27 +137,30 @@ def render(job: Job, interrupt: Interrupt) -> int:
         preview = settings.render.preview and numbered(str(Path(settings.render.preview).expanduser()), job.number)
         previews = _preview_files(preview) if preview else []
         denoised = _denoised_files(settings, outs)
-        kept = settings.render.checkpoint and numbered(str(Path(settings.render.checkpoint).expanduser()), job.number)
+        checkpoint = settings.render.checkpoint
+        if checkpoint:
+            checkpoint = numbered(str(Path(checkpoint).expanduser()), job.number)
         check_distinct(
             [
                 *(("out", path) for path in outs),
                 *(("render.preview", path) for path in previews),
-                *((("render.checkpoint", kept),) if kept else ()),
+                *((("render.checkpoint", checkpoint),) if checkpoint else ()),
                 *(("film.denoise", path) for path in denoised),
             ]
         )
-        for path in (*outs, *previews, *denoised) if first else ():
+        for path in (*outs, *previews, *denoised) if writes_files else ():
             check_writable(path)
-        if kept is not None:
-            settings = replace(settings, render=settings.render.but(checkpoint=kept))
-            if first:
-                CheckpointFile(kept).check(settings.render.resume)
+        if checkpoint is not None:
+            settings = replace(settings, render=settings.render.but(checkpoint=checkpoint))
+            if writes_files:
+                CheckpointFile(checkpoint).check(settings.render.resume)
         scene = Scene(description, device_of(settings.render.device))
     scene.load_seconds = time.perf_counter() - start
-    if first:
-        which_job(job, outs)
-    if preview and first:
+    if writes_files:
+        which_job(job, outs)  # prints
+    if preview and writes_files:
         hits = first_hit(scene, settings)
+        # The last of the three files is the picture, which is written after each pass.
         for path, name in zip(previews, ("albedo", "normal"), strict=False):
             _write_layer(path, name, hits[name])
 
@@ -165,21 +168,22 @@ def render(job: Job, interrupt: Interrupt) -> int:
     with Bar(_name(job.scene)) as bar:
 
         def on_progress(state: Any) -> bool:
+            # ``done`` and ``total`` count paths. Returning True stops the render.
             bar.update(state.done, state.total, state.rays, state.seconds)
-            if preview and first and state.pass_finished and state.done < state.total:
+            if preview and writes_files and state.pass_finished and state.done < state.total:
                 write_rendered(preview, state.snapshot(), settings.film)
             return interrupt.signum is not None
 
         rendering = _keeping(interrupt, lambda: render_scene(scene, settings, on_progress=on_progress, **shared))
-    if group is not None:  # a signal to one rank stops all
+    if group is not None:  # a signal to one rank stops all; 0: no signal
         interrupt.signum = int(max(group.all_gather_numbers("signals", interrupt.signum or 0))[0]) or None
-    if not first:
+    if not writes_files:
         return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
     facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, settings)
     summary = {"out": _names(outs), **job.facts(), **facts, **rendering.summary()}
     if not rendering.complete:
         summary["complete"] = False
-    not_finite(summary)
+    not_finite(summary)  # both print warnings, where there are any
     unknown_error(summary)
     summary = plain(summary, digits=6)
     height, width = rendering.image.shape[:2]
@@ -188,8 +192,8 @@ def render(job: Job, interrupt: Interrupt) -> int:
     note_job(job, summary)
     if interrupt.signum is None:
         return 0
-    again = "" if settings.render.checkpoint is None else "; render.resume=true goes on"
-    print(f"torchpt: stopped by a signal; {outs[0]} holds the picture so far{again}", file=sys.stderr)
+    resume_hint = "" if settings.render.checkpoint is None else "; render.resume=true goes on"
+    print(f"torchpt: stopped by a signal; {outs[0]} holds the picture so far{resume_hint}", file=sys.stderr)
     return Interrupted(interrupt.signum).exit_code
 
 
@@ -206,10 +210,13 @@ def scene_and_settings(job: Job) -> tuple[Any, Any]:
 
 
 def with_error_pilots(settings: Any) -> Any:
-    """Replace ``render.pilots: auto`` by true where the integrator allows it: the summary reports the error."""
+    """Replace ``render.pilots: auto`` by true where the integrator allows it, so that the summary reports the error.
+
+    Integrators that splat do not: their samples do not belong to one pixel.
+    """
     render = settings.render
-    able = render.pilots == "auto" and not settings.integrator.splats
-    return replace(settings, render=render.but(pilots=True)) if able else settings
+    with_pilots = render.pilots == "auto" and not settings.integrator.splats
+    return replace(settings, render=render.but(pilots=True)) if with_pilots else settings
 
 
 def _keeping(interrupt: Interrupt, work: Callable[[], Any]) -> Any:
@@ -220,13 +227,17 @@ def _keeping(interrupt: Interrupt, work: Callable[[], Any]) -> Any:
 
 
 def _name(scene: str) -> str:
+    """Return the name of a scene, without the folder and ending of its file."""
     path = Path(scene)
     return path.stem if path.suffix in (".yaml", ".yml") else path.name
 
 
 def _outputs(job: Job, settings: Any) -> list[str]:
-    """Return the files to write; refuse ``film.aovs`` of the command line if no file can hold layers."""
-    layers = [name for name in settings.film.aovs or ()]
+    """Return the files to write; refuse ``film.aovs`` of the command line if no file can hold layers.
+
+    Layers that only the scene file asks for are left out in other formats.
+    """
+    layers = list(settings.film.aovs or ())
     outs = [str(Path(path).expanduser()) for path in job.outs]
     if not outs:
         outs = [_name(job.scene) + (".exr" if layers else ".png")]
@@ -249,8 +260,8 @@ def check_distinct(files: Sequence[tuple[str, str]]) -> None:
         with suppress(OSError, ValueError):  # an invalid path is reported when it is written
             place = os.path.normcase(os.path.realpath(path))
             if place in seen:
-                other, before = seen[place]
-                raise SceneError(key, path, f"another file than {before!r} of {other}")
+                other_key, other_path = seen[place]
+                raise SceneError(key, path, f"another file than {other_path!r} of {other_key}")
             seen[place] = key, path
 
 
@@ -315,9 +326,9 @@ def _written_elsewhere(path: str, rendering: Any, settings: Any) -> str | None:
     from torchpt.rendering.result import write_rendered
 
     name = Path(path)
-    for place in (os.path.expanduser("~"), tempfile.gettempdir()):
-        spare = Path(place) / f"{name.stem}-{secrets.token_hex(3)}{name.suffix}"
-        if Path(place).is_dir():
+    for folder in (os.path.expanduser("~"), tempfile.gettempdir()):
+        spare = Path(folder) / f"{name.stem}-{secrets.token_hex(3)}{name.suffix}"
+        if Path(folder).is_dir():
             with suppress(OutputError):
                 write_rendered(spare, rendering, settings.film)
                 return str(spare)
@@ -333,6 +344,7 @@ def _write_layer(path: str, name: str, layer: Any) -> None:
 
 
 def _names(paths: list[str]) -> str | list[str]:
+    """Return the paths as the summary shows them: a single one as text, several as a list."""
     return paths[0] if len(paths) == 1 else paths
 
 

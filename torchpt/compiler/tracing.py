@@ -80,9 +80,15 @@ def tracer_of(tensor: Tensor) -> Tracer | None:
 
 @dataclass(frozen=True)
 class Value:
-    """The nodes of a traced tensor: an array whose lanes' axis is shorter by the number of lanes."""
+    """The nodes of a traced tensor.
 
-    nodes: Any  # numpy array of objects; numpy's types cannot express that its elements are int
+    Attributes:
+        nodes: numpy array of node numbers (of objects, as numpy's types cannot express int), of the tensor's shape with the
+            lanes' axis divided by the number of lanes.
+        lane: the lanes' axis; None: the tensor is the same for all lanes.
+    """
+
+    nodes: Any
     lane: int | None
 
 
@@ -98,15 +104,14 @@ class Tracer(TorchDispatchMode):
         uniforms: inputs that are the same for all lanes, in order: type and number of elements.
         tables: tables that the graph reads, in order.
         steps: the prologue.
-        guards: values that the trace depends on.
+        guards: values of tables that Python code read: the trace holds only for these.
         constants: tensors that are neither leaves nor results of steps.
     """
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        return (
-            False  # else torch imports torch._dynamo at the first operator, which takes longer than tracing most stages
-        )
+        # If True, torch imports torch._dynamo at the first operator, which takes longer than tracing most stages.
+        return False
 
     def __init__(self, lanes: int, leaves: dict[int, tuple[str, Tensor]]) -> None:
         super().__init__()
@@ -171,7 +176,7 @@ class Tracer(TorchDispatchMode):
             raise Unsupported(f"a result of shape {tuple(tensor.shape)} whose last axis is not the lanes'")
         return [int(node) for node in value.nodes.reshape(-1)]
 
-    # -- for handlers
+    # -- for handlers, the functions that lower operators
 
     def is_traced(self, tensor: Tensor) -> bool:
         """Return True if a tensor depends on lanes or on inputs."""
@@ -189,7 +194,7 @@ class Tracer(TorchDispatchMode):
         return tuple(size // self.lanes if axis == lane else size for axis, size in enumerate(shape))
 
     def put(self, out: Tensor, nodes: Any, lane: int | None = None) -> None:
-        """Set the nodes of ``out``, broadcast to its shape."""
+        """Set the nodes of ``out``, broadcast to its shape; ``lane``: the lanes' axis, None: found from the shape."""
         nodes = np.asarray(nodes, dtype=object)
         lane = self.lane_axis(out.shape) if lane is None else lane
         shape = self.inner(out.shape, lane)
@@ -239,7 +244,10 @@ class Tracer(TorchDispatchMode):
         return source
 
     def table(self, tensor: Tensor, axis: int | None) -> int:
-        """Return the number of a table, which is added if it is new."""
+        """Return the number of a table, which is added if it is new.
+
+        ``axis``: the axis that lanes index, the first one in the kernel's memory; None: the layout stays.
+        """
         table = Table(self.source(tensor), axis)
         if table not in self._numbers:
             self._numbers[table] = len(self.tables)
@@ -254,7 +262,7 @@ class Tracer(TorchDispatchMode):
         self.graph.origin = _files()
         given = [x for x in _flat((args, kwargs)) if isinstance(x, Tensor)]
         traced = any(id(x) in self._values for x in given)
-        if name == "_local_scalar_dense":
+        if name == "_local_scalar_dense":  # tensor.item(), bool(tensor)
             if traced:
                 raise Unsupported("a lane's value read by Python")
             out = func(*args, **kwargs)
@@ -278,6 +286,7 @@ class Tracer(TorchDispatchMode):
         return out
 
     def _factory(self, name: str, out: Tensor) -> None:
+        """Set the nodes of a tensor with lanes that an operator without tensors made, such as ``torch.zeros``."""
         ty = DTYPES[out.dtype]
         if name == "arange":
             if out.shape[0] != self.lanes or out[0] != 0 or out[1] != 1:
@@ -321,6 +330,7 @@ class _Reads(TorchFunctionMode):
 
 
 def _flat(values: Any) -> Iterable[Any]:
+    """Yield the elements of nested lists, tuples and dictionaries."""
     for value in values.values() if isinstance(values, dict) else values:
         if isinstance(value, list | tuple | dict):
             yield from _flat(value)

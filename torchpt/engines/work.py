@@ -12,9 +12,9 @@ __all__ = ["TASKS", "Block", "SampleRange", "TaskResult"]
 #: Tasks of a pass for each thread: enough that no thread waits long for the last task.
 TASKS = 6
 
-#: A pixel set, the first sample of each of its pixels, and the number of samples.
+#: A pixel set, the index of the first sample of each of its pixels, and the number of samples of each.
 SampleRange = tuple[PixelSet, int, int]
-#: A pixel set, its first pixel, number of pixels, first sample and number of samples of each pixel.
+#: Part of a pixel set: the set, first pixel in it, number of pixels, first sample and number of samples of each pixel.
 Block = tuple[PixelSet, int, int, int, int]
 
 
@@ -26,7 +26,7 @@ class TaskResult:
         tally: counts of rays and truncated paths.
         samples: number of camera samples.
         lost: samples that were not finite.
-        light: sum of radiance before and after the clamp.
+        light: sums of radiance before and after the firefly clamp, from which the summary reports the light that was lost.
         rest: blocks that ran out of memory, to be rendered again.
     """
 

@@ -84,8 +84,9 @@ def denoise(image: Tensor, albedo: Tensor | None = None, normal: Tensor | None =
     for name, guide, low in (("albedo", albedo, 0.0), ("normal", normal, -1.0)):
         if guide is not None:
             values = np.nan_to_num(guide.cpu().double().numpy(), nan=0.0)
-            inputs[name] = _filtered(library, {name: _framed(np.clip(values, low, 1.0))}, {})
-    made = _filtered(library, inputs, {"hdr": True, "cleanAux": albedo is not None})
+            inputs[name] = _filtered(library, {name: _framed(np.clip(values, low, 1.0))}, flags={})
+    # cleanAux: the guides are free of noise, as they have been filtered.
+    made = _filtered(library, inputs, flags={"hdr": True, "cleanAux": albedo is not None})
     inside = made[MARGIN:-MARGIN, MARGIN:-MARGIN].astype(np.float64) * scale
     return torch.from_numpy(inside.clip(0.0, _HIGHEST)).to(image.device, image.dtype)
 
@@ -122,6 +123,11 @@ def _framed(values: NDArray[np.float64]) -> Picture:
 
 def _filtered(library: Any, inputs: dict[str, Picture], flags: dict[str, bool]) -> Picture:
     """Run the filter on one layer alone, or on a picture with its layers.
+
+    Args:
+        library: the package pyoidn.
+        inputs: pictures by the names of the filter's inputs: ``color``, ``albedo``, ``normal``.
+        flags: boolean parameters of the filter.
 
     Raises:
         RenderError: with the message of the library.

@@ -35,7 +35,7 @@ class RayCounts:
 
     Attributes:
         rays: rays that were traced, shadow rays included.
-        truncated: paths that were still alive at depth :data:`torchpt.paths.integrators.base.ENDLESS`.
+        truncated: paths that were still alive, and were ended, at depth :data:`torchpt.paths.integrators.base.ENDLESS`.
     """
 
     rays: int = 0
@@ -52,7 +52,7 @@ class PixelSet:
     Attributes:
         film: sums of radiance.
         layers: films of the layers of first surfaces, by name.
-        streams: randomizations that their samples belong to.
+        streams: randomizations of the sampler that their samples belong to.
         places: ``(n,)`` int64 indices of the pixels in the picture, row by row, on the lanes' device; None: all pixels.
     """
 
@@ -66,14 +66,14 @@ class PixelSet:
 
 
 def clamp_scale(values: Tensor, clamp: float) -> Tensor:
-    """Return the factors ``(...)`` that keep all channels of samples ``(3, ...)`` within ``clamp``; hue is kept."""
+    """Return factors ``(...)``, at most 1, by which samples ``(3, ...)`` have no channel above ``clamp``; hue is kept."""
     return clamp / values.abs().amax(0).clamp_min(clamp)
 
 
 # ---- Waves: from a range of pixels and samples to camera rays
 
 
-#: The stage of a vertex on surfaces of one BSDF model.
+#: The stage of a vertex on surfaces of one BSDF model; the int is the model's index.
 Bounce = Callable[[StageContext, int, VertexInput], VertexOutput]
 
 
@@ -82,7 +82,7 @@ class Rays:
     """Rays that paths start with in place of camera rays: one for each pixel of a picture with a single row.
 
     Attributes:
-        o: origins ``(3, N)``, in the lanes' coordinates.
+        o: origins ``(3, N)``, in the lanes' coordinates (:class:`torchpt.scene.space.Space`).
         d: unit directions ``(3, N)``.
         number: ``(N,)`` int64 indices of the pixels whose random numbers they use; None: those of their own pixel.
     """
@@ -104,7 +104,8 @@ class Wave:
         filter: the reconstruction filter.
         sampler: makes the keys of random numbers.
         crop: ``(x, y, width, height)`` of the picture on the film.
-        centre: ``(3,)`` float64 origin of the lanes' coordinates, see Space.shift.
+        centre: ``(3,)`` float64 origin of the lanes' coordinates in the scene, in the lanes' unit of length: the result of
+            :attr:`torchpt.scene.space.Space.shift`. Only the layer of positions adds it.
         first: shading of first surfaces, of an integrator that stops there; None: paths go on.
         given: rays that paths start with; None: camera rays.
     """
@@ -131,18 +132,19 @@ class Wave:
         """Return camera rays of consecutive pixels and samples; lanes run over pixels, then over samples.
 
         Args:
-            first_pixel: index in the pixel set.
-            pixels: how many.
+            first_pixel: index of the first pixel in the pixel set.
+            pixels: number of pixels.
             first_sample: index of the first sample of each pixel.
-            samples: how many of each.
-            pixel_set: None: all pixels of the picture, row by row.
+            samples: number of samples of each pixel.
+            pixel_set: the pixels that ``first_pixel`` counts, and their randomizations; None: all pixels of the picture, row by
+                row, with the picture's randomizations.
         """
         device = self.centre.device
         x0, y0, width, _ = self.crop
-        place = torch.arange(first_pixel, first_pixel + pixels, device=device)
+        index = torch.arange(first_pixel, first_pixel + pixels, device=device)  # in the picture
         if pixel_set is not None and pixel_set.places is not None:
-            place = pixel_set.places[first_pixel : first_pixel + pixels]
-        x, y = place % width + x0, place // width + y0
+            index = pixel_set.places[first_pixel : first_pixel + pixels]
+        x, y = index % width + x0, index // width + y0
         sample = torch.arange(first_sample, first_sample + samples, device=device).repeat_interleave(pixels)
         return self.rays_of(
             x.repeat(samples), y.repeat(samples), sample, None if pixel_set is None else pixel_set.streams
@@ -165,18 +167,24 @@ class Wave:
             return camera_state(take(self.given.o, pixel), take(self.given.d, pixel), key)
         key = self.sampler.key(pixel, sample, streams)
         x, y = (a.to(self.context.plan.dtype) for a in (x, y))
-        return generate(self.context.plan, self.camera, self.filter, x, y, key, salts(0, self.centre.device))
+        camera_salts = salts(0, self.centre.device)  # depth 0: the camera's random dimensions
+        return generate(self.context.plan, self.camera, self.filter, x, y, key, camera_salts)
 
     def with_rays(self, rays: Rays) -> Wave:
         """Return the wave whose paths start with ``rays``; samples have no filter weights."""
         n = rays.d.shape[1]
-        # A filter without weights is kept, so that the kernels of renders fit.
+        # Given rays need no filter. One with negative lobes (``signed``) would still weigh the samples, so the box replaces it.
+        # Others have no weights and stay: the filter is part of the key of compiled kernels, which are shared with renders.
         filter = filter_of("box", rays.d.device) if self.filter.signed else self.filter
         camera = replace(self.camera, resolution=(n, 1))
         return replace(self, camera=camera, crop=(0, 0, n, 1), filter=filter, given=rays)
 
     def with_optional_fields(self, state: PathState) -> PathState:
-        """Return the paths with the initial values of fields that only some scenes and integrators use."""
+        """Return the paths with the initial values of fields that only some scenes and integrators use.
+
+        ``eta`` exists where a material refracts. ``p`` and ``n``, the last vertex and its normal, exist where the choice of a
+        light depends on them; a camera is no surface, so ``n`` starts as 0. ``extra`` has the integrator's own fields.
+        """
         world = self.context.world
         if any(model.refracts for model in world.materials.models):
             state = replace(state, eta=torch.ones_like(state.t_max))
@@ -187,18 +195,28 @@ class Wave:
         return state
 
     def weight(self, state: PathState) -> Tensor:
-        """Return what the filter weighs the samples with ``(N,)``; after the paths are traced, since no stage needs to know."""
+        """Return the filter weights of samples ``(N,)``.
+
+        No stage needs them: they are drawn again from the key of each sample and multiply the result of its path.
+        """
         draws = Draws(self.context.plan.sampler, state.key, salts(0, self.centre.device))
         return self.filter.weight(draws.two(Dimension.PIXEL)).to(self.context.plan.dtype)
 
 
 def with_detached_geometry(wave: Wave) -> Wave:
-    """Return the wave with geometry not differentiated: the same values, with searches between the stages."""
+    """Return the wave with geometry not differentiated (``plan.attached`` False); the paths have the same values.
+
+    With differentiated geometry the stage of a surface searches the next hit itself, because the direction depends on both
+    ends of the ray. Here hits are found between the stages, as the kernels of the backward pass expect.
+    """
     return replace(wave, context=replace(wave.context, plan=replace(wave.context.plan, attached=False)))
 
 
 def camera_state(o: Tensor, d: Tensor, key: Tensor) -> PathState:
-    """Return the state of paths that start with rays ``o, d (3, N)``, d unit; ``key`` is that of their random numbers."""
+    """Return the state of paths that start with rays ``o, d (3, N)``, d unit; ``key`` is the sampler's key ``(rows, N)``.
+
+    The pdf is infinite: no light sampling competes with the camera, so emission that a camera ray hits counts whole.
+    """
     n = d.shape[1]
     forever = torch.full((n,), math.inf, dtype=d.dtype, device=d.device)
     lane, nothing = torch.arange(n, device=d.device), torch.zeros_like(d)

@@ -4,6 +4,10 @@ A graph holds tensors, numbers and text. So the scene is passed by its number, o
 tensors; the seed is a separate number, so that another seed does not recompile. Everything else breaks the graph and is
 rendered outside of it: ``full=True`` (a :class:`torchpt.Rendering`), scenes with models of the user's own, arguments that are
 not plain values.
+
+The backward operator calls ``render`` again, with parameters that require gradients, and differentiates its picture. It does
+not trace that picture again: an empty one with the same number of samples stands in for it (:func:`reuse_rendering`), as
+gradients do not depend on its pixels.
 """
 
 from __future__ import annotations
@@ -34,12 +38,15 @@ R = TypeVar("R")
 
 #: Types of arguments that can be written as text. (Older torch traces no unions of types, but tuples of them.)
 _LISTS, _PLAIN = (list, tuple), (bool, int, str)
-#: While an operator runs: the rendering of its forward pass, which its backward pass reuses.
+#: While an operator runs: a list that gets, or in the backward pass has, the rendering of the forward pass. None outside.
 _known: ContextVar[list[Rendering] | None] = ContextVar("reuse_rendering", default=None)
 
 
 def reuse_rendering(make: Callable[[], Rendering]) -> Rendering:
-    """Return the rendering of the forward pass inside an operator's backward pass; else call ``make``."""
+    """Return the rendering of the forward pass inside an operator's backward pass; else call ``make``.
+
+    Inside an operator's forward pass the result is also stored for the operator, which returns its number of samples.
+    """
     made = _known.get()
     if made:
         return made[0]
@@ -83,16 +90,17 @@ def _in_graph(
 ) -> Any:
     """Call the operator, or ``render`` outside of the graph; ``torch.compile`` traces this function."""
     if full or len(scene.own_models) > 0 or not _fits_graph(params, seed, dtype, options):
-        with_graph_break: Any = torch.compiler.disable(render)
-        return with_graph_break(scene, params=params, full=full, seed=seed, dtype=dtype, **options)
+        outside: Any = torch.compiler.disable(render)
+        return outside(scene, params=params, full=full, seed=seed, dtype=dtype, **options)
     given = dict(params) if params is not None else {}
     if torch.is_grad_enabled():
         for name, value in scene.params.items():
             if value.requires_grad and name not in given:
                 given[name] = value
     wanted = [name for name in given if given[name].requires_grad]
-    text = _text([options, list(given), wanted, dtype is torch.float64])
-    return torch.ops.torchpt.render(scene.number, text, -1 if seed is None else seed, list(given.values()))[0]
+    text = _text([options, list(given), wanted, dtype is torch.float64])  # read by _OperatorCall.read
+    seed_number = -1 if seed is None else seed
+    return torch.ops.torchpt.render(scene.number, text, seed_number, list(given.values()))[0]
 
 
 def _fits_graph(params: Any, seed: Any, dtype: Any, options: Mapping[str, Any]) -> bool:
@@ -143,7 +151,16 @@ class _OperatorCall(NamedTuple):
 
     @classmethod
     def read(cls, number: int, text: str, seed: int) -> _OperatorCall:
-        """Return the arguments that :func:`_in_graph` wrote; RenderError if the scene was garbage-collected."""
+        """Return the arguments that :func:`_in_graph` wrote.
+
+        Args:
+            number: number of the scene.
+            text: options, names, wanted names, and whether the dtype is float64.
+            seed: the seed; -1: the scene's.
+
+        Raises:
+            RenderError: the scene was garbage-collected.
+        """
         scene = scene_by_number(int(number))
         if scene is None:
             raise RenderError("the scene that this compiled graph renders is gone: keep a reference to it")
@@ -153,7 +170,7 @@ class _OperatorCall(NamedTuple):
 
     def versions(self) -> dict[str, int]:
         """Return the versions of the scene's own parameters, without those that are passed as tensors."""
-        return {name: edition for name, edition in self.scene.versions().items() if name not in self.names}
+        return {name: version for name, version in self.scene.versions().items() if name not in self.names}
 
     def like(self) -> Tensor:
         """Return an uninitialized picture of the right size, dtype and device."""
@@ -164,7 +181,13 @@ class _OperatorCall(NamedTuple):
 
 
 def _in_thread(work: Callable[[], R], made: list[Rendering], device: torch.device) -> R:
-    """Return ``work()``, run in another thread: in the operator's own thread autograd would not record it."""
+    """Return ``work()``, run in another thread: in the operator's own thread autograd would not record it.
+
+    Args:
+        work: renders.
+        made: list for :func:`reuse_rendering`: empty in the forward pass, which adds its rendering, else with that rendering.
+        device: of the scene; the work runs on the current CUDA stream of the calling thread.
+    """
     stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
     found: list[R] = []
     failed: list[BaseException] = []
@@ -186,7 +209,11 @@ def _in_thread(work: Callable[[], R], made: list[Rendering], device: torch.devic
 
 
 def _register(render: Callable[..., Any]) -> None:
-    """Make the operators ``torchpt::render`` and ``torchpt::render_gradients``."""
+    """Make the operators ``torchpt::render`` and ``torchpt::render_gradients``.
+
+    ``torchpt::render`` returns the picture and ``facts``, an int64 tensor: the samples a pixel, then the versions of the
+    scene's own parameters, by which the backward pass refuses parameters that were changed in place since.
+    """
 
     def picture(number: int, text: str, seed: int, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         request, made = _OperatorCall.read(number, text, seed), []
@@ -200,7 +227,9 @@ def _register(render: Callable[..., Any]) -> None:
         return _in_thread(work, made, request.scene.device), torch.tensor([made[0].spp, *versions])
 
     def like_picture(number: int, text: str, seed: int, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        request = _OperatorCall.read(number, text, 0)
+        request = _OperatorCall.read(
+            number, text, seed=0
+        )  # any will do; to compare a symbolic seed would bind the graph to it
         return request.like(), torch.empty(1 + len(request.versions()), dtype=torch.int64)
 
     def gradients(
@@ -210,7 +239,7 @@ def _register(render: Callable[..., Any]) -> None:
         spp, *versions = facts.tolist()
         now = request.versions()
         check_unchanged(dict(zip(now, versions, strict=True)), now, AFTER)
-        made = [Rendering(request.like(), spp=spp)]
+        made = [Rendering(request.like(), spp=spp)]  # stands in for the picture
 
         def work() -> list[Tensor]:
             given = {name: value.detach() for name, value in zip(request.names, tensors, strict=True)}
@@ -228,13 +257,13 @@ def _register(render: Callable[..., Any]) -> None:
         return [torch.empty_like(value, memory_format=torch.contiguous_format) for value in tensors]
 
     def keep(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        *ctx.named, tensors = inputs
+        *ctx.call, tensors = inputs  # ctx.call: scene number, text, seed
         ctx.mark_non_differentiable(output[1])
         ctx.save_for_backward(output[1], *tensors)
 
     def go_back(ctx: Any, cotangent: Tensor, _: Any) -> tuple[Any, ...]:
         facts, *tensors = ctx.saved_tensors
-        return None, None, None, back(*ctx.named, tensors, facts, cotangent)
+        return None, None, None, back(*ctx.call, tensors, facts, cotangent)
 
     forth = torch.library.custom_op("torchpt::render", picture, mutates_args=())
     forth.register_fake(like_picture)

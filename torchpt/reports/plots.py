@@ -17,11 +17,12 @@ from torchpt.reports.study import ERRORS
 __all__ = ["COLOURS", "NAMES", "curves", "encoded", "overview"]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D1F")
+#: Matplotlib's markers and dashes.
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 _DASHES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)))
 #: Dashes of denoised curves, which have hollow markers and the colour of the curve that was denoised.
 _DENOISED = (0, (4, 4))
-#: Names of measures in the report.
+#: Names of measures in the report, by their keys in studies.
 NAMES = {
     "relmse": "relMSE",
     "relmse_trimmed": "relMSE, 0.1 % trimmed",
@@ -54,7 +55,13 @@ def _matplotlib() -> Any:
 
 
 def curves(scene_report: SceneReport, measure: str, over: str) -> Any:
-    """Return the figure of a measure over ``seconds`` or ``spp``, with all curves that have it."""
+    """Return the figure of a measure with all curves that have it.
+
+    Args:
+        scene_report: the curves of a scene.
+        measure: a key of :data:`NAMES`.
+        over: the x axis, ``seconds`` or ``spp``; curves with a step of unknown samples have no ``spp``.
+    """
     matplotlib = _matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -82,7 +89,7 @@ def curves(scene_report: SceneReport, measure: str, over: str) -> Any:
 
 
 def overview(scene_report: SceneReport, measures: Sequence[str]) -> Any:
-    """Return a figure of all measures over seconds, in small plots."""
+    """Return a figure of all measures over seconds, in small plots with one legend."""
     matplotlib = _matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -91,10 +98,10 @@ def overview(scene_report: SceneReport, measures: Sequence[str]) -> Any:
         rows = -(-len(measures) // 2)
         figure = Figure(figsize=(7.2, 2.3 * rows + 0.21 * len(scene_report.lines)), layout="constrained")
         FigureCanvasAgg(figure)
-        for place, measure in enumerate(measures):
-            axes = figure.add_subplot(rows, 2, place + 1)
+        for number, measure in enumerate(measures):
+            axes = figure.add_subplot(rows, 2, number + 1)
             for line in scene_report.lines:
-                _draw(axes, line, measure, "seconds", slopes=False if place == 0 else None)
+                _draw(axes, line, measure, "seconds", slopes=False if number == 0 else None)
             _finish(axes, measure, "seconds")
             axes.set_title(NAMES[measure], loc="left", fontsize=10.0)
             axes.set_ylabel("")
@@ -114,7 +121,10 @@ def encoded(figure: Any) -> tuple[bytes, bytes]:
 
 
 def _points(line: ErrorCurve, measure: str, over: str) -> list[tuple[float, float, float, float]]:
-    """Return x, mean, lower and upper bound of each step that can be drawn."""
+    """Return x, mean, lower and upper bound of each step that can be drawn: finite, and positive where the axis is logarithmic.
+
+    The bounds are those of the 95 % confidence interval, or the mean where a step has none.
+    """
     points = []
     for step in line.steps:
         found, x = step.estimate(measure), step.seconds if over == "seconds" else step.spp
@@ -130,8 +140,17 @@ def _points(line: ErrorCurve, measure: str, over: str) -> list[tuple[float, floa
 
 
 def _draw(axes: Any, line: ErrorCurve, measure: str, over: str, slopes: bool | None = True) -> None:
-    """Draw one curve; ``slopes``: with a legend and slope, without slope (False), or without a legend (None)."""
+    """Draw one curve with its band.
+
+    Args:
+        axes: axes of the plot.
+        line: the curve.
+        measure: a key of :data:`NAMES`.
+        over: ``seconds`` or ``spp``.
+        slopes: its entry in the legend: True: name and slope; False: the name; None: no entry.
+    """
     look, inside = line.look, "auto" if line.of is None else "white"
+    # The dashes change with each curve and once more with each round of colours, so colour and dashes do not repeat together.
     colour, mark = COLOURS[look % len(COLOURS)], _MARKS[look % len(_MARKS)]
     dash: Any = _DASHES[(look // len(COLOURS) + look) % len(_DASHES)] if line.measured else ":"
     dash = dash if line.of is None else _DENOISED
@@ -146,6 +165,7 @@ def _draw(axes: Any, line: ErrorCurve, measure: str, over: str, slopes: bool | N
         axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
     else:  # runs so short that more samples took less time
         axes.vlines(x, low, high, color=colour, alpha=0.5)
+    # The least error that more samples can reach, where the bias test found a bias.
     floor = line.floor if measure == "relmse" else 0.0
     if floor > 0:
         axes.axhline(floor, color=colour, linewidth=1.0, linestyle=(0, (1, 2)))
@@ -155,12 +175,13 @@ def _draw(axes: Any, line: ErrorCurve, measure: str, over: str, slopes: bool | N
 
 
 def _slope(line: ErrorCurve, over: str) -> str:
+    """Return the slope of a curve for the legend, with a minus sign; an empty text without a confidence interval."""
     found = line.by_seconds if over == "seconds" else line.by_spp
     return "" if found is None or found.slope.low is None else f"   slope {found.slope.mean:.2f}".replace("-", "−")
 
 
 def _guide(axes: Any, lines: Sequence[ErrorCurve], measure: str) -> None:
-    """Draw the guide ``1 / samples`` of an unbiased estimator."""
+    """Draw the error ``1 / samples`` of an unbiased estimator, from the worst curve's first point; squared errors only."""
     points = [point for line in lines if line.of is None for point in _points(line, measure, "spp")]
     if measure not in ("relmse", "mse", "relmse_trimmed") or not points:
         return
@@ -178,6 +199,7 @@ def _guide(axes: Any, lines: Sequence[ErrorCurve], measure: str) -> None:
 
 
 def _finish(axes: Any, measure: str, over: str) -> None:
+    """Set scales, ticks, grid and the label of the x axis; errors have a logarithmic y axis, PSNR and SSIM a linear one."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")

@@ -1,4 +1,4 @@
-"""The coordinates of lanes: their origin in the scene, and their unit of length.
+"""The coordinates of lanes, in which a scene is rendered: their origin in the scene, and their unit of length.
 
 Searches, areas and densities compute squares and cubes of lengths, and float32 holds cubes of 1e-12 to 1e12 only. So a scene
 whose lengths are far from 1 is rendered in another unit. It is a power of two, so that scaling rounds nothing.
@@ -22,7 +22,7 @@ from torchpt.spec.schema import ParsedParams
 
 __all__ = ["MAX_COORDINATE", "Space", "bounds_center", "bounds_extent", "centre_and_unit"]
 
-#: A scene is moved to the origin where its distance from it is more than this many times its size.
+#: The centre of a scene becomes the origin if its distance from the scene's own origin is more than this many times its size.
 RECENTRE_DISTANCE = 8.0
 #: Scenes with all lengths between 1 / UNSCALED_RANGE and UNSCALED_RANGE keep their unit.
 UNSCALED_RANGE = 2.0**30
@@ -36,11 +36,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Space:
-    """Transform from the scene's coordinates to those of lanes.
+    """Transform from the scene's coordinates to those of lanes: ``(p - centre) / unit``.
 
     Attributes:
-        centre: ``(3,)`` float64, their origin in the scene's coordinates.
-        unit: length of their unit in the scene's units; a power of two.
+        centre: ``(3,)`` float64, the origin of the lanes' coordinates in the scene's.
+        unit: the lanes' unit of length in the scene's units; a power of two.
     """
 
     centre: Tensor
@@ -51,7 +51,7 @@ class Space:
         return (p.double() - self.centre) / self.unit
 
     def pose(self, to_world: Tensor) -> Tensor:
-        """Convert transforms ``(..., 4, 4)`` to the scene into ``(..., 3, 4)`` to these coordinates, in float64."""
+        """Convert object-to-scene transforms ``(..., 4, 4)`` to object-to-lanes transforms ``(..., 3, 4)``, in float64."""
         pose = to_world.double()
         return torch.cat((pose[..., :3, :3], pose[..., :3, 3:4] - self.centre[:, None]), -1) / self.unit
 
@@ -78,6 +78,14 @@ def centre_and_unit(
 ) -> tuple[Array, float]:
     """Choose the origin ``(3,)`` and the unit of the coordinates of lanes.
 
+    Args:
+        parts: the parts of shapes.
+        copies: instances of meshes.
+        sources: lights without a surface.
+        parameters: the scene's parameters by dotted name; read for the positions of camera and lights.
+        camera: the camera's settings.
+        file: scene file, for errors.
+
     Raises:
         SceneError: a shape beyond the range of float32, or lengths too far apart for it.
     """
@@ -86,7 +94,7 @@ def centre_and_unit(
     if not names:
         return centre, 1.0
     farthest = np.abs(boxes).max((1, 2))
-    if not farthest.max() <= np.finfo(np.float32).max:
+    if not farthest.max() <= np.finfo(np.float32).max:  # True for NaN too
         worst = int(farthest.argmax())
         expected = "a place that is finite in float32 (up to 3.4e38)"
         raise SceneError(names[worst], [boxes[worst].min(0).tolist(), boxes[worst].max(0).tolist()], expected, file)
@@ -94,10 +102,10 @@ def centre_and_unit(
     middle = 0.5 * (low + high)
     if np.abs(middle).max() > RECENTRE_DISTANCE * (high - low).max():
         centre = middle
-    reaches = np.abs(boxes - centre).max((1, 2))
-    far, near = int(reaches.argmax()), int(sizes.argmin())
+    reaches = np.abs(boxes - centre).max((1, 2))  # largest coordinate of each shape
+    far, smallest = int(reaches.argmax()), int(sizes.argmin())
     lengths = [(names[far], float(reaches[far])), *_reaches(sources, parameters, camera, centre)]
-    return centre, _unit(lengths, (names[near], float(sizes[near])), file)
+    return centre, _unit(lengths, (names[smallest], float(sizes[smallest])), file)
 
 
 def bounds_center(parts: Sequence[Part], copies: Sequence[Copy]) -> Array:
@@ -113,7 +121,11 @@ def bounds_extent(parts: Sequence[Part], copies: Sequence[Copy]) -> float:
 
 
 def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Array, Array]:
-    """Return, for all parts and copies, names, corners ``(N, 8, 3)`` of bounding boxes in the scene, and longest sides."""
+    """Return names of all parts and copies, the corners ``(N, 8, 3)`` of their bounding boxes, and longest sides ``(N,)``.
+
+    Corners and sides are in the scene's coordinates. The boxes of shapes other than meshes are those of the cube ``[-1, 1]^3``
+    in object space.
+    """
     cube = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
     own: dict[str, Array] = {}
     found = []
@@ -139,18 +151,31 @@ def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Ar
 def _reaches(
     sources: Sequence[Source], parameters: Mapping[str, Array], camera: ParsedParams, centre: Array
 ) -> list[tuple[str, float]]:
-    """Return the lengths of camera and lights that lanes hold, by key."""
+    """Return the lengths of camera and lights that enter the computation in float32, as pairs of key and length.
+
+    They are the largest coordinates of their positions, relative to ``centre``, and parameters of the camera such as the
+    aperture radius (``reaches`` of its kind).
+    """
     found = [("camera", float(np.abs(parameters["camera.to_world"][:3, 3] - centre).max()))]
     found += [(f"camera.{key}", float(camera[key])) for key in camera.kind.reaches]
     for source in sources:
-        for place in LIGHTS[source.kind].places:
-            name = f"{source.name}.{place}"
+        for parameter in LIGHTS[source.kind].places:
+            name = f"{source.name}.{parameter}"
             found.append((name, float(np.abs(parameters[name] - centre).max())))
     return found
 
 
 def _unit(lengths: Sequence[tuple[str, float]], smallest: tuple[str, float], file: str | None) -> float:
-    """Return 1, or a power of two near the geometric mean of the longest length and the smallest shape."""
+    """Return 1, or a power of two near the geometric mean of the longest length and the smallest shape.
+
+    Args:
+        lengths: pairs of key and length.
+        smallest: name and size of the smallest shape.
+        file: scene file, for errors.
+
+    Raises:
+        SceneError: the lengths are too far apart for float32.
+    """
     (far, longest), (near, size) = max(lengths, key=lambda item: item[1]), smallest
     longest = max(longest, size)
     if longest > MAX_RATIO * size:

@@ -16,7 +16,7 @@ __all__ = ["Accel", "Array", "Hits", "mark_non_opaque"]
 #: A numpy array, float32 or int32.
 Array = np.ndarray[Any, Any]
 
-#: ``t`` (N,) float32, ``prim`` (N,) int32, ``u`` (N,), ``v`` (N,).
+#: ``t`` (N,) float32, ``prim`` (N,) int32, ``u`` (N,) and ``v`` (N,) float32, see :class:`Accel`.
 Hits = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
@@ -105,7 +105,10 @@ class Accel(ABC):
 
 
 def mark_non_opaque(out: Array, non_opaque: Array | None) -> None:
-    """Replace 1 by 2 in ``out`` if there are non-opaque primitives, for a search that does not test for them."""
+    """Replace 1 by 2 in ``out`` if there are non-opaque primitives, for a search that does not test for them.
+
+    2 means that the caller has to compute the transmittance, see :meth:`Accel.blocked`.
+    """
     if non_opaque is not None:
         np.left_shift(out, 1, out=out)
 

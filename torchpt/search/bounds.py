@@ -21,11 +21,13 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
     p0, p1, p2 = geometry.p0.double(), geometry.p1.double(), geometry.p2.double()
     n_tri, n_rect, n_disk, n_ball, _ = geometry.counts
     low, high = torch.minimum(torch.minimum(p0, p1), p2), torch.maximum(torch.maximum(p0, p1), p2)
+    # Ids up to a are triangles, up to b rectangles, up to c disks, up to q spheres, the others quadrics.
     a, b, c, q = n_tri, n_tri + n_rect, n_tri + n_rect + n_disk, n_tri + n_rect + n_disk + n_ball
     # the searches use the float32 sum as the corner
     fourth = ((geometry.p1 + geometry.p2) - geometry.p0)[:, a:b].double()
     low[:, a:b], high[:, a:b] = torch.minimum(low[:, a:b], fourth), torch.maximum(high[:, a:b], fourth)
     reach = ((p1 - p0)[:, b:c].square() + (p2 - p0)[:, b:c].square()).sqrt()
+    # ``p1`` of a sphere has its radius as x.
     reach = torch.cat([reach, p1[:1, c:q].abs().expand(3, -1)], 1)
     low[:, b:q], high[:, b:q] = p0[:, b:q] - reach, p0[:, b:q] + reach
     if geometry.quadrics is not None:
@@ -39,7 +41,7 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
 
 
 def select_primitives(geometry: Geometry, prim: Tensor) -> Geometry:
-    """Return the primitives with ids ``prim`` ``(K,)`` int64, which must rise."""
+    """Return the primitives with ids ``prim`` ``(K,)`` int64, in ascending order."""
     starts = torch.tensor([sum(geometry.counts[:k]) for k in range(6)], device=prim.device)
     a, b, c, d, e = torch.diff(torch.searchsorted(prim, starts)).tolist()
     p0, p1, p2 = (p.index_select(1, prim) for p in (geometry.p0, geometry.p1, geometry.p2))
@@ -52,6 +54,6 @@ def select_primitives(geometry: Geometry, prim: Tensor) -> Geometry:
 
 
 def half_areas(low: Tensor, high: Tensor) -> Tensor:
-    """Compute half the surface area of boxes ``(3, N)``."""
+    """Return half the surface areas ``(N,)`` of boxes ``(3, N)``."""
     x, y, z = (high - low).unbind(0)
     return x * y + y * z + z * x

@@ -54,7 +54,7 @@ class Harness:
             integrator={"type": "path", **integrator},
             film={"width": size, "height": size, "filter": "box"},
             accel=self.accel,
-            compile="off" if self.dtype == torch.float64 else self.compile,
+            compile="off" if self.dtype == torch.float64 else self.compile,  # kernels compute in float32 only
             dtype=self.dtype,
             full=True,
         )

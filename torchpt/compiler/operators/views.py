@@ -43,6 +43,7 @@ def _slice(
         if out.shape != a.shape:
             raise Unsupported("a slice of the lanes' axis")
         return tracer.alias(out, a)
+    # torch writes an open end as the largest int64.
     part: list[Any] = [slice(None)] * a.dim()
     part[axis] = slice(start, None if end is not None and end > 1 << 40 else end, step)
     tracer.put(out, value.nodes[tuple(part)])

@@ -51,12 +51,18 @@ __all__ = [
     "transmit",
 ]
 
+#: Mask of a :class:`~torchpt.compiler.sinks.Scatter` that stores in every lane.
+_ALL_LANES = -1
+
 
 # ---- The search of few primitives inside kernels: each ray of a packet against every primitive
+#
+# Node types are letters, see :mod:`torchpt.compiler.graph`. ``nearest`` nodes have the type ``S``: a tuple of t, prim, u and v,
+# which ``part`` nodes read by their position.
 
 
 def nearest(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
-    """Return the nearest hits of rays."""
+    """Return the nearest hits of rays ``o, d (3, N)`` within ``t_max (N,)``, found inside the kernel."""
     graph = tracer.graph
     hits = graph.node("nearest", "S", *_ray(tracer, o, d, t_max))
 
@@ -75,6 +81,7 @@ def occluded(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
 
 
 def _ray(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> list[int]:
+    """Return the seven nodes of rays: ``o``, ``d`` and ``t_max``."""
     return [*tracer.nodes(o), *tracer.nodes(d), *tracer.nodes(t_max)]
 
 
@@ -102,7 +109,7 @@ def search_occluded(trace: Trace) -> Sinks:
 
 
 def kinds_of(world: World) -> tuple[str, ...]:
-    """Return the kinds of primitives in a scene, of those that packets can search."""
+    """Return the kinds of primitives that the scene has, among those that packets can search."""
     return tuple(kind for kind, count in zip(KINDS, world.geometry.counts, strict=False) if count)
 
 
@@ -117,8 +124,10 @@ def search_words(wave: Wave) -> Any:
 # Each function traces one stage of :mod:`torchpt.paths.vertex` with the loads and stores around it.
 
 
-#: Integers that identify the samples of a chunk: first pixel and number of pixels; randomization (counted from ``stream``) and
-#: point of the first sample; first randomization and how many share the samples; corner and width of the crop; film width.
+#: Integers that identify the samples of a chunk. ``first, pixels``: first pixel and number of pixels. ``turn, point``: position
+#: of the first sample, its randomization (counted from ``stream``) and its index in the point sequence. ``stream, streams``:
+#: first of the randomizations that share the samples of a pixel, and their number. Samples go to them in turn. ``x, y, crop``:
+#: corner and width of the crop on the film, in pixels. ``film``: width of the film.
 CHUNK_FIELDS = ("first", "pixels", "turn", "point", "stream", "streams", "x", "y", "crop", "film")
 
 
@@ -129,24 +138,25 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
     rays, else they are camera rays.
     """
     layout, tracer, wave = trace.layout, trace.tracer, trace.layout.wave
-    place = trace.uniform("place", torch.ones(len(CHUNK_FIELDS), dtype=torch.int32))
+    chunk_fields = trace.uniform("place", torch.ones(len(CHUNK_FIELDS), dtype=torch.int32))
     salts = trace.salts()
     pixels = layout.state.read(tracer, "prim")["prim"] if chosen else torch.empty(0)
     rays = layout.state.read(tracer, "o", "d") if given else {}
     passthrough: dict[str, Tensor] = {}
     with tracer:
-        chunk = dict(zip(CHUNK_FIELDS, place.to(torch.int64).unbind(), strict=True))
+        chunk = dict(zip(CHUNK_FIELDS, chunk_fields.to(torch.int64).unbind(), strict=True))
         # Lanes run over the chunk's pixels, then over its samples.
         lane = torch.arange(tracer.lanes)
         sample = torch.div(lane, chunk["pixels"], rounding_mode="floor")
         pixel = pixels if chosen else lane - sample * chunk["pixels"] + chunk["first"]
         row = torch.div(pixel, chunk["crop"], rounding_mode="floor")
         x, y = pixel - row * chunk["crop"] + chunk["x"], row + chunk["y"]
-        number = y * chunk["film"] + x
+        film_pixel = y * chunk["film"] + x
+        # The same randomization and point as in Sampler.key, without the index of the sample, which may exceed 32 bits.
         turn = sample + chunk["turn"]
         group = turn % chunk["streams"] + chunk["stream"]
         point = torch.div(turn, chunk["streams"], rounding_mode="floor") + chunk["point"]
-        key = wave.sampler.points.key(layout.numbers, number, group, point)
+        key = wave.sampler.points.key(layout.numbers, film_pixel, group, point)
         x, y = x.to(layout.plan.dtype), y.to(layout.plan.dtype)
         if given:
             state = camera_state(rays["o"], rays["d"], key)
@@ -164,7 +174,10 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
 
 
 def sort_lanes(trace: Trace, shadow: bool) -> Sinks:
-    """Append lanes to lists by their hits and end paths; ``shadow``: first add the contributions of shadow rays."""
+    """Append lanes to lists by their hits, and end paths that hit nothing, unless the scene has an environment.
+
+    ``shadow``: first add the contributions of the shadow rays of the vertex before.
+    """
     tracer, rows = trace.tracer, trace.layout.state
     state, passthrough = trace.state()
     prim = rows.read(tracer, "prim")["prim"]
@@ -185,7 +198,7 @@ def sort_lanes(trace: Trace, shadow: bool) -> Sinks:
 
 
 def emit(trace: Trace) -> Sinks:
-    """Add the emission of emitters that were hit to the paths in the arena."""
+    """Add the emission of emitters that were hit to the radiance of the paths, which go on: to the arena, in place."""
     tracer, layout = trace.tracer, trace.layout
     context = layout.wave.context.at(trace.salts())
     state, _ = trace.state()
@@ -194,7 +207,7 @@ def emit(trace: Trace) -> Sinks:
     with tracer:
         radiance = state.radiance + layout.wave.integrator.emit(context, VertexInput(state, hit)).brought
     rows = tuple(layout.state.nodes(tracer, radiance=radiance))
-    return Sinks(scatter=[Scatter(-1, trace.node(place), rows)])
+    return Sinks(scatter=[Scatter(_ALL_LANES, trace.node(place), rows)])
 
 
 def escape(trace: Trace) -> Sinks:
@@ -204,17 +217,20 @@ def escape(trace: Trace) -> Sinks:
     context = wave.context.at(trace.salts())
     with trace.tracer:
         radiance = state.radiance + wave.integrator.escape(context, VertexInput(state, hit)).brought
-    return Sinks(scatter=[trace.ended(-1, state.lane, radiance, passthrough)])
+    return Sinks(scatter=[trace.ended(_ALL_LANES, state.lane, radiance, passthrough)])
 
 
 def terminate(trace: Trace) -> Sinks:
     """End paths at the depth limit."""
     state, passthrough = trace.state()
-    return Sinks(scatter=[trace.ended(-1, state.lane, state.radiance, passthrough)])
+    return Sinks(scatter=[trace.ended(_ALL_LANES, state.lane, state.radiance, passthrough)])
 
 
 def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
-    """Run the stage of surfaces of one BSDF model, and store the paths that go on."""
+    """Run the stage of surfaces of one BSDF model, and store the paths that go on.
+
+    ``model``: index of the BSDF model. ``roulette``: upper bound of the survival probability; 0: no roulette at this vertex.
+    """
     layout, tracer = trace.layout, trace.tracer
     salts = trace.salts()
     state, passthrough = trace.state()
@@ -240,18 +256,22 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
 
 
 def _searched(trace: Trace, sinks: Sinks, state: PathState, passthrough: dict[str, Tensor]) -> None:
-    """Search inside the kernel: compact the lanes that go on, end the others."""
+    """Search inside the kernel: compact the lanes that go on, end the others; the stores are added to ``sinks``."""
     hit = nearest(trace.tracer, state.o, state.d, state.t_max)
     on, appends = trace.sorted(sinks, state, hit.prim, passthrough)
     rows = trace.kept(state, passthrough)
     rows += trace.layout.state.nodes(trace.tracer, t=hit.t, prim=hit.prim, u=hit.u, v=hit.v)
-    sinks.compact.append(Compact(on, tuple(rows), 0, tuple(appends)))
+    sinks.compact.append(Compact(on, tuple(rows), counter=0, appends=tuple(appends)))
 
 
 def _with_shadow(
     trace: Trace, state: PathState, shadow: Shadow | None, splat: Splat | None, passthrough: dict[str, Tensor]
 ) -> Sinks:
-    """Search later: store all lanes, with their shadow rays and splats."""
+    """Search later: store all lanes, with their shadow rays and splats.
+
+    The kernels of the BSDF models write one after another to the same arena, each behind the lanes of those before. The engine
+    sets counter 0 to their number, and ``shift=0`` adds it to the indices. Each splat has a shadow ray too, which counts.
+    """
     tracer, rows = trace.tracer, trace.layout.state
     sinks = Sinks(
         shift=0, write=trace.kept(state, passthrough), shadows=int(shadow is not None) + int(splat is not None)
@@ -263,7 +283,8 @@ def _with_shadow(
     if "splat_o" in rows:
         if splat is None:
             with tracer:
-                splat = Splat(torch.full_like(state.lane, -1), no_shadow(state))
+                no_pixel = torch.full_like(state.lane, -1)
+                splat = Splat(no_pixel, no_shadow(state))
         light = splat.light
         sinks.write += rows.nodes(
             tracer,
@@ -292,19 +313,28 @@ def _with_shadow(
 
 
 def list_transmitting(trace: Trace) -> Sinks:
-    """Append lanes to the list of rays that the stage ``transmit`` runs for."""
+    """Append lanes to the list of rays that the stage ``transmit`` runs for.
+
+    An integrator with its own ``transmit`` (media) gets all live rays, others those whose hit is on a surface that may let
+    them pass.
+    """
     rows, tracer, layout = trace.layout.state, trace.tracer, trace.layout
     given = rows.read(tracer, "prim", "t_max")
     with tracer:
         if layout.wave.integrator.own_transmit:
-            held_up = given["t_max"] > 0
+            may_pass = given["t_max"] > 0
         else:
-            held_up = non_opaque(layout.world, given["prim"]) & (given["prim"] >= 0)
-    return Sinks(appends=[AppendIndex(trace.node(held_up), 0, 0)])
+            may_pass = non_opaque(layout.world, given["prim"]) & (given["prim"] >= 0)
+    return Sinks(appends=[AppendIndex(trace.node(may_pass), list=0, counter=0)])
 
 
 def transmit(trace: Trace, again: bool) -> Sinks:
-    """Stop rays at their hits or move them on; ``again``: for rays in transit, else for rays of the list."""
+    """Stop rays at their hits or move them on; ``again``: for rays in transit, else for rays of the list.
+
+    A ray in transit keeps the distance that it has come since its vertex (row ``before``), so that the hit of its path has the
+    whole distance, and the lane of its path (row ``home``), which gets that hit. A ray that a medium scatters starts anew: its
+    distance is 0, and its path gets the new state.
+    """
     layout, tracer = trace.layout, trace.tracer
     salts = trace.salts()
     rows = layout.passed if again else layout.state
@@ -312,34 +342,35 @@ def transmit(trace: Trace, again: bool) -> Sinks:
     if again:
         given = rows.read(tracer, "pass_o", "pass_d", "pass_t", "before", "home", "key")
         o, d, t_max, before, home, key = given.values()
-        at_home = layout.state.read(tracer, *layout.state.state, place=trace.node(home))
-        state = replace(path_state(at_home), o=o, d=d, t_max=t_max, key=key)
+        path = layout.state.read(tracer, *layout.state.state, place=trace.node(home))
+        state = replace(path_state(path), o=o, d=d, t_max=t_max, key=key)
     else:
         state, before, home = trace.state()[0], None, trace.place()
     with tracer:
         out = layout.wave.integrator.transmit(layout.wave.context.at(salts), VertexInput(state, hit))
         on = out.on & (state.t_max > 0) if layout.wave.integrator.own_transmit else out.on
-        met = ~on
-        whole = hit.t if before is None else hit.t + before
-        after, start, turned = replace(state, o=out.o), whole, None
+        stops = ~on
+        distance = hit.t if before is None else hit.t + before  # from the vertex to this hit
+        after, come, scatters = replace(state, o=out.o), distance, None
         if out.state is not None and out.scattered is not None:
-            turned = on & out.scattered
+            scatters = on & out.scattered
             ray = {
-                name: torch.where(turned, getattr(out.state, name), getattr(after, name))
+                name: torch.where(scatters, getattr(out.state, name), getattr(after, name))
                 for name in ("o", "d", "t_max")
             }
-            after, start = replace(after, **ray), torch.where(turned, 0.0, whole)
+            after, come = replace(after, **ray), torch.where(scatters, 0.0, distance)
     onward = layout.passed.nodes(
-        tracer, pass_o=after.o, pass_d=after.d, pass_t=after.t_max, before=start, home=home, key=state.key
+        tracer, pass_o=after.o, pass_d=after.d, pass_t=after.t_max, before=come, home=home, key=state.key
     )
-    sinks = Sinks(compact=[Compact(trace.node(on), tuple(onward), 0)])
+    sinks = Sinks(compact=[Compact(trace.node(on), tuple(onward), counter=0)])
+    # The slots of this kernel are the arena of the paths. In the first step a ray that stops has its hit there already.
     if again:
-        stopped = layout.state.nodes(tracer, t=whole, prim=hit.prim, u=hit.u, v=hit.v)
-        sinks.scatter.append(Scatter(trace.node(met), trace.node(home), tuple(stopped), slots=True))
-    if out.state is not None and turned is not None:
+        final_hit = layout.state.nodes(tracer, t=distance, prim=hit.prim, u=hit.u, v=hit.v)
+        sinks.scatter.append(Scatter(trace.node(stops), trace.node(home), tuple(final_hit), slots=True))
+    if out.state is not None and scatters is not None:
         check_fields(layout.wave.integrator, out.state)
-        scattered = tuple(trace.kept(out.state, {}))
-        sinks.scatter.append(Scatter(trace.node(turned), trace.node(home), scattered, slots=True))
+        scattered = tuple(trace.kept(out.state, passthrough={}))
+        sinks.scatter.append(Scatter(trace.node(scatters), trace.node(home), scattered, slots=True))
     return sinks
 
 
@@ -347,6 +378,7 @@ def begin_shadow_rays(trace: Trace) -> Sinks:
     """Start the rays in transit of shadow rays that may pass surfaces; write the transmittance of all others."""
     layout, tracer = trace.layout, trace.tracer
     ray = layout.state.read(tracer, "shadow_o", "shadow_d", "shadow_t", "blocked")
+    # Row ``blocked``: 0 free, 1 blocked, 2 only surfaces that may let light pass. Packets have none: every live ray is traced.
     o, d, t_max = list(ray.values())[:3]
     home = trace.place()
     with tracer:
@@ -368,7 +400,7 @@ def attenuate_shadow_rays(trace: Trace) -> Sinks:
         tracer, "pass_o", "pass_d", "pass_t", "home", "transmittance"
     ).values()
     with tracer:
-        opacity = opacity_at(layout.world, o, d, hit, 0.0)
+        opacity = opacity_at(layout.world, o, d, hit, miss=0.0)
         transmittance = transmittance * (1.0 - opacity)
         on = (hit.prim >= 0) & (opacity < 1)
         off = ~on
@@ -381,17 +413,26 @@ def attenuate_shadow_rays(trace: Trace) -> Sinks:
 def _passed(
     trace: Trace, on: Tensor, onward: list[tuple[int, int]], off: Tensor, home: Tensor, transmittance: Tensor
 ) -> Sinks:
-    """Compact shadow rays that go on; write the transmittance of the others to the arena of their paths."""
+    """Compact shadow rays that go on; write the transmittance of the others to the arena of their paths.
+
+    Args:
+        trace: the trace.
+        on: mask ``(N,)`` of rays that go on.
+        onward: rows and nodes of these rays in transit.
+        off: mask ``(N,)`` of rays whose transmittance is known.
+        home: their lanes in the arena of the paths ``(N,)``.
+        transmittance: ``(N,)``.
+    """
     known = tuple(trace.layout.state.nodes(trace.tracer, transmittance=transmittance))
     done = Scatter(trace.node(off), trace.node(home), known, slots=True)
-    return Sinks(compact=[Compact(trace.node(on), tuple(onward), 0)], scatter=[done])
+    return Sinks(compact=[Compact(trace.node(on), tuple(onward), counter=0)], scatter=[done])
 
 
 # ---- Kernels of results: layers of first surfaces, and adding samples to the film
 
 
 def layers(trace: Trace, model: int, names: tuple[str, ...]) -> Sinks:
-    """Write the layers of first surfaces of one BSDF model."""
+    """Write the layers ``names`` of first surfaces of one BSDF model to the slots of their samples; ``model``: its index."""
     wave = trace.layout.wave
     state, passthrough = trace.state()
     hit = trace.hit()
@@ -400,13 +441,16 @@ def layers(trace: Trace, model: int, names: tuple[str, ...]) -> Sinks:
         if "weight" in passthrough:
             values = aov.weighted(values, passthrough["weight"])
     nodes = [node for name in names for node in trace.tracer.nodes(values[name])]
-    return Sinks(scatter=[Scatter(-1, trace.node(state.lane), tuple(enumerate(nodes)), slots=True)])
+    return Sinks(scatter=[Scatter(_ALL_LANES, trace.node(state.lane), tuple(enumerate(nodes)), slots=True)])
 
 
 def accumulate(trace: Trace, channels: int, clamp: bool) -> Sinks:
-    """Add one sample of each pixel to the film's sums; samples that are not finite are counted, and added as black."""
+    """Add one sample of each pixel to the film's sums; samples that are not finite are counted, and added as black.
+
+    ``clamp``: scale samples down to the uniform ``clamp`` as :func:`torchpt.paths.wave.clamp_scale` does, and return them too.
+    """
     tracer, graph = trace.tracer, trace.tracer.graph
-    trace.tensors = 2
+    trace.tensors = 2  # inputs: the samples and the sums
     sample = tracer.lane(torch.zeros(channels, tracer.lanes), lambda k: graph.node("tensor", "f", extra=(0, k)))
     total = tracer.lane(
         torch.zeros(channels, tracer.lanes, dtype=torch.float64), lambda k: graph.node("tensor", "d", extra=(1, k))
@@ -422,4 +466,5 @@ def accumulate(trace: Trace, channels: int, clamp: bool) -> Sinks:
     results = [Store(tuple(tracer.nodes(total)), "d")]
     if clamp:
         results.append(Store(tuple(tracer.nodes(value)), "f"))
-    return Sinks(count=[(trace.node(bad), 0)], store=results)
+    counter = 0
+    return Sinks(count=[(trace.node(bad), counter)], store=results)

@@ -22,7 +22,7 @@ class Film:
         randomizations: number of independent sequences that share the samples, see :mod:`torchpt.physics.samplers`.
         device: device of the lanes.
         channels: C, three for radiance.
-        splats: whether integrators splat to other pixels. The value of a pixel is then the mean of its own samples plus its
+        splats: True: integrators splat to other pixels. The value of a pixel is then the mean of its own samples plus its
             splats over the mean number of samples of all pixels.
 
     Attributes:
@@ -48,16 +48,17 @@ class Film:
     @staticmethod
     def bytes_of(pixels: int, randomizations: int, channels: int = 3, splats: bool = False) -> int:
         """Return the size in bytes of a film of this many pixels."""
+        # 8 bytes each: first samples, and for each randomization sums and a count.
         own = 8 * pixels * (channels + randomizations * (channels + 1))
         return own + (SplatSums.bytes_of(pixels, randomizations) if splats else 0)
 
     def add(self, radiance: Tensor, first_pixel: int, first_sample: int) -> None:
-        """Add samples ``(C, S, n)`` of ``n`` consecutive pixels, ``S`` consecutive samples each."""
+        """Add samples ``(C, S, n)``: ``S`` consecutive ones of ``n`` consecutive pixels, from the given indices on."""
         for place, value in self.after(radiance, first_pixel, first_sample):
             place.copy_(value)
 
     def after(self, radiance: Tensor, first_pixel: int, first_sample: int) -> list[tuple[Tensor, Tensor]]:
-        """Return what :meth:`add` would change: pairs of a view of this film and its new values.
+        """Return the changes that :meth:`add` would make: pairs of a view of this film and its new values.
 
         The film is not changed. Copying the values allocates nothing, so that on lack of memory all or nothing is added.
         """

@@ -18,12 +18,14 @@ __all__ = ["build"]
 #: Paths take three bits a level of an int64, which holds 21 levels. From this level on children get equal numbers of lights, so
 #: that ten more levels suffice for any input: eight to the tenth is more lights than memory holds.
 _EVEN = 11
+#: Bins of a split along each axis; two more rows are the sums from the upper and from the lower end.
 _BINS = 12
 _UPPER, _LOWER = _BINS, _BINS + 1
 _INF = np.inf
 _PI = math.pi
 
-# A group of lights is a row of twelve: low (3), high (3), sum of the axes (3), cos_e, intensity, count.
+# A group of lights is a row of twelve: corners of the bounding box (low 3, high 3), sum of the axes weighted by intensity (3),
+# cosine of the angle theta_e of the paper, intensity, count.
 
 
 @jit()

@@ -25,7 +25,7 @@ __all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
 #: Rays leave a surface ``OFFSET * world.geometry.bound`` off its plane. Re-deriving a point and evaluating its plane in the
 #: search each round by less than ``4 * 2^-24 * 2 bound``; this is twice their sum, and scales with the scene.
 OFFSET = 2.0**-19
-#: Distances below this fraction of the coordinates count as 0 and have no derivative.
+#: Distances below this fraction of the coordinates count as 0 and have no derivative, in :func:`reattach`.
 NEAR = 2.0**-15
 
 
@@ -38,8 +38,8 @@ def _plane_uv(o: Tensor, d: Tensor, p0: Tensor, e1: Tensor, e2: Tensor) -> tuple
     return dot(tvec, pvec) * inverse, dot(d, cross(tvec, e1)) * inverse
 
 
-def _round(world: World, prim: Tensor) -> list[tuple[type[Primitive], Tensor]]:
-    """Return the kinds present that are not flat, each with the mask of its primitives."""
+def _not_flat(world: World, prim: Tensor) -> list[tuple[type[Primitive], Tensor]]:
+    """Return the kinds in the scene that are not flat (spheres, quadrics), each with the mask of its lanes ``(N,)``."""
     return [(kind, world.geometry.of(kind, prim)) for kind in world.geometry.kinds if not kind.flat]
 
 
@@ -51,38 +51,41 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_ray: bool = Fa
         o: ray origins ``(3, N)``.
         d: ray directions ``(3, N)``.
         hit: hits of the search.
-        follow_ray: re-intersect the ray with the plane, so that the point follows ``o``, ``d`` and the geometry.
+        follow_ray: re-intersect the ray with the primitive, so that the point follows ``o``, ``d`` and the geometry.
     """
-    geometry, place = world.geometry, lane_primitives(world, hit.prim)
-    prim, p0, e1, e2, u, v = place.prim, place.p0, place.e1, place.e2, hit.u, hit.v
-    round_ = _round(world, prim)
+    geometry, primitives = world.geometry, lane_primitives(world, hit.prim)
+    prim, p0, e1, e2, u, v = primitives.prim, primitives.p0, primitives.e1, primitives.e2, hit.u, hit.v
+    not_flat = _not_flat(world, prim)
     if follow_ray:
         u, v = _plane_uv(o, d, p0, e1, e2)
-    for _, mine in round_:
+    # In lanes of other kinds u and v are no affine coordinates; at 0 the sum below stays finite. ``hit_points`` replaces it.
+    for _, mine in not_flat:
         u, v = torch.where(mine, 0.0, u), torch.where(mine, 0.0, v)
     p = affine(p0, e1, u, e2, v)
-    ng = take(geometry.normal, prim) if place.copies is None else place.turned(take(geometry.normal, prim))
-    bound, own = None, None
-    if place.copied is not None and place.reach is not None:
-        bound = torch.where(place.copied, dot(ng.detach().abs(), place.reach), take(geometry.bound, prim))
-    for kind, mine in round_:
-        met = kind.hit_points(world, place, Rays(o, d, hit, follow_ray), mine)
-        p, ng = torch.where(mine, met.p, p), torch.where(mine, met.ng, ng)
-        if met.bound is not None:
-            bound = torch.where(mine, met.bound, take(geometry.bound, prim) if bound is None else bound)
-        own = own if met.own is None else met.own
+    ng = take(geometry.normal, prim) if primitives.copies is None else primitives.turned(take(geometry.normal, prim))
+    bound, own = None, None  # see Interaction
+    if primitives.copied is not None and primitives.reach is not None:
+        bound = torch.where(primitives.copied, dot(ng.detach().abs(), primitives.reach), take(geometry.bound, prim))
+    for kind, mine in not_flat:
+        points = kind.hit_points(world, primitives, Rays(o, d, hit, follow_ray), mine)
+        p, ng = torch.where(mine, points.p, p), torch.where(mine, points.ng, ng)
+        if points.bound is not None:
+            bound = torch.where(mine, points.bound, take(geometry.bound, prim) if bound is None else bound)
+        own = own if points.own is None else points.own
     ns = ng
     if geometry.normals is not None:
         corners = [take(n, prim) for n in geometry.normals]
-        if place.copies is not None:
-            corners = [place.turned(n) for n in corners]
+        if primitives.copies is not None:
+            corners = [primitives.turned(n) for n in corners]
         ns = normalize(affine(corners[0] * (1.0 - u - v), corners[1], u, corners[2], v))
-        if any(geometry.counts[1:]):
+        if any(geometry.counts[1:]):  # only triangles, which come first, have normals at their corners
             ns = torch.where(prim < geometry.ends[0], ns, ng)
-    return _framed(world, place, Interaction(p, ng, ns, None, None, prim, geometry.slot(hit.prim), bound, u, v, own))
+    slot = geometry.slot(hit.prim)
+    at = Interaction(p, ng, ns, tangent=None, bitangent=None, prim=prim, slot=slot, bound=bound, u=u, v=v, own=own)
+    return _framed(world, primitives, at)
 
 
-def _framed(world: World, place: LanePrimitives, at: Interaction) -> Interaction:
+def _framed(world: World, primitives: LanePrimitives, at: Interaction) -> Interaction:
     """Add tangents and bitangents, if the world has them."""
     geometry = world.geometry
     if geometry.tangents is None:
@@ -92,12 +95,14 @@ def _framed(world: World, place: LanePrimitives, at: Interaction) -> Interaction
     at = replace(at, tangent=tangent, bitangent=bitangent)
     for kind in (kind for kind in geometry.kinds if kind.has_own_uv):
         mine = geometry.of(kind, at.prim)
-        along_u, along_v = kind.tangents(world, place, at, mine)
+        along_u, along_v = kind.tangents(world, primitives, at, mine)
         tangent = torch.where(mine, along_u, tangent)
         bitangent = None if bitangent is None or along_v is None else torch.where(mine, along_v, bitangent)
-    if place.copied is not None:
-        tangent = torch.where(place.copied, place.moved(tangent), tangent)
-        bitangent = None if bitangent is None else torch.where(place.copied, place.moved(bitangent), bitangent)
+    if primitives.copied is not None:
+        tangent = torch.where(primitives.copied, primitives.moved(tangent), tangent)
+        bitangent = (
+            None if bitangent is None else torch.where(primitives.copied, primitives.moved(bitangent), bitangent)
+        )
     return replace(at, tangent=tangent, bitangent=bitangent)
 
 
@@ -116,15 +121,16 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
         change of measure from solid angle to area.
     """
     missed = hit.prim < 0
-    place = lane_primitives(world, hit.prim.clamp_min(0))
-    y = affine(place.p0, place.e1, hit.u, place.e2, hit.v)
-    area = cross(place.e1, place.e2)
-    round_ = _round(world, place.prim)
-    if round_:
+    primitives = lane_primitives(world, hit.prim.clamp_min(0))
+    y = affine(primitives.p0, primitives.e1, hit.u, primitives.e2, hit.v)
+    # Along the normal of ``y``; the length is the area in the world for one unit of area in the parametrization.
+    area = cross(primitives.e1, primitives.e2)
+    not_flat = _not_flat(world, primitives.prim)
+    if not_flat:
         rays = Rays(x, wi, replace(hit, t=torch.where(missed, 0.0, hit.t)))
-        for kind, mine in round_:
-            held = kind.fixed_points(world, place, rays, mine)
-            y, area = torch.where(mine, held.p, y), torch.where(mine, held.area, area)
+        for kind, mine in not_flat:
+            fixed = kind.fixed_points(world, primitives, rays, mine)
+            y, area = torch.where(mine, fixed.p, y), torch.where(mine, fixed.area, area)
     offset = torch.where(missed, wi, y - x)
     square = dot(offset, offset)
     # Where two surfaces touch, the derivative grows as one over the distance. Points within rounding of each other count as
@@ -142,9 +148,10 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
 
 
 def offset_origin(world: World, at: Interaction, w: Tensor) -> Tensor:
-    """Return origins ``(3, N)`` of rays in directions ``w``, moved off the surface to the side of ``w``.
+    """Return origins ``(3, N)`` of rays in directions ``w (3, N)``, moved off the surface to the side of ``w``.
 
     After Waechter and Binder, *A Fast and Robust Method for Avoiding Self-Intersection*, Ray Tracing Gems, 2019.
     """
+    # ``at.bound`` is None if the scene has only primitives whose bound is in the table.
     step = (take(world.geometry.bound, at.prim) if at.bound is None else at.bound) * OFFSET
     return torch.addcmul(at.p, at.ng, torch.copysign(step, dot(w, at.ng)))

@@ -3,6 +3,9 @@
 A subclass of :class:`Quadric` defines the surface in object space, in the file of its shape. A primitive maps it by
 ``p = p0 + x e1 + y e2 + z e3``; normals are mapped by the cofactor matrix, which needs no inverse and keeps them outward under
 mirroring maps. The functions below take lanes of all quadrics of a scene together.
+
+``q`` is a point in object space. ``u, v`` are those of a hit, as the search returns them; texture coordinates are those of
+:func:`surface_uv`.
 """
 
 from __future__ import annotations
@@ -72,7 +75,7 @@ class Quadric:
     Attributes:
         name: name of the surface.
         form: equation of the surface.
-        area: area in object space.
+        area: area in object space, by which emitters are sampled.
     """
 
     name: ClassVar[str] = ""
@@ -86,12 +89,12 @@ class Quadric:
 
     @classmethod
     def normal(cls, q: Tensor) -> Tensor:
-        """Return outward normals ``(3, N)`` at points of the surface, of any length; along the axis where undefined."""
+        """Return outward normals ``(3, N)`` at points of the surface, not of unit length; along the axis where undefined."""
         raise NotImplementedError
 
     @classmethod
     def climb(cls, q: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
-        """Return derivatives of the distance from the axis (``radius (N,)``) and of z by the texture coordinate ``v``."""
+        """Return ``dr/dv`` and ``dz/dv (N,)`` at points: r is the distance from the axis, here ``radius (N,)``."""
         return torch.zeros_like(radius), torch.ones_like(radius)
 
     @classmethod
@@ -111,13 +114,17 @@ class Quadric:
 
 
 def ring(u: Tensor) -> Tensor:
-    """Return points ``(3, N)`` of the unit circle in the xy plane, by the arc length u in [-2, 2] along ``|x| + |y| = 1``."""
+    """Return points ``(3, N)`` of the unit circle in the xy plane, by their position ``u`` in [-2, 2].
+
+    ``u`` is the position along the square ``|x| + |y| = 1``, each side of which counts 1: 0 at +x, 1 at +y, 2 and -2 at -x, -1
+    at -y. Unlike an angle it needs no trigonometry. The point of the square is projected to the circle.
+    """
     across, sign = u.abs(), torch.copysign(torch.ones_like(u), u)
     return normalize(torch.stack((1.0 - across, sign * torch.minimum(across, 2.0 - across), torch.zeros_like(u))))
 
 
 def octahedral(u: Tensor, v: Tensor) -> Tensor:
-    """Return unit directions ``(3, N)`` by octahedral coordinates."""
+    """Return unit directions ``(3, N)`` by octahedral coordinates ``u, v (N,)`` in [-1, 1]."""
     z = 1.0 - u.abs() - v.abs()
     x = torch.where(z < 0, torch.copysign(1.0 - v.abs(), u), u)
     y = torch.where(z < 0, torch.copysign(1.0 - u.abs(), v), v)
@@ -127,9 +134,10 @@ def octahedral(u: Tensor, v: Tensor) -> Tensor:
 def polar(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Return distance from the axis ``(N,)`` and azimuth over 2 pi ``(N,)``, with finite derivatives on the axis."""
     square = torch.addcmul(x * x, y, y)
-    some = square > 0
-    across = torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)
-    return across, azimuth(x, y) * (0.5 / math.pi)
+    off_axis = square > 0
+    # The inner ``where`` keeps the infinite derivative of the root at 0 out of the backward pass.
+    radius = torch.where(off_axis, torch.where(off_axis, square, 1.0).sqrt(), 0.0)
+    return radius, azimuth(x, y) * (0.5 / math.pi)
 
 
 # -- when a world is built
@@ -145,9 +153,9 @@ def quadrics_of(kinds: Sequence[type[Quadric]], turned: Sequence[bool], frames: 
         dtype: dtype of the world.
     """
     p0, e1, e2, e3 = frames[0:3], frames[3:6], frames[6:9], frames[9:12]
-    faces = [cross(e2, e3), cross(e3, e1), cross(e1, e2)]
+    faces = [cross(e2, e3), cross(e3, e1), cross(e1, e2)]  # columns of the cofactor matrix
     front = torch.tensor([-1.0 if turn else 1.0 for turn in turned], dtype=p0.dtype, device=p0.device)
-    front = front * torch.sign(dot(e1, faces[0]).detach())
+    front = front * torch.sign(dot(e1, faces[0]).detach())  # the sign of the determinant: mirroring maps
     scale = torch.stack(faces).detach().abs().amax((0, 1))
     n1, n2, n3 = ((n * (front / scale)).to(dtype) for n in faces)
     reach = (p0.abs() + e1.abs() + e2.abs() + e3.abs()).detach().to(dtype)
@@ -169,20 +177,26 @@ def table_of(table: Quadrics, frames: Tensor) -> QuadricTable:
 
 
 def areas(table: Quadrics, frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Return for quadrics the area in object space times ``|det|`` ``(Q,)`` float64, and the area in the world (detached)."""
+    """Return two areas of each quadric, ``(Q,)`` float64.
+
+    The first is the area in object space times ``|det|``, differentiable. Emitters are sampled uniformly in object space, and
+    :func:`torchpt.physics.lights.surfaces.quadric.world_area` turns this area into one over the density by area in the world.
+    The second is the area in the world, detached, for the power of emitters. Ellipsoids have no closed form, so it is the area
+    in object space times a numerical mean, over a 16 x 16 grid of samples, of the factor by which the map scales area.
+    """
     e1, e2, e3 = frames[3:6], frames[6:9], frames[9:12]
     own = torch.tensor([kind.area for kind in table.kinds], dtype=torch.float64, device=e1.device)
     own = own.expand(e1.shape[1]) if table.code is None else own[table.code]
     det = dot(e1, cross(e2, e3)).abs()
     faces = [n.detach() for n in (cross(e2, e3), cross(e3, e1), cross(e1, e2))]
     grid = (torch.arange(16, dtype=torch.float64, device=e1.device) + 0.5) / 16
-    spots = torch.cartesian_prod(grid, grid)
+    samples = torch.cartesian_prod(grid, grid)
     total = torch.zeros_like(own)
-    for spot in spots:
-        n = normal(table, sample(table, spot[:, None].expand(2, len(own))))
-        grown = affine(faces[0] * n[0], faces[1], n[1], faces[2], n[2])
-        total += (dot(grown, grown) / dot(n, n)).sqrt()
-    return own * det, own * total / len(spots)
+    for u in samples:
+        n = normal(table, sample(table, u[:, None].expand(2, len(own))))
+        mapped = affine(faces[0] * n[0], faces[1], n[1], faces[2], n[2])  # cofactor matrix times n
+        total += (dot(mapped, mapped) / dot(n, n)).sqrt()
+    return own * det, own * total / len(samples)
 
 
 # -- on lanes
@@ -220,7 +234,10 @@ def direction(table: Quadrics, n: Tensor) -> Tensor:
 
 
 def outward(table: Quadrics, q: Tensor) -> Tensor:
-    """Return unit normals ``(3, N)`` in the world, on the front."""
+    """Return unit normals ``(3, N)`` in the world at points ``q`` of object space, on the front.
+
+    The front is the outside, or the inside of quadrics whose normals are flipped.
+    """
     return normalize(direction(table, normal(table, q)))
 
 
@@ -230,18 +247,18 @@ def tangent(e1: Tensor, e2: Tensor, q: Tensor) -> Tensor:
 
 
 def bitangent(table: Quadrics, e1: Tensor, e2: Tensor, q: Tensor) -> Tensor:
-    """Return derivatives ``(3, N)`` of the point in the world by ``v``."""
-    across = (q[0] * q[0] + q[1] * q[1]).detach()
-    radius = torch.where(across > 0, across, 1.0).sqrt()
+    """Return derivatives ``(3, N)`` of the point in the world by the texture coordinate ``v``."""
+    square = (q[0] * q[0] + q[1] * q[1]).detach()
+    radius = torch.where(square > 0, square, 1.0).sqrt()
     x, y = q[0] / radius, q[1] / radius
-    inward, upward = (_each(table, part) for part in zip(*(kind.climb(q, radius) for kind in table.kinds), strict=True))
-    return affine(e1 * (inward * x), e2, inward * y, table.e3, upward)
+    dr_dv, dz_dv = (_each(table, part) for part in zip(*(kind.climb(q, radius) for kind in table.kinds), strict=True))
+    return affine(e1 * (dr_dv * x), e2, dr_dv * y, table.e3, dz_dv)
 
 
 def surface_uv(table: Quadrics, q: Tensor) -> Tensor:
     """Return texture coordinates ``(2, N)``: the azimuth about z over 2 pi, and :meth:`Quadric.v`."""
-    across, turn = polar(q[0], q[1])
-    return torch.stack((turn, _each(table, (kind.v(q, across) for kind in table.kinds))))
+    radius, azimuth_u = polar(q[0], q[1])
+    return torch.stack((azimuth_u, _each(table, (kind.v(q, radius) for kind in table.kinds))))
 
 
 def follow_ray(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, t: Tensor, q: Tensor) -> Tensor:
@@ -253,10 +270,10 @@ def follow_ray(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, t:
     det = dot(e1, table.n1)
     inverse = 1.0 / torch.where(det == 0, 1.0, det)
 
-    def own(x: Tensor) -> Tensor:
+    def to_object(x: Tensor) -> Tensor:
         return torch.stack((dot(table.n1, x), dot(table.n2, x), dot(table.n3, x))) * inverse
 
-    f, e = own(o - p0), own(d)
+    f, e = to_object(o - p0), to_object(d)
     at = f + e * t.detach()
     value = _each(table, (_residual(kind.form, at) for kind in table.kinds))
     slope = _each(table, (_slope(kind.form, at, e) for kind in table.kinds)).detach()

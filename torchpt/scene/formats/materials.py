@@ -22,10 +22,10 @@ __all__ = [
 #: A type of material: a class of :data:`torchpt.physics.bsdfs.KINDS`, or an instance from the caller.
 Kind = type[Bsdf] | Bsdf
 
-#: Greatest depth of nested blends: every level can double the BSDFs that a lane evaluates.
+#: Maximum depth of nested blends: every level can double the BSDFs that a lane evaluates.
 MAX_BLENDS = 8
 
-#: Slots that cannot read vertex colours.
+#: Slots whose textures must have texture coordinates, so they cannot be vertex colours.
 _IMAGED = ("opacity", "emission", "normal_map", "bump_map")
 #: Slots whose textures are not filtered by the footprint: emission and opacity must be the same for every ray.
 POINTS = ("opacity", "emission")
@@ -56,7 +56,11 @@ def material_types(models: Mapping[str, Bsdf] | None) -> Mapping[str, Kind]:
 
 
 def _check_own(model: Bsdf, key: str) -> None:
-    """Check the names and defaults of the parameters that a BSDF declares."""
+    """Check the names and defaults of the parameters that the caller's BSDF declares; ``key`` is ``bsdfs.NAME``.
+
+    Raises:
+        SceneError: a name that is no identifier or is taken, or an invalid default.
+    """
     if not isinstance(model.parameters, Mapping):
         raise SceneError(f"{key}.parameters", model.parameters, "a mapping from names to defaults")
     own = {} if model.parameters is Bsdf.parameters else model.parameters
@@ -91,6 +95,7 @@ def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | Non
     if isinstance(raw, Mapping) and "type" in raw and raw["type"] is None:
         raw = {**raw, "type": "null"}  # YAML reads the bare word as nothing
     name = raw.get("type") if isinstance(raw, Mapping) else None
+    # The keys of materials inside a blend; none if ``type`` is wrong, which ``read_typed`` reports.
     sides = _inner_keys(types[name]) if isinstance(name, str) and name in types else ()
     if sides:
         if depth == MAX_BLENDS:
@@ -107,6 +112,7 @@ def plain_material() -> ParsedParams:
 
 
 def _inner_keys(kind: Kind) -> tuple[str, ...]:
+    """Return the parameters of a material type that are materials themselves: those of a blend."""
     return tuple(key for key, spec in parameters_of(kind).items() if isinstance(spec, Inner))
 
 
@@ -116,7 +122,7 @@ def inner_of(material: ParsedParams) -> dict[str, str | ParsedParams]:
 
 
 def model_of(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> tuple[Bsdf, dict[str, Any]]:
-    """Return the BSDF of a material and the values of its parameters.
+    """Return the BSDF of a material and the values of its parameters; a blend's BSDF has those of its inner materials.
 
     Args:
         material: the material.
@@ -156,16 +162,18 @@ def check_material(
     inner = inner_of(material)
     if inner:
         name = key.removeprefix("materials.")
-        _check_blend(material, key, materials, file, (name,) if materials.get(name) is material else (), 1)
+        # A material written in place has no name by which a blend inside could refer to it.
+        trail = (name,) if materials.get(name) is material else ()
+        _check_blend(material, key, materials, file, trail, depth=1)
         for side, item in inner.items():
             if isinstance(item, ParsedParams):
                 check_material(item, f"{key}.{side}", materials, textures, file)
     slots = {slot: value for slot, value in material.values.items() if isinstance(value, TextureInput)}
     for slot, value in slots.items():
-        sheer = slot == "weight" and any(item.kind.sheer for item in _sides(material, materials))
-        check_texture(
-            value, f"{key}.{slot}", textures, file, coordinates=slot in _IMAGED or sheer, points=slot in POINTS or sheer
-        )
+        # The weight of a blend with a null surface acts as its opacity, so it has the limits of an opacity texture.
+        is_opacity = slot == "weight" and any(item.kind.sheer for item in _sides(material, materials))
+        coordinates, points = slot in _IMAGED or is_opacity, slot in POINTS or is_opacity
+        check_texture(value, f"{key}.{slot}", textures, file, coordinates=coordinates, points=points)
     model, _ = model_of(material, materials)
     for slot in slots:
         if slot in model.tabulated:
@@ -187,10 +195,24 @@ def _check_blend(
     trail: tuple[str, ...],
     depth: int,
 ) -> None:
+    """Check the materials inside a blend, and those inside inner blends.
+
+    Args:
+        blend: the blend.
+        key: its dotted key.
+        materials: all materials by name.
+        file: scene file, for errors.
+        trail: names of the blends that contain these materials, outermost first, to find a blend that contains itself.
+        depth: number of nested blends, this one included.
+
+    Raises:
+        SceneError: too many nested blends, an unknown material, a blend of itself or of a material that cannot be blended.
+        NotBuiltError: a texture that is not supported inside a blend.
+    """
     if depth > MAX_BLENDS:
         raise SceneError(key, blend.name, f"blends nested at most {MAX_BLENDS} deep", file)
     for side, item in inner_of(blend).items():
-        at, beyond = f"{key}.{side}", trail
+        at, inner_trail = f"{key}.{side}", trail
         if isinstance(item, str):
             if item not in materials:
                 known = ", ".join(materials) or "none is defined"
@@ -199,7 +221,7 @@ def _check_blend(
             if item in trail:
                 circle = " -> ".join((*trail[trail.index(item) :], item))
                 raise SceneError(at, item, f"a blend that does not contain itself ({circle})", file)
-            beyond = (*trail, item)
+            inner_trail = (*trail, item)
         inner = materials[item] if isinstance(item, str) else item
         if inner["emission"] is not None:
             where, value = (at, item) if isinstance(item, str) else (f"{at}.emission", inner["emission"])
@@ -209,7 +231,7 @@ def _check_blend(
             where, value = (at, item) if isinstance(item, str) else (f"{at}.two_sided", False)
             raise SceneError(where, value, "a two-sided material (say two_sided on the blend itself)", file)
         if inner_of(inner):
-            _check_blend(inner, at, materials, file, beyond, depth + 1)
+            _check_blend(inner, at, materials, file, inner_trail, depth + 1)
 
 
 def _check_maps(
@@ -220,7 +242,20 @@ def _check_maps(
     materials: Mapping[str, ParsedParams],
     file: str | None,
 ) -> None:
-    """Raise for normal maps, bump maps and opacity textures inside a blend, which the blend itself must have."""
+    """Check that a material inside a blend has no normal map, bump map or opacity texture: the blend itself must have them.
+
+    Args:
+        blend: the blend.
+        inner: the material inside.
+        item: the same as the blend has it: the name of a material, or ``inner`` written in place.
+        at: dotted key of ``item``.
+        materials: all materials by name.
+        file: scene file, for errors.
+
+    Raises:
+        SceneError: a normal map or a bump map.
+        NotBuiltError: an opacity texture, or a textured weight where ``inner`` has an opacity below 1.
+    """
     for key, advice in (("normal_map", "give it to the blend itself"), ("bump_map", "give it to the blend itself")):
         if inner[key] is not None:
             where = at if isinstance(item, str) else f"{at}.{key}"

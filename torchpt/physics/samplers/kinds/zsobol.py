@@ -26,7 +26,7 @@ DIGITS = 12
 
 
 def _spread(x: Tensor) -> Tensor:
-    """Insert a zero between any two of the low 16 bits of int64 lanes."""
+    """Return the low 16 bits of int64 lanes with a zero bit before each: half of a Morton code."""
     for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
         x = (x | (x << shift)) & mask
     return x

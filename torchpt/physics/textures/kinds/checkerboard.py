@@ -38,10 +38,19 @@ class Checkerboard(Mapped):
         opening.declare_all(cls, values)
         matrix = cls.matrix(values, values["scale"])
         filtered = values["filter"] in cls.filters
-        return ImageNode(opening.name, channel, "repeat", True, matrix, (1.0, 1.0, 1.0), filtered, _squares)
+        return ImageNode(
+            opening.name,
+            channel,
+            wrap="repeat",
+            nearest=True,
+            transform=matrix,
+            scale=(1.0, 1.0, 1.0),
+            filtered=filtered,
+            made=_squares,
+        )
 
 
 def _squares(parameters: Mapping[str, Tensor], name: str) -> Tensor:
-    """Return the image ``(2, 2, 3)``."""
+    """Return the image ``(2, 2, 3)``; ``name``: the texture's dotted name."""
     a, b = parameters[f"{name}.color0"], parameters[f"{name}.color1"]
     return torch.stack((torch.stack((a, b)), torch.stack((b, a))))
