@@ -59,7 +59,7 @@ def _reduce(op: str, boolean: bool = False) -> Any:
 
 
 def _sums(op: str, out: Tensor) -> str:
-    """Return the node type in which a reduction is computed: "L" (int64) for integer sums and products, else that of `out`."""
+    """Return the node type in which a reduction is computed: "L" (64 bits) for int64 sums and products, else that of `out`."""
     return "L" if out.dtype == torch.int64 and op in ("add", "mul") else DTYPES[out.dtype]
 
 
