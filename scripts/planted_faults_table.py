@@ -415,7 +415,7 @@ FAULTS = (
         "gradients render",
         "sample_cotangents",
         "(cotangent * scale).scatter_add(0, channel, -back)",
-        "asked * scale",
+        "cotangent * scale",
         "dropped term of a gradient: with integrator.clamp the brightest channel still pulls",
     ),
     Fault(

@@ -35,6 +35,7 @@ BLOCK = 64
 GRAIN = 3_000_000
 #: Most structures of arguments that are kept for one function.
 _MOST = 32
+#: Number of the word of a kernel's arguments that holds the address of the tables.
 _TABLES = HEAD.index("tables")
 
 
@@ -65,9 +66,10 @@ class Lanewise:
         if kinds:
             raise ValueError(f"no parameters {', '.join(kinds)}")
         name = f"{function.__module__}.{getattr(function, '__qualname__', '<')}"
-        # Functions of this package are identified by name, on disk too, as keys hold a digest of its code; others by object.
+        # Functions of this package are identified by name, on disk too, as keys hold a digest of its code; others, and local
+        # functions and lambdas ("<locals>", "<lambda>"), by object.
         self._name = name if name.startswith("torchpt.") and "<" not in name else function
-        self._made: dict[Any, _CompiledFunction] = {}
+        self._made: dict[Any, _CompiledFunction] = {}  # by the structure of arguments
         self.refused: dict[Any, str] = {}
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
@@ -82,7 +84,7 @@ class Lanewise:
         inputs: list[Tensor] = []
         uniforms: list[Tensor] = []
         records: list[Any] = []
-        count = -1
+        count = -1  # of lanes; -1: not known yet
         for kind, value in zip(self._kinds, args, strict=True):
             if kind == "table" or not isinstance(value, Tensor):
                 records.append(value)
@@ -118,14 +120,16 @@ class Lanewise:
         return made.run(inputs, uniforms, count, thread_count(None))
 
     def _unfit(self, tensor: Tensor) -> bool:
+        """Return True for a tensor that kernels cannot read."""
         return tensor.device.type != "cpu" or (tensor.requires_grad and not self._detached)
 
     def _make(self, key: tuple[Any, ...], args: Sequence[Any], tables: list[Tensor]) -> _CompiledFunction:
-        paths = {str(k): table for k, table in enumerate(tables)}
-        whole = self._name, tuple(self._kinds), key
-        program = cache.program_of(whole, paths, lambda: self._traced(args, paths))
+        """Return the compiled function for arguments of this structure, with these tables, and cache it."""
+        paths = {str(k): table for k, table in enumerate(tables)}  # tables have no names here: their numbers
+        program_key = self._name, tuple(self._kinds), key
+        program = cache.program_of(program_key, paths, lambda: self._traced(args, paths))
         states = [(table, _version(table)) for table in tables]
-        before = self._made.get(key)
+        before = self._made.get(key)  # with tables that have changed since
         results = self._results(args) if before is None else before.results
         made = _CompiledFunction(
             program, bind_tables(program.tables, program.steps, program.constants, paths), states, results
@@ -151,10 +155,12 @@ class Lanewise:
             return self._function(*self._changed(args, lambda x: x[..., :0], lambda x: x))
 
     def _traced(self, args: Sequence[Any], paths: dict[str, Tensor]) -> TracedStage:
-        near = self._changed(args, lambda x: x[..., 0], lambda x: x)
-        lanes = choose_lane_count(leaves(near))
+        """Trace the function on example lanes of these arguments."""
+        # The tracer knows the axis of the lanes by its length, so no other axis of an argument may have that length.
+        without_lanes = self._changed(args, lambda x: x[..., 0], lambda x: x)
+        lanes = choose_lane_count(leaves(without_lanes))
         tracer = Tracer(lanes, {id(table): (path, table) for path, table in paths.items()})
-        slots = 0
+        slots = 0  # inputs so far
 
         def lane(x: Tensor) -> Tensor:
             nonlocal slots
@@ -165,12 +171,15 @@ class Lanewise:
         with torch.no_grad(), tracer:
             results = self._function(*given)
         stores = _stores(tracer, [results] if isinstance(results, Tensor) else results)
+        # Threads call kernels for a range of lanes, which kernels number from 0.
         if any(op == "iota" for op, *_ in tracer.graph.nodes):
             raise Unsupported("a use of the lane's own number")
         tables, steps, guards = without_unused_steps(tracer.tables, tracer.steps, tracer.guards)
         names = [str(k) for k in range(len(tracer.uniforms))]
         sinks = Sinks(store=stores)
-        return TracedStage(tracer.graph, sinks, tables, steps, tuple(tracer.constants), guards, names, slots)
+        return TracedStage(
+            tracer.graph, sinks, tables, steps, tuple(tracer.constants), guards, uniforms=names, tensors=slots
+        )
 
 
 @dataclass
@@ -182,6 +191,10 @@ class _CompiledFunction:
         tables: tables in the layout of kernels, as of the last call.
         states: the tensors that the tables were made from, each with its version.
         results: results for no lanes; a tuple if the function returns one.
+        outputs: shape without lanes, and dtype, of each result.
+        arguments: C type of the kernel's arguments: the words of :data:`HEAD`, an address for each uniform, address and row
+            length for each input and output.
+        grain: least number of blocks that are worth another thread.
     """
 
     program: Program
@@ -192,11 +205,11 @@ class _CompiledFunction:
     def __post_init__(self) -> None:
         each = [self.results] if isinstance(self.results, Tensor) else self.results
         self.outputs = [(x.shape[:-1], x.dtype) for x in each]
-        self.block = ctypes.c_int64 * (
+        self.arguments = ctypes.c_int64 * (
             len(HEAD) + len(self.program.uniforms) + 2 * (self.program.tensors + len(self.outputs))
         )
-        work = max(self.program.nodes.values(), default=1)
-        self.grain = max(GRAIN // work // BLOCK, 1)
+        operations = max(self.program.nodes.values(), default=1)  # a lane
+        self.grain = max(GRAIN // operations // BLOCK, 1)
 
     def is_current(self, tables: list[Tensor]) -> bool:
         """Return True if the tables were made from these tensors in their present versions."""
@@ -214,13 +227,13 @@ class _CompiledFunction:
         head += [x.data_ptr() for x in uniforms]
         rows = [(x.data_ptr(), x.element_size()) for x in (*inputs, *outputs)]
 
-        def part(first: int, last: int) -> None:
+        def part(first: int, last: int) -> None:  # blocks first .. last - 1
             start, end = first * BLOCK, min(last * BLOCK, count)
             words = head.copy()
             for address, size in rows:
                 words += (address + start * size, count)
-            block = self.block(*words)
-            self.program.call(ctypes.addressof(block), end - start)
+            arguments = self.arguments(*words)
+            self.program.call(ctypes.addressof(arguments), end - start)
 
         blocks = -(-count // BLOCK)
         parallel_for(part, blocks, min(threads, max(blocks // self.grain, 1)))
@@ -240,7 +253,7 @@ def compile_lanewise(
     Raises:
         Unsupported: the function does something that the lane compiler cannot compile.
     """
-    lanes = choose_lane_count([x[..., 0] for x in like if x.numel()])
+    lanes = choose_lane_count([x[..., 0] for x in like if x.numel()])  # see Lanewise._traced
     tracer = Tracer(lanes, {})
     given = [_input(tracer, slot, _sample(x, lanes)) for slot, x in enumerate(like)]
     with torch.no_grad(), tracer:
@@ -249,10 +262,10 @@ def compile_lanewise(
     stage = TracedStage(tracer.graph, sinks, tracer.tables, tracer.steps, tracer.constants, tensors=len(given))
     tables = bind_tables(stage.tables, stage.steps, stage.constants, {})
     program = cache.compile_stage(stage, target)
-    made = _CompiledFunction(program, tables, [], tuple(x[..., :0] for x in results))
+    made = _CompiledFunction(program, tables, states=[], results=tuple(x[..., :0] for x in results))
 
     def run(*arguments: Tensor) -> list[Tensor]:
-        return list(made.run(arguments, (), arguments[0].shape[-1], 1))
+        return list(made.run(arguments, uniforms=(), count=arguments[0].shape[-1], threads=1))
 
     return run
 
@@ -264,6 +277,7 @@ def _input(tracer: Tracer, slot: int, x: Tensor) -> Tensor:
 
 
 def _stores(tracer: Tracer, results: Sequence[Tensor]) -> list[Store]:
+    """Return the stores of a trace's results, one for each tensor."""
     return [Store(tuple(tracer.nodes(x)), DTYPES[x.dtype]) for x in results]
 
 

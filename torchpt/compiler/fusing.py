@@ -25,7 +25,8 @@ def fused_products(graph: Graph, needed: list[int], roots: list[int]) -> dict[in
     """
     uses = Counter(roots)
     for node in needed:
-        uses.update(graph.nodes[node][2])
+        _, _, terms, _ = graph.nodes[node]
+        uses.update(terms)
     found: dict[int, int] = {}
     for node in needed:
         op, ty, terms, _ = graph.nodes[node]

@@ -69,7 +69,7 @@ def without_unused_steps(
     tables: Sequence[Table], steps: Sequence[Step], guards: Sequence[Guard]
 ) -> tuple[tuple[Table, ...], tuple[Step, ...], tuple[Guard, ...]]:
     """Return tables, steps and guards without the unused steps."""
-    needed: set[int] = set()
+    needed: set[int] = set()  # numbers of steps
 
     def mark_needed(value: Any) -> None:
         if isinstance(value, Source):
@@ -85,19 +85,19 @@ def without_unused_steps(
     mark_needed([guard.source for guard in guards])
     numbers = {old: new for new, old in enumerate(sorted(needed))}
 
-    def renamed(value: Any) -> Any:
+    def renumbered(value: Any) -> Any:
         if isinstance(value, Source):
             return replace(value, name=numbers[int(value.name)]) if value.kind == "step" else value
-        return type(value)(renamed(x) for x in value) if isinstance(value, list | tuple) else value
+        return type(value)(renumbered(x) for x in value) if isinstance(value, list | tuple) else value
 
     kept = [steps[old] for old in sorted(needed)]
     return (
-        tuple(replace(table, source=renamed(table.source)) for table in tables),
+        tuple(replace(table, source=renumbered(table.source)) for table in tables),
         tuple(
-            replace(step, args=renamed(step.args), kwargs={k: renamed(v) for k, v in step.kwargs.items()})
+            replace(step, args=renumbered(step.args), kwargs={k: renumbered(v) for k, v in step.kwargs.items()})
             for step in kept
         ),
-        tuple(replace(guard, source=renamed(guard.source)) for guard in guards),
+        tuple(replace(guard, source=renumbered(guard.source)) for guard in guards),
     )
 
 
@@ -115,8 +115,11 @@ class StepKey:
 
 
 def step_keys(steps: Sequence[Step]) -> tuple[StepKey | None, ...]:
-    """Return the names of steps; None for a step that depends on a constant tensor or has unhashable arguments."""
-    names: list[StepKey | None] = []
+    """Return the keys of steps.
+
+    None for a step that depends on a constant tensor, has unhashable arguments or writes into them.
+    """
+    keys: list[StepKey | None] = []
     leaves: set[str] = set()  # of the current step
 
     def content_of(value: Any) -> Any:
@@ -126,11 +129,11 @@ def step_keys(steps: Sequence[Step]) -> tuple[StepKey | None, ...]:
             if value.kind == "leaf":
                 leaves.add(str(value.name))
                 return "leaf", value.name
-            name = names[int(value.name)]
-            if name is None:
-                raise TypeError("a step that has no name")
-            leaves.update(name.leaves)
-            return "step", name.number, value.item
+            earlier = keys[int(value.name)]
+            if earlier is None:
+                raise TypeError("a step that has no key")
+            leaves.update(earlier.leaves)
+            return "step", earlier.number, value.item
         if isinstance(value, list | tuple):
             return type(value), tuple(content_of(x) for x in value)
         # As text 0.0 and -0.0 differ, and NaN equals itself.
@@ -141,16 +144,16 @@ def step_keys(steps: Sequence[Step]) -> tuple[StepKey | None, ...]:
         schema = getattr(step.function, "_schema", None)
         try:
             if schema is None or schema.is_mutable:
-                raise TypeError("what writes into its arguments")
-            key = (
+                raise TypeError("a step that writes into its arguments")
+            content = (
                 step.function,
                 content_of(step.args),
                 tuple((k, content_of(value)) for k, value in step.kwargs.items()),
             )
-            names.append(StepKey(_numbers.setdefault(key, next(_count)), frozenset(leaves)))
-        except TypeError:  # also raised by hash()
-            names.append(None)
-    return tuple(names)
+            keys.append(StepKey(_numbers.setdefault(content, next(_count)), frozenset(leaves)))
+        except TypeError:  # raised above, or by hash()
+            keys.append(None)
+    return tuple(keys)
 
 
 #: Number of each step, by operator and arguments.
@@ -159,6 +162,7 @@ _count = count()
 
 
 def _small(result: Any) -> bool:
+    """Return True for a single tensor that is small enough to be kept."""
     return isinstance(result, Tensor) and result.untyped_storage().nbytes() <= SMALL
 
 
@@ -175,8 +179,8 @@ def run_prologue(
         steps: the prologue.
         constants: the program's constant tensors.
         leaves: the scene's tensors by path.
-        names: names of the steps, see :func:`step_keys`.
-        known: results of steps of other prologues on the same leaves, by name; small results are added.
+        names: keys of the steps, see :func:`step_keys`.
+        known: results of steps of other prologues on the same leaves, by key; small results are added.
     """
     results: list[Any] = []
 
@@ -195,11 +199,11 @@ def run_prologue(
 
     with torch.no_grad():
         for number, step in enumerate(steps):
-            name = names[number] if names and known is not None else None
-            result = None if name is None or known is None else known.get(name)
+            key = names[number] if names and known is not None else None
+            result = None if key is None or known is None else known.get(key)
             if result is None:
                 result = step.function(*filled(step.args), **{k: filled(v) for k, v in step.kwargs.items()})
-                if name is not None and known is not None and _small(result):
-                    known[name] = result
+                if key is not None and known is not None and _small(result):
+                    known[key] = result
             results.append(result)
     return tensor

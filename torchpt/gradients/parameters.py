@@ -32,11 +32,12 @@ __all__ = ["SceneTape", "attached"]
 def attached(scene: Scene, names: Iterable[str]) -> bool:
     """Return True if a parameter moves surfaces or the camera, or changes the direction of rays behind delta lobes."""
     owners = [*scene.built.parts, *scene.built.copies]
+    # Materials with smooth refraction: their index of refraction sets the direction of the refracted ray.
     bending = {material.name for owner in owners for material in owner.material.all() if material.bends}
 
     def moves(name: str) -> bool:
         moved = scene.spec(name).moves
-        if moved is Moves.RAYS:  # a parameter of such a material, or of a texture that it may read
+        if moved is Moves.RAYS:  # of a bending material, or of a texture that it may read
             return any(name.startswith(f"{own}.") for own in bending) or bool(bending and "textures." in name)
         return moved is Moves.SURFACES
 
@@ -62,6 +63,9 @@ class SceneTape(Tape):
         by_rays: True: rays are differentiated too.
     """
 
+    # `_inputs`: autograd leaves, the wanted parameters and then the rays. `_outputs`: the tensors of the wave that depend on
+    # them, in the order of the tape's leaves.
+
     def __init__(
         self,
         scene: Scene,
@@ -78,16 +82,19 @@ class SceneTape(Tape):
         self._ranks = ranks
         self._inputs = [params[name].detach().requires_grad_() for name in wanted]
         if rays is not None:
-            o, d = rays = rays[0].detach().requires_grad_(by_rays), rays[1].detach().requires_grad_(by_rays)
+            o, d = (tensor.detach().requires_grad_(by_rays) for tensor in rays)
+            rays = o, d
             self._inputs += [o, d] if by_rays else []
+        # The inputs may end with the rays, which have no name.
         given = {name: value.detach() for name, value in params.items()} | dict(zip(wanted, self._inputs, strict=False))
         with torch.enable_grad():
-            made = make_wave(scene, settings, given, dtype, True, attached, rays=rays)
+            made = make_wave(scene, settings, given, dtype, tape=True, attached=attached, rays=rays)
         self._outputs: list[Tensor] = []
         primals: dict[int, Tensor] = {}
         leaves: dict[int, Tensor] = {}
 
         def detached(tensor: Tensor) -> Tensor:
+            # Other leaves are weights of modules: they are in `captured`, and stages read the modules' own tensors.
             if not tensor.requires_grad or (tensor.is_leaf and id(tensor) not in inputs):
                 return tensor
             if id(tensor) not in primals:
@@ -100,23 +107,30 @@ class SceneTape(Tape):
 
         inputs = {id(tensor) for tensor in self._inputs}
         wave = _over(made, detached)
-        ones = [primals[id(tensor)] for tensor in self._outputs]
-        leaves |= {id(one): one.detach().requires_grad_() for one in ones}
-        super().__init__(wave, _over(wave, leaf), [leaves[id(one)] for one in ones], ones, tuple(captured))
+        detached_outputs = [primals[id(tensor)] for tensor in self._outputs]
+        leaves |= {id(primal): primal.detach().requires_grad_() for primal in detached_outputs}
+        super().__init__(
+            wave=wave,
+            taped=_over(wave, leaf),
+            leaves=[leaves[id(primal)] for primal in detached_outputs],
+            primals=detached_outputs,
+            captured=tuple(captured),
+        )
 
     def blocks(self, pixels: int, samples: int) -> list[tuple[int, int]]:
         """Return the blocks of consecutive pixels, first and number, of this process; the same for all engines."""
         return blocks(pixels, samples, self._ranks)
 
     def through(self, budget: Budget, work: Callable[[Span], None], pixels: int, samples: int) -> None:
-        """Call ``work`` with the chunks of these blocks, as large as the budget allows."""
+        """Call ``work`` with the chunks of this process's :meth:`blocks`, as large as the budget allows."""
         for start, count in self.blocks(pixels, samples):
 
             def moved(span: Span, start: int = start) -> None:
-                work((start + span[0], *span[1:]))
+                first_pixel, count, first_sample, samples = span  # the pixel counts from the block's first
+                work((start + first_pixel, count, first_sample, samples))
 
             for _ in budget.through(moved, count, 0, samples):
-                pass
+                pass  # running the iterator calls `work`
 
     def sums(self) -> GradientSums:
         """Return zero gradient sums for the leaves and the captured tensors."""
@@ -124,19 +138,22 @@ class SceneTape(Tape):
 
     def gradients(self, sums: GradientSums) -> list[Tensor]:
         """Return gradients of parameters, rays and captured tensors from the gradient sums of the leaves."""
-        found = sums.gradients()
+        found = sums.gradients()  # of the leaves, then of the captured tensors
         pairs = [(y, g) for y, g in zip(self._outputs, found, strict=False) if g is not None]
-        own: Sequence[Tensor | None] = [None] * len(self._inputs)
+        of_inputs: Sequence[Tensor | None] = [None] * len(self._inputs)
         if pairs and self._inputs:
-            own = torch.autograd.grad([y for y, _ in pairs], self._inputs, [g for _, g in pairs], allow_unused=True)
-        given = zip((*self._inputs, *self.captured), (*own, *found[len(self.leaves) :]), strict=True)
-        return [torch.zeros_like(tensor) if gradient is None else gradient for tensor, gradient in given]
+            outputs, cotangents = [y for y, _ in pairs], [g for _, g in pairs]
+            of_inputs = torch.autograd.grad(outputs, self._inputs, cotangents, allow_unused=True)
+        of_captured = found[len(self.leaves) :]
+        results = zip((*self._inputs, *self.captured), (*of_inputs, *of_captured), strict=True)
+        return [torch.zeros_like(tensor) if gradient is None else gradient for tensor, gradient in results]
 
 
 def _over(wave: Wave, change: Callable[[Tensor], Tensor]) -> Wave:
     """Return the wave with ``change`` applied to all of its tensors."""
     context = wave.context
-    own = context.world, context.pixel, wave.camera, wave.first, wave.given
-    world, pixel, camera, first, given = map_leaves(change, own)
+    # `first`: shading of first surfaces; `given`: rays in place of camera rays. Either may be None.
+    records = context.world, context.pixel, wave.camera, wave.first, wave.given
+    world, pixel, camera, first, given = map_leaves(change, records)
     context = replace(context, world=world, pixel=pixel, camera=None if context.camera is None else camera)
     return replace(wave, context=context, camera=camera, first=first, given=given)

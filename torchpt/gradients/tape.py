@@ -41,7 +41,8 @@ def sample_cotangents(settings: Settings, radiance: Tensor, pixels: Tensor) -> T
     if clamp is None:
         return cotangent
     values = torch.where(finite, radiance, 0.0)
-    # VJP of v c / m, where m is the largest channel: through v, and through the channel that is m.
+    # VJP of v c / m, with the clamp c, where m is the largest channel in magnitude: `cotangent * scale` through v, and `back`
+    # through the channel that is m.
     most, channel = values.abs().max(0, keepdim=True)
     scale = (clamp / most.clamp_min(clamp)).squeeze(0)
     back = (cotangent * values).sum(0, keepdim=True) * scale / most.clamp_min(clamp)
@@ -86,20 +87,22 @@ def tape(scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: Gra
 
     def chunk_loss(span: Span) -> tuple[Tensor, Tensor]:
         splats: list[Splats] = []
+        first_pixel, pixel_count, _, _ = span
         radiance = radiance_of(wave, *span, splats=splats)
-        share = sample_cotangents(
-            settings, radiance.detach(), cotangent[:, span[0] : span[0] + span[1]].to(radiance.dtype)
-        )
+        of_pixels = cotangent[:, first_pixel : first_pixel + pixel_count].to(radiance.dtype)
+        of_samples = sample_cotangents(settings, radiance.detach(), of_pixels)
         # Samples that are not finite are 0, since NaN times a cotangent of 0 is NaN.
         values = torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0)
         if not wave.integrator.splats:
-            return values, share
-        other = [clamped_samples(settings, one.value) for one in splats]
-        pixels = torch.cat([values.new_zeros(0, dtype=torch.int64), *(one.pixel for one in splats)])
-        wanted = take(cotangent, pixels).to(share.dtype) / settings.render.spp
-        return torch.cat((values.flatten(1), *other), 1), torch.cat((share.flatten(1), wanted), 1)
+            return values, of_samples
+        # A splat is clamped on the tape, so its cotangent is that of its pixel over spp.
+        splatted = [clamped_samples(settings, splat.value) for splat in splats]
+        pixels = torch.cat([values.new_zeros(0, dtype=torch.int64), *(splat.pixel for splat in splats)])
+        of_splats = take(cotangent, pixels).to(of_samples.dtype) / settings.render.spp
+        return torch.cat((values.flatten(1), *splatted), 1), torch.cat((of_samples.flatten(1), of_splats), 1)
 
-    chunk_by_chunk(scene_tape, settings, sums, chunk_loss, wave.crop[2] * wave.crop[3], settings.render.spp)
+    _, _, width, height = wave.crop
+    chunk_by_chunk(scene_tape, settings, sums, chunk_loss, count=width * height, samples=settings.render.spp)
 
 
 def chunk_by_chunk(
@@ -128,6 +131,7 @@ def chunk_by_chunk(
 def chunk_sums(scene_tape: SceneTape, chunk_loss: ChunkLoss, span: Span) -> GradientSums:
     """Return the gradient sums of a chunk."""
     found = scene_tape.sums()
+    # Backward passes of gathers from the leaves add to the sums directly; autograd returns the other gradients.
     with torch.enable_grad(), recording_gathers(found):
         values, cotangent = chunk_loss(span)
     if values.requires_grad:  # False: nothing in these pixels depends on the parameters
@@ -139,10 +143,10 @@ def chunk_sums(scene_tape: SceneTape, chunk_loss: ChunkLoss, span: Span) -> Grad
 
 def _budget(settings: Settings, scene_tape: SceneTape) -> Budget:
     """Return the budget of a chunk: a fixed number of lanes, or fewer where ``render.max_memory`` needs it."""
-    device, each = scene_tape.wave.centre.device, tape_per_lane(settings)
-    lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE_BYTES // each, 1))
+    device, per_lane = scene_tape.wave.centre.device, tape_per_lane(settings)
+    lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE_BYTES // per_lane, 1))
     limit = settings.render.max_memory
-    budget = Budget(device, lanes, what="the tape of a single lane", limit=limit, per_lane=each)
+    budget = Budget(device, lanes, what="the tape of a single lane", limit=limit, per_lane=per_lane)
     budget.drop_unneeded_limit()
     return budget
 

@@ -10,7 +10,9 @@ from importlib import import_module
 
 __all__ = ["channel_names", "group_channels"]
 
+#: Names of components by their number.
 _SUFFIXES = {2: "XY", 3: "RGB", 4: "RGBA"}
+#: Order of the components of a layer.
 _ORDER = "RGBXYZUVA"
 
 
@@ -30,6 +32,7 @@ def channel_names(layer: str, components: int) -> tuple[str, ...]:
 
 
 def _rank(channel: str) -> tuple[int, int, str]:
+    """Return the sort key of a channel among the components of its layer: numbers first, then letters by _ORDER."""
     last = channel.rpartition(".")[2]
     if last.isdecimal() and last.isascii():
         return 0, int(last), last

@@ -72,10 +72,11 @@ def _gif(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
 
     pictures: list[Image.Image] = []
     times: list[int] = []  # milliseconds
-    last = b""
+    last = b""  # pixels of the frame before
     for number, frame in enumerate(frames):
         picture = Image.fromarray(frame).quantize(256)
         shown = picture.convert("RGB").tobytes()
+        # Whole hundredths, whose sum never differs from the exact time by more than half of one.
         time = 10 * (round(100 * (number + 1) / fps) - round(100 * number / fps))
         if pictures and shown == last:  # Pillow merges equal frames too, but fails if a single one is left
             times[-1] += time

@@ -50,35 +50,38 @@ def perturb_normal(
 
     Args:
         textures: textures of the model.
-        row: ``(N,)`` rows of the materials in it.
+        row: ``(N,)`` rows of the materials in the tables of that model.
         local: ``(3, N)`` values of the normal map; None for a bump map.
         slope: derivatives of the bump map's height with respect to u and v, ``(N,)`` each; None for a normal map.
         d: ``(3, N)`` directions of the incoming rays.
         at: the surface points.
-        side: see :class:`torchpt.paths.surface.Surface`.
+        side: ``(N,)`` -1 where the shading normal is flipped toward the viewer, else 1; None where the model transmits.
     """
     assert at.tangent is not None
     base = Frame.along(at.ns, at.tangent)
     if local is not None:
-        local = local * 2.0 - 1.0
-        x, y, z = local[0], local[1], local[2].clamp_min(1e-3)
+        local = local * 2.0 - 1.0  # colours 0 to 1 to components -1 to 1
+        x, y, z = local[0], local[1], local[2].clamp_min(1e-3)  # above the surface
         if textures.strength is not None:
             strength = take(textures.strength, row)
             x, y = x * strength, y * strength
     else:
         assert slope is not None and at.bitangent is not None
         du, dv = slope
+        # Derivatives of the displaced surface by u and v; their cross product is its normal.
         along = torch.addcmul(at.tangent, at.ns, du - dot(at.ns, at.tangent))
         across = torch.addcmul(at.bitangent, at.ns, dv - dot(at.ns, at.bitangent))
         x, y, z = base.to_local(cross(along, across))
+        # A mirrored chart of texture coordinates gives the normal of the other side.
         sign = torch.copysign(torch.ones_like(z), z.detach())
         x, y, z = x * sign, y * sign, z * sign
     n = at.ns if side is None else at.ns * side
     normal = normalize(affine(base.s * x, base.t, y, n, z))
-    away = (dot(d, n) * dot(d, normal) <= 0).detach()
+    away = (dot(d, n) * dot(d, normal) <= 0).detach()  # the ray meets the two normals from different sides
     normal = torch.where(away, normalize(affine(base.s * -x, base.t, -y, n, z)), normal)
     flat = dot(normal, normal) == 0  # no texture coordinates, so no slope
     normal = torch.where(flat, n, normal)
     square = dot(normal, n).square().clamp_min(1e-12)
+    # alpha^2 of the tilt, tan^2 / 8, as in the paper at `shadowing`.
     alpha2 = (0.125 * (1.0 - square).clamp_min(0.0) / square).clamp_max(1.0)
     return Frame.along(normal, at.tangent), PerturbedNormal(n, alpha2)

@@ -30,7 +30,7 @@ __all__ = ["Figure", "ImageStrip", "Panel", "closest_step", "largest_errors", "p
 
 #: Largest side of a map in pixels; larger maps are averaged over squares.
 _WIDE = 400
-#: A crop has 1 / _PART of the smaller side, within these bounds in pixels.
+#: A crop has 1 / _PART of the picture's smaller side, but at least _LEAST and at most _MOST pixels.
 _PART, _LEAST, _MOST = 5, 16, 64  # crops are enlarged three times or more
 
 
@@ -40,9 +40,9 @@ class Panel:
 
     Attributes:
         line: the curve.
-        step: the step whose time is closest.
-        crop: PNG of the cropped picture.
-        errors: PNG of the error map.
+        step: its step whose time is closest to the common one.
+        crop: PNG of the cropped picture of the step's first run.
+        errors: PNG of the error map of that picture.
     """
 
     line: ErrorCurve
@@ -85,8 +85,8 @@ def largest_errors(errors: Tensor, side: int) -> tuple[int, int]:
     Square roots of errors are summed, so that a single firefly does not decide.
     """
     sums = torch.nn.functional.avg_pool2d(errors.sqrt()[None, None], side, stride=1)[0, 0]
-    place = int(sums.argmax())
-    return place % sums.shape[1], place // sums.shape[1]
+    y, x = divmod(int(sums.argmax()), sums.shape[1])
+    return x, y
 
 
 def sheet_of(scene_report: SceneReport) -> ImageStrip | None:
@@ -98,10 +98,12 @@ def sheet_of(scene_report: SceneReport) -> ImageStrip | None:
     lines = [line for line in scene_report.lines if line.reference.image.shape == reference.image.shape]
     seconds = min(line.steps[-1].seconds for line in lines)
     chosen = [closest_step(line, seconds) for line in lines]
-    images = [torch.nan_to_num(step.pictures[0](), 0.0, 0.0, 0.0) for step in chosen]
+    # `pictures` are functions that load the pictures of the runs; the first run is shown.
+    images = [torch.nan_to_num(step.pictures[0](), nan=0.0, posinf=0.0, neginf=0.0) for step in chosen]
     maps = [error_map(image, line.reference) for image, line in zip(images, lines, strict=True)]
     high, wide = maps[0].shape
     side = min(max(min(high, wide) // _PART, _LEAST), _MOST, high, wide)
+    # `line.of` is the curve that a denoised curve was made from.
     rendered = [found for found, line in zip(maps, lines, strict=True) if line.of is None]
     x, y = largest_errors(torch.stack(rendered).mean(0), side)
     smaller = [_reduced(found) for found in maps]
@@ -115,17 +117,19 @@ def sheet_of(scene_report: SceneReport) -> ImageStrip | None:
 
 
 def _shown(image: Tensor, film: Any) -> np.ndarray:
+    """Return a linear picture as 8-bit display values, by the exposure, tone map and gamma of the film."""
     levels = colour.display(image, film.exposure, film.tonemap, film.gamma)
     return (levels * 255 + 0.5).to(torch.uint8).numpy()
 
 
 def _reduced(errors: Tensor) -> Tensor:
-    by = -(-max(errors.shape) // _WIDE)
-    return torch.nn.functional.avg_pool2d(errors[None, None], by, ceil_mode=True)[0, 0]
+    """Return a map averaged over squares, so that no side is larger than _WIDE."""
+    side = -(-max(errors.shape) // _WIDE)
+    return torch.nn.functional.avg_pool2d(errors[None, None], side, ceil_mode=True)[0, 0]
 
 
 def _scale(maps: Sequence[Tensor]) -> tuple[float, float]:
-    """Return powers of ten that enclose most values."""
+    """Return powers of ten that enclose the values between the quantiles 0.1 and 0.995, four decades at most."""
     values = torch.cat([found.flatten() for found in maps])
     values = values[values > 0].log10()
     if not len(values):
@@ -154,10 +158,10 @@ def _png(levels: np.ndarray) -> bytes:
 # ---- The page: self-contained HTML, without scripts
 
 
-#: Characters for the markers of curves.
+#: Characters for the markers of curves, and hollow ones for denoised curves.
 _MARKS = "●■▲◆▼✚✖★"
 _HOLLOW = "○□△◇▽✛✕☆"
-#: PNG and SVG.
+#: A plot as PNG and as SVG.
 Figure = tuple[bytes, bytes]
 
 
@@ -183,7 +187,10 @@ def page(
         title=study.options["title"],
         made=made,
         ramp=_ramp(),
-        scenes=[_scene(study, *parts) for parts in zip(scene_reports, sheets, plots, strict=True)],
+        scenes=[
+            _scene(study, scene_report, sheet, figures)
+            for scene_report, sheet, figures in zip(scene_reports, sheets, plots, strict=True)
+        ],
         method=_method(study),
         settings=_settings(scene_reports),
     )
@@ -192,8 +199,12 @@ def page(
 def _scene(
     study: Study, scene_report: SceneReport, sheet: ImageStrip | None, plots: dict[str, Figure]
 ) -> dict[str, Any]:
+    """Return the values of the template for one scene."""
     names = study.options["metrics"]
-    main, most = NAMES[names[0]], formatting.count(study.options["spp"][-1])
+    main, most = (
+        NAMES[names[0]],
+        formatting.count(study.options["spp"][-1]),
+    )  # the first measure; samples of the last step
     columns = ["Setting", *(f"Time to {main} {formatting.number(target, 2)}" for target in scene_report.targets)]
     columns += [f"{main} at {most} samples", "Slope over samples", "Efficiency", "Bias", "Not finite"]
     return {
@@ -213,44 +224,49 @@ def _scene(
 
 def _headline(scene_report: SceneReport, main: str) -> str:
     """Return a sentence on the fastest unbiased setting and its lead, or that it is not significant; "" for a single one."""
-    able = [line for line in scene_report.lines if line.estimates and not (line.bias and line.bias["biased"])]
-    lines = sorted(
-        (line for line in able if line.times and line.times[-1]["seconds"]), key=lambda line: line.times[-1]["seconds"]
-    )
-    timed = [(line.times[-1]["seconds"], line.label) for line in lines]
+    # `estimates` is False for denoised curves and for other renderers' pictures.
+    unbiased = [line for line in scene_report.lines if line.estimates and not (line.bias and line.bias["biased"])]
+    # Of each curve the time to the last target, the smallest error: its label, the seconds and their interval.
+    timed = [(line.label, line.times[-1]) for line in unbiased if line.times and line.times[-1]["seconds"]]
+    timed.sort(key=lambda item: item[1]["seconds"])
     if len(timed) < 2:
         return ""
-    (least, first), (_, second), (most, last) = timed[0], timed[1], timed[-1]
-    aim, (high, low) = (
-        formatting.number(scene_report.targets[-1], 2),
-        (lines[0].times[-1]["high"], lines[1].times[-1]["low"]),
+    (first, fastest), (second, next_fastest), (last, slowest) = timed[0], timed[1], timed[-1]
+    target, least = formatting.number(scene_report.targets[-1], 2), fastest["seconds"]
+    if fastest["high"] is None or next_fastest["low"] is None or fastest["high"] >= next_fastest["low"]:
+        return (
+            f"These runs do not show whether {first} or {second} reaches {main} {target} first: "
+            "more runs (seeds=) may show it."
+        )
+    text = f"{first} reaches {main} {target} first, in {formatting.seconds(least)}: "
+    text += f"{formatting.times(next_fastest['seconds'] / least)} as fast as {second}"
+    return (
+        f"{text}." if len(timed) == 2 else f"{text}, {formatting.times(slowest['seconds'] / least)} as fast as {last}."
     )
-    if high is None or low is None or high >= low:
-        return f"These runs do not show whether {first} or {second} reaches {main} {aim} first: more runs would."
-    text = f"{first} reaches {main} {aim} first, in {formatting.seconds(least)}: "
-    text += f"{formatting.times(timed[1][0] / least)} as fast as {second}"
-    return f"{text}." if len(timed) == 2 else f"{text}, {formatting.times(most / least)} as fast as {last}."
 
 
 def _about(scene_report: SceneReport) -> str:
+    """Return sentences on the size of the picture and on the reference."""
     reference = scene_report.lines[0].reference
     high, wide = reference.image.shape[:2]
     size = f"{wide} × {high} pixels."
-    if not reference.origin["made"]:
+    if not reference.origin["made"]:  # not rendered by this study, but read from a file
         return f"{size} Reference: {reference.origin['file']}."
     origin, spp = reference.origin, formatting.count(reference.origin["spp"])
     return (
         f"{size} Reference: the mean of {origin['seeds']} independent runs of {spp} samples a pixel "
-        f"({formatting.seconds(origin['seconds'])} in all); its own relMSE, {formatting.number(reference.noise, 2)}, "
-        "is taken off."
+        f"({formatting.seconds(origin['seconds'])} in all); its noise (relMSE {formatting.number(reference.noise, 2)}) "
+        "is subtracted from relMSE and MSE below."
     )
 
 
 def _cell(text: str, *small: str, tone: str = "") -> dict[str, Any]:
+    """Return a cell of a table: its text, smaller lines below it (empty ones are left out), and ``good``, ``bad`` or ""."""
     return {"text": text, "small": [line for line in small if line], "tone": tone}
 
 
 def _row(scene_report: SceneReport, line: ErrorCurve, main: str) -> dict[str, Any]:
+    """Return a curve's row of the summary; ``main`` is the first measure."""
     cells = [_time_cell(scene_report, line, number) for number in range(len(scene_report.targets))]
     last = line.steps[-1]
     found = last.estimate(main)
@@ -261,16 +277,20 @@ def _row(scene_report: SceneReport, line: ErrorCurve, main: str) -> dict[str, An
     cells.append(_bias_cell(line))
     bad = sum(step.nonfinite for step in line.steps)
     cells.append(_cell(formatting.count(bad), tone="bad" if bad else ""))
+    # A denoised curve has the `look` of the curve that it is made from (`line.of`), but hollow marks.
     colour, marks = COLOURS[line.look % len(COLOURS)], _MARKS if line.of is None else _HOLLOW
     return {"label": line.label, "mark": marks[line.look % len(marks)], "colour": colour, "cells": cells}
 
 
 def _time_cell(scene_report: SceneReport, line: ErrorCurve, number: int) -> dict[str, Any]:
+    """Return the time to target error ``number``, and how it compares with that of the first curve."""
     reached, first = line.times[number], scene_report.lines[0].times[number]
     if reached.get("never"):
         return _cell("never", "its bias is larger", tone="bad")
     if reached["seconds"] is None:
-        return _cell("–", "too far to tell" if line.by_seconds else "beyond its runs" if line.of else "")
+        # Denoised curves are not extrapolated; others are unless they do not fall, or the time is too far from the runs.
+        reason = "cannot be extrapolated" if line.by_seconds else "not reached in its runs" if line.of else ""
+        return _cell("–", reason)
     parts = [formatting.span(reached["low"], reached["high"]), "extrapolated" if reached["extrapolated"] else ""]
     if line is not scene_report.lines[0] and first["seconds"]:
         ratio = first["seconds"] / reached["seconds"]
@@ -283,7 +303,7 @@ def _efficiency_cell(scene_report: SceneReport, line: ErrorCurve) -> dict[str, A
     if found is None:
         return _cell("–")
     ratio = (
-        f"{formatting.times(found.mean / first.mean)} that of the first"
+        f"{formatting.times(found.mean / first.mean)} that of the first setting"
         if first and line is not scene_report.lines[0]
         else ""
     )
@@ -292,16 +312,17 @@ def _efficiency_cell(scene_report: SceneReport, line: ErrorCurve) -> dict[str, A
 
 def _bias_cell(line: ErrorCurve) -> dict[str, Any]:
     if line.bias is None:
-        return _cell("–", "one picture")
-    share = f"light {100 * line.bias['share']:+.2g} %".replace("-", "−")
+        return _cell("–", "a single picture")
+    share = f"mean brightness {100 * line.bias['share']:+.2g} %".replace("-", "−")
     if line.bias["biased"]:
         return _cell("biased", share, f"p {_chance(line.bias['chance'])}", tone="bad")
     if line.of is not None:
-        return _cell("none found", share, f"p {_chance(line.bias['chance'])}", "a guess all the same")
+        return _cell("none found", share, f"p {_chance(line.bias['chance'])}", "may be hidden by noise")
     return _cell("none found", share, f"p {_chance(line.bias['chance'])}", tone="good")
 
 
 def _chance(value: float) -> str:
+    """Return a p-value with its sign of comparison."""
     return "< 0.0001" if value < 1e-4 else f"= {value:.2g}"
 
 
@@ -338,7 +359,7 @@ def _sheet(sheet: ImageStrip, main: str) -> dict[str, Any]:
     panels = []
     for panel in sheet.panels:
         samples = "" if panel.step.spp is None else f"{formatting.count(panel.step.spp)} samples, "
-        error = f"{NAMES[main]} {formatting.number(panel.step.errors[main][0])}"
+        error = f"{NAMES[main]} {formatting.number(panel.step.errors[main][0])}"  # of the first run, which is shown
         panels.append(
             {
                 "label": panel.line.label,
@@ -362,9 +383,10 @@ def _sheet(sheet: ImageStrip, main: str) -> dict[str, Any]:
 
 def _plot(figure: Figure, alt: str) -> dict[str, Any]:
     """Return an SVG and its size in pixels, which reserves its space while it loads."""
-    text = figure[1].decode()
+    _, svg = figure
+    text = svg.decode()
     wide, high = (float(text.partition(f'{name}="')[2].partition("pt")[0]) for name in ("width", "height"))
-    return {"data": _data(figure[1], "svg+xml"), "alt": alt, "width": round(wide), "height": round(high)}
+    return {"data": _data(svg, "svg+xml"), "alt": alt, "width": round(wide), "height": round(high)}
 
 
 def _data(content: bytes, kind: str) -> str:
@@ -379,7 +401,7 @@ def _ramp() -> str:
 
 
 def _method(study: Study) -> list[str]:
-    """Return paragraphs on the method of measurement."""
+    """Return paragraphs on the method of measurement, for the end of the page."""
     seeds, steps = study.options["seeds"], ", ".join(map(formatting.count, study.options["spp"]))
     denoised = (
         "Denoised curves (loose dashes, hollow markers) show the pictures of the same runs, denoised with albedo and normals "
@@ -393,16 +415,16 @@ def _method(study: Study) -> list[str]:
         "errors) and MSE; other measures include it. PSNR and SSIM compare displayed pictures. HDR-FLIP is of each step's "
         "first run.",
         "A slope is of the straight line through the logarithms of error and samples; independent samples give −1. The time to "
-        "an error is read from the line over seconds, and marked if it lies outside of the runs. Efficiency is 1 / (variance × "
-        "seconds) at the largest step, with the variance relative to the reference's square + 0.01.",
+        "an error is read from the line over seconds, and marked as extrapolated if it lies outside of the runs. Efficiency is "
+        "1 / (variance × seconds) at the largest step, with the variance relative to the reference's square + 0.01.",
         "Biased: the mean over the runs of the largest step differs from the reference by more than their variances explain "
-        "(p < 0.1 %). A dotted line is the error at which such a curve ends.",
+        "(p < 0.1 %). A dotted line in a plot is the error that a biased setting keeps however many samples it takes.",
         *((denoised,) if study.options["denoise"] else ()),
     ]
 
 
 def _settings(scene_reports: Sequence[SceneReport]) -> str:
-    """Return the complete settings as YAML."""
+    """Return the complete settings as YAML, of the curves that the study rendered."""
     import yaml
 
     shown: dict[str, Any] = {}
@@ -412,6 +434,7 @@ def _settings(scene_reports: Sequence[SceneReport]) -> str:
 
 
 def _listed(value: Any) -> Any:
+    """Return a value for YAML: tuples as lists, infinity and NaN as text."""
     if isinstance(value, dict):
         return {key: _listed(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -71,6 +71,7 @@ def _figures(scene_report: SceneReport, measures: tuple[str, ...]) -> dict[str, 
 
 def facts_of(study: Study, scene_reports: Sequence[SceneReport], made: str) -> dict[str, Any]:
     """Return the content of the report as plain values."""
+    # Other renderers' pictures (`extra`) are among the curves below, and the targets in use beside them.
     options = {key: value for key, value in study.options.items() if key not in ("extra", "target")}
     return {
         "torchpt": __version__,

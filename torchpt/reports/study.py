@@ -43,7 +43,8 @@ __all__ = [
 
 #: Settings whose value is a list: of these only a list of lists is an axis.
 LISTS = ("film.crop",)
-#: Settings that a study has its own way of saying, or that have no place in one.
+#: Settings that a study refuses, each with what to write instead. Role.ENDS: those that may end a render before `spp` samples;
+#: Role.FILES: those that decide which files a render writes.
 _REFUSED = {
     **{
         f"render.{name}": "nothing: every run takes the samples that spp= says"
@@ -67,7 +68,8 @@ class Variant:
 
     Attributes:
         label: the settings that differ from other variants, in words.
-        settings: values by dotted key or name of a group, as written.
+        settings: values as written, by dotted key, or by the name of a block that has a folder in ``configs/``:
+            ``{"integrator": "path"}`` takes the block from ``configs/integrator/path.yaml``.
         axes: keys that have more than one value in the grid.
         changes: overrides of the scene's keys, as :func:`torchpt.load` takes them.
     """
@@ -100,39 +102,48 @@ def variants_of(
     """Return all combinations of the listed values; the last list varies fastest.
 
     Args:
-        settings: values or lists of values by dotted key (``integrator.max_depth``) or name of a group.
+        settings: values or lists of values by dotted key (``integrator.max_depth``) or name of a block, see
+            :class:`Variant`.
         file: the study file, for errors.
-        changes: values of the scene's keys, a list each.
+        changes: values of the scene's keys, a list each (``overrides`` of the study).
 
     Raises:
         SceneError: an unknown key, an empty list, a repeated value, or a setting that a study refuses.
     """
     for key in settings:
-        check_keys({key.partition(".")[0]: 0}, BLOCKS, "", "a study", file)
+        check_keys({key.partition(".")[0]: 0}, BLOCKS, "", "a study", file)  # looks at the key alone
         if key in _REFUSED:
             raise SceneError(key, settings[key], _REFUSED[key], file)
     axes = {key: _values(key, value, file) for key, value in settings.items() if _is_axis(key, value)}
-    wide = tuple(key for key, values in axes.items() if len(values) > 1)
-    swept = [key for key, values in changes.items() if len(_values(key, values, file)) > 1]
-    found = [
-        ({**settings, **dict(zip(axes, chosen, strict=True))}, dict(zip(changes, scene, strict=True)))
+    varied = tuple(key for key, values in axes.items() if len(values) > 1)
+    varied_changes = [key for key, values in changes.items() if len(_values(key, values, file)) > 1]
+    combinations = [
+        ({**settings, **dict(zip(axes, chosen, strict=True))}, dict(zip(changes, chosen_changes, strict=True)))
         for chosen in product(*axes.values())
-        for scene in product(*changes.values())
+        for chosen_changes in product(*changes.values())
     ]
     labels = _labels(
-        [flat({key: one[key] for key in wide}) | {key: scene[key] for key in swept} for one, scene in found]
+        [
+            flat({key: values[key] for key in varied}) | {key: overrides[key] for key in varied_changes}
+            for values, overrides in combinations
+        ]
     )
     if len(set(labels)) < len(labels):
         expected = "settings that differ in more than how they are written"
-        raise SceneError(wide[0], settings[wide[0]], expected, file)
-    return [Variant(label, one, wide, scene) for label, (one, scene) in zip(labels, found, strict=True)]
+        raise SceneError(varied[0], settings[varied[0]], expected, file)
+    return [
+        Variant(label, values, axes=varied, changes=overrides)
+        for label, (values, overrides) in zip(labels, combinations, strict=True)
+    ]
 
 
 def _is_axis(key: str, value: Any) -> bool:
+    """Return True if a value is a list of alternatives; an empty one counts, so that it is refused."""
     return isinstance(value, list) and (key not in LISTS or not value or isinstance(value[0], list))
 
 
 def _values(key: str, values: list[Any], file: str | None) -> list[Any]:
+    """Return the values of an axis unchanged; raise if there are none, or two are equal."""
     if not values or any(value in values[:index] for index, value in enumerate(values)):
         raise SceneError(key, values, "a list of different values", file)
     return values
@@ -141,11 +152,14 @@ def _values(key: str, values: list[Any], file: str | None) -> list[Any]:
 def _labels(chosen: list[dict[str, Any]]) -> list[str]:
     """Return a label for each combination that tells it from the others."""
     keys = list(dict.fromkeys(key for item in chosen for key in item))
-    told = [key for key in keys if len({repr(item.get(key)) for item in chosen}) > 1]
-    return [", ".join(_words(key, item[key]) for key in told if key in item) or "as the scene says" for item in chosen]
+    differing = [key for key in keys if len({repr(item.get(key)) for item in chosen}) > 1]
+    return [
+        ", ".join(_words(key, item[key]) for key in differing if key in item) or "as the scene says" for item in chosen
+    ]
 
 
 def _words(key: str, value: Any) -> str:
+    """Return a setting as it stands in labels: ``max_depth: 4`` is "depth 4", ``clamp: null`` is "no clamp"."""
     name = key.rpartition(".")[2].removeprefix("max_").replace("_", " ")
     if key in BLOCKS or name in ("type", "filter"):
         return str(value)
@@ -160,14 +174,14 @@ def blocks_of(settings: Mapping[str, Any], file: str | None) -> dict[str, dict[s
     """Return overrides by block, as :func:`torchpt.scene.formats.description.settings` takes them; nulls are kept.
 
     Raises:
-        SceneError: a group has no such file, or a setting that a study refuses.
+        SceneError: ``configs/`` has no such file, or a setting that a study refuses.
     """
     blocks: dict[str, dict[str, Any]] = {}
-    for key, value in sorted(settings.items(), key=lambda item: item[0] not in BLOCKS):  # a group first
+    for key, value in sorted(settings.items(), key=lambda item: item[0] not in BLOCKS):  # whole blocks first
         if key in BLOCKS:
             blocks[key] = dict(value) if isinstance(value, Mapping) else _group(key, value, file)
-            if taken := next((name for name in blocks[key] if f"{key}.{name}" in _REFUSED), None):
-                raise SceneError(f"{key}.{taken}", blocks[key][taken], _REFUSED[f"{key}.{taken}"], file)
+            if refused := next((name for name in blocks[key] if f"{key}.{name}" in _REFUSED), None):
+                raise SceneError(f"{key}.{refused}", blocks[key][refused], _REFUSED[f"{key}.{refused}"], file)
             continue
         block, *inner, last = key.split(".")
         place = blocks.setdefault(block, {})
@@ -181,7 +195,7 @@ def blocks_of(settings: Mapping[str, Any], file: str | None) -> dict[str, dict[s
 
 
 def _group(group: str, name: Any, file: str | None) -> dict[str, Any]:
-    """Return the settings of a group's file: ``integrator=path`` is ``configs/integrator/path.yaml``."""
+    """Return the settings of a block's file in ``configs/``: ``integrator=path`` is ``configs/integrator/path.yaml``."""
     folder = configs() / group
     names = sorted(path.stem for path in folder.glob("*.yaml"))
     if name not in names:
@@ -190,6 +204,7 @@ def _group(group: str, name: Any, file: str | None) -> dict[str, Any]:
 
 
 def _set(block: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the keys and values of a block that are set: without nulls and empty blocks."""
     for key, value in block.items():
         kept = dict(_set(value)) if isinstance(value, Mapping) else value
         if kept is not None and kept != {}:
@@ -203,7 +218,7 @@ def _set(block: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 #: What a curve can show, in the order of tables. Other measures have no trimmed form: `relmse_trimmed` is of this package.
 MEASURES = tuple(dict.fromkeys(("relmse", "relmse_trimmed", *METRICS)))
-#: Those that fall toward 0: slopes, and times to an error, are computed for these.
+#: The measures that fall toward 0: slopes, and times to an error, are computed for these.
 ERRORS = tuple(name for name in MEASURES if name not in ("psnr", "ssim"))
 _MOST_STEPS = 64
 
@@ -356,6 +371,7 @@ class Study:
 
     def reference_overrides(self, variant: Variant) -> dict[str, dict[str, Any]]:
         """Return the overrides of a variant's reference: shared settings, its film, no clamp; then those of ``reference``."""
+        # Axes of the film are kept, since a reference has to show the same picture.
         own = {k: v for k, v in variant.settings.items() if k not in variant.axes or k.partition(".")[0] == "film"}
         return blocks_of({**own, "integrator.clamp": None, **self.reference.settings}, self.file)
 
@@ -381,10 +397,10 @@ def read_study(name: str) -> tuple[dict[str, Any], str]:
     raw = plain(raw, path)
     base = Path(path).parent
 
-    def placed(file: Any) -> Any:
+    def placed(file: Any) -> Any:  # a path, relative to the study file's folder
         return str(base / file) if isinstance(file, str) else file
 
-    def named(scene: Any) -> Any:
+    def named(scene: Any) -> Any:  # a scene: a path, or the name of one that ships
         return placed(scene) if str(scene).endswith((".yaml", ".yml")) else scene
 
     if "scene" in raw:
@@ -443,13 +459,13 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
         if item["name"] in labels:
             raise SceneError(f"extra.{index}.name", item["name"], "a name that no curve has", file)
         extras.append(Extra(item["name"], float(item["seconds"]), item["file"], scene, item.get("spp")))
-    plan = _plan(raw.get("reference"), scenes, options["spp"][-1], file)
+    plan = _plan(raw.get("reference"), scenes, largest_spp=options["spp"][-1], file=file)
     if plan.files and (several := next((key for key, values in changes.items() if len(values) > 1), None)):
         raise SceneError(several, changes[several], "one value where reference= is a file, which shows one scene", file)
     return Study(scenes, variants, options.values, tuple(extras), plan, file)
 
 
-def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> ReferencePlan:
+def _plan(raw: Any, scenes: tuple[str, ...], largest_spp: int, file: str | None) -> ReferencePlan:
     """Return the reference of a path, of a mapping with ``file``, or of one with ``spp``, ``seeds`` and settings."""
     if raw is None or isinstance(raw, str):
         raw = {} if raw is None else {"file": raw}
@@ -462,12 +478,12 @@ def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> Ref
         files = {scenes[0]: files} if isinstance(files, str) and len(scenes) == 1 else files
         if not isinstance(files, Mapping) or set(files) != set(scenes):
             raise SceneError("reference.file", files, f"a file for each of {', '.join(scenes)}", file)
-        return ReferencePlan(dict(files), 0, 0, {})
+        return ReferencePlan(dict(files), spp=0, seeds=0, settings={})  # not rendered
     own = {key: value for key, value in raw.items() if key in parameters_of(Reference)}
-    made = read_params(Reference, own, "reference", file, "a reference")
+    options = read_params(Reference, own, "reference", file, "a reference")
     settings = flat({key: value for key, value in raw.items() if key not in own})
     for key, value in settings.items():
         if isinstance(value, list) and key not in LISTS:
             raise SceneError(f"reference.{key}", value, "one value: there is one reference", file)
-    variants_of(settings, file)  # refuses what is no setting
-    return ReferencePlan({}, made["spp"] or 4 * most, made["seeds"], settings)
+    variants_of(settings, file)  # for its errors: unknown keys, and settings that a study refuses
+    return ReferencePlan({}, options["spp"] or 4 * largest_spp, options["seeds"], settings)

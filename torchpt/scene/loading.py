@@ -45,9 +45,10 @@ def load(
         AssetError: a missing or malformed file.
         RenderError: the device is not available.
     """
-    if torch.compiler.is_compiling():  # not before: this imports the compiler
-        outside: Any = torch.compiler.disable(_load)
-        return outside(source, device, bsdfs, overrides)
+    # No decorator, which would import torch's compiler together with this module.
+    if torch.compiler.is_compiling():
+        not_compiled: Any = torch.compiler.disable(_load)
+        return not_compiled(source, device, bsdfs, overrides)
     return _load(source, device, bsdfs, overrides)
 
 
@@ -58,18 +59,19 @@ def _load(
     overrides: Mapping[str, Any] | None,
 ) -> Scene:
     start = time.perf_counter()
-    tensors = DictTensors()
+    tensors = DictTensors()  # collects the tensors of the dict and of the overrides; the description gets plain numbers
     with explain_out_of_memory("the scene file"):
         may_hold_tensors = bool(overrides) or isinstance(source, Mapping)
         description = read_description(source, bsdfs, tensors.extract if may_hold_tensors else None, overrides)
-    chosen = device_of(settings(description).render.device if device is None else device)
+    chosen_device = device_of(settings(description).render.device if device is None else device)
     with outside_inference_mode():
         scene = Scene(
             with_all_intrinsics(description, tensors),
-            chosen,
+            chosen_device,
             tuple((bsdfs or {}).values()),
             vertex_attributes_in(tensors),
         )
+    # So that gradients reach the caller's tensors, and not only the numbers read from them.
     scene.params |= params_from_tensors(tensors, scene.description, scene.built, scene.params)
     scene.load_seconds = time.perf_counter() - start
     return scene

@@ -23,16 +23,18 @@ def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], 
     Raises:
         SceneError: it is not, or it is on the device meta.
     """
-    found, dense, others = value, True, ", or texels (H, W, C)" if texels else ""
+    shown, dense, or_texels = value, True, ", or texels (H, W, C)" if texels else ""  # shown: the value in the error
     if isinstance(value, Tensor):
         dense, floats = value.layout is torch.strided, value.is_floating_point()
         if dense and floats and value.shape == shape and not value.is_meta:
             return
-        found = "a tensor on the device meta" if value.is_meta else (tuple(value.shape), value.dtype)
-        found = found if dense else f"a {value.layout} tensor"
-        others = "" if floats and value.dim() == 3 else others  # texels were checked before
-    kind = "floating tensor" if dense else "dense floating tensor"
-    raise SceneError(f"params.{name}", found, f"a {kind} of shape {tuple(shape)}{others}")
+        shown = "a tensor on the device meta" if value.is_meta else (tuple(value.shape), value.dtype)
+        shown = shown if dense else f"a {value.layout} tensor"
+        or_texels = (
+            "" if floats and value.dim() == 3 else or_texels
+        )  # texels for a parameter that takes them passed before
+    kind = "floating tensor" if dense else "dense floating tensor"  # says dense only where that is what is wrong
+    raise SceneError(f"params.{name}", shown, f"a {kind} of shape {tuple(shape)}{or_texels}")
 
 
 def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:
@@ -41,25 +43,26 @@ def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:
     Raises:
         SceneError: see :meth:`Scene.check_own`.
     """
-    own = scene.built.parameters
-    for name in own.keys() ^ scene.params.keys():
+    loaded = scene.built.parameters
+    for name in loaded.keys() ^ scene.params.keys():  # removed or added
         raise SceneError(
-            f"params.{name}", "nothing" if name in own else name, "the names that the scene was loaded with"
+            f"params.{name}", "nothing" if name in loaded else name, "the names that the scene was loaded with"
         )
     changed = changed_versions(validated_versions, scene.versions())
     if not changed:
         return
     for name in changed:
         value = scene.params[name]
-        check_tensor(name, value, own[name].shape)
+        check_tensor(name, value, loaded[name].shape)
         scene.check_number(name, value.detach())
-    check_light_params(scene.built.sources, changed, scene.merged(None))
+    check_light_params(scene.built.sources, changed, scene.merged(None))  # None: the scene's own parameters
     validated_versions |= changed
 
 
 def inherited_checks(made: Scene, scene: Scene, validated_versions: dict[str, int]) -> dict[str, int]:
     """Return the validated versions of a scene ``made`` from another, for the tensors that both share."""
     before, now = scene.versions(), made.versions()
+    # A version of 0 or less cannot be compared, see `changed_versions`.
     return {
         name: version
         for name, version in now.items()

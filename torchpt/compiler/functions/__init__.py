@@ -15,10 +15,10 @@ from torchpt.compiler.functions.trigonometric import acos, asin, atan, atan2, ta
 
 __all__ = ["FUNCTIONS"]
 
-#: Functions of one or two values: ``function(block, type, *arguments)``.
+#: Functions of one or two values: ``function(block, type, *arguments)`` adds instructions to a block and returns the result.
 FUNCTIONS: dict[str, Callable[..., str]] = {
-    "sin": trigonometric(0),
-    "cos": trigonometric(1),
+    "sin": trigonometric(shift=0),
+    "cos": trigonometric(shift=1),  # the sine a quarter of a turn further
     "tan": tan,
     "asin": asin,
     "acos": acos,
@@ -28,8 +28,9 @@ FUNCTIONS: dict[str, Callable[..., str]] = {
     "exp2": exp2,
     "expm1": expm1,
     "log": log,
-    "log2": log_by(1.4426950408889634, 2.0355273740931033e-17),
-    "log10": log_by(0.4342944819032518, 1.098319650216765e-17),
+    # 1 / ln 2 and 1 / ln 10, each as a double and the rest that it leaves out.
+    "log2": log_by(factor=1.4426950408889634, rest=2.0355273740931033e-17),
+    "log10": log_by(factor=0.4342944819032518, rest=1.098319650216765e-17),
     "log1p": log1p,
     "pow": power,
     "sinh": sinh,

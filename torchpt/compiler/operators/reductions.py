@@ -19,12 +19,15 @@ __all__: list[str] = []
 
 
 def _axes(axis: Any, rank: int) -> list[int]:
+    """Return the reduced axes of a call, ascending and not negative; all where torch's ``dim`` is None or empty."""
     if axis is None or axis in ((), []):
         return list(range(rank))
     return sorted(a % rank for a in ([axis] if isinstance(axis, int) else axis))
 
 
 def _reduce(op: str, boolean: bool = False) -> Any:
+    """Return the lowering of a reduction by the binary node ``op``; ``boolean``: of values as booleans (node type "b")."""
+
     def handler(
         tracer: Tracer, out: Tensor, a: Tensor, axis: Any = None, keepdim: bool = False, dtype: Any = None
     ) -> None:
@@ -37,7 +40,8 @@ def _reduce(op: str, boolean: bool = False) -> Any:
                 summed = sum_over_lanes(tracer, nodes, k, DTYPES[out.dtype])
                 nodes = np.expand_dims(summed, k) if keepdim else summed
                 continue
-            parts: list[Any] = [np.squeeze(np.take(nodes, [j], k), k) for j in range(nodes.shape[k])]
+            # Slices of the array of nodes along the axis; squeezed, so that one of a vector is an array and no number.
+            parts: list[Any] = [np.squeeze(np.take(nodes, [j], axis=k), axis=k) for j in range(nodes.shape[k])]
             if not parts:
                 shape = (*nodes.shape[:k], *nodes.shape[k + 1 :])
                 parts = [np.full(shape, _nothing(graph, op, DTYPES[out.dtype]), object)]
@@ -55,7 +59,7 @@ def _reduce(op: str, boolean: bool = False) -> Any:
 
 
 def _sums(op: str, out: Tensor) -> str:
-    """Return the node type in which a reduction is computed."""
+    """Return the node type in which a reduction is computed: "L" (64 bits) for int64 sums and products, else that of `out`."""
     return "L" if out.dtype == torch.int64 and op in ("add", "mul") else DTYPES[out.dtype]
 
 
@@ -76,9 +80,9 @@ register_lowering("any")(_reduce("or", boolean=True))
 
 @register_lowering("mean")
 def _mean(tracer: Tracer, out: Tensor, a: Tensor, axis: Any = None, keepdim: bool = False, dtype: Any = None) -> None:
-    _reduce("add")(tracer, out, a, axis, keepdim)
+    _reduce("add")(tracer, out, a, axis=axis, keepdim=keepdim)
     count = math.prod(a.shape[k] for k in _axes(axis, a.dim()))
-    binary("div")(tracer, out, out, count)
+    binary("div")(tracer, out, out, count)  # the sum, now in `out`, over the count
 
 
 @register_lowering("cumsum")

@@ -42,9 +42,9 @@ class Pyramid:
         widths = _halved(width)
         parts, first, end = [], [], 0
         for rows in heights:
-            lower = _means(map, rows, True).transpose(0, 1)  # (W, rows, 3)
+            lower = _means(map, rows, latitude=True).transpose(0, 1)  # (W, rows, 3)
             for columns in widths:
-                parts.append(_means(lower, columns, False).transpose(0, 1).reshape(-1, 3))
+                parts.append(_means(lower, columns, latitude=False).transpose(0, 1).reshape(-1, 3))
                 first.append(end)
                 end += rows * columns
         places = torch.tensor(first, dtype=torch.int64).view(len(heights), len(widths))
@@ -53,10 +53,12 @@ class Pyramid:
 
 def resampled(map: Tensor, height: int, width: int) -> Tensor:
     """Downsample a map to ``(height, width, 3)`` by means; differentiable, linear."""
-    return _means(_means(map, height, True).transpose(0, 1), width, False).transpose(0, 1)
+    rows = _means(map, height, latitude=True).transpose(0, 1)  # (W, height, 3)
+    return _means(rows, width, latitude=False).transpose(0, 1)
 
 
 def _halved(size: int) -> tuple[int, ...]:
+    """Return ``size`` and its halves, rounded up, down to 1."""
     sizes = [size]
     while sizes[-1] > 1:
         sizes.append((sizes[-1] + 1) // 2)
@@ -64,7 +66,7 @@ def _halved(size: int) -> tuple[int, ...]:
 
 
 def _means(x: Tensor, size: int, latitude: bool) -> Tensor:
-    """Downsample a map ``(n, m, 3)`` to ``size`` rows."""
+    """Downsample a map ``(n, m, 3)`` to ``size`` rows; ``latitude``: they go from pole to pole, else around and wrap."""
     n, m, _ = x.shape
     if n == size:
         return x
@@ -97,6 +99,7 @@ def _matrix(fine: int, coarse: int, latitude: bool) -> tuple[np.ndarray, np.ndar
     mass = (0.5 * span * weights).ravel() * (np.sin(math.pi * t) if latitude else 1.0)
 
     def hats(size: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        # At each node of the quadrature the two texels whose hat functions are not zero, and their values.
         place = t * (size - 1) if latitude else t * size - 0.5
         below = np.floor(place).astype(np.int64)
         if latitude:

@@ -81,7 +81,10 @@ class Triangles:
 
 
 def _material(value: Any) -> Any:
-    """Return the name of a material, or a material that the scene reader has already made of an inline one."""
+    """Return the name of a material, or a material that the scene reader has already made of an inline one.
+
+    Other plain data is refused: the class of a made material is not known here.
+    """
     plain = isinstance(value, str | bool | int | float | Mapping | Sequence | np.ndarray)
     if plain and not (isinstance(value, str) and value):
         raise Refused("the name of a material, or a material")
@@ -155,7 +158,10 @@ class Shape:
 
 
 def placed(origin: Sequence[Any], size: Sequence[Any], turn: Matrix) -> Any:
-    """Return scale, then rotation ``turn (3, 3)``, then translation as ``(4, 4)``; a tensor if any number is one."""
+    """Return scale by ``size``, then rotation ``turn (3, 3)``, then translation to ``origin`` as ``(4, 4)``.
+
+    The result is a tensor, on the device of the first tensor among the numbers, if any is one; else an array.
+    """
     device = next((number.device for number in (*origin, *size) if isinstance(number, Tensor)), None)
     place, factors = (np.array(three) if device is None else tensor_of([*three], device) for three in (origin, size))
     return affine(constant(turn, factors) * factors, place)

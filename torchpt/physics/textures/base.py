@@ -29,9 +29,10 @@ __all__ = [
     "UvTransform", "transform_uv",
 ]  # fmt: skip
 
-#: Channels from which a number may be read.
+#: Channels from which a number may be read. A node holds the index minus 1: -1 for luminance, else the component of a texel.
 CHANNELS = ("luminance", "r", "g", "b", "a")
 
+#: Rows of an affine transform of texture coordinates; the third column is the translation.
 Matrix = tuple[tuple[float, float, float], tuple[float, float, float]]
 #: The identity transform of texture coordinates.
 SAME: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -56,7 +57,7 @@ class TextureInput:
         linear: whether the values are not colours: then ``colorspace: auto`` means linear.
         low: least accepted value.
         high: greatest accepted value.
-        moves: geometry that moves with the values.
+        moves: the geometry that moves with the values, for gradients.
     """
 
     texture: ParsedParams | Named
@@ -82,7 +83,10 @@ class TexturePoint:
 
 
 class Table:
-    """Nodes that are looked up by the same code, one a row; a dataclass of tensors and static values."""
+    """Nodes that are looked up by the same code, one a row; a dataclass of tensors and static values.
+
+    Static values are part of the code that is compiled for a look-up; tensors are its data.
+    """
 
     @property
     def count(self) -> int:
@@ -95,7 +99,10 @@ class Table:
         return False
 
     def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
-        """Return values of nodes ``(N,)`` at points: ``(3, N)`` if ``coloured``, as all these nodes are then, else ``(N,)``."""
+        """Return values at points, ``nodes (N,)`` being rows of the table: ``(3, N)`` if ``coloured``, else ``(N,)``.
+
+        All nodes of a call are colours, or all are numbers.
+        """
         raise NotImplementedError
 
     def slope(self, nodes: Tensor, point: TexturePoint) -> tuple[Tensor, Tensor]:
@@ -131,7 +138,7 @@ class Node:
         return replace(self, filtered=False) if self.filtered else self  # type: ignore[type-var]
 
     def divided(self, unit: float) -> Any:
-        """Return the node with its values divided by a unit of length."""
+        """Return the node with its values, which are lengths, divided by the unit of length of the world's coordinates."""
         raise NotImplementedError
 
     def table(
@@ -153,8 +160,8 @@ class Node:
         uv = torch.stack(torch.meshgrid(side, side, indexing="xy")).reshape(2, -1)
         given = {name: value.detach().cpu() for name, value in parameters.items()}
         table = self.table([self], given, torch.float64, uv.device)
-        lanes = torch.zeros(uv.shape[1], dtype=torch.int64)
-        return table.look_up(lanes, TexturePoint(uv), True).mean(1)
+        rows = torch.zeros(uv.shape[1], dtype=torch.int64)  # this node is the only one of the table
+        return table.look_up(rows, TexturePoint(uv), coloured=True).mean(1)
 
 
 @dataclass(frozen=True)
@@ -219,8 +226,8 @@ class Opening:
             SceneError: with the accepted range; ``label`` names the file.
         """
         slot = self.slot
-        ends = [float(end) * factor for end in (values.min(), values.max()) for factor in scale]
-        low, high = min(ends), max(ends)
+        extremes = [float(extreme) * factor for extreme in (values.min(), values.max()) for factor in scale]
+        low, high = min(extremes), max(extremes)
         if low < slot.low - _CLOSE or high > slot.high * (1 + _CLOSE):
             where = f" in the texels of {label}" if label else ""
             raise SceneError(key, [low, high], f"numbers{_words(slot.low, slot.high)}{where}", self.file)
@@ -231,8 +238,8 @@ class Opening:
         for factor in {factor for factor in scale if factor != 0.0}:
             a, b = sorted((self.slot.low / factor, self.slot.high / factor))
             low, high = max(low, a), min(high, b)
-        mine = replace(spec, low=low if low > -LARGEST else None, high=high if high < LARGEST else None)
-        return _both(spec, mine)
+        of_slot = replace(spec, low=low if low > -LARGEST else None, high=high if high < LARGEST else None)
+        return _both(spec, of_slot)
 
 
 #: Tolerance for rounding in the range check of a slot.
@@ -240,12 +247,13 @@ _CLOSE = 1e-6
 
 
 def _words(low: float, high: float) -> str:
+    """Return a range in words; from 1e30 on ``high`` is no bound."""
     return f" in {low:g}..{high:g}" if high < 1e30 else f" >= {low:g}"
 
 
 def _both(a: Any, b: Any) -> Any:
-    """Return the spec of a parameter that two slots share: the intersection of the ranges."""
-    if not hasattr(a, "bounds") or not hasattr(b, "bounds"):
+    """Return the spec of a parameter that two slots share: the intersection of the ranges, the larger `moves`."""
+    if not hasattr(a, "bounds") or not hasattr(b, "bounds"):  # specs without ranges
         return b
     lows, highs = ([low for low in (a.low, b.low) if low is not None], [h for h in (a.high, b.high) if h is not None])
     moves = max(a.moves, b.moves, key=lambda moves: moves.value)
@@ -296,7 +304,7 @@ class Texture:
 
     @classmethod
     def label(cls, values: Mapping[str, Any]) -> str | None:
-        """Return the file after which a texture of a mesh file is named; None: it is named after its slot."""
+        """Return the image file that names a texture of a mesh file's material; None: it is named after its slot."""
         return None
 
 
@@ -348,7 +356,10 @@ class Mapped(Texture):
 
 
 def transform_uv(maps: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Transform ``uv (2, N)`` by affine maps, the first six rows of ``maps (., N)``; return ``u, v``, each ``(N,)``."""
+    """Transform ``uv (2, N)`` by affine maps; return ``u, v``, each ``(N,)``.
+
+    The first six rows of ``maps (., N)`` are the elements of a :data:`Matrix`, row by row: u is ``m0 u + m1 v + m2``.
+    """
     u, v = uv[0], uv[1]
     return (
         torch.addcmul(torch.addcmul(maps[2], u, maps[0]), v, maps[1]),

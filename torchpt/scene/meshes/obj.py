@@ -25,12 +25,21 @@ from torchpt.scene.meshes.mtl import decoded_lines, find_file, read_mtl
 
 __all__ = ["load_obj"]
 
+#: Statements of curves, surfaces, lines and points, which are not read.
 _CURVES = ("curv", "curv2", "surf", "l", "p")
 
 
 @dataclass
 class _Text:
-    """The statements of a file by key, as written, with line numbers for errors."""
+    """The statements of a file by key (positions ``v``, texture coordinates ``vt``, normals ``vn``, faces ``f``), as written.
+
+    Attributes:
+        lines: the line number of each statement, for errors.
+        face_groups: the number of each face's group.
+        groups: numbers of the groups by name of their material.
+        libraries: MTL files that the file names.
+        ignored: statements that are not read, and MTL files that are missing.
+    """
 
     v: list[str] = field(default_factory=list)
     vt: list[str] = field(default_factory=list)

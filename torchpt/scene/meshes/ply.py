@@ -26,6 +26,7 @@ _TYPES = {
 }
 _INDICES = ("vertex_indices", "vertex_index")
 _COLORS = ("red", "green", "blue")
+#: The material of vertices with colours.
 _COLORED = {"type": "diffuse", "reflectance": {"type": "vertex_color"}}
 #: Most bytes of a header.
 _MOST_HEADER = 2**20
@@ -81,7 +82,7 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], 
         problem = problem if missing[0] in vertex else f"has no property {missing[0]}"
         raise AssetError(path, f"element vertex {problem}")
 
-    def stack(names: tuple[str, ...]) -> NDArray[np.float64] | None:
+    def stack(names: tuple[str, ...]) -> NDArray[np.float64] | None:  # None if a property is missing
         if not all(isinstance(vertex.get(name), np.ndarray) for name in names):
             return None
         return np.stack([np.asarray(vertex[name], dtype=np.float64) for name in names], axis=1)
@@ -95,18 +96,27 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], 
     if key is None:
         if any(element.name == "face" and element.size for element in elements):
             raise AssetError(path, "element face has no list vertex_indices")
-        return MeshPart("", vertices, np.zeros((0, 3), dtype=np.int64))
+        return MeshPart(name="", vertices=vertices, faces=np.zeros((0, 3), dtype=np.int64))
     counts, items = face[key]
-    bad = np.flatnonzero(counts < 3)
-    if len(bad):
-        raise AssetError(path, f"face {bad[0]} has {counts[bad[0]]} corners, expected three or more")
+    too_few = np.flatnonzero(counts < 3)
+    if len(too_few):
+        raise AssetError(path, f"face {too_few[0]} has {counts[too_few[0]]} corners, expected three or more")
     if items.dtype.kind == "f":
         raise AssetError(path, "the vertex indices of element face are no integers")
     colors = _colors(vertex, elements)
     own = FileMaterial("vertex colors", _COLORED) if materials and colors is not None else None
     starts = np.cumsum(counts) - counts
     faces = items.astype(np.int64)[polygon_fans(starts, counts)] if len(counts) else np.zeros((0, 3), np.int64)
-    return MeshPart("", vertices, faces, stack(("nx", "ny", "nz")), uvs, colors, own, tuple(ignored))
+    return MeshPart(
+        name="",
+        vertices=vertices,
+        faces=faces,
+        normals=stack(("nx", "ny", "nz")),
+        uvs=uvs,
+        colors=colors,
+        material=own,
+        ignored=tuple(ignored),
+    )
 
 
 def _colors(vertex: Columns, elements: list[_Element]) -> NDArray[np.float64] | None:

@@ -13,6 +13,7 @@ from torchpt.scene.meshes.mesh import MeshPart
 __all__ = ["load_stl"]
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+#: Bytes of the header with the number of triangles; each triangle has 50.
 _HEADER = 84
 
 
@@ -24,6 +25,7 @@ def load_stl(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     """
     del materials  # the format has none
     declared = int.from_bytes(data[80:84], "little") if len(data) >= _HEADER else -1
+    # Some binary files begin with "solid" too, but have the size that their header declares.
     if data.lstrip()[:5].lower() == b"solid" and len(data) != _HEADER + 50 * declared:
         corners = _ascii(path, data)
     elif declared < 0:
@@ -36,15 +38,15 @@ def load_stl(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     if not len(corners):
         return []
     vertices, index = np.unique(corners + 0.0, axis=0, return_inverse=True)  # + 0.0: -0 and 0 are one corner
-    return [MeshPart("", vertices, index.reshape(-1, 3).astype(np.int64))]
+    return [MeshPart(name="", vertices=vertices, faces=index.reshape(-1, 3).astype(np.int64))]
 
 
 def _ascii(path: Path, data: bytes) -> NDArray[np.float64]:
     words = data.split()
     if b"endsolid" not in words and b"ENDSOLID" not in words:
         raise AssetError(path, "truncated: no endsolid")
-    lowered = np.array([word.lower() == b"vertex" for word in words])
-    at = np.flatnonzero(lowered)
+    is_vertex = np.array([word.lower() == b"vertex" for word in words])
+    at = np.flatnonzero(is_vertex)  # three numbers follow each
     if len(at) % 3 or (len(at) and at[-1] + 3 >= len(words)):
         raise AssetError(path, f"truncated: {len(at)} corners are no whole number of triangles")
     try:

@@ -38,7 +38,7 @@ class Blend(Bsdf):
         "b": Inner(doc="the material at weight 1"),
         "weight": fraction(REQUIRED, "share of `b`"),
     }
-    lobed = True
+    lobed = True  # `sample` reads a number `lobe`, which chooses between the models
 
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
@@ -50,17 +50,17 @@ class Blend(Bsdf):
         """Return blends of two opaque models, of an opaque and a transmitting one, and of a blend with another model."""
         from torchpt.physics.bsdfs import KINDS
 
-        made: dict[str, Any] = {name: KINDS[name] for name in KINDS}
-        matt, rough, glass = made["diffuse"](), made["roughconductor"](), made["dielectric"]()
-        inner = cls(matt, made["conductor"](schlick=True))
-        return cls(matt, rough), cls(glass, matt), cls(inner, made["roughdielectric"]())
+        kinds: dict[str, Any] = {name: KINDS[name] for name in KINDS}  # Any: the models' constructors differ
+        matt, rough, glass = kinds["diffuse"](), kinds["roughconductor"](), kinds["dielectric"]()
+        inner = cls(matt, kinds["conductor"](schlick=True))
+        return cls(matt, rough), cls(glass, matt), cls(inner, kinds["roughdielectric"]())
 
     def __post_init__(self) -> None:
         a, b = self.a, self.b
         self.has(
-            factors=(*a.factors, *b.factors),
-            delta=a.delta or b.delta,
-            smooth=a.smooth and b.smooth,
+            factors=(*a.factors, *b.factors),  # names of the parameters that scale a lobe
+            delta=a.delta or b.delta,  # some lobe is a delta
+            smooth=a.smooth and b.smooth,  # all lobes are deltas
             transmits=a.transmits or b.transmits,
             refracts=a.refracts or b.refracts,
             anisotropic=a.anisotropic or b.anisotropic,
@@ -92,34 +92,36 @@ class Blend(Bsdf):
         # Given the choice, the number rescaled to [0, 1) is uniform again.
         low, width = (
             torch.where(second, 0.0, second_probability),
-            torch.where(second, second_probability, 1.0 - second_probability),
+            torch.where(second, second_probability, 1.0 - second_probability),  # also the probability of the choice
         )
-        lobe = ((lobe - low) / width).clamp(0.0, 1.0 - 2.0**-24)
+        lobe = ((lobe - low) / width).clamp(0.0, 1.0 - 2.0**-24)  # below 1, which division may round to
         a = self._facing(self.a).sample(parameters["a"], wo, lobe if self.a.lobed else None, u)
         b = self._facing(self.b).sample(parameters["b"], wo, lobe if self.b.lobed else None, u)
         wi, pdf = torch.where(second, b.wi, a.wi), torch.where(second, b.pdf, a.pdf).detach()
-        drawn = mixture_sample(self, parameters, wo, wi, (pdf > 0).to(pdf.dtype))
+        drawn = mixture_sample(self, parameters, wo, wi, valid=(pdf > 0).to(pdf.dtype))
         if self.delta:
+            # The value is 1, as weight and probability cancel; the derivative is that of the weight.
             amount = torch.where(second, weight, 1.0 - weight) / width
             drawn = with_delta(drawn, torch.isinf(pdf), wi, torch.where(second, b.weight, a.weight) * amount)
         eta = None
         if self.refracts:
-            one = torch.ones_like(lobe)
-            eta = torch.where(second, one if b.eta is None else b.eta, one if a.eta is None else a.eta)
+            unrefracted = torch.ones_like(lobe)
+            eta_a, eta_b = (unrefracted if drawn.eta is None else drawn.eta for drawn in (a, b))
+            eta = torch.where(second, eta_b, eta_a)
         return replace(drawn, eta=eta)
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """Return the blend of both."""
+        """Return the blend of both albedos."""
         a, b = self.a.albedo(parameters["a"]), self.b.albedo(parameters["b"])
         return a + parameters["weight"].clamp(0.0, 1.0) * (b - a)
 
     def preview(self, parameters: Parameters, shade: Callable[[SplitSumMaterial], Tensor]) -> Tensor:
-        """Return the blend of both."""
+        """Return the blend of both previews."""
         a, b = self.a.preview(parameters["a"], shade), self.b.preview(parameters["b"], shade)
         return a + (b - a) * parameters["weight"].clamp(0.0, 1.0)
 
     def weights(self) -> Iterator[Tensor]:
-        """Yield those of both models."""
+        """Yield the trainable tensors of both models."""
         yield from self.a.weights()
         yield from self.b.weights()
 
@@ -127,6 +129,7 @@ class Blend(Bsdf):
         return f"{self.name} ({self.a}, {self.b})"
 
     def _facing(self, inner: Bsdf) -> Bsdf:
+        """Return the model; beside one that transmits, an opaque model made two-sided."""
         return _Mirrored(inner) if self.transmits and not inner.transmits else inner
 
 
@@ -147,4 +150,5 @@ class _Mirrored(Bsdf):
 
 
 def _turned(w: Tensor, side: Tensor) -> Tensor:
+    """Return local directions with z multiplied by ``side``, 1 or -1."""
     return torch.stack((w[0], w[1], w[2] * side))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.vectors import azimuth, cross, dot, normalize, take
-from torchpt.physics.shapes.geometry import Interaction
+from torchpt.physics.shapes.geometry import KINDS, Interaction
 from torchpt.physics.shapes.primitive import Corners, FixedPoints, HitPoints, LanePrimitives, Primitive, Rays, Triple
 from torchpt.physics.shapes.quadrics import polar
 from torchpt.physics.world import World
@@ -20,20 +20,22 @@ if TYPE_CHECKING:
 
 __all__ = ["Sphere", "axes"]
 
+_NUMBER = KINDS.index("sphere")
+
 
 class Sphere(Primitive):
-    """A sphere."""
+    """A sphere. Masks ``mine (N,)`` tell the lanes whose primitive is a sphere; results in other lanes are arbitrary."""
 
     name = "sphere"
     has_own_uv = True
     flat = False
-    angles = True
+    angles = True  # under a transform that is no similarity a sphere becomes a quadric
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
         """See :meth:`Primitive.corners`."""
         linear, move = pose.split((3, 1), 1)
-        radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)
+        radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)  # the pose scales equally along all axes
         zero = torch.zeros_like(radius)
         p1 = torch.stack((radius, zero, zero))[:, None]
         return Corners(move.to(dtype), p1.to(dtype), torch.zeros_like(move).to(dtype))
@@ -44,6 +46,7 @@ class Sphere(Primitive):
         linear = linear.to(corners.p0)
         radius, zero = corners.p1[0].abs(), torch.zeros_like(corners.p1[0])
         turned = -1.0 if part.flip else 1.0  # sign of the normal
+        # -1 for a mirroring pose or for flipped normals: u then grows the other way round the axis.
         handed = torch.sign(torch.linalg.det(linear.detach().double())).to(corners.p0) * turned
         around = normalize(linear[:, 2:3]) * (2.0 * math.pi * radius * handed)
         return around, torch.stack((math.pi * radius * handed, zero, zero))
@@ -53,7 +56,7 @@ class Sphere(Primitive):
         """See :meth:`Primitive.hit_points`."""
         assert world.geometry.flip is not None
         o, d, p0 = rays.o, rays.d, place.p0
-        radius = torch.where(mine, place.e1[0], 1.0)
+        radius = torch.where(mine, place.e1[0], 1.0)  # 1 and 0: finite values, and so gradients, in other lanes
         t = _distance(o, d, p0, radius, rays.hit.t) if rays.follow_ray else rays.hit.t
         t = torch.where(mine, t, 0.0)
         away = o + d * t - p0
@@ -81,12 +84,16 @@ class Sphere(Primitive):
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
         """See :meth:`Primitive.uv`."""
         assert world.geometry.axes is not None
-        first, end = world.geometry.ends[2], world.geometry.ends[3]
-        row = torch.minimum((at.prim - first).clamp_min(0), end - first - 1)
+        first, end = (
+            world.geometry.ends[_NUMBER - 1],
+            world.geometry.ends[_NUMBER],
+        )  # ids of the spheres: first .. end - 1
+        column = torch.minimum((at.prim - first).clamp_min(0), end - first - 1)  # in the axes, which only spheres have
         away = at.p - take(world.geometry.p0, at.prim)
-        x, y, z = (dot(take(axis, row), away) for axis in world.geometry.axes)
-        across, turn = polar(x, y)
-        return torch.stack((turn, azimuth(z, across) * (1.0 / math.pi)))
+        x, y, z = (dot(take(axis, column), away) for axis in world.geometry.axes)
+        distance, u = polar(x, y)  # distance from the axis, and azimuth over 2 pi
+        v = azimuth(z, distance) * (1.0 / math.pi)  # angle from z over pi
+        return torch.stack((u, v))
 
 
 def axes(poses: list[Tensor], dtype: torch.dtype) -> Triple:
@@ -96,9 +103,9 @@ def axes(poses: list[Tensor], dtype: torch.dtype) -> Triple:
     return x, y, z
 
 
-def _distance(o: Tensor, d: Tensor, centre: Tensor, radius: Tensor, near: Tensor) -> Tensor:
-    """Return the ray parameter of the hit next to ``near``, with the derivative of the sphere's implicit equation."""
-    t = near.detach()
+def _distance(o: Tensor, d: Tensor, centre: Tensor, radius: Tensor, found: Tensor) -> Tensor:
+    """Return the ray parameter of a hit that the search ``found``, with the derivative of the sphere's implicit equation."""
+    t = found.detach()
     f = o + d * t - centre
     # One Newton step on |f|^2 = r^2 with a detached slope: it refines the value and gives the exact derivative.
     slope = (2.0 * dot(f, d)).detach()
