@@ -18,7 +18,7 @@ from torchpt.physics import bsdfs, cameras, lights, shapes, textures
 from torchpt.scene.fingerprint import fingerprint
 from torchpt.scene.formats.compose import KEYS, PATHS
 from torchpt.scene.formats.description import Description, read_description
-from torchpt.scene.formats.overrides import told
+from torchpt.scene.formats.overrides import override_words
 from torchpt.scene.settings import BLOCKS
 from torchpt.spec import parameters_of
 from torchpt.spec.parameters import Path as PathSpec
@@ -358,4 +358,4 @@ def test_words_are_told_as_they_can_be_said() -> None:
         "camera.h": "back\\slash", "camera.m": "at the end\\", "camera.n": "both\\'s", "camera.i": "1",
         "camera.j": "$TORCHPT_ASSETS/a-b.ply", "camera.k": "é", "~camera.l": None,
     }  # fmt: skip
-    assert {key: values for word in told(values) for key, (values,), _ in [read_word(word)]} == values
+    assert {key: values for word in override_words(values) for key, (values,), _ in [read_word(word)]} == values

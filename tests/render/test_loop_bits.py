@@ -130,7 +130,7 @@ def test_progress_may_end_it_early(threads):
 def test_an_error_in_a_task_ends_the_render(monkeypatch, threads):
     scene = torchpt.load("cornell_box", "cpu")
     film = film_of(64)
-    whole, before = rendered(scene, 4, film), set(threading.enumerate())
+    whole, before = rendered(scene, 4, film, threads=threads), set(threading.enumerate())  # the pool keeps its threads
     kept = KernelsEngine.trace
 
     def fails(self: KernelsEngine, chunk: Chunk) -> RayCounts:

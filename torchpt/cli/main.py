@@ -23,7 +23,7 @@ from torchpt.cli.interrupt import Interrupt, Interrupted, interruption
 from torchpt.cli.render import Job
 from torchpt.cli.streams import flushed_stdout, open_streams
 from torchpt.cli.sweep_folder import sweep_folder
-from torchpt.cli.sweep_table import tell_jobs
+from torchpt.cli.sweep_table import print_jobs
 from torchpt.core.errors import LostRankError, OtherRankError, TorchptError, did_you_mean
 from torchpt.core.version import __version__
 
@@ -216,9 +216,9 @@ class _Task:
         overrides = _given(composed, words)
         told = {"scene_number": f"scene={scene}"} if len(self.arguments.scenes) > 1 else {}
         if changes:
-            from torchpt.scene.formats.overrides import told as words_for
+            from torchpt.scene.formats.overrides import override_words
 
-            told |= dict(zip(chosen, words_for(changes), strict=True))
+            told |= dict(zip(chosen, override_words(changes), strict=True))
         words = [told.get(word.lstrip("+").partition("=")[0], word) for word in words]
         for key, path in self.arguments.paths.items():
             group, _, name = key.partition(".")
@@ -306,7 +306,7 @@ def _compose_and_run(
             finally:
                 GlobalHydra.instance().clear()
                 if folder is not None:
-                    tell_jobs(folder)
+                    print_jobs(folder)
     interrupt.check()
     return 0
 

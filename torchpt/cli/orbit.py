@@ -24,7 +24,7 @@ from torchpt.cli.notices import notices, which_job
 from torchpt.cli.progress import Bar
 from torchpt.cli.render import Job, check_distinct, numbered, plain, scene_and_settings, with_error_pilots
 from torchpt.cli.streams import flushed_stdout
-from torchpt.cli.sweep_table import note_job
+from torchpt.cli.sweep_table import record_job
 from torchpt.core.errors import OutputError, SceneError
 from torchpt.core.version import __version__
 
@@ -195,7 +195,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     facts["seconds"] = round(time.perf_counter() - start, 4)
     with flushed_stdout():
         print(json.dumps(plain(facts), allow_nan=False))
-    note_job(job, facts)
+    record_job(job, facts)
     if interrupt.signum is None:
         return 0
     kept = (

@@ -21,7 +21,7 @@ from torchpt.cli.interrupt import Interrupt, Interrupted
 from torchpt.cli.notices import not_finite, notices, unknown_error, which_job
 from torchpt.cli.progress import Bar
 from torchpt.cli.streams import flushed_stdout
-from torchpt.cli.sweep_table import brief, error_of, note_job
+from torchpt.cli.sweep_table import brief, error_of, record_job
 from torchpt.core.errors import OutputError, RenderError, SceneError, TorchptError
 
 __all__ = [
@@ -189,7 +189,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     height, width = rendering.image.shape[:2]
     with flushed_stdout():  # one print, as the jobs of a sweep may share stdout; the last line is the summary
         print(f"{sentence(summary, width, height)}\n{json.dumps(summary, allow_nan=False)}")
-    note_job(job, summary)
+    record_job(job, summary)
     if interrupt.signum is None:
         return 0
     resume_hint = "" if settings.render.checkpoint is None else "; render.resume=true goes on"

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torchpt.cli.render import Job
 
-__all__ = ["brief", "error_of", "note_job", "tell_jobs"]
+__all__ = ["brief", "error_of", "print_jobs", "record_job"]
 
 _HEADING = ("job", "overrides", "out", "error", "seconds")
 
 
-def note_job(job: Job, facts: Mapping[str, Any]) -> None:
+def record_job(job: Job, facts: Mapping[str, Any]) -> None:
     """Write the results of a job to the sweep's folder; do nothing outside a sweep or if the folder cannot be reached.
 
     Args:
@@ -36,7 +36,7 @@ def note_job(job: Job, facts: Mapping[str, Any]) -> None:
             (Path(job.folder) / f"torchpt-job-{job.number}.json").write_text(json.dumps(told))
 
 
-def tell_jobs(folder: str) -> None:
+def print_jobs(folder: str) -> None:
     """Print the table of a sweep on stderr, if at least two jobs wrote results."""
     found = [json.loads(path.read_text()) for path in Path(folder).glob("torchpt-job-*.json")]
     if len(found) > 1:

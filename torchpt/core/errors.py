@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache
 
 __all__ = [
@@ -147,9 +147,9 @@ def warn_caller(message: str, category: type[Warning]) -> None:
     warnings.warn(message, category, stacklevel=level)
 
 
-def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return `` (did you mean X?)`` with the known name closest to ``name``; "" if none is close."""
+def did_you_mean(name: object, known: Iterable[str], show: Callable[[str], str] = str) -> str:
+    """Return `` (did you mean X?)`` with the known name closest to ``name``, as ``show`` writes it; "" if none is close."""
     import difflib
 
     close = difflib.get_close_matches(name, list(known), 1) if isinstance(name, str) else []
-    return f" (did you mean {close[0]}?)" if close else ""
+    return f" (did you mean {show(close[0])}?)" if close else ""

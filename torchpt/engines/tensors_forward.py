@@ -47,14 +47,14 @@ class TensorsForward:
         for pixel_set, first, count in spans:
             pixels = pixel_set.film.width * pixel_set.film.height
             for _ in self.budget.through(partial(self._take, pixel_set), pixels, first, count):
-                if each(self._share):
+                if each(self._result):
                     return False
         return True
 
     def _take(self, pixel_set: PixelSet, span: Span) -> None:
         """Render a piece and add it to the films; if it raises, nothing was added."""
         piece = _piece(self.wave, pixel_set, span)
-        self._share = TaskResult(piece.tally, span[1] * span[3], piece.lost, piece.light)
+        self._result = TaskResult(piece.tally, span[1] * span[3], piece.lost, piece.light)
         piece.write()
 
     def release_workers(self, keeps: bool) -> None:
@@ -114,7 +114,8 @@ def _piece(wave: Wave, pixel_set: PixelSet, span: Span) -> Piece:
             before = _light(radiance, splats)
             radiance = radiance * clamp_scale(radiance, clamp)
             splats = [replace(one, value=one.value * clamp_scale(one.value, clamp)) for one in splats]
-            piece.light = before, _light(radiance, splats)
+            before, after = torch.stack((before, _light(radiance, splats))).tolist()  # one transfer
+            piece.light = before, after
         piece.writes += pixel_set.film.after(radiance, first, sample)
         if pixel_set.film.splats is not None and splats:
             lane, pixel, value = (
@@ -129,5 +130,5 @@ def _piece(wave: Wave, pixel_set: PixelSet, span: Span) -> Piece:
     return piece
 
 
-def _light(radiance: Tensor, splats: Sequence[Splats]) -> float:
-    return float(radiance.double().sum() + sum(one.value.double().sum() for one in splats))
+def _light(radiance: Tensor, splats: Sequence[Splats]) -> Tensor:
+    return radiance.double().sum() + sum(one.value.double().sum() for one in splats)

@@ -23,7 +23,7 @@ from torchpt.core.memory import Budget, Span, is_out_of_memory
 from torchpt.core.threads import map_in_order
 from torchpt.engines.engine import LANES_OF_KERNELS, Backward, BackwardKernels, backward_kernels, backward_tensors
 from torchpt.gradients.parameters import SceneTape
-from torchpt.gradients.tape import sample_cotangents
+from torchpt.gradients.tape import budget_of_chunks, sample_cotangents
 from torchpt.math.sums import ChunkGradientSums, GradientSums
 from torchpt.paths.walk import KEPT, Counts, Observer, Population, walk
 from torchpt.scene import Scene
@@ -129,7 +129,7 @@ def replay_paths(
     """Add the gradients of a render to ``sums`` by path replay; memory hardly grows with depth.
 
     Sums of chunks are merged in the order of chunks, independent of threads. Chunks of tensor operations have fewer lanes only
-    after an allocation failed.
+    where ``render.max_memory`` needs it or an allocation failed.
 
     Args:
         scene: the scene.
@@ -179,7 +179,7 @@ def _over_threads(
 ) -> str:
     """Replay all chunks by kernels on threads; return why that is not possible, or ""."""
     wave, cotangent = scene_tape.wave, cotangent.float()
-    budget = _budget(kernels, settings)
+    budget = _budget_of_kernels(kernels, settings)
     blocks = scene_tape.blocks(wave.crop[2] * wave.crop[3], settings.render.spp)
     engines: list[Backward[Any, Any, Any]] = []
     lock = threading.Lock()
@@ -215,14 +215,16 @@ def _over_threads(
 
 
 def _budget_of_tensors(device: torch.device, settings: Settings) -> Budget:
-    """Return chunks of always the same size, or, where that is more than ``render.max_memory`` leaves, of what fits."""
-    depth = settings.integrator.limits.max_depth
-    # A vertex at a time is on a tape, which takes about as much as a wave does.
-    each = 2 * BYTES_PER_LANE + BYTES_PER_VERTEX * (min(depth, KEPT) if depth >= 0 else KEPT)
+    """Return the budget of a chunk: a fixed number of lanes, or fewer where ``render.max_memory`` needs it."""
+    # One vertex at a time is on a tape, which takes about as much as a wave does.
+    per_lane = 2 * BYTES_PER_LANE + BYTES_PER_VERTEX * _kept_vertices(settings)
     lanes, limit = LANES.get(device.type, LANES["cpu"]), settings.render.max_memory
-    budget = Budget(device, lanes, what="the vertices of a single lane", limit=limit, per_lane=each)
-    budget.drop_unneeded_limit()
-    return budget
+    return budget_of_chunks(device, lanes, "the vertices of a single lane", limit, per_lane)
+
+
+def _kept_vertices(settings: Settings) -> int:
+    depth = settings.integrator.limits.max_depth
+    return min(depth, KEPT) if depth >= 0 else KEPT
 
 
 def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
@@ -235,14 +237,13 @@ def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
                 yield pixel, min(step, start + pixels - pixel), sample, count
 
 
-def _budget(kernels: BackwardKernels, settings: Settings) -> Budget:
+def _budget_of_kernels(kernels: BackwardKernels, settings: Settings) -> Budget:
     """Return the budget of threads: fewer than torch has if their arenas would take more than half of ``render.max_memory``."""
     threads = torch.get_num_threads()
     budget = Budget(torch.device("cpu"), LANES_OF_KERNELS, threads, what="a gradient", instead="one thread")
-    limit, depth = settings.render.max_memory, settings.integrator.limits.max_depth
+    limit = settings.render.max_memory
     if limit is not None:
-        levels = min(depth, KEPT) if depth >= 0 else KEPT
-        budget.fit(limit // 2, kernels.bytes_per_lane(levels), LANES_OF_KERNELS)
+        budget.fit(limit // 2, kernels.bytes_per_lane(_kept_vertices(settings)), LANES_OF_KERNELS)
     return budget
 
 

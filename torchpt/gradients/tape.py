@@ -146,7 +146,12 @@ def _budget(settings: Settings, scene_tape: SceneTape) -> Budget:
     device, per_lane = scene_tape.wave.centre.device, tape_per_lane(settings)
     lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE_BYTES // per_lane, 1))
     limit = settings.render.max_memory
-    budget = Budget(device, lanes, what="the tape of a single lane", limit=limit, per_lane=per_lane)
+    return budget_of_chunks(device, lanes, "the tape of a single lane", limit, per_lane)
+
+
+def budget_of_chunks(device: torch.device, lanes: int, what: str, limit: int | None, per_lane: int) -> Budget:
+    """Return a budget of ``lanes`` a chunk, whatever the limit as long as they fit: sums of other chunks round differently."""
+    budget = Budget(device, lanes, what=what, limit=limit, per_lane=per_lane)
     budget.drop_unneeded_limit()
     return budget
 

@@ -22,6 +22,7 @@ terms of an entry are added pairwise (:func:`summed_by_entry`).
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -40,8 +41,8 @@ DENSE = 1 << 15
 FEW = 1 << 7
 
 
-class GradientSums:
-    """Sums of the gradients of tables.
+class _TableSums(ABC):
+    """Base of the sums of a whole pass and of a chunk: gradients as large as their tables, and gathers from them.
 
     Args:
         tables: the tables, each ``(..., M)``.
@@ -50,15 +51,45 @@ class GradientSums:
     def __init__(self, tables: Sequence[Tensor]) -> None:
         self.tables = tuple(tables)
         self._numbers = {id(table): number for number, table in enumerate(self.tables)}
-        self._totals: list[Tensor | None] = [None] * len(self.tables)
 
     def take(self, table: Tensor, index: Tensor) -> Tensor | None:
         """See :class:`torchpt.math.gathers.GatherRecorder`: the derivative of the look-up is added to the sums."""
         number = self._numbers.get(id(table))
         return None if number is None else _Taken.apply(table, index, self, number)
 
+    @abstractmethod
     def total(self, number: int) -> Tensor:
-        """Return the sum of a table as ``(M, R)``, R numbers an entry."""
+        """Return the sum of a table as ``(M, R)``, R numbers an entry; values may be added to it in place."""
+
+    @abstractmethod
+    def add_at(self, number: int, index: Tensor, values: Tensor) -> None:
+        """Add ``values (..., n)`` to the entries ``index (n,)`` of a table, in their order."""
+
+    def add(self, number: int, gradient: Tensor) -> None:
+        """Add a gradient as large as the table."""
+        total = self.total(number)
+        total += gradient.reshape(total.shape[1], total.shape[0]).T
+
+    def add_each(self, gradients: Iterable[Tensor | None]) -> None:
+        """Add gradients as large as their tables, one for each table in order; None adds nothing."""
+        for number, gradient in enumerate(gradients):
+            if gradient is not None:
+                self.add(number, gradient)
+
+
+class GradientSums(_TableSums):
+    """Sums of the gradients of tables.
+
+    Args:
+        tables: the tables, each ``(..., M)``.
+    """
+
+    def __init__(self, tables: Sequence[Tensor]) -> None:
+        super().__init__(tables)
+        self._totals: list[Tensor | None] = [None] * len(self.tables)
+
+    def total(self, number: int) -> Tensor:
+        """See :class:`_TableSums`."""
         found = self._totals[number]
         if found is None:
             table = self.tables[number]
@@ -83,17 +114,6 @@ class GradientSums:
         if len(index):
             entries, found = summed_by_entry(index, values.reshape(total.shape[1], -1).to(total.dtype))
             total.index_add_(0, entries, found.T)
-
-    def add(self, number: int, gradient: Tensor) -> None:
-        """Add a gradient as large as the table."""
-        total = self.total(number)
-        total += gradient.reshape(total.shape[1], total.shape[0]).T
-
-    def add_each(self, gradients: Iterable[Tensor | None]) -> None:
-        """Add gradients as large as their tables, one for each table in order; None adds nothing."""
-        for number, gradient in enumerate(gradients):
-            if gradient is not None:
-                self.add(number, gradient)
 
     def join(self, part: GradientSums) -> None:
         """Add the sums of another part of the work: all of them, or none if memory runs out."""
@@ -135,7 +155,7 @@ class GradientSums:
         ]
 
 
-class ChunkGradientSums:
+class ChunkGradientSums(_TableSums):
     """Sums of one chunk: dense sums of small tables, and the terms of large tables.
 
     Args:
@@ -148,15 +168,10 @@ class ChunkGradientSums:
     """
 
     def __init__(self, tables: Sequence[Tensor], whole: GradientSums | None = None) -> None:
-        self.tables, self._whole = tuple(tables), whole
-        self._numbers = {id(table): number for number, table in enumerate(self.tables)}
+        super().__init__(tables)
+        self._whole = whole
         self.dense: dict[int, Tensor] = {}
         self.stream: list[tuple[int, np.ndarray, np.ndarray]] = []
-
-    def take(self, table: Tensor, index: Tensor) -> Tensor | None:
-        """See :class:`torchpt.math.gathers.GatherRecorder`."""
-        number = self._numbers.get(id(table))
-        return None if number is None else _Taken.apply(table, index, self, number)
 
     def add_at(self, number: int, index: Tensor, values: Tensor) -> None:
         """See :class:`GradientSums`."""
@@ -179,9 +194,9 @@ class ChunkGradientSums:
         from torchpt.math.sum_kernels import add_at, add_by_columns
 
         if numbers <= FEW:
-            add_by_columns(self._total(number).numpy(), index, values, slots)
+            add_by_columns(self.total(number).numpy(), index, values, slots)
         else:
-            add_at(self._total(number).numpy(), index, values)
+            add_at(self.total(number).numpy(), index, values)
 
     def add_all(self, number: int, values: np.ndarray, slots: np.ndarray) -> None:
         """Add the sums over lanes of ``values (all numbers of a table, n)``; ``slots`` as in :meth:`add_rows`."""
@@ -191,18 +206,8 @@ class ChunkGradientSums:
         add_by_columns(total.view(1, -1).numpy(), np.zeros(len(slots), np.int32), values, slots)
         self.add(number, total)
 
-    def add(self, number: int, gradient: Tensor) -> None:
-        """Add a gradient as large as the table."""
-        total = self._total(number)
-        total += gradient.reshape(total.shape[1], total.shape[0]).T
-
-    def add_each(self, gradients: Iterable[Tensor | None]) -> None:
-        """See :class:`GradientSums`."""
-        for number, gradient in enumerate(gradients):
-            if gradient is not None:
-                self.add(number, gradient)
-
-    def _total(self, number: int) -> Tensor:
+    def total(self, number: int) -> Tensor:
+        """Return the dense sum of a table as ``(M, R)``."""
         if number not in self.dense:
             self.dense[number] = torch.zeros(*_form(self.tables[number]), dtype=torch.float64)
         return self.dense[number]

@@ -29,7 +29,7 @@ from torchpt.reports.study import Study, Variant
 from torchpt.scene.devices import device_of
 from torchpt.scene.fingerprint import fingerprint as fingerprint_of
 from torchpt.scene.formats.description import Description, overridden, read_description
-from torchpt.scene.formats.overrides import told
+from torchpt.scene.formats.overrides import override_words
 from torchpt.scene.prepare import SceneCache, scene_cache
 from torchpt.scene.scene import Scene
 from torchpt.scene.settings import Settings, settings_with
@@ -373,7 +373,7 @@ def prepare(study: Study) -> list[Measured]:
         known: dict[tuple[str, ...], tuple[Description, dict[str, tuple[Scene, str]]]] = {}
         curves = []
         for variant in study.variants:
-            words = told(variant.changes)
+            words = override_words(variant.changes)
             if words not in known:
                 known[words] = read_description(name, overrides=variant.changes), {}
             description, loaded = known[words]

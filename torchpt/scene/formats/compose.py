@@ -29,8 +29,25 @@ from torchpt.scene.settings import BLOCKS, TYPED_BLOCKS, keep_aspect
 from torchpt.spec.schema import parameters_of
 
 __all__ = [
-    "KEEPING", "KEYS", "MAX_FILES", "MAX_LEVELS", "NAMED", "PATHS", "TABLES", "Layers", "Parts", "compose", "kept", "one_of",
-    "over", "path_in", "placed", "prefixes", "skeleton", "things", "with_size",
+    "KEEPING",
+    "KEYS",
+    "MAX_FILES",
+    "MAX_LEVELS",
+    "NAMED",
+    "PATHS",
+    "TABLES",
+    "Layers",
+    "Parts",
+    "compose",
+    "expected_name",
+    "merge_named",
+    "merge_values",
+    "prefixes",
+    "resolve_path",
+    "resolve_paths",
+    "shared_keys",
+    "skeleton",
+    "with_size",
 ]  # fmt: skip
 
 #: Blocks that map names to blocks, and what errors call one of those.
@@ -160,11 +177,11 @@ class _Reader:
                 raise SceneError(key, name, f"a scene of at most {MAX_FILES} files", file)
             shown = _shown(path)
             part = self.merge(plain(read_yaml(path, shown), shown), shown, path.parent, (*trail, path))
-            below = _merged(below, part, shown, strict=False) if below else part
+            below = _merge_layers(below, part, shown, strict=False) if below else part
         if trail and folder.resolve() != self.base:
-            own = placed(own, folder.resolve())
+            own = resolve_paths(own, folder.resolve())
         self.layers.append((file, skeleton(own)))
-        return _merged(below, own, file, strict="defaults" in raw)
+        return _merge_layers(below, own, file, strict="defaults" in raw)
 
     def found(self, name: str, folder: Path, key: str, file: str | None, trail: tuple[Path, ...]) -> Path:
         """Return the file of an entry of ``defaults``: beside the file that has it, or in one of the places."""
@@ -200,19 +217,22 @@ def _shown(path: Path) -> str:
         return str(path)
 
 
-def placed(value: Any, folder: Path) -> Any:
+def resolve_paths(value: Any, folder: Path) -> Any:
     """Return nested mappings with relative paths joined to a folder."""
     if isinstance(value, dict):
-        return {key: path_in(item, folder) if key in PATHS else placed(item, folder) for key, item in value.items()}
+        return {
+            key: resolve_path(item, folder) if key in PATHS else resolve_paths(item, folder)
+            for key, item in value.items()
+        }
     if isinstance(value, list) and any(isinstance(item, dict | list) for item in value):
-        return [placed(item, folder) for item in value]
+        return [resolve_paths(item, folder) for item in value]
     return value
 
 
-def path_in(value: Any, folder: Path) -> Any:
+def resolve_path(value: Any, folder: Path) -> Any:
     """Return a path, or a list of them, joined to a folder; one that begins with a variable is unchanged."""
     if isinstance(value, list):
-        return [path_in(item, folder) for item in value]
+        return [resolve_path(item, folder) for item in value]
     if not isinstance(value, str) or value.startswith("$") or not value.strip():
         return value
     return os.path.normpath(folder / value)
@@ -221,7 +241,9 @@ def path_in(value: Any, folder: Path) -> Any:
 # ---- Merging of two layers
 
 
-def _merged(below: Mapping[str, Any], above: Mapping[str, Any], file: str | None, *, strict: bool) -> dict[str, Any]:
+def _merge_layers(
+    below: Mapping[str, Any], above: Mapping[str, Any], file: str | None, *, strict: bool
+) -> dict[str, Any]:
     """Return two layers merged; neither is changed.
 
     Args:
@@ -237,26 +259,26 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any], file: str | None
     result = dict(below)
     for block, value in above.items():
         if block in NAMED and isinstance(value, Mapping):
-            result[block] = things(block, below.get(block), value, file, strict)
+            result[block] = merge_named(block, below.get(block), value, file, strict)
         else:
-            result[block] = over(below.get(block), value, (block,))
+            result[block] = merge_values(below.get(block), value, (block,))
     return result
 
 
-def things(block: str, below: Any, above: Mapping[str, Any], file: str | None, strict: bool) -> dict[str, Any]:
-    """Merge two blocks of :data:`NAMED`; see :func:`_merged`."""
+def merge_named(block: str, below: Any, above: Mapping[str, Any], file: str | None, strict: bool) -> dict[str, Any]:
+    """Merge two blocks of :data:`NAMED`; see :func:`_merge_layers`."""
     result = dict(below) if isinstance(below, Mapping) else {}
     for name, value in above.items():
         if value is not None:
-            result[name] = over(result.get(name), value, (block, name))
+            result[name] = merge_values(result.get(name), value, (block, name))
         elif result.pop(name, None) is None:
             if strict:
-                raise SceneError(f"{block}.{name}", None, one_of(block, name, list(result)), file)
+                raise SceneError(f"{block}.{name}", None, expected_name(block, name, list(result)), file)
             result[name] = None
     return result
 
 
-def over(below: Any, above: Any, where: Parts) -> Any:
+def merge_values(below: Any, above: Any, where: Parts) -> Any:
     """Merge the values of two layers at the key ``where``."""
     if where in KEEPING:
         below, above = (({"type": item} if isinstance(item, str) else item) for item in (below, above))
@@ -266,12 +288,12 @@ def over(below: Any, above: Any, where: Parts) -> Any:
         above = keep_aspect(below, above)
     if where in KEEPING:
         table, default = KEEPING[where]
-        below = kept(below, above.get("type") or below.get("type") or default, table, default)
+        below = shared_keys(below, above.get("type") or below.get("type") or default, table, default)
     elif _identity(above) not in (None, _identity(below)):
         return above
     result = dict(below)
     for key, value in above.items():
-        result[key] = over(below.get(key), value, (*where, key))
+        result[key] = merge_values(below.get(key), value, (*where, key))
     return result
 
 
@@ -282,7 +304,7 @@ def _identity(thing: Mapping[str, Any]) -> Any:
     return "texture" if "texture" in thing else None
 
 
-def kept(below: Mapping[str, Any], name: Any, table: Mapping[str, Any], default: str) -> dict[str, Any]:
+def shared_keys(below: Mapping[str, Any], name: Any, table: Mapping[str, Any], default: str) -> dict[str, Any]:
     """Return the keys of a block that stay when its type changes to ``name``: those that both types read."""
     if name == below.get("type", default) or not isinstance(name, str) or name not in table:
         return dict(below)
@@ -305,7 +327,7 @@ def with_size(below: Mapping[str, Any], above: Mapping[str, Any]) -> Mapping[str
     return {**below, "camera": {**camera, "size": size}}
 
 
-def one_of(block: str, name: str, known: Sequence[str]) -> str:
+def expected_name(block: str, name: str, known: Sequence[str]) -> str:
     """Return the phrase of what is accepted in place of an unknown name."""
     hint = did_you_mean(name, known)
     shown = [*known[:20], "..."] if len(known) > 20 else known

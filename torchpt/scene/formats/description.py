@@ -18,7 +18,7 @@ from torchpt.scene import settings as run_settings
 from torchpt.scene.formats.cameras import read_camera
 from torchpt.scene.formats.compose import KEYS, Layers, compose
 from torchpt.scene.formats.materials import Kind, check_material, material_types, read_material
-from torchpt.scene.formats.overrides import overridden_by, told
+from torchpt.scene.formats.overrides import overridden_by, override_words
 from torchpt.scene.formats.textures import check_texture, texture_of
 from torchpt.scene.formats.yaml import parse_yaml, plain, read_open, read_yaml
 from torchpt.scene.settings import BLOCKS, Settings, settings_with
@@ -172,7 +172,7 @@ def read_description(
             found = _describe(merged, types, file, base, layers)
         except SceneError as error:
             raise layers.blame(error) from None
-        return replace(found, overrides=told(overrides)) if overrides else found
+        return replace(found, overrides=override_words(overrides)) if overrides else found
 
     if isinstance(source, Mapping):
         return made(source, None, Path.cwd())

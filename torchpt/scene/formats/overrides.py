@@ -5,14 +5,13 @@ They are the top layer of a scene, merged by the rules of :mod:`torchpt.scene.fo
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchpt.core.errors import SceneError
+from torchpt.core.errors import SceneError, did_you_mean
 from torchpt.physics.bsdfs import KINDS as MATERIALS
 from torchpt.physics.textures import KINDS as TEXTURES
 from torchpt.scene.formats.compose import (
@@ -23,21 +22,21 @@ from torchpt.scene.formats.compose import (
     TABLES,
     Layers,
     Parts,
-    kept,
-    one_of,
-    over,
-    path_in,
-    placed,
+    expected_name,
+    merge_named,
+    merge_values,
     prefixes,
+    resolve_path,
+    resolve_paths,
+    shared_keys,
     skeleton,
-    things,
     with_size,
 )  # fmt: skip
 from torchpt.scene.formats.yaml import MAX_DEPTH, plain
 from torchpt.scene.settings import keep_aspect
 from torchpt.spec.schema import dotted
 
-__all__ = ["overridden_by", "told", "words_of"]
+__all__ = ["overridden_by", "override_words", "words_of"]
 
 
 def overridden_by(
@@ -71,7 +70,7 @@ def overridden_by(
     if base.resolve() != (here := Path.cwd()):
         for change in changes:
             inside = any(part in PATHS for part in change.key.split(".")[2:])
-            change.value = path_in(change.value, here) if inside else placed(change.value, here)
+            change.value = resolve_path(change.value, here) if inside else resolve_paths(change.value, here)
     blocks: dict[str, dict[str, Any]] = {}
     for change in changes:
         block, _, inner = change.key.partition(".")
@@ -136,8 +135,7 @@ def _change(name: Any, value: Any) -> _Change:
 
 def _near_key(parts: list[str]) -> str:
     known = [key for key in KEYS if key != "defaults"]
-    close = difflib.get_close_matches(parts[0], known, 1)
-    return f" (did you mean {'.'.join([close[0], *parts[1:]])}?)" if close else ""
+    return did_you_mean(parts[0], known, lambda name: ".".join([name, *parts[1:]]))
 
 
 def _apply(raw: dict[str, Any], change: _Change) -> None:
@@ -155,7 +153,7 @@ def _apply(raw: dict[str, Any], change: _Change) -> None:
         if name == rest:
             break
         rest = rest[len(name) + 1 :]
-        place = _entered(place, name, tuple(parts), change)
+        place = _descend(place, name, tuple(parts), change)
     change.parts = tuple(parts)
     if isinstance(place, list):
         _put_in_list(place, name, change)
@@ -173,15 +171,17 @@ def _apply(raw: dict[str, Any], change: _Change) -> None:
             change.key, change.value, f"a key that is not there yet (it is; {change.key}= without + changes it)"
         )
     if change.sign == "" and thing and not there:
-        raise SceneError(change.key, change.value, f"{one_of(parts[0], name, list(place))}; +{change.key}= adds one")
+        raise SceneError(
+            change.key, change.value, f"{expected_name(parts[0], name, list(place))}; +{change.key}= adds one"
+        )
     if thing and change.value is None:
         place.pop(name, None)
     elif name == "type":
         _retype(place, change)
     elif change.key in NAMED and isinstance(change.value, Mapping):
-        place[name] = things(name, place.get(name), change.value, None, strict=True)
+        place[name] = merge_named(name, place.get(name), change.value, None, strict=True)
     else:
-        place[name] = over(place.get(name), change.value, change.parts)
+        place[name] = merge_values(place.get(name), change.value, change.parts)
 
 
 def _next_part(place: Any, rest: str) -> str:
@@ -193,7 +193,7 @@ def _next_part(place: Any, rest: str) -> str:
     return rest.partition(".")[0]
 
 
-def _entered(place: Any, name: str, parts: Parts, change: _Change) -> Any:
+def _descend(place: Any, name: str, parts: Parts, change: _Change) -> Any:
     """Replace an inner mapping or list of the scene by a copy, which may be changed, and return it."""
     if isinstance(place, list):
         index = _index(place, name, change)
@@ -203,7 +203,9 @@ def _entered(place: Any, name: str, parts: Parts, change: _Change) -> Any:
     if value is None:
         if len(parts) == 2 and parts[0] in NAMED:
             known = [key for key, item in place.items() if item is not None]
-            raise SceneError(".".join(parts), name, f"{one_of(parts[0], name, known)}; +{'.'.join(parts)}= adds one")
+            raise SceneError(
+                ".".join(parts), name, f"{expected_name(parts[0], name, known)}; +{'.'.join(parts)}= adds one"
+            )
         if change.sign == "~":
             raise SceneError(change.key, None, _absent(place, parts, "to be there, as it is removed"))
         value = {}
@@ -238,7 +240,7 @@ def _put_in_list(place: list[Any], name: str, change: _Change) -> None:
         _check_removed(place[index], change)
         del place[index]
     else:
-        place[index] = over(place[index], change.value, change.parts)
+        place[index] = merge_values(place[index], change.value, change.parts)
 
 
 def _check_removed(value: Any, change: _Change) -> None:
@@ -250,10 +252,8 @@ def _check_removed(value: Any, change: _Change) -> None:
 def _absent(place: Mapping[str, Any], parts: Parts, expected: str) -> str:
     known = [name for name, value in place.items() if value is not None]
     if len(parts) == 2 and parts[0] in NAMED:
-        return one_of(parts[0], parts[1], known)
-    close = difflib.get_close_matches(parts[-1], known, 1)
-    hint = f" (did you mean {dotted(*parts[:-1], close[0])}?)" if close else ""
-    return f"{dotted(*parts)} {expected}{hint}"
+        return expected_name(parts[0], parts[1], known)
+    return f"{dotted(*parts)} {expected}{did_you_mean(parts[-1], known, lambda name: dotted(*parts[:-1], name))}"
 
 
 def _retype(place: dict[str, Any], change: _Change) -> None:
@@ -263,7 +263,7 @@ def _retype(place: dict[str, Any], change: _Change) -> None:
         change.value = "null"  # a material that YAML reads as nothing
     table, default = KEEPING.get(above) or (_table_of(above[0], place.get("type"), change.value), "")
     if table is not None:
-        keys = kept(place, change.value, table, default)
+        keys = shared_keys(place, change.value, table, default)
         place.clear()
         place.update(keys)
     place["type"] = change.value
@@ -311,7 +311,7 @@ def words_of(value: Any) -> str:
     return f"<{type(value).__name__} {'x'.join(map(str, getattr(value, 'shape', ())))}>"
 
 
-def told(overrides: Mapping[str, Any]) -> tuple[str, ...]:
+def override_words(overrides: Mapping[str, Any]) -> tuple[str, ...]:
     """Return overrides in the form of the command line."""
     return tuple(
         key if key.startswith("~") and value is None else f"{key}={words_of(value)}" for key, value in overrides.items()
