@@ -190,6 +190,12 @@ class Block:
         """Load a scalar; ``invariant`` promises LLVM that nothing writes there while the kernel runs."""
         return self.op(f"load {element}, ptr {pointer}{', !invariant.load !0' if invariant else ''}")
 
+    def load_pointer(self, pointer: str, invariant: bool = False) -> str:
+        """Load a pointer; that of a GPU points to global memory, which LLVM is told by a cast from that address space."""
+        if not self.form.threads:
+            return self.load("ptr", pointer, invariant)
+        return self.op(f"addrspacecast ptr addrspace(1) {self.load('ptr addrspace(1)', pointer, invariant)} to ptr")
+
     def at(self, pointer: str, element: str, index: str | int) -> str:
         """Return the address of an element; ``index`` is an i64, or a vector (or i32) with its type before it."""
         index = index if isinstance(index, str) and index.startswith(("<", "i32 ")) else f"i64 {index}"
@@ -223,7 +229,7 @@ class Block:
 
     def masked_load(self, element: str, pointer: str, mask: str) -> str:
         """Load consecutive elements; 0 where the mask is not set."""
-        if self.width == 1:  # a loop over single lanes ends at the last lane: the mask is set
+        if self.width == 1:  # a loop over single lanes ends at the last lane, and threads beyond it load that one again
             return self.load(element, pointer, False)
         vector, suffix = self.each(element), self.suffix(element)
         name = f"llvm.masked.load.{suffix}.p0"

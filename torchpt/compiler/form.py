@@ -1,10 +1,10 @@
-"""The form of a kernel: lanes in a register, and elements in a row of the arena."""
+"""The form of a kernel: lanes in a register, elements in a row of the arena, and how lanes are divided among threads."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["CAPACITY", "SCALAR", "VECTORS", "Form"]
+__all__ = ["CAPACITY", "SCALAR", "THREADS", "VECTORS", "WARP", "Form"]
 
 
 # ---- Path states between kernels: an *arena* has a row of 32-bit elements for each component of the path state
@@ -17,6 +17,10 @@ CAPACITY = 16384 + 16
 # ---- The form of a kernel. Stages do not depend on it, only the generation of LLVM IR does
 
 
+#: Threads of a warp on NVIDIA GPUs.
+WARP = 32
+
+
 @dataclass(frozen=True)
 class Form:
     """The layout of lanes in a kernel.
@@ -24,16 +28,37 @@ class Form:
     Results have the same bits in any form: the graph decides which products and sums are fused
     (:mod:`torchpt.compiler.fusing`), and each lane is computed by the same operations.
 
+    A CPU kernel is ``kernel(ptr arguments, i64 lanes)`` and computes lanes 0 to ``lanes - 1`` in order. ``arguments`` is the
+    address of a block of 64-bit words: the words of :data:`torchpt.compiler.kernel.HEAD`, the address of each uniform, the
+    address of each list, and address and row length of each input tensor and then of each result tensor
+    (:func:`torchpt.compiler.kernel.argument_words`).
+
+    A GPU kernel (``threads``) is ``kernel(block arguments, ptr lanes)``, in PTX an entry with two parameters:
+
+    - ``arguments``: the same block of words, by value. All addresses are of global memory of the device.
+    - ``lanes``: address of one int64 in global memory, the number of lanes. The kernel itself must not write there, so it may
+      be a counter of an earlier kernel, not one that this kernel increments.
+
+    Any 1-D grid of 1-D blocks may run it whose block size is a multiple of :data:`WARP`: thread ``k`` of ``T`` computes lanes
+    ``k``, ``k + T``, ... below ``lanes``. Warps stay whole: a thread whose lane does not exist computes the last lane again and
+    stores nothing. Compacted lanes and appended indices keep their order within a warp, but warps append in any order. Memory
+    that tables, uniforms, ``tables`` and ``search`` point to must not change while the kernel runs. There is no shared memory,
+    and the kernel needs as much local memory as its code says.
+
     Attributes:
         width: lanes of a value; a value is an LLVM vector if there is more than one, else a scalar.
         row: elements from one row of an arena to the next.
+        threads: True: each lane is computed by a GPU thread; False: a loop of one CPU thread takes ``width`` lanes at a time.
     """
 
     width: int
     row: int = CAPACITY
+    threads: bool = False
 
 
 #: The form of CPU kernels. LLVM splits the vectors on machines with narrower registers.
 VECTORS = Form(16)
-#: One lane at a time.
+#: One lane at a time on a CPU.
 SCALAR = Form(1)
+#: One lane a GPU thread, here with the rows of CPU arenas; see :class:`Form` for the calling convention.
+THREADS = Form(1, threads=True)

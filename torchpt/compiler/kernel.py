@@ -1,7 +1,7 @@
 """Generate a kernel: a loop over lanes whose body computes the nodes of a stage and stores its results.
 
 A kernel reads lanes of one arena (:mod:`~torchpt.compiler.form`): all of them in order, or those at the indices of a list. Its
-sinks (:mod:`~torchpt.compiler.sinks`) say where results go, its form how many lanes an iteration takes.
+sinks (:mod:`~torchpt.compiler.sinks`) say where results go, its form how it is called and which lanes an iteration takes.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from collections.abc import Sequence
 
 from torchpt.compiler.block import ELEMENTS
 from torchpt.compiler.codegen import MEMORY, LoopBody, generate_node
-from torchpt.compiler.form import Form
+from torchpt.compiler.form import WARP, Form
 from torchpt.compiler.fusing import fused_products
 from torchpt.compiler.graph import Graph, Unsupported
 from torchpt.compiler.packet import binary_searches, packet_search
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 
-__all__ = ["HEAD", "SinkWriter", "kernel_ir", "sink_writer"]
+__all__ = ["HEAD", "SinkWriter", "argument_words", "kernel_ir", "sink_writer"]
 
 
 # ---- Stores: the LLVM IR at the end of the loop's body that writes the results to the sinks
@@ -30,8 +30,8 @@ __all__ = ["HEAD", "SinkWriter", "kernel_ir", "sink_writer"]
 class SinkWriter(ABC):
     """A writer of the stores to a kernel's sinks.
 
-    In the loop ``%i`` is the number of the (first) lane, ``%mask`` marks the lanes that exist, and ``%first0``, ``%first1``,
-    ... are the counters at the kernel's start.
+    In the loop ``%i`` is the number of the (first) lane and ``%mask`` marks the lanes that exist. ``%first0``, ``%first1``, ...
+    are the counters at the kernel's start.
 
     Attributes:
         before: lines at the head of the loop.
@@ -74,6 +74,14 @@ class SinkWriter(ABC):
     @abstractmethod
     def _count(self, counter: int, mask: str) -> None: ...
 
+    @abstractmethod
+    def _put_scattered(self, stores: Sequence[tuple[str, str, str]], place: str, mask: str) -> None:
+        """Store at index ``place`` where the mask is set; each store is an LLVM type, a value and the address of index 0."""
+
+    @abstractmethod
+    def _put_lanes(self, stores: Sequence[tuple[str, str, str]]) -> None:
+        """Store at the lanes' numbers, for lanes that exist; stores as for :meth:`_put_scattered`."""
+
     def _masked(self, mask: int) -> str:
         return self.block.op(f"and {self.block.each('i1')} {self.names[mask]}, %mask")
 
@@ -97,18 +105,21 @@ class SinkWriter(ABC):
         block = self.block
         mask = "%mask" if scatter.mask < 0 else self._masked(scatter.mask)
         place = self._stored_value(scatter.place)[1]
+        stores = []
         for row, node in scatter.rows:
             element, value = self._stored_value(node)
             if scatter.slots:
                 start = block.at("%slots", element, block.op(f"mul i64 %stride, {row}")) if row else "%slots"
             else:
                 start = self._start(row)
-            block.scatter(element, value, start, place, mask)
+            stores.append((element, value, start))
+        self._put_scattered(stores, place, mask)
 
     def _store(self, number: int, store: Store) -> None:
         block = self.block
         element = {"l": "i64", "L": "i64", "b": "i8", "u": "i8"}.get(store.ty, ELEMENTS[store.ty])
         size = {"i64": 8, "double": 8, "i8": 1}.get(element, 4)
+        stores = []
         for k, node in enumerate(store.nodes):
             ty, value = self.graph.type(node), self.names[node]
             if store.ty in "lL" and ty != "L":
@@ -120,7 +131,8 @@ class SinkWriter(ABC):
             row = f"%out{number}"
             if k:
                 row = block.at(row, "i8", block.op(f"mul i64 %out{number}s, {k * size}"))
-            block.masked_store(element, value, block.at(row, element, "%i"), "%mask")
+            stores.append((element, value, row))
+        self._put_lanes(stores)
 
 
 class _VectorSinks(SinkWriter):
@@ -155,6 +167,14 @@ class _VectorSinks(SinkWriter):
     def _put(self, element: str, value: str, pointer: str) -> None:
         self.block.do(f"store {self.block.each(element)} {value}, ptr {pointer}, align 4")
 
+    def _put_scattered(self, stores: Sequence[tuple[str, str, str]], place: str, mask: str) -> None:
+        for element, value, start in stores:
+            self.block.scatter(element, value, start, place, mask)
+
+    def _put_lanes(self, stores: Sequence[tuple[str, str, str]]) -> None:
+        for element, value, start in stores:
+            self.block.masked_store(element, value, self.block.at(start, element, "%i"), "%mask")
+
     def _compact(self, compact: Compact) -> None:
         block, mask = self.block, self._masked(compact.mask)
         start = self._counters[compact.counter]
@@ -182,7 +202,7 @@ class _VectorSinks(SinkWriter):
         self._count(append.counter, mask)
 
 
-#: ``@take(counter, mask)`` returns the counter, and increments it if the mask is set.
+#: ``@take(counter, mask)`` returns the counter, and increments it if the mask is set. For one thread of a CPU.
 _TAKE = """define internal i64 @take(ptr %counter, i1 %mask) alwaysinline {
   %place = load i64, ptr %counter
   %by = zext i1 %mask to i64
@@ -192,12 +212,49 @@ _TAKE = """define internal i64 @take(ptr %counter, i1 %mask) alwaysinline {
 }"""
 
 
+#: The same for the threads of a GPU, a warp at a time: lanes of the warp where the mask is set take consecutive indices, in
+#: their order, by one atomic addition of the first of them. All threads of the warp must call it, whatever their masks.
+_TAKE_BY_WARPS = """define internal i64 @take(ptr %counter, i1 %mask) alwaysinline convergent {
+entry:
+  %set = call i32 @llvm.nvvm.vote.ballot.sync(i32 -1, i1 %mask)
+  %below = call i32 @llvm.nvvm.read.ptx.sreg.lanemask.lt()
+  %set_below = and i32 %set, %below
+  %rank = call i32 @llvm.ctpop.i32(i32 %set_below)
+  %is_first = icmp eq i32 %rank, 0
+  %adds = and i1 %is_first, %mask
+  br i1 %adds, label %add, label %share
+add:
+  %count = call i32 @llvm.ctpop.i32(i32 %set)
+  %by = zext i32 %count to i64
+  %old = atomicrmw add ptr %counter, i64 %by syncscope("device") monotonic
+  %old_low = trunc i64 %old to i32
+  br label %share
+share:
+  %own = phi i32 [ 0, %entry ], [ %old_low, %add ]
+  %first = call i32 @llvm.cttz.i32(i32 %set, i1 false)
+  %source = and i32 %first, 31
+  %start = call i32 @llvm.nvvm.shfl.sync.idx.i32(i32 -1, i32 %own, i32 %source, i32 31)
+  %place = add i32 %start, %rank
+  %wide = zext i32 %place to i64
+  ret i64 %wide
+}"""
+_WARP_INTRINSICS = (
+    "declare i32 @llvm.nvvm.vote.ballot.sync(i32, i1)",
+    "declare i32 @llvm.nvvm.read.ptx.sreg.lanemask.lt()",
+    "declare i32 @llvm.nvvm.shfl.sync.idx.i32(i32, i32, i32, i32)",
+    "declare i32 @llvm.ctpop.i32(i32)",
+    "declare i32 @llvm.cttz.i32(i32, i1)",
+)
+
+
 class _LaneSinks(SinkWriter):
     """Stores of single lanes: the function ``take`` returns the next index from a counter in memory."""
 
     def __init__(self, block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
         super().__init__(block, graph, names, sinks)
-        self.functions.append(_TAKE)
+        if block.form.threads:
+            block.declarations.update(_WARP_INTRINSICS)
+        self.functions.append(_TAKE_BY_WARPS if block.form.threads else _TAKE)
 
     def _count(self, counter: int, mask: str) -> None:
         self._take(counter, mask)
@@ -213,6 +270,16 @@ class _LaneSinks(SinkWriter):
         with self.block.when(mask):
             for row, element, value in stored:
                 self.block.do(f"store {element} {value}, ptr {self._row(row, element, place)}")
+
+    def _put_scattered(self, stores: Sequence[tuple[str, str, str]], place: str, mask: str) -> None:
+        with self.block.when(mask):
+            for element, value, start in stores:
+                self.block.do(f"store {element} {value}, ptr {self.block.at(start, element, f'i32 {place}')}")
+
+    def _put_lanes(self, stores: Sequence[tuple[str, str, str]]) -> None:
+        with self.block.when("%mask"):
+            for element, value, start in stores:
+                self.block.do(f"store {element} {value}, ptr {self.block.at(start, element, '%i')}")
 
     def _compact(self, compact: Compact) -> None:
         mask = self._masked(compact.mask)
@@ -240,13 +307,26 @@ def sink_writer(block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sin
 HEAD = ("src", "dst", "list", "slots", "stride", "counters", "tables", "search")
 
 
+def argument_words(stage: TracedStage) -> list[tuple[str, str]]:
+    """Return name and LLVM type (``ptr`` or ``i64``) of each word of a kernel's arguments, in order."""
+    words = [(name, "i64" if name == "stride" else "ptr") for name in HEAD]
+    words += [(f"uniform{k}", "ptr") for k in range(len(stage.uniforms))]
+    words += [(f"list{k}", "ptr") for k in range(stage.sinks.lists())]
+    for name in [f"in{k}" for k in range(stage.tensors)] + [f"out{k}" for k in range(len(stage.sinks.store))]:
+        words += [(name, "ptr"), (f"{name}s", "i64")]  # a tensor's address, and elements from one row to the next
+    return words
+
+
 def kernel_ir(stage: TracedStage, form: Form) -> str:
-    """Return the IR of ``void kernel(ptr arguments, i64 lanes)``.
+    """Return the IR of a module with the function ``kernel``, whose calling convention :class:`Form` defines.
 
     Raises:
-        Unsupported: an unknown operation, or a table that does not exist.
+        Unsupported: an unknown operation, a table that does not exist, or for threads a counter that both shifts the results
+            and is incremented.
     """
     graph, sinks, needed = stage.graph, stage.sinks, stage.needed()
+    if form.threads and sinks.shift in sinks.incremented():
+        raise Unsupported("a counter that shifts the results while other threads increment it")
     products = fused_products(graph, needed, sinks.roots())
     body = LoopBody(form, stage.listed, products)
     _enter(body, stage, needed)
@@ -263,25 +343,11 @@ def kernel_ir(stage: TracedStage, form: Form) -> str:
     if stage.searched is not None:
         inner.append(packet_search(stage.searched, form))
     declarations = set().union(*(block.declarations for block in (body, *inner)))
+    frame = _grid_stride_loop if form.threads else _loop
     lines = [
         *(line for block in inner for line in block.lines),
         *ends.functions,
-        "define void @kernel(ptr noalias %arguments, i64 %n) #0 {",
-        "entry:",
-        *entry,
-        "  %any = icmp slt i64 0, %n",
-        "  br i1 %any, label %loop, label %exit",
-        "loop:",
-        f"  %i = phi i64 [ 0, %entry ], [ %next, %{body.label} ]",
-        *ends.before,
-        *body.lines,
-        f"  %next = add i64 %i, {form.width}",
-        "  %more = icmp slt i64 %next, %n",
-        "  br i1 %more, label %loop, label %exit",
-        "exit:",
-        *ends.after,
-        "  ret void",
-        "}",
+        *frame(entry, body, ends, len(argument_words(stage))),
         *sorted(declarations),
         f"attributes #0 = {{ nounwind{_PREFERRED if form.width > 1 else ''} }}",
         "!0 = !{}",
@@ -293,13 +359,72 @@ def kernel_ir(stage: TracedStage, form: Form) -> str:
 _PREFERRED = ' "prefer-vector-width"="512" "min-legal-vector-width"="512"'
 
 
+def _loop(entry: list[str], body: LoopBody, ends: SinkWriter, words: int) -> list[str]:
+    """Return the kernel of a CPU: a loop over all lanes."""
+    return [
+        "define void @kernel(ptr noalias %arguments, i64 %n) #0 {",
+        "entry:",
+        *entry,
+        "  %any = icmp slt i64 0, %n",
+        "  br i1 %any, label %loop, label %exit",
+        "loop:",
+        f"  %i = phi i64 [ 0, %entry ], [ %next, %{body.label} ]",
+        *ends.before,
+        *body.lines,
+        f"  %next = add i64 %i, {body.width}",
+        "  %more = icmp slt i64 %next, %n",
+        "  br i1 %more, label %loop, label %exit",
+        "exit:",
+        *ends.after,
+        "  ret void",
+        "}",
+    ]
+
+
+def _grid_stride_loop(entry: list[str], body: LoopBody, ends: SinkWriter, words: int) -> list[str]:
+    """Return the kernel of a GPU: each thread takes the lanes of its number plus multiples of the number of threads.
+
+    The loop's condition is that of the warp's first thread, so that all threads of a warp meet in the calls of ``take``.
+    """
+    registers = ("tid", "ntid", "ctaid", "nctaid")
+    body.declarations.update(f"declare i32 @llvm.nvvm.read.ptx.sreg.{name}.x()" for name in registers)
+    return [
+        f"define ptx_kernel void @kernel(ptr byval([{words} x i64]) align 8 %arguments, ptr addrspace(1) %lanes) #0 {{",
+        "entry:",
+        *entry,
+        "  %n = load i64, ptr addrspace(1) %lanes, !invariant.load !0",
+        "  %last_lane = sub i64 %n, 1",
+        *(f"  %{name} = call i32 @llvm.nvvm.read.ptx.sreg.{name}.x()" for name in registers),
+        *(f"  %{name}_wide = zext i32 %{name} to i64" for name in registers),
+        "  %block_start = mul i64 %ctaid_wide, %ntid_wide",
+        "  %thread = add i64 %block_start, %tid_wide",
+        "  %threads = mul i64 %nctaid_wide, %ntid_wide",
+        "  br label %head",
+        "head:",
+        f"  %lane = phi i64 [ %thread, %entry ], [ %next, %{body.label} ]",
+        f"  %first_of_warp = and i64 %lane, {-WARP}",
+        "  %more = icmp slt i64 %first_of_warp, %n",
+        "  br i1 %more, label %loop, label %exit",
+        "loop:",
+        "  %mask = icmp slt i64 %lane, %n",
+        "  %i = select i1 %mask, i64 %lane, i64 %last_lane",
+        *body.lines,
+        "  %next = add i64 %lane, %threads",
+        "  br label %head",
+        "exit:",
+        "  ret void",
+        "}",
+    ]
+
+
 def _begin(body: LoopBody) -> None:
     """Write the head of the loop's body: the mask of the lanes (``%mask``) and their indices in the arena (``%place``)."""
-    body.declarations.add("declare i64 @llvm.smin.i64(i64, i64)")
-    left = body.op("sub i64 %n, %i")
-    few = body.op(f"call i64 @llvm.smin.i64(i64 {left}, i64 {body.width})")
-    few = body.splat("i", body.op(f"trunc i64 {few} to i32"))
-    body.do(f"%mask = icmp sgt {body.each('i32')} {few}, {body.numbers()}")
+    if not body.form.threads:
+        body.declarations.add("declare i64 @llvm.smin.i64(i64, i64)")
+        left = body.op("sub i64 %n, %i")
+        few = body.op(f"call i64 @llvm.smin.i64(i64 {left}, i64 {body.width})")
+        few = body.splat("i", body.op(f"trunc i64 {few} to i32"))
+        body.do(f"%mask = icmp sgt {body.each('i32')} {few}, {body.numbers()}")
     if body.listed:
         listed = body.at("%list", "i32", "%i")
         body.do(f"%place = load {body.each('i32')}, ptr {listed}, align 4")
@@ -308,22 +433,25 @@ def _begin(body: LoopBody) -> None:
 def _enter(body: LoopBody, stage: TracedStage, needed: list[int]) -> None:
     """Load the kernel's arguments, before the loop."""
     graph, sinks = stage.graph, stage.sinks
-    words = [(name, "i64" if name == "stride" else "ptr") for name in HEAD]
-    words += [(f"uniform{k}", "ptr") for k in range(len(stage.uniforms))]
-    words += [(f"list{k}", "ptr") for k in range(sinks.lists())]
-    for name in [f"in{k}" for k in range(stage.tensors)] + [f"out{k}" for k in range(len(sinks.store))]:
-        words += [(name, "ptr"), (f"{name}s", "i64")]
-    for place, (name, ty) in enumerate(words):
-        body.do(f"%{name} = load {ty}, ptr {body.at('%arguments', 'i64', place)}")
+    for place, (name, ty) in enumerate(argument_words(stage)):
+        _load_word(body, name, ty, body.at("%arguments", "i64", place))
     found = [graph.nodes[node] for node in needed]
     for k in sorted({extra[0] for op, _, _, extra in found if op in ("gather", "element", "search")}):
         if k >= len(stage.tables):
             raise Unsupported("a table that does not exist")
-        body.do(f"%table{k} = load ptr, ptr {body.at('%tables', 'i64', 2 * k)}")
-        body.do(f"%count{k} = load i64, ptr {body.at('%tables', 'i64', 2 * k + 1)}")
+        invariant = body.form.threads
+        _load_word(body, f"table{k}", "ptr", body.at("%tables", "i64", 2 * k), invariant)
+        _load_word(body, f"count{k}", "i64", body.at("%tables", "i64", 2 * k + 1), invariant)
         last = body.op(f"sub i32 {body.op(f'trunc i64 %count{k} to i32')}, 1")
         body.let(f"last{k}", body.each("i32"), body.splat("i", last))
     for k in sorted({extra for op, _, _, extra in found if op == "arena"}):
         body.do(f"%row{k} = getelementptr i8, ptr %src, i64 {4 * body.form.row * k}")
-    for k in range(sinks.counters()):
+    # Vectors keep counters in registers. Single lanes read only the one that shifts what they write, and which none of them
+    # increments: other threads may have begun already.
+    for k in range(sinks.counters()) if body.width > 1 else () if sinks.shift is None else (sinks.shift,):
         body.do(f"%first{k} = load i64, ptr {body.at('%counters', 'i64', k)}")
+
+
+def _load_word(body: LoopBody, name: str, ty: str, pointer: str, invariant: bool = False) -> None:
+    """Load a word of the arguments or of the tables, and bind it to ``%name``; ``invariant`` as in :meth:`Block.load`."""
+    body.let(name, ty, body.load_pointer(pointer, invariant) if ty == "ptr" else body.load(ty, pointer, invariant))

@@ -29,7 +29,7 @@ def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
         vector, places = block.vector(ty), block.each("i32")
         block.lines += [
             f"define internal {places} @sorted_{ty}_{'right' if right else 'left'}"
-            f"(ptr %table, i64 %count, {vector} %value) #0 {{",
+            f"(ptr %table, i64 %count, {vector} %value) {_attributes(form)} {{",
             "entry:",
             "  %count32 = trunc i64 %count to i32",
             "  %last = sub i32 %count32, 1",
@@ -46,7 +46,7 @@ def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
             "  %step = sub i32 %half, 1",
         ]
         middle = block.call("llvm.umin", "i", block.add("i", "%base", block.splat("i", "%step")), last)
-        entry = block.gather(element, "%table", middle)
+        entry = block.gather(element, "%table", middle, invariant=True)
         below = block.compare(
             ("ule" if right else "ult") if ty in "fd" else ("sle" if right else "slt"), ty, entry, "%value"
         )
@@ -64,6 +64,11 @@ def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
         whole.lines += block.lines
         whole.declarations |= block.declarations
     return whole
+
+
+def _attributes(form: Form) -> str:
+    """Return the attributes of a function that kernels call: a call costs a GPU thread registers and local memory."""
+    return "alwaysinline #0" if form.threads else "noinline #0"  # the CPU's passes inline nothing
 
 
 # ---- Brute-force intersection of a packet of rays with every primitive, as functions inside a kernel, for small scenes
@@ -124,7 +129,7 @@ class _Search(Block):
         """Write the function."""
         given = ", ".join(f"{self.f} %{name}" for name in (*_RAY, "t_max"))
         name, result = ("occluded", self.b) if self.any_hit else ("nearest", self.hit)
-        self.lines.append(f"define internal {result} @{name}({given}, ptr %search) noinline #0 {{\nentry:")
+        self.lines.append(f"define internal {result} @{name}({given}, ptr %search) {_attributes(self.form)} {{\nentry:")
         self._start()
         t, prim, before = "%t0", self.constant("i", -1), "entry"
         for kind in self.kinds:
@@ -138,8 +143,11 @@ class _Search(Block):
     def _start(self) -> None:
         words = ("rows", "balls", *(f"end_{kind}" for kind in KINDS))
         for k, word in enumerate(words):
-            self.lines.append(f"  %{word}p = getelementptr i64, ptr %search, i64 {k}")
-            self.lines.append(f"  %{word} = load {'ptr' if k < 2 else 'i64'}, ptr %{word}p, !invariant.load !0")
+            place = self.at("%search", "i64", k)
+            if k < 2:
+                self.let(word, "ptr", self.load_pointer(place, invariant=True))
+            else:
+                self.let(word, "i64", self.load("i64", place))
         extent = self.load("double", self.at("%search", "i64", len(words)))
         extent = self.splat("f", self.op(f"fptrunc double {extent} to float"))
         zero = self.constant("f", 0.0)
@@ -313,7 +321,7 @@ class _Search(Block):
         if any(kind != "sphere" for kind in self.kinds):
             place = self.mul("i", self.select("i", planar, prim, "zeroinitializer"), self.constant("i", _ROW))
             p = tuple(self.fma("f", t, f"%{d}", f"%{o}") for o, d in zip(_RAY[:3], _RAY[3:], strict=True))
-            row = [self.gather("float", self.at("%rows", "float", k), place) for k in range(4, 12)]
+            row = [self.gather("float", self.at("%rows", "float", k), place, invariant=True) for k in range(4, 12)]
             u, v = self._affine(row[:4], p), self._affine(row[4:], p)
             flat = self.op(f"icmp slt {self.i} {prim}, {ends['rectangle']}")
             three = self.op(f"icmp slt {self.i} {prim}, {ends['triangle']}")

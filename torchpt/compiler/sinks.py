@@ -90,14 +90,15 @@ class Sinks:
         roots += [mask for mask, _ in self.count]
         return roots + [node for store in self.store for node in store.nodes]
 
+    def incremented(self) -> set[int]:
+        """Return the counters that the kernel increments."""
+        appends = [*self.appends, *(append for compact in self.compact for append in compact.appends)]
+        numbers = {x.counter for x in (*self.compact, *appends)}
+        return numbers | {counter for _, counter in self.count}
+
     def counters(self) -> int:
         """Return the number of counters."""
-        numbers = [compact.counter for compact in self.compact] + [counter for _, counter in self.count]
-        numbers += [append.counter for compact in self.compact for append in compact.appends] + [
-            append.counter for append in self.appends
-        ]
-        numbers += [] if self.shift is None else [self.shift]
-        return max(numbers, default=-1) + 1
+        return max(self.incremented() | ({self.shift} if self.shift is not None else set()), default=-1) + 1
 
     def lists(self) -> int:
         """Return the number of lists."""
