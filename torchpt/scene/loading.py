@@ -33,8 +33,8 @@ def load(
             or a dict of the same schema. Relative paths in it start at the file's folder, else at the current one. In a dict
             numbers, colours, poses, texels and vertices may be arrays, and tensors on any device: those that require
             gradients get them from every picture (docs/reference/scenes.md, *Tensors in dicts*).
-        device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``; by default the scene's own
-            ``render.device``, which is ``auto`` where it does not say.
+        device: ``auto`` (CUDA where ``scripts/first_gpu.py`` has passed, else the CPU), ``cpu``, ``cuda`` or ``cuda:N``; by
+            default the scene's own ``render.device``, which is ``auto`` where it does not say.
         bsdfs: models of your own by the ``type`` that materials name them by. Gradients flow to their weights too.
         overrides: values of the scene's keys by dotted key: ``{"camera.fov": 20, "+shapes.ball": {"type": "sphere"},
             "~lights.sky": None}`` sets one, adds a shape and removes a light (docs/reference/scenes.md, *Overrides*). They may

@@ -211,7 +211,7 @@ class TraceOptions(TypedDict, total=False):
             "auto",
             reader=_device,
             words="auto, cpu, cuda or cuda:N",
-            doc="auto: CUDA where there is one; in Python the scene's own, where it was loaded",
+            doc="auto: CUDA where a check of it passed, else the CPU; in Python the scene's own, where it was loaded",
         ),
     ]
     accel: Annotated[

@@ -1,0 +1,134 @@
+"""What is known of this machine's GPUs: the driver, and whether a card has passed the first check of kernels.
+
+``scripts/first_gpu.py`` runs the check and calls :func:`record`; ``device=auto`` takes a card only where its
+:func:`last_check` passed. A result is kept in the cache folder, by card and driver: a new driver compiles kernels anew, so it
+is checked anew.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import json
+import sys
+import warnings
+from contextlib import suppress
+from typing import NamedTuple
+
+import torch
+
+from torchpt.core.version import __version__
+from torchpt.native import cache
+
+__all__ = [
+    "CheckResult",
+    "card_name",
+    "cuda_of_driver",
+    "driver_too_old",
+    "driver_version",
+    "last_check",
+    "record",
+    "recorded",
+    "why_unavailable",
+]
+
+
+class CheckResult(NamedTuple):
+    """The result of a check of one card with one driver.
+
+    Attributes:
+        card: the card's name, as torch knows it.
+        driver: version of the NVIDIA driver.
+        passed: True if every kernel gave the bits of the CPU.
+        detail: one line for people: what was compared, or what failed.
+        version: version of torchpt that was checked.
+    """
+
+    card: str
+    driver: str
+    passed: bool
+    detail: str = ""
+    version: str = __version__
+
+
+def card_name(device: torch.device | int | None = None) -> str:
+    """Return the name of a CUDA device; None: the current one."""
+    return torch.cuda.get_device_name(device)
+
+
+def driver_version() -> str:
+    """Return the version of the NVIDIA driver, such as ``550.54.15``; ``""`` if there is none.
+
+    NVML has it. Where that library is missing, it is the version of CUDA that the driver has, such as ``CUDA 12.4``.
+    """
+    text = ctypes.create_string_buffer(96)
+    with suppress(OSError, AttributeError):
+        nvml = ctypes.CDLL("nvml.dll" if sys.platform == "win32" else "libnvidia-ml.so.1")
+        if nvml.nvmlInit_v2() == 0:
+            found = nvml.nvmlSystemGetDriverVersion(text, ctypes.c_uint(len(text)))
+            nvml.nvmlShutdown()
+            if found == 0:
+                return text.value.decode(errors="replace")
+    version = cuda_of_driver()
+    return f"CUDA {version[0]}.{version[1]}" if version else ""
+
+
+def cuda_of_driver() -> tuple[int, int] | None:
+    """Return the newest version of CUDA that the driver has, such as ``(12, 4)``; None if there is no driver."""
+    number = ctypes.c_int(0)
+    with suppress(OSError, AttributeError):
+        driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+        if driver.cuDriverGetVersion(ctypes.byref(number)) == 0 and number.value:
+            return number.value // 1000, number.value % 1000 // 10
+    return None
+
+
+def why_unavailable() -> str | None:
+    """Return why torch finds no CUDA device, in words that go on after "as "; None where it finds one."""
+    with warnings.catch_warnings():  # torch warns in a paragraph of a driver that is too old
+        warnings.simplefilter("ignore")
+        if torch.cuda.is_available():
+            return None
+    wanted = torch.version.cuda
+    if wanted is None:
+        return f"torch {torch.__version__} was built without CUDA"
+    found = cuda_of_driver()
+    if found is None:
+        return "there is no NVIDIA driver"
+    if driver_too_old():
+        return f"the NVIDIA driver is too old: it has CUDA {found[0]}.{found[1]}, and torch was built for CUDA {wanted}"
+    return "no CUDA device was found"
+
+
+def driver_too_old() -> bool:
+    """Return True if there is a driver, and torch was built for a later major version of CUDA than the driver's."""
+    wanted, found = torch.version.cuda, cuda_of_driver()
+    return wanted is not None and found is not None and found[0] < int(wanted.partition(".")[0])
+
+
+def _entry(card: str, driver: str) -> str:
+    return f"cuda-check-{hashlib.sha256(json.dumps([card, driver]).encode()).hexdigest()[:32]}.json"
+
+
+def record(result: CheckResult) -> None:
+    """Remember the result of a check, in place of an earlier one of the same card and driver.
+
+    Without a private cache folder (:func:`torchpt.native.cache.cache_folder`) nothing is remembered.
+    """
+    cache.write(_entry(result.card, result.driver), json.dumps(result._asdict()).encode())
+
+
+def recorded(card: str, driver: str) -> CheckResult | None:
+    """Return the result of the last check of a card with a driver; None if there was none."""
+    content = cache.read(_entry(card, driver))
+    if content is None:
+        return None
+    try:
+        return CheckResult(**json.loads(content))
+    except (TypeError, ValueError):  # written by another version
+        return None
+
+
+def last_check(device: torch.device | int | None = None) -> CheckResult | None:
+    """Return the last result for a CUDA device, by its name and the driver of this machine; None: it was never checked."""
+    return recorded(card_name(device), driver_version())
