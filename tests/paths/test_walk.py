@@ -103,23 +103,31 @@ def test_an_observer_sees_each_vertex_and_may_end_the_walk() -> None:
             self.seen.append(f"{what} {paths.depth}")
             return self.seen[-1] == self.end
 
-        def arrived(self, paths: Toy) -> bool:
-            return self.note("arrived", paths)
+        def on_hits(self, paths: Toy) -> bool:
+            return self.note("on_hits", paths)
 
-        def sorted(self, paths: Toy, counts: Counts) -> bool:
-            return self.note("sorted", paths)
+        def on_sorted(self, paths: Toy, counts: Counts) -> bool:
+            return self.note("on_sorted", paths)
 
-        def gathered(self, paths: Toy) -> None:
-            self.note("gathered", paths)
+        def on_emission(self, paths: Toy) -> None:
+            self.note("on_emission", paths)
 
-        def left(self, paths: Toy) -> None:
-            self.note("left", paths)
+        def on_scattered(self, paths: Toy) -> None:
+            self.note("on_scattered", paths)
 
     looks = Looks()
     verbs(Limits(2, 9), looks)
-    assert looks.seen == ["arrived 1", "sorted 1", "gathered 1", "left 2", "arrived 2", "sorted 2", "gathered 2"]
-    assert verbs(Limits(9, 9), Looks("arrived 2"))[-1] == "intersect 2"
-    assert verbs(Limits(9, 9), Looks("sorted 2"))[-1] == "sort"
+    assert looks.seen == [
+        "on_hits 1",
+        "on_sorted 1",
+        "on_emission 1",
+        "on_scattered 2",
+        "on_hits 2",
+        "on_sorted 2",
+        "on_emission 2",
+    ]
+    assert verbs(Limits(9, 9), Looks("on_hits 2"))[-1] == "intersect 2"
+    assert verbs(Limits(9, 9), Looks("on_sorted 2"))[-1] == "sort"
 
 
 def _gradient(compile: str) -> Callable[[torchpt.Scene], Any]:

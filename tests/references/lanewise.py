@@ -93,13 +93,13 @@ class _Recorder(TensorsEngine):
 
     def _gather(self, paths: Paths, index: Tensor, stage: Any) -> None:
         kept = self.emits if stage == self.wave.integrator.emit else self.escapes
-        kept.append((_copied(paths.state), paths.met, index))
+        kept.append((_copied(paths.state), paths.hits, index))
         super()._gather(paths, index, stage)
 
     def scatter(self, paths: Paths, roulette: float) -> Paths:
         state = _copied(paths.state)
         self.states.append(state)
-        self.bounces += [(model, state, paths.met, index, paths.depth) for model, index in paths.groups or ()]
+        self.bounces += [(model, state, paths.hits, index, paths.depth) for model, index in paths.groups or ()]
         return super().scatter(paths, roulette)
 
 
@@ -132,7 +132,7 @@ def compare(scene: torchpt.Scene, wishes: Mapping[str, Any], pixels: int, sample
     wave, _ = prepared(scene, wishes)
     with torch.no_grad():
         chosen = kernels_of(scene, wave)
-        if wave.first is not None:
+        if wave.first_surface is not None:
             _first_hits(found, wave, chosen, pixels, samples)
             return found
         recorder = waves(wave, pixels, samples)

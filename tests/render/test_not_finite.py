@@ -272,13 +272,13 @@ def test_the_first_ones_are_kept_in_order():
     values[0, 1, 2], values[1, 3, 29], values[2, 1, 2] = torch.inf, torch.nan, -torch.inf
     lost = NonFinite.of(values, 10, 5, (3, 2, 16, 12))
     assert (lost.nan, lost.infinite, lost.count) == (1, 1, 2)
-    assert lost.places == [SampleId(6, 2, 15, nan=False), SampleId(8, 4, 10, nan=True)]
-    assert str(lost.places[0]) == "sample 6 of pixel (15, 2)"
+    assert lost.samples == [SampleId(6, 2, 15, nan=False), SampleId(8, 4, 10, nan=True)]
+    assert str(lost.samples[0]) == "sample 6 of pixel (15, 2)"
     chosen = PixelSet(
         torchpt.physics.film.Film(30, 1, 1, torch.device("cpu")), {}, Randomizations(2, 3), torch.arange(100, 140)
     )
-    (first, _) = NonFinite.of(values, 10, 5, (3, 2, 16, 12), chosen).places
-    assert (first.x, first.y, first.first, first.streams) == (112 % 16 + 3, 112 // 16 + 2, 2, 3)
+    (first, _) = NonFinite.of(values, 10, 5, (3, 2, 16, 12), chosen).samples
+    assert (first.x, first.y, first.first_randomization, first.randomizations) == (112 % 16 + 3, 112 // 16 + 2, 2, 3)
     assert NonFinite.read(lost.plain()) == lost
 
 
@@ -286,11 +286,13 @@ def test_no_more_are_kept_than_are_traced():
     lost = NonFinite()
     for sample in (9, 3):
         lost.add(NonFinite.of(torch.full((3, 1, 50), torch.nan), 0, sample, (0, 0, 50, 1)))
-    assert lost.count == 100 and len(lost.places) == KEPT
-    assert [place.sample for place in lost.places] == [3] * 50 + [9] * (KEPT - 50)
+    assert lost.count == 100 and len(lost.samples) == KEPT
+    assert [place.sample for place in lost.samples] == [3] * 50 + [9] * (KEPT - 50)
     pilots = PixelSet(torchpt.physics.film.Film(50, 1, 1, torch.device("cpu")), {}, Randomizations(1, 1))
     lost.add(NonFinite.of(torch.full((3, 1, 50), torch.nan), 0, 0, (0, 0, 50, 1), pilots))
-    assert lost.count == 150 and {place.first for place in lost.places} == {0}, "paths of the picture can be looked at"
+    assert lost.count == 150 and {place.first_randomization for place in lost.samples} == {0}, (
+        "paths of the picture can be looked at"
+    )
 
 
 @pytest.mark.parametrize(

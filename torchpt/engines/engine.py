@@ -121,8 +121,8 @@ def kernels_of(wave: Wave, own: Sequence[int], before: Kernels | None = None) ->
         before: kernels of another render; its tables are shared where they were made of the same tensors.
     """
     packets = uses_packets(wave)
-    opaque = wave.context.world.materials.opacity is None and not wave.integrator.own_transmit
-    fused = packets and opaque and wave.first is None and not wave.integrator.splats
+    opaque = wave.context.world.materials.opacity is None and not wave.integrator.has_own_transmit
+    fused = packets and opaque and wave.first_surface is None and not wave.integrator.splats
     kernels = Kernels(wave, packets, fused, before, fixed=not own)
     eager = kernels.probe(own) if wave.integrator.light else {}
     if eager and kernels.fused:  # stages that run as tensor operations need searches between the stages

@@ -22,7 +22,7 @@ from torchpt.paths.integrators.path import Ends, follows_ray, partition
 from torchpt.paths.layers import LAYERS
 from torchpt.paths.state import Emission, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
 from torchpt.paths.transmission import beyond, non_opaque, opacity_at
-from torchpt.paths.walk import Counts, Observer, find, walk
+from torchpt.paths.walk import Counts, Observer, find_hits, walk
 from torchpt.paths.wave import PixelSet, RayCounts, Wave
 from torchpt.physics.film.splats import LARGEST, Splats
 from torchpt.physics.samplers import salts
@@ -88,7 +88,7 @@ class Paths:
     passed: tuple[list[Tensor], list[Tensor]] = field(default_factory=lambda: ([], []))
 
     @property
-    def met(self) -> Hit:
+    def hits(self) -> Hit:
         """Return the hits, which must be known."""
         assert self.hit is not None
         return self.hit
@@ -120,7 +120,7 @@ class TensorsEngine:
         self.keeps = keeps
         self.wave, self.context, self.tally = wave, wave.context, RayCounts() if tally is None else tally
         self.plan, self.world = wave.context.plan, wave.context.world
-        self.has_transmission = self.world.materials.opacity is not None or wave.integrator.own_transmit
+        self.has_transmission = self.world.materials.opacity is not None or wave.integrator.has_own_transmit
         self.splats = splats
         self._clear(lanes)
 
@@ -152,7 +152,7 @@ class TensorsEngine:
 
     def _may_transmit(self, state: PathState, hit: Hit) -> Tensor:
         """Return the lanes that the stage ``transmit`` runs for."""
-        if self.wave.integrator.own_transmit:
+        if self.wave.integrator.has_own_transmit:
             some = state.t_max > 0
         else:
             some = (hit.prim >= 0) & non_opaque(self.world, hit.prim)
@@ -165,7 +165,7 @@ class TensorsEngine:
             return False
         salt = salts(paths.depth, in_transit.lanes.device, in_transit.step)
         out = self.wave.integrator.transmit(self.context.at(salt), VertexInput(in_transit.state, in_transit.hit))
-        hit, on = paths.met, out.on.nonzero().squeeze(1)
+        hit, on = paths.hits, out.on.nonzero().squeeze(1)
         if out.chance is not None:
             chance = torch.ones_like(hit.t) if hit.chance is None else hit.chance
             hit = replace(
@@ -194,12 +194,12 @@ class TensorsEngine:
     def hits(self, state: PathState, depth: int) -> Hit:
         """Return the hits of rays on their way to a vertex, behind all surfaces that they pass; the rays are not counted."""
         paths = Paths(state, depth)
-        find(TensorsEngine(self.wave, 0), paths)
-        return paths.met
+        find_hits(TensorsEngine(self.wave, 0), paths)
+        return paths.hits
 
     def sort(self, paths: Paths) -> Counts:
         """See :class:`torchpt.paths.walk.Engine`. Needs one sort of small keys and one transfer of the counts."""
-        paths.ends, paths.groups = partition(self.world, paths.met)
+        paths.ends, paths.groups = partition(self.world, paths.hits)
         return Counts([len(index) for _, index in paths.groups], len(paths.ends.emissive), len(paths.ends.missed))
 
     def emit(self, paths: Paths) -> None:
@@ -229,7 +229,7 @@ class TensorsEngine:
         return self.context.at(salt, follow_ray, roulette, partial(self.hits, depth=paths.depth + 1))
 
     def _input(self, paths: Paths, index: Tensor) -> VertexInput:
-        return VertexInput(rows(paths.state, index), rows(paths.met, index))
+        return VertexInput(rows(paths.state, index), rows(paths.hits, index))
 
     def scatter(self, paths: Paths, roulette: float) -> Paths:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -335,7 +335,7 @@ class TensorsEngine:
 def escaped(wave: Wave, state: PathState, ends: Ends) -> Tensor:
     """Return the lanes that get the radiance of the environment: rays without a hit, but for those that a medium ended."""
     index = ends.missed
-    return index[take(state.t_max, index) > 0] if wave.integrator.own_transmit else index
+    return index[take(state.t_max, index) > 0] if wave.integrator.has_own_transmit else index
 
 
 def trace(
@@ -399,9 +399,9 @@ class _Layers(Observer[Paths]):
         self.names, self.context, self.centre = names, replace(wave.context, follow_ray=follow_ray), wave.centre
         self.found: dict[str, Tensor] = {}
 
-    def sorted(self, paths: Paths, counts: Counts) -> bool:
+    def on_sorted(self, paths: Paths, counts: Counts) -> bool:
         """See :class:`Observer`."""
-        state, hit = paths.state, paths.met
+        state, hit = paths.state, paths.hits
         self.found = {k: state.d.new_zeros(len(LAYERS[k].channels), len(state.lane)) for k in self.names}
         for model, index in paths.groups or ():
             o, d, met = take(state.o, index), take(state.d, index), rows(hit, index)

@@ -86,7 +86,7 @@ class TensorsBackward(TensorsEngine):
         """See :class:`torchpt.engines.engine.Backward`. Lanes are sorted by sample, the order in which gradients are added."""
         depth, order = paths.depth, paths.state.lane.argsort()
         place = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
-        state, hit = rows(paths.state, order), rows(paths.met, order)
+        state, hit = rows(paths.state, order), rows(paths.hits, order)
         ends = Ends(take(place, paths.ends.emissive).msort(), take(place, paths.ends.missed).msort())
         chance, chance_cotangent = self._chance(state, depth)
         hit = replace(hit, chance=chance)

@@ -69,7 +69,7 @@ def gradients(
         RenderError: not even a single lane fits in memory.
     """
     integrator = settings.integrator
-    if attached and integrator.own_transmit:
+    if attached and integrator.has_own_transmit:
         expected = "one without a transmit of its own, where geometry is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)
     if (attached or film_space) and integrator.splats:
@@ -82,7 +82,7 @@ def gradients(
             need = memory_estimate(settings, scene.device, "tape", len(scene_tape.wave.context.world.materials.models))
             check_memory(settings.render.max_memory, scene.device, need.backward_bytes, 0)
         carried = any(not own.whole for own in integrator.fields)
-        if kind == "replay" and integrator.own_transmit and (carried or scene_tape.differentiates_opacity):
+        if kind == "replay" and integrator.has_own_transmit and (carried or scene_tape.differentiates_opacity):
             what = "its fields" if carried else "opacity"
             raise NotBuiltError(
                 "adjoint",

@@ -152,8 +152,7 @@ class SceneTape(Tape):
 def _over(wave: Wave, change: Callable[[Tensor], Tensor]) -> Wave:
     """Return the wave with ``change`` applied to all of its tensors."""
     context = wave.context
-    # `first`: shading of first surfaces; `given`: rays in place of camera rays. Either may be None.
-    records = context.world, context.pixel, wave.camera, wave.first, wave.given
-    world, pixel, camera, first, given = map_leaves(change, records)
+    records = context.world, context.pixel, wave.camera, wave.first_surface, wave.start_rays
+    world, pixel, camera, first_surface, start_rays = map_leaves(change, records)
     context = replace(context, world=world, pixel=pixel, camera=None if context.camera is None else camera)
-    return replace(wave, context=context, camera=camera, first=first, given=given)
+    return replace(wave, context=context, camera=camera, first_surface=first_surface, start_rays=start_rays)

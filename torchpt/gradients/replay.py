@@ -58,7 +58,7 @@ class VertexRecorder(Observer[Any]):
         self.marks: list[tuple[int, Any]] = []
         self._engine, self._first, self._mark, self._step = engine, first, mark, KEPT
 
-    def arrived(self, paths: Population) -> bool:
+    def on_hits(self, paths: Population) -> bool:
         """See :class:`Observer`."""
         past = paths.depth - self._first
         if past > 0 and past % self._step == 0:
@@ -69,7 +69,7 @@ class VertexRecorder(Observer[Any]):
                 self.marks, self._step = self.marks[::2], 2 * self._step
         return False
 
-    def sorted(self, paths: Population, counts: Counts) -> bool:
+    def on_sorted(self, paths: Population, counts: Counts) -> bool:
         """See :class:`Observer`."""
         if not self.marks:
             self.kept.append(paths)

@@ -47,7 +47,7 @@ class ReadablePopulation(Population, Protocol):
         ...
 
     @property
-    def met(self) -> Hit:
+    def hits(self) -> Hit:
         """Return the hits of their rays."""
         ...
 
@@ -152,33 +152,33 @@ class Explainer(Observer[ReadablePopulation]):
         self.world = world
         self.events: list[Event] = []
 
-    def keep(self, event: Event) -> None:
+    def record(self, event: Event) -> None:
         """Record an event."""
         self.events.append(event)
 
-    def began(self, state: PathState) -> None:
+    def on_start(self, state: PathState) -> None:
         """Record camera rays."""
-        self.keep(CameraRay(state.lane, state))
+        self.record(CameraRay(state.lane, state))
 
-    def arrived(self, paths: ReadablePopulation) -> bool:
+    def on_hits(self, paths: ReadablePopulation) -> bool:
         """See :class:`Observer`."""
         state = paths.state
-        self.keep(Intersection(paths.depth, state.lane, replace(state, radiance=state.radiance.clone()), paths.met))
+        self.record(Intersection(paths.depth, state.lane, replace(state, radiance=state.radiance.clone()), paths.hits))
         return False
 
-    def gathered(self, paths: ReadablePopulation) -> None:
+    def on_emission(self, paths: ReadablePopulation) -> None:
         """See :class:`Observer`."""
         for index, light in paths.emissions:
-            prim = take(paths.met.prim, index)
+            prim = take(paths.hits.prim, index)
             slot = None if bool((prim < 0).any()) else self.world.geometry.slot(prim)
-            self.keep(EmitterHit(paths.depth, take(paths.state.lane, index), slot, light))
+            self.record(EmitterHit(paths.depth, take(paths.state.lane, index), slot, light))
 
-    def left(self, paths: ReadablePopulation) -> None:
+    def on_scattered(self, paths: ReadablePopulation) -> None:
         """See :class:`Observer`."""
         transmittance = iter(paths.transmittance)
         for model, lanes, output in paths.outputs:
             arrived = None if output.shadow is None else next(transmittance)
-            self.keep(Scattering(paths.depth - 1, lanes, model, output, arrived))
+            self.record(Scattering(paths.depth - 1, lanes, model, output, arrived))
 
 
 #: Names of causes, and their descriptions.
@@ -230,8 +230,8 @@ def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[SampleId]) -> l
         places: the samples.
     """
     found: dict[SampleId, NonFiniteCause] = {}
-    for streams in sorted({(place.first, place.streams) for place in places}):
-        own = [place for place in places if (place.first, place.streams) == streams]
+    for streams in sorted({(place.first_randomization, place.randomizations) for place in places}):
+        own = [place for place in places if (place.first_randomization, place.randomizations) == streams]
         found |= zip(own, _find_causes(trace, wave, own, Randomizations(*streams)), strict=True)
     return [found[place] for place in places]
 
@@ -245,10 +245,10 @@ def _find_causes(trace: Trace, wave: Wave, places: Sequence[SampleId], streams: 
         for name in ("x", "y", "sample")
     )
     state = wave.rays_of(x, y, sample, streams)
-    finder.began(state)
+    finder.on_start(state)
     radiance = trace(wave, state, finder)
     if not finder.full:  # a walk that was ended early returns no radiance
-        finder.look("sum", radiance, torch.arange(len(places), device=x.device), 0, None)
+        finder.check("sum", radiance, torch.arange(len(places), device=x.device), 0, None)
     rest = NonFiniteCause("not repeated", False, 0)
     return [cause or rest for cause in finder.causes]
 
@@ -273,12 +273,12 @@ class _CauseFinder(Explainer):
         """Return True once the cause of every lane is known."""
         return None not in self.causes
 
-    def arrived(self, paths: ReadablePopulation) -> bool:
+    def on_hits(self, paths: ReadablePopulation) -> bool:
         """See :class:`Explainer`. End the walk once all causes are known: a path with NaN might go on for ever."""
-        super().arrived(paths)
+        super().on_hits(paths)
         return self.full
 
-    def keep(self, event: Event) -> None:
+    def record(self, event: Event) -> None:
         """Check an event for values that are not finite."""
         slot = None
         depth = 0 if isinstance(event, CameraRay) else event.depth
@@ -289,9 +289,9 @@ class _CauseFinder(Explainer):
         elif isinstance(event, Intersection):
             slot = self.world.geometry.slot(event.hit.prim)
         for cause, value in _checks(event, self.world):
-            self.look(cause, value, event.lanes, depth, slot)
+            self.check(cause, value, event.lanes, depth, slot)
 
-    def look(self, cause: str, value: Tensor, lanes: Tensor, depth: int, slot: Tensor | None) -> None:
+    def check(self, cause: str, value: Tensor, lanes: Tensor, depth: int, slot: Tensor | None) -> None:
         """Record ``cause`` for the lanes ``(n,)`` where ``value (C, n)`` or ``(n,)`` is the first that is not finite."""
         value = value if value.dim() == 2 else value[None]
         bad = ~torch.isfinite(value).all(0)

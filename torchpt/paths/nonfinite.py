@@ -28,21 +28,22 @@ class SampleId:
     Attributes:
         sample: index in the pixel.
         y, x: row and column of the pixel on the whole film.
-        first, streams: randomizations that share the pixel's samples, see :class:`torchpt.physics.samplers.Randomizations`.
+        first_randomization, randomizations: index of the first of the randomizations that share the pixel's samples, and their
+            number: the fields of :class:`torchpt.physics.samplers.Randomizations`.
         nan: True: it was NaN. False: infinite.
     """
 
     sample: int
     y: int
     x: int
-    first: int = 0
-    streams: int = 1
+    first_randomization: int = 0
+    randomizations: int = 1
     nan: bool = True
 
     @property
     def sort_key(self) -> tuple[int, ...]:
         """Return the sort key: samples of the picture first, then those of error probes, each in the order of sampling."""
-        return self.first, self.sample, self.y, self.x
+        return self.first_randomization, self.sample, self.y, self.x
 
     def __str__(self) -> str:
         return f"sample {self.sample} of pixel ({self.x}, {self.y})"
@@ -55,12 +56,12 @@ class NonFinite:
     Attributes:
         nan: how many had a NaN in a channel.
         infinite: how many of the others were infinite.
-        places: the first :data:`KEPT` of them, sorted.
+        samples: the first :data:`KEPT` of them, sorted.
     """
 
     nan: int = 0
     infinite: int = 0
-    places: list[SampleId] = field(default_factory=list)
+    samples: list[SampleId] = field(default_factory=list)
 
     @property
     def count(self) -> int:
@@ -72,11 +73,11 @@ class NonFinite:
         if other.count:
             self.nan += other.nan
             self.infinite += other.infinite
-            self.places = sorted([*self.places, *other.places], key=lambda place: place.sort_key)[:KEPT]
+            self.samples = sorted([*self.samples, *other.samples], key=lambda place: place.sort_key)[:KEPT]
 
     def plain(self) -> dict[str, Any]:
         """Return a dict of plain values, for a checkpoint."""
-        places = [[p.sample, p.y, p.x, p.first, p.streams, p.nan] for p in self.places]
+        places = [[p.sample, p.y, p.x, p.first_randomization, p.randomizations, p.nan] for p in self.samples]
         return {"nan": self.nan, "infinite": self.infinite, "places": places}
 
     @staticmethod
@@ -115,11 +116,11 @@ class NonFinite:
         bad = ~torch.isfinite(radiance).all(0)
         nan = torch.isnan(radiance).any(0)
         count, nans = int(bad.sum()), int(nan.sum())
-        streams = Randomizations() if pixel_set is None else pixel_set.streams
+        streams = Randomizations() if pixel_set is None else pixel_set.randomizations
         places = []
         for s, p in bad.nonzero()[:KEPT].tolist():
             pixel = first_pixel + p
-            pixel = pixel if pixel_set is None or pixel_set.places is None else int(pixel_set.places[pixel])
+            pixel = pixel if pixel_set is None or pixel_set.indices is None else int(pixel_set.indices[pixel])
             y, x = divmod(pixel, crop[2])
             of_nan = bool(nan[s, p])
             places.append(SampleId(first_sample + s, y + crop[1], x + crop[0], streams.first, streams.count, of_nan))

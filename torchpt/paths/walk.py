@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 
 from torchpt.paths.integrators.base import Limits
 
-__all__ = ["KEPT", "Counts", "Engine", "Observer", "Population", "find", "walk"]
+__all__ = ["KEPT", "Counts", "Engine", "Observer", "Population", "find_hits", "walk"]
 
 #: Consecutive vertices that an engine keeps at once for a backward pass.
 KEPT = 16
@@ -85,25 +85,25 @@ class Engine(Protocol[P]):
 class Observer(Generic[Q]):
     """Callbacks of the walk: path replay keeps populations, layers read the first surface, a debugger prints one path.
 
-    :meth:`arrived` and :meth:`sorted` may return True, which ends the walk.
+    :meth:`on_hits` and :meth:`on_sorted` may return True, which ends the walk.
     """
 
-    def arrived(self, paths: Q) -> bool:
+    def on_hits(self, paths: Q) -> bool:
         """Read paths that have their hits but are not sorted yet."""
         return False
 
-    def sorted(self, paths: Q, counts: Counts) -> bool:
+    def on_sorted(self, paths: Q, counts: Counts) -> bool:
         """Read sorted paths, before emission is added and they scatter."""
         return False
 
-    def gathered(self, paths: Q) -> None:
+    def on_emission(self, paths: Q) -> None:
         """Read paths after the emission of their hits, or of the environment, was added."""
 
-    def left(self, paths: Q) -> None:
+    def on_scattered(self, paths: Q) -> None:
         """Read paths behind a vertex, after its shadow rays were traced."""
 
 
-def find(engine: Engine[P], paths: P) -> None:
+def find_hits(engine: Engine[P], paths: P) -> None:
     """Find the hits of a population's rays, behind all surfaces and media that they pass."""
     if engine.intersect(paths):
         while engine.transmit(paths):
@@ -127,18 +127,18 @@ def walk(
         engine.terminate(paths, truncated=False)
         return
     while paths.depth != until:
-        find(engine, paths)
-        if observer is not None and observer.arrived(paths):
+        find_hits(engine, paths)
+        if observer is not None and observer.on_hits(paths):
             return
         counts = engine.sort(paths)
-        if observer is not None and observer.sorted(paths, counts):
+        if observer is not None and observer.on_sorted(paths, counts):
             return
         if counts.emissive:
             engine.emit(paths)
         if counts.missed:
             engine.escape(paths)
         if observer is not None:
-            observer.gathered(paths)
+            observer.on_emission(paths)
         if paths.depth >= last:
             engine.terminate(paths, truncated=endless)
             return
@@ -147,7 +147,7 @@ def walk(
         paths = engine.scatter(paths, limits.roulette(paths.depth))
         engine.occlude(paths)
         if observer is not None:
-            observer.left(paths)
+            observer.on_scattered(paths)
         if limits.first_surface:
             engine.terminate(paths, truncated=False)
             return

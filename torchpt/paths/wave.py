@@ -52,14 +52,14 @@ class PixelSet:
     Attributes:
         film: sums of radiance.
         layers: films of the layers of first surfaces, by name.
-        streams: randomizations of the sampler that their samples belong to.
-        places: ``(n,)`` int64 indices of the pixels in the picture, row by row, on the lanes' device; None: all pixels.
+        randomizations: randomizations of the sampler that their samples belong to.
+        indices: ``(n,)`` int64 indices of the pixels in the picture, row by row, on the lanes' device; None: all pixels.
     """
 
     film: Film
     layers: dict[str, Film] = field(default_factory=dict)
-    streams: Randomizations = field(default_factory=Randomizations)
-    places: Tensor | None = None
+    randomizations: Randomizations = field(default_factory=Randomizations)
+    indices: Tensor | None = None
 
 
 # ---- The firefly clamp: ``integrator.clamp``
@@ -106,8 +106,8 @@ class Wave:
         crop: ``(x, y, width, height)`` of the picture on the film.
         centre: ``(3,)`` float64 origin of the lanes' coordinates in the scene, in the lanes' unit of length: the result of
             :attr:`torchpt.scene.space.Space.shift`. Only the layer of positions adds it.
-        first: shading of first surfaces, of an integrator that stops there; None: paths go on.
-        given: rays that paths start with; None: camera rays.
+        first_surface: shading of first surfaces, of an integrator that stops there; None: paths go on.
+        start_rays: rays that paths start with; None: camera rays.
     """
 
     context: StageContext
@@ -118,13 +118,13 @@ class Wave:
     sampler: Sampler
     crop: tuple[int, int, int, int]
     centre: Tensor
-    first: FirstSurface | None = None
-    given: Rays | None = None
+    first_surface: FirstSurface | None = None
+    start_rays: Rays | None = None
 
     @property
     def bounce(self) -> Bounce:
         """Return the stage of surfaces."""
-        return self.integrator.bounce if self.first is None else self.first.bounce
+        return self.integrator.bounce if self.first_surface is None else self.first_surface.bounce
 
     def rays(
         self, first_pixel: int, pixels: int, first_sample: int, samples: int, pixel_set: PixelSet | None = None
@@ -142,30 +142,30 @@ class Wave:
         device = self.centre.device
         x0, y0, width, _ = self.crop
         index = torch.arange(first_pixel, first_pixel + pixels, device=device)  # in the picture
-        if pixel_set is not None and pixel_set.places is not None:
-            index = pixel_set.places[first_pixel : first_pixel + pixels]
+        if pixel_set is not None and pixel_set.indices is not None:
+            index = pixel_set.indices[first_pixel : first_pixel + pixels]
         x, y = index % width + x0, index // width + y0
         sample = torch.arange(first_sample, first_sample + samples, device=device).repeat_interleave(pixels)
         return self.rays_of(
-            x.repeat(samples), y.repeat(samples), sample, None if pixel_set is None else pixel_set.streams
+            x.repeat(samples), y.repeat(samples), sample, None if pixel_set is None else pixel_set.randomizations
         )
 
-    def rays_of(self, x: Tensor, y: Tensor, sample: Tensor, streams: Randomizations | None = None) -> PathState:
+    def rays_of(self, x: Tensor, y: Tensor, sample: Tensor, randomizations: Randomizations | None = None) -> PathState:
         """Return the first rays of single samples.
 
         Args:
             x: column of the pixel on the whole film ``(N,)`` int64.
             y: its row, likewise.
             sample: index of the sample in the pixel ``(N,)`` int64.
-            streams: randomizations that share the samples of a pixel; None: those of the picture.
+            randomizations: randomizations that share the samples of a pixel; None: those of the picture.
         """
         # Pixels are numbered on the whole film, so that a crop has the same samples as the full picture.
         pixel = y * self.camera.resolution[0] + x
-        if self.given is not None:
-            number = pixel if self.given.number is None else take(self.given.number, pixel)
-            key = self.sampler.key(number, sample, streams)
-            return camera_state(take(self.given.o, pixel), take(self.given.d, pixel), key)
-        key = self.sampler.key(pixel, sample, streams)
+        if self.start_rays is not None:
+            number = pixel if self.start_rays.number is None else take(self.start_rays.number, pixel)
+            key = self.sampler.key(number, sample, randomizations)
+            return camera_state(take(self.start_rays.o, pixel), take(self.start_rays.d, pixel), key)
+        key = self.sampler.key(pixel, sample, randomizations)
         x, y = (a.to(self.context.plan.dtype) for a in (x, y))
         camera_salts = salts(0, self.centre.device)  # depth 0: the camera's random dimensions
         return generate(self.context.plan, self.camera, self.filter, x, y, key, camera_salts)
@@ -177,7 +177,7 @@ class Wave:
         # Others have no weights and stay: the filter is part of the key of compiled kernels, which are shared with renders.
         filter = filter_of("box", rays.d.device) if self.filter.signed else self.filter
         camera = replace(self.camera, resolution=(n, 1))
-        return replace(self, camera=camera, crop=(0, 0, n, 1), filter=filter, given=rays)
+        return replace(self, camera=camera, crop=(0, 0, n, 1), filter=filter, start_rays=rays)
 
     def with_optional_fields(self, state: PathState) -> PathState:
         """Return the paths with the initial values of fields that only some scenes and integrators use.

@@ -141,7 +141,7 @@ def identity(
         "params": {name: fingerprint(value).hex() for name, value in (params or {}).items()},
         "dtype": str(dtype).removeprefix("torch."),
         "device": scene.device.type,
-        **({"integrator_code": fingerprint(settings.integrator).hex()} if settings.integrator.foreign else {}),
+        **({"integrator_code": fingerprint(settings.integrator).hex()} if settings.integrator.is_foreign else {}),
         **json.loads(json.dumps(settings.plain(FREE))),
     }
 
@@ -321,7 +321,7 @@ def check_samples(run: Run, state: RenderState, path: Path) -> None:
 
 def ends_a_pass(run: Run, taken: int) -> bool:
     """Return True if ``target_error`` is checked after ``taken`` samples a pixel in a render without a time limit."""
-    stop = StopRules(run.settings.render.but(spp=taken + BLOCK, time_limit=None), run.picture.streams.count)
+    stop = StopRules(run.settings.render.but(spp=taken + BLOCK, time_limit=None), run.picture.randomizations.count)
     end = taken - taken % (4 * BLOCK)  # passes from here on are whole blocks
     while end < taken:
         end += stop.step(end)
@@ -354,8 +354,8 @@ def check_plausible(run: Run, state: RenderState, path: Path) -> None:
     seen = counts["picture"] if run.integrator.light else next(iter(c for n, c in counts.items() if n != "picture"))
     total = int(seen.sum())
     if rounds:
-        assert run.probes is not None and run.probes.pixel_set.places is not None
-        pilots = seen.sum(0)[run.probes.pixel_set.places.cpu()]
+        assert run.probes is not None and run.probes.pixel_set.indices is not None
+        pilots = seen.sum(0)[run.probes.pixel_set.indices.cpu()]
         problems["pilots.counts"] |= bool((counts["pilots"].sum(0) != pilots).any())
         for name in run.picture.layers:
             problems[f"layers.{name}.counts"] |= bool((counts[f"layers.{name}"].sum(0) != seen.sum(0)).any())
@@ -364,7 +364,7 @@ def check_plausible(run: Run, state: RenderState, path: Path) -> None:
         total += int(counts["pilots"].sum())
     problems["done"] = done != total
     problems["truncated"] = facts["truncated"] > done
-    problems["lost"] = lost.count > done or not all(_is_taken(run, place, int(seen.max())) for place in lost.places)
+    problems["lost"] = lost.count > done or not all(_is_taken(run, place, int(seen.max())) for place in lost.samples)
     for name, wrong in problems.items():
         if wrong:
             raise AssetError(path, f"is no whole checkpoint (no render comes to its {name})")
@@ -379,6 +379,6 @@ def _is_taken(run: Run, place: SampleId, samples: int) -> bool:
     x, y, width, height = run.wave.crop
     pixel_sets = [run.picture] if run.probes is None else [run.picture, run.probes.pixel_set]
     inside = x <= place.x < x + width and y <= place.y < y + height and place.sample < samples
-    return inside and (place.first, place.streams) in [
-        (pixel_set.streams.first, pixel_set.streams.count) for pixel_set in pixel_sets
+    return inside and (place.first_randomization, place.randomizations) in [
+        (pixel_set.randomizations.first, pixel_set.randomizations.count) for pixel_set in pixel_sets
     ]

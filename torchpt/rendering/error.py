@@ -57,7 +57,7 @@ class ErrorProbes:
         """Return the picture ``(H, W, 3)`` in float64, with the second values where they count."""
         if not self.counted or not len(self.pilots):
             return film.mean()
-        places, second = self.pixel_set.places, self.pixel_set.film
+        places, second = self.pixel_set.indices, self.pixel_set.film
         values, first = film.values(), film.counts[places].double()
         again = second.counts.double()
         share = (again / (first + again).clamp_min(1.0))[:, None]
@@ -68,7 +68,7 @@ class ErrorProbes:
         """Return the number of samples of each pixel ``(pixels,)`` int64."""
         counts = film.counts
         if self.counted and len(self.pilots):
-            counts[self.pixel_set.places] += self.pixel_set.film.counts
+            counts[self.pixel_set.indices] += self.pixel_set.film.counts
         return counts
 
     def estimate(self, film: Film, picture: Tensor) -> ErrorEstimate | None:
@@ -79,8 +79,8 @@ class ErrorProbes:
         if self.resampled is not None:
             pixel_set, suspects = self.resampled
             values = torch.stack(pixel_set.film.streams()).cpu()
-            assert pixel_set.places is not None
-            again = Resampled(pixel_set.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
+            assert pixel_set.indices is not None
+            again = Resampled(pixel_set.indices.cpu(), suspects, values.mean(0), values.var(0) / len(values))
         first = self._first(film)
         return error_estimate(
             picture.cpu(), self.pilots, first, self._second(), self._second_variance(), self.counted, again
@@ -104,7 +104,7 @@ class ErrorProbes:
         if from_first_rank is not None:
             suspects, doubtful = from_first_rank(suspects), from_first_rank(doubtful)
         places = torch.cat((suspects, doubtful)).to(film.sums.device)
-        streams = Randomizations(self.pixel_set.streams.first + self.pixel_set.streams.count, STREAMS)
+        streams = Randomizations(self.pixel_set.randomizations.first + self.pixel_set.randomizations.count, STREAMS)
         pixel_set = PixelSet(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
         self.resampled = pixel_set, len(suspects)
         self.resampled_at = float(film.counts.double().mean())
@@ -118,8 +118,8 @@ class ErrorProbes:
         return probe_estimate(self.pilots, self._first(film), self._second(), self._second_variance(), self.counted)
 
     def _first(self, film: Film) -> Tensor:
-        assert self.pixel_set.places is not None
-        return film.taken(self.pixel_set.places).values().cpu()
+        assert self.pixel_set.indices is not None
+        return film.taken(self.pixel_set.indices).values().cpu()
 
     def _second(self) -> Tensor:
         return self.pixel_set.film.values().cpu()
@@ -203,7 +203,7 @@ class SampleAllocation:
         for name, film in (("", pixel_set.film), *pixel_set.layers.items()):
             films[name] = film.taken(places)
             self._parts.append((film, places, films[name]))
-        return PixelSet(films.pop(""), films, pixel_set.streams, pixels)
+        return PixelSet(films.pop(""), films, pixel_set.randomizations, pixels)
 
     def _of_blocks(self, counts: Tensor) -> Tensor:
         """Return the samples a pixel of each block; the pixels of a block have the same number."""

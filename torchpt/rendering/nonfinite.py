@@ -35,12 +35,12 @@ def causes_of(scene: Scene, wave: Wave, lost: NonFinite) -> tuple[dict[str, int]
         return {}, ""
     from torchpt.paths.explain import causes_of_samples
 
-    faults = causes_of_samples(_trace, wave, lost.places)
+    faults = causes_of_samples(_trace, wave, lost.samples)
     causes = Counter(fault.name for fault in faults)
-    nans = sum(place.nan for place in lost.places)
+    nans = sum(place.nan for place in lost.samples)
     causes["nan, not traced"] = lost.nan - nans
-    causes["infinite, not traced"] = lost.infinite - (len(lost.places) - nans)
-    first = f"{_named(wave, lost.places[0])}: {_said(scene, wave, faults[0])}"
+    causes["infinite, not traced"] = lost.infinite - (len(lost.samples) - nans)
+    first = f"{_named(wave, lost.samples[0])}: {_said(scene, wave, faults[0])}"
     return {name: count for name, count in causes.most_common() if count}, first
 
 
@@ -57,9 +57,9 @@ def _trace(wave: Wave, state: PathState, observer: Any) -> Tensor:
 
 def _named(wave: Wave, place: SampleId) -> str:
     """Return the name of a sample: its index and pixel or ray, and whether it is a second value of an error probe."""
-    if wave.given is not None:
+    if wave.start_rays is not None:
         return f"sample {place.sample} of ray {place.y * wave.crop[2] + place.x}"
-    return str(place) + (" (its second value)" if place.first else "")
+    return str(place) + (" (its second value)" if place.first_randomization else "")
 
 
 def _said(scene: Scene, wave: Wave, fault: NonFiniteCause) -> str:

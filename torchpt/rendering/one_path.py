@@ -186,7 +186,7 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         explainer = Explainer(wave.context.world)
         x, y, number = (torch.tensor([value], device=scene.device) for value in (*pixel, sample))
         state = wave.rays_of(x, y, number)
-        explainer.began(state)
+        explainer.on_start(state)
         radiance = weighted_radiance(wave, state, observer=explainer)
         return _PathBuilder(scene, explainer).build(settings, pixel, sample, radiance)
 

@@ -498,7 +498,7 @@ class Run:
     def _count(self, lost: NonFinite) -> None:
         """Count non-finite samples; with ``integrator.strict`` raise RenderError at the first one."""
         if lost.count and self.integrator.strict:
-            raise RenderError(f"integrator.strict: {describe_sample(self.scene, self.wave, lost.places[0])}")
+            raise RenderError(f"integrator.strict: {describe_sample(self.scene, self.wave, lost.samples[0])}")
         self.lost.add(lost)
 
     def result(self) -> Rendering:

@@ -121,8 +121,8 @@ class DistributedRender:
         device = pixel_set.film.sums.device
         places = dealt(pixel_set.film.width * pixel_set.film.height, self.group.rank, self.group.size).to(device)
         layers = {name: film.taken(places) for name, film in pixel_set.layers.items()}
-        pixels = places if pixel_set.places is None else pixel_set.places[places]
-        part = PixelSet(pixel_set.film.taken(places), layers, pixel_set.streams, pixels)
+        pixels = places if pixel_set.indices is None else pixel_set.indices[places]
+        part = PixelSet(pixel_set.film.taken(places), layers, pixel_set.randomizations, pixels)
         self._parts.append((pixel_set, part))
         return part
 
@@ -158,5 +158,5 @@ def render_fingerprint(
     """Return a hash of everything that ranks must have in common to share a render."""
     free = settings_with(Role.FREE, but=Role.FILES)  # ranks must have the same file settings
     free["render"] = (*free["render"], "device")
-    own = settings.integrator if settings.integrator.foreign else None
+    own = settings.integrator if settings.integrator.is_foreign else None
     return tree.fingerprint((__version__, settings.plain(free), own, fingerprints(scene, params), dtype))

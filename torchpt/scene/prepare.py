@@ -137,7 +137,7 @@ def make_wave(
         sampler=Sampler(points, settings.render.seed, settings.streams, spp, film.width),
         crop=crop,
         centre=scene.space.shift,
-        first=_first(scene, integrator, world, own) if like is None else like.first,
+        first_surface=_first(scene, integrator, world, own) if like is None else like.first_surface,
     )
     return wave if rays is None else wave.with_rays(_lane_rays(scene, *rays, dtype))
 
@@ -206,7 +206,12 @@ def rebuild_with_tape(wave: Wave, scene: Scene, settings: Settings, params: Mapp
         world = replace(world, lights=None)
     camera = scene.camera(settings.film, scene.merged(params), wave.context.plan.dtype)
     context = _context(wave.context.plan, world, camera, wave.crop, wave.integrator)
-    return replace(wave, context=context, camera=camera, first=None if wave.first is None else wave.first.again(world))
+    return replace(
+        wave,
+        context=context,
+        camera=camera,
+        first_surface=None if wave.first_surface is None else wave.first_surface.again(world),
+    )
 
 
 def points_of(sampler: ParsedParams) -> Points:

@@ -431,7 +431,7 @@ class KernelsEngine:
     def start(self, chunk: Chunk) -> None:
         """Set the pixels and samples of the next chunk."""
         wave, pixel_set = self.wave, chunk.pixel_set
-        streams = wave.sampler.streams if pixel_set is None else pixel_set.streams
+        streams = wave.sampler.streams if pixel_set is None else pixel_set.randomizations
         x, y, width, _ = wave.crop
         point, turn = divmod(chunk.first_sample, streams.count)
         self.calls.place[:] = np.array(
@@ -445,9 +445,9 @@ class KernelsEngine:
     def spawn(self, chunk: Chunk) -> Paths:
         """Return the population of a chunk's camera rays, with their first hits if the search is part of the stages."""
         self.start(chunk)
-        kernels, calls, given = self.kernels, self.calls, self.wave.given
+        kernels, calls, given = self.kernels, self.calls, self.wave.start_rays
         self.splats, self._lost = [], []
-        count, places = chunk.pixels * chunk.samples, None if chunk.pixel_set is None else chunk.pixel_set.places
+        count, places = chunk.pixels * chunk.samples, None if chunk.pixel_set is None else chunk.pixel_set.indices
         if given is not None:
             places = given.number
         paths, source = self._begin(self.room(1), 1, count), self.room(1).arena
@@ -606,7 +606,7 @@ class _Layers(Observer[Paths]):
     def __init__(self, worker: KernelsEngine, names: tuple[str, ...]) -> None:
         self.worker, self.names = worker, names
 
-    def sorted(self, paths: Paths, counts: Counts) -> bool:
+    def on_sorted(self, paths: Paths, counts: Counts) -> bool:
         """See :class:`Observer`."""
         worker, kernels = self.worker, self.worker.kernels
         for model, count in enumerate(paths.groups):

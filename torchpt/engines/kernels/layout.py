@@ -222,7 +222,7 @@ class Layout:
         self.has_environment = table is not None and table.environment is not None
         self.has_emitters = table is not None and table.row_of_prim is not None
         self.has_opacity = self.world.materials.opacity is not None
-        self.has_transmission = self.has_opacity or wave.integrator.own_transmit
+        self.has_transmission = self.has_opacity or wave.integrator.has_own_transmit
         self.listed = not fused or self.models > 1 or self.has_environment
         self.state = Rows(_path_fields(self))
         self.passed = Rows({**PASS, "transmittance": ((), "f"), **_key_field(wave), **HIT})
@@ -255,7 +255,7 @@ def _path_fields(layout: Layout) -> Fields:
     fields |= HIT
     if wave.integrator.splats:
         fields |= SPLAT
-    shadows = world.lights is not None if wave.first is None else wave.first.shadows(world)
+    shadows = world.lights is not None if wave.first_surface is None else wave.first_surface.shadows(world)
     if not layout.fused and (shadows or wave.integrator.splats):
         fields |= SHADOW
         if layout.has_opacity:

@@ -227,15 +227,15 @@ class Kernels(Layout):
                 "sampler": self.numbers,
                 "centre": wave.centre,
                 "pixel": wave.context.pixel,
-                "first": wave.first,
+                "first": wave.first_surface,
                 "cotangent": cotangent,
             },
             None if before is None else before._leaves,
         )
         same = fixed and before is not None and before.world is self.world
         self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
-        own = (fingerprint(wave.integrator), wave.context.crop) if wave.integrator.own_stages else None
-        parts = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, own, self._leaves.tensors)
+        own = (fingerprint(wave.integrator), wave.context.crop) if wave.integrator.has_own_stages else None
+        parts = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first_surface, own, self._leaves.tensors)
         self.structure = (self._of_world, *map(signature, parts), packets, fused)
         alike = before is not None and before.structure == self.structure
         self.kernel_cache = before.kernel_cache if alike else KernelCache()  # pyright: ignore[reportOptionalMemberAccess]

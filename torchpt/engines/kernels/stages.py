@@ -321,7 +321,7 @@ def list_transmitting(trace: Trace) -> Sinks:
     rows, tracer, layout = trace.layout.state, trace.tracer, trace.layout
     given = rows.read(tracer, "prim", "t_max")
     with tracer:
-        if layout.wave.integrator.own_transmit:
+        if layout.wave.integrator.has_own_transmit:
             may_pass = given["t_max"] > 0
         else:
             may_pass = non_opaque(layout.world, given["prim"]) & (given["prim"] >= 0)
@@ -348,7 +348,7 @@ def transmit(trace: Trace, again: bool) -> Sinks:
         state, before, home = trace.state()[0], None, trace.place()
     with tracer:
         out = layout.wave.integrator.transmit(layout.wave.context.at(salts), VertexInput(state, hit))
-        on = out.on & (state.t_max > 0) if layout.wave.integrator.own_transmit else out.on
+        on = out.on & (state.t_max > 0) if layout.wave.integrator.has_own_transmit else out.on
         stops = ~on
         distance = hit.t if before is None else hit.t + before  # from the vertex to this hit
         after, come, scatters = replace(state, o=out.o), distance, None

@@ -38,7 +38,7 @@ class Along:
     def __init__(self, scene: Scene, settings: Settings, wave: Wave) -> None:
         self._scene, self._clamp = scene, wave.integrator.clamp
         # Kernels of a kind with stages of its own are made anew for each depth that is asked for.
-        compiled = uses_kernels(settings, scene.device, wave.context.plan.dtype) and not wave.integrator.own_stages
+        compiled = uses_kernels(settings, scene.device, wave.context.plan.dtype) and not wave.integrator.has_own_stages
         self._compiled = compiled
         self._kernels: Kernels | None = None
         self._keep = settings.render.max_memory is None

@@ -152,17 +152,17 @@ class Integrator(FrozenConfig):
         return transmission.transmit(context, vertex)
 
     @property
-    def foreign(self) -> bool:
+    def is_foreign(self) -> bool:
         """Return True for a class outside torchpt, whose code may differ under the same name."""
         return type(self).__module__.partition(".")[0] != "torchpt"
 
     @property
-    def own_transmit(self) -> bool:
+    def has_own_transmit(self) -> bool:
         """Return True if the kind overrides :meth:`transmit`, so that more than surfaces may stop rays."""
         return type(self).transmit is not Integrator.transmit
 
     @property
-    def own_stages(self) -> bool:
+    def has_own_stages(self) -> bool:
         """Return True if the kind has fields, splats or stages of its own, which need kernels of their own."""
         kind, base = type(self), Integrator
         own = any(getattr(kind, name) is not getattr(base, name) for name in ("emit", "escape", "bounce", "transmit"))
