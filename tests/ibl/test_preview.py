@@ -14,7 +14,7 @@ from torch import Tensor
 import torchpt
 from torchpt.ibl import IblMaps, Sky, brdf_table
 from torchpt.math.sampling import Distribution1D
-from torchpt.paths.integrators.split_sum import under
+from torchpt.paths.integrators.split_sum import shade_under
 from torchpt.physics import bsdfs
 from torchpt.physics.lights import without_environment
 
@@ -102,7 +102,7 @@ def test_a_model_without_a_rule_is_diffuse() -> None:
 
     even = torch.full((2, 1, 3), 2.0)
     lanes = torch.tensor([[0.0], [0.0], [1.0]])
-    found = under(
+    found = shade_under(
         Sky.of(IblMaps(even, (even, even), brdf_table(8, 64).float())), Own(), {"color": lanes * 0 + 0.3}, lanes, lanes
     )
     assert torch.allclose(found, torch.full((3, 1), 0.6))

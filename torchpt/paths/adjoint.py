@@ -1,7 +1,9 @@
 """Vector-Jacobian products of the path stages: cotangents of a stage's outputs in, cotangents of its inputs out.
 
-Each function runs a stage of :mod:`torchpt.paths.vertex` on an autograd tape of its own and differentiates it at once. They are
-tensor functions of single vertices, so the lane compiler makes kernels of them as it does of the stages.
+Each function runs a stage of :mod:`torchpt.paths.vertex` on an autograd tape of its own and differentiates it at once. Path
+replay (:mod:`torchpt.gradients.replay`) calls them vertex by vertex, from the last vertex to the first. They are tensor
+functions of single vertices, so the lane compiler makes kernels of them as it does of the stages. n is the number of lanes of a
+call.
 """
 
 from __future__ import annotations
@@ -53,8 +55,8 @@ class Tape:
         opacity, maps = world.materials.opacity, world.textures.opacity
         if opacity is None:
             return False
-        read = [] if maps is None else [x for k in maps.tables for x in leaves(world.textures.tables[k])]
-        return any(x.requires_grad for x in (opacity, *read))
+        texels = [] if maps is None else [x for k in maps.tables for x in leaves(world.textures.tables[k])]
+        return any(x.requires_grad for x in (opacity, *texels))
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class VertexCotangents:
         radiance: of the radiance of the samples.
         throughput: of the throughput of the rays that leave.
         o: of their origins; None where geometry is not differentiated.
-        d: of their directions; likewise.
+        d: of their directions; None where geometry is not differentiated.
         extra: of the integrator's own fields, by name.
     """
 
@@ -82,7 +84,7 @@ class InputCotangents:
 
     Attributes:
         throughput, o, d: of the incoming rays ``(3, n)``.
-        chance: of :attr:`torchpt.physics.shapes.geometry.Hit.chance` ``(n,)``.
+        chance: of :attr:`torchpt.physics.shapes.geometry.Hit.chance` ``(n,)``, by which opacity gets its gradient.
         extra_leaves: of the tensors of the :data:`LeafSource`, in its order.
         extra: of the integrator's own fields, by name.
     """
@@ -95,14 +97,14 @@ class InputCotangents:
     extra: Mapping[str, Tensor | None] = field(default_factory=dict)
 
     def of_rays(self, state: PathState, attached: bool) -> Iterator[tuple[str, Tensor | None, Tensor]]:
-        """Yield name, cotangent (None: zero) and a tensor of its shape, for each field of the incoming rays.
+        """Yield name, cotangent (None: zero) and a tensor of the cotangent's shape, for each field of the incoming rays.
 
         ``attached``: True where geometry is differentiated, so that origins and directions have cotangents.
         """
         for name in ("throughput", "o", "d") if attached else ("throughput",):
             yield name, getattr(self, name), state.throughput
-        for name, found in self.extra.items():
-            yield EXTRA + name, found, state.extra[name]
+        for name, cotangent in self.extra.items():
+            yield EXTRA + name, cotangent, state.extra[name]
 
 
 #: Returns further tensors that gradients are wanted for, called after the stage ran: recorded gathers, tables, weights.
@@ -134,24 +136,25 @@ def bounce(
         splat: returns the contributions of splats to their pixels ``(3, n)``, differentiable, and their cotangents.
     """
 
-    def found(_: PathState) -> Hit:
+    def search(_: PathState) -> Hit:
+        """Return the hits of the forward pass, in place of a search."""
         assert next_hit is not None
         return next_hit
 
     with torch.enable_grad():
         vertex, input_leaves = _with_leaves(context.plan, vertex)
-        output = stage(replace(context, search=found), model, vertex)
-        after, shadow = output.leaving, output.shadow
-        pairs = [(after.throughput, cotangents.throughput), (after.radiance, cotangents.radiance)]
+        output = stage(replace(context, search=search), model, vertex)
+        leaving, shadow = output.leaving, output.shadow
+        pairs = [(leaving.throughput, cotangents.throughput), (leaving.radiance, cotangents.radiance)]
         if cotangents.o is not None and cotangents.d is not None:
-            pairs += [(after.o, cotangents.o), (after.d, cotangents.d)]
-        pairs += [(after.extra[name], cotangent) for name, cotangent in cotangents.extra.items()]
+            pairs += [(leaving.o, cotangents.o), (leaving.d, cotangents.d)]
+        pairs += [(leaving.extra[name], cotangent) for name, cotangent in cotangents.extra.items()]
         if shadow is not None:
-            passed = transmittance(shadow)
-            if passed.requires_grad:
-                pairs.append((shadow.radiance * passed, cotangents.radiance))
+            arriving = transmittance(shadow)
+            if arriving.requires_grad:
+                pairs.append((shadow.radiance * arriving, cotangents.radiance))
             else:
-                pairs.append((shadow.radiance, cotangents.radiance * passed))
+                pairs.append((shadow.radiance, cotangents.radiance * arriving))
         if output.splat is not None and splat is not None:
             pairs.append(splat(output.splat))
         return _vjp(pairs, input_leaves, extra_leaves)
@@ -183,15 +186,15 @@ def splatted(clamp: float | None, cotangent: Tensor, splat: Splat, transmittance
 
     Args:
         clamp: upper bound of a contribution; None: unbounded.
-        cotangent: ``(3, H W)`` of the picture, divided by the samples a pixel.
+        cotangent: ``(3, H W)`` of the picture, divided by the number of samples a pixel.
         splat: splats of n lanes.
         transmittance: ``(n,)`` of their shadow rays.
     """
     value = splat.light.radiance * transmittance
     with torch.no_grad():
-        counts = (splat.pixel >= 0) & (value.abs() < LARGEST).all(0)
-        own = torch.where(counts, take(cotangent, splat.pixel.clamp_min(0)), 0.0)
-    return value if clamp is None else value * clamp_scale(value, clamp), own
+        counted = (splat.pixel >= 0) & (value.abs() < LARGEST).all(0)  # the splats that the film adds
+        of_pixels = torch.where(counted, take(cotangent, splat.pixel.clamp_min(0)), 0.0)
+    return value if clamp is None else value * clamp_scale(value, clamp), of_pixels
 
 
 @dataclass(frozen=True)
@@ -228,23 +231,22 @@ def _with_leaves(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _InputLe
 
 def _vjp(pairs: list[tuple[Tensor, Tensor]], input_leaves: _InputLeaves, extra_leaves: LeafSource) -> InputCotangents:
     """Differentiate (output, cotangent) pairs with respect to the inputs of a vertex and the extra leaves."""
-    pairs = [(y, g) for y, g in pairs if y.requires_grad]
-    own, rest = leaves(input_leaves), list(extra_leaves())
-    grads: Sequence[Any] = [None] * (len(own) + len(rest))
+    pairs = [(output, cotangent) for output, cotangent in pairs if output.requires_grad]
+    inputs, extra_inputs = leaves(input_leaves), list(extra_leaves())
+    grads: Sequence[Any] = [None] * (len(inputs) + len(extra_inputs))
     if pairs:
-        outputs, wanted = [y for y, _ in pairs], [g for _, g in pairs]
-        grads = torch.autograd.grad(outputs, [*own, *rest], wanted, allow_unused=True)
-    found = {id(leaf): gradient for leaf, gradient in zip(own, grads, strict=False)}
+        outputs, cotangents = [output for output, _ in pairs], [cotangent for _, cotangent in pairs]
+        grads = torch.autograd.grad(outputs, [*inputs, *extra_inputs], cotangents, allow_unused=True)
+    gradients = {id(leaf): gradient for leaf, gradient in zip(inputs, grads, strict=False)}
 
-    def of(leaf: Tensor | None) -> Tensor | None:
-        return None if leaf is None else found[id(leaf)]
+    def gradient_of(leaf: Tensor | None) -> Tensor | None:
+        return None if leaf is None else gradients[id(leaf)]
 
-    extra = {name: of(leaf) for name, leaf in input_leaves.extra.items()}
     return InputCotangents(
-        of(input_leaves.throughput),
-        of(input_leaves.o),
-        of(input_leaves.d),
-        of(input_leaves.chance),
-        tuple(grads[len(own) :]),
-        extra,
+        throughput=gradient_of(input_leaves.throughput),
+        o=gradient_of(input_leaves.o),
+        d=gradient_of(input_leaves.d),
+        chance=gradient_of(input_leaves.chance),
+        extra_leaves=tuple(grads[len(inputs) :]),
+        extra={name: gradient_of(leaf) for name, leaf in input_leaves.extra.items()},
     )

@@ -1,5 +1,7 @@
 """Record the events along paths, to print a path or to find the cause of a sample that is not finite.
 
+Both are observers of the walk over vertices (:mod:`torchpt.paths.walk`), of a few lanes that are traced by tensor operations.
+
 A sample that is not finite is traced again. At each vertex the contributions of emission and light sampling, the throughput and
 the next ray are checked; where one of them is not finite, the first of its factors that is not finite names the cause.
 """
@@ -58,12 +60,12 @@ class ReadablePopulation(Population, Protocol):
 
     @property
     def outputs(self) -> Sequence[tuple[int, Tensor, VertexOutput]]:
-        """Return index of the BSDF model, lanes of the wave and stage outputs, all of the vertex before."""
+        """Return, for each BSDF model that the vertex before was on: index of the model, lanes in the wave, stage outputs."""
         ...
 
     @property
     def transmittance(self) -> Sequence[Tensor]:
-        """Return the transmittance of the shadow rays of the vertex before, model by model."""
+        """Return the transmittance ``(n,)`` of the shadow rays of the vertex before: of each output that has some, in order."""
         ...
 
 
@@ -104,7 +106,7 @@ class EmitterHit:
     Attributes:
         depth: number of the vertex.
         lanes: ``(n,)``.
-        slot: ``(n,)`` of the emitter, see :class:`~torchpt.physics.shapes.geometry.Interaction`; None: the environment.
+        slot: ``(n,)`` index of the emitter among all primitives, then instances; None: the environment.
         light: the emission and its MIS weight.
     """
 
@@ -161,24 +163,24 @@ class Explainer(Observer[ReadablePopulation]):
         self.record(CameraRay(state.lane, state))
 
     def on_hits(self, paths: ReadablePopulation) -> bool:
-        """See :class:`Observer`."""
+        """Record the hits; return False, so that the walk goes on."""
         state = paths.state
         self.record(Intersection(paths.depth, state.lane, replace(state, radiance=state.radiance.clone()), paths.hits))
         return False
 
     def on_emission(self, paths: ReadablePopulation) -> None:
-        """See :class:`Observer`."""
+        """Record the emission that was added, of emitters or of the environment."""
         for index, light in paths.emissions:
             prim = take(paths.hits.prim, index)
             slot = None if bool((prim < 0).any()) else self.world.geometry.slot(prim)
             self.record(EmitterHit(paths.depth, take(paths.state.lane, index), slot, light))
 
     def on_scattered(self, paths: ReadablePopulation) -> None:
-        """See :class:`Observer`."""
-        transmittance = iter(paths.transmittance)
+        """Record light and BSDF samples of the vertex that the paths leave; ``paths`` are at the next one already."""
+        transmittances = iter(paths.transmittance)
         for model, lanes, output in paths.outputs:
-            arrived = None if output.shadow is None else next(transmittance)
-            self.record(Scattering(paths.depth - 1, lanes, model, output, arrived))
+            transmittance = None if output.shadow is None else next(transmittances)
+            self.record(Scattering(paths.depth - 1, lanes, model, output, transmittance))
 
 
 #: Names of causes, and their descriptions.
@@ -207,7 +209,7 @@ class NonFiniteCause:
         cause: a key of :data:`CAUSES`.
         nan: True: the first value that was not finite was NaN. False: infinite.
         depth: number of the vertex, from 1; 0: at the camera, or after the path.
-        slot: of the surface there, see :class:`~torchpt.physics.shapes.geometry.Interaction`; -1: no surface.
+        slot: index of the surface there among all primitives, then instances; -1: no surface.
     """
 
     cause: str
@@ -221,36 +223,39 @@ class NonFiniteCause:
         return self.cause if self.cause == "not repeated" else f"{'nan' if self.nan else 'infinite'} {self.cause}"
 
 
-def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[SampleId]) -> list[NonFiniteCause]:
+def causes_of_samples(trace: Trace, wave: Wave, samples: Sequence[SampleId]) -> list[NonFiniteCause]:
     """Return the cause of each sample that is not finite, by tracing it again with tensor operations.
 
     Args:
         trace: traces camera rays with tensor operations.
         wave: of the render.
-        places: the samples.
+        samples: the samples, in any order.
     """
     found: dict[SampleId, NonFiniteCause] = {}
-    for streams in sorted({(place.first_randomization, place.randomizations) for place in places}):
-        own = [place for place in places if (place.first_randomization, place.randomizations) == streams]
-        found |= zip(own, _find_causes(trace, wave, own, Randomizations(*streams)), strict=True)
-    return [found[place] for place in places]
+    # Samples of the picture and of error probes have other randomizations: each group is traced as one wave.
+    for first, count in sorted({(sample.first_randomization, sample.randomizations) for sample in samples}):
+        group = [sample for sample in samples if (sample.first_randomization, sample.randomizations) == (first, count)]
+        found |= zip(group, _find_causes(trace, wave, group, Randomizations(first, count)), strict=True)
+    return [found[sample] for sample in samples]
 
 
 @torch.no_grad()
-def _find_causes(trace: Trace, wave: Wave, places: Sequence[SampleId], streams: Randomizations) -> list[NonFiniteCause]:
+def _find_causes(
+    trace: Trace, wave: Wave, samples: Sequence[SampleId], randomizations: Randomizations
+) -> list[NonFiniteCause]:
     """Return the causes for samples that belong to the same randomizations."""
-    finder = _CauseFinder(wave.context.world, len(places))
-    x, y, sample = (
-        torch.tensor([getattr(place, name) for place in places], device=wave.centre.device)
+    finder = _CauseFinder(wave.context.world, len(samples))
+    x, y, index = (
+        torch.tensor([getattr(sample, name) for sample in samples], device=wave.centre.device)
         for name in ("x", "y", "sample")
     )
-    state = wave.rays_of(x, y, sample, streams)
+    state = wave.rays_of(x, y, index, randomizations)
     finder.on_start(state)
     radiance = trace(wave, state, finder)
-    if not finder.full:  # a walk that was ended early returns no radiance
-        finder.check("sum", radiance, torch.arange(len(places), device=x.device), 0, None)
-    rest = NonFiniteCause("not repeated", False, 0)
-    return [cause or rest for cause in finder.causes]
+    if not finder.found_all:  # a walk that was ended early returns no radiance
+        finder.check("sum", radiance, torch.arange(len(samples), device=x.device), depth=0, slot=None)
+    not_repeated = NonFiniteCause("not repeated", nan=False, depth=0)
+    return [cause or not_repeated for cause in finder.causes]
 
 
 class _CauseFinder(Explainer):
@@ -269,14 +274,14 @@ class _CauseFinder(Explainer):
         self.causes: list[NonFiniteCause | None] = [None] * lanes
 
     @property
-    def full(self) -> bool:
+    def found_all(self) -> bool:
         """Return True once the cause of every lane is known."""
         return None not in self.causes
 
     def on_hits(self, paths: ReadablePopulation) -> bool:
-        """See :class:`Explainer`. End the walk once all causes are known: a path with NaN might go on for ever."""
+        """Check the hits; return True once all causes are known, as a path with NaN might go on for ever."""
         super().on_hits(paths)
-        return self.full
+        return self.found_all
 
     def record(self, event: Event) -> None:
         """Check an event for values that are not finite."""
@@ -292,14 +297,17 @@ class _CauseFinder(Explainer):
             self.check(cause, value, event.lanes, depth, slot)
 
     def check(self, cause: str, value: Tensor, lanes: Tensor, depth: int, slot: Tensor | None) -> None:
-        """Record ``cause`` for the lanes ``(n,)`` where ``value (C, n)`` or ``(n,)`` is the first that is not finite."""
+        """Record ``cause`` for the lanes ``(n,)`` where ``value (C, n)`` or ``(n,)`` is the first that is not finite.
+
+        ``slot (n,)``: index of the surface there; None: no surface.
+        """
         value = value if value.dim() == 2 else value[None]
         bad = ~torch.isfinite(value).all(0)
-        for n in bad.nonzero().squeeze(1).tolist():  # of KEPT lanes at most
-            lane = int(lanes[n])
+        for i in bad.nonzero().squeeze(1).tolist():  # of nonfinite.KEPT lanes at most
+            lane = int(lanes[i])
             if self.causes[lane] is None:
-                nan = bool(torch.isnan(value[:, n]).any())
-                self.causes[lane] = NonFiniteCause(cause, nan, depth, -1 if slot is None else int(slot[n]))
+                nan = bool(torch.isnan(value[:, i]).any())
+                self.causes[lane] = NonFiniteCause(cause, nan, depth, -1 if slot is None else int(slot[i]))
 
 
 def _checks(event: Event, world: World) -> Iterator[tuple[str, Tensor]]:
@@ -318,35 +326,38 @@ def _checks(event: Event, world: World) -> Iterator[tuple[str, Tensor]]:
 def _of_vertex(event: Scattering, world: World) -> Iterator[tuple[str, Tensor]]:
     """Yield causes and values of a vertex at which paths scatter."""
     output = event.output
-    after, surface, at, direct, drawn = output.leaving, output.surface, output.at, output.direct, output.drawn
-    goes_on = after.t_max > 0
-    ray = torch.where(goes_on, torch.cat((after.o, after.d)), 0.0)
-    brought = torch.zeros_like(after.throughput) if output.shadow is None else output.shadow.radiance
-    own = torch.zeros_like(brought) if drawn is not None else after.radiance
-    # A factor may be infinite where the product is finite, such as the pdf of a delta lobe.
-    spoiled = ~torch.isfinite(torch.cat((brought, own, after.throughput, ray))).all(0)
+    leaving, surface, at, direct, drawn = output.leaving, output.surface, output.at, output.direct, output.drawn
+    goes_on = leaving.t_max > 0
+    ray = torch.where(goes_on, torch.cat((leaving.o, leaving.d)), 0.0)
+    light = torch.zeros_like(leaving.throughput) if output.shadow is None else output.shadow.radiance
+    # Without a BSDF sample the integrator stops here, and its stage added the shading of the first surface to the radiance.
+    preview = torch.zeros_like(light) if drawn is not None else leaving.radiance
+    # Factors are checked only in lanes with a product that is not finite: some factors are infinite where the product is
+    # finite, such as the pdf of a delta lobe.
+    spoiled = ~torch.isfinite(torch.cat((light, preview, leaving.throughput, ray))).all(0)
 
-    def of(cause: str, value: Tensor) -> tuple[str, Tensor]:
+    def where_spoiled(cause: str, value: Tensor) -> tuple[str, Tensor]:
         return cause, torch.where(spoiled, value, 0.0)
 
-    read = "texture" if world.materials.textures[event.model] is not None else "material"
-    yield of("surface", torch.cat((at.p, at.ng, at.ns)))
+    source = "texture" if world.materials.textures[event.model] is not None else "material"
+    yield where_spoiled("surface", torch.cat((at.p, at.ng, at.ns)))
     if surface is not None:
         for value in leaves(surface.parameters):
-            if value.dim() and value.shape[-1] == len(spoiled):
-                yield of(read, value.reshape(-1, len(spoiled)))
-        yield of("surface" if surface.perturbed_normal is None else "texture", torch.cat((surface.frame.n, surface.wo)))
+            if value.dim() and value.shape[-1] == len(spoiled):  # others are tables, not values by lane
+                yield where_spoiled(source, value.reshape(-1, len(spoiled)))
+        cause = "surface" if surface.perturbed_normal is None else "texture"
+        yield where_spoiled(cause, torch.cat((surface.frame.n, surface.wo)))
     if direct is not None:
-        unlit = torch.isfinite(brought).all(0)
+        finite = torch.isfinite(light).all(0)
         factors = [("light", direct.radiance), ("light", direct.sample.weight), ("bsdf", direct.reflected)]
         if direct.weight is not None:
             factors.append(("bsdf", direct.weight))
         for cause, value in factors:
-            yield of(cause, torch.where(unlit, 0.0, value))
-    yield of("light", brought)
+            yield where_spoiled(cause, torch.where(finite, 0.0, value))
+    yield where_spoiled("light", light)
     if drawn is None:
-        yield of("preview", own)
+        yield where_spoiled("preview", preview)
         return
-    yield of("bsdf", torch.where(torch.isfinite(after.throughput).all(0), 0.0, drawn.weight))
-    yield of("throughput", after.throughput)
-    yield of("ray", ray)
+    yield where_spoiled("bsdf", torch.where(torch.isfinite(leaving.throughput).all(0), 0.0, drawn.weight))
+    yield where_spoiled("throughput", leaving.throughput)
+    yield where_spoiled("ray", ray)

@@ -1,6 +1,8 @@
 """Layers (AOVs): pictures of quantities other than radiance, and their values at first surfaces.
 
-A layer is a class of this file with a name; :data:`LAYERS` finds it. To add a layer, add a class.
+A layer is a class of this file with a name; :data:`LAYERS` finds it. To add a layer, add a class. Engines evaluate the layers
+of first surfaces by :func:`values`, for n lanes that hit one BSDF model; :mod:`torchpt.rendering.picture` calls
+:meth:`FilmLayer.of` for the others once the film is complete. A film adds samples up and divides by their number.
 """
 
 from __future__ import annotations
@@ -33,10 +35,11 @@ class Seen:
         world: the scene's tensors.
         model: index of the BSDF model.
         d: directions ``(3, n)`` of the camera rays.
-        hit: their hits; ``t`` is the distance.
-        at: the surface points.
+        hit: their hits; ``t`` is the distance, as ``d`` is unit.
+        at: the surface points: positions, normals, and ``slot (n,)``, the index of the primitive or instance.
         point: texture coordinates of the points; None where the model has no textures.
-        centre: ``(3,)`` float64 to add to the lanes' coordinates for those of the scene.
+        centre: ``(3,)`` float64, the origin of the lanes' coordinates in the scene: adding it gives coordinates of the scene,
+            but in the world's unit.
         dtype: of the lanes.
     """
 
@@ -69,7 +72,7 @@ class SurfaceLayer(Layer):
 
     Attributes:
         averaged: True: a pixel is the mean of its samples. False: its first sample, for identifiers, which have no mean.
-        length: True: a length or position, converted to scene units.
+        length: True: a length or position: ``values`` are in the world's unit, and the picture is converted to scene units.
         uv: True: needs texture coordinates, even in a scene without textures.
     """
 
@@ -79,7 +82,10 @@ class SurfaceLayer(Layer):
 
     @classmethod
     def values(cls, seen: Seen) -> Tensor:
-        """Return the values ``(C, n)`` at first surfaces. A pure function of tensors: kernels are traced from it."""
+        """Return the values ``(C, n)`` at first surfaces, one row a channel.
+
+        A pure function of tensors: kernels are traced from it.
+        """
         raise NotImplementedError
 
 
@@ -92,7 +98,8 @@ class FilmLayer(Layer):
 
         Args:
             film: sums of radiance.
-            counts: number of samples of each pixel ``(pixels,)``; for error probes, of both estimates.
+            counts: number of samples of each pixel ``(pixels,)``; of an error probe, which is sampled twice, those of both
+                times.
         """
         raise NotImplementedError
 
@@ -108,7 +115,7 @@ class Albedo(SurfaceLayer):
 
     @classmethod
     def values(cls, seen: Seen) -> Tensor:
-        """See :class:`SurfaceLayer`."""
+        """Return the reflectances ``(3, n)``."""
         materials = seen.world.materials
         parameters = parameters_at(seen.world, seen.model, take(materials.row, seen.at.slot), seen.at, seen.point)
         return materials.models[seen.model].albedo(parameters)
@@ -122,7 +129,7 @@ class Normal(SurfaceLayer):
 
     @classmethod
     def values(cls, seen: Seen) -> Tensor:
-        """See :class:`SurfaceLayer`."""
+        """Return the normals ``(3, n)``, unit."""
         return shading_normal(seen.world, seen.model, seen.d, seen.at, seen.point)
 
 
@@ -135,7 +142,7 @@ class Depth(SurfaceLayer):
 
     @classmethod
     def values(cls, seen: Seen) -> Tensor:
-        """See :class:`SurfaceLayer`."""
+        """Return the distances ``(1, n)``."""
         return seen.hit.t[None]
 
 
@@ -148,7 +155,7 @@ class Position(SurfaceLayer):
 
     @classmethod
     def values(cls, seen: Seen) -> Tensor:
-        """See :class:`SurfaceLayer`."""
+        """Return the points ``(3, n)``."""
         return seen.at.p + seen.centre.to(seen.dtype)[:, None]
 
 
@@ -161,7 +168,7 @@ class Uv(SurfaceLayer):
 
     @classmethod
     def values(cls, seen: Seen) -> Tensor:
-        """See :class:`SurfaceLayer`."""
+        """Return the texture coordinates ``(2, n)``."""
         return surface_uv(seen.world, seen.at)
 
 
@@ -174,19 +181,22 @@ class ObjectId(SurfaceLayer):
 
     @classmethod
     def values(cls, seen: Seen) -> Tensor:
-        """See :class:`SurfaceLayer`."""
+        """Return the indices ``(1, n)``, as floats."""
         return take(seen.world.geometry.object_id, seen.at.slot).to(seen.dtype)[None]
 
 
 class Alpha(SurfaceLayer):
-    """The fraction of the pixel that surfaces cover, opacity included: the alpha channel of the picture."""
+    """The fraction of the pixel that surfaces cover, opacity included: the alpha channel of the picture.
+
+    Its value is 1 at any surface that a camera ray stops at; rays that hit nothing count as 0 in the mean.
+    """
 
     name = "alpha"
     channels = ("A",)
 
     @classmethod
     def values(cls, seen: Seen) -> Tensor:
-        """See :class:`SurfaceLayer`."""
+        """Return ones ``(1, n)``."""
         return torch.ones_like(seen.hit.t)[None]
 
 
@@ -199,7 +209,7 @@ class Variance(FilmLayer):
 
     @classmethod
     def of(cls, film: Film, counts: Tensor) -> Tensor:
-        """See :class:`FilmLayer`."""
+        """Return the variances ``(H, W, 3)``."""
         variance = film.variance()
         return torch.full_like(film.mean(), torch.inf) if variance is None else variance
 
@@ -213,11 +223,11 @@ class Samples(FilmLayer):
 
     @classmethod
     def of(cls, film: Film, counts: Tensor) -> Tensor:
-        """See :class:`FilmLayer`."""
+        """Return the numbers of samples ``(H, W, 1)``."""
         return counts.double().reshape(film.height, film.width, 1)
 
 
-#: All layers of this file by name.
+#: All layers of this file by name: the classes above that have one, which the base classes do not.
 LAYERS: dict[str, type[Layer]] = {
     kind.name: kind
     for kind in tuple(vars().values())
@@ -238,17 +248,25 @@ def surface_layer(name: str) -> type[SurfaceLayer]:
 def values(
     names: tuple[str, ...], context: StageContext, model: int, o: Tensor, d: Tensor, hit: Hit, centre: Tensor
 ) -> dict[str, Tensor]:
-    """Return the layers ``names``, each ``(C, n)``, where rays ``o, d`` hit surfaces of BSDF model ``model``.
+    """Return the values of layers at first surfaces, each ``(C, n)``, by name.
 
-    ``centre``: see :class:`torchpt.paths.wave.Wave`.
+    Args:
+        names: names of layers of the first surface.
+        context: inputs of stages that are the same for all lanes.
+        model: index of the BSDF model that all rays hit.
+        o: ray origins ``(3, n)``.
+        d: unit ray directions ``(3, n)``.
+        hit: hits of the rays.
+        centre: ``(3,)`` float64 origin of the lanes' coordinates, as in :class:`torchpt.paths.wave.Wave`.
     """
     world = context.world
     at = interact(world, o, d, hit, context.follow_ray)
-    if context.follow_ray:
+    if context.follow_ray:  # the distance follows the point, which was intersected anew
         hit = replace(hit, t=dot(at.p - o, d))
     point = texture_point_at(world, model, at, context.pixel)
     seen = Seen(world, model, d, hit, at, point, centre, context.plan.dtype)
     found = {name: surface_layer(name).values(seen) for name in names}
+    # `chance` is 1, with the derivative of the probability that the ray passed the surfaces before.
     return found if hit.chance is None else {name: value * hit.chance for name, value in found.items()}
 
 

@@ -1,12 +1,13 @@
 """Samples that are NaN or infinite: their number, and the identity of the first ones. They count as black.
 
 A path is a function of its pixel, sample and randomization, so the identity is enough to trace it again and find the cause
-(:mod:`torchpt.paths.explain`).
+(:mod:`torchpt.paths.explain`). Engines count them chunk by chunk, and a render adds the counts up
+(:mod:`torchpt.rendering.run`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import Any
 
 import torch
@@ -17,7 +18,8 @@ from torchpt.physics.samplers import Randomizations
 
 __all__ = ["KEPT", "NonFinite", "SampleId"]
 
-#: How many of the samples are recorded, and traced again: the first of the picture, independent of threads.
+#: How many of the samples are recorded, and traced again: the first by :attr:`SampleId.sort_key`, independent of threads.
+#: Enough to name the causes, few enough that tracing them again takes no time.
 KEPT = 64
 
 
@@ -30,7 +32,7 @@ class SampleId:
         y, x: row and column of the pixel on the whole film.
         first_randomization, randomizations: index of the first of the randomizations that share the pixel's samples, and their
             number: the fields of :class:`torchpt.physics.samplers.Randomizations`.
-        nan: True: it was NaN. False: infinite.
+        nan: True: some channel was NaN. False: infinite.
     """
 
     sample: int
@@ -73,12 +75,11 @@ class NonFinite:
         if other.count:
             self.nan += other.nan
             self.infinite += other.infinite
-            self.samples = sorted([*self.samples, *other.samples], key=lambda place: place.sort_key)[:KEPT]
+            self.samples = sorted([*self.samples, *other.samples], key=lambda sample: sample.sort_key)[:KEPT]
 
     def plain(self) -> dict[str, Any]:
-        """Return a dict of plain values, for a checkpoint."""
-        places = [[p.sample, p.y, p.x, p.first_randomization, p.randomizations, p.nan] for p in self.samples]
-        return {"nan": self.nan, "infinite": self.infinite, "places": places}
+        """Return a dict of plain values, for a checkpoint: ``places`` has the fields of each sample as a list."""
+        return {"nan": self.nan, "infinite": self.infinite, "places": [list(astuple(id_)) for id_ in self.samples]}
 
     @staticmethod
     def read(facts: dict[str, Any]) -> NonFinite:
@@ -89,12 +90,15 @@ class NonFinite:
         """
         try:
             counts, places = [facts["nan"], facts["infinite"]], facts["places"]
-            whole = all(type(n) is int and 0 <= n < 2**62 for row in (counts, *(p[:5] for p in places)) for n in row)
-            if not whole or len(places) > KEPT or any(len(p) != 6 or type(p[5]) is not bool for p in places):
+            # Each place is five numbers and the flag `nan`.
+            numbers = [counts, *(place[:-1] for place in places)]
+            whole = all(type(n) is int and 0 <= n < 2**62 for row in numbers for n in row)
+            formed = all(len(place) == 6 and type(place[-1]) is bool for place in places)
+            if not whole or not formed or len(places) > KEPT:
                 raise ValueError("lost samples")
-        except (KeyError, TypeError):
+        except (KeyError, TypeError, IndexError):
             raise ValueError("lost samples") from None
-        return NonFinite(facts["nan"], facts["infinite"], [SampleId(*place) for place in facts["places"]])
+        return NonFinite(facts["nan"], facts["infinite"], [SampleId(*place) for place in places])
 
     @staticmethod
     def of(
@@ -107,21 +111,30 @@ class NonFinite:
         """Return the counts of a chunk. It reads every value: call it only where some sample is not finite.
 
         Args:
-            radiance: ``(3, samples, pixels)``.
+            radiance: ``(3, samples, pixels)`` of the chunk's samples.
             first_pixel: index of the first pixel in the pixel set.
             first_sample: index of the first sample of each pixel.
             crop: ``(x, y, width, height)`` of the picture on the film.
-            pixel_set: None: all pixels of the picture, with one randomization.
+            pixel_set: the pixels that ``first_pixel`` counts; None: all pixels of the picture, with one randomization.
         """
         bad = ~torch.isfinite(radiance).all(0)
         nan = torch.isnan(radiance).any(0)
         count, nans = int(bad.sum()), int(nan.sum())
-        streams = Randomizations() if pixel_set is None else pixel_set.randomizations
-        places = []
-        for s, p in bad.nonzero()[:KEPT].tolist():
+        randomizations = Randomizations() if pixel_set is None else pixel_set.randomizations
+        x0, y0, width, _ = crop
+        samples = []
+        for s, p in bad.nonzero()[:KEPT].tolist():  # rows are samples, so these are the first by their sort key
             pixel = first_pixel + p
             pixel = pixel if pixel_set is None or pixel_set.indices is None else int(pixel_set.indices[pixel])
-            y, x = divmod(pixel, crop[2])
-            of_nan = bool(nan[s, p])
-            places.append(SampleId(first_sample + s, y + crop[1], x + crop[0], streams.first, streams.count, of_nan))
-        return NonFinite(nans, count - nans, places)
+            y, x = divmod(pixel, width)
+            samples.append(
+                SampleId(
+                    sample=first_sample + s,
+                    y=y + y0,
+                    x=x + x0,
+                    first_randomization=randomizations.first,
+                    randomizations=randomizations.count,
+                    nan=bool(nan[s, p]),
+                )
+            )
+        return NonFinite(nans, count - nans, samples)

@@ -1,4 +1,8 @@
-"""Normal and bump maps: the perturbed shading frame, and the shadowing of the relief that a map stands for."""
+"""Normal and bump maps: the perturbed shading frame, and the shadowing of the relief that a map stands for.
+
+Called where a surface point's material is resolved (:mod:`torchpt.paths.surface`); the shadowing multiplies light samples and
+BSDF samples there (:mod:`torchpt.paths.vertex`).
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,11 @@ from torchpt.physics.shapes.geometry import Interaction
 from torchpt.physics.textures import MaterialTextures
 
 __all__ = ["PerturbedNormal", "perturb_normal"]
+
+#: Lower bound of squared cosines that are divided by.
+_LEAST_SQUARE = 1e-12
+#: Lower bound of the z component of a map's normals, which must point out of the surface.
+_LEAST_Z = 1e-3
 
 
 @dataclass(frozen=True)
@@ -27,7 +36,9 @@ class PerturbedNormal:
         Smith's masking function in place of the hard edge between the horizons of the two normals (Conty Estevez, Lecocq,
         Stein, *A Microfacet-Based Shadowing Function to Solve the Bump Terminator Problem*, Ray Tracing Gems, 2019).
         """
-        square = dot(w, self.normal).square().clamp_min(1e-12)
+        square = (
+            dot(w, self.normal).square().clamp_min(_LEAST_SQUARE)
+        )  # cos^2 of the angle to the normal; 1 / it - 1 is tan^2
         return 2.0 / (1.0 + (1.0 + self.alpha2 * (1.0 - square).clamp_min(0.0) / square).sqrt())
 
 
@@ -42,7 +53,8 @@ def perturb_normal(
 ) -> tuple[Frame, PerturbedNormal]:
     """Return the shading frame about the normal of a normal or bump map, and the unperturbed normal.
 
-    The vectors of a normal map are relative to the tangent along u, its cross product with the shading normal, and that normal.
+    The vectors of a normal map are relative to the tangent along texture coordinate u, the cross product of the shading normal
+    with this tangent, and the shading normal.
     The heights of a bump map displace the surface along its normal (Blinn, *Simulation of Wrinkled Surfaces*, 1978). The back
     of a surface shows the mirror image. A perturbed normal that faces away from the viewer is mirrored about the unperturbed
     one (after Schuessler, Heitz, Hanika, Dachsbacher, *Microfacet-based Normal Mapping*, 2017). All as Mitsuba's ``normalmap``
@@ -51,17 +63,17 @@ def perturb_normal(
     Args:
         textures: textures of the model.
         row: ``(N,)`` rows of the materials in the tables of that model.
-        local: ``(3, N)`` values of the normal map; None for a bump map.
+        local: ``(3, N)`` colours of the normal map, 0 to 1; None for a bump map.
         slope: derivatives of the bump map's height with respect to u and v, ``(N,)`` each; None for a normal map.
         d: ``(3, N)`` directions of the incoming rays.
         at: the surface points.
         side: ``(N,)`` -1 where the shading normal is flipped toward the viewer, else 1; None where the model transmits.
     """
     assert at.tangent is not None
-    base = Frame.along(at.ns, at.tangent)
+    base = Frame.along(at.ns, at.tangent)  # s along the tangent, t across, n the shading normal
     if local is not None:
         local = local * 2.0 - 1.0  # colours 0 to 1 to components -1 to 1
-        x, y, z = local[0], local[1], local[2].clamp_min(1e-3)  # above the surface
+        x, y, z = local[0], local[1], local[2].clamp_min(_LEAST_Z)
         if textures.strength is not None:
             strength = take(textures.strength, row)
             x, y = x * strength, y * strength
@@ -71,7 +83,7 @@ def perturb_normal(
         # Derivatives of the displaced surface by u and v; their cross product is its normal.
         along = torch.addcmul(at.tangent, at.ns, du - dot(at.ns, at.tangent))
         across = torch.addcmul(at.bitangent, at.ns, dv - dot(at.ns, at.bitangent))
-        x, y, z = base.to_local(cross(along, across))
+        x, y, z = base.to_local(cross(along, across))  # not unit yet
         # A mirrored chart of texture coordinates gives the normal of the other side.
         sign = torch.copysign(torch.ones_like(z), z.detach())
         x, y, z = x * sign, y * sign, z * sign
@@ -81,7 +93,7 @@ def perturb_normal(
     normal = torch.where(away, normalize(affine(base.s * -x, base.t, -y, n, z)), normal)
     flat = dot(normal, normal) == 0  # no texture coordinates, so no slope
     normal = torch.where(flat, n, normal)
-    square = dot(normal, n).square().clamp_min(1e-12)
+    square = dot(normal, n).square().clamp_min(_LEAST_SQUARE)
     # alpha^2 of the tilt, tan^2 / 8, as in the paper at `shadowing`.
     alpha2 = (0.125 * (1.0 - square).clamp_min(0.0) / square).clamp_max(1.0)
     return Frame.along(normal, at.tangent), PerturbedNormal(n, alpha2)

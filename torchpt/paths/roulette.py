@@ -13,11 +13,13 @@ __all__ = ["DEEP", "DEEP_CAP", "LEAST", "russian_roulette", "survival_probabilit
 #: throughput. For shorter paths a cap below 1 only adds noise: each vertex of a path that loses nothing multiplies its variance
 #: by 1 / cap.
 DEEP = 1000
-#: Bound of the survival probability beyond ``DEEP`` vertices. A path that loses the share ``a`` of its light at each vertex has
-#: finite variance if the cap is above ``(1 - a)^2``; one that loses nothing ends after another thousand vertices on average.
+#: Bound of the survival probability beyond ``DEEP`` vertices. A path that loses the fraction ``a`` of its light at each vertex
+#: has finite variance if the cap is above ``(1 - a)^2``; one that loses nothing ends after another 1 / (1 - 0.999) = 1000
+#: vertices on average.
 DEEP_CAP = 0.999
 #: Lower bound of the survival probability under differentiation. A small throughput does not mean a small derivative: with
-#: respect to a reflectance of 0 the derivative is the throughput that a reflectance of 1 would give.
+#: respect to a reflectance of 0 the derivative is the throughput that a reflectance of 1 would give. A quarter bounds the
+#: factor by which roulette scales such a derivative by 4.
 LEAST = 0.25
 
 
@@ -25,7 +27,7 @@ def russian_roulette(chance: Tensor, draws: Draws, alive: Tensor, throughput: Te
     """Play roulette; return the mask of paths that are alive ``(N,)`` and their throughput ``(3, N)``.
 
     Args:
-        chance: survival probability ``(N,)``, see :func:`survival_probability`.
+        chance: survival probability ``(N,)``, from :func:`survival_probability`.
         draws: random numbers of the vertex.
         alive: ``(N,)`` bool before roulette.
         throughput: ``(3, N)`` before roulette.
@@ -35,19 +37,19 @@ def russian_roulette(chance: Tensor, draws: Draws, alive: Tensor, throughput: Te
 
 
 def survival_probability(
-    chance: float | None, cap: float, brightest: Tensor, eta: Tensor | None, tape: bool = False
+    rr_prob: float | None, cap: float, brightest: Tensor, eta: Tensor | None, tape: bool = False
 ) -> Tensor:
     """Return the survival probability of paths ``(N,)``.
 
     Args:
-        chance: a constant probability; None: ``min(cap, throughput * eta^2)``.
-        cap: upper bound.
+        rr_prob: the integrator's constant probability; None: ``min(cap, brightest * eta^2)``.
+        cap: upper bound: 1, or :data:`DEEP_CAP` for deep paths.
         brightest: largest component of the throughput ``(N,)``.
         eta: index of refraction at the path's end over that at the camera ``(N,)``; None where nothing refracts.
         tape: True under differentiation: the probability is then at least :data:`LEAST`.
     """
-    if chance is not None:
-        return torch.full_like(brightest, chance)
+    if rr_prob is not None:
+        return torch.full_like(brightest, rr_prob)
     # Refraction scales radiance by 1 / eta^2, which the path gets back when it leaves the glass.
     expected = brightest if eta is None else brightest * eta * eta
     expected = expected.clamp_max(float(cap))

@@ -1,7 +1,11 @@
 """Records of paths: their state, and the inputs and outputs of stages.
 
-A stage is a pure function of a :class:`StageContext` and a :class:`VertexInput`. The stage of a surface returns a
-:class:`VertexOutput` with all intermediate values that an observer may read; compiled stages drop those that nobody reads.
+A stage is a pure function of a :class:`StageContext` and a :class:`VertexInput` that does one step of a vertex
+(:mod:`torchpt.paths.vertex`). The stage of a surface returns a :class:`VertexOutput` with all intermediate values that an
+observer may read; compiled stages drop those that nobody reads.
+
+Each path has a lane, an index of the last axis. N is the number of paths of a wave, n the number of those that one stage runs
+for, such as the paths that hit one BSDF model. Lengths are in the world's unit, directions in world coordinates.
 """
 
 from __future__ import annotations
@@ -19,8 +23,6 @@ from torchpt.physics.shapes.geometry import Hit, Interaction
 from torchpt.physics.world import World
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from torchpt.paths.surface import Surface
     from torchpt.physics.cameras import Camera
 
@@ -54,15 +56,15 @@ class PathState:
 
     o: Tensor  # (3, N) ray origin
     d: Tensor  # (3, N) ray direction, unit
-    t_max: Tensor  # (N,) the largest float; 0 once the path has ended
-    throughput: Tensor  # (3, N)
+    t_max: Tensor  # (N,) end of the ray: T_MAX, or inf at the camera; 0 once the path has ended
+    throughput: Tensor  # (3, N) product of BSDF weights so far, over the chances of roulette
     radiance: Tensor  # (3, N) gathered so far
     pdf: Tensor  # (N,) density with which d was sampled: inf where emission counts whole, 0 where it does not count
     lane: Tensor  # (N,) int64 index of the sample in the wave
-    key: Tensor  # (2, N) int32 key of the sampler
+    key: Tensor  # (rows, N) int32: tells the sampler which sample of which pixel the path is; rows depend on its kind
     eta: Tensor | None = None  # (N,) index of refraction here over that at the camera; None where nothing refracts
-    #: (3, N) the vertex that d leaves, and the normal that `lights.sample` was given there; None where the light sampler does
-    #: not depend on the point.
+    #: (3, N) the last vertex, which d leaves, and the normal that `lights.sample` was given there, 0 where light comes from
+    #: both sides; None where the light sampler does not depend on the point.
     p: Tensor | None = None
     n: Tensor | None = None
     #: The integrator's own fields by name, see :class:`torchpt.paths.state.Field`; `(N,)` or `(rows, N)` each.
@@ -73,8 +75,8 @@ class PathState:
 class Shadow:
     """Shadow rays, and the radiance that is added to a path where its shadow ray is not blocked."""
 
-    o: Tensor  # (3, N)
-    d: Tensor  # (3, N)
+    o: Tensor  # (3, N) origin, moved off the surface
+    d: Tensor  # (3, N) from the origin to the light, not unit; unit where the light is infinitely far away
     t_max: Tensor  # (N,) in units of |d|; 0 where the contribution is zero
     radiance: Tensor  # (3, N) contribution of the light sample
 
@@ -96,15 +98,15 @@ class Plan:
     strategy: str  # one of STRATEGIES
     rr_prob: float | None  # constant survival probability; None: by throughput
     dtype: torch.dtype  # of the lanes
-    tape: bool  # derivatives are wanted
-    attached: bool  # geometry is differentiated too
+    tape: bool  # the stages run on an autograd tape
+    attached: bool  # geometry is differentiated too: some parameter moves points
 
 
 # ---- The records of a path vertex: inputs and outputs of its stages
 
 
 def no_search(state: PathState) -> Hit:
-    """Raise an AssertionError: the default search of stages that must not search."""
+    """Raise an AssertionError: the default of :attr:`StageContext.search`, for stages that must not search."""
     raise AssertionError("hits are found between stages where no geometry is differentiated")
 
 
@@ -126,7 +128,8 @@ class Field:
         name: its key in ``state.extra``, where it is ``(N,)``, or ``(rows, N)`` for several rows.
         rows: how many numbers it has.
         start: its value where paths begin.
-        whole: True: a 32-bit integer (int64 to stages), without derivatives. False: of the lanes' dtype, differentiated.
+        whole: True: a 32-bit integer, which stages see as int64, without derivatives. False: of the lanes' dtype,
+            differentiated.
 
     Raises:
         ValueError: ``rows`` below 1, or a ``start`` with a fraction where the field is whole.
@@ -157,13 +160,15 @@ class StageContext:
     Attributes:
         plan: static configuration of the render.
         world: the scene's tensors.
-        pixel: ``(5,)`` pixel footprint, see :func:`torchpt.paths.surface.texture_point_at`; None: textures are not filtered.
-        salts: hashed random dimensions of this vertex, see :func:`torchpt.physics.samplers.salts`.
+        pixel: ``(5,)`` footprint of a pixel, as :meth:`torchpt.physics.cameras.base.Camera.pixel` returns it; None: textures
+            are not filtered.
+        salts: ``(len(Dimension),)`` int32, the hashed random dimensions of this vertex: with a path's key they give its random
+            numbers, see :func:`torchpt.physics.samplers.salts`.
         follow_ray: True: hit points are intersected anew along their rays, see :func:`torchpt.physics.shapes.interact`.
         roulette: upper bound of the survival probability; 0: no roulette at this vertex.
         search: returns the hits of rays that leave; called only where ``plan.attached``.
         camera: the camera of the picture; None for an integrator without splats.
-        crop: ``(x, y, width, height)`` of the picture on the camera's film; None likewise.
+        crop: ``(x, y, width, height)`` of the picture on the camera's film, in pixels; None for an integrator without splats.
     """
 
     plan: Plan
@@ -205,12 +210,13 @@ class Transmission:
     """Result of one step of rays through surfaces that are not opaque, or through media.
 
     Attributes:
-        on: ``(n,)`` bool, True where the ray goes on; the others stop at their hit.
+        on: ``(n,)`` bool, True where the ray passes and is searched again; the others stop at their hit.
         o: ``(3, n)`` new origins of rays that pass straight on; ``t`` is still counted from where such a ray began.
         scattered: ``(n,)`` bool, True where a medium scattered the ray; None: nowhere.
         state: the scattered rays, with new origins, directions, pdfs and fields; ``t_max`` 0 ends a path. Their throughput is
             not changed.
-        chance: ``(n,)`` ones that carry the derivative of the probability to stop or to pass; None: it has no derivative.
+        chance: ``(n,)`` factor of value 1 whose derivative is that of the probability of this outcome, over the probability;
+            None: it has no derivative.
     """
 
     on: Tensor
@@ -263,14 +269,14 @@ class DirectLight:
 class Drawn:
     """The next ray, sampled from the BSDF."""
 
-    o: Tensor  # (3, n) origin, detached
-    d: Tensor  # (3, n) direction in the world, detached until `attach`
+    o: Tensor  # (3, n) origin of the next ray, detached
+    d: Tensor  # (3, n) its direction in the world, detached until `torchpt.paths.vertex.attach`
     wi: Tensor  # (3, n) direction in the local frame; that of a delta lobe is differentiable
     pdf: Tensor  # (n,) detached; inf where the lobe is a delta
     weight: Tensor  # (3, n) = eval / pdf
-    least: Tensor  # (n,) positive where the sample is valid and the path may go on
+    least: Tensor  # (n,) least of all values that must be positive: positive where the sample is valid
     sharp: Tensor | None  # (n,) bool, True where the lobe is a delta; None: the model has no delta
-    eta: Tensor | None  # see BsdfSample
+    eta: Tensor | None  # (n,) index of refraction on the side of wi over that on the side of wo; None: nothing refracts
 
 
 @dataclass(frozen=True)
@@ -281,7 +287,7 @@ class Splat:
 
     Attributes:
         pixel: ``(n,)`` int64 index of the pixel in the picture, row by row; -1: no splat.
-        light: shadow rays with the radiance to add where they arrive; one with ``t_max`` 0 always arrives.
+        light: shadow rays with the radiance to add where they arrive; one with ``t_max`` 0 is not traced, and arrives.
     """
 
     pixel: Tensor
@@ -295,7 +301,7 @@ class VertexOutput:
     Attributes:
         leaving: the paths with their next rays; ``t_max`` is 0 where a path ended.
         next_hit: the hits of these rays, where geometry is differentiated; else None.
-        shadow: shadow rays with contributions still to be added; None where no light is sampled.
+        shadow: shadow rays, which the engine traces to add their contributions; None where no light is sampled.
         at: the surface points.
         splat: radiance for other pixels; None: none. Only integrators that declare ``splats`` return it.
         surface: the points with their materials; None where the stage did not resolve them.

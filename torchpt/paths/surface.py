@@ -1,4 +1,9 @@
-"""Surface points with their materials resolved: textures, shading normals, bump maps, opacity, texture footprints."""
+"""Surface points with their materials resolved: textures, shading normals, bump maps, opacity, texture footprints.
+
+Stages call :func:`surface_at` for n lanes that all hit one BSDF model, ``number`` in ``world.materials.models``. A primitive or
+instance, ``at.slot (n,)``, has a material; ``row (n,)`` is this material's row in the parameter tables of the model. A texture
+in use is a *node*, a row of one of ``world.textures.tables``; -1 stands for no texture.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +33,7 @@ __all__ = [
 ]
 
 
-#: Lower bound of the cosine by which a footprint grows at grazing angles.
+#: Lower bound of the cosine by which a footprint grows at grazing angles: it grows to a thousand times its area.
 _SLANT = 1e-3
 
 
@@ -39,7 +44,8 @@ def texture_point_at(world: World, number: int, at: Interaction, pixel: Tensor |
         world: the scene's tensors.
         number: index of the BSDF model.
         at: the surface points.
-        pixel: ``(5,)`` pixel footprint, see :meth:`torchpt.cameras.Camera.pixel`; None: textures are not filtered.
+        pixel: ``(5,)`` footprint of a pixel, see :meth:`torchpt.physics.cameras.base.Camera.pixel`; None: textures are not
+            filtered.
     """
     textures = world.materials.textures[number]
     if textures is None:
@@ -58,14 +64,16 @@ def _footprint(at: Interaction, pixel: Tensor) -> Tensor:
     4th edition, 10.1.3). Texture filters are isotropic, so the area of the pixel's ellipse is enough.
     """
     assert at.tangent is not None and at.bitangent is not None
-    away = torch.addcmul(pixel[0:3, None], at.p, pixel[3], value=-1)
-    square = dot(away, away)
-    cosine = dot(normalize(away), at.ng).abs().clamp_min(_SLANT)
+    eye, w, spread = pixel[0:3, None], pixel[3], pixel[4]  # see Camera.pixel: the camera lies in direction `eye - w p`
+    to_camera = torch.addcmul(eye, at.p, w, value=-1)
+    square = dot(to_camera, to_camera)
+    cosine = dot(normalize(to_camera), at.ng).abs().clamp_min(_SLANT)
     across = cross(at.tangent, at.bitangent)
-    stretch = dot(across, across)  # of the area, squared
-    some = stretch > 0
-    stretch = torch.where(some, torch.where(some, stretch, 1.0).sqrt(), torch.inf)
-    return square * (pixel[4] * pixel[4]) / (cosine * stretch)
+    stretch = dot(across, across)  # surface area for one unit of area in texture coordinates, squared
+    textured = stretch > 0
+    # The inner `where` keeps the derivative of the root finite.
+    stretch = torch.where(textured, torch.where(textured, stretch, 1.0).sqrt(), torch.inf)
+    return square * (spread * spread) / (cosine * stretch)
 
 
 @dataclass(frozen=True)
@@ -75,8 +83,8 @@ class Surface:
     frame: Frame  # about the shading normal, flipped to the side of wo unless the model transmits
     side: Tensor | None  # (N,) -1 where the normal was flipped, else 1; None where the model transmits
     front_mask: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
-    parameters: bsdfs.Parameters  # lane values of the BSDF
-    wo: Tensor  # (3, N) in the frame
+    parameters: bsdfs.Parameters  # parameters of the BSDF at each lane, textures included
+    wo: Tensor  # (3, N) direction to the previous vertex, in the frame
     perturbed_normal: PerturbedNormal | None  # None without a normal or bump map
 
 
@@ -88,7 +96,7 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
         number: index of the BSDF model that all points have.
         d: directions ``(3, N)`` of the incoming rays.
         at: the surface points.
-        pixel: see :func:`texture_point_at`.
+        pixel: ``(5,)`` footprint of a pixel, as for :func:`texture_point_at`; None: textures are not filtered.
     """
     model, row = world.materials.models[number], take(world.materials.row, at.slot)
     textures = world.materials.textures[number]
@@ -96,12 +104,12 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
     ns, side, front_mask, perturbed_normal = at.ns, None, None, None
     if not model.transmits:
         side = torch.copysign(torch.ones_like(ns[0]), -dot(d, ns).detach())
-        both = world.materials.two_sided[number]
-        if both is not None:
-            front_mask = ((side > 0) | take(both, row)).to(side.dtype)
+        two_sided = world.materials.two_sided[number]
+        if two_sided is not None:
+            front_mask = ((side > 0) | take(two_sided, row)).to(side.dtype)
     if textures is not None and (textures.normal is not None or textures.bump is not None):
         assert point is not None
-        frame, perturbed_normal = _mapped(world, textures, row, point, d, at, side)
+        frame, perturbed_normal = _perturbed_frame(world, textures, row, point, d, at, side)
     else:
         ns = ns if side is None else ns * side
         frame = Frame.along(ns, at.tangent) if model.anisotropic and at.tangent is not None else Frame.about(ns)
@@ -113,7 +121,10 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
 def parameters_at(
     world: World, number: int, row: Tensor, at: Interaction, point: TexturePoint | None
 ) -> bsdfs.Parameters:
-    """Return the parameters of BSDF model ``number`` for each lane, at rows ``row (N,)``, textures included."""
+    """Return the parameters of BSDF model ``number`` for each lane, at rows ``row (N,)`` of its tables, textures included.
+
+    ``point``: texture coordinates of the lanes; needed if the model has textures.
+    """
     values, textures = bsdfs.gather(world.materials.parameters[number], row), world.materials.textures[number]
     if textures is None:
         return values
@@ -128,7 +139,10 @@ def _filled(
     row: Tensor,
     point: TexturePoint,
 ) -> bsdfs.Parameters:
-    """Return the parameters with textured ones replaced by their texture values."""
+    """Return the parameters with textured ones replaced by their texture values.
+
+    ``readings`` has a :class:`TextureBinding` for each textured parameter, in nested dicts where ``values`` nests them.
+    """
     filled = dict(values)
     for key, reading in readings.items():
         if isinstance(reading, TextureBinding):
@@ -139,22 +153,27 @@ def _filled(
 
 
 def _read(world: World, binding: TextureBinding, row: Tensor, point: TexturePoint) -> Tensor:
+    """Return the texture values of a parameter, a colour ``(3, n)`` or a number ``(n,)``, for materials ``row (n,)``."""
     table = world.textures.tables[binding.table]
-    point = point if binding.filtered else point.bare
-    return table.look_up(take(binding.nodes, row), point, binding.channel is None)
+    point = point if binding.filtered else point.bare  # without footprints
+    return table.look_up(take(binding.nodes, row), point, coloured=binding.channel is None)
 
 
-def _mapped_value(world: World, maps: NodeMap, at: Interaction, coloured: bool) -> Tensor:
-    """Return the values of per-primitive textures at points; arbitrary where a surface has no texture."""
-    row, point = take(maps.nodes, at.slot).clamp_min(0), TexturePoint(surface_uv(world, at))
+def _value_by_slot(world: World, maps: NodeMap, at: Interaction, *, coloured: bool) -> Tensor:
+    """Return the values of textures that belong to primitives, not to BSDF parameters; arbitrary where there is no texture.
+
+    ``coloured``: True: colours ``(3, n)``. False: numbers ``(n,)``.
+    """
+    node, point = take(maps.nodes, at.slot).clamp_min(0), TexturePoint(surface_uv(world, at))
     first, *others = (world.textures.tables[number] for number in maps.tables)
-    if maps.table is None:
-        return first.look_up(row, point, coloured)
-    which = take(maps.table, at.slot)
-    value = first.look_up(torch.where(which == 0, row, 0), point, coloured)
+    if maps.table is None:  # all nodes are rows of the first table
+        return first.look_up(node, point, coloured)
+    table_of_lane = take(maps.table, at.slot)
+    # Each table looks up all lanes; those of other tables read its row 0, and the result is dropped.
+    value = first.look_up(torch.where(table_of_lane == 0, node, 0), point, coloured)
     for k, table in enumerate(others, 1):
-        mine = which == k
-        value = torch.where(mine, table.look_up(torch.where(mine, row, 0), point, coloured), value)
+        in_table = table_of_lane == k
+        value = torch.where(in_table, table.look_up(torch.where(in_table, node, 0), point, coloured), value)
     return value
 
 
@@ -162,10 +181,10 @@ def opacity_map(world: World, at: Interaction) -> Tensor:
     """Return the factor ``(N,)`` of opacity textures at surface points; 1 where there is no texture."""
     maps = world.textures.opacity
     assert maps is not None
-    value = _mapped_value(world, maps, at, False)
+    value = _value_by_slot(world, maps, at, coloured=False)
     value = torch.addcmul(take(maps.bias, at.slot), take(maps.factor, at.slot), value)
     if maps.cutoff is not None:
-        cutoff = take(maps.cutoff, at.slot)
+        cutoff = take(maps.cutoff, at.slot)  # -1 where the material has none
         value = torch.where(cutoff < 0, value, (value >= cutoff).to(value.dtype))
     return torch.where(take(maps.nodes, at.slot) < 0, 1.0, value)
 
@@ -174,22 +193,31 @@ def emission_map(world: World, at: Interaction) -> Tensor:
     """Return the factor ``(3, N)`` of emission textures at surface points; 1 where there is no texture."""
     maps = world.textures.emission
     assert maps is not None
-    value = _mapped_value(world, maps, at, True)
+    value = _value_by_slot(world, maps, at, coloured=True)
     return torch.where(take(maps.nodes, at.slot) < 0, 1.0, value)
 
 
 def shading_normal(world: World, number: int, d: Tensor, at: Interaction, point: TexturePoint | None) -> Tensor:
-    """Return the shading normal ``(3, N)`` on the shape's outside, normal and bump maps included."""
+    """Return the shading normal ``(3, N)`` on the shape's outside, normal and bump maps included.
+
+    Args:
+        world: the scene's tensors.
+        number: index of the BSDF model that all points have.
+        d: directions ``(3, N)`` of the incoming rays.
+        at: the surface points.
+        point: their texture coordinates, see :func:`texture_point_at`; needed if the model has a normal or bump map.
+    """
     textures = world.materials.textures[number]
     if textures is None or (textures.normal is None and textures.bump is None):
         return at.ns
     assert point is not None
     row = take(world.materials.row, at.slot)
     side = torch.copysign(torch.ones_like(d[0]), -dot(d, at.ns))
-    return _mapped(world, textures, row, point, d, at, side)[0].n * side
+    frame, _ = _perturbed_frame(world, textures, row, point, d, at, side)
+    return frame.n * side
 
 
-def _mapped(
+def _perturbed_frame(
     world: World,
     textures: MaterialTextures,
     row: Tensor,
@@ -198,7 +226,7 @@ def _mapped(
     at: Interaction,
     side: Tensor | None,
 ) -> tuple[Frame, PerturbedNormal]:
-    """Return the shading frame of a normal or bump map, and the unperturbed normal."""
+    """Return the shading frame of a normal or bump map, and the unperturbed normal; arguments as for :func:`perturb_normal`."""
     local = None if textures.normal is None else _read(world, textures.normal, row, point)
     slope = None
     if local is None:

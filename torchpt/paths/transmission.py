@@ -1,7 +1,9 @@
 """Opacity: rays of paths pass a surface with probability ``1 - opacity``; shadow rays are weakened by that factor.
 
 Passing a surface is no vertex of a path: direction, depth, and the vertex that the direction was sampled at stay the same.
-Scenes in which everything is opaque run none of this.
+Scenes in which everything is opaque run none of this. Engines call :func:`transmit` until no ray passes any more, and weaken
+shadow rays by :func:`opacity_at`. A *slot* is the index of a primitive, or of an instance after all primitives, by which
+materials and opacities are looked up.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ __all__ = ["beyond", "non_opaque", "opacity_at", "times_map", "transmit"]
 
 
 def opacity_at(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:
-    """Return the opacity ``(N,)`` of the surfaces that rays ``o, d`` hit, textures included; ``miss`` where there is no hit."""
+    """Return the opacity ``(N,)`` of the surfaces that rays ``o, d (3, N)`` hit, textures included; ``miss`` where none is."""
     assert world.materials.opacity is not None
     missed = hit.prim < 0
     slot = world.geometry.slot(hit.prim).clamp_min(0)
@@ -36,18 +38,18 @@ def opacity_at(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Ten
 @dispatched
 def times_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Tensor:
     """Multiply ``opacity (N,)`` by the opacity texture in the lanes where the mask ``textured (N,)`` is True."""
-    some = textured.nonzero().squeeze(1)
-    at = interact(world, take(o, some), take(d, some), rows(hit, some))
-    return opacity.index_copy(0, some, take(opacity, some) * opacity_map(world, at))
+    lanes = textured.nonzero().squeeze(1)
+    at = interact(world, take(o, lanes), take(d, lanes), rows(hit, lanes))
+    return opacity.index_copy(0, lanes, take(opacity, lanes) * opacity_map(world, at))
 
 
 def beyond(world: World, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
-    """Return ray origins ``(3, N)`` just behind the surfaces that were hit."""
+    """Return ray origins ``(3, N)`` just behind the surfaces that were hit, off them by their rounding bound."""
     return offset_origin(world, interact(world, o, d, hit), d)
 
 
 def non_opaque(world: World, prim: Tensor) -> Tensor:
-    """Return True ``(N,)`` for primitives that may let a ray pass."""
+    """Return True ``(N,)`` where primitives ``prim (N,)``, ids of the search, may let a ray pass."""
     assert world.materials.opacity is not None
     slot = world.geometry.slot(prim).clamp_min(0)
     may_pass = take(world.materials.opacity, slot) < 1
@@ -59,16 +61,17 @@ def non_opaque(world: World, prim: Tensor) -> Tensor:
 def transmit(context: StageContext, vertex: VertexInput) -> Transmission:
     """Stop each ray at its hit with the probability of the opacity there; let the others pass.
 
-    The stage runs for rays whose hit may let them pass.
+    A stage: engines run it for rays whose hit is :func:`non_opaque`.
     """
     world, state, hit = context.world, vertex.state, vertex.hit
-    opacity = opacity_at(world, state.o, state.d, hit, 1.0)
+    opacity = opacity_at(world, state.o, state.d, hit, miss=1.0)
     draws = Draws(context.plan.sampler, state.key, context.salts)
-    met = draws.one(Dimension.OPACITY) < opacity.detach()
+    stops = draws.one(Dimension.OPACITY) < opacity.detach()
     chance = None
     if opacity.requires_grad:
-        share = torch.where(met, opacity, 1.0 - opacity)
-        chance = torch.where(opacity.detach() < 1, share / share.detach(), 1.0)
+        probability = torch.where(stops, opacity, 1.0 - opacity)
+        # Of value 1, with the derivative of the logarithm of the probability. An opacity of 1 has none: 1 - opacity is 0.
+        chance = torch.where(opacity.detach() < 1, probability / probability.detach(), 1.0)
     with torch.no_grad():
         o = beyond(world, state.o.detach(), state.d.detach(), hit)
-    return Transmission(~met, o, chance=chance)
+    return Transmission(~stops, o, chance=chance)

@@ -1,7 +1,9 @@
 """The stages of path tracing at a vertex, and the sampling routines that they are made of.
 
-A stage is a pure function of lanes; :mod:`torchpt.paths.state` has its input and output records. A Python ``if`` depends on the
-scene and the settings only, never on lane values, so a stage compiles to one graph whatever the number of lanes.
+A stage is a pure function of lanes, one path a lane; :mod:`torchpt.paths.state` has its input and output records. A Python
+``if`` depends on the scene and the settings only, never on lane values, so a stage compiles to one graph whatever the number
+of lanes. Engines call the four stages at the end of this file; ``model`` is an index into ``world.materials.models``, and all
+n lanes of a call hit surfaces of this BSDF model.
 """
 
 from __future__ import annotations
@@ -67,7 +69,8 @@ __all__ = [
 # :func:`shade` = surface -> light sample -> shadow ray. The engine traces the shadow ray after the stage.
 
 
-#: Fraction of its length by which a shadow ray ends before the light, beside the offset from the light's surface.
+#: Fraction of its length by which a shadow ray ends before the light, beside the offset from the light's surface: rounding of
+#: its length must not let it hit the light itself. pbrt's ``ShadowEpsilon`` has the same value.
 SHORTEN = 1e-4
 
 
@@ -81,6 +84,7 @@ def shade(
     """
     plan, world = context.plan, context.world
     surface, kind = surface_at(world, model, state.d, at, context.pixel), world.materials.models[model]
+    # Light samples never hit a delta lobe, and a `smooth` model has no others.
     if world.lights is None or plan.strategy in ("bsdf", "uniform") or kind.smooth:
         return surface, None, None
     light = sample_light(context, model, state, at, surface)
@@ -94,14 +98,14 @@ def shade(
         reflected = kind.eval(surface.parameters, surface.wo, wi)
     share = shading_weight(world, model, at, surface, light.wi, wi)
     weight = weight if share is None else weight * share
-    shining = light_radiance(world, light)
-    radiance = state.throughput * reflected * shining * weight
-    direct = DirectLight(light, shining, reflected, share, pdf, heuristic)
+    emitted = light_radiance(world, light)
+    radiance = state.throughput * reflected * emitted * weight
+    direct = DirectLight(light, emitted, reflected, share, pdf, heuristic)
     return surface, direct, _shadow_ray(plan, world, at, light, radiance, weight)
 
 
 def shading_weight(
-    world: World, model: int, at: Interaction, surface: Surface, light: Tensor, wi: Tensor
+    world: World, model: int, at: Interaction, surface: Surface, world_wi: Tensor, wi: Tensor
 ) -> Tensor | None:
     """Return the factor ``(n,)`` on light from a direction, beside the BSDF: shading normals and one-sided surfaces.
 
@@ -113,16 +117,16 @@ def shading_weight(
         model: index of the BSDF model.
         at: the surface points.
         surface: the points with their material.
-        light: ``(3, n)`` direction to the light.
+        world_wi: ``(3, n)`` unit direction to the light in the world.
         wi: the same direction in the surface's frame.
     """
     share: Tensor | None = None
     if has_shading_normals(world, model):
-        share = (same_hemisphere(at, surface, light, wi) > 0).to(wi.dtype)
+        share = (same_hemisphere(at, surface, world_wi, wi) > 0).to(wi.dtype)
     if surface.front_mask is not None:
         share = surface.front_mask if share is None else share * surface.front_mask
     if surface.perturbed_normal is not None:
-        shadowing = surface.perturbed_normal.shadowing(light)
+        shadowing = surface.perturbed_normal.shadowing(world_wi)
         share = shadowing if share is None else share * shadowing
     return share
 
@@ -134,27 +138,29 @@ def sample_light(context: StageContext, model: int, state: PathState, at: Intera
     assert table is not None
     draws = Draws(plan.sampler, state.key, context.salts)
     # The pdf of an emitter that a ray hits is evaluated at the ray's origin. So lights are sampled from the origin of a
-    # reflected ray, unless paths keep the vertex itself, or no emitter can be hit.
-    kept = lights.depends_on_point(table) or table.row_of_prim is None
-    x = at.p if kept else offset_origin(world, at, -state.d)
+    # reflected ray, unless paths keep the vertex itself (PathState.p), or no emitter can be hit.
+    from_vertex = lights.depends_on_point(table) or table.row_of_prim is None
+    x = at.p if from_vertex else offset_origin(world, at, -state.d)
     n = None if world.materials.models[model].transmits else surface.frame.n
-    numbers, which = draws.two(Dimension.LIGHT), None
-    if table.choice is not None:
-        # The number that chooses the light is used again for the point on it, so that both are stratified together.
-        which = lights.from_digits(torch.stack((numbers[0], draws.one(Dimension.LIGHT_DIGITS))))
-    return lights.sample(table, x, which, numbers.to(plan.dtype), OFFSET, n, plan.strategy == "mis")
+    u, which = draws.two(Dimension.LIGHT), None  # (2, n)
+    if table.choice is not None:  # more than one light
+        # The number that chooses the light is used again for the point on it, so that both are stratified together. It has
+        # 24 bits, and the other number appends 24 more.
+        which = lights.from_digits(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS))))
+    return lights.sample(table, x, which, u.to(plan.dtype), offset=OFFSET, n=n, mis=plan.strategy == "mis")
 
 
 def light_radiance(world: World, light: LightSample) -> Tensor:
     """Return the radiance ``(3, N)`` of light samples, textures of emission and opacity included."""
-    if light.at is None:
+    if light.at is None:  # no emissive surface has a texture
         return light.radiance
-    share = torch.ones_like(light.radiance)
+    factor = torch.ones_like(light.radiance)
     if world.textures.emission is not None:
-        share = share * emission_map(world, light.at)
+        factor = factor * emission_map(world, light.at)
     if world.textures.opacity is not None:
-        share = share * opacity_map(world, light.at)
-    return light.radiance * (share if light.bare is None else torch.where(light.bare, 1.0, share))
+        factor = factor * opacity_map(world, light.at)
+    # `bare` lights have no surface, so their factor is meaningless.
+    return light.radiance * (factor if light.bare is None else torch.where(light.bare, 1.0, factor))
 
 
 def _shadow_ray(
@@ -162,7 +168,8 @@ def _shadow_ray(
 ) -> Shadow:
     """Return the shadow rays of light samples with contributions ``radiance``; of length 0 where the contribution is 0.
 
-    Under differentiation they have length 0 where ``weight (n,)`` is 0 instead: a reflectance of 0 has a derivative.
+    Under differentiation they have length 0 where ``weight (n,)`` is 0 instead, the MIS weight over the pdf with the factor of
+    the shading normal: a contribution that is 0 for a reflectance of 0 has a derivative.
     """
     o = offset_origin(world, at, light.wi)
     d = light.target - o
@@ -186,6 +193,12 @@ def same_hemisphere(at: Interaction, surface: Surface, world_wi: Tensor, wi: Ten
     """Return values that are positive where a direction lies on the same side of the geometric and the shading normal.
 
     Elsewhere the shading normal would let light through the surface.
+
+    Args:
+        at: the surface points, with the geometric normal on the shape's outside.
+        surface: the points with their material; ``side`` is -1 where its frame is flipped toward the viewer.
+        world_wi: ``(3, n)`` direction in the world.
+        wi: the same direction in the surface's frame.
     """
     same = dot(world_wi, at.ng) * wi[2]
     return same if surface.side is None else same * surface.side
@@ -205,7 +218,7 @@ class Continuation:
     throughput: Tensor  # (3, n)
     eta: Tensor | None  # see PathState
     carried: Tensor  # (3, n) throughput before roulette
-    chance: Tensor | None  # (n,) survival probability; None without roulette
+    chance: Tensor | None  # (n,) survival probability of roulette; None without roulette
 
 
 def scatter(
@@ -236,9 +249,11 @@ def sample_bsdf(context: StageContext, model: int, at: Interaction, surface: Sur
     u = draws.two(Dimension.BSDF).to(plan.dtype)
     if plan.strategy == "uniform" and not kind.delta:
         wi = uniform_sphere(u) if kind.transmits else uniform_hemisphere(u)
+        # 1 / (4 pi) over the sphere, 1 / (2 pi) over the hemisphere, per steradian.
         pdf = torch.full_like(wi[2], (0.25 if kind.transmits else 0.5) / math.pi)
         sample = BsdfSample(wi, pdf, kind.eval(surface.parameters, surface.wo, wi) / pdf)
     else:
+        # The number that chooses a lobe; models that are not `lobed` need none.
         lobe = draws.one(Dimension.LOBE).to(plan.dtype) if kind.lobed else None
         sample = kind.sample(surface.parameters, surface.wo, lobe, u)
     pdf = sample.pdf.detach()
@@ -265,29 +280,34 @@ def attach(
     plan, world = context.plan, context.world
     kind, frame = world.materials.models[model], surface.frame
     d, weight, pdf, sharp = drawn.d, drawn.weight, drawn.pdf, drawn.sharp
-    hit, follow, measure, alive = None, d, 1.0, drawn.least > 0
+    # attached_d: the same direction, differentiable in both ends of the ray. measure: 1, with the derivative of the change of
+    # measure from solid angle to the area at the next hit, see `reattach`.
+    hit, attached_d, measure, alive = None, d, 1.0, drawn.least > 0
     if plan.attached:
         hit = context.search(replace(state, o=drawn.o, d=d, t_max=alive.to(plan.dtype) * T_MAX))
-        follow, measure = reattach(world, at.p, hit, d)
+        attached_d, measure = reattach(world, at.p, hit, d)
     if not kind.smooth:
-        value = kind.eval(surface.parameters, surface.wo, frame.to_local(follow))
-        again = value * (measure / torch.where(alive & ~torch.isinf(pdf), pdf, 1.0))
-        weight = again if sharp is None else torch.where(sharp, weight, again)
+        value = kind.eval(surface.parameters, surface.wo, frame.to_local(attached_d))
+        attached_weight = value * (measure / torch.where(alive & ~torch.isinf(pdf), pdf, 1.0))
+        weight = attached_weight if sharp is None else torch.where(sharp, weight, attached_weight)
     if plan.attached:
         # The direction of a delta lobe depends on the surface that it leaves; the next hit is intersected anew along it.
-        d = follow if sharp is None else torch.where(sharp, frame.to_world(drawn.wi), follow)
+        d = attached_d if sharp is None else torch.where(sharp, frame.to_world(drawn.wi), attached_d)
     return replace(drawn, d=d, weight=weight), hit
 
 
 def continue_paths(
     plan: Plan, state: PathState, surface: Surface, drawn: Drawn, draws: Draws, roulette: float
 ) -> Continuation:
-    """Return the throughput behind the surface and the mask of paths that go on: not black, and alive after roulette."""
+    """Return the throughput behind the surface and the mask of paths that go on: not black, and alive after roulette.
+
+    ``roulette``: upper bound of the survival probability; 0: no roulette at this vertex.
+    """
     weight = drawn.weight
     if surface.perturbed_normal is not None:
         weight = weight * surface.perturbed_normal.shadowing(drawn.d)
     throughput = state.throughput * weight
-    brightest = largest(throughput.detach())
+    brightest = largest(throughput.detach())  # (n,) over the channels
     # Under differentiation black paths go on: the light behind is the derivative with respect to a reflectance of 0.
     alive = (drawn.least if plan.tape else torch.minimum(drawn.least, brightest)) > 0
     eta = state.eta
@@ -311,14 +331,14 @@ def next_ray(
 ) -> PathState:
     """Return the paths with the rays that leave the surface; paths that ended have rays of length 0."""
     plan, world = context.plan, context.world
-    on = continuation.alive.to(plan.dtype)
+    on = continuation.alive.to(plan.dtype)  # (n,) 1 where the path goes on, 0 where it ended
     # The pdf that weights emission by MIS if the ray hits a light.
     if plan.strategy == "mis" and world.lights is not None:
         pdf = drawn.pdf
     else:
-        alone = plan.strategy == "light" and world.lights is not None  # light sampling has counted lights already
-        pdf = torch.full_like(drawn.pdf, 0.0 if alone else math.inf)
-        if alone and drawn.sharp is not None:
+        by_lights_alone = plan.strategy == "light" and world.lights is not None  # emission was counted by light samples
+        pdf = torch.full_like(drawn.pdf, 0.0 if by_lights_alone else math.inf)
+        if by_lights_alone and drawn.sharp is not None:  # but behind a delta lobe, which light samples miss
             pdf = torch.where(drawn.sharp, drawn.pdf, pdf)
     # A throughput that is NaN ends the path, since comparisons with NaN are false. Added to radiance, it is still reported.
     radiance = state.radiance if plan.tape else state.radiance + continuation.throughput * 0.0
@@ -345,7 +365,17 @@ def next_ray(
 
 
 def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
-    """Return camera rays through pixels ``x, y (N,)``, at points sampled from the filter (and on the lens, if any)."""
+    """Return camera rays at points sampled from the filter (and on the lens, if any).
+
+    Args:
+        plan: static configuration of the render.
+        camera: the camera of the whole film.
+        filter: the reconstruction filter, from which the offset to the pixel's centre is sampled.
+        x: column of each pixel on the whole film ``(N,)``, in the lanes' dtype.
+        y: row of each pixel, likewise.
+        key: the sampler's keys ``(rows, N)`` int32.
+        salts: the camera's random dimensions, :func:`torchpt.physics.samplers.salts` of depth 0.
+    """
     draws = Draws(plan.sampler, key, salts)
     offset = filter.offset(draws.two(Dimension.PIXEL)).to(plan.dtype)
     lens = draws.two(Dimension.LENS).to(plan.dtype) if camera.lens else None
@@ -378,6 +408,7 @@ def escape(context: StageContext, vertex: VertexInput) -> Emission:
 
 
 def _gathered(vertex: VertexInput, radiance: Tensor, light_pdf: Tensor) -> Emission:
+    """Return emitted ``radiance (3, n)`` as a contribution; light sampling finds it with ``light_pdf (n,)`` per steradian."""
     state, hit = vertex.state, vertex.hit
     # `chance` is 1 with the derivative of the probability that the ray passed the surfaces before.
     throughput = state.throughput if hit.chance is None else state.throughput * hit.chance

@@ -1,8 +1,8 @@
 """The loop over the vertices of paths: the order of stages along a path, the same for every engine.
 
 Forward renders, first-surface previews, layers, the forward half of path replay and printed paths all run :func:`walk`. A
-*population* is some thousand paths at one vertex. The walk reads its depth and nothing else: only the engine that made it knows
-its memory.
+*population* is some thousand paths at one vertex, each in a *lane* of its own. The walk reads the depth of a population and
+nothing else: only the engine that made it knows where its paths lie in memory.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from torchpt.paths.integrators.base import Limits
 
 __all__ = ["KEPT", "Counts", "Engine", "Observer", "Population", "find_hits", "walk"]
 
-#: Consecutive vertices that an engine keeps at once for a backward pass.
+#: Consecutive vertices that an engine keeps at once for a backward pass: as many as the default ``max_depth``, so paths of
+#: default length are never traced again.
 KEPT = 16
 
 
@@ -28,6 +29,7 @@ class Population(Protocol):
         ...
 
 
+#: The populations of one engine; ``Q``: those that an observer reads.
 P = TypeVar("P", bound=Population)
 Q = TypeVar("Q", bound=Population, contravariant=True)
 
@@ -78,8 +80,8 @@ class Engine(Protocol[P]):
     def occlude(self, paths: P) -> None:
         """Trace the pending shadow rays, and add their contributions times transmittance."""
 
-    def terminate(self, paths: P, truncated: bool) -> None:
-        """End all paths that remain; ``truncated``: count them as truncated."""
+    def terminate(self, paths: P, *, truncated: bool) -> None:
+        """End all paths that remain; ``truncated``: count them as truncated, since no limit of the user's ended them."""
 
 
 class Observer(Generic[Q]):
@@ -100,7 +102,7 @@ class Observer(Generic[Q]):
         """Read paths after the emission of their hits, or of the environment, was added."""
 
     def on_scattered(self, paths: Q) -> None:
-        """Read paths behind a vertex, after its shadow rays were traced."""
+        """Read the paths that go on from a vertex, after its shadow rays were traced; their depth is that of the next one."""
 
 
 def find_hits(engine: Engine[P], paths: P) -> None:
@@ -118,12 +120,12 @@ def walk(
     Args:
         engine: runs the stages.
         paths: a population of that engine.
-        limits: maximum depth, and where roulette begins.
+        limits: greatest depth (``last``; ``endless`` where the user set none), and where roulette begins.
         observer: gets the callbacks, and may end the walk.
         until: vertex at which the walk stops, before the rays to it are searched; None: it goes on until all paths ended.
     """
     last, endless = limits.last, limits.endless
-    if last < paths.depth:
+    if last < paths.depth:  # ``max_depth`` 0
         engine.terminate(paths, truncated=False)
         return
     while paths.depth != until:

@@ -1,4 +1,8 @@
-"""The tensors and settings that all waves of a render share, the pixels that samples are added to, and ray counts."""
+"""The tensors and settings that all waves of a render share, the pixels that samples are added to, and ray counts.
+
+A *wave* is a range of pixels and samples whose paths are traced together, one path a *lane*. :class:`Wave` makes their first
+rays and their initial state; an engine (:mod:`torchpt.engines`) takes them from there.
+"""
 
 from __future__ import annotations
 
@@ -50,9 +54,9 @@ class PixelSet:
     """Pixels that get the same number of samples, with their films.
 
     Attributes:
-        film: sums of radiance.
+        film: sums of radiance, a column for each pixel of the set.
         layers: films of the layers of first surfaces, by name.
-        randomizations: randomizations of the sampler that their samples belong to.
+        randomizations: the sampler's independent sequences that share the samples of a pixel.
         indices: ``(n,)`` int64 indices of the pixels in the picture, row by row, on the lanes' device; None: all pixels.
     """
 
@@ -73,7 +77,7 @@ def clamp_scale(values: Tensor, clamp: float) -> Tensor:
 # ---- Waves: from a range of pixels and samples to camera rays
 
 
-#: The stage of a vertex on surfaces of one BSDF model; the int is the model's index.
+#: The stage of a vertex on surfaces of one BSDF model; the int is the model's index in ``world.materials.models``.
 Bounce = Callable[[StageContext, int, VertexInput], VertexOutput]
 
 
@@ -84,7 +88,7 @@ class Rays:
     Attributes:
         o: origins ``(3, N)``, in the lanes' coordinates (:class:`torchpt.scene.space.Space`).
         d: unit directions ``(3, N)``.
-        number: ``(N,)`` int64 indices of the pixels whose random numbers they use; None: those of their own pixel.
+        number: ``(N,)`` int64: each ray draws the random numbers of the pixel with this index; None: ray k those of pixel k.
     """
 
     o: Tensor
@@ -99,13 +103,14 @@ class Wave:
     Attributes:
         context: inputs of stages that are the same for all lanes.
         integrator: has the stages and limits of the paths.
-        accel: the acceleration structure.
-        camera: the camera of the whole film.
+        accel: the search: the acceleration structure over the scene's primitives.
+        camera: the camera of the whole film, of which the picture may be a crop.
         filter: the reconstruction filter.
         sampler: makes the keys of random numbers.
         crop: ``(x, y, width, height)`` of the picture on the film.
-        centre: ``(3,)`` float64 origin of the lanes' coordinates in the scene, in the lanes' unit of length: the result of
-            :attr:`torchpt.scene.space.Space.shift`. Only the layer of positions adds it.
+        centre: ``(3,)`` float64 origin of the lanes' coordinates in the scene, in the lanes' unit of length, as
+            :attr:`torchpt.scene.space.Space.shift` returns it: lanes count from there, so that float32 is exact enough. Only
+            the layer of positions adds it.
         first_surface: shading of first surfaces, of an integrator that stops there; None: paths go on.
         start_rays: rays that paths start with; None: camera rays.
     """
@@ -166,14 +171,14 @@ class Wave:
             key = self.sampler.key(number, sample, randomizations)
             return camera_state(take(self.start_rays.o, pixel), take(self.start_rays.d, pixel), key)
         key = self.sampler.key(pixel, sample, randomizations)
-        x, y = (a.to(self.context.plan.dtype) for a in (x, y))
+        x, y = x.to(self.context.plan.dtype), y.to(self.context.plan.dtype)
         camera_salts = salts(0, self.centre.device)  # depth 0: the camera's random dimensions
         return generate(self.context.plan, self.camera, self.filter, x, y, key, camera_salts)
 
     def with_rays(self, rays: Rays) -> Wave:
-        """Return the wave whose paths start with ``rays``; samples have no filter weights."""
+        """Return the wave whose paths start with ``rays``, a picture of one row; samples have no filter weights."""
         n = rays.d.shape[1]
-        # Given rays need no filter. One with negative lobes (``signed``) would still weigh the samples, so the box replaces it.
+        # Start rays need no filter. One with negative lobes (``signed``) would still weigh the samples, so the box replaces it.
         # Others have no weights and stay: the filter is part of the key of compiled kernels, which are shared with renders.
         filter = filter_of("box", rays.d.device) if self.filter.signed else self.filter
         camera = replace(self.camera, resolution=(n, 1))
@@ -195,7 +200,7 @@ class Wave:
         return state
 
     def weight(self, state: PathState) -> Tensor:
-        """Return the filter weights of samples ``(N,)``.
+        """Return the filter weights of samples ``(N,)``: 1, or a constant with the filter's sign if it has negative lobes.
 
         No stage needs them: they are drawn again from the key of each sample and multiply the result of its path.
         """
@@ -207,13 +212,13 @@ def with_detached_geometry(wave: Wave) -> Wave:
     """Return the wave with geometry not differentiated (``plan.attached`` False); the paths have the same values.
 
     With differentiated geometry the stage of a surface searches the next hit itself, because the direction depends on both
-    ends of the ray. Here hits are found between the stages, as the kernels of the backward pass expect.
+    ends of the ray. In the wave that is returned hits are found between the stages, as the kernels of the backward pass expect.
     """
     return replace(wave, context=replace(wave.context, plan=replace(wave.context.plan, attached=False)))
 
 
 def camera_state(o: Tensor, d: Tensor, key: Tensor) -> PathState:
-    """Return the state of paths that start with rays ``o, d (3, N)``, d unit; ``key`` is the sampler's key ``(rows, N)``.
+    """Return the state of paths that start with rays ``o, d (3, N)``, d unit, and the sampler's ``key (rows, N)`` int32.
 
     The pdf is infinite: no light sampling competes with the camera, so emission that a camera ray hits counts whole.
     """

@@ -124,7 +124,7 @@ def make_wave(
     else:
         world, accel = like.context.world, like.accel
     points = points_of(settings.sampler)
-    plan = integrator.plan(points, dtype, tape, attached)
+    plan = integrator.plan(points, dtype, tape=tape, attached=attached)
     camera = _camera(scene, settings, params, dtype)
     crop = film.crop or (0, 0, film.width, film.height)
     context = _context(plan, world, camera, crop, integrator)

@@ -13,7 +13,7 @@ from torchpt.spec import Kinds
 if TYPE_CHECKING:
     from torchpt.paths.integrators.base import Integrator
 
-#: The integrators.
+#: The integrators by ``type`` of a scene file, one file each in ``kinds/``; lists show them in this order.
 KINDS: Kinds[Integrator] = Kinds("torchpt.paths.integrators.kinds", ("path", "direct", "aov", "ibl"))
 
 __all__ = ["KINDS"]

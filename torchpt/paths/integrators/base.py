@@ -1,4 +1,9 @@
-"""The base class of integrators: their parameters, stages, fields and limits."""
+"""The base class of integrators: their parameters, stages, fields and limits.
+
+An integrator has no loop of its own: :func:`torchpt.paths.walk.walk` takes paths from vertex to vertex, and an engine calls the
+integrator's *stages* there, pure functions of whole tensors with one path a lane. A *field* is a number that each path carries
+beside the fields of :class:`~torchpt.paths.state.PathState`.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +36,7 @@ __all__ = ["ENDLESS", "LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limi
 #: one path in 10^12 comes so far, even if it loses nothing: only a later ``rr_depth`` or ``rr_prob`` near 1 truncates paths.
 ENDLESS = 1 << 15
 
-#: Parameters that several kinds share.
+#: Parameters that several kinds of integrators share, for their ``parameters``.
 STRATEGY: dict[str, Spec] = {
     "strategy": Choice(
         "mis",
@@ -58,7 +63,7 @@ class Limits:
 
     Attributes:
         max_depth: greatest number of vertices; -1: only roulette ends paths.
-        rr_depth: first vertex with Russian roulette.
+        rr_depth: first vertex with Russian roulette; vertex 1 is the first hit.
         first_surface: True: paths end behind the first surface, after its light sample.
     """
 
@@ -93,7 +98,12 @@ class Integrator(FrozenConfig):
         lit: True: it uses the scene's lights. False: its world has none.
         fields: fields of its own in the path state.
         splats: True: its stages add radiance to pixels other than a sample's own.
-        strategy, rr_prob, light_choice, clamp, strict: values for kinds without such a parameter; meaning as for ``path``.
+        strategy: how light is found, one of :data:`torchpt.paths.state.STRATEGIES`. This value and those below are for kinds
+            without a parameter of the name.
+        rr_prob: constant survival probability of roulette; None: by throughput.
+        light_choice: which of many lights is sampled, one of :data:`torchpt.physics.lights.LIGHT_SAMPLERS`.
+        clamp: largest component of a sample; None: unbounded.
+        strict: True: a sample that is not finite is an error.
     """
 
     name: ClassVar[str] = ""
@@ -110,24 +120,24 @@ class Integrator(FrozenConfig):
     strict: bool = False
 
     def __init_subclass__(cls) -> None:
-        names = [own.name for own in cls.fields]
+        names = [field.name for field in cls.fields]
         if len(set(names)) < len(names):
             raise TypeError(f"{cls.__name__} declares a field twice: {', '.join(names)}")
 
     @property
     def limits(self) -> Limits:
-        """Return the depth limits of paths."""
-        return Limits(2, 3)
+        """Return the depth limits of paths; by default emission and direct light, without roulette."""
+        return Limits(max_depth=2, rr_depth=3)
 
-    def plan(self, sampler: Points, dtype: torch.dtype, tape: bool = False, attached: bool = False) -> Plan:
-        """Return the static configuration of the stages."""
+    def plan(self, sampler: Points, dtype: torch.dtype, *, tape: bool = False, attached: bool = False) -> Plan:
+        """Return the static configuration of the stages; the arguments are fields of :class:`torchpt.paths.state.Plan`."""
         return Plan(sampler, self.strategy, self.rr_prob, dtype, tape, attached)
 
     def counted_in(self, unit: float) -> Self:
         """Return a copy with parameters that are lengths divided by ``unit``, the world unit in scene units."""
         specs = parameters_of(type(self))
         lengths = {key: value / unit for key, value in self.values.items() if specs[key].length and value is not None}
-        return self.but(**lengths) if lengths and unit != 1.0 else self
+        return self.but(**lengths) if lengths and unit != 1.0 else self  # `but` returns a copy with other values
 
     def emit(self, context: StageContext, vertex: VertexInput) -> Emission:
         """Return the emission of emitters that paths hit. A stage: a pure function of lanes."""
@@ -142,7 +152,9 @@ class Integrator(FrozenConfig):
         return stages.bounce(context, model, vertex)
 
     def transmit(self, context: StageContext, vertex: VertexInput) -> Transmission:
-        """Return which rays pass their hit or are scattered before it. A stage, repeated until all rays have stopped.
+        """Return which rays pass their hit, and which a medium scatters before it.
+
+        A stage, repeated until all rays have stopped.
 
         An integrator's own ``transmit`` runs for all rays, those without a hit included, and calls this one for the rays that
         reach their surface. Only surfaces block shadow rays: ``bounce`` has to weaken them by media in between.
@@ -165,11 +177,13 @@ class Integrator(FrozenConfig):
     def has_own_stages(self) -> bool:
         """Return True if the kind has fields, splats or stages of its own, which need kernels of their own."""
         kind, base = type(self), Integrator
-        own = any(getattr(kind, name) is not getattr(base, name) for name in ("emit", "escape", "bounce", "transmit"))
-        return own or bool(self.fields) or self.splats
+        overrides = any(
+            getattr(kind, name) is not getattr(base, name) for name in ("emit", "escape", "bounce", "transmit")
+        )
+        return overrides or bool(self.fields) or self.splats
 
     def first(self, world: World) -> FirstSurface | None:
-        """Return the shading of first surfaces, made once a scene and differentiable in its world; None: paths go on."""
+        """Return the shading of first surfaces, made once a scene and differentiable in its tensors; None: paths go on."""
         return None
 
 
@@ -192,16 +206,18 @@ def check_fields(integrator: Integrator, state: PathState) -> None:
     """
     if not integrator.fields and not state.extra:
         return
-    declared = {own.name: own for own in integrator.fields}
+    declared = {field.name: field for field in integrator.fields}
     for name in declared.keys() | state.extra.keys():
-        own, value = declared.get(name), state.extra.get(name)
-        if own is None or value is None:
-            found = "a field that is not declared" if own is None else "left out by a stage"
+        field, value = declared.get(name), state.extra.get(name)
+        if field is None or value is None:
+            found = "a field that is not declared" if field is None else "left out by a stage"
             raise SceneError(
                 f"integrator.fields.{name}", found, f"the fields of {integrator.name}: {', '.join(declared)}"
             )
-        if value.dim() != (1 if own.rows == 1 else 2) or (own.rows > 1 and len(value) != own.rows):
-            form = "(n,)" if own.rows == 1 else f"({own.rows}, n)"
-            raise SceneError(f"integrator.fields.{name}", f"a tensor of shape {tuple(value.shape)}", form)
-        if value.is_floating_point() == own.whole:
-            raise SceneError(f"integrator.fields.{name}", value.dtype, "int64" if own.whole else "numbers of the lanes")
+        if value.dim() != (1 if field.rows == 1 else 2) or (field.rows > 1 and len(value) != field.rows):
+            shape = "(n,)" if field.rows == 1 else f"({field.rows}, n)"
+            raise SceneError(f"integrator.fields.{name}", f"a tensor of shape {tuple(value.shape)}", shape)
+        if value.is_floating_point() == field.whole:
+            raise SceneError(
+                f"integrator.fields.{name}", value.dtype, "int64" if field.whole else "numbers of the lanes"
+            )

@@ -1,4 +1,7 @@
-"""Integrators that stop at the first surface: one vertex, with at most one shadow ray."""
+"""Integrators that stop at the first surface: one vertex, with at most one shadow ray.
+
+Such an integrator returns a :class:`FirstSurface` from ``first``, whose stage runs in place of ``Integrator.bounce``.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +17,14 @@ __all__ = ["FirstSurface", "FirstSurfaceIntegrator"]
 class FirstSurface(ABC):
     """Shading of first surfaces.
 
-    Implementations are frozen dataclasses: kernels read their tensors as tables, and are compiled anew if other fields differ.
+    Implementations are frozen dataclasses: kernels read their tensors as data, and are compiled anew if other fields differ.
     """
 
     def again(self, world: World) -> FirstSurface:
-        """Return the shading for a world on an autograd tape: rebuilt where gradients flow through it, else itself."""
+        """Return the shading for ``world``, whose tensors are on an autograd tape.
+
+        It is made again where it depends on tensors that require gradients; by default it does not, and is returned as it is.
+        """
         return self
 
     def shadows(self, world: World) -> bool:
@@ -38,5 +44,5 @@ class FirstSurfaceIntegrator(Integrator):
 
     @property
     def limits(self) -> Limits:
-        """See :class:`Integrator`."""
-        return Limits(2, 3, first_surface=True)
+        """Return limits that end paths at the first surface, after its light sample."""
+        return Limits(max_depth=2, rr_depth=3, first_surface=True)

@@ -1,6 +1,7 @@
 """Unidirectional path tracing with next event estimation, as a wavefront: lanes are grouped by BSDF model at each vertex.
 
-``max_depth`` and ``rr_depth`` count as in Mitsuba: 1 is emission only, 2 adds direct light.
+``max_depth`` and ``rr_depth`` count as in Mitsuba: 1 is emission only, 2 adds direct light. The base class of the kinds
+``path`` and ``direct``, and two decisions that engines take at each vertex: :func:`follows_ray` and :func:`partition`.
 """
 
 from __future__ import annotations
@@ -26,16 +27,22 @@ class PathIntegrator(Integrator):
 def follows_ray(plan: Plan, world: World, depth: int) -> bool:
     """Return True where hit points are intersected anew along their rays; see :func:`torchpt.physics.shapes.interact`.
 
-    Where geometry is differentiated, the first hit follows the camera ray, and so do hits behind delta lobes; all others keep
-    their place on the primitive. In float64 hits are intersected anew, since the search rounds to float32.
+    Where geometry is differentiated, the first hit follows the camera ray, and so do hits behind delta lobes, so all of a scene
+    with such lobes; all others keep their ``u``, ``v`` on the primitive. In float64 hits are intersected anew too, since the
+    search rounds to float32.
+
+    Args:
+        plan: static configuration of the render.
+        world: the scene's tensors.
+        depth: number of the vertex; 1 is the first hit.
     """
-    exact = plan.attached or plan.dtype == torch.float64
-    return exact and (depth == 1 or any(model.delta for model in world.materials.models))
+    intersects_anew = plan.attached or plan.dtype == torch.float64
+    return intersects_anew and (depth == 1 or any(model.delta for model in world.materials.models))
 
 
 @dataclass(frozen=True)
 class Ends:
-    """Lanes ``(n,)`` of paths that hit an emitter, and of paths that hit nothing."""
+    """Lanes whose paths gain emission: int64 indices ``(n,)`` of those that hit an emitter, and of those that hit nothing."""
 
     emissive: Tensor
     missed: Tensor
@@ -48,12 +55,15 @@ def partition(world: World, hit: Hit) -> tuple[Ends, list[tuple[int, Tensor]]]:
         The lanes that hit an emitter or nothing; index and lanes of each model that was hit.
     """
     models = len(world.materials.models)
+    # Keys: m for an emissive surface of model m, `models + m` for another surface of model m, `2 * models` for a miss. The slot
+    # of a miss is -1, so it reads the table's entry 0.
     keys, order = torch.sort(take(world.materials.key, world.geometry.slot(hit.prim) + 1), stable=True)
     bounds = torch.searchsorted(keys, torch.arange(2 * models + 1, dtype=keys.dtype, device=keys.device)).tolist()
-    bounds.append(len(order))
+    bounds.append(len(order))  # lanes of key k: order[bounds[k] : bounds[k + 1]]
     groups = []
-    for m in range(models):
-        pieces = [order[bounds[k] : bounds[k + 1]] for k in (m, models + m) if bounds[k + 1] > bounds[k]]
+    for model in range(models):
+        of_model = (model, models + model)
+        pieces = [order[bounds[key] : bounds[key + 1]] for key in of_model if bounds[key + 1] > bounds[key]]
         if pieces:
-            groups.append((m, pieces[0] if len(pieces) == 1 else torch.cat(pieces)))
-    return Ends(order[: bounds[models]], order[bounds[2 * models] :]), groups
+            groups.append((model, pieces[0] if len(pieces) == 1 else torch.cat(pieces)))
+    return Ends(emissive=order[: bounds[models]], missed=order[bounds[2 * models] :]), groups

@@ -1,4 +1,4 @@
-"""Layers without light transport."""
+"""Layers without light transport: engines evaluate them at first surfaces (:mod:`torchpt.paths.layers`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Direct light."""
+"""Direct light: ``path`` with the base class's limits, a ``max_depth`` of 2."""
 
 from __future__ import annotations
 

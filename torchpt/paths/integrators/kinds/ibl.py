@@ -1,6 +1,7 @@
 """A preview by the split-sum approximation: the first surface under prefiltered environment maps, plus lights with shadows.
 
-The environment casts no shadows and there is no indirect light: that is the error of the preview.
+The environment casts no shadows and there is no indirect light: that is the error of the preview. The split-sum approximation
+is that of :mod:`torchpt.physics.ibl`.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from torch import Tensor
 
 from torchpt.core.tree import leaves
 from torchpt.math.vectors import dot
-from torchpt.paths import vertex as pure
+from torchpt.paths import vertex as stages
 from torchpt.paths.integrators.base import LIGHT_CHOICE, SAMPLES
 from torchpt.paths.integrators.first_surface import FirstSurface, FirstSurfaceIntegrator
-from torchpt.paths.integrators.split_sum import under
+from torchpt.paths.integrators.split_sum import shade_under
 from torchpt.paths.state import StageContext, VertexInput, VertexOutput
 from torchpt.physics import lights
 from torchpt.physics.ibl.shading import IblMaps, Sky, maps
@@ -35,7 +36,7 @@ class Ibl(FirstSurfaceIntegrator):
     strategy = "light"
 
     def first(self, world: World) -> Preview:
-        """See :class:`Integrator`."""
+        """Return the preview of a world, with its environment prefiltered."""
         return Preview.of(world)
 
 
@@ -54,35 +55,35 @@ class Preview(FirstSurface):
     @staticmethod
     def of(world: World) -> Preview:
         """Return the shading for a world; differentiable in its environment."""
-        around = lights.environment_image(world.lights)
-        if around is None:
+        environment = lights.environment_image(world.lights)
+        if environment is None:
             return Preview(None)
-        if around.even:
-            texels = around.texels
-            return Preview(Sky.of(IblMaps(texels, (texels, texels), brdf_table().to(texels))), around.turn)
-        return Preview(Sky.of(maps(around.texels)), around.turn)
+        if environment.even:  # constant radiance: every prefiltered map is the image itself
+            texels = environment.texels
+            return Preview(Sky.of(IblMaps(texels, (texels, texels), brdf_table().to(texels))), environment.turn)
+        return Preview(Sky.of(maps(environment.texels)), environment.turn)
 
     def turned(self, d: Tensor) -> Tensor:
         """Return world directions ``(3, N)`` in the space of the maps."""
         return d if self.turn is None else torch.stack([dot(self.turn[k][:, None], d) for k in range(3)])
 
     def again(self, world: World) -> Preview:
-        """See :class:`FirstSurface`."""
+        """Return the preview prefiltered anew if the environment requires gradients, else this one."""
         environment = None if world.lights is None else world.lights.environment
         return Preview.of(world) if any(t.requires_grad for t in leaves(environment)) else self
 
     def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
-        """See :class:`FirstSurface`."""
+        """Return the paths with split-sum radiance added, and shadow rays to the lights other than the environment."""
         world, state, hit = context.world, vertex.state, vertex.hit
-        local = replace(context, world=replace(world, lights=lights.without_environment(world.lights)))
+        without_sky = replace(context, world=replace(world, lights=lights.without_environment(world.lights)))
         throughput = state.throughput if hit.chance is None else state.throughput * hit.chance
         arriving = replace(state, throughput=throughput)
         at = interact(world, state.o, state.d, hit, context.follow_ray)
-        surface, direct, shadow = pure.shade(local, model, arriving, at)
+        surface, direct, shadow = stages.shade(without_sky, model, arriving, at)
         radiance = torch.zeros_like(state.radiance)
         if self.sky is not None:
             n, v = self.turned(surface.frame.n), self.turned(-state.d)
-            radiance = throughput * under(self.sky, world.materials.models[model], surface.parameters, n, v)
+            radiance = throughput * shade_under(self.sky, world.materials.models[model], surface.parameters, n, v)
             if surface.front_mask is not None:
                 radiance = radiance * surface.front_mask
         return VertexOutput(replace(state, radiance=state.radiance + radiance), None, shadow, at, surface, direct)

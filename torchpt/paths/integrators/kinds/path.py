@@ -37,12 +37,12 @@ class Path(PathIntegrator):
 
     @property
     def limits(self) -> Limits:
-        """See :class:`Integrator`."""
+        """Return the depth limits that the parameters set."""
         return Limits(self.max_depth, self.rr_depth)
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`FrozenConfig`."""
+        """Refuse values by which paths would never end; arguments as for :meth:`torchpt.spec.FrozenConfig.check`."""
         if values["max_depth"] == -1 and values["rr_prob"] == 1.0:
             expected = "a survival probability below 1 where max_depth is -1 (paths would not end)"
             raise Refused(expected, 1.0, ("rr_prob",))
