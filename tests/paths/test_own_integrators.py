@@ -6,6 +6,7 @@ Nothing of the package is edited for them: each is a class in this file.
 from __future__ import annotations
 
 import math
+import platform
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -15,6 +16,8 @@ import torch
 from torch import Tensor
 
 import torchpt
+from torchpt.compiler import cpu
+from torchpt.compiler.cache import clear_programs
 from torchpt.math.sampling import cosine_hemisphere, uniform_sphere
 from torchpt.math.vectors import dot
 from torchpt.paths.integrators.base import Limits
@@ -222,6 +225,21 @@ def test_nothing_is_lost_in_a_furnace_of_fog(compile):
     torch.testing.assert_close(alone, torch.ones(12, 12, 3), rtol=1e-4, atol=0)
     both = torchpt.render(scene, spp=256, integrator=Foggy(max_depth=-1, rr_depth=10**6), full=True, **keys)
     assert float(both.image.mean()) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="these are x86 machines")
+def test_fog_is_the_same_without_avx512(monkeypatch):
+    """Rows of an arena hold any number behind the last lane where vectors are compressed in memory: nothing is read by them."""
+    scene = torchpt.load(furnace(), "cpu")
+    keys: Mapping[str, Any] = {"film": {"width": 13, "height": 11}, "spp": 3, "integrator": Foggy(max_depth=9)}
+    here = torchpt.render(scene, compile="on", threads=1, **keys)
+    older = "haswell" if "+avx2" in cpu.host().features.split(",") else "nehalem"
+    clear_programs()
+    monkeypatch.setitem(cpu._state, "host", cpu.Target(older, ""))
+    try:
+        assert torch.equal(torchpt.render(torchpt.load(furnace(), "cpu"), compile="on", threads=1, **keys), here)
+    finally:
+        clear_programs()
 
 
 def test_fog_is_the_same_by_both_engines_and_over_threads():

@@ -201,8 +201,13 @@ class Block:
         index = index if isinstance(index, str) and index.startswith(("<", "i32 ")) else f"i64 {index}"
         return self.op(f"getelementptr {element}, ptr {pointer}, {index}")
 
-    def gather(self, element: str, pointer: str, index: str, invariant: bool = False) -> str:
-        """Load an element for each lane at int32 indices; ``invariant`` as in :meth:`load`."""
+    def gather(
+        self, element: str, pointer: str, index: str, invariant: bool = False, mask: str = "splat (i1 true)"
+    ) -> str:
+        """Load an element for each lane at int32 indices; ``invariant`` as in :meth:`load`.
+
+        Vectors load 0 where ``mask`` is not set; a single lane always loads, so its index must be valid.
+        """
         if self.width == 1:
             return self.load(element, self.at(pointer, element, f"i32 {index}"), invariant)
         vector, suffix = self.each(element), self.suffix(element)
@@ -211,7 +216,7 @@ class Block:
         places = self.at(pointer, element, f"{self.each('i32')} {index}")
         size = 8 if element in ("double", "i64") else 4
         return self.op(
-            f"call {vector} @{name}({self.each('ptr')} {places}, i32 {size}, {self.each('i1')} splat (i1 true), "
+            f"call {vector} @{name}({self.each('ptr')} {places}, i32 {size}, {self.each('i1')} {mask}, "
             f"{vector} zeroinitializer)"
         )
 

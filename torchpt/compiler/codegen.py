@@ -327,7 +327,8 @@ def _slot(block: Block, ty: str, place: str, extra: int) -> str:
     """Load a row of the slots at an index."""
     element = MEMORY[ty]
     start = block.at("%slots", element, block.op(f"mul i64 %stride, {extra}")) if extra else "%slots"
-    return _from_memory(block, ty, block.gather(element, start, place))
+    # The index comes from the arena, whose rows hold any number behind the last lane.
+    return _from_memory(block, ty, block.gather(element, start, place, mask="%mask"))
 
 
 def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
