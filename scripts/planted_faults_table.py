@@ -245,7 +245,7 @@ FAULTS = (
         "physics/samplers/dimensions.py",
         "samplers integrators",
         "salt",
-        "1 + (depth + step * STEPS) * STREAMS + int(dimension)",
+        "1 + (depth + step * VERTICES_OF_STEP) * DIMENSIONS_OF_VERTEX + int(dimension)",
         "1 + int(dimension)",
         "a random dimension used again: every vertex of a path draws the numbers of the one before, and pictures are wrong",
     ),

@@ -1,4 +1,8 @@
-"""The base class of kinds of samplers."""
+"""The base class of kinds of samplers, and the tensors that it reads.
+
+A kind turns integers into numbers in [0, 1). Its methods are pure tensor functions of lanes (one lane a path, ``N`` of them);
+the lane compiler makes kernels of them, so they neither branch on values nor loop over lanes.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,8 @@ from torchpt.spec import Flag, Spec
 
 __all__ = ["ADAPTIVE", "Points", "SamplerTensors"]
 
-#: Parameters of kinds with any number of points, so that numbers may differ by pixel.
+#: Parameters of kinds that serve any number of points, so that pixels may have different numbers. The renderer reads them: they
+#: are no fields of :class:`Points`.
 ADAPTIVE: dict[str, Spec] = {
     "adaptive": Flag(
         False, doc="whether to take more samples where the error is larger; `spp` is then their mean number"
@@ -25,13 +30,13 @@ ADAPTIVE: dict[str, Spec] = {
 
 @dataclass(frozen=True)
 class SamplerTensors:
-    """Tensors of a sampler, so that a compiled kernel serves all samplers of a kind."""
+    """The numbers of one ``Sampler`` as tensors, so that one compiled kernel serves all samplers of a kind."""
 
-    seeds: Tensor  # (R,) int32 seeds of the randomizations
-    every: Tensor  # () int64 number of points of each randomization
-    more: Tensor  # () int64 number of randomizations that have one more
-    bits: Tensor  # () int64 number of bits of the largest index of a point
-    width: Tensor  # () int64 width of the film
+    seeds: Tensor  # (randomizations,) int32, those of the picture and spare ones
+    points_each: Tensor  # () int64 number of points of each randomization; 0 if unknown
+    with_one_more: Tensor  # () int64 number of randomizations, the first ones, that have one point more
+    index_bits: Tensor  # () int64 number of bits of the largest index of a point
+    film_width: Tensor  # () int64 width of the film in pixels
 
 
 @dataclass(frozen=True)
@@ -45,8 +50,8 @@ class Points(ABC):
         name: the ``type`` in a scene file.
         parameters: specs of the parameters, a field each.
         needs_count: whether the number of points must be known beforehand, so that ``spp`` is the only stop rule.
-        rows: number of rows of a key.
-        of_film: whether points depend on the position of a pixel, not on its index alone.
+        rows: number of rows of a key: 2, or 3 with the number of points as the third.
+        of_film: whether points depend on the position of a pixel on the whole film, not on its index alone.
         joint: whether :meth:`draw_further` continues sets of two dimensions to four, stratified together.
     """
 
@@ -57,35 +62,35 @@ class Points(ABC):
     of_film: ClassVar[bool] = False
     joint: ClassVar[bool] = False
 
-    def key(self, numbers: SamplerTensors, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
+    def key(self, tensors: SamplerTensors, pixel: Tensor, randomization: Tensor, point: Tensor) -> Tensor:
         """Return the keys of samples ``(rows, N)`` int32: seed of the pixel, index of the point, number of points (if 3 rows).
 
         For each seed and randomization the pixel's seed is a bijection of its index, so no two pixels share a sequence.
 
         Args:
-            numbers: the sampler's tensors.
-            pixel: index on the film ``(N,)`` int64, row by row.
-            group: randomization ``(N,)`` int64.
-            point: index in the sequence ``(N,)`` int64.
+            tensors: those of the sampler.
+            pixel: index of the pixel on the whole film, row by row ``(N,)`` int64.
+            randomization: index into ``tensors.seeds`` ``(N,)`` int64.
+            point: index of the point in its sequence ``(N,)`` int64.
         """
-        seed = torch.index_select(numbers.seeds, 0, group)
+        seed = torch.index_select(tensors.seeds, 0, randomization)
         key = [mix(mix(pixel.to(torch.int32)) ^ seed), point.to(torch.int32)]
         if self.rows > 2:
-            key.append((numbers.every + (group < numbers.more)).to(torch.int32))
+            key.append((tensors.points_each + (randomization < tensors.with_one_more)).to(torch.int32))
         return torch.stack(key)
 
     @abstractmethod
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """Return ``(N,)`` float32 in ``[0, 1)``, multiples of ``2^-24``.
+        """Return one number for each lane: ``(N,)`` float32 in ``[0, 1)``, multiples of ``2^-24``.
 
         Args:
             key: ``(rows, N)`` int32 from :meth:`key`.
-            salt: int32 from :func:`~torchpt.physics.samplers.dimensions.salt`.
+            salt: int32, the hash of the dimension: :func:`~torchpt.physics.samplers.dimensions.salt`.
         """
 
     @abstractmethod
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """Return ``(2, N)`` float32 in ``[0, 1)``; arguments as for :meth:`draw_1d`."""
+        """Return two numbers for each lane: ``(2, N)`` float32 in ``[0, 1)``; arguments as for :meth:`draw_1d`."""
 
     def draw_further(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """Return dimensions three and four ``(2, N)`` of the set that :meth:`draw_2d` begins; called only if ``joint``."""

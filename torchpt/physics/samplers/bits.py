@@ -1,4 +1,8 @@
-"""Integer arithmetic of samplers: Sobol' points, Owen scrambling, permutations, strata."""
+"""Integer arithmetic of samplers: Sobol' points, Owen scrambling, permutations, strata.
+
+Kinds of samplers compose these functions. All take int32 lanes ``(N,)`` unless said: 32-bit words are signed here, as in torch,
+and products and sums wrap around.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +13,13 @@ from torchpt.math.hashing import HALVES, as_int32, logical_shift, mix, reverse_b
 
 __all__ = [
     "ROUNDS",
-    "STEP",
-    "STRIDE",
     "W",
     "X",
     "Y",
     "Z",
     "fourth_dimension",
     "jittered",
-    "place",
+    "point_in_stratum",
     "reverse_bits",
     "scramble",
     "second_dimension",
@@ -42,53 +44,60 @@ __all__ = [
 # two are; a bit of each digit of the fourth is added to the other for that.
 
 
-#: Constants that are mixed into a seed, for each of four coordinates.
+#: Arbitrary constants that are mixed into a seed, so that each of up to four coordinates is scrambled by itself.
 X, Y, Z, W = as_int32(0x68BC21EB), as_int32(0x02E5BE93), as_int32(0x967A889B), as_int32(0x368CC8B7)
-_K0, _K1, _K2 = 0x3D20ADEA, 0x05526C56, 0x53A22864
-#: Low bits of the base-4 digits whose position is 0, 1 or 2 modulo 3.
-_FIRST, _SECOND, _THIRD = 0x41041041, 0x04104104, 0x10410410
-_STAYS = as_int32(3 * _FIRST)
+#: Multipliers of Vegdahl's scrambling hash.
+_HASH_0, _HASH_1, _HASH_2 = 0x3D20ADEA, 0x05526C56, 0x53A22864
+#: Low bits of the base-4 digits whose position, from the lowest, is 0, 1 or 2 modulo 3: powers of w repeat after three.
+_DIGITS_0, _DIGITS_1, _DIGITS_2 = 0x41041041, 0x04104104, 0x10410410
+#: Both bits of the digits at positions 0 modulo 3, whose factor is 1.
+_UNCHANGED = as_int32(3 * _DIGITS_0)
+#: Low bits of all base-4 digits.
+_LOW_BITS = 0x55555555
 
 
 def scramble(x: Tensor, seed: Tensor) -> Tensor:
-    """Apply Owen scrambling to bit-reversed numbers: each bit is flipped by a hash of the bits below it."""
-    x = x ^ (x * _K0)
+    """Apply Owen scrambling to bit-reversed numbers ``x``: each bit is flipped by a hash of ``seed`` and the bits below it."""
+    x = x ^ (x * _HASH_0)
     x = x + seed
     x = x * (logical_shift(seed, 16) | 1)
-    x = x ^ (x * _K1)
-    return x ^ (x * _K2)
+    x = x ^ (x * _HASH_1)
+    return x ^ (x * _HASH_2)
 
 
 def second_dimension(index: Tensor) -> Tensor:
-    """Return the bit-reversed second Sobol' coordinate of point ``index``."""
+    """Return the bit-reversed second Sobol' coordinate of point ``index``: the coefficients of ``p(x + 1)``."""
     for shift, mask in reversed(HALVES):
         index = index ^ ((index >> shift) & mask)
     return index
 
 
 def third_dimension(index: Tensor) -> Tensor:
-    """Return the bit-reversed third coordinate of point ``index``."""
-    return _turned(_shifted(_turned(index, _SECOND, _THIRD)), _THIRD, _SECOND)
+    """Return the bit-reversed third coordinate of point ``index``: ``p(x + w)``, as ``q(y) = p(w y)`` at ``y = w² x + 1``."""
+    return _times_powers(_shifted(_times_powers(index, w=_DIGITS_1, w2=_DIGITS_2)), w=_DIGITS_2, w2=_DIGITS_1)
 
 
 def fourth_dimension(index: Tensor) -> Tensor:
-    """Return the bit-reversed fourth coordinate of point ``index``."""
-    index = _turned(_shifted(_turned(index, _THIRD, _SECOND)), _SECOND, _THIRD)
-    return index ^ ((index >> 1) & 0x55555555)
+    """Return the bit-reversed fourth coordinate of point ``index``: ``p(x + w²)``, one bit of each digit added to the other."""
+    index = _times_powers(_shifted(_times_powers(index, w=_DIGITS_2, w2=_DIGITS_1)), w=_DIGITS_1, w2=_DIGITS_2)
+    return index ^ ((index >> 1) & _LOW_BITS)
 
 
 def _shifted(index: Tensor) -> Tensor:
-    """Return ``p(x + 1)`` for coefficients of two bits each."""
+    """Return the coefficients of ``p(x + 1)`` for a ``p`` whose coefficients, in ``index``, have two bits each."""
     for shift, mask in reversed(HALVES[1:]):
         index = index ^ ((index >> shift) & mask)
     return index
 
 
-def _turned(index: Tensor, once: int, twice: int) -> Tensor:
-    """Multiply base-4 digits by w at positions ``once``, by w² at ``twice``; w maps bits (low, high) to (high, low + high)."""
-    low, high = index & 0x55555555, (index >> 1) & 0x55555555
+def _times_powers(index: Tensor, *, w: int, w2: int) -> Tensor:
+    """Multiply the base-4 digits whose low bits are in the mask ``w`` by w, and those in ``w2`` by w².
+
+    By w a digit's bits (low, high) become (high, low + high), modulo 2; by w² they become (low + high, low).
+    """
+    low, high = index & _LOW_BITS, (index >> 1) & _LOW_BITS
     both = low ^ high
-    return (index & _STAYS) | (high & once) | (both & twice) | (((both & once) | (low & twice)) << 1)
+    return (index & _UNCHANGED) | (high & w) | (both & w2) | (((both & w) | (low & w2)) << 1)
 
 
 # ---- Permutations of any length by hashing, for each lane separately and without branches
@@ -100,24 +109,25 @@ def _turned(index: Tensor, once: int, twice: int) -> Tensor:
 # still in order.
 
 
+#: Rounds of the shuffle: some ``2^-ROUNDS`` of the original order remains.
 ROUNDS = 8
 #: A linear congruential generator gives the pivots, whose top bits alone are used (constants of O'Neill's PCG, 2014).
-STRIDE, STEP = 0x2C9277B5, as_int32(0xAC564B05)
+_MULTIPLIER, _INCREMENT = 0x2C9277B5, as_int32(0xAC564B05)
 
 
 def shuffle(index: Tensor, count: Tensor, seed: Tensor) -> Tensor:
-    """Return the image of ``index`` under the permutation of ``0 .. count - 1`` given by ``seed``; int32 ``(N,)``."""
+    """Return the image of ``index`` under the permutation of ``0 .. count - 1`` given by ``seed``; all int32 ``(N,)``."""
     wide = count.to(torch.int64)
 
-    def pivot(seed: Tensor) -> Tensor:
+    def pivot(seed: Tensor) -> Tensor:  # uniform in 0 .. count - 1: the top 31 bits as a fraction of count
         return ((logical_shift(seed, 1).to(torch.int64) * wide) >> 31).to(torch.int32)
 
-    def wrapped(x: Tensor) -> Tensor:
+    def wrapped(x: Tensor) -> Tensor:  # x modulo count, for -count <= x < count: x >> 31 is -1 where x is negative
         return x + ((x >> 31) & count)
 
     index = wrapped(index - pivot(seed))
     for _ in range(ROUNDS):
-        seed = seed * STRIDE + STEP
+        seed = seed * _MULTIPLIER + _INCREMENT
         partner = wrapped(pivot(seed) - index)
         swap = mix(torch.maximum(index, partner) ^ seed) >> 31  # all bits or none
         index = index ^ ((index ^ partner) & swap)
@@ -127,19 +137,29 @@ def shuffle(index: Tensor, count: Tensor, seed: Tensor) -> Tensor:
 # ---- Stratification into equal intervals, for samplers with a known number of points
 
 
+#: Numbers are multiples of one over this, as float32 holds 24 bits.
 _LEVELS = float(1 << 24)
 
 
-def place(stratum: Tensor, jitter: Tensor, count: Tensor) -> Tensor:
-    """Return ``(stratum + jitter) / count`` of float64 lanes as float32 below 1, truncated to 24 bits as all numbers are."""
+def point_in_stratum(stratum: Tensor, jitter: Tensor, count: Tensor) -> Tensor:
+    """Return ``(stratum + jitter) / count`` as float32 below 1, truncated to 24 bits as all numbers are.
+
+    Args:
+        stratum: index of the interval, or its position in intervals, from 0 below ``count``; float64 ``(N,)``, as all three.
+        jitter: position within the interval, from 0 below 1.
+        count: number of intervals.
+    """
     return ((stratum + jitter) / count * _LEVELS).floor().clamp_max(_LEVELS - 1.0).to(torch.float32) * (1.0 / _LEVELS)
 
 
 def jittered(key: Tensor, salt: Tensor | int) -> Tensor:
     """Return jittered numbers ``(N,)`` float32, one in each of ``count`` intervals of ``[0, 1)``, in an order by ``salt``.
 
-    ``key (3, N)`` int32: seed of the pixel, index of the point, number ``count`` of points.
+    Args:
+        key: ``(3, N)`` int32: seed of the pixel, index of the point, number ``count`` of points.
+        salt: int32, the hash of the dimension.
     """
-    seed = mix(key[0] ^ salt)
-    stratum = shuffle(key[1], key[2], seed)
-    return place(stratum.double(), to_unit(mix(mix(seed ^ X) ^ stratum)).double(), key[2].double())
+    pixel_seed, point, count = key[0], key[1], key[2]
+    seed = mix(pixel_seed ^ salt)
+    stratum = shuffle(point, count, seed)
+    return point_in_stratum(stratum.double(), to_unit(mix(mix(seed ^ X) ^ stratum)).double(), count.double())

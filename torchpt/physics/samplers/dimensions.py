@@ -1,4 +1,8 @@
-"""The dimensions of random numbers along a path, and their hashes."""
+"""The dimensions of random numbers along a path, and their hashes, the *salts*.
+
+Each number of a path has a dimension: its use, the vertex that it is drawn at, and the step on the way there (a ray that passes
+surfaces by their opacity draws a number at each). The salt makes the numbers of two dimensions independent.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ from enum import IntEnum
 
 from torchpt.math.hashing import mix_int
 
-__all__ = ["STREAMS", "Dimension", "salt"]
+__all__ = ["DIMENSIONS_OF_VERTEX", "Dimension", "salt"]
 
 
 class Dimension(IntEnum):
@@ -14,11 +18,11 @@ class Dimension(IntEnum):
 
     PIXEL = 0  # 2D, offset in the reconstruction filter
     LENS = 1  # 2D, point on the lens
-    LIGHT_DIGITS = 2  # 1D, low digits of the first number of LIGHT
+    LIGHT_DIGITS = 2  # 1D, low digits of the first number of LIGHT, whose high digits the choice of the light uses up
     LIGHT = 3  # 2D, choice of the light, and point on it
     LOBE = 4  # 1D, choice of the lobe
-    BSDF = 5  # 2D, direction
-    ROULETTE = 6  # 1D
+    BSDF = 5  # 2D, direction from a BSDF
+    ROULETTE = 6  # 1D, whether the path survives Russian roulette
     OPACITY = 7  # 1D, hit or pass through
     PREVIOUS_DIRECTION = 8  # an alias of the dimension that led to the vertex: BSDF of the previous vertex, or PIXEL
     DISTANCE = 9  # 1D, free-flight distance in a medium
@@ -26,12 +30,12 @@ class Dimension(IntEnum):
     EDGE = 11  # 2D, choice of an edge of the scene and point on it; choice of its line if it has two
 
 
-#: Stride between vertices, larger than the number of dimensions, so that a new dimension does not change the others.
-STREAMS = 16
-
-
-#: Stride between steps on the way to a vertex, in vertices: numbers repeat only on paths with more vertices.
-STEPS = 1 << 13
+#: Stride between the dimensions of two vertices: more than there are, so that a new dimension does not change the others.
+DIMENSIONS_OF_VERTEX = 16
+#: Stride between two steps on the way to a vertex, in vertices: numbers repeat only on paths with more vertices than this.
+VERTICES_OF_STEP = 1 << 13
+#: Odd multiplier that spreads consecutive indices over 32 bits before they are hashed: 2^32 over the golden ratio (Knuth).
+_GOLDEN = 0x9E3779B9
 
 
 def salt(dimension: Dimension, depth: int, step: int = 0) -> int:
@@ -40,8 +44,9 @@ def salt(dimension: Dimension, depth: int, step: int = 0) -> int:
     Args:
         dimension: the use of the number.
         depth: depth of the path vertex; 0 is the camera.
-        step: index of the surface that the ray passes on its way to the vertex.
+        step: number of surfaces that the ray has passed on its way to the vertex.
     """
     if dimension is Dimension.PREVIOUS_DIRECTION:
+        # The first surface vertex (depth 1) was reached from the camera, whose direction is drawn by PIXEL.
         dimension, depth = (Dimension.BSDF, depth - 1) if depth > 1 else (Dimension.PIXEL, 0)
-    return mix_int(0x9E3779B9 * (1 + (depth + step * STEPS) * STREAMS + int(dimension)))
+    return mix_int(_GOLDEN * (1 + (depth + step * VERTICES_OF_STEP) * DIMENSIONS_OF_VERTEX + int(dimension)))

@@ -1,5 +1,7 @@
 """Hammersley points ``(i / n, van der Corput(i))``, padded: each set of dimensions is shuffled and scrambled separately.
 
+The key of a sample has three rows: seed of the pixel, index of the point, number n of points.
+
 The second coordinate is Owen-scrambled rather than rotated (Cranley-Patterson): a rotation moves points across elementary
 intervals, and leaves the same grid in every pixel; scrambling keeps one point in every interval and lets the variance of smooth
 integrands fall faster than ``n^-2``. For the same reason the first is jittered within its stratum. The order is a permutation
@@ -15,7 +17,7 @@ from torch import Tensor
 
 from torchpt.math.hashing import mix, to_unit
 from torchpt.physics.samplers.base import Points
-from torchpt.physics.samplers.bits import X, Y, jittered, place, reverse_bits, scramble, shuffle
+from torchpt.physics.samplers.bits import X, Y, jittered, point_in_stratum, reverse_bits, scramble, shuffle
 
 __all__ = ["Hammersley"]
 
@@ -29,12 +31,13 @@ class Hammersley(Points):
     rows = 3
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :meth:`Points.draw_1d`."""
+        """Return a jittered number, one in each of n intervals; arguments as for :meth:`Points.draw_1d`."""
         return jittered(key, salt)
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :meth:`Points.draw_2d`."""
-        seed = mix(key[0] ^ salt)
-        index = shuffle(key[1], key[2], seed)
-        x = place(index.double(), to_unit(mix(mix(seed ^ X) ^ index)).double(), key[2].double())
+        """Return a point of the shuffled and scrambled set; arguments as for :meth:`Points.draw_1d`."""
+        pixel_seed, point, count = key[0], key[1], key[2]
+        seed = mix(pixel_seed ^ salt)
+        index = shuffle(point, count, seed)
+        x = point_in_stratum(index.double(), to_unit(mix(mix(seed ^ X) ^ index)).double(), count.double())
         return torch.stack((x, to_unit(reverse_bits(scramble(index, mix(seed ^ Y))))))

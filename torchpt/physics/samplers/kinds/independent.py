@@ -1,4 +1,7 @@
-"""Independent uniform numbers by counter-based hashing: no state, no order."""
+"""Independent uniform numbers by counter-based hashing: no state, no order.
+
+A key has two rows: seed of the pixel, index of the point.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,12 @@ from torchpt.physics.samplers.base import ADAPTIVE, Points
 
 __all__ = ["Independent"]
 
+#: Flips bits of the first word, whose hash is then the second: any odd constant would do (2^32 over the golden ratio).
 _SECOND = as_int32(0x9E3779B9)
 
 
 def _word(key: Tensor, salt: Tensor | int) -> Tensor:
+    """Return a hash ``(N,)`` int32 of seed, point and dimension."""
     # Two rounds: the first hashes the sample index with the salt, the second adds the pixel. So two lanes share a number only
     # if both rounds collide, and then in this dimension alone.
     return mix(mix(key[1] ^ salt) + key[0])
@@ -29,10 +34,10 @@ class Independent(Points):
     parameters = ADAPTIVE
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :meth:`Points.draw_1d`."""
+        """Return a uniform number; arguments as for :meth:`Points.draw_1d`."""
         return to_unit(_word(key, salt))
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :meth:`Points.draw_2d`."""
+        """Return two uniform numbers; arguments as for :meth:`Points.draw_1d`."""
         word = _word(key, salt)
         return torch.stack((to_unit(word), to_unit(mix(word ^ _SECOND))))

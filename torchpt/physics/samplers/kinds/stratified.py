@@ -2,6 +2,8 @@
 
 In two dimensions the strata are arranged in ``round(sqrt(n))`` columns with nearly equal numbers of strata and widths in
 proportion: all strata have the same area and are nearly square, for any n (primes included).
+
+The key of a sample has three rows: seed of the pixel, index of the point, number n of points.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from torch import Tensor
 
 from torchpt.math.hashing import mix, to_unit
 from torchpt.physics.samplers.base import Points
-from torchpt.physics.samplers.bits import X, Y, jittered, place, shuffle
+from torchpt.physics.samplers.bits import X, Y, jittered, point_in_stratum, shuffle
 
 __all__ = ["Stratified"]
 
@@ -27,18 +29,21 @@ class Stratified(Points):
     rows = 3
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :meth:`Points.draw_1d`."""
+        """Return a jittered number, one in each of n intervals; arguments as for :meth:`Points.draw_1d`."""
         return jittered(key, salt)
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
-        """See :meth:`Points.draw_2d`."""
-        seed = mix(key[0] ^ salt)
-        stratum = shuffle(key[1], key[2], seed)
-        jitter = to_unit(mix(mix(seed ^ X) ^ stratum)).double(), to_unit(mix(mix(seed ^ Y) ^ stratum)).double()
+        """Return a jittered point, one in each of n strata; arguments as for :meth:`Points.draw_1d`."""
+        pixel_seed, point, points = key[0], key[1], key[2]
+        seed = mix(pixel_seed ^ salt)
+        stratum = shuffle(point, points, seed)
+        jitter_x = to_unit(mix(mix(seed ^ X) ^ stratum)).double()
+        jitter_y = to_unit(mix(mix(seed ^ Y) ^ stratum)).double()
         # Integers below 2^53, so that quotients are floored correctly.
-        k, count = stratum.double(), key[2].double()
+        k, count = stratum.double(), points.double()
         columns = (count.sqrt() + 0.5).floor()
-        column = (((k + 1.0) * columns - 1.0) / count).floor()
+        column = (((k + 1.0) * columns - 1.0) / count).floor()  # the one whose strata include k
         first, end = (column * count / columns).floor(), ((column + 1.0) * count / columns).floor()
-        rows = end - first
-        return torch.stack((place(first, jitter[0] * rows, count), place(k - first, jitter[1], rows)))
+        rows = end - first  # strata of the column, which is `rows / count` wide
+        x = point_in_stratum(first, jitter_x * rows, count)
+        return torch.stack((x, point_in_stratum(k - first, jitter_y, rows)))
