@@ -107,7 +107,7 @@ class OneByOne:
             pixels = pixel_set.film.width * pixel_set.film.height
             for sample in range(first, first + count):
                 values = radiance(self.wave, 0, pixels, sample, 1, pixel_set)
-                for place, value in pixel_set.film.after(values, 0, sample):
+                for place, value in pixel_set.film.writes_of_add(values, 0, sample):
                     place.copy_(value)
                 self.taken += 1
                 if each(TaskResult(RayCounts(pixels), pixels)):

@@ -47,7 +47,7 @@ def test_mean_and_variance_are_those_of_the_randomizations():
     assert variance is not None
     torch.testing.assert_close(variance, (groups.var(0) / 4).T.reshape(2, 3, 3))
     assert film.relmse() == pytest.approx(float((variance / (film.mean() ** 2 + FLOOR)).mean()))
-    torch.testing.assert_close(film.first(), samples[:, 0].double().T.reshape(2, 3, 3))
+    torch.testing.assert_close(film.first_samples(), samples[:, 0].double().T.reshape(2, 3, 3))
 
 
 def test_the_variance_is_unbiased():

@@ -7,7 +7,14 @@ import torch
 from torch import Tensor
 
 from torchpt.physics.film import ErrorEstimate, pilots_of
-from torchpt.physics.film.error import STREAMS, Resampled, around, error_estimate, pixels_to_resample, probe_estimate
+from torchpt.physics.film.error import (
+    RESAMPLING_RANDOMIZATIONS,
+    Resampled,
+    error_estimate,
+    mean_of_neighbours,
+    pixels_to_resample,
+    probe_estimate,
+)
 
 SIDE = 96
 
@@ -38,13 +45,13 @@ def known(radiance: Tensor, sparkle: float, seed: int) -> tuple[ErrorEstimate, f
     picture, whole = noisy(radiance, sparkle, g), (SIDE, SIDE)
     pilots = pilots_of(seed, whole, (0, 0, *whole))
     flat = picture.view(-1, 3)
-    a, b = flat[pilots.places].clone(), noisy(radiance, sparkle, g).reshape(-1, 3)[pilots.places]
-    flat[pilots.places] = (a + b) / 2
+    a, b = flat[pilots.pixels].clone(), noisy(radiance, sparkle, g).reshape(-1, 3)[pilots.pixels]
+    flat[pilots.pixels] = (a + b) / 2
     suspects, doubtful = pixels_to_resample(picture, pilots, a, b)
     places = torch.cat((suspects, doubtful))
-    more = torch.stack([noisy(radiance, sparkle, g).reshape(-1, 3)[places] for _ in range(STREAMS)])
-    again = Resampled(places, len(suspects), more.mean(0), more.var(0) / STREAMS)
-    estimate = error_estimate(picture, pilots, a, b, None, True, again)
+    more = torch.stack([noisy(radiance, sparkle, g).reshape(-1, 3)[places] for _ in range(RESAMPLING_RANDOMIZATIONS)])
+    again = Resampled(places, len(suspects), more.mean(0), more.var(0) / RESAMPLING_RANDOMIZATIONS)
+    estimate = error_estimate(picture, pilots, a, b, None, b_counted=True, resampled=again)
     assert estimate is not None
     return estimate, float(((picture - mean).square() / (mean.square() + 0.01)).mean())
 
@@ -84,12 +91,12 @@ def test_an_error_of_few_pixels_is_called_heavy_tailed():
 
     for seed in range(20):
         picture, pilots = value().clone(), pilots_of(seed, (SIDE, SIDE), (0, 0, SIDE, SIDE))
-        first, second = (values.reshape(-1, 3)[pilots.places] for values in (picture, value()))
+        first, second = (values.reshape(-1, 3)[pilots.pixels] for values in (picture, value()))
         suspects, doubtful = pixels_to_resample(picture, pilots, first, second)
         places = torch.cat((suspects, doubtful))
-        more = torch.stack([value().reshape(-1, 3)[places] for _ in range(STREAMS)])
-        again = Resampled(places, len(suspects), more.mean(0), more.var(0) / STREAMS)
-        estimate = error_estimate(picture, pilots, first, second, None, False, again)
+        more = torch.stack([value().reshape(-1, 3)[places] for _ in range(RESAMPLING_RANDOMIZATIONS)])
+        again = Resampled(places, len(suspects), more.mean(0), more.var(0) / RESAMPLING_RANDOMIZATIONS)
+        estimate = error_estimate(picture, pilots, first, second, None, b_counted=False, resampled=again)
         assert estimate is not None
         flags += estimate.heavy_tailed
     assert flags >= 18
@@ -100,11 +107,11 @@ def test_a_sparkle_is_known_wherever_it_is():
     a = radiance.clone()
     a[33, 50] = 30.0
     pilots = pilots_of(0, (SIDE, SIDE), (0, 0, SIDE, SIDE))
-    b = radiance.reshape(-1, 3)[pilots.places]
+    b = radiance.reshape(-1, 3)[pilots.pixels]
     suspects, _ = pixels_to_resample(a, pilots, b, b)
     assert 33 * SIDE + 50 in suspects.tolist()
     again = Resampled(suspects, len(suspects), radiance.reshape(-1, 3)[suspects], torch.zeros(len(suspects), 3))
-    estimate = error_estimate(a, pilots, b, b, None, False, again)
+    estimate = error_estimate(a, pilots, b, b, None, b_counted=False, resampled=again)
     assert estimate is not None and estimate.relmse == pytest.approx(
         29.5**2 / ((30 / 32) ** 2 + 0.01) / SIDE**2, rel=0.01
     )
@@ -116,8 +123,8 @@ def test_pilots_alone_ask_no_other_pixel():
     pilots = pilots_of(1, (64, 64), (0, 0, 64, 64))
     a, b = (0.5 + 0.05 * torch.randn(len(pilots), 3, generator=g, dtype=torch.float64) for _ in range(2))
     exact = 0.05**2 / 0.26
-    assert probe_estimate(pilots, a, b, None, False).relmse == pytest.approx(exact, rel=0.2)
-    alone, both = (probe_estimate(pilots, a, b, None, counted).relmse for counted in (False, True))
+    assert probe_estimate(pilots, a, b, None, b_counted=False).relmse == pytest.approx(exact, rel=0.2)
+    alone, both = (probe_estimate(pilots, a, b, None, b_counted=counted).relmse for counted in (False, True))
     assert both == pytest.approx(alone * 31 / 32)
 
 
@@ -129,16 +136,16 @@ def test_second_values_of_another_variance():
     a = 0.5 + 0.05 * torch.randn(n, 3, generator=g, dtype=torch.float64)
     halves = 0.5 + 0.1 * torch.randn(2, n, 3, generator=g, dtype=torch.float64)
     b, spare = halves.mean(0), (halves[0] - halves[1]).square() / 4
-    assert probe_estimate(pilots, a, b, spare, False).relmse == pytest.approx(0.05**2 / 0.26, rel=0.1)
+    assert probe_estimate(pilots, a, b, spare, b_counted=False).relmse == pytest.approx(0.05**2 / 0.26, rel=0.1)
 
 
 def test_what_lies_around():
     values = torch.arange(12.0, dtype=torch.float64).view(3, 4, 1)
-    near = around(values, torch.ones(3, 4, dtype=torch.bool))
+    near = mean_of_neighbours(values, torch.ones(3, 4, dtype=torch.bool))
     assert float(near[1, 1, 0]) == pytest.approx(5.0) and float(near[0, 0, 0]) == pytest.approx((1 + 4 + 5) / 3)
     known_ones = torch.zeros(3, 4, dtype=torch.bool)
     known_ones[0, 1] = True
-    masked = around(values, known_ones)
+    masked = mean_of_neighbours(values, known_ones)
     assert float(masked[1, 1, 0]) == 1.0 and float(masked[2, 3, 0]) == 11.0  # none around: its own
 
 
@@ -151,7 +158,7 @@ def test_pictures_of_a_few_pixels(side):
     places = torch.cat((suspects, doubtful))
     again = Resampled(places, len(suspects), torch.full((len(places), 3), 0.5).double(), torch.zeros(len(places), 3))
     for looked in (None, again):
-        estimate = error_estimate(picture, pilots, a, b, None, True, looked)
+        estimate = error_estimate(picture, pilots, a, b, None, b_counted=True, resampled=looked)
         assert estimate is None or estimate.relmse >= 0
         if estimate is not None:
             assert (len(pilots) - len(suspects) >= 8) <= (estimate.interval is not None) <= (len(pilots) >= 8)
@@ -160,4 +167,5 @@ def test_pictures_of_a_few_pixels(side):
 def test_a_picture_without_error():
     pilots = pilots_of(0, (32, 32), (0, 0, 32, 32))
     black, values = torch.zeros(32, 32, 3).double(), torch.zeros(len(pilots), 3).double()
-    assert error_estimate(black, pilots, values, values, None, True, None) == ErrorEstimate(0.0, (0.0, 0.0), False)
+    estimate = error_estimate(black, pilots, values, values, None, b_counted=True, resampled=None)
+    assert estimate == ErrorEstimate(0.0, (0.0, 0.0), False)

@@ -190,7 +190,7 @@ def test_sums_of_splats_are_exact_in_any_order() -> None:
     one.add(stream, pixel, value)
     for part in order.split(3001):
         other.add(stream[part], pixel[part], value[:, part])
-        sums, place, total = third.after(stream[part], pixel[part], value[:, part])
+        sums, place, total = third.writes_of_add(stream[part], pixel[part], value[:, part])
         sums.index_copy_(2, place, total)
     assert torch.equal(one.state(), other.state()) and torch.equal(one.state(), third.state())
     for s in range(streams):

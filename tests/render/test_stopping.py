@@ -241,7 +241,7 @@ def test_a_crop_without_pilots(box, sampler, compile):
 
 def pilots_at(seed: int, side: int) -> torch.Tensor:
     mask = torch.zeros(side * side, dtype=torch.bool)
-    mask[pilots_of(seed, (side, side), (0, 0, side, side)).places] = True
+    mask[pilots_of(seed, (side, side), (0, 0, side, side)).pixels] = True
     return mask
 
 

@@ -116,17 +116,17 @@ def _piece(wave: Wave, pixel_set: PixelSet, span: Span) -> Piece:
             splats = [replace(one, value=one.value * clamp_scale(one.value, clamp)) for one in splats]
             before, after = torch.stack((before, _light(radiance, splats))).tolist()  # one transfer
             piece.light = before, after
-        piece.writes += pixel_set.film.after(radiance, first, sample)
+        piece.writes += pixel_set.film.writes_of_add(radiance, first, sample)
         if pixel_set.film.splats is not None and splats:
             lane, pixel, value = (
                 torch.cat([getattr(one, name) for one in splats], -1) for name in ("lane", "pixel", "value")
             )
-            stream = pixel_set.film.stream(sample + lane // pixels)
-            piece.splats.append(pixel_set.film.splats.after(stream, pixel, value))
+            stream = pixel_set.film.randomization_of(sample + lane // pixels)
+            piece.splats.append(pixel_set.film.splats.writes_of_add(stream, pixel, value))
     if pixel_set.layers:
         piece.tally.rays += pixels * samples
         for name, values in tensors.layers(wave, tuple(pixel_set.layers), *span, pixel_set).items():
-            piece.writes += pixel_set.layers[name].after(values, first, sample)
+            piece.writes += pixel_set.layers[name].writes_of_add(values, first, sample)
     return piece
 
 

@@ -12,7 +12,7 @@ from torchpt.paths.wave import PixelSet, Wave
 from torchpt.physics.film import ErrorEstimate, Film, Pilots, pilots_of
 from torchpt.physics.film.error import (
     BLOCK,
-    STREAMS,
+    RESAMPLING_RANDOMIZATIONS,
     Resampled,
     allocate_samples,
     error_by_pilots,
@@ -78,17 +78,27 @@ class ErrorProbes:
         again = None
         if self.resampled is not None:
             pixel_set, suspects = self.resampled
-            values = torch.stack(pixel_set.film.streams()).cpu()
+            values = torch.stack(pixel_set.film.randomization_means()).cpu()
             assert pixel_set.indices is not None
             again = Resampled(pixel_set.indices.cpu(), suspects, values.mean(0), values.var(0) / len(values))
         first = self._first(film)
         return error_estimate(
-            picture.cpu(), self.pilots, first, self._second(), self._second_variance(), self.counted, again
+            picture.cpu(),
+            self.pilots,
+            first,
+            self._second(),
+            self._second_variance(),
+            b_counted=self.counted,
+            resampled=again,
         )
 
     def resampling_share(self, pixels: int) -> float:
         """Return the samples that third values take, as a share of the samples of a picture of ``pixels`` pixels."""
-        return STREAMS * sum(resample_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
+        return (
+            RESAMPLING_RANDOMIZATIONS * sum(resample_counts(pixels, len(self.pilots))) / pixels
+            if len(self.pilots)
+            else 0.0
+        )
 
     def resample_outliers(
         self, film: Film, from_first_rank: Callable[[Tensor], Tensor] | None = None
@@ -104,22 +114,24 @@ class ErrorProbes:
         if from_first_rank is not None:
             suspects, doubtful = from_first_rank(suspects), from_first_rank(doubtful)
         places = torch.cat((suspects, doubtful)).to(film.sums.device)
-        streams = Randomizations(self.pixel_set.randomizations.first + self.pixel_set.randomizations.count, STREAMS)
-        pixel_set = PixelSet(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
+        streams = Randomizations(self.pixel_set.randomizations.first + self.pixel_set.randomizations.count, RESAMPLING_RANDOMIZATIONS)
+        pixel_set = PixelSet(Film(len(places), 1, RESAMPLING_RANDOMIZATIONS, film.sums.device), {}, streams, places)
         self.resampled = pixel_set, len(suspects)
         self.resampled_at = float(film.counts.double().mean())
         samples = round(self.resampled_at)
-        return [(pixel_set, 0, STREAMS * samples)]
+        return [(pixel_set, 0, RESAMPLING_RANDOMIZATIONS * samples)]
 
     def probe_estimate(self, film: Film) -> ErrorEstimate | None:
         """Return the error estimate that the probes give without third values; None without probes."""
         if not len(self.pilots):
             return None
-        return probe_estimate(self.pilots, self._first(film), self._second(), self._second_variance(), self.counted)
+        return probe_estimate(
+            self.pilots, self._first(film), self._second(), self._second_variance(), b_counted=self.counted
+        )
 
     def _first(self, film: Film) -> Tensor:
         assert self.pixel_set.indices is not None
-        return film.taken(self.pixel_set.indices).values().cpu()
+        return film.extract(self.pixel_set.indices).values().cpu()
 
     def _second(self) -> Tensor:
         return self.pixel_set.film.values().cpu()
@@ -128,7 +140,7 @@ class ErrorProbes:
         """Return the variance of the second values where it differs from that of the first ones; else None."""
         if self.counted:
             return None
-        one, other = self.pixel_set.film.streams()
+        one, other = self.pixel_set.film.randomization_means()
         return ((one - other).square() / 4).cpu()
 
 
@@ -138,7 +150,7 @@ def error_probes(wave: Wave, settings: Settings, device: torch.device) -> ErrorP
     pilots = pilots_of(settings.render.seed, (film.width, film.height), wave.crop)
     streams = Randomizations(wave.sampler.randomizations, 2 if settings.adaptive else 1)
     sums = Film(len(pilots), 1, streams.count, device)
-    return ErrorProbes(pilots, PixelSet(sums, {}, streams, pilots.places.to(device)), not settings.adaptive)
+    return ErrorProbes(pilots, PixelSet(sums, {}, streams, pilots.pixels.to(device)), not settings.adaptive)
 
 
 # ---- Adaptive sampling: error probes decide where samples go
@@ -174,34 +186,34 @@ class SampleAllocation:
         """
         device = picture.film.sums.device
         counts = self._of_blocks(picture.film.counts.cpu())
-        aims = allocate_samples(self._errors(probes), counts, self.pixels, mean, last)
+        aims = allocate_samples(self._errors(probes), counts, self.pixels, mean, last=last)
         spans: list[tuple[PixelSet, int, int]] = []
         if self._from_first_rank is not None:
             aims = self._from_first_rank(aims)
         most = int(aims.max()) + 1
         kinds = (counts * most + aims)[aims > counts].unique().tolist()
-        pilot_blocks = self.block[self.pilots.places]
+        pilot_blocks = self.block[self.pilots.pixels]
         for have, aim in (divmod(kind, most) for kind in kinds):
             chosen = (counts == have) & (aims == aim)
             places = chosen[self.block].nonzero()[:, 0].to(device)
             spans.append((self._part(picture, places, places), have, aim - have))
             seconds = chosen[pilot_blocks].nonzero()[:, 0]
             if len(seconds):
-                part = self._part(probes.pixel_set, seconds.to(device), self.pilots.places[seconds].to(device))
+                part = self._part(probes.pixel_set, seconds.to(device), self.pilots.pixels[seconds].to(device))
                 spans.append((part, have, aim - have))
         return spans
 
     def merge(self) -> None:
         """Add the samples of the round to the films that its pixels were taken from."""
         for whole, places, part in self._parts:
-            whole.put(places, part)
+            whole.write_back(places, part)
         self._parts.clear()
 
     def _part(self, pixel_set: PixelSet, places: Tensor, pixels: Tensor) -> PixelSet:
         """Return pixels ``places`` of a pixel set as a set with films of their own."""
         films = {}
         for name, film in (("", pixel_set.film), *pixel_set.layers.items()):
-            films[name] = film.taken(places)
+            films[name] = film.extract(places)
             self._parts.append((film, places, films[name]))
         return PixelSet(films.pop(""), films, pixel_set.randomizations, pixels)
 
@@ -213,7 +225,7 @@ class SampleAllocation:
 
     def _errors(self, probes: ErrorProbes) -> Tensor:
         """Return the relative variance of each block's pixels, up to a factor, from the second values alone."""
-        a, b = (x.cpu() for x in probes.pixel_set.film.streams())
+        a, b = (x.cpu() for x in probes.pixel_set.film.randomization_means())
         errors, probed = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
         at = tuple(self.pilots.block)
         errors[at], probed[at] = error_by_pilots(self.pilots, a, b), True

@@ -111,7 +111,7 @@ def _layers(run: Run) -> dict[str, Tensor]:
     film = run.picture.film
     for name, layer in run.seen.items():
         seen = run.picture.layers[name]
-        values = seen.mean() * (run.unit if layer.length else 1.0) if layer.averaged else seen.first()
+        values = seen.mean() * (run.unit if layer.length else 1.0) if layer.averaged else seen.first_samples()
         layers[name] = values.to(run.dtype)
     for name in run.settings.film.aovs:
         if name not in run.seen:

@@ -120,9 +120,9 @@ class DistributedRender:
                 return part
         device = pixel_set.film.sums.device
         places = dealt(pixel_set.film.width * pixel_set.film.height, self.group.rank, self.group.size).to(device)
-        layers = {name: film.taken(places) for name, film in pixel_set.layers.items()}
+        layers = {name: film.extract(places) for name, film in pixel_set.layers.items()}
         pixels = places if pixel_set.indices is None else pixel_set.indices[places]
-        part = PixelSet(pixel_set.film.taken(places), layers, pixel_set.randomizations, pixels)
+        part = PixelSet(pixel_set.film.extract(places), layers, pixel_set.randomizations, pixels)
         self._parts.append((pixel_set, part))
         return part
 
@@ -131,13 +131,13 @@ class DistributedRender:
         sent = torch.cat([value.reshape(-1).view(torch.int64) for value in own.state().values()])
         for rank, values in enumerate(self.group.gather(sent)):
             places = dealt(whole.width * whole.height, rank, self.group.size).to(sent.device)
-            part = whole.part(len(places))
+            part = whole.empty_part(len(places))
             state, first = {}, 0
             for name, value in part.state().items():
                 state[name] = values[first : first + value.numel()].view(value.dtype).view(value.shape)
                 first += value.numel()
             part.restore(state)
-            whole.put(places, part)
+            whole.write_back(places, part)
 
     def _of_all(self, own: NonFinite) -> NonFinite:
         """Return the non-finite samples of all ranks."""

@@ -281,7 +281,7 @@ class KernelsForward:
                 before += float(value.sum(dtype=torch.float64))
                 value = value * clamp_scale(value, self.clamp)
                 after += float(value.sum(dtype=torch.float64))
-            stream = film.stream(chunk.first_sample + splats.lane // chunk.pixels)
+            stream = film.randomization_of(chunk.first_sample + splats.lane // chunk.pixels)
             film.splats.add(stream, splats.pixel, value)
         share.light = share.light[0] + before, share.light[1] + after
 
@@ -317,9 +317,9 @@ class KernelsForward:
             if clamp is not None:
                 words[rest + 6], words[rest + 7] = source, CAPACITY
             kernel.call(ctypes.addressof(words), n)
-        film.counted(chunk.first_pixel, n, chunk.first_sample, chunk.samples)
+        film.count_samples(chunk.first_pixel, n, chunk.first_sample, chunk.samples)
         if chunk.first_sample == 0:
-            film.keep_first(values[:, :n], chunk.first_pixel)
+            film.set_first_samples(values[:, :n], chunk.first_pixel)
         return int(counters[0])
 
     def _lost(self, used: np.ndarray, chunk: Chunk) -> NonFinite:

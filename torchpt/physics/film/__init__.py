@@ -2,8 +2,9 @@
 
 A sample counts for one pixel: its film position is sampled from the filter (Ernst, Stamminger, Greiner, *Filter Importance
 Sampling*, 2006), so chunks of pixels are independent. ``sums.py`` adds samples in float64 and in order, one sum for each
-randomization of the sampler; ``splats.py`` adds splats to other pixels in fixed point, exact in any order; ``error.py``
-estimates the error and allocates samples for adaptive sampling.
+randomization of the sampler (read it first); ``splats.py`` adds splats, which are radiance that paths send to other pixels than
+their own, in fixed point, exact in any order; ``error.py`` estimates the error and allocates samples for adaptive sampling.
+``filters.py`` has the base class of filters, ``kinds/`` one file for each.
 """
 
 from __future__ import annotations
@@ -33,7 +34,12 @@ FILTERS: Kinds[Filter] = Kinds("torchpt.physics.film.kinds", ("gaussian", "box",
 
 
 def filter_of(kind: str, device: torch.device, **given: Any) -> Filter:
-    """Return a filter by name; parameters that are not ``given`` have their defaults.
+    """Return a filter by name.
+
+    Args:
+        kind: the ``type`` in a scene file.
+        device: device of the lanes.
+        given: values of parameters; the others have their defaults.
 
     Raises:
         SceneError: an unknown parameter, or a bad value.

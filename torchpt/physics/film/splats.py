@@ -1,4 +1,8 @@
-"""Sums of splats, which do not depend on the order of addition."""
+"""Sums of splats, which do not depend on the order of addition.
+
+A splat is radiance that a path adds to a pixel other than its own. Threads add splats to any pixel at any time, so the sums are
+integers (fixed point): integer addition gives the same bits in any order.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +15,20 @@ from torch import Tensor
 
 __all__ = ["LARGEST", "SplatSums", "Splats"]
 
-#: A sum is three 64-bit integers: the whole part, and twice 36 bits of the fraction.
-BITS = 36
-#: Splats from this value on count as infinite: a sum holds 256 of them.
+#: A sum is three 64-bit integers, *limbs*: the whole part, and twice this many bits of the fraction.
+FRACTION_BITS = 36
+#: Splats from this value on count as infinite: a sum holds 256 of them below 2^63.
 LARGEST = 2.0**55
-#: Number of splats after which carries are propagated: the lower integers hold twice as many at one pixel.
-CARRY = 1 << 26
+#: Number of splats after which carries are propagated: a limb of 64 bits holds twice as many of 36 bits.
+SPLATS_BEFORE_CARRY = 1 << 26
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Splats of a wave or of a chunk.
+    """The k splats of a wave or of a chunk (the samples that are traced together).
 
     Attributes:
-        lane: ``(k,)`` int64 lanes of the samples.
+        lane: ``(k,)`` int64 index, within the wave or chunk, of the sample that sends each splat.
         pixel: ``(k,)`` int64 indices of the target pixels, row by row.
         value: ``(3, k)`` radiance.
     """
@@ -41,90 +45,101 @@ class SplatSums:
 
     Args:
         pixels: number of pixels of the picture.
-        streams: number of randomizations, see :class:`torchpt.physics.samplers.Randomizations`.
+        randomizations: number of randomizations of the sampler, see :class:`torchpt.physics.samplers.Randomizations`.
         device: device of the sums.
     """
 
-    def __init__(self, pixels: int, streams: int, device: torch.device) -> None:
-        self._pixels, self._streams, self._added = pixels, streams, 0
-        self._sums = torch.zeros(3, 3, streams * pixels, dtype=torch.int64, device=device)
+    def __init__(self, pixels: int, randomizations: int, device: torch.device) -> None:
+        self._pixels = pixels
+        self._since_carry = 0  # splats since carries were last propagated
+        # Limbs, highest first; channels; sums of randomization k at pixel p at k * pixels + p.
+        self._sums = torch.zeros(3, 3, randomizations * pixels, dtype=torch.int64, device=device)
         self._lock = threading.Lock()
 
     @staticmethod
-    def bytes_of(pixels: int, streams: int) -> int:
+    def bytes_of(pixels: int, randomizations: int) -> int:
         """Return the size in bytes of the sums of this many pixels."""
-        return 72 * pixels * streams
+        return 72 * pixels * randomizations  # three limbs of 8 bytes for each of three channels
 
-    def add(self, stream: Tensor, pixel: Tensor, value: Tensor) -> None:
+    def add(self, randomization: Tensor, pixel: Tensor, value: Tensor) -> None:
         """Add splats on a CPU; thread-safe.
 
         Args:
-            stream: ``(k,)`` int64 randomizations of the samples.
-            pixel: ``(k,)`` int64.
+            randomization: ``(k,)`` int64 index of the randomization of each splat's sample.
+            pixel: ``(k,)`` int64 index of the target pixel.
             value: ``(3, k)``, each less than :data:`LARGEST`.
         """
         # By numpy: torch would start a team of threads for each thread that renders.
-        place, sums = stream.numpy() * self._pixels + pixel.numpy(), self._sums.numpy()
-        parts = [part.astype(np.int64) for part in _parts(value.numpy().astype(np.float64), np.trunc)]
+        index, sums = randomization.numpy() * self._pixels + pixel.numpy(), self._sums.numpy()
+        limbs = [limb.astype(np.int64) for limb in _limbs(value.numpy().astype(np.float64), np.trunc)]
         with self._lock:
-            self._count(len(place))
-            for total, part in zip(sums, parts, strict=True):
-                for row, values in zip(total, part, strict=True):
-                    np.add.at(row, place, values)
+            self._count(len(index))
+            for sums_of_limb, limb in zip(sums, limbs, strict=True):
+                for row, values in zip(sums_of_limb, limb, strict=True):  # one row a channel
+                    np.add.at(row, index, values)
 
-    def after(self, stream: Tensor, pixel: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what :meth:`add` would change, on any device: sums, indices ``(n,)`` into their last axis, and new values.
+    def writes_of_add(self, randomization: Tensor, pixel: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the changes that :meth:`add` would make, on any device; arguments as there.
 
-        Writing the values twice has no further effect; see :meth:`torchpt.physics.film.Film.after`.
+        Nothing is changed. Writing the values twice has no further effect, as for
+        :meth:`torchpt.physics.film.Film.writes_of_add`.
+
+        Returns:
+            The sums ``(3, 3, m)``, indices ``(n,)`` int64 into their last axis, and the new values there ``(3, 3, n)``.
         """
-        place, where = torch.unique(stream * self._pixels + pixel, return_inverse=True)
+        index, index_of_splat = torch.unique(randomization * self._pixels + pixel, return_inverse=True)
         with self._lock:
             self._count(len(pixel))
-            total = self._sums[..., place]
-        for own, part in zip(total, _parts(value.double(), torch.trunc), strict=True):
-            own.index_add_(1, where, part.to(torch.int64))
-        return self._sums, place, total
+            values = self._sums[..., index]
+        for values_of_limb, limb in zip(values, _limbs(value.double(), torch.trunc), strict=True):
+            values_of_limb.index_add_(1, index_of_splat, limb.to(torch.int64))
+        return self._sums, index, values
 
-    def join(self, sums: Tensor) -> None:
+    def add_state(self, sums: Tensor) -> None:
         """Add sums from :meth:`state` of another object."""
         with self._lock:
             self._sums += sums
-            self._added += 1
+            self._since_carry += 1
             self._carry()
 
     def state(self) -> Tensor:
-        """Return the sums ``(3, 3, streams * pixels)`` int64, with all carries propagated, so that they are unique."""
+        """Return the sums ``(3, 3, randomizations * pixels)`` int64, with all carries propagated, so that they are unique."""
         with self._lock:
             self._carry()
         return self._sums
 
-    def values(self, stream: int) -> Tensor:
+    def values(self, randomization: int) -> Tensor:
         """Return the sums of one randomization ``(3, pixels)`` float64."""
         with self._lock:  # other threads may be adding while a preview is read
             self._carry()
-            high, middle, low = (part.double() for part in self._sums.view(3, 3, -1, self._pixels)[:, :, stream])
-        return high + (middle + low * 2.0**-BITS) * 2.0**-BITS
+            limbs = self._sums.view(3, 3, -1, self._pixels)[:, :, randomization]
+            high, middle, low = (limb.double() for limb in limbs)
+        return high + (middle + low * 2.0**-FRACTION_BITS) * 2.0**-FRACTION_BITS
 
     def _count(self, splats: int) -> None:
         """Count splats that are about to be added, after propagating carries if there are too many."""
-        if self._added + splats > CARRY:
+        if self._since_carry + splats > SPLATS_BEFORE_CARRY:
             self._carry()
-        self._added += splats
+        self._since_carry += splats
 
     def _carry(self) -> None:
-        if not self._added:
+        """Move what exceeds the bits of a lower limb to the next higher one; the caller holds the lock."""
+        if not self._since_carry:
             return
         high, middle, low = self._sums
-        middle += low >> BITS
-        low &= (1 << BITS) - 1
-        high += middle >> BITS
-        middle &= (1 << BITS) - 1
-        self._added = 0
+        middle += low >> FRACTION_BITS
+        low &= (1 << FRACTION_BITS) - 1
+        high += middle >> FRACTION_BITS
+        middle &= (1 << FRACTION_BITS) - 1
+        self._since_carry = 0
 
 
-def _parts(value, whole):
-    """Yield integers in units of 1, 2**-36 and 2**-72 that add up to ``value``, in float64; ``whole`` truncates."""
+def _limbs(value, truncate):
+    """Yield three integers, in float64, in units of 1, 2**-36 and 2**-72 that add up to ``value``.
+
+    ``value`` is a float64 array of numpy with ``np.trunc`` as ``truncate``, or a tensor with ``torch.trunc``.
+    """
     for _ in range(3):
-        part = whole(value)
-        yield part
-        value = (value - part) * 2.0**BITS
+        limb = truncate(value)
+        yield limb
+        value = (value - limb) * 2.0**FRACTION_BITS

@@ -1,4 +1,9 @@
-"""Sums of samples by pixel and randomization."""
+"""Sums of samples by pixel and randomization: the film that engines add chunks of samples to.
+
+Samples ``i`` with the same ``i % R`` come from one of R independent randomizations of the sampler
+(:mod:`torchpt.physics.samplers`); the film sums each randomization by itself, so that their spread estimates the variance.
+Additions happen in the order of samples, whatever the threads, so sums have the same bits in every render.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +19,14 @@ __all__ = ["Film"]
 
 
 class Film:
-    """Sums of radiance per pixel and randomization.
+    """Sums of radiance (or of an AOV) by pixel and randomization, with the number of samples of each.
+
+    Pixels are counted row by row. Channels come before pixels inside, as on lanes; pictures have them last.
 
     Args:
         width: width of the picture (after a crop) in pixels.
         height: height of the picture in pixels.
-        randomizations: number of independent sequences that share the samples, see :mod:`torchpt.physics.samplers`.
+        randomizations: R, the number of randomizations that share the samples.
         device: device of the lanes.
         channels: C, three for radiance.
         splats: True: integrators splat to other pixels. The value of a pixel is then the mean of its own samples plus its
@@ -36,6 +43,7 @@ class Film:
         randomizations: int,
         device: torch.device,
         channels: int = 3,
+        *,
         splats: bool = False,
     ) -> None:
         self.width, self.height, self.randomizations, self.channels = width, height, randomizations, channels
@@ -46,65 +54,65 @@ class Film:
         self.splats = SplatSums(pixels, randomizations, device) if splats else None
 
     @staticmethod
-    def bytes_of(pixels: int, randomizations: int, channels: int = 3, splats: bool = False) -> int:
+    def bytes_of(pixels: int, randomizations: int, channels: int = 3, *, splats: bool = False) -> int:
         """Return the size in bytes of a film of this many pixels."""
         # 8 bytes each: first samples, and for each randomization sums and a count.
-        own = 8 * pixels * (channels + randomizations * (channels + 1))
-        return own + (SplatSums.bytes_of(pixels, randomizations) if splats else 0)
+        without_splats = 8 * pixels * (channels + randomizations * (channels + 1))
+        return without_splats + (SplatSums.bytes_of(pixels, randomizations) if splats else 0)
 
     def add(self, radiance: Tensor, first_pixel: int, first_sample: int) -> None:
         """Add samples ``(C, S, n)``: ``S`` consecutive ones of ``n`` consecutive pixels, from the given indices on."""
-        for place, value in self.after(radiance, first_pixel, first_sample):
-            place.copy_(value)
+        for target, value in self.writes_of_add(radiance, first_pixel, first_sample):
+            target.copy_(value)
 
-    def after(self, radiance: Tensor, first_pixel: int, first_sample: int) -> list[tuple[Tensor, Tensor]]:
+    def writes_of_add(self, radiance: Tensor, first_pixel: int, first_sample: int) -> list[tuple[Tensor, Tensor]]:
         """Return the changes that :meth:`add` would make: pairs of a view of this film and its new values.
 
         The film is not changed. Copying the values allocates nothing, so that on lack of memory all or nothing is added.
         """
-        count, n = radiance.shape[1], radiance.shape[2]
+        _, samples, n = radiance.shape
         pixels = slice(first_pixel, first_pixel + n)
-        changed = []
+        writes = []
         if first_sample == 0:
-            changed.append((self._first[:, pixels], radiance[:, 0].double()))
-        for group in {(first_sample + s) % self.randomizations for s in range(min(count, self.randomizations))}:
-            own = range((group - first_sample) % self.randomizations, count, self.randomizations)
-            sums = self._sums[group, :, pixels].clone()
-            for s in own:
+            writes.append((self._first[:, pixels], radiance[:, 0].double()))
+        for k in {(first_sample + s) % self.randomizations for s in range(min(samples, self.randomizations))}:
+            of_randomization = range((k - first_sample) % self.randomizations, samples, self.randomizations)
+            sums = self._sums[k, :, pixels].clone()
+            for s in of_randomization:
                 sums += radiance[:, s]
-            changed.append((self._sums[group, :, pixels], sums))
-            changed.append((self._counts[group, pixels], self._counts[group, pixels] + len(own)))
-        return changed
+            writes.append((self._sums[k, :, pixels], sums))
+            writes.append((self._counts[k, pixels], self._counts[k, pixels] + len(of_randomization)))
+        return writes
 
-    def part(self, pixels: int) -> Film:
-        """Return an empty film for some of its pixels, whose samples may send splats to all of them."""
+    def empty_part(self, pixels: int) -> Film:
+        """Return an empty film for ``pixels`` of the pixels of this one; splats of its samples may go to all pixels."""
         part = Film(pixels, 1, self.randomizations, self._sums.device, self.channels)
         if self.splats is not None:
             part.splats = SplatSums(self.width * self.height, self.randomizations, self._sums.device)
         return part
 
-    def stream(self, sample: Tensor) -> Tensor:
-        """Return the randomization of each sample ``(k,)`` of a pixel, by its index."""
+    def randomization_of(self, sample: Tensor) -> Tensor:
+        """Return the index of the randomization ``(k,)`` of each sample, by its index within its pixel ``(k,)`` int64."""
         return sample % self.randomizations
 
-    def taken(self, places: Tensor) -> Film:
-        """Return some of the pixels as a separate film, whose sums of splats are empty."""
-        part = self.part(len(places))
-        part._first, part._sums = self._first[:, places].contiguous(), self._sums[:, :, places].contiguous()
-        part._counts = self._counts[:, places].contiguous()
+    def extract(self, pixels: Tensor) -> Film:
+        """Return the pixels of the given indices ``(n,)`` int64 as a separate film, one row high, without splats."""
+        part = self.empty_part(len(pixels))
+        part._first, part._sums = self._first[:, pixels].contiguous(), self._sums[:, :, pixels].contiguous()
+        part._counts = self._counts[:, pixels].contiguous()
         return part
 
-    def put(self, places: Tensor, part: Film) -> None:
-        """Write back pixels from :meth:`taken` after more samples, and add their splats."""
-        self._first[:, places], self._sums[:, :, places] = part._first, part._sums
-        self._counts[:, places] = part._counts
+    def write_back(self, pixels: Tensor, part: Film) -> None:
+        """Overwrite the pixels that :meth:`extract` returned as ``part``, after more samples, and add its splats."""
+        self._first[:, pixels], self._sums[:, :, pixels] = part._first, part._sums
+        self._counts[:, pixels] = part._counts
         if self.splats is not None and part.splats is not None:
-            self.splats.join(part.splats.state())
+            self.splats.add_state(part.splats.state())
 
     def state(self) -> dict[str, Tensor]:
         """Return the tensors of the film by name, for a checkpoint."""
-        own = {"sums": self._sums, "counts": self._counts, "first": self._first}
-        return own if self.splats is None else {**own, "splats": self.splats.state()}
+        state = {"sums": self._sums, "counts": self._counts, "first": self._first}
+        return state if self.splats is None else {**state, "splats": self.splats.state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Load the :meth:`state` of another film of the same size.
@@ -127,39 +135,39 @@ class Film:
         mean = self._sums.sum(0) / self._counts.sum(0).clamp_min(1)
         if self.splats is not None:
             total = sum(self.splats.values(k) for k in range(self.randomizations))
-            mean += total / _samples(self._counts.sum(0))
+            mean += total / _samples_a_pixel(self._counts.sum(0))
         return mean
 
-    def _stream(self, k: int) -> Tensor:
-        """Return means of the pixels by one randomization ``(C, pixels)``."""
+    def _mean_of(self, k: int) -> Tensor:
+        """Return means of the pixels over the samples of randomization ``k`` ``(C, pixels)``."""
         mean = self._sums[k] / self._counts[k].clamp_min(1)
         if self.splats is not None:
-            mean += self.splats.values(k) / _samples(self._counts[k])
+            mean += self.splats.values(k) / _samples_a_pixel(self._counts[k])
         return mean
 
     def values(self) -> Tensor:
         """Return means of the pixels ``(pixels, C)`` float64; those without samples are black."""
         return self._mean().T.contiguous()
 
-    def streams(self) -> list[Tensor]:
-        """Return the means by each randomization ``(pixels, C)`` float64."""
-        return [self._stream(k).T.contiguous() for k in range(self.randomizations)]
+    def randomization_means(self) -> list[Tensor]:
+        """Return the means of the pixels by each randomization, R times ``(pixels, C)`` float64."""
+        return [self._mean_of(k).T.contiguous() for k in range(self.randomizations)]
 
     @property
     def sums(self) -> Tensor:
-        """Sums of samples ``(randomizations, C, pixels)`` float64."""
+        """Sums of samples ``(randomizations, C, pixels)`` float64, to which kernels add; then :meth:`count_samples`."""
         return self._sums
 
-    def counted(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> None:
-        """Count consecutive samples that were added to :attr:`sums` of consecutive pixels."""
+    def count_samples(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> None:
+        """Count ``samples`` consecutive samples of ``pixels`` consecutive pixels, which a kernel has added to :attr:`sums`."""
         counts = self._counts.numpy()
-        for group in range(self.randomizations):
-            # Number of sample indices that are `group` modulo the randomizations.
-            number = len(range((group - first_sample) % self.randomizations, samples, self.randomizations))
-            counts[group, first_pixel : first_pixel + pixels] += number
+        for k in range(self.randomizations):
+            # Number of sample indices that are `k` modulo the randomizations.
+            number = len(range((k - first_sample) % self.randomizations, samples, self.randomizations))
+            counts[k, first_pixel : first_pixel + pixels] += number
 
-    def keep_first(self, values: np.ndarray, first_pixel: int) -> None:
-        """Keep the first samples ``(C, n)`` of consecutive pixels."""
+    def set_first_samples(self, values: np.ndarray, first_pixel: int) -> None:
+        """Store the first samples ``(C, n)`` of ``n`` consecutive pixels, which a kernel has added to :attr:`sums`."""
         # By numpy: torch would start a team of threads for each thread that renders.
         self._first.numpy()[:, first_pixel : first_pixel + values.shape[1]] = values
 
@@ -167,11 +175,12 @@ class Film:
         """Return the picture ``(H, W, C)`` in float64; pixels without samples are black."""
         return self._picture(self._mean())
 
-    def first(self) -> Tensor:
+    def first_samples(self) -> Tensor:
         """Return the first sample of each pixel ``(H, W, C)``, for AOVs that cannot be averaged."""
         return self._picture(self._first)
 
     def _picture(self, values: Tensor) -> Tensor:
+        """Return values ``(C, pixels)`` as a picture ``(H, W, C)``."""
         return values.T.reshape(self.height, self.width, -1)
 
     def variance(self) -> Tensor | None:
@@ -185,23 +194,23 @@ class Film:
         # One randomization at a time, to save memory on large films.
         mean = torch.zeros_like(self._first)
         for k in filled:
-            mean += self._stream(k)
+            mean += self._mean_of(k)
         mean /= len(filled)
         spread = torch.zeros_like(mean)
         for k in filled:
-            spread += (self._stream(k) - mean).square_()
+            spread += (self._mean_of(k) - mean).square_()
         spread /= len(filled) - 1
         return self._picture(spread / len(filled))
 
     def relmse(self) -> float | None:
-        """Return the relMSE estimated from :meth:`variance`; None without it."""
+        """Return the relative mean squared error of :meth:`mean`, estimated from :meth:`variance`; None without it."""
         variance = self.variance()
         if variance is None:
             return None
         return float(mean_all(relative(variance, self.mean())))
 
 
-def _samples(counts: Tensor) -> Tensor:
-    """Return the mean number of samples a pixel, 1 without samples."""
+def _samples_a_pixel(counts: Tensor) -> Tensor:
+    """Return the mean ``()`` of the numbers of samples of all pixels ``(pixels,)``; 1 without samples."""
     mean = counts.double().mean()
     return torch.where(mean > 0, mean, 1.0)

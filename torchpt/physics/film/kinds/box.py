@@ -20,13 +20,13 @@ class Box(Filter):
     jumps: ClassVar[bool] = True
 
     def half_width(self) -> float:
-        """See :meth:`Filter.half_width`."""
+        """Return the radius in pixels: half a pixel."""
         return 0.5
 
     def profile(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See :meth:`Filter.profile`."""
+        """Return 1 within the pixel, 0 outside at distances ``x`` from the centre in pixels."""
         return (np.abs(x) <= self.radius).astype(np.float64)
 
     def offset(self, u: Tensor) -> Tensor:
-        """See :meth:`Filter.offset`."""
+        """Return offsets that are uniform over the pixel, from ``u`` in [0, 1)."""
         return (u - 0.5) * (2.0 * self._radius)

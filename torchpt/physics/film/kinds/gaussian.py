@@ -25,10 +25,10 @@ class Gaussian(Tabulated):
     }
 
     def half_width(self) -> float:
-        """See :meth:`Filter.half_width`."""
+        """Return the radius in pixels: the parameter ``radius``."""
         return self.values["radius"]
 
     def profile(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See :meth:`Filter.profile`."""
+        """Return the truncated gaussian at distances ``x`` from the centre in pixels."""
         stddev, radius = self.values["stddev"], self.values["radius"]
         return np.maximum(np.exp(-0.5 * (x / stddev) ** 2) - np.exp(-0.5 * (radius / stddev) ** 2), 0.0)

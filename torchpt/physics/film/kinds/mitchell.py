@@ -26,11 +26,11 @@ class Mitchell(Tabulated):
     }
 
     def half_width(self) -> float:
-        """See :meth:`Filter.half_width`."""
+        """Return the radius in pixels: 2, where the cubic ends."""
         return 2.0
 
     def profile(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See :meth:`Filter.profile`."""
+        """Return the cubic at distances ``x`` from the centre in pixels."""
         b, c = self.values["B"], self.values["C"]
         x = np.abs(x)
         inner = (12 - 9 * b - 6 * c) * x**3 + (-18 + 12 * b + 6 * c) * x**2 + (6 - 2 * b)

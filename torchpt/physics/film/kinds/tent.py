@@ -22,14 +22,14 @@ class Tent(Filter):
     parameters: ClassVar = {"radius": Scalar(1.0, above=0.0, doc="half width in pixels")}
 
     def half_width(self) -> float:
-        """See :meth:`Filter.half_width`."""
+        """Return the radius in pixels: the parameter ``radius``."""
         return self.values["radius"]
 
     def profile(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See :meth:`Filter.profile`."""
+        """Return the triangle at distances ``x`` from the centre in pixels."""
         return np.maximum(1.0 - np.abs(x) / self.radius, 0.0)
 
     def offset(self, u: Tensor) -> Tensor:
-        """See :meth:`Filter.offset`."""
+        """Return offsets distributed as the triangle, from ``u`` in [0, 1): the inverse CDF, both halves at once."""
         t = 2.0 * u - 1.0
         return torch.copysign(1.0 - (1.0 - t.abs()).sqrt(), t) * self._radius
