@@ -13,7 +13,7 @@ CPU = torch.device("cpu")
 
 
 def budget(lanes: int = 1000, threads: int = 1, fewest: int = 1, limit: int | None = None) -> Budget:
-    return Budget(CPU, lanes, threads, what="a thing", limit=limit, per_lane=10, fewest=fewest)
+    return Budget(CPU, lanes, threads, what="a thing", limit=limit, bytes_per_lane=10, min_lanes=fewest)
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_threads_go_first_and_then_lanes(capsys):
         while True:
             found.shrink()
             seen.append((found.threads, found.lanes))
-    assert seen == [(1, 64), (1, 32), (1, 16)] and found.short
+    assert seen == [(1, 64), (1, 32), (1, 16)] and found.has_shrunk
 
 
 def test_pieces_take_each_sample_once_and_those_of_a_pixel_in_their_order():
@@ -54,14 +54,14 @@ def test_pieces_take_each_sample_once_and_those_of_a_pixel_in_their_order():
         pixel, n, sample, samples = span
         taken.extend((p, s) for s in range(sample, sample + samples) for p in range(pixel, pixel + n))
 
-    spans = list(found.through(work, 13, 5, 70))
+    spans = list(found.run_in_chunks(work, 13, 5, 70))
     assert sorted(taken) == [(p, s) for p in range(13) for s in range(5, 75)]
     for p in range(13):
         own = [s for pixel, s in taken if pixel == p]
         assert own == sorted(own)
-    assert sum(n * samples for _, n, _, samples in spans) == 13 * 70 and found.short and found.lanes < 8
+    assert sum(n * samples for _, n, _, samples in spans) == 13 * 70 and found.has_shrunk and found.lanes < 8
     with pytest.raises(ZeroDivisionError):
-        list(found.through(lambda _: 1 // 0, 1, 0, 1))
+        list(found.run_in_chunks(lambda _: 1 // 0, 1, 0, 1))
 
 
 def test_lanes_grow_to_what_was_measured(monkeypatch):
@@ -69,7 +69,7 @@ def test_lanes_grow_to_what_was_measured(monkeypatch):
     monkeypatch.setattr(memory.MemoryMeter, "base", lambda _: 0)
     monkeypatch.setattr(memory.MemoryMeter, "now", lambda _: held["now"])
     monkeypatch.setattr(memory.MemoryMeter, "peak", lambda _: held["peak"])
-    monkeypatch.setattr(memory, "FEWEST", 16)
+    monkeypatch.setattr(memory, "FIRST_WAVE_LANES", 16)
     found, lanes = budget(10_000, limit=101_000), []
     most = [0]
 
@@ -79,23 +79,23 @@ def test_lanes_grow_to_what_was_measured(monkeypatch):
         most[0] = max(most[0], 1000 + 20 * taken)
         held["peak"] = max(held["peak"], 1000 + 20 * taken)
 
-    list(found.through(work, 100_000, 0, 1))
+    list(found.run_in_chunks(work, 100_000, 0, 1))
     assert lanes[0] == 16 and most[0] <= 101_000
-    assert max(lanes) == int(memory.SHARE * 100_000 / 20)  # twice what was expected of a lane
+    assert max(lanes) == int(memory.WAVE_FRACTION * 100_000 / 20)  # twice what was expected of a lane
 
 
 def test_a_limit_that_holds_all_lanes_is_forgotten(monkeypatch):
     monkeypatch.setattr(memory.MemoryMeter, "base", lambda _: 0)
     monkeypatch.setattr(memory.MemoryMeter, "now", lambda _: 0)
     for limit, lanes in ((11_500, 8000), (20_000, 8000), (80_000, 8000), (100_000, 8000)):
-        found = Budget(CPU, lanes, what="a thing", limit=limit, per_lane=10)
+        found = Budget(CPU, lanes, what="a thing", limit=limit, bytes_per_lane=10)
         found.drop_unneeded_limit()
         assert (found.limit is None and found.lanes == lanes) == (limit == 100_000)
 
 
 def test_what_is_kept_goes_before_it_is_an_error(monkeypatch):
     kept = [1]
-    monkeypatch.setattr(memory, "_spare", [])
+    monkeypatch.setattr(memory, "_cache_releasers", [])
     memory.on_low_memory(kept.clear)
 
     def work() -> str:

@@ -217,11 +217,11 @@ def test_a_crew_takes_more_while_it_works():
     queue = TaskQueue[str, int](2)
     try:
         queue.add("a", lambda: 1)
-        found = [queue.next(True)]
+        found = [queue.next(wait=True)]
         for k in range(5):
             queue.add("b", lambda k=k: k)
         while queue.pending:
-            found.append(queue.next(True))
+            found.append(queue.next(wait=True))
     finally:
         queue.close()
     came = [one for one in found if one is not None]

@@ -272,8 +272,8 @@ def test_free_memory_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     (tmp_path / "memory.max").write_text("1000\n")
     (tmp_path / "memory.current").write_text("900\n")
     (tmp_path / "memory.stat").write_text("anon 3\ninactive_file 50\n")
-    monkeypatch.setattr(memory, "_GROUP", tmp_path)
+    monkeypatch.setattr(memory, "_CONTROL_GROUP", tmp_path)
     assert memory.free_memory(torch.device("cpu")) == 150
-    monkeypatch.setattr(memory, "_GROUP", tmp_path / "none")
+    monkeypatch.setattr(memory, "_CONTROL_GROUP", tmp_path / "none")
     monkeypatch.setattr(memory, "_MEMINFO", tmp_path / "none")
     assert memory.free_memory(torch.device("cpu")) is None

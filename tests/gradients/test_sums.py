@@ -125,8 +125,8 @@ def several(opacity: float = 1.0) -> torchpt.Scene:
 @pytest.fixture(params=["few", "dense", "stream"])
 def table(request, monkeypatch) -> None:
     """How the tables of a scene are summed, which have few numbers."""
-    monkeypatch.setattr(sums, "FEW", sums.FEW if request.param == "few" else 0)
-    monkeypatch.setattr(sums, "DENSE", 0 if request.param == "stream" else sums.DENSE)
+    monkeypatch.setattr(sums, "MAX_BY_COLUMNS", sums.MAX_BY_COLUMNS if request.param == "few" else 0)
+    monkeypatch.setattr(sums, "MAX_DENSE", 0 if request.param == "stream" else sums.MAX_DENSE)
 
 
 def sums_of(scene: torchpt.Scene, name: str, **wish: Any) -> torch.Tensor:

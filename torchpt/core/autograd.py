@@ -1,4 +1,8 @@
-"""Functions of tensors with a custom backward pass (VJP), for autograd and ``torch.func``."""
+"""Functions of tensors with a custom backward pass (VJP, vector-Jacobian product), for autograd and ``torch.func``.
+
+A render is such a function: :func:`custom_vjp` puts it on autograd's tape as one operation. A *cotangent* is the derivative of
+the loss with respect to a result (PyTorch: ``grad_output``).
+"""
 
 from __future__ import annotations
 
@@ -19,15 +23,16 @@ __all__ = ["Backward", "Forward", "custom_vjp", "is_batched", "is_transformed", 
 Forward = Callable[..., tuple[Tensor, ...]]
 Backward = Callable[..., Sequence[Tensor | None]]
 
-_FORWARD_MODE = (
+# What errors tell the user of derivatives that a render does not have.
+_NO_FORWARD_MODE = (
     "render has no forward-mode derivatives (jvp, jacfwd): take torch.func.vjp or backward(),"
     " or the difference of two renders of one seed"
 )
-_TWICE = (
+_NO_SECOND_DERIVATIVES = (
     "render has no second derivatives: take the difference of two gradients of one seed_grad,"
     " or torch.func.vjp of the picture for a Gauss-Newton step"
 )
-_BATCHES = (
+_NO_OLD_VMAP = (
     "render takes batches of cotangents by torch.func.jacrev alone, not by vectorize=True or is_grads_batched=True"
 )
 
@@ -42,8 +47,8 @@ def custom_vjp(
 
     Args:
         forward: returns a tuple of tensors, given ``tensors``.
-        backward: the VJP: returns cotangents of ``tensors`` and ``captured``, given those of the results (a tuple) and
-            ``tensors``.
+        backward: the VJP, called as ``backward(cotangents_of_results, *tensors)`` with a tuple first; returns the cotangents of
+            ``tensors`` and then of ``captured``, None for 0.
         tensors: arguments of both.
         captured: tensors that both functions capture, such as weights of modules; they may change before the backward pass.
 
@@ -74,7 +79,7 @@ def outside_transforms() -> AbstractContextManager[Any]:
 
 
 def _levels(value: Tensor) -> Iterator[Tensor]:
-    """Yield a tensor, and the tensors that transforms wrapped in it."""
+    """Yield a tensor, and the tensors that transforms of ``torch.func`` wrapped in it, one in the other."""
     yield value
     while is_functorch_wrapped_tensor(value):
         value = get_unwrapped(value)
@@ -82,41 +87,44 @@ def _levels(value: Tensor) -> Iterator[Tensor]:
 
 
 class _CustomVjp(torch.autograd.Function):
+    """One call of :func:`custom_vjp`; the last ``captured`` (a number) of ``tensors`` are the captured ones."""
+
     @staticmethod
     def forward(forward: Forward, backward: Backward, captured: int, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return tuple(forward(*(t.detach() for t in tensors[: len(tensors) - captured])))
+        return tuple(forward(*(tensor.detach() for tensor in tensors[: len(tensors) - captured])))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        _, ctx.work, ctx.captured, *tensors = inputs
-        ctx.save_for_backward(*tensors[: len(tensors) - ctx.captured])
+        _, ctx.vjp, captured, *tensors = inputs
+        ctx.save_for_backward(*tensors[: len(tensors) - captured])
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        found = _CustomVjpBackward.apply(ctx.work, len(cotangents), *cotangents, *ctx.saved_tensors)
-        assert found is not None
-        return (None, None, None, *found)
+        gradients = _CustomVjpBackward.apply(ctx.vjp, len(cotangents), *cotangents, *ctx.saved_tensors)
+        assert gradients is not None
+        return (None, None, None, *gradients)  # forward, backward and captured are no tensors
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:
-        raise TorchptError(_FORWARD_MODE)
+        raise TorchptError(_NO_FORWARD_MODE)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
-        return _each(_CustomVjp.apply, info.batch_size, in_dims, arguments)
+        return _call_for_each(_CustomVjp.apply, info.batch_size, in_dims, arguments)
 
 
 class _CustomVjpBackward(torch.autograd.Function):
     """The backward pass as a function of its own, on which ``torch.func`` may call ``vmap`` or differentiate again."""
 
     @staticmethod
-    def forward(work: Backward, count: int, *tensors: Tensor) -> tuple[Tensor | None, ...]:
+    def forward(vjp: Backward, results: int, *tensors: Tensor) -> tuple[Tensor | None, ...]:
+        # The first tensors are the cotangents of that many results; the others are the arguments of the forward pass.
         try:
-            plain = tuple(t.detach() for t in tensors)
-        except RuntimeError as error:  # tensors of torch's older vmap, which has no rule for it
-            raise TorchptError(_BATCHES) from error
+            plain = tuple(tensor.detach() for tensor in tensors)
+        except RuntimeError as error:  # tensors of torch's older vmap, which has no rule for a custom Function
+            raise TorchptError(_NO_OLD_VMAP) from error
         with without_autocast(plain[0].device):
-            return tuple(work(plain[:count], *plain[count:]))
+            return tuple(vjp(plain[:results], *plain[results:]))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -124,24 +132,28 @@ class _CustomVjpBackward(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Any) -> Any:
-        raise TorchptError(_TWICE)
+        raise TorchptError(_NO_SECOND_DERIVATIVES)
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:
-        raise TorchptError(_TWICE)
+        raise TorchptError(_NO_SECOND_DERIVATIVES)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
-        return _each(_CustomVjpBackward.apply, info.batch_size, in_dims, arguments)
+        return _call_for_each(_CustomVjpBackward.apply, info.batch_size, in_dims, arguments)
 
 
-def _each(
-    call: Callable[..., Any], count: int, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...]
+def _call_for_each(
+    call: Callable[..., Any], batch_size: int, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...]
 ) -> tuple[tuple[Tensor | None, ...], tuple[int | None, ...]]:
-    """Return the stacked results of one call for each element of a batch, and their batch dimensions."""
-    rows = [
-        call(*(a if dim is None else a.select(dim, k) for a, dim in zip(arguments, in_dims, strict=True)))
-        for k in range(count)
+    """Return the stacked results of one call for each element of a batch, and their batch dimensions.
+
+    ``in_dims`` has the batch dimension of each argument, None where it is the same for the whole batch, as ``vmap`` passes it.
+    """
+    calls = [
+        call(*(value if dim is None else value.select(dim, k) for value, dim in zip(arguments, in_dims, strict=True)))
+        for k in range(batch_size)
     ]
-    columns = tuple(None if column[0] is None else torch.stack(column) for column in zip(*rows, strict=True))
-    return columns, tuple(None if column is None else 0 for column in columns)
+    # From results by call to calls by result; a cotangent of 0 is None in all calls alike.
+    stacked = tuple(None if result[0] is None else torch.stack(result) for result in zip(*calls, strict=True))
+    return stacked, tuple(None if result is None else 0 for result in stacked)

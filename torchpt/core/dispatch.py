@@ -1,4 +1,9 @@
-"""Tensor functions that physics defines and engines may replace by faster implementations."""
+"""Tensor functions for which engines register faster implementations.
+
+``math`` and ``physics`` mark a function with :func:`dispatched`, such as a hash or the walk down the light tree. An engine (the
+code that runs renders: by tensors, or by compiled kernels) registers what replaces it on its devices or while it traces a
+kernel.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +18,13 @@ T = TypeVar("T")
 
 
 class Dispatched(Generic[P, T]):
-    """A function with registered implementations, the latest of which that accepts the arguments is called.
+    """A function that asks its registered implementations first, the latest one before the others.
 
     Args:
         function: is called where no implementation accepts the arguments.
 
     Attributes:
-        function: the function itself.
+        function: as above.
         implementations: registered implementations, in the order in which they are tried.
     """
 

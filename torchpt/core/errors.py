@@ -1,4 +1,8 @@
-"""Exceptions and warnings for users. Each message is one line: where, what was found, what is accepted."""
+"""Exceptions and warnings for users. Each message is one line: where, what was found, what is accepted.
+
+Exceptions define ``__reduce__`` where their arguments are not their message, so that they can be sent between processes
+(pickled). A *rank* is one of several processes that share a render (``torch.distributed``).
+"""
 
 from __future__ import annotations
 
@@ -25,25 +29,30 @@ __all__ = [
 ]
 
 
-def _shown(value: object, limit: int = 80) -> str:
+# Most characters that a message shows of a value, of any other text, and of what a key accepts.
+_VALUE_LENGTH, _TEXT_LENGTH, _EXPECTED_LENGTH = 80, 500, 1000
+
+
+def _shown(value: object) -> str:
+    """Return a value as a message shows it: its ``repr``, cut to one short line."""
     try:
         shape = getattr(value, "shape", ())
         text = repr(value)
-        if len(shape) > 1:  # the shape, as the rows of numbers are cut off
+        if len(shape) > 1:  # says the shape first, as most rows of numbers are cut off
             text = f"an array of shape {tuple(shape)}: {text}"
     except Exception:  # integers of more than 4300 digits, and objects whose repr fails
         text = f"a value of type {type(value).__name__} that cannot be shown"
-    return _one_line(text, limit)
+    return _one_line(text, _VALUE_LENGTH)
 
 
-def _one_line(text: str, limit: int = 500) -> str:
-    """Return text as one printable line of at most ``limit`` characters."""
-    text = "".join(letter if letter.isprintable() else " " for letter in text[: limit + 1])
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+def _one_line(text: str, max_length: int = _TEXT_LENGTH) -> str:
+    """Return text as one printable line of at most ``max_length`` characters."""
+    text = "".join(letter if letter.isprintable() else " " for letter in text[: max_length + 1])
+    return text if len(text) <= max_length else text[: max_length - 3] + "..."
 
 
 def _where(key: str, file: str | None) -> str:
-    """Return the scene file, if any, and the dotted key."""
+    """Return the scene file, if any, and the dotted key. A path is never cut: it is to be copied."""
     return f"{_one_line(file, len(file))}: {_one_line(key)}" if file else _one_line(key)
 
 
@@ -63,14 +72,14 @@ class SceneError(TorchptError):
 
     def __init__(self, key: str, value: object, expected: str, file: str | None = None) -> None:
         self.key, self.value, self.expected, self.file = key, value, expected, file
-        super().__init__(f"{_where(key, file)}: expected {_one_line(expected, 1000)}, got {_shown(value)}")
+        super().__init__(f"{_where(key, file)}: expected {_one_line(expected, _EXPECTED_LENGTH)}, got {_shown(value)}")
 
-    def __reduce__(self) -> tuple:  # crosses process boundaries in worker pools
+    def __reduce__(self) -> tuple:
         return type(self), (self.key, self.value, self.expected, self.file)
 
 
 class NotBuiltError(SceneError):
-    """A key of the scene format that this version does not build yet."""
+    """A value of the scene format that this version does not build yet; ``expected`` lists the values that it does."""
 
     def __init__(self, key: str, value: object, expected: str = "", file: str | None = None) -> None:
         TorchptError.__init__(
@@ -81,7 +90,7 @@ class NotBuiltError(SceneError):
 
 
 class AssetError(TorchptError):
-    """A file (mesh, image) that is missing, unreadable or malformed."""
+    """A file that a scene reads (mesh, image) and that is missing, unreadable or malformed."""
 
     def __init__(self, file: object, problem: str) -> None:
         self.file, self.problem = str(file), _one_line(problem)
@@ -111,7 +120,7 @@ class LostRankError(RenderError):
 
 
 class OtherRankError(RenderError):
-    """A rank of the render failed; its own error says why. ``code`` is its exit code."""
+    """Another rank of the render failed; its own error says why. ``code`` is its exit code: 2 for an error of input."""
 
     def __init__(self, text: str, code: int = 2) -> None:
         self.code = code
@@ -141,7 +150,7 @@ def warn_once(text: str) -> None:
 
 def warn_caller(message: str, category: type[Warning]) -> None:
     """Warn at the line that called this package, directly or through torch (``nn.Module``, a data loader)."""
-    frame, level = sys._getframe(), 1
+    frame, level = sys._getframe(), 1  # level: as warnings.warn counts, 1 for this function
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("torchpt", "torch"):
         frame, level = frame.f_back, level + 1
     warnings.warn(message, category, stacklevel=level)

@@ -1,4 +1,4 @@
-"""Files: paths from users, safe reading of files that a scene names, and configs that ship with torchpt.
+"""Files: paths from users, safe reading of files that a scene names, and configs (YAML) that ship with torchpt.
 
 A scene may name anything: ``/dev/zero`` is endless, and opening a pipe blocks. So only regular files are read.
 """
@@ -19,11 +19,11 @@ __all__ = ["MAX_BYTES", "UnreadableFile", "as_path", "check_regular", "configs",
 MAX_BYTES = 4 * 2**30
 
 _PACKAGE = Path(__file__).resolve().parent.parent
-_PIECE = 2**20  # bytes of a read once a file turns out longer than its size
+_READ_BYTES = 2**20  # bytes of a read once a file turns out longer than its size
 
 
 class UnreadableFile(OSError):
-    """A path that is not read although it exists; ``strerror`` says why, with "it" as subject."""
+    """A path that is not read although it exists; ``strerror`` says why and lacks its subject: "is a folder"."""
 
 
 def as_path(path: Any) -> Path:
@@ -32,10 +32,10 @@ def as_path(path: Any) -> Path:
     Raises:
         SceneError: neither a string nor a path of strings.
     """
-    found = os.fspath(path) if isinstance(path, str | os.PathLike) else None
-    if not isinstance(found, str):  # bytes neither
+    text = os.fspath(path) if isinstance(path, str | os.PathLike) else None
+    if not isinstance(text, str):  # a PathLike may return bytes
         raise SceneError("path", path, "a file's path, as text or a pathlib.Path")
-    return Path(found)
+    return Path(text)
 
 
 def is_regular(path: str | os.PathLike[str]) -> bool:
@@ -46,49 +46,50 @@ def is_regular(path: str | os.PathLike[str]) -> bool:
         return False
 
 
-def check_regular(path: str | os.PathLike[str], most: int | None = None) -> int:
+def check_regular(path: str | os.PathLike[str], max_bytes: int | None = None) -> int:
     """Return the size of a regular file in bytes.
 
     Args:
         path: path of the file.
-        most: size limit in bytes; None: no limit.
+        max_bytes: size limit; None: no limit.
 
     Raises:
-        UnreadableFile: a folder, device, pipe or socket, or a file of more than ``most`` bytes.
+        UnreadableFile: a folder, device, pipe or socket, or a file of more than ``max_bytes``.
         OSError: no such file.
     """
     try:
-        facts = os.stat(path)
-    except ValueError:
+        status = os.stat(path)
+    except ValueError:  # a name with a NUL
         raise UnreadableFile(errno.EINVAL, "has a name that no file can have") from None
-    if stat.S_ISDIR(facts.st_mode):
+    if stat.S_ISDIR(status.st_mode):
         raise UnreadableFile(errno.EISDIR, "is a folder")
-    if not stat.S_ISREG(facts.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise UnreadableFile(errno.EINVAL, "is a device, a pipe or a socket")
-    if most is not None and facts.st_size > most:
-        raise UnreadableFile(errno.EFBIG, f"has {facts.st_size} bytes; at most {most} are read")
-    return facts.st_size
+    if max_bytes is not None and status.st_size > max_bytes:
+        raise UnreadableFile(errno.EFBIG, f"has {status.st_size} bytes; at most {max_bytes} are read")
+    return status.st_size
 
 
-def read_regular(path: str | os.PathLike[str], most: int = MAX_BYTES) -> bytes:
+def read_regular(path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> bytes:
     """Return the content of a regular file.
 
     Raises:
         OSError: as :func:`check_regular`, or it cannot be read.
     """
-    size = check_regular(path, most)
+    size = check_regular(path, max_bytes)
     with Path(path).open("rb", buffering=0) as file:
-        parts = [file.read(size + 1)]
-        total = len(parts[0])
-        while parts[-1]:  # the file has grown, or its size was unknown (as under /proc)
-            if total > most:
-                raise UnreadableFile(errno.EFBIG, f"has more than {most} bytes; at most so many are read")
-            parts.append(file.read(min(_PIECE, most + 1 - total)))
-            total += len(parts[-1])
-    return parts[0] if total == len(parts[0]) else b"".join(parts)  # avoids a copy
+        reads = [file.read(size + 1)]
+        total = len(reads[0])
+        # Read on to the end of the file: it may have grown, or have had no known size (as under /proc).
+        while reads[-1]:
+            if total > max_bytes:
+                raise UnreadableFile(errno.EFBIG, f"has more than {max_bytes} bytes; at most so many are read")
+            reads.append(file.read(min(_READ_BYTES, max_bytes + 1 - total)))
+            total += len(reads[-1])
+    return reads[0] if total == len(reads[0]) else b"".join(reads)  # the usual case without a copy
 
 
 def configs() -> Path:
-    """Return the folder of the configs that ship (``scene/``, ...), in an installed wheel or in a checkout."""
+    """Return the folder of the configs that ship (``scene/``, ...): ``share/`` of an installed wheel, or the checkout's."""
     installed = _PACKAGE / "share" / "configs"
     return installed if installed.is_dir() else _PACKAGE.parent / "configs"

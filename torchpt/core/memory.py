@@ -1,9 +1,11 @@
 """Memory: used and free memory, the limit of a job, and what is done when memory runs out.
 
-A job has threads, each of which traces some lanes at once. Under a limit (``render.max_memory``) a :class:`Budget` chooses both
-numbers: by the known size of a lane (``fit``), or by the measured size of earlier ones (``through``). If an allocation fails
-all the same, caches are freed (:func:`release_memory`), then one thread goes on alone, then with half as many lanes, and so on
-(``shrink``). If the fewest lanes do not fit, a one-line error is raised.
+A *job* is a render or a gradient. It has threads, each of which traces some lanes at once: elements of tensors, one for each
+sample of a pixel. Lanes that are traced together are a *wave*; a *chunk* is the pixels and samples of a wave. Under a limit
+(``render.max_memory``) a :class:`Budget` chooses the numbers of threads and lanes: by the known size of a lane (``fit``), or by
+the measured size of earlier ones (``run_in_chunks``). If an allocation fails all the same, caches are freed
+(:func:`release_memory`), then one thread goes on alone, then with half as many lanes, and so on (``shrink``). If the fewest
+lanes do not fit, a one-line error is raised.
 
 The limit is on the memory of the process above that after import. Memory in use (scene, search structure, world) is measured;
 memory to come (films, the final picture, code to load) is estimated by each job.
@@ -27,7 +29,7 @@ import torch
 from torchpt.core.errors import RenderError, SceneError, TorchptError, warn_once
 
 __all__ = [
-    "FEWEST",
+    "FIRST_WAVE_LANES",
     "Budget",
     "MemoryMeter",
     "Span",
@@ -46,20 +48,20 @@ __all__ = [
 ]
 
 #: Lanes of the first wave under a limit. After it all code is loaded, whose memory must not count as that of lanes.
-FEWEST = 4096
-#: Share of the free memory for waves: the next one may need more than the measured one.
-SHARE = 0.88
-#: Largest growth of a wave over the one before.
-GROWTH = 2
+FIRST_WAVE_LANES = 4096
+#: Fraction of the free memory that waves may fill: the next one may need more than the measured one.
+WAVE_FRACTION = 0.88
+#: Largest growth of a wave, as a factor, over the one before.
+MAX_GROWTH = 2
 #: Bytes of address space that libraries may need to make code; some of them abort the process without it.
-MARGIN = 96 << 20
+CODE_BYTES = 96 << 20
 
-#: Files of Linux with the free memory, and with the limits of control groups.
+#: Files of Linux with the free memory, and with the limits of control groups (which containers are).
 _MEMINFO = Path("/proc/meminfo")
-_GROUP = Path("/sys/fs/cgroup")
+_CONTROL_GROUP = Path("/sys/fs/cgroup")
 
 #: Messages of out-of-memory errors that have no type of their own.
-_SAID = (
+_OUT_OF_MEMORY_TEXTS = (
     "can't allocate memory",
     "not enough memory",
     "out of memory",
@@ -71,7 +73,7 @@ _SAID = (
 
 T = TypeVar("T")
 
-#: ``(first_pixel, pixels, first_sample, samples)``
+#: A chunk, ``(first_pixel, pixels, first_sample, samples)``: two numbers of consecutive pixels, and of samples of each of them.
 Span = tuple[int, int, int, int]
 
 
@@ -92,13 +94,13 @@ class MemoryMeter:
         """Return the memory in use now."""
         if self.device.type == "cuda":
             return torch.cuda.memory_allocated(self.device)
-        return _status("VmRSS:")
+        return _process_memory("VmRSS:")
 
     def peak(self) -> int:
         """Return the largest memory that was ever in use."""
         if self.device.type == "cuda":
             return torch.cuda.max_memory_allocated(self.device)
-        return _status("VmHWM:")
+        return _process_memory("VmHWM:")
 
     def base(self) -> int:
         """Return the memory that belongs to no render: that after import, 0 on CUDA."""
@@ -111,16 +113,20 @@ class MemoryMeter:
 
 @cache
 def after_import() -> int:
-    """Return the memory of the process after import, in bytes: it is measured by the first call."""
-    return _status("VmRSS:")
+    """Return the memory of the process after import, in bytes: measured by the first call, before a scene is loaded."""
+    return _process_memory("VmRSS:")
 
 
-def _status(key: str) -> int:
-    """Return a value of ``/proc/self/status`` in bytes; elsewhere the peak memory, or 0 if that is unknown."""
+def _process_memory(key: str) -> int:
+    """Return a value of ``/proc/self/status`` in bytes; elsewhere the peak memory, or 0 if that is unknown.
+
+    Args:
+        key: "VmRSS:" for the resident memory now, "VmHWM:" for its peak.
+    """
     try:
         with open("/proc/self/status", "rb") as file:
             for line in file:
-                if line.startswith(key.encode()):
+                if line.startswith(key.encode()):  # such as "VmRSS:     5432 kB"
                     return int(line.split()[1]) * 1024
     except OSError:
         pass
@@ -129,45 +135,46 @@ def _status(key: str) -> int:
     except ImportError:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
+    return peak if sys.platform == "darwin" else peak * 1024  # macOS counts in bytes, others in kB
 
 
 def mb(size: float) -> str:
     """Return a number of bytes in megabytes, rounded up: ``37MB``."""
-    return f"{-int(-size // 1_000_000)}MB"
+    return f"{-int(-size // 1_000_000)}MB"  # floor division of the negative rounds up
 
 
 def free_memory(device: torch.device) -> int | None:
-    """Return the free memory in bytes, on a CPU that of machine and container; None if unknown."""
+    """Return the free memory in bytes, on a CPU the lesser of machine and container; None if unknown."""
     if device.type == "cuda":
-        return torch.cuda.mem_get_info(device)[0]
-    found = [size for size in (_of_machine(), _of_group()) if size is not None]
-    return min(found, default=None)
+        free, _ = torch.cuda.mem_get_info(device)
+        return free
+    sizes = [size for size in (_free_in_machine(), _free_in_control_group()) if size is not None]
+    return min(sizes, default=None)
 
 
-def _of_machine() -> int | None:
+def _free_in_machine() -> int | None:
     try:
-        lines = _MEMINFO.read_text().splitlines()
+        lines = _MEMINFO.read_text().splitlines()  # such as "MemAvailable:   12345 kB"
         return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
     except (OSError, ValueError, IndexError):
         return None
 
 
-def _of_group() -> int | None:
-    """Return the memory that the limit of a control group (version 2) leaves; its file cache counts as free."""
+def _free_in_control_group() -> int | None:
+    """Return the bytes that the limit of a control group (version 2) leaves; its file cache counts as free."""
     try:
-        limit = int((_GROUP / "memory.max").read_text())
-        taken = int((_GROUP / "memory.current").read_text())
-        facts = dict(line.split() for line in (_GROUP / "memory.stat").read_text().splitlines())
-        return limit - taken + int(facts.get("inactive_file", 0))
+        limit = int((_CONTROL_GROUP / "memory.max").read_text())
+        taken = int((_CONTROL_GROUP / "memory.current").read_text())
+        statistics = dict(line.split() for line in (_CONTROL_GROUP / "memory.stat").read_text().splitlines())
+        return limit - taken + int(statistics.get("inactive_file", 0))
     except (OSError, ValueError):  # no such group, or no limit ("max")
         return None
 
 
-def check_address_space(size: int = MARGIN) -> None:
+def check_address_space(size: int = CODE_BYTES) -> None:
     """Raise if the process cannot get ``size`` more bytes of address space.
 
-    Called before libraries that would abort the process then (LLVM, OpenMP, BLAS).
+    Called before libraries that abort the process where they cannot (LLVM, OpenMP, BLAS).
 
     Raises:
         MemoryError: the system refuses.
@@ -180,28 +187,28 @@ def check_address_space(size: int = MARGIN) -> None:
 
 # -- releasing memory
 
-_spare: list[Callable[[], object]] = []
+_cache_releasers: list[Callable[[], object]] = []
 
 
 def on_low_memory(release: Callable[[], object]) -> None:
     """Register a function that drops cached memory; :func:`release_memory` calls it."""
-    _spare.append(release)
+    _cache_releasers.append(release)
 
 
 def release_memory() -> None:
     """Free caches, reference cycles, and the memory that allocators keep."""
-    for release in _spare:
+    for release in _cache_releasers:
         release()
     gc.collect()
     if torch.cuda.is_initialized():
         torch.cuda.empty_cache()
-    trim = _trim()
+    trim = _malloc_trim()
     if trim is not None:
-        trim(0)
+        trim(0)  # bytes to keep at the top of the heap
 
 
 @cache
-def _trim() -> ctypes._NamedFuncPointer | None:
+def _malloc_trim() -> ctypes._NamedFuncPointer | None:
     """Return glibc's ``malloc_trim``; None elsewhere."""
     if not sys.platform.startswith("linux"):
         return None
@@ -226,7 +233,9 @@ def is_out_of_memory(error: BaseException) -> bool:
             return True
         if isinstance(cause, OSError) and cause.errno == errno.ENOMEM:
             return True
-        if isinstance(cause, RuntimeError | ImportError | OSError) and any(text in str(cause) for text in _SAID):
+        if isinstance(cause, RuntimeError | ImportError | OSError) and any(
+            text in str(cause) for text in _OUT_OF_MEMORY_TEXTS
+        ):
             return True
         cause = cause.__cause__ or cause.__context__
     return False
@@ -245,7 +254,7 @@ def fits_in_memory(work: Callable[[], object]) -> bool:
 
 @contextmanager
 def explain_out_of_memory(what: str | Callable[[], str]) -> Iterator[None]:
-    """Turn out-of-memory errors within into a line that names ``what``: a text, or a function that returns it.
+    """Turn out-of-memory errors within into a line that names ``what`` memory was for: a text, or a function that returns it.
 
     Raises:
         RenderError: memory ran out.
@@ -257,6 +266,7 @@ def explain_out_of_memory(what: str | Callable[[], str]) -> Iterator[None]:
             raise
     else:
         return
+    # Outside of the except block: the dropped error's traceback held memory, which what() may need.
     subject = what if isinstance(what, str) else what()
     raise RenderError(
         f"not enough memory for {subject}, with {mb(MemoryMeter(torch.device('cpu')).above())} held already"
@@ -266,22 +276,31 @@ def explain_out_of_memory(what: str | Callable[[], str]) -> Iterator[None]:
 def retry_out_of_memory(what: str | Callable[[], str], work: Callable[[], T]) -> T:
     """Return ``work()``; if memory runs out, release memory and try once more.
 
+    Args:
+        what: names, in the error, what memory is for, as :func:`explain_out_of_memory`.
+        work: the function.
+
     Raises:
         RenderError: memory ran out again.
     """
-    found: list[T] = []
-    if not fits_in_memory(lambda: found.append(work())):
+    results: list[T] = []
+    if not fits_in_memory(lambda: results.append(work())):
         release_memory()
         with explain_out_of_memory(what):
             return work()
-    return found[0]
+    return results[0]
 
 
 # -- limits
 
 
 def check_limit(limit: int, least: int, expected: str) -> None:
-    """Raise if ``render.max_memory`` is below ``least`` bytes; a number below a megabyte was probably not meant in bytes.
+    """Raise if ``render.max_memory`` is too small.
+
+    Args:
+        limit: ``render.max_memory`` in bytes.
+        least: the least limit in bytes.
+        expected: says in the error what is accepted.
 
     Raises:
         SceneError: it is too small.
@@ -290,6 +309,7 @@ def check_limit(limit: int, least: int, expected: str) -> None:
         return
     if limit >= 1_000_000:
         raise SceneError("render.max_memory", mb(limit), expected)
+    # A number below a megabyte was probably not meant in bytes.
     raise SceneError("render.max_memory", f"{limit} bytes", f"{expected}, as bytes or with a unit such as 4GB")
 
 
@@ -297,10 +317,10 @@ def check_memory(limit: int, device: torch.device, least: Callable[[int], int], 
     """Raise if nothing can be rendered within a limit.
 
     Args:
-        limit: ``render.max_memory``.
+        limit: ``render.max_memory`` in bytes.
         device: the device of the lanes.
-        least: returns the least limit, given the memory in use above import.
-        loading: peak memory above import while the scene was loaded; 0 if unknown.
+        least: returns the least limit in bytes, given the bytes in use above :meth:`MemoryMeter.base`.
+        loading: peak bytes above that base while the scene was loaded; 0 if unknown.
 
     Raises:
         SceneError: the limit is too small; the message gives the least.
@@ -318,15 +338,16 @@ class Budget:
         lanes: largest number of lanes of a thread.
         threads: largest number of threads.
         what: names, in the error, what does not fit even with the fewest lanes of one thread.
-        instead: tells the user how the job goes on after memory ran out.
-        limit: ``render.max_memory`` if the memory of lanes is to be measured; else None.
-        per_lane: expected bytes of a lane, until it is measured.
-        fewest: least number of lanes.
+        fallback: tells the user how the job goes on after memory ran out.
+        limit: ``render.max_memory`` in bytes if the memory of lanes is to be measured; else None.
+        bytes_per_lane: expected bytes of a lane, until it is measured.
+        min_lanes: least number of lanes.
 
     Attributes:
         threads: current number of threads.
         lanes: current number of lanes of a thread.
-        short: True once memory ran out.
+        has_shrunk: True once memory ran out.
+        limit: largest memory of the process in bytes (that after import included); None if lanes are not measured.
     """
 
     def __init__(
@@ -336,48 +357,51 @@ class Budget:
         threads: int = 1,
         *,
         what: str,
-        instead: str = "waves of fewer lanes",
+        fallback: str = "waves of fewer lanes",
         limit: int | None = None,
-        per_lane: int = 0,
-        fewest: int = 1,
+        bytes_per_lane: int = 0,
+        min_lanes: int = 1,
     ) -> None:
-        self.meter, self.threads, self.fewest, self.per_lane = MemoryMeter(device), threads, fewest, per_lane
-        self.what, self.instead, self.short = what, instead, False
+        self.meter, self.threads = MemoryMeter(device), threads
+        self.min_lanes, self.bytes_per_lane = min_lanes, bytes_per_lane
+        self.what, self.fallback, self.has_shrunk = what, fallback, False
         self.limit = None if limit is None else self.meter.base() + limit
-        self._most = max(lanes, 1)
-        self.lanes = self._most if limit is None else min(FEWEST, self._most)
-        self._start: int | None = None  # memory in use after the first wave
-        self._before = 0
+        self._max_lanes = max(lanes, 1)
+        self.lanes = self._max_lanes if limit is None else min(FIRST_WAVE_LANES, self._max_lanes)
+        self._in_use: int | None = None  # bytes in use after the first wave, without lanes
+        self._peak_before = 0  # peak bytes before the wave that runs now
 
-    def fit(self, left: int, per_lane: int, least: int) -> None:
-        """Set threads and lanes to the most that fit into ``left`` bytes, but at least one thread with ``least`` lanes.
+    def fit(self, available: int, bytes_per_lane: int, min_lanes: int) -> None:
+        """Set threads and lanes to the most that fit into memory, but at least one thread with ``min_lanes`` lanes.
 
         Args:
-            left: bytes that are available.
-            per_lane: bytes of a lane.
-            least: fewest lanes for which a thread is worth its cost.
+            available: bytes for all lanes.
+            bytes_per_lane: bytes of a lane.
+            min_lanes: fewest lanes for which a thread is worth its cost.
         """
         for threads in range(self.threads, 0, -1):
-            lanes = left // (per_lane * threads)
-            if lanes >= least or threads == 1:
-                self.threads, self.lanes = threads, min(max(lanes, least), self._most)
+            lanes = available // (bytes_per_lane * threads)
+            if lanes >= min_lanes or threads == 1:
+                self.threads, self.lanes = threads, min(max(lanes, min_lanes), self._max_lanes)
                 return
 
     def drop_unneeded_limit(self) -> None:
         """Drop the limit if all lanes are expected to fit: chunks then have the same size as without one."""
-        if self.limit is None or self._most * self.per_lane <= SHARE * (self.limit - self.meter.now()):
-            self.limit, self.lanes = None, self._most
+        if self.limit is None or self._max_lanes * self.bytes_per_lane <= WAVE_FRACTION * (
+            self.limit - self.meter.now()
+        ):
+            self.limit, self.lanes = None, self._max_lanes
 
-    def through(self, work: Callable[[Span], object], pixels: int, first: int, count: int) -> Iterator[Span]:
-        """Call ``work`` for chunks of samples ``first .. first + count`` of all pixels; yield each finished chunk.
+    def run_in_chunks(self, work: Callable[[Span], object], pixels: int, first: int, count: int) -> Iterator[Span]:
+        """Call ``work`` for chunks of some samples of all pixels; yield each finished chunk.
 
         A chunk has some pixels; samples of a pixel are taken in order, so that sums do not depend on the chunks.
 
         Args:
             work: takes all samples of a chunk, or raises and takes none.
             pixels: number of pixels.
-            first: first sample.
-            count: samples of each pixel.
+            first: number of the first sample of each pixel.
+            count: how many samples of each pixel.
 
         Raises:
             RenderError: not even the fewest lanes fit in memory.
@@ -387,71 +411,83 @@ class Budget:
             samples = max(min(first + count - sample, self.lanes), 1)
             pixel = 0
             while pixel < pixels:
-                n = min(max(self.lanes // samples, 1), pixels - pixel)
-                yield from self._whole(work, (pixel, n, sample, samples))
-                pixel += n
+                chunk_pixels = min(max(self.lanes // samples, 1), pixels - pixel)
+                yield from self._run_chunk(work, (pixel, chunk_pixels, sample, samples))
+                pixel += chunk_pixels
             sample += samples
 
-    def _whole(self, work: Callable[[Span], object], span: Span) -> Iterator[Span]:
-        """Take a chunk at once; if memory runs out, in halves."""
-        todo = [span]
-        while todo:
-            pixel, n, sample, samples = span = todo.pop()
-            if n * samples <= self.lanes:
-                self._begins()
+    def _run_chunk(self, work: Callable[[Span], object], span: Span) -> Iterator[Span]:
+        """Take a chunk at once; if memory runs out, in halves. Yield what was taken, in order."""
+        stack = [span]
+        while stack:
+            pixel, pixels, sample, samples = span = stack.pop()
+            if pixels * samples <= self.lanes:
+                self._before_wave()
                 if fits_in_memory(partial(work, span)):
-                    self._ended(n * samples)
+                    self._after_wave(pixels * samples)
                     yield span
                     continue
-                self.shrink(n * samples)
-            half = n // 2 if n > 1 else samples // 2
-            if n > 1:
-                todo += (pixel + half, n - half, sample, samples), (pixel, half, sample, samples)
+                self.shrink(pixels * samples)
+            # The second half is pushed first, so that the first is popped first.
+            half = pixels // 2 if pixels > 1 else samples // 2
+            if pixels > 1:
+                stack += (pixel + half, pixels - half, sample, samples), (pixel, half, sample, samples)
             else:
-                todo += (pixel, n, sample + half, samples - half), (pixel, n, sample, half)
+                stack += (pixel, pixels, sample + half, samples - half), (pixel, pixels, sample, half)
 
-    def shrink(self, tried: int | None = None) -> None:
-        """After memory ran out, go on with one thread, or with half of the ``tried`` lanes (None: of the current number).
+    def shrink(self, tried_lanes: int | None = None) -> None:
+        """After memory ran out, go on with one thread, or with half of the lanes that were tried (None: ``lanes``).
 
         Raises:
             RenderError: one thread had the fewest lanes already.
         """
         release_memory()
-        tried = self.lanes if tried is None else tried
+        tried_lanes = self.lanes if tried_lanes is None else tried_lanes
         if self.threads > 1:
             self.threads = 1
-        elif tried <= self.fewest:
+        elif tried_lanes <= self.min_lanes:
             raise RenderError(f"not enough memory for {self.what}")
         else:
-            self.lanes = max(tried // 2, self.fewest)
-        self.limit, self.short = None, True  # waves no longer grow
-        warn_once(f"torchpt: memory ran out: {self.instead} from now on, for the same picture")
+            self.lanes = max(tried_lanes // 2, self.min_lanes)
+        self.limit, self.has_shrunk = None, True  # waves no longer grow
+        warn_once(f"torchpt: memory ran out: {self.fallback} from now on, for the same picture")
 
     # -- measured memory of lanes
 
-    def _begins(self) -> None:
+    def _before_wave(self) -> None:
         """Record the peak memory before a wave."""
         if self.limit is not None:
-            self._before = self.meter.peak()
+            self._peak_before = self.meter.peak()
 
-    def _ended(self, taken: int) -> None:
+    def _after_wave(self, taken: int) -> None:
         """Measure a wave of ``taken`` lanes, and decide the size of the next."""
         if self.limit is None:
             return
-        if self._start is None:
+        if self._in_use is None:
+            # The first wave also loaded code, so its peak says nothing: the second counts with four times what is expected.
             release_memory()
-            self._start = self.meter.now()
-            self._grow(self.limit, self._start, 4 * self.per_lane, False)
+            self._in_use = self.meter.now()
+            self._grow(self.limit, self._in_use, 4 * self.bytes_per_lane, measured=False)
             return
         peak = self.meter.peak()
-        rose = peak > self._before
-        if rose or (peak <= self.limit and 2 * taken >= self.lanes):  # otherwise the wave tells nothing
-            self._grow(self.limit, self._start, max(peak - self._start, 1) / taken, rose)
+        measured = (
+            peak > self._peak_before
+        )  # this wave set the peak; else an earlier one did, with at least as much memory
+        if measured or (peak <= self.limit and 2 * taken >= self.lanes):  # a small wave below the peak tells nothing
+            self._grow(self.limit, self._in_use, max(peak - self._in_use, 1) / taken, measured=measured)
 
-    def _grow(self, limit: int, start: int, cost: float, rose: bool) -> None:
-        """Set lanes to as many as fit at ``cost`` bytes each: measured if the peak ``rose``, else an upper bound."""
-        fit = int(SHARE * max(limit - start, 0) / cost)
-        if rose and self._before > 0 and self.meter.peak() > limit:
+    def _grow(self, limit: int, in_use: int, bytes_per_lane: float, *, measured: bool) -> None:
+        """Set lanes to as many as fit.
+
+        Args:
+            limit: largest memory of the process in bytes.
+            in_use: bytes in use without lanes.
+            bytes_per_lane: bytes of a lane.
+            measured: True if ``bytes_per_lane`` is that of the last wave, False if it is an upper bound.
+        """
+        fit = int(WAVE_FRACTION * max(limit - in_use, 0) / bytes_per_lane)
+        if measured and self._peak_before > 0 and self.meter.peak() > limit:
             self.lanes = max(min(fit, self.lanes), 1)
         else:
-            self.lanes = max(self.lanes, min(fit, GROWTH * self.lanes if rose else max(fit, 1), self._most))
+            growth = MAX_GROWTH * self.lanes if measured else max(fit, 1)
+            self.lanes = max(self.lanes, min(fit, growth, self._max_lanes))

@@ -50,35 +50,43 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 #: Seconds between two checks of a waiting thread whether it is to stop.
-PATIENCE = 0.05
+POLL_SECONDS = 0.05
 #: Elements of a piece that one thread computes: fewer than torch splits, and a multiple of the vectors of any CPU.
 PIECE = 1 << 14
-#: Elements up to which torch uses one thread.
-_GRAIN = 32_768
-#: Bytes of address space that a thread needs: its stack, and a margin.
-_STACK = 12 << 20
+#: Elements up to which torch uses one thread (``at::internal::GRAIN_SIZE``).
+_TORCH_GRAIN = 32_768
+#: Bytes of address space that a thread needs: a stack of 8 MiB, the default of Linux, and a margin.
+_THREAD_BYTES = 12 << 20
 #: Functions that torch computes by MKL's vector math.
-_FUNCTIONS = "acos asin atan cos erf erfc erfinv exp log log10 log2 sin sqrt tan tanh trunc".split()
+_MKL_FUNCTIONS = "acos asin atan cos erf erfc erfinv exp log log10 log2 sin sqrt tan tanh trunc".split()
 
 
 # -- the pool
 
 
 class _Thread:
-    """A thread of the pool, in which torch is single-threaded; RuntimeError or MemoryError if it cannot be started.
+    """A thread of the pool, in which torch is single-threaded.
 
-    A team of OpenMP threads in each would live as long as the thread, and make every other team sleep instead of spin.
+    With more, each would have a team of OpenMP threads as long as it lives, and every other team would sleep instead of spin.
+
+    Attributes:
+        inbox: pairs of a function to call, and a queue that gets None once it has returned; None ends the thread.
+
+    Raises:
+        RuntimeError: the thread cannot be started.
+        MemoryError: as above.
     """
 
     def __init__(self) -> None:
-        self.given = SimpleQueue[tuple[Callable[[], object], SimpleQueue[None]] | None]()
+        self.inbox = SimpleQueue[tuple[Callable[[], object], SimpleQueue[None]] | None]()
         self.thread = threading.Thread(target=self._run, name=f"torchpt_{next(_numbers)}", daemon=True)
         self._ready = SimpleQueue[None]()
-        with _starting:
+        with _start_lock:
             count = torch.get_num_threads()
             self.thread.start()
             self._ready.get()
-            torch.set_num_threads(count)  # new threads inherit the process's number
+            # set_num_threads(1) of the new thread changed the number that further threads of the process begin with.
+            torch.set_num_threads(count)
 
     def _run(self) -> None:
         try:
@@ -86,23 +94,28 @@ class _Thread:
             torch.set_num_threads(1)
         finally:
             self._ready.put(None)
-        while (given := self.given.get()) is not None:
-            work, ended = given
+        while (message := self.inbox.get()) is not None:
+            work, ended = message
             work()
-            del given, work  # frees what it references
-            _idle.append(self)
+            del message, work  # an idle thread keeps nothing alive
+            _idle.append(self)  # before the caller hears of the end, so that it finds this thread idle
             ended.put(None)
 
 
+#: Numbers for the names of threads.
 _numbers = itertools.count()
-#: Serializes starts: each changes the process's number of threads for a moment.
-_starting = threading.Lock()
+#: Serializes starts of threads: each changes torch's number of threads for a moment.
+_start_lock = threading.Lock()
 #: Idle threads.
 _idle: list[_Thread] = []
 
 
 def _run_in_pool(work: Callable[[], object], ended: SimpleQueue[None]) -> bool:
-    """Run ``work``, which must not raise, on a thread of the pool; return False if no thread can be started."""
+    """Run ``work``, which must not raise, on a thread of the pool, which then puts None into ``ended``.
+
+    Returns:
+        False if no thread can be started.
+    """
     try:
         thread = _idle.pop()
     except IndexError:
@@ -110,7 +123,7 @@ def _run_in_pool(work: Callable[[], object], ended: SimpleQueue[None]) -> bool:
             thread = _Thread()
         except (RuntimeError, MemoryError):
             return False
-    thread.given.put((work, ended))
+    thread.inbox.put((work, ended))
     return True
 
 
@@ -120,16 +133,16 @@ def _before_fork() -> None:
     while _idle:
         ending.append(_idle.pop())
     for thread in ending:
-        thread.given.put(None)
+        thread.inbox.put(None)
     for thread in ending:
         thread.thread.join()
 
 
 def _after_fork() -> None:
     """Forget all threads after a fork: the child has neither its parent's nor torch's, and would wait forever."""
-    global _torch_threads, _starting
+    global _torch_threads, _start_lock
     _idle.clear()
-    _starting = threading.Lock()
+    _start_lock = threading.Lock()  # another thread may have held the old one during the fork
     _torch_threads = _TorchThreads(forked=True)
 
 
@@ -144,8 +157,8 @@ class TaskQueue(Generic[T, R]):
         threads: largest number of threads; fewer run if memory is short.
 
     Attributes:
-        threads: the number of threads.
-        pending: tasks that are queued or running, or whose results ``next`` has not returned.
+        threads: largest number of threads; lowered once no more can be started.
+        pending: number of tasks that are queued or running, or whose results ``next`` has not returned.
     """
 
     def __init__(self, threads: int) -> None:
@@ -153,7 +166,7 @@ class TaskQueue(Generic[T, R]):
         self._todo = SimpleQueue[tuple[T, Callable[[], R]] | None]()
         self._done = SimpleQueue[tuple[T, R | BaseException]]()
         self._ended = SimpleQueue[None]()
-        self._size = 0
+        self._started = 0  # threads that work for this queue
 
     def add(self, tag: T, task: Callable[[], R]) -> None:
         """Queue a task; ``next`` returns ``tag`` with its result.
@@ -163,23 +176,23 @@ class TaskQueue(Generic[T, R]):
         """
         self.pending += 1
         self._todo.put((tag, task))
-        if self._size >= min(self.threads, self.pending):
+        if self._started >= min(self.threads, self.pending):
             return
         if _run_in_pool(self._work, self._ended):
-            self._size += 1
-        elif self._size:
-            self.threads = self._size
+            self._started += 1
+        elif self._started:
+            self.threads = self._started
         else:
             raise RenderError("not enough memory for a thread that renders")
 
-    def next(self, wait: bool) -> tuple[T, R | BaseException] | None:
-        """Return tag and result (or exception) of a finished task; None if there is none, with ``wait`` after a while."""
+    def next(self, *, wait: bool) -> tuple[T, R | BaseException] | None:
+        """Return tag and result (or exception) of a finished task, or None: at once, or after ``POLL_SECONDS`` if ``wait``."""
         try:
-            found = self._done.get(timeout=PATIENCE) if wait else self._done.get_nowait()
+            finished = self._done.get(timeout=POLL_SECONDS) if wait else self._done.get_nowait()
         except Empty:
             return None
         self.pending -= 1
-        return found
+        return finished
 
     def close(self) -> None:
         """Drop queued tasks, and return the threads to the pool once the running ones are finished."""
@@ -188,27 +201,28 @@ class TaskQueue(Generic[T, R]):
                 self._todo.get_nowait()
         except Empty:
             pass
-        for _ in range(self._size):
+        for _ in range(self._started):
             self._todo.put(None)
-        while self._size:
+        while self._started:
             self._ended.get()
-            self._size -= 1
+            self._started -= 1
 
     def _work(self) -> None:
-        while (job := self._todo.get()) is not None:
-            tag, task = job
+        """Run tasks until None comes (on a thread of the pool)."""
+        while (entry := self._todo.get()) is not None:
+            tag, task = entry
             try:
                 self._done.put((tag, task()))
             except BaseException as error:
                 self._done.put((tag, error))
-            del job, tag, task
+            del entry, tag, task  # keeps nothing alive while it waits
 
 
 def map_in_order(
     items: Iterable[T],
     task: Callable[[T], R],
     threads: int,
-    each: Callable[[R | None], bool],
+    on_result: Callable[[R | None], bool],
     halt: threading.Event | None = None,
     ahead: int | None = None,
 ) -> None:
@@ -218,69 +232,71 @@ def map_in_order(
         items: items, taken one by one.
         task: is called in a thread of the pool; the calling thread only handles results and signals.
         threads: largest number of threads.
-        each: is called in this thread with every result, and now and then with None while tasks run; True ends the
-            work.
-        halt: set from outside to end the work, and here after ``each`` returned True or something raised. Then no task
+        on_result: is called in this thread with every result, and every ``POLL_SECONDS`` with None while tasks run; it returns
+            True to end the work.
+        halt: set from outside to end the work, and here after ``on_result`` returned True or something raised. Then no task
             starts, and a running ``task`` may check it to end early.
         ahead: largest number of tasks that start before the oldest one's result was passed on; None: any number.
 
     Raises:
         RenderError: there is no memory for a single thread.
-        Exception: the exception of a task or of ``each``; of several tasks that of the first in order.
+        Exception: the exception of a task or of ``on_result``; of several tasks that of the first in order.
     """
     halt = halt or threading.Event()
-    queue, left = TaskQueue[int, R](threads), enumerate(items)
-    found: dict[int, R | BaseException] = {}
-    begun = delivered = 0
+    queue, numbered_items = TaskQueue[int, R](threads), enumerate(items)
+    results: dict[int, R | BaseException] = {}  # not passed on yet, by the number of their item
+    begun = delivered = 0  # items whose task was queued; results that were passed on
 
-    def tell() -> None:
+    def deliver() -> None:
         """Pass on the results that are next in order."""
         nonlocal delivered
-        while delivered in found:
-            result = found.pop(delivered)
+        while delivered in results:
+            result = results.pop(delivered)
             delivered += 1
             if isinstance(result, BaseException):
                 try:
                     raise result
                 finally:  # the error's traceback would keep this frame, and this frame the error
                     del result
-            if each(result):
+            if on_result(result):
                 halt.set()
 
     try:
         while not halt.is_set():
             while ahead is None or begun - delivered < ahead:
-                item = next(left, None)
-                if item is None:
+                numbered = next(numbered_items, None)
+                if numbered is None:
                     break
-                queue.add(item[0], functools.partial(task, item[1]))
+                number, item = numbered
+                queue.add(number, functools.partial(task, item))
                 begun += 1
             if delivered == begun:
                 return
-            came = queue.next(wait=True)
-            if came is not None:
-                found[came[0]] = came[1]
-            tell()
-            if came is None and each(None):
+            finished = queue.next(wait=True)
+            if finished is not None:
+                number, results[number] = finished
+            deliver()
+            if finished is None and on_result(None):
                 halt.set()
     except BaseException:
         halt.set()
         raise
     finally:
         queue.close()
-    while (came := queue.next(wait=False)) is not None:  # tasks that were running
-        found[came[0]] = came[1]
-    late = [found[number] for number in sorted(found)]
+    # Halted without an error: results of tasks that were running are passed on too, then errors among them raised.
+    while (finished := queue.next(wait=False)) is not None:
+        number, results[number] = finished
+    late = [results[number] for number in sorted(results)]
     for result in late:
         if not isinstance(result, BaseException):
-            each(result)
+            on_result(result)
     for result in late:
         if isinstance(result, BaseException):
             raise result
 
 
 def parallel_for(work: Callable[[int, int], object], items: int, threads: int) -> None:
-    """Call ``work(first, last)`` for parts of ``range(items)``, one part for each thread, the first in this one.
+    """Call ``work(first, last)`` for parts ``range(first, last)`` of ``range(items)``, one a thread, the first in this one.
 
     Args:
         work: machine code that releases the GIL.
@@ -290,10 +306,10 @@ def parallel_for(work: Callable[[int, int], object], items: int, threads: int) -
     if threads == 1:
         work(0, items)
         return
-    parts = deque(pairwise(items * k // threads for k in range(threads + 1)))
+    parts = deque(pairwise(items * k // threads for k in range(threads + 1)))  # (first, last), last excluded
     errors: list[BaseException] = []
 
-    def take() -> None:
+    def work_on_parts() -> None:
         while True:
             try:
                 part = parts.popleft()
@@ -305,13 +321,13 @@ def parallel_for(work: Callable[[int, int], object], items: int, threads: int) -
                 errors.append(error)
 
     ended = SimpleQueue[None]()
-    first = parts.popleft()
-    helpers = sum(_run_in_pool(take, ended) for _ in range(threads - 1))
+    own_part = parts.popleft()
+    started = sum(_run_in_pool(work_on_parts, ended) for _ in range(threads - 1))
     try:
-        work(*first)
-        take()  # parts that no thread has begun
+        work(*own_part)
+        work_on_parts()  # those that no other thread has begun
     finally:
-        for _ in range(helpers):
+        for _ in range(started):
             ended.get()
     if errors:
         raise errors[0]
@@ -326,27 +342,36 @@ def thread_count(threads: int | None) -> int:
 
 
 class _TorchThreads:
-    """Torch's number of threads before the first of overlapping renders, and the number of those."""
+    """Sets torch's number of threads while renders run, which may overlap, and restores it after the last.
 
-    def __init__(self, forked: bool) -> None:
+    Args:
+        forked: True in a process that was forked from one that had imported this package.
+
+    Attributes:
+        before: the number before the first of the renders that run now.
+        renders: how many run now.
+    """
+
+    def __init__(self, *, forked: bool) -> None:
         self.forked, self.lock = forked, threading.Lock()
         self.before, self.renders = 0, 0
 
     def enter(self, threads: int | str) -> None:
+        """Begin a render with a number of threads, or "auto": as many as torch has."""
         with self.lock:
             if self.renders == 0:
                 self.before = torch.get_num_threads()
             self.renders += 1
             # Torch's thread pool does not survive a fork: the child would wait for it forever.
-            now = 1 if self.forked else self.before if threads == "auto" else int(threads)
-            if now != torch.get_num_threads():
-                torch.set_num_threads(now)
+            count = 1 if self.forked else self.before if threads == "auto" else int(threads)
+            if count != torch.get_num_threads():
+                torch.set_num_threads(count)
             start_torch_threads()
 
     def leave(self) -> None:
+        """End a render."""
         with self.lock:
             self.renders -= 1
-            # The last of overlapping renders restores the number that the first one found.
             if self.renders == 0 and torch.get_num_threads() != self.before and not self.forked:
                 torch.set_num_threads(self.before)
 
@@ -357,14 +382,14 @@ _torch_threads = _TorchThreads(forked=False)
 
 @contextmanager
 def limited_threads(threads: int | str) -> Iterator[None]:
-    """Let torch use ``threads`` threads within, also in overlapping renders."""
-    here = _torch_threads
-    here.enter(threads)
+    """Let torch use ``threads`` threads within, also in overlapping renders; "auto": as many as before."""
+    entered = _torch_threads
+    entered.enter(threads)
     try:
         yield
     finally:
-        if here is _torch_threads:  # otherwise this is the child of a fork, where another thread may hold the lock
-            here.leave()
+        if entered is _torch_threads:  # otherwise this is the child of a fork, where another thread may hold the lock
+            entered.leave()
 
 
 @contextmanager
@@ -389,12 +414,12 @@ def warm_up() -> None:
     """
     for dtype in (torch.float32, torch.float64):
         half = torch.full((1,), 0.5, dtype=dtype)
-        for name in _FUNCTIONS:
+        for name in _MKL_FUNCTIONS:
             getattr(torch, name)(half)
 
 
-#: Numbers of threads for which torch's team was started.
-_started: set[int] = set()
+#: Numbers of threads for which torch's team of OpenMP threads was started.
+_started_counts: set[int] = set()
 
 
 def start_torch_threads() -> None:
@@ -403,10 +428,10 @@ def start_torch_threads() -> None:
     OpenMP aborts the process if it cannot start a thread, which happens at the first large tensor.
     """
     count = torch.get_num_threads()
-    if count > 1 and count not in _started:
-        if fits_in_memory(lambda: check_address_space(count * _STACK)):
-            torch.zeros(count * _GRAIN).add_(1.0)
-            _started.add(count)
+    if count > 1 and count not in _started_counts:
+        if fits_in_memory(lambda: check_address_space(count * _THREAD_BYTES)):
+            torch.zeros(count * _TORCH_GRAIN).add_(1.0)  # so large that every thread has elements
+            _started_counts.add(count)
         else:
             torch.set_num_threads(1)
 
@@ -431,21 +456,23 @@ def without_autocast(device: torch.device) -> Iterator[None]:
 # -- results that do not depend on the number of threads
 
 
-def map_in_pieces(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
-    """Return an elementwise ``function`` of tensors of one shape, computed in pieces of one thread each."""
-    first = given[0]
+def map_in_pieces(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
+    """Return an elementwise ``function`` of tensors of one shape, computed in pieces that torch does not split."""
+    first = tensors[0]
     if first.device.type != "cpu" or first.numel() <= PIECE:
-        return function(*given)
-    pieces = [function(*piece) for piece in zip(*(x.reshape(-1).split(PIECE) for x in given), strict=True)]
+        return function(*tensors)
+    pieces = [function(*piece) for piece in zip(*(x.reshape(-1).split(PIECE) for x in tensors), strict=True)]
     return torch.cat(pieces).view(first.shape)
 
 
 def sum_all(x: Tensor) -> Tensor:
     """Return the sum ``()`` of all elements."""
-    # Of two sums in one call, torch computes each in one thread.
+    # Torch splits a single sum among threads; two rows that are summed at once (views of one tensor) it computes in a thread
+    # each.
     return x.expand(2, *x.shape).sum(tuple(range(1, x.dim() + 1)))[0]
 
 
 def mean_all(x: Tensor) -> Tensor:
     """Return the mean ``()`` of all elements."""
+    # Two rows, as in sum_all.
     return x.expand(2, *x.shape).mean(tuple(range(1, x.dim() + 1)))[0]

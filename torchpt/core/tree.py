@@ -28,13 +28,15 @@ T = TypeVar("T")
 #: ``field(metadata=NOT_FINGERPRINTED)`` for a dataclass field on which no picture depends, such as the path of a file.
 NOT_FINGERPRINTED = {"fingerprint": False}
 
+#: How instances of a class are walked: a leaf, by values, by items, not at all. Those of a dataclass: by the names of its
+#: fields.
 _TENSOR, _MAPPING, _SEQUENCE, _STATIC = range(4)
-#: For each class, how its instances are walked: one of the above, or the names of dataclass fields.
-_known: dict[type, Any] = {}
+#: One of the above, or a tuple of names, for each class met so far. Walks look it up inline: a call would cost them much time.
+_forms: dict[type, Any] = {}
 
 
 def _form(kind: type) -> Any:
-    """Return how instances of a class are walked."""
+    """Return how instances of a class are walked, and remember it."""
     if issubclass(kind, Tensor):
         form: Any = _TENSOR
     elif issubclass(kind, dict):
@@ -45,7 +47,7 @@ def _form(kind: type) -> Any:
         form = tuple(field.name for field in fields(kind))
     else:
         form = _STATIC
-    _known[kind] = form
+    _forms[kind] = form
     return form
 
 
@@ -57,8 +59,9 @@ def leaves(record: Any) -> list[Tensor]:
 
 
 def _gather(record: Any, found: list[Tensor]) -> None:
+    """Append the leaves of a record to ``found``."""
     kind = type(record)
-    form = _known.get(kind)
+    form = _forms.get(kind)
     if form is None:
         form = _form(kind)
     if form is _STATIC:
@@ -79,7 +82,7 @@ def _gather(record: Any, found: list[Tensor]) -> None:
 def named_leaves(record: Any, path: str) -> Iterator[tuple[str, Tensor]]:
     """Yield dotted path and tensor of each leaf, in the order of :func:`leaves`; paths begin with ``path``."""
     kind = type(record)
-    form = _known.get(kind)
+    form = _forms.get(kind)
     if form is None:
         form = _form(kind)
     if form is _TENSOR:
@@ -98,41 +101,43 @@ def named_leaves(record: Any, path: str) -> Iterator[tuple[str, Tensor]]:
 def map_leaves(function: Callable[..., Any], record: T, *others: T) -> T:
     """Return a record whose leaves are ``function`` of the leaves of ``record`` and of the corresponding ones of ``others``.
 
-    Parts without a changed leaf are not copied.
+    Records in it without a changed leaf are not copied.
     """
-    made, rest = cast("Any", record), cast("Sequence[Any]", others)
-    kind: Any = type(made)
-    form = _known.get(kind)
+    old, old_others = cast("Any", record), cast("Sequence[Any]", others)  # the type checker does not follow forms
+    kind: Any = type(old)
+    form = _forms.get(kind)
     if form is None:
         form = _form(kind)
     if form is _TENSOR:
-        return function(made, *rest)
+        return function(old, *old_others)
     if form is _STATIC:
         return record
     if form is _SEQUENCE:
-        parts = [map_leaves(function, *each) for each in zip(made, *rest, strict=True)]
-        if all(new is old for new, old in zip(parts, made, strict=True)):
+        items = [map_leaves(function, *corresponding) for corresponding in zip(old, *old_others, strict=True)]
+        if all(new is value for new, value in zip(items, old, strict=True)):
             return record
-        return made._make(parts) if hasattr(made, "_make") else kind(parts)
+        return old._make(items) if hasattr(old, "_make") else kind(items)  # _make: of a named tuple
     if form is _MAPPING:
-        values = {name: map_leaves(function, value, *[each[name] for each in rest]) for name, value in made.items()}
-        return record if all(values[name] is value for name, value in made.items()) else kind({**made, **values})
-    values, same = {}, True
+        values = {
+            name: map_leaves(function, value, *[other[name] for other in old_others]) for name, value in old.items()
+        }
+        return record if all(values[name] is value for name, value in old.items()) else kind({**old, **values})
+    values, unchanged = {}, True
     for name in form:
-        value = new = getattr(made, name)
-        if rest:
-            new = map_leaves(function, value, *[getattr(each, name) for each in rest])
+        value = new = getattr(old, name)
+        if old_others:
+            new = map_leaves(function, value, *[getattr(other, name) for other in old_others])
         elif type(value) is Tensor:  # the most frequent case, without a call
             new = function(value)
         elif value is not None:
             new = map_leaves(function, value)
-        same = same and new is value
+        unchanged = unchanged and new is value
         values[name] = new
-    return record if same else kind(**values)
+    return record if unchanged else kind(**values)
 
 
 def rebuild(record: T, tensors: Sequence[Tensor]) -> T:
-    """Return a record whose :func:`leaves` are replaced by ``tensors``.
+    """Return a record whose :func:`leaves` are replaced by ``tensors``, in order.
 
     Raises:
         ValueError: their number differs.
@@ -140,18 +145,18 @@ def rebuild(record: T, tensors: Sequence[Tensor]) -> T:
     count = len(leaves(record))
     if count != len(tensors):
         raise ValueError(f"{len(tensors)} tensors for a record of {count}")
-    each = iter(tensors)
-    return map_leaves(lambda _: next(each), record)
+    remaining = iter(tensors)
+    return map_leaves(lambda _: next(remaining), record)
 
 
 def signature(record: Any) -> Any:
-    """Return a hashable key of everything in a record but the values of its leaves: for code specialized to it.
+    """Return a hashable key of everything in a record but the values of its leaves: compiled code for it is kept by this key.
 
     A user's objects count by identity, by the plain values that they hold, and by the identity of their tensors: compiled code
     reads those from memory, and keeps them alive.
     """
     kind = type(record)
-    form = _known.get(kind)
+    form = _forms.get(kind)
     if form is None:
         form = _form(kind)
     if form is _TENSOR:
@@ -169,20 +174,20 @@ def _is_plain(value: Any) -> bool:
     return value is None or isinstance(value, bool | int | float | str | bytes | type | torch.dtype)
 
 
-def _contents(value: Any, seen: set[int]) -> Any:
-    """Return the contents of a user's object for :func:`signature`."""
+def _contents(value: Any, around: set[int]) -> Any:
+    """Return the contents of a user's object for :func:`signature`; ``around`` are ids of the objects that it lies in."""
     if _is_plain(value):
         return value
-    if id(value) in seen:
+    if id(value) in around:  # a cycle
         return None
     if isinstance(value, Tensor):
         return id(value), value.dtype, tuple(value.shape)
-    seen = seen | {id(value)}
+    around = around | {id(value)}
     if isinstance(value, dict):
-        return tuple((str(key), _contents(item, seen)) for key, item in value.items())
+        return tuple((str(key), _contents(item, around)) for key, item in value.items())
     if isinstance(value, tuple | list):
-        return tuple(_contents(item, seen) for item in value)
-    return id(value), _contents(getattr(value, "__dict__", {}), seen)
+        return tuple(_contents(item, around) for item in value)
+    return id(value), _contents(getattr(value, "__dict__", {}), around)
 
 
 # -- fingerprints
@@ -205,11 +210,17 @@ def fingerprint(record: Any) -> bytes:
 
 
 class _Fingerprinter:
-    """One call of :func:`fingerprint`."""
+    """One call of :func:`fingerprint`.
+
+    Each value is encoded as bytes that begin with a letter or word for its type; what varies in length is preceded by its
+    length, so that no two sequences of values have the same bytes.
+    """
 
     def __init__(self) -> None:
-        self._printed: dict[int, tuple[Any, bytes]] = {}  # keeps objects alive, so that ids stay unique
-        self._open: dict[int, int] = {}  # depth of each object around the current one, for cycles
+        # Objects and their encoding by id: an object that occurs twice is hashed once. Keeps them alive, so that ids stay
+        # unique.
+        self._encodings: dict[int, tuple[Any, bytes]] = {}
+        self._depths: dict[int, int] = {}  # by id: the depths of the objects that the current one lies in
 
     def digest(self, value: Any) -> bytes:
         """Return the fingerprint of a value."""
@@ -228,18 +239,18 @@ class _Fingerprinter:
             return b"i" + _sized(repr(value).encode())
         if kind is bytes:
             return b"b" + _sized(value)
-        known = self._printed.get(id(value))
-        if known is not None:
-            return known[1]
-        if id(value) in self._open:
-            return b"^" + _sized(str(len(self._open) - self._open[id(value)]).encode())
-        self._open[id(value)] = len(self._open)
+        if id(value) in self._encodings:
+            _, encoding = self._encodings[id(value)]
+            return encoding
+        if id(value) in self._depths:  # a cycle: how many levels up it leads
+            return b"^" + _sized(str(len(self._depths) - self._depths[id(value)]).encode())
+        self._depths[id(value)] = len(self._depths)
         try:
-            found = _hash(self._large(value))
+            encoding = _hash(self._large(value))
         finally:
-            del self._open[id(value)]
-        self._printed[id(value)] = value, found
-        return found
+            del self._depths[id(value)]
+        self._encodings[id(value)] = value, encoding
+        return encoding
 
     def _large(self, value: Any) -> bytes:
         """Return bytes that identify a container, a tensor or an object."""
@@ -247,7 +258,7 @@ class _Fingerprinter:
             value = value.detach().cpu().resolve_conj().resolve_neg().contiguous()
             numbers = value.reshape(-1).view(torch.uint8).numpy()
             return _named("tensor", value.dtype, tuple(value.shape)) + _hash(numbers.data)
-        if isinstance(value, np.ndarray | np.generic) and value.dtype != object:
+        if isinstance(value, np.ndarray | np.generic) and value.dtype != object:  # generic: numpy's scalars
             array = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
             return _named("array", array.dtype.str, np.shape(value)) + _hash(array.reshape(-1).view(np.uint8).data)
         if isinstance(value, np.ndarray):
@@ -281,16 +292,16 @@ class _Fingerprinter:
         if isinstance(value, types.BuiltinFunctionType):
             return _named("builtin", value.__module__, value.__qualname__)
         if isinstance(value, staticmethod | classmethod | property | functools.cached_property):
-            held = (getattr(value, name, None) for name in ("__func__", "fget", "fset", "fdel", "func"))
-            return self._class(type(value)) + self._each(held)
+            functions = (getattr(value, name, None) for name in ("__func__", "fget", "fset", "fdel", "func"))
+            return self._class(type(value)) + self._each(functions)
         if is_dataclass(value) and not isinstance(value, torch.nn.Module):
             state = {field.name: getattr(value, field.name) for field in fields(value)}
-            if _is_own(type(value)):
-                state |= _state(value)
-            state = {name: item for name, item in state.items() if name not in _unprinted(type(value))}
+            if _is_user_code(type(value)):
+                state |= _state(value)  # attributes that are no fields
+            state = {name: item for name, item in state.items() if name not in _not_fingerprinted(type(value))}
         elif hasattr(value, "__dict__") or hasattr(type(value), "__slots__"):
             state = _state(value)
-        else:
+        else:  # as pickle sees it: a global's name, or (callable, arguments, state, ...)
             reduced = value.__reduce_ex__(4)
             state = {"": reduced if isinstance(reduced, str) else reduced[1:3]}
         if isinstance(value, tuple | list):  # for example a named tuple
@@ -302,8 +313,9 @@ class _Fingerprinter:
     def _class(self, kind: type) -> bytes:
         """Return bytes that identify a class: its name, and the code of its methods if it is a user's."""
         name = _named("class", kind.__module__, kind.__qualname__)
-        if not _is_own(kind):
+        if not _is_user_code(kind):
             return name
+        # Without docstrings, line numbers and what Python adds by itself.
         members = {
             key: value
             for key, value in vars(kind).items()
@@ -313,24 +325,30 @@ class _Fingerprinter:
         return name + self._each((*kind.__bases__, *(part for item in sorted(members.items()) for part in item)))
 
     def _function(self, function: types.FunctionType) -> bytes:
-        cells = [cell.cell_contents for cell in function.__closure__ or ()]
-        held = self._each((function.__defaults__, function.__kwdefaults__, cells))
-        if not _is_own(function):
-            return _named("name", function.__module__, function.__qualname__) + held
-        return held + self._code(function.__code__, function.__globals__)
+        """Return bytes that identify a function: defaults, the variables that it captures, and its name or a user's code."""
+        captured = [cell.cell_contents for cell in function.__closure__ or ()]
+        values = self._each((function.__defaults__, function.__kwdefaults__, captured))
+        if not _is_user_code(function):
+            return _named("name", function.__module__, function.__qualname__) + values
+        return values + self._code(function.__code__, function.__globals__)
 
-    def _code(self, code: types.CodeType, around: Mapping[str, Any]) -> bytes:
-        """Return bytes that identify code: instructions, constants, names, and the values of names in ``around``."""
-        inner = [self._code(part, around) if isinstance(part, types.CodeType) else part for part in code.co_consts]
-        named = [around.get(name) for name in code.co_names]
+    def _code(self, code: types.CodeType, global_values: Mapping[str, Any]) -> bytes:
+        """Return bytes that identify code: instructions, constants, names, and the values of the globals that it names."""
+        # Constants of a code object include the code of functions that are defined in it.
+        constants = [
+            self._code(constant, global_values) if isinstance(constant, types.CodeType) else constant
+            for constant in code.co_consts
+        ]
+        named = [global_values.get(name) for name in code.co_names]
         read = [
             value
             for value in named
             if isinstance(value, type | types.FunctionType | Tensor | np.ndarray) or _is_plain(value)
         ]
-        return self._each((code.co_code, code.co_names, code.co_freevars, inner, read))
+        return self._each((code.co_code, code.co_names, code.co_freevars, constants, read))
 
     def _each(self, values: Any) -> bytes:
+        """Return the hash of a sequence of values."""
         return _hash(b"".join([self._encoded(value) for value in values]))
 
 
@@ -339,20 +357,22 @@ def _hash(content: Any) -> bytes:
 
 
 def _sized(content: bytes) -> bytes:
+    """Return content after its length in bytes."""
     return b"%d:%b" % (len(content), content)
 
 
 def _named(*words: Any) -> bytes:
+    """Return bytes that identify plain values by their ``repr``."""
     return _sized(repr(words).encode())
 
 
-def _is_own(code: Any) -> bool:
+def _is_user_code(code: Any) -> bool:
     """Return True for a class or function that no library defines."""
     return str(code.__module__).partition(".")[0] not in _LIBRARIES
 
 
 @functools.cache
-def _unprinted(kind: Any) -> frozenset[str]:
+def _not_fingerprinted(kind: Any) -> frozenset[str]:
     """Return the fields of a dataclass that fingerprints leave out."""
     return frozenset(field.name for field in fields(kind) if not field.metadata.get("fingerprint", True))
 
@@ -360,12 +380,15 @@ def _unprinted(kind: Any) -> frozenset[str]:
 def _state(value: Any) -> dict[str, Any]:
     """Return the attributes of an object, without cached properties."""
     kinds = type(value).__mro__
-    slots = [name for kind in kinds for name in _names(kind) if hasattr(value, name)]
+    slots = [name for kind in kinds for name in _slot_names(kind) if hasattr(value, name)]
     state = {name: getattr(value, name) for name in slots} | getattr(value, "__dict__", {})
-    kept = {name for kind in kinds for name, item in vars(kind).items() if isinstance(item, functools.cached_property)}
-    return {name: item for name, item in state.items() if name not in kept and name != "__weakref__"}
+    cached = {
+        name for kind in kinds for name, item in vars(kind).items() if isinstance(item, functools.cached_property)
+    }
+    return {name: item for name, item in state.items() if name not in cached and name != "__weakref__"}
 
 
-def _names(kind: type) -> Sequence[str]:
+def _slot_names(kind: type) -> Sequence[str]:
+    """Return the names in ``__slots__`` of a class, which may be one name or several."""
     slots = vars(kind).get("__slots__", ())
     return [slots] if isinstance(slots, str) else list(slots)

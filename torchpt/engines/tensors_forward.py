@@ -46,7 +46,7 @@ class TensorsForward:
         """See :class:`torchpt.engines.engine.Forward`."""
         for pixel_set, first, count in spans:
             pixels = pixel_set.film.width * pixel_set.film.height
-            for _ in self.budget.through(partial(self._take, pixel_set), pixels, first, count):
+            for _ in self.budget.run_in_chunks(partial(self._take, pixel_set), pixels, first, count):
                 if each(self._result):
                     return False
         return True

@@ -129,7 +129,7 @@ class SceneTape(Tape):
                 first_pixel, count, first_sample, samples = span  # the pixel counts from the block's first
                 work((start + first_pixel, count, first_sample, samples))
 
-            for _ in budget.through(moved, count, 0, samples):
+            for _ in budget.run_in_chunks(moved, count, 0, samples):
                 pass  # running the iterator calls `work`
 
     def sums(self) -> GradientSums:

@@ -240,7 +240,7 @@ def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
 def _budget_of_kernels(kernels: BackwardKernels, settings: Settings) -> Budget:
     """Return the budget of threads: fewer than torch has if their arenas would take more than half of ``render.max_memory``."""
     threads = torch.get_num_threads()
-    budget = Budget(torch.device("cpu"), LANES_OF_KERNELS, threads, what="a gradient", instead="one thread")
+    budget = Budget(torch.device("cpu"), LANES_OF_KERNELS, threads, what="a gradient", fallback="one thread")
     limit = settings.render.max_memory
     if limit is not None:
         budget.fit(limit // 2, kernels.bytes_per_lane(_kept_vertices(settings)), LANES_OF_KERNELS)

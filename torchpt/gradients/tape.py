@@ -151,7 +151,7 @@ def _budget(settings: Settings, scene_tape: SceneTape) -> Budget:
 
 def budget_of_chunks(device: torch.device, lanes: int, what: str, limit: int | None, per_lane: int) -> Budget:
     """Return a budget of ``lanes`` a chunk, whatever the limit as long as they fit: sums of other chunks round differently."""
-    budget = Budget(device, lanes, what=what, limit=limit, per_lane=per_lane)
+    budget = Budget(device, lanes, what=what, limit=limit, bytes_per_lane=per_lane)
     budget.drop_unneeded_limit()
     return budget
 

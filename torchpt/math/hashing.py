@@ -1,5 +1,8 @@
 """Integer hashing of int32 lanes (wrap-around arithmetic), with the same bits on every device and in every kernel.
 
+Samplers make their random numbers of it. Torch has no unsigned 32-bit arithmetic, so bits are held in int32, as two's
+complement.
+
 ``mix`` is Wellons' two-round multiply-xorshift of low bias ("Prospecting for hash functions", 2018): a bijection of 32 bits.
 """
 
@@ -9,11 +12,12 @@ from torch import Tensor
 
 from torchpt.core.dispatch import dispatched
 
-__all__ = ["HALVES", "M0", "M1", "as_int32", "logical_shift", "mix", "mix_int", "reverse_bits", "to_unit"]
+__all__ = ["HALVES", "as_int32", "logical_shift", "mix", "mix_int", "reverse_bits", "to_unit"]
 
 #: Steps of the reversal of 32 bits: a shift, and the mask of the bits that it swaps with higher ones.
 HALVES = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
-M0, M1 = 0x7FEB352D, 0x846CA68B - (1 << 32)
+#: Multipliers of ``mix``; the second as a signed 32-bit value.
+_MULTIPLIER_0, _MULTIPLIER_1 = 0x7FEB352D, 0x846CA68B - (1 << 32)
 
 
 def as_int32(x: int) -> int:
@@ -36,8 +40,8 @@ def reverse_bits(x: Tensor) -> Tensor:
 
 def mix(x: Tensor) -> Tensor:
     """Hash int32 lanes ``(N,)``."""
-    x = (x ^ logical_shift(x, 16)) * M0
-    x = (x ^ logical_shift(x, 15)) * M1
+    x = (x ^ logical_shift(x, 16)) * _MULTIPLIER_0
+    x = (x ^ logical_shift(x, 15)) * _MULTIPLIER_1
     return x ^ logical_shift(x, 16)
 
 
@@ -50,5 +54,5 @@ def mix_int(x: int) -> int:
 
 
 def to_unit(x: Tensor) -> Tensor:
-    """Convert the top 24 bits to float32 in ``[0, 1 - 2^-24]``, exactly."""
+    """Convert the top 24 bits of int32 lanes to float32 in ``[0, 1 - 2^-24]``, exactly."""
     return logical_shift(x, 8) * (1.0 / (1 << 24))

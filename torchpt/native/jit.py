@@ -23,7 +23,7 @@ from numba.core.compiler import CompileResult
 from numba.core.event import Event, Listener, register
 
 from torchpt.core.errors import RenderError
-from torchpt.core.memory import MARGIN, check_address_space
+from torchpt.core.memory import CODE_BYTES, check_address_space
 from torchpt.core.threads import parallel_for
 from torchpt.native import cache, compile_time
 from torchpt.native.content import code_of_function
@@ -131,7 +131,7 @@ def ensure_compiled(kernel: Any, *args: Any) -> Any:
     """Compile a kernel by a call without work, and return it; a long compilation prints a message to stderr, once."""
     if not kernel.overloads:
         # LLVM aborts the process without memory, and so does the BLAS that numba loads with its first kernel.
-        check_address_space(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN)
+        check_address_space(CODE_BYTES if "numba.np.arraymath" in sys.modules else 4 * CODE_BYTES)
         timer = threading.Timer(_PATIENCE, _say)
         timer.daemon = True
         timer.start()

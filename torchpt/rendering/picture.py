@@ -76,7 +76,7 @@ def rendering_of(run: Run) -> Rendering:
         stopped_by=run.stop.reason,
         complete=bool(run.stop.reason) and not run.ended,
         peak_memory=max(meter.peak() - meter.base(), 0),
-        lanes=run.engine.budget.lanes if run.engine.budget.short and not run.engine.compiled else None,
+        lanes=run.engine.budget.lanes if run.engine.budget.has_shrunk and not run.engine.compiled else None,
         eager=tuple(run.eager),
         scene=run.name,
         overrides=run.scene.description.overrides,

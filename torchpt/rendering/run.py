@@ -134,7 +134,9 @@ class Run:
     def _by_tensors(self) -> Forward:
         lanes = LANES.get(self.device.type, LANES["cpu"])
         limit, what = self.settings.render.max_memory, "a wave of a single lane"
-        return forward_tensors(self.wave, Budget(self.device, lanes, what=what, limit=limit, per_lane=BYTES_PER_LANE))
+        return forward_tensors(
+            self.wave, Budget(self.device, lanes, what=what, limit=limit, bytes_per_lane=BYTES_PER_LANE)
+        )
 
     def _begin(self) -> None:
         """Set films and counts to zero."""

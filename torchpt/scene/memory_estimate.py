@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from torchpt.core.errors import SceneError
-from torchpt.core.memory import FEWEST, free_memory
+from torchpt.core.memory import FIRST_WAVE_LANES, free_memory
 from torchpt.physics.film import Film
 from torchpt.scene.prepare import surface_layers
 from torchpt.scene.settings import Settings
@@ -109,7 +109,7 @@ def memory_estimate(settings: Settings, device: torch.device, how: str, models: 
         code += NUMBA
     if device.type != "cpu":
         code = 0
-    waves = FEWEST_OF_KERNELS * 4 * rows if how == "compiled" else FEWEST * 2 * BYTES_PER_LANE
+    waves = FEWEST_OF_KERNELS * 4 * rows if how == "compiled" else FIRST_WAVE_LANES * 2 * BYTES_PER_LANE
     return MemoryEstimate(pixels * films, code, waves, pixels * picture)
 
 

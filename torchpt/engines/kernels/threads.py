@@ -106,8 +106,8 @@ class KernelsForward:
             LANES,
             threads,
             what="the compiled loop on one thread",
-            instead="one thread and fewer lanes",
-            fewest=VECTORS.width,
+            fallback="one thread and fewer lanes",
+            min_lanes=VECTORS.width,
         )
         self._workers: list[KernelsEngine] = []
         self._halt = threading.Event()
