@@ -46,7 +46,9 @@ def test_both_pictures_are_written_and_named(
 ) -> None:
     assert main(["render", "scene=s.yaml", ON, "out=[a.exr,b.c.png]", "film.aovs=[depth]", "film.gamma=1.0"]) == 0
     assert files(folder) == {"a.exr", "a.denoised.exr", "b.c.png", "b.c.denoised.png"}
-    facts = json.loads(capsys.readouterr().out.splitlines()[-1])
+    shown, line = capsys.readouterr().out.splitlines()
+    assert "; denoised: a.denoised.exr, b.c.denoised.png" in shown
+    facts = json.loads(line)
     assert facts["out"] == ["a.exr", "b.c.png"] and facts["denoised"] == ["a.denoised.exr", "b.c.denoised.png"]
     assert facts["denoise_seconds"] >= 0 and facts["mean"] == [1, 1, 1]  # of the picture as rendered
     assert halved == [("albedo", "normal")]

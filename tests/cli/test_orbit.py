@@ -248,7 +248,7 @@ def test_mp4_without_ffmpeg(
     assert main(["orbit", "scene=s.yaml", *TINY, "out=a.mp4"]) == 2
     line = capsys.readouterr().err
     assert (
-        "needs the packages imageio and imageio-ffmpeg: pip install '.[video]' in the checkout of torchpt" in line
+        "needs the package imageio-ffmpeg: pip install '.[video]' in the checkout of torchpt" in line
         and files(folder) == set()
     )
 

@@ -27,7 +27,7 @@ TORCHPT = [sys.executable, "-m", "torchpt"]
 
 #: What a small render to a PNG file has no use for.
 NEEDLESS = (
-    *("trimesh", "kornia", "matplotlib", "numba", "OpenImageIO", "imageio", "mitsuba"),
+    *("trimesh", "kornia", "matplotlib", "numba", "OpenImageIO", "mitsuba"),
     *("networkx", "pandas", "pydantic", "rich", "scipy", "sympy", "triton"),
     *("torch._dynamo", "torch._inductor", "torch.onnx", "torch.utils.tensorboard"),
     "PIL.TiffImagePlugin",

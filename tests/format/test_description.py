@@ -167,6 +167,27 @@ def test_bad_input_is_one_line_that_names_the_key(name: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "suggested"),
+    [
+        ("{}/rom.yaml", "{}/room.yaml"),
+        ("{}/room.yml", "{}/room.yaml"),
+        ("{}/cornel_box.yaml", "cornell_box"),
+        ("{}/away/cornel_box.yaml", "cornell_box"),
+        ("cornel_box", "cornell_box"),
+        ("room", "room.yaml"),
+    ],
+)
+def test_a_misspelt_scene_gets_a_suggestion(
+    name: str, suggested: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "room.yaml").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SceneError) as caught:
+        read_description(name.format(tmp_path))
+    assert f"(did you mean {suggested.format(tmp_path)}?)" in str(caught.value)
+
+
 LATER: dict[str, tuple[dict[str, Any], str]] = {
     "integrator": (scene(integrator={"type": "bdpt"}), "integrator.type"),
 }

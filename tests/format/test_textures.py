@@ -92,6 +92,12 @@ def test_files_that_are_not_there_or_lack_alpha(tmp_path: Path):
     image = {"type": "image", "path": str(tmp_path / "a.png"), "channel": "a"}
     with pytest.raises(torchpt.AssetError, match=r"has no alpha channel, asked for by materials.m.opacity"):
         scene({"m": {"type": "diffuse", "opacity": image}})
+    (tmp_path / "b.png").write_text("no picture")
+    bad = {"type": "image", "path": str(tmp_path / "b.png")}
+    with pytest.raises(
+        torchpt.AssetError, match=r"b\.png: cannot be read .*, named by materials\.m\.reflectance\.path$"
+    ):
+        scene({"m": {"type": "diffuse", "reflectance": bad}})
 
 
 def test_info_says_what_is_read(png: str):

@@ -245,6 +245,9 @@ def test_bad_keys(quadrants, name):
 def test_bad_maps_and_parameters(quadrants, tmp_path):
     with pytest.raises(AssetError, match="no such file"):
         torchpt.load(under({"type": "envmap", "path": "nowhere.exr"}), "cpu")
+    (tmp_path / "bad.png").write_text("no picture")
+    with pytest.raises(AssetError, match=r"bad\.png: cannot be read .*, named by lights\.sky\.path$"):
+        torchpt.load(under({"type": "envmap", "path": str(tmp_path / "bad.png")}), "cpu")
     torchpt.write_image(tmp_path / "below.exr", torch.full((4, 8, 3), -1.0))
     with pytest.raises(SceneError, match="numbers >= 0"):
         torchpt.load(under({"type": "envmap", "path": str(tmp_path / "below.exr")}), "cpu")

@@ -19,6 +19,8 @@ from torchpt.core.errors import SceneError
 from torchpt.math.vectors import luminance
 from torchpt.physics.parts import Parameters
 from torchpt.physics.textures import KINDS, Node, Table, TexturePoint
+from torchpt.scene.formats.cameras import read_camera
+from torchpt.scene.formats.description import Description
 from torchpt.scene.formats.textures import texture_of
 from torchpt.scene.texture_loader import TextureLoader
 from torchpt.spec import Color, Moves, Scalar, Spec, Texels, parameters_of
@@ -95,6 +97,8 @@ ROWS: dict[str, Row] = {
         {"filter": "fade"},
     ),
 }  # fmt: skip
+#: Finds files by their absolute paths.
+DESCRIPTION = Description(None, Path("/"), read_camera({"type": "perspective"}, {}, None))
 MAPPED = [name for name in ROWS if KINDS[name].reads == "uv"]
 FILTERED = [name for name in ROWS if ROWS[name].filters]
 
@@ -116,7 +120,7 @@ def opened(path: str) -> Callable[..., Opened]:
     def make(name: str, spec: Spec = COLOUR, *, named: str | None = None, **more: Any) -> Opened:
         entry, parameters = entry_of(name, path, **more), Parameters()
         textures = {"t": read_typed("texture", KINDS, entry, "t", None)}
-        opener = TextureLoader(textures, lambda paths, key: Path(paths[0]), parameters, None)
+        opener = TextureLoader(textures, DESCRIPTION, parameters)
         node = opener(texture_of({"texture": "t", "channel": named} if named else entry, spec), "slot")
         given = {key: torch.from_numpy(np.asarray(value, np.float64)) for key, value in parameters.items()}
         return node, given, parameters.specs

@@ -6,13 +6,13 @@ the classes that declare them would take seconds.
 
 from __future__ import annotations
 
-import difflib
 import textwrap
 from collections.abc import Iterable
 from functools import cache
 from typing import Any
 
 from torchpt.cli.arguments import GROUPS, SCENE_BLOCKS
+from torchpt.core.errors import did_you_mean
 from torchpt.core.files import configs
 
 __all__ = ["known_keys", "listed", "options", "scenes", "types", "unknown"]
@@ -71,17 +71,17 @@ def unknown(key: str, words: Iterable[str] = ()) -> str:
             how = f"+{key}= adds it, as does `defaults: [default]` there"
             return f"{key}: expected a key of the file of {group} that is chosen; {how}"
         known = [f"{group}.{name}" for name in known_keys(group)]
-        near = difflib.get_close_matches(key, known, 1)
-        return f"{key}: unknown key; known: {', '.join(known)}" + (f"; did you mean {near[0]}?" if near else "")
+        return f"{key}: unknown key{did_you_mean(key, known)}; known: {', '.join(known)}"
     every = [f"{group}.{known}" for group in GROUPS for known in known_keys(group)]
-    same = [known for known in every if known.endswith(f".{key}")]
-    near = same or difflib.get_close_matches(key, [*every, *GROUPS, "scene", "out"], 1)
-    blocks = difflib.get_close_matches(group, SCENE_BLOCKS, 1)
-    if not near and blocks:
-        near = [f"{blocks[0]}.{name}" if name else blocks[0]]
-    hint = f"; did you mean {near[0]}?" if near else ""
+    in_some_group = next((known for known in every if known.endswith(f".{key}")), None)
+    hint = (
+        f" (did you mean {in_some_group}?)"
+        if in_some_group
+        else did_you_mean(key, [*every, *GROUPS, "scene", "out"])
+        or did_you_mean(group, SCENE_BLOCKS, lambda block: f"{block}.{name}" if name else block)
+    )
     ours = ", ".join(f"{group}.*" for group in GROUPS)
-    return f"{key}: unknown key; known: scene, out, {ours}, and the scene's own: {', '.join(SCENE_BLOCKS[1:])}{hint}"
+    return f"{key}: unknown key{hint}; known: scene, out, {ours}, and the scene's own: {', '.join(SCENE_BLOCKS[1:])}"
 
 
 def scenes() -> str:

@@ -361,6 +361,8 @@ def sentence(facts: Mapping[str, Any], width: int, height: int) -> str:
     text += f"{spp} sample{'' if spp == 1 else 's'} a pixel, {brief(facts['seconds'])} s"
     if error := error_of(facts):
         text += f"; relative error {error}"
+    if denoised := facts.get("denoised"):
+        text += f"; denoised: {denoised if isinstance(denoised, str) else ', '.join(denoised)}"
     if not facts.get("complete", True):
         text += "; stopped early"
     elif "stopped_by" in facts:

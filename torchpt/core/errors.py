@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 
 __all__ = [
@@ -23,7 +23,9 @@ __all__ = [
     "RenderError",
     "SceneError",
     "TorchptError",
+    "closest_names",
     "did_you_mean",
+    "example_names",
     "warn_caller",
     "warn_once",
 ]
@@ -158,7 +160,17 @@ def warn_caller(message: str, category: type[Warning]) -> None:
 
 def did_you_mean(name: object, known: Iterable[str], show: Callable[[str], str] = str) -> str:
     """Return `` (did you mean X?)`` with the known name closest to ``name``, as ``show`` writes it; "" if none is close."""
+    close = closest_names(name, known, 1)
+    return f" (did you mean {show(close[0])}?)" if close else ""
+
+
+def closest_names(name: object, known: Iterable[str], count: int) -> list[str]:
+    """Return up to ``count`` known names that look like ``name``, the closest first; none where ``name`` is no text."""
     import difflib
 
-    close = difflib.get_close_matches(name, list(known), 1) if isinstance(name, str) else []
-    return f" (did you mean {show(close[0])}?)" if close else ""
+    return difflib.get_close_matches(name, list(known), count) if isinstance(name, str) else []
+
+
+def example_names(name: object, known: Sequence[str]) -> str:
+    """Return names to try in place of the unknown ``name``, with commas: the closest three, or else the first eight."""
+    return ", ".join(closest_names(name, known, 3) or known[:8])

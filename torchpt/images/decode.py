@@ -201,7 +201,8 @@ def _through_pillow(source: Path | EncodedImage, label: str, kind: str, max_pixe
     from PIL.PpmImagePlugin import PpmImageFile
     from PIL.TgaImagePlugin import TgaImageFile
 
-    # The plugins are called directly: each reads only its own format, and none warns of sizes that are checked here.
+    # Pillow's plugins are called directly, not through imageio, which would hand a damaged file to all of Pillow's forty
+    # formats, apply Pillow's limit of sizes before ours, and give no reason for a failure.
     plugin = {".png": PngImageFile, ".jpg": JpegImageFile, ".jpeg": JpegImageFile, ".bmp": BmpImageFile}
     plugin |= {".tga": TgaImageFile, ".ppm": PpmImageFile, ".pgm": PpmImageFile}
     data = read_regular(source) if isinstance(source, Path) else source.data

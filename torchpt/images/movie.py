@@ -1,4 +1,4 @@
-"""Write GIF (Pillow) and MP4 (ffmpeg through imageio); a failure leaves no partial file."""
+"""Write GIF and MP4 through imageio; a failure leaves no partial file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.core.errors import OutputError
-from torchpt.images.write import check_writable, output_path, temporary_beside, write_error
+from torchpt.images.write import check_writable, open_pillow_writer, output_path, temporary_beside, write_error
 
 __all__ = ["MOVIES", "check_movie", "write_movie"]
 
@@ -41,9 +41,9 @@ def check_movie(path: str | PathLike[str], fps: float) -> None:
     kind = place.suffix.lower()
     if fps > _FASTEST[kind]:
         raise OutputError(path, f"{kind} shows at most {_FASTEST[kind]:g} frames a second, fps={fps:g} are asked for")
-    if kind == ".mp4" and not (find_spec("imageio") and find_spec("imageio_ffmpeg")):
+    if kind == ".mp4" and not find_spec("imageio_ffmpeg"):
         how = "pip install '.[video]' in the checkout of torchpt (.gif needs nothing)"
-        raise OutputError(path, f"writing .mp4 needs the packages imageio and imageio-ffmpeg: {how}")
+        raise OutputError(path, f"writing .mp4 needs the package imageio-ffmpeg: {how}")
 
 
 def write_movie(path: str | PathLike[str], frames: Iterable[Frame], fps: float) -> None:
@@ -68,25 +68,16 @@ def write_movie(path: str | PathLike[str], frames: Iterable[Frame], fps: float) 
 
 
 def _gif(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
-    from PIL import Image
-
-    pictures: list[Image.Image] = []
-    times: list[int] = []  # milliseconds
-    last = b""  # pixels of the frame before
-    for number, frame in enumerate(frames):
-        picture = Image.fromarray(frame).quantize(256)
-        shown = picture.convert("RGB").tobytes()
-        # Whole hundredths, whose sum never differs from the exact time by more than half of one.
-        time = 10 * (round(100 * (number + 1) / fps) - round(100 * number / fps))
-        if pictures and shown == last:  # Pillow merges equal frames too, but fails if a single one is left
-            times[-1] += time
-        else:
-            pictures.append(picture)
-            times.append(time)
-        last = shown
     encoded = BytesIO()
-    duration = times if len(times) > 1 else times[0]
-    pictures[0].save(encoded, "GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0)
+    durations: list[int] = []  # milliseconds, by frame
+    with open_pillow_writer(encoded) as writer:
+        for number, frame in enumerate(frames):
+            # Whole hundredths of a second, whose sum never differs from the exact time by more than half of one.
+            durations.append(10 * (round(100 * (number + 1) / fps) - round(100 * number / fps)))
+            # Written at the end of the context, with the last call's options: the list is complete by then. Pillow merges
+            # equal frames and adds up their durations; of a single frame it takes no list.
+            shown_for = durations if number else durations[0]
+            writer.write(frame, format="GIF", is_batch=False, bits=8, duration=shown_for, loop=0)
     temporary.write_bytes(encoded.getvalue())
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -27,7 +28,15 @@ from torchpt.images.colour import display
 from torchpt.images.header import Fact, checked_header, put_header
 from torchpt.images.layers import channel_names
 
-__all__ = ["WRITABLE", "check_writable", "output_path", "temporary_beside", "write_error", "write_image"]
+__all__ = [
+    "WRITABLE",
+    "check_writable",
+    "open_pillow_writer",
+    "output_path",
+    "temporary_beside",
+    "write_error",
+    "write_image",
+]
 
 WRITABLE = (".exr", ".hdr", ".png", ".jpg", ".jpeg", ".ppm")
 
@@ -228,13 +237,26 @@ def _try_bytes(path: Path, size: int) -> None:
 
 
 def _encode_integer(temporary: Path, levels: np.ndarray) -> None:
-    from PIL import Image
-
     kind = {".png": "PNG", ".ppm": "PPM"}.get(temporary.suffix, "JPEG")
     options: dict[str, Any] = {"quality": 95} if kind == "JPEG" else {}
     encoded = BytesIO()
-    Image.fromarray(levels).save(encoded, kind, **options)  # with the format's name Pillow imports only that plugin
+    with open_pillow_writer(encoded) as writer:
+        writer.write(levels, format=kind, is_batch=False, **options)
     temporary.write_bytes(encoded.getvalue())
+
+
+def open_pillow_writer(encoded: BytesIO) -> Any:
+    """Return imageio's writer of 8-bit pictures and GIFs, a context that encodes into memory when it ends.
+
+    Each call of its ``write`` names the format.
+    """
+    import imageio.v3 as iio
+
+    with warnings.catch_warnings():
+        # Without a file name imageio warns that no ending tells it the format. With one it would import all of Pillow's
+        # formats to look the ending up, which takes longer than writing the picture.
+        warnings.filterwarnings("ignore", "Can't determine file format", UserWarning)
+        return iio.imopen(encoded, "w", plugin="pillow")
 
 
 def _levels(pixels: np.ndarray, alpha: bool, exposure: float, tonemap: str, gamma: str | float) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, Unpack
@@ -10,7 +9,7 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor, nn
 
-from torchpt.core.errors import SceneError
+from torchpt.core.errors import SceneError, example_names
 from torchpt.nn.parametrizations import parametrization_of
 from torchpt.rendering.api import render
 from torchpt.scene import Scene
@@ -186,9 +185,7 @@ def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
             raise SceneError("names", name, "a name of scene.params or a pattern of some, as text")
         matches = [each for each in scene.params if each == name or fnmatchcase(each, name)]
         if not matches:
-            close = difflib.get_close_matches(name, scene.params, 3) or list(scene.params)[:8]
-            raise SceneError(
-                "names", name, f"a parameter of this scene or a pattern of some, such as {', '.join(close)}"
-            )
+            examples = example_names(name, list(scene.params))
+            raise SceneError("names", name, f"a parameter of this scene or a pattern of some, such as {examples}")
         found.update(matches)
     return tuple(name for name in scene.params if name in found)

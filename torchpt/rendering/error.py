@@ -114,7 +114,9 @@ class ErrorProbes:
         if from_first_rank is not None:
             suspects, doubtful = from_first_rank(suspects), from_first_rank(doubtful)
         places = torch.cat((suspects, doubtful)).to(film.sums.device)
-        streams = Randomizations(self.pixel_set.randomizations.first + self.pixel_set.randomizations.count, RESAMPLING_RANDOMIZATIONS)
+        streams = Randomizations(
+            self.pixel_set.randomizations.first + self.pixel_set.randomizations.count, RESAMPLING_RANDOMIZATIONS
+        )
         pixel_set = PixelSet(Film(len(places), 1, RESAMPLING_RANDOMIZATIONS, film.sums.device), {}, streams, places)
         self.resampled = pixel_set, len(suspects)
         self.resampled_at = float(film.counts.double().mean())

@@ -65,7 +65,7 @@ def build_parts(description: Description, vertex_params: Collection[str] = ()) -
 
 def _built(description: Description, vertex_params: Collection[str]) -> SceneBuild:
     parameters = Parameters()
-    texture_loader = TextureLoader(description.textures, description.resolve, parameters, description.file)
+    texture_loader = TextureLoader(description.textures, description, parameters)
     builder = ShapeBuilder(description, parameters, texture_loader)
     owners = [ShapeEntry(name, number, shape) for number, (name, shape) in enumerate(description.shapes.items(), 1)]
     parts = [part for owner in owners if not owner.shape.kind.copies for part in builder.parts(owner)]

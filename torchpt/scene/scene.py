@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import itertools
 import math
 import threading
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from torchpt import search
 from torchpt.core.autograd import outside_transforms
-from torchpt.core.errors import SceneError
+from torchpt.core.errors import SceneError, example_names
 from torchpt.core.memory import MemoryMeter, mb, retry_out_of_memory
 from torchpt.core.threads import outside_inference_mode, warm_up
 from torchpt.physics.bsdfs import Bsdf
@@ -242,8 +241,8 @@ class Scene:
             raise SceneError("params", params, "a mapping from names of scene.params to tensors")
         for name, value in (params or {}).items():
             if name not in self.params:
-                close = difflib.get_close_matches(str(name), self.params, 3) or list(self.params)[:8]
-                raise SceneError(f"params.{name}", name, f"a parameter of this scene such as {', '.join(close)}")
+                examples = example_names(str(name), list(self.params))
+                raise SceneError(f"params.{name}", name, f"a parameter of this scene such as {examples}")
             check_tensor(name, value, self.params[name].shape, self.spec(name).texture)
             self.check_number(name, value.detach())
         check_light_params(self._built.sources, params or {}, self.merged(params))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -80,7 +81,8 @@ def build_lights(description: Description, parameters: Parameters) -> list[Sourc
         key = f"lights.{name}"
         parameters.declare_all(key, light.kind, light.values)
         try:
-            arrays = light.kind.files(light.values, partial(_file, description, key, light))
+            with description.reading_files() as resolve:
+                arrays = light.kind.files(light.values, partial(_file_of, resolve, key, light))
         except Refused as error:
             raise scene_error(error, key, None, description.file) from None
         for stem, (values, spec) in arrays.items():
@@ -88,8 +90,9 @@ def build_lights(description: Description, parameters: Parameters) -> list[Sourc
     return [Source(f"lights.{name}", light.name, light.values) for name, light in lights.items()]
 
 
-def _file(description: Description, key: str, light: ParsedParams, parameter: str) -> Path:
-    return description.resolve(light[parameter], f"{key}.{parameter}")
+def _file_of(resolve: Callable[[Any, str], Path], key: str, light: ParsedParams, parameter: str) -> Path:
+    """Return the file that a parameter of the light ``key`` names."""
+    return resolve(light[parameter], f"{key}.{parameter}")
 
 
 def check_light_params(sources: Sequence[Source], given: Collection[str], parameters: Mapping[str, Tensor]) -> None:

@@ -119,7 +119,7 @@ def _built(scene: Scene, texels: Mapping[str, Tensor]) -> SceneBuild:
     parameters |= before.parameters
     parameters.specs |= before.parameters.specs
     parameters.stated |= before.parameters.stated | texels.keys()
-    texture_loader = TextureLoader({}, scene.description.resolve, parameters, file)
+    texture_loader = TextureLoader({}, scene.description, parameters)
     materials = {m.name: m for owner in (*before.parts, *before.copies) for m in owner.material.all()}
     nodes: dict[str, dict[str, Node]] = {}
     for name, value in texels.items():

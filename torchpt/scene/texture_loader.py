@@ -12,6 +12,7 @@ import torch
 
 from torchpt.physics.parts import Parameters
 from torchpt.physics.textures import Named, Node, Opening, TextureInput, TexturePoint
+from torchpt.scene.formats.description import Description
 from torchpt.spec.schema import ParsedParams
 
 __all__ = ["TextureLoader"]
@@ -22,19 +23,13 @@ class TextureLoader:
 
     Args:
         textures: textures by name.
-        resolve: returns the file for paths as written and a dotted key.
+        description: finds the files that the scene names.
         parameters: gets the textures' parameters, as ``textures.NAME.*`` or under the slot's own name.
-        file: scene file for errors.
     """
 
-    def __init__(
-        self,
-        textures: Mapping[str, ParsedParams],
-        resolve: Callable[[tuple[str, ...], str], Path],
-        parameters: Parameters,
-        file: str | None,
-    ) -> None:
-        self._textures, self._resolve, self._parameters, self.file = textures, resolve, parameters, file
+    def __init__(self, textures: Mapping[str, ParsedParams], description: Description, parameters: Parameters) -> None:
+        self._textures, self._description, self._parameters = textures, description, parameters
+        self.file = description.file
         self._pictures: dict[Any, Any] = {}
         self._nodes: dict[str, Node] = {}  # by key: many shapes may share a material
         self._shared: dict[str, dict[str, str]] = {}
@@ -55,8 +50,9 @@ class TextureLoader:
         texture, channel = slot.texture, None
         if isinstance(texture, Named):
             name, channel, texture = f"textures.{texture.texture}", texture.channel, self._textures[texture.texture]
-        opening = Opening(slot, key, name, channel, parameters, self._resolve, self.file, self._pictures)
-        return texture.kind.open(texture.values, opening)
+        with self._description.reading_files() as resolve:
+            opening = Opening(slot, key, name, channel, parameters, resolve, self.file, self._pictures)
+            return texture.kind.open(texture.values, opening)
 
     def sharing(self, prefix: str) -> Callable[[TextureInput, str], Node]:
         """Return a function like this object for the materials of a mesh file, whose images are named after their files.

@@ -6,13 +6,13 @@ A function takes them as ``**options: Unpack[Form]``. Type checkers read the for
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, TypeVar, get_args, get_type_hints
 
+from torchpt.core.errors import closest_names
 from torchpt.spec.parameters import Spec
 from torchpt.spec.reading import Refused
 
@@ -129,6 +129,6 @@ def check_names(call: str, given: Collection[str], form: Any, own: Collection[st
     known = arguments_of(form)
     for name in given:
         if name not in known:
-            close = difflib.get_close_matches(name, sorted({*known, *own}), 1)
+            close = closest_names(name, sorted({*known, *own}), 1)
             hint = f". Did you mean '{close[0]}'?" if close else ""
             raise TypeError(f"{call}() got an unexpected keyword argument '{name}'{hint}")

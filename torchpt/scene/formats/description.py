@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -126,9 +127,34 @@ class Description:
                 "no such file" if isinstance(error, FileNotFoundError | NotADirectoryError) else str(error.strerror)
             )
             hint = f"; only {ASSETS} is expanded" if path.startswith(("$", "~")) and head != ASSETS else ""
-            where = f"{key} of {file}" if file else key
-            raise AssetError(found, f"{problem}, named by {where}{hint}") from None
+            raise AssetError(found, f"{problem}, {self._named_by(key)}{hint}") from None
         return found
+
+    @contextmanager
+    def reading_files(self) -> Iterator[Callable[[str | tuple[str, ...], str], Path]]:
+        """Yield :meth:`resolve`; errors in the context about a file that it returned get the dotted key of the file.
+
+        Raises:
+            AssetError: the error with the key.
+        """
+        key_of_file: dict[str, str] = {}
+
+        def resolve(path: str | tuple[str, ...], key: str) -> Path:
+            found = self.resolve(path, key)
+            key_of_file[str(found)] = key
+            return found
+
+        try:
+            yield resolve
+        except AssetError as error:
+            if error.file not in key_of_file:  # a missing file, whose error has the key; or an image of a mesh file
+                raise
+            raise AssetError(error.file, f"{error.problem}, {self._named_by(key_of_file[error.file])}") from None
+
+    def _named_by(self, key: str) -> str:
+        """Return the end of an error message about a file: the dotted key that holds the path, and the scene file."""
+        file = self.layers.file_of(key, self.file)
+        return f"named by {key} of {file}" if file else f"named by {key}"
 
 
 def scene_names() -> list[str]:
@@ -188,6 +214,7 @@ def read_description(
         return made(parse_yaml(source), None, Path.cwd())
     if file.endswith((".yaml", ".yml")):
         path = Path(file)
+        _check_exists(path, file, places)
     else:
         path = _named_scene(file, places)
         file = str(path)
@@ -200,13 +227,40 @@ def _named_scene(name: str, places: Sequence[Path]) -> Path:
     Raises:
         SceneError: no scene has this name.
     """
-    files = {
-        path.stem: path for place in (configs() / "scene", *reversed(places)) for path in sorted(place.glob("*.yaml"))
-    }
+    files = _files_by_name(places)
     if name not in files:
-        hint = did_you_mean(name, files)
+        local = f"{name}.yaml"
+        hint = f" (did you mean {local}?)" if is_regular(local) else did_you_mean(name, files)
         raise SceneError("scene", name, f"one of {', '.join(sorted(files))}{hint}, or a path ending in .yaml")
     return files[name]
+
+
+def _files_by_name(places: Sequence[Path]) -> dict[str, Path]:
+    """Return the scene files that a name alone finds: those of the places, earlier ones first, and those that ship."""
+    return {
+        path.stem: path for place in (configs() / "scene", *reversed(places)) for path in sorted(place.glob("*.yaml"))
+    }
+
+
+def _check_exists(path: Path, file: str, places: Sequence[Path]) -> None:
+    """Raise a SceneError for a scene file that is missing, with the closest name beside it or of a scene."""
+    try:
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        reason = error.strerror
+    except (OSError, ValueError):  # reported when the file is read
+        return
+    else:
+        return
+    beside: set[str] = set()
+    if path.parent.is_dir():
+        beside = {other.name for ending in ("*.yaml", "*.yml") for other in path.parent.glob(ending)}
+    hint = did_you_mean(
+        path.name,
+        [*sorted(beside), *_files_by_name(places)],
+        lambda name: str(path.with_name(name)) if name in beside else name,
+    )
+    raise SceneError("scene", file, f"a scene file that can be read ({reason}){hint}")
 
 
 def settings(description: Description, overrides: Mapping[str, Any] | None = None) -> Settings:
