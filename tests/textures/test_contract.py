@@ -98,7 +98,9 @@ ROWS: dict[str, Row] = {
     ),
 }  # fmt: skip
 #: Finds files by their absolute paths.
-DESCRIPTION = Description(None, Path("/"), read_camera({"type": "perspective"}, {}, None))
+DESCRIPTION = Description(
+    None, Path("/"), read_camera({"type": "perspective", "origin": [0, 0, 1], "target": [0, 0, 0]}, {}, None)
+)
 MAPPED = [name for name in ROWS if KINDS[name].reads == "uv"]
 FILTERED = [name for name in ROWS if ROWS[name].filters]
 
