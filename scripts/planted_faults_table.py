@@ -433,8 +433,8 @@ FAULTS = (
         "scene/versions.py",
         "scene render",
         "VersionCounter.of",
-        "before is None or before[0]() is not value or before[1] != version",
-        "before is None or before[0]() is not value",
+        "tensor() is not value or before_torch_version != torch_version",
+        "tensor() is not value",
         "a stale cache: a parameter changed in place by an optimizer still renders as it was",
     ),
     Fault(
@@ -442,8 +442,8 @@ FAULTS = (
         "scene/prepare.py",
         "render scene",
         "_camera",
-        "([id(value) for value in held], [value._version for value in given], film.width, film.height, dtype)",
-        "([id(value) for value in held], [value._version for value in given], film.width, dtype)",
+        "([id(value) for value in objects], [value._version for value in tensors], film.width, film.height, dtype)",
+        "([id(value) for value in objects], [value._version for value in tensors], film.width, dtype)",
         "a stale cache: the second picture of a scene, of another height, is seen through the first one's film",
     ),
     Fault(
@@ -451,8 +451,8 @@ FAULTS = (
         "scene/world/primitives.py",
         "scene shapes search",
         "copy_maps",
-        "torch.linalg.inv(shift) @ pose @ back[copy.of] @ shift",
-        "torch.linalg.inv(shift) @ pose @ shift",
+        "torch.linalg.inv(lanes_to_scene) @ pose @ from_scene[copy.of] @ lanes_to_scene",
+        "torch.linalg.inv(lanes_to_scene) @ pose @ lanes_to_scene",
         "an instance of a mesh that has a transform is moved by both transforms",
     ),
     Fault(

@@ -99,7 +99,7 @@ class Run:
         before = 0 if limit is None else meter.peak()
         compiled = uses_kernels(settings, self.device, dtype)
         self.wave = retry_out_of_memory(
-            lambda: f"a scene of {scene.told}",
+            lambda: f"a scene of {scene.size_phrase}",
             lambda: make_wave(scene, settings, params, dtype, like=like, rays=rays),
         )
         built = before if limit is None else meter.peak()

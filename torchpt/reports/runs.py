@@ -461,7 +461,8 @@ def _swap_kernels(latest: Job | None, job: Job) -> None:
         latest.left = replace(scene_cache(latest.scene))
     if job.left is not None:
         keeper = scene_cache(job.scene)
-        keeper.kernels, keeper.first, keeper.without_lights = job.left.kernels, job.left.first, job.left.without_lights
+        keeper.kernels, keeper.first_surface = job.left.kernels, job.left.first_surface
+        keeper.without_lights = job.left.without_lights
 
 
 Wanted = tuple[Job, int, int, list[Run]]

@@ -1,5 +1,9 @@
 """Load scenes and prepare them for engines: YAML -> description -> parts -> :class:`Scene` -> world and wave.
 
+A *description* is a scene file that was read and checked. *Parts* are its surfaces as NumPy arrays, one for each material of a
+shape. The *world* holds the same as tensors, in the coordinates that a render computes in; a *wave* is the world together with
+camera, sampler, film filter and integrator: all that an engine needs.
+
 ====================  ==================================================================================
 ``formats/``          reads scene files and validates them: the description
 ``meshes/``           reads mesh files: triangles with their materials, lights and cameras

@@ -1,4 +1,9 @@
-"""Build the parts and parameters of a description: read files, resolve names, drop faces without area."""
+"""Build the parts and parameters of a description: read files, resolve names, drop faces without area.
+
+:class:`~torchpt.scene.scene.Scene` calls :func:`build_parts` once, when it is loaded. All is in NumPy and float64. A *part* is
+a set of primitives of one kind with one material, a *copy* an instance of a part, a *source* a light that is no surface
+(:mod:`torchpt.physics.parts`).
+"""
 
 from __future__ import annotations
 
@@ -27,10 +32,10 @@ class SceneBuild:
     """Parts, parameters and coordinates of a scene, before any tensor of a device.
 
     Attributes:
-        parts: the surfaces, in the order of ``records.KINDS``.
-        parameters: arrays by dotted name.
+        parts: the surfaces, in the order of ``geometry.KINDS``.
+        parameters: arrays by dotted name; they become ``scene.params``.
         centre: ``(3,)`` float64, subtracted from all positions (:mod:`torchpt.scene.space`).
-        unit: divisor of all lengths.
+        unit: the unit of length of a render in the scene's units, a power of two.
         sources: delta lights and environments, in the order of ``lights.sort_key``.
         copies: instances of parts.
     """
@@ -60,17 +65,18 @@ def build_parts(description: Description, vertex_params: Collection[str] = ()) -
     try:
         return _built(description, vertex_params)
     except SceneError as error:
-        raise description.layers.blame(error) from None
+        raise description.layers.blame(error) from None  # names the file that the key comes from
 
 
 def _built(description: Description, vertex_params: Collection[str]) -> SceneBuild:
     parameters = Parameters()
     texture_loader = TextureLoader(description.textures, description, parameters)
     builder = ShapeBuilder(description, parameters, texture_loader)
-    owners = [ShapeEntry(name, number, shape) for number, (name, shape) in enumerate(description.shapes.items(), 1)]
-    parts = [part for owner in owners if not owner.shape.kind.copies for part in builder.parts(owner)]
-    copies = [copy for owner in owners if owner.shape.kind.copies for copy in builder.copies(owner, parts)]
-    for name, material in description.materials.items():
+    entries = [ShapeEntry(name, number, shape) for number, (name, shape) in enumerate(description.shapes.items(), 1)]
+    # `copies` is True for the kind `instance`. Instances come after all meshes, which they may precede in the file.
+    parts = [part for entry in entries if not entry.shape.kind.copies for part in builder.parts(entry)]
+    copies = [copy for entry in entries if entry.shape.kind.copies for copy in builder.copies(entry, parts)]
+    for name, material in description.materials.items():  # those that no shape uses have parameters too
         declare(resolved(material, f"materials.{name}", description.materials, texture_loader), parameters)
     sources = build_lights(description, parameters)
     sources = sorted([*sources, *builder.sources], key=lambda source: sort_key(source.kind))

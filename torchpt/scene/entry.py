@@ -1,4 +1,4 @@
-"""Check the type of scenes that callers pass."""
+"""Check that what a caller passes as a scene is one; entry points such as ``torchpt.render`` call this first."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from torchpt.scene.scene import Scene
 __all__ = ["as_scene"]
 
 
-def as_scene(given: Any, key: str = "scene") -> Scene:
+def as_scene(argument: Any, key: str = "scene") -> Scene:
     """Return a scene unchanged.
 
     Args:
-        given: the argument.
+        argument: what the caller passed.
         key: name of the argument in errors.
 
     Raises:
         SceneError: not a scene.
     """
-    if not isinstance(given, Scene):
-        raise SceneError(key, given, "a scene from torchpt.load")
-    return given
+    if not isinstance(argument, Scene):
+        raise SceneError(key, argument, "a scene from torchpt.load")
+    return argument

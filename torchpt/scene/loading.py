@@ -1,4 +1,8 @@
-"""Load a :class:`Scene` from a file, a name, text or a dict."""
+"""Load a :class:`Scene` from a file, a name, text or a dict.
+
+The source is read to a *description* (checked names and numbers), whose parts and parameters :class:`Scene` builds. Tensors in
+a dict are taken out first, and connected with the scene's parameters at the end, so that they get gradients.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +70,7 @@ def _load(
     chosen_device = device_of(settings(description).render.device if device is None else device)
     with outside_inference_mode():
         scene = Scene(
-            with_all_intrinsics(description, tensors),
+            with_all_intrinsics(description, tensors),  # a tensor `K` makes each of its numbers a parameter
             chosen_device,
             tuple((bsdfs or {}).values()),
             vertex_attributes_in(tensors),

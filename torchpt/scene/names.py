@@ -1,4 +1,9 @@
-"""Look up the scene file's names of shapes, materials and lights by their indices on lanes."""
+"""Look up the scene file's names of shapes, materials and lights by their indices on lanes.
+
+Diagnostics use them: printed paths, causes of NaN, missing light. A hit has two indices: ``prim`` of the geometry, shared by a
+mesh and its instances, and ``slot`` of what each has of its own. Slots are the primitives of all parts, then one for each
+instance.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +24,7 @@ class SurfaceNames:
 
     Attributes:
         shape: name of the shape.
-        kind: kind of the primitive, from ``records.KINDS``.
+        kind: kind of the primitive, from ``geometry.KINDS``.
         primitive: index of the primitive in its part of the shape.
         material: name of the material.
         model: ``type`` of the material.
@@ -42,19 +47,20 @@ class Names:
 
     def __init__(self, built: SceneBuild, world: World) -> None:
         self._parts, self._copies, self._sources = built.parts, built.copies, built.sources
-        self._ends = [0, *accumulate(1 if part.faces is None else len(part.faces) for part in built.parts)]
+        # First primitive of each part, and the number of all primitives.
+        self._starts = [0, *accumulate(1 if part.faces is None else len(part.faces) for part in built.parts)]
         rows = None if world.lights is None else world.lights.row_of_prim
-        self._shining: list[int] = []  # slot of each row of an emissive surface
+        # Primitive of each row of the light table that is a surface; these rows come first.
+        self._emissive_prims: list[int] = []
         if rows is not None:
-            slots = (rows >= 0).nonzero().squeeze(1)
-            self._shining = slots[rows[slots].argsort()].tolist()
+            prims = (rows >= 0).nonzero().squeeze(1)
+            self._emissive_prims = prims[rows[prims].argsort()].tolist()
 
     def surface(self, slot: int, prim: int) -> SurfaceNames:
         """Return the names of a surface by the slot and primitive of an Interaction."""
-        number = bisect_right(self._ends, prim) - 1
-        part, first = self._parts[number], self._ends[number]
-        copied = slot >= self._ends[-1]
-        owner: Part | Copy = self._copies[slot - self._ends[-1]] if copied else part
+        number = bisect_right(self._starts, prim) - 1  # index of the part
+        part, first = self._parts[number], self._starts[number]
+        owner = self._owner(slot)
         name = owner.material.name.removeprefix("materials.")
         return SurfaceNames(owner.shape, part.kind, prim - first, name, owner.material.model.name)
 
@@ -69,11 +75,13 @@ class Names:
         return owner.shape, owner.material.model.name
 
     def _owner(self, slot: int) -> Part | Copy:
-        copied = slot >= self._ends[-1]
-        return self._copies[slot - self._ends[-1]] if copied else self._parts[bisect_right(self._ends, slot) - 1]
+        """Return the part or instance that a slot belongs to."""
+        copied = slot >= self._starts[-1]
+        return self._copies[slot - self._starts[-1]] if copied else self._parts[bisect_right(self._starts, slot) - 1]
 
     def light(self, row: int) -> str:
         """Return the name of a row of the light table: that of its shape, or of its light."""
-        if row < len(self._shining):
-            return self.surface(self._shining[row], self._shining[row]).shape
-        return self._sources[row - len(self._shining)].name.removeprefix("lights.")
+        if row < len(self._emissive_prims):
+            prim = self._emissive_prims[row]  # instances do not emit, so the slot is the primitive
+            return self.surface(prim, prim).shape
+        return self._sources[row - len(self._emissive_prims)].name.removeprefix("lights.")

@@ -1,4 +1,10 @@
-"""Build the wave and the kernels of a render, and cache what later renders of the scene can use again."""
+"""Build the wave and the kernels of a render, and cache what later renders of the scene can use again.
+
+A *wave* (:class:`~torchpt.paths.wave.Wave`) is all that an engine needs: world, search, camera, integrator, sampler, film
+filter. Its *stage context* is what the stages of an integrator know beside the lanes; the *plan* in it is what does not depend
+on the world. *Kernels* are machine code of stages for a CPU; without them stages run as tensor operations (*eager*). Renders,
+gradients and ``torchpt info`` begin with :func:`make_wave`; only renders call :func:`kernel_engine`.
+"""
 
 from __future__ import annotations
 
@@ -55,25 +61,25 @@ class SceneCache:
 
     Attributes:
         kernels: kernels of the latest render.
-        first: integrator, world, and the ``FirstSurface`` made from them.
+        first_surface: integrator, world, and the ``FirstSurface`` made from them: what shades first surfaces on its own.
         without_lights: a world, and a copy of it without lights.
-        camera: key of the latest camera on a film, and that camera.
+        camera: of the latest render: key, objects whose ids are in the key, and the camera on its film.
         outlines: edges of the meshes, found by :mod:`torchpt.gradients.edges.curves`.
     """
 
     kernels: Kernels | None = None
-    first: tuple[Integrator, World, FirstSurface] | None = None
+    first_surface: tuple[Integrator, World, FirstSurface] | None = None
     without_lights: tuple[World, World] | None = None
-    camera: tuple[Any, Camera] | None = None
+    camera: tuple[Any, Any, Camera] | None = None
     outlines: dict[str, Any] = field(default_factory=dict)
 
 
-_scenes: WeakKeyDictionary[Scene, SceneCache] = WeakKeyDictionary()
+_caches: WeakKeyDictionary[Scene, SceneCache] = WeakKeyDictionary()
 
 
 def scene_cache(scene: Scene) -> SceneCache:
     """Return the cache of a scene, which lives as long as the scene; its views share it."""
-    return _scenes.setdefault(scene.origin, SceneCache())
+    return _caches.setdefault(scene.origin, SceneCache())
 
 
 # ---- The wave of a render, and its engine: tensor operations or kernels
@@ -84,6 +90,7 @@ def make_wave(
     settings: Settings,
     params: Mapping[str, Tensor] | None,
     dtype: torch.dtype,
+    *,
     tape: bool = False,
     attached: bool = False,
     like: Wave | None = None,
@@ -97,8 +104,8 @@ def make_wave(
         settings: complete settings.
         params: tensors in place of the scene's, by name.
         dtype: dtype of the lanes.
-        tape: see :class:`Plan`.
-        attached: see :class:`Plan`.
+        tape: True where autograd records the stages.
+        attached: True where the geometry is differentiated.
         like: a wave that differs in the camera's parameters only; its world and search are used again.
         rays: origins and directions ``(..., 3)`` in the scene's coordinates, in place of the camera's.
         packets: False to search a tree even where packets would be faster.
@@ -109,24 +116,26 @@ def make_wave(
     film, spp = settings.film, settings.render.spp
     integrator = settings.integrator.counted_in(scene.space.unit)
     params = params or {}
-    shaping = {name: value for name, value in params.items() if not name.startswith("camera.")}
-    own = not shaping  # the world is the scene's own, so objects made from it may be cached
+    world_params = {name: value for name, value in params.items() if not name.startswith("camera.")}
+    own = not world_params  # the world is the scene's own, so objects made from it may be cached
     if like is None:
-        uv = any(layer.uv for layer in surface_layers(settings).values())
-        world, geometry = scene.world(dtype, shaping, uv, settings.light_choice)
+        uv = any(layer.uv for layer in surface_layers(settings).values())  # an AOV shows texture coordinates
+        world, geometry = scene.world(dtype, world_params, uv=uv, choice=settings.light_choice)
         threads = None if settings.render.threads == "auto" else int(settings.render.threads)
-        moved = any(name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in shaping)
+        moved = any(name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in world_params)
         accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
-        if accel.name == "brute" and not packets:
+        if (
+            accel.name == "brute" and not packets
+        ):  # `brute` tests packets of rays against all primitives; `numba` is a tree
             accel = scene.accel("numba", threads, geometry if moved else None)
-        if not integrator.lit:
-            world = _without_lights(scene, world, own)
+        if not integrator.lit:  # an integrator that does not use lights
+            world = _without_lights(scene, world, own=own)
     else:
         world, accel = like.context.world, like.accel
     points = points_of(settings.sampler)
     plan = integrator.plan(points, dtype, tape=tape, attached=attached)
     camera = _camera(scene, settings, params, dtype)
-    crop = film.crop or (0, 0, film.width, film.height)
+    crop = film.crop or (0, 0, film.width, film.height)  # x y width height
     context = _context(plan, world, camera, crop, integrator)
     wave = Wave(
         context=context if rays is None else replace(context, pixel=None),  # rays have no width
@@ -134,31 +143,32 @@ def make_wave(
         accel=accel,
         camera=camera,
         filter=_filter(film.filter.kind, tuple(film.filter.values.items()), scene.device),
+        # `streams`: number of independent randomizations. The film's width numbers pixels alike in every crop.
         sampler=Sampler(points, settings.render.seed, settings.streams, spp, film.width),
         crop=crop,
         centre=scene.space.shift,
-        first_surface=_first(scene, integrator, world, own) if like is None else like.first_surface,
+        first_surface=_first_surface(scene, integrator, world, own=own) if like is None else like.first_surface,
     )
     return wave if rays is None else wave.with_rays(_lane_rays(scene, *rays, dtype))
 
 
 def _lane_rays(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
-    """Convert rays ``(..., 3)`` in the scene's coordinates to lanes, differentiable."""
-    o, d = (x.reshape(-1, 3).T.double() for x in (o, d))
+    """Convert rays ``(..., 3)`` in the scene's coordinates to ``(3, N)`` in those of lanes, differentiable."""
+    o, d = (vectors.reshape(-1, 3).T.double() for vectors in (o, d))
     origin = ((o - scene.space.centre[:, None]) / scene.space.unit).to(dtype).contiguous()
     _check_rays(
         "o", o, torch.isfinite(origin).all(0), f"an origin that is finite in {str(dtype).removeprefix('torch.')}"
     )
     _check_rays("d", d, torch.isfinite(d).all(0) & (d != 0).any(0), "a direction that is finite and not zero")
     unit = normalize(d)
-    # Directions of unit length up to rounding keep their bits.
-    near = (dot(d, d) - 1.0).abs() < 8.0 * torch.finfo(dtype).eps
-    unit = unit + torch.where(near, d - unit, 0.0).detach()
+    # Directions of unit length up to rounding keep their bits; their gradients are still those of `normalize`.
+    is_unit = (dot(d, d) - 1.0).abs() < 8.0 * torch.finfo(dtype).eps  # the error of three squares and two sums, doubled
+    unit = unit + torch.where(is_unit, d - unit, 0.0).detach()
     return Rays(origin, unit.to(dtype).contiguous())
 
 
 def _check_rays(key: str, given: Tensor, good: Tensor, expected: str) -> None:
-    """Raise for the first of the vectors ``(3, N)`` that is not ``good (N,)``.
+    """Raise for the first of the vectors ``given (3, N)`` where ``good (N,)`` is False.
 
     Raises:
         SceneError: names the ray and its value.
@@ -173,16 +183,20 @@ def _camera(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtyp
     merged, film = scene.merged(params), settings.film
     if torch.is_grad_enabled():
         return scene.camera(film, merged, dtype)
-    given = [value for name, value in merged.items() if name.startswith("camera.")]
-    if any(value.is_inference() for value in given):
+    tensors = [value for name, value in merged.items() if name.startswith("camera.")]
+    if any(value.is_inference() for value in tensors):  # torch counts no versions of these
         return scene.camera(film, merged, dtype)
     # Keyed by id; the objects are stored too, since an id is unique only while its object lives.
-    held = (scene.description.camera, *given)
-    made_of = ([id(value) for value in held], [value._version for value in given], film.width, film.height, dtype)
-    keeper = scene_cache(scene)
-    if keeper.camera is None or keeper.camera[0][0] != made_of:
-        keeper.camera = (made_of, held), scene.camera(film, merged, dtype)
-    return keeper.camera[1]
+    objects = (scene.description.camera, *tensors)
+    key = ([id(value) for value in objects], [value._version for value in tensors], film.width, film.height, dtype)
+    cache = scene_cache(scene)
+    if cache.camera is not None:
+        cached_key, _, camera = cache.camera
+        if cached_key == key:
+            return camera
+    camera = scene.camera(film, merged, dtype)
+    cache.camera = key, objects, camera
+    return camera
 
 
 @lru_cache(maxsize=64)
@@ -201,7 +215,7 @@ def rebuild_with_tape(wave: Wave, scene: Scene, settings: Settings, params: Mapp
         params: tensors in place of the scene's, by name.
     """
     uv = any(layer.uv for layer in surface_layers(settings).values())
-    world, _ = scene.world(wave.context.plan.dtype, params, uv, settings.light_choice)
+    world, _ = scene.world(wave.context.plan.dtype, params, uv=uv, choice=settings.light_choice)
     if not wave.integrator.lit:
         world = replace(world, lights=None)
     camera = scene.camera(settings.film, scene.merged(params), wave.context.plan.dtype)
@@ -210,12 +224,14 @@ def rebuild_with_tape(wave: Wave, scene: Scene, settings: Settings, params: Mapp
         wave,
         context=context,
         camera=camera,
-        first_surface=None if wave.first_surface is None else wave.first_surface.again(world),
+        first_surface=None
+        if wave.first_surface is None
+        else wave.first_surface.again(world),  # the same for another world
     )
 
 
 def points_of(sampler: ParsedParams) -> Points:
-    """Return the sampler that the settings describe."""
+    """Return the sampler that the settings describe; options of adaptive sampling are not part of it."""
     return sampler.kind(**{key: value for key, value in sampler.values.items() if key not in ADAPTIVE})
 
 
@@ -228,33 +244,39 @@ def surface_layers(settings: Settings) -> dict[str, type[SurfaceLayer]]:
     return {name: layer for name, layer in layers.items() if issubclass(layer, SurfaceLayer)}
 
 
-def _first(scene: Scene, integrator: Integrator, world: World, own: bool) -> FirstSurface | None:
+def _first_surface(scene: Scene, integrator: Integrator, world: World, *, own: bool) -> FirstSurface | None:
     """Return the integrator's ``FirstSurface``, cached with the scene where the world is the scene's ``own``."""
     if not own or torch.is_grad_enabled():
-        return integrator.first(world)
-    keeper = scene_cache(scene)
-    if keeper.first is not None and keeper.first[0] == integrator and keeper.first[1] is world:
-        return keeper.first[2]
-    first = integrator.first(world)
-    if first is not None:
-        keeper.first = integrator, world, first
-    return first
+        return integrator.first(world)  # None where the integrator has no shading of first surfaces alone
+    cache = scene_cache(scene)
+    if cache.first_surface is not None:
+        cached_integrator, cached_world, first_surface = cache.first_surface
+        if cached_integrator == integrator and cached_world is world:
+            return first_surface
+    first_surface = integrator.first(world)
+    if first_surface is not None:
+        cache.first_surface = integrator, world, first_surface
+    return first_surface
 
 
-def _without_lights(scene: Scene, world: World, own: bool) -> World:
+def _without_lights(scene: Scene, world: World, *, own: bool) -> World:
     """Return the world without lights, cached with the scene where the world is the scene's ``own``."""
     if not own:
         return replace(world, lights=None)
-    keeper = scene_cache(scene)
-    if keeper.without_lights is None or keeper.without_lights[0] is not world:
-        keeper.without_lights = world, replace(world, lights=None)
-    return keeper.without_lights[1]
+    cache = scene_cache(scene)
+    if cache.without_lights is not None:
+        lit_world, unlit_world = cache.without_lights
+        if lit_world is world:
+            return unlit_world
+    unlit_world = replace(world, lights=None)
+    cache.without_lights = world, unlit_world
+    return unlit_world
 
 
 def _context(
     plan: Plan, world: World, camera: Camera, crop: tuple[int, int, int, int], integrator: Integrator
 ) -> StageContext:
-    """Return the stage context of a render."""
+    """Return the stage context of a render; only integrators that splat, to any pixel, know the camera and the crop."""
     context = StageContext(plan, world, _pixel_of(world, camera))
     return replace(context, camera=camera, crop=crop) if integrator.splats else context
 
@@ -283,13 +305,13 @@ def uses_kernels(settings: Settings, device: torch.device, dtype: torch.dtype) -
 
 
 def own_models(scene: Scene, wave: Wave) -> list[int]:
-    """Return the indices of models that the caller wrote; they are not compiled."""
+    """Return the indices, in the world's table of models, of those that the caller wrote; they are not compiled."""
     models = wave.context.world.materials.models
-    return [k for k, model in enumerate(models) if any(model is mine for mine in scene.own_models)]
+    return [index for index, model in enumerate(models) if any(model is own for own in scene.own_models)]
 
 
 def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
-    """Return the kernels of a scene's wave; see :func:`torchpt.engines.engine.kernels_of`."""
+    """Return the kernels of a scene's wave; ``before``: those of an earlier wave, used again where they fit."""
     return engine.kernels_of(wave, own_models(scene, wave), before)
 
 
@@ -302,12 +324,16 @@ def describe_engine(scene: Scene, settings: Settings) -> dict[str, Any]:
 
 
 def kernel_engine(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Tasks:
-    """Return the kernel engine of a render on ``threads`` (None: torch's number); its kernels are cached with the scene.
+    """Return the kernel engine of a render; its kernels are cached with the scene.
 
-    Models that cannot be compiled are appended to ``eager``, with the reason.
+    Args:
+        scene: the scene.
+        wave: the wave of the render.
+        eager: gets the names of models that cannot be compiled, each with the reason.
+        threads: number of threads; None: torch's number.
     """
-    keeper = scene_cache(scene)
-    kernels = keeper.kernels = kernels_of(scene, wave, keeper.kernels)
+    cache = scene_cache(scene)
+    kernels = cache.kernels = kernels_of(scene, wave, cache.kernels)
     for number, reason in kernels.eager.items():
         name = str(wave.context.world.materials.models[number])
         eager.append(f"{name}: {reason}")

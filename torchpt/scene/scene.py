@@ -1,4 +1,10 @@
-"""A loaded scene: its parameters as tensors, and a cache of the worlds and search structures built from them."""
+"""A loaded scene: its parameters as tensors, and a cache of the worlds and search structures built from them.
+
+A *world* holds the tensors that stages read, in *the coordinates of lanes*: about the scene's centre and in another unit, so
+that float32 suffices (:mod:`torchpt.scene.space`). A *spec* declares range, unit and effect of a parameter. The *build* is what
+loading made of the scene file; it never changes. Each parameter has a *version*, a number that changes when its tensor does, by
+which the caches find out what is stale.
+"""
 
 from __future__ import annotations
 
@@ -42,9 +48,10 @@ from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 __all__ = ["Scene", "scene_by_number"]
 
 #: Attributes that copies take over; all others are rebuilt on demand.
-_KEPT = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
+_COPIED_ATTRIBUTES = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
 
 _numbers = itertools.count(1)
+#: All live scenes by number.
 _scenes: WeakValueDictionary[int, Scene] = WeakValueDictionary()
 
 
@@ -81,14 +88,15 @@ class Scene:
     ) -> None:
         warm_up()
         meter = MemoryMeter(device)
-        meter.base()  # now that all modules are imported
+        meter.base()  # the memory from which peaks are counted, now that all modules are imported
         before = meter.peak()
         self.load_seconds = 0.0
         self.description, self.device, self.own_models = description, device, own_models
         self._built: SceneBuild = retry_out_of_memory(
             "the files and shapes of the scene", lambda: build_parts(description, vertex_params)
         )
-        # Far from the origin, positions in float32 would lose detail before they are moved to it.
+        # A centre other than 0 means that the scene lies far from its origin. Then positions (`spec.place`) stay in float64:
+        # float32 would lose detail before they are moved to the origin.
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {
             name: torch.from_numpy(value.copy()).to(
@@ -97,7 +105,7 @@ class Scene:
             for name, value in self._built.parameters.items()
         }
         after = meter.peak()
-        #: Peak bytes above those after import while the scene was read; 0 where unknown.
+        #: Peak bytes while the scene was read, above those after import; 0 where unknown, and where no new peak was reached.
         self.peak = after - meter.base() if after > before else 0
         self._reset_caches()
         self._checked_versions = self.versions()  # the reader has checked these values
@@ -106,17 +114,22 @@ class Scene:
         """Reset all caches."""
         self._space = Space(torch.from_numpy(self._built.centre).to(self.device), self._built.unit)
         self._lock = threading.RLock()
+        # By dtype, whether texture coordinates were asked for, and light sampler.
         self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
+        # By kind of search and number of threads: those of the scene's own parameters, and the latest of any parameters, to
+        # refit or to reuse its topology.
         self._accels: dict[tuple[str, int | None], Accel] = {}
-        self._latest: dict[tuple[str, int | None], Accel] = {}  # to refit, or to reuse its topology
-        # Versions of the parameters that the caches were built from; views of the scene share them.
-        self._sources, self._made_of = VersionCounter(), dict[str, int]()
+        self._latest_accels: dict[tuple[str, int | None], Accel] = {}
+        # Versions of the parameters that the caches were built from, by a counter of their own; views of the scene share both.
+        self._cache_counter, self._cached_versions = VersionCounter(), dict[str, int]()
         self._origin: Scene | None = None
         self._assign_number()
 
     def _assign_number(self) -> None:
         """Take a new number and forget which versions were checked."""
-        self.textured: dict[Any, Scene] = {}  # by :mod:`torchpt.scene.texel_params`
+        # Scenes with textures in place of numbers, by names and sizes of the texels; :mod:`torchpt.scene.texel_params` has
+        # them.
+        self.textured: dict[Any, Scene] = {}
         self._version_counter = VersionCounter()
         self._checked_versions: dict[str, int] = {}
         #: Unique in this process; compiled graphs refer to the scene by it.
@@ -140,8 +153,10 @@ class Scene:
         """
         view = object.__new__(type(self))
         with outside_inference_mode():
-            own = view_attributes(self.description, self._built, self.params, camera, {} if film is None else film)
-        view.__dict__.update(self.__dict__ | own)
+            view_state = view_attributes(
+                self.description, self._built, self.params, camera, {} if film is None else film
+            )
+        view.__dict__.update(self.__dict__ | view_state)  # the caches are shared, not copied
         view._origin = self.origin
         view._assign_number()
         view.mark_checked(self)
@@ -158,33 +173,33 @@ class Scene:
         chosen = device_of(device)
         if chosen.type == self.device.type and chosen.index in (None, self.device.index or 0):
             return self
-        return self._copied(chosen, {name: value.to(chosen) for name, value in self.params.items()}, {})
+        return self._copied(chosen, {name: value.to(chosen) for name, value in self.params.items()}, memo={})
 
     def __copy__(self) -> Scene:
         """Return another scene of the same tensors."""
-        return self._copied(self.device, dict(self.params), None)
+        return self._copied(self.device, dict(self.params), memo=None)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
         """Return another scene of copied tensors and BSDFs; the immutable build is shared."""
-        return self._copied(
-            self.device, {name: copy.deepcopy(_leaf(value), memo) for name, value in self.params.items()}, memo
-        )
+        params = {name: copy.deepcopy(_leaf(value), memo) for name, value in self.params.items()}
+        return self._copied(self.device, params, memo)
 
     def _copied(self, device: torch.device, params: dict[str, Tensor], memo: dict[int, Any] | None) -> Scene:
-        """Return another scene with other parameters; with a ``memo``, the caller's BSDFs are copied too."""
+        """Return another scene of other parameters; with a ``memo`` of ``copy.deepcopy`` the caller's BSDFs are copied too."""
         made = object.__new__(type(self))
         state = self.__dict__ | {"device": device, "params": params, "peak": 0}
         if memo is not None and self.own_models:
             state |= copy.deepcopy({name: state[name] for name in ("description", "_built", "own_models")}, memo)
+            # `held` returns the torch modules of a BSDF.
             for module in (module for model in state["own_models"] for module in model.held()):
                 module.to(device)
-        made.__setstate__({name: state[name] for name in _KEPT})
+        made.__setstate__({name: state[name] for name in _COPIED_ATTRIBUTES})
         return made
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state to pickle; unpickling reads no files."""
-        held = {name: getattr(self, name) for name in _KEPT}
-        return held | {"params": {name: _leaf(value) for name, value in self.params.items()}}
+        state = {name: getattr(self, name) for name in _COPIED_ATTRIBUTES}
+        return state | {"params": {name: _leaf(value) for name, value in self.params.items()}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         warm_up()
@@ -202,14 +217,14 @@ class Scene:
         return Path(self.description.file or "").stem
 
     @property
-    def told(self) -> str:
-        """Return a phrase about its size, for errors."""
+    def size_phrase(self) -> str:
+        """Return a phrase about the scene's size, for errors."""
         triangles = sum(len(value) for name, value in self.params.items() if name.endswith(".vertices"))
         held = sum(value.numel() * value.element_size() for value in self.params.values())
         return f"{len(self._built.parts)} parts with {triangles} vertices, whose parameters alone take {mb(held)}"
 
     def replace_build(self, built: SceneBuild) -> None:
-        """Replace the build by one with the same names of parameters, before anything is cached."""
+        """Replace the build of a new copy by one with other materials, before anything is cached."""
         self._built = built
 
     @property
@@ -228,8 +243,9 @@ class Scene:
 
     @property
     def length(self) -> float:
-        """Return the longest side of the bounding box of all surfaces, rounded to a power of two."""
-        return 2.0 ** round(math.log2(max(bounds_extent(self._built.parts, self._built.copies), 2.0**-100)))
+        """Return the longest side of the bounding box of all surfaces in scene units, rounded to a power of two."""
+        extent = bounds_extent(self._built.parts, self._built.copies)
+        return 2.0 ** round(math.log2(max(extent, 2.0**-100)))  # a single point has a logarithm too
 
     def check(self, params: Mapping[str, Tensor] | None) -> None:
         """Check parameters that are to replace the scene's in a render.
@@ -243,7 +259,7 @@ class Scene:
             if name not in self.params:
                 examples = example_names(str(name), list(self.params))
                 raise SceneError(f"params.{name}", name, f"a parameter of this scene such as {examples}")
-            check_tensor(name, value, self.params[name].shape, self.spec(name).texture)
+            check_tensor(name, value, self.params[name].shape, texels=self.spec(name).texture)
             self.check_number(name, value.detach())
         check_light_params(self._built.sources, params or {}, self.merged(params))
 
@@ -266,9 +282,9 @@ class Scene:
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """Return all parameters, with those of ``params`` (checked before) in place of the scene's."""
-        every = {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
+        merged = {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
         # Autograd refuses tensors of torch.inference_mode, but not their clones.
-        return {name: value.clone() if value.is_inference() else value for name, value in every.items()}
+        return {name: value.clone() if value.is_inference() else value for name, value in merged.items()}
 
     def spec(self, name: str) -> Spec:
         """Return the spec of a parameter."""
@@ -284,13 +300,14 @@ class Scene:
         try:
             spec.check(value)
         except Refused as error:
-            shown = value.tolist() if error.value is ... else error.value
+            shown = value.tolist() if error.value is ... else error.value  # ...: the whole value is wrong
             raise SceneError(f"params.{name}", shown, error.expected) from None
         if isinstance(spec, Pose) and spec.moves is Moves.SURFACES:
-            reach, place = MAX_COORDINATE * self._space.unit, value.double().cpu().numpy()[:3, 3]
-            if not np.abs(place - self._built.centre).max() <= reach:
+            # The position of the shape: the translation of its pose.
+            reach, position = MAX_COORDINATE * self._space.unit, value.double().cpu().numpy()[:3, 3]
+            if not np.abs(position - self._built.centre).max() <= reach:  # True for NaN too
                 expected = f"a place up to {reach:.3g} from the middle of this scene as it was loaded"
-                raise SceneError(f"params.{name}", place.tolist(), expected)
+                raise SceneError(f"params.{name}", position.tolist(), expected)
 
     def world(
         self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None, uv: bool = False, choice: str = "auto"
@@ -301,16 +318,16 @@ class Scene:
             dtype: dtype of the lanes.
             params: checked tensors in place of the scene's.
             uv: True for texture coordinates even where no texture reads them.
-            choice: the light sampler, from ``lights.WAYS``.
+            choice: the light sampler, from ``lights.LIGHT_SAMPLERS``.
         """
         if params:
-            return self._assemble(self.merged(params), dtype, uv, choice)
+            return self._assemble(self.merged(params), dtype, uv=uv, choice=choice)
         with self._lock:
             self._refresh()
             key = dtype, uv, choice
             if key not in self._worlds:
                 with outside_inference_mode(), torch.no_grad():
-                    self._worlds[key] = self._assemble(self.merged(None), dtype, uv, choice)
+                    self._worlds[key] = self._assemble(self.merged(None), dtype, uv=uv, choice=choice)
             return self._worlds[key]
 
     def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
@@ -318,31 +335,37 @@ class Scene:
 
         A new one is made by refitting the latest where that is good enough (:meth:`Accel.refit`), since in an optimization
         vertices move from render to render. The latest itself is not changed.
+
+        Args:
+            kind: value of ``render.accel``.
+            threads: threads of the search; None: torch's number.
+            geometry: geometry of other parameters; None: that of the scene's own.
         """
         key = kind, threads
         with self._lock:
             if geometry is None:
                 _, own = self.world(torch.float32)
                 if key not in self._accels:
-                    self._accels[key] = self._made(key, own)
+                    self._accels[key] = self._build_accel(key, own)
                 return self._accels[key]
-        return self._made(key, geometry)
+        return self._build_accel(key, geometry)
 
-    def _made(self, key: tuple[str, int | None], geometry: Geometry) -> Accel:
-        made = search.build(geometry, *key, before=self._latest.get(key))
-        if made.refits:
-            self._latest[key] = made
+    def _build_accel(self, key: tuple[str, int | None], geometry: Geometry) -> Accel:
+        """Build a search structure from the latest of the same kind and threads (``key``)."""
+        made = search.build(geometry, *key, before=self._latest_accels.get(key))
+        if made.refits:  # a kind that later ones can be refitted from
+            self._latest_accels[key] = made
         return made
 
     def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
         """Return the camera on a film, in the coordinates of lanes."""
         camera, values = self.description.camera, dict(self.description.camera.values)
         for key, spec in parameters_of(camera.kind).items():
-            number = params.get(f"camera.{key}")
-            if spec.differentiable and number is not None:
-                values[key] = (number.double() / self._space.unit if spec.length else number).to(dtype)
+            value = params.get(f"camera.{key}")
+            if spec.differentiable and value is not None:
+                values[key] = (value.double() / self._space.unit if spec.length else value).to(dtype)
         pose = params["camera.to_world"]
-        pose = torch.cat((self._space.pose(pose), pose[3:].double())).to(dtype)
+        pose = torch.cat((self._space.pose(pose), pose[3:].double())).to(dtype)  # (3, 4), and the last row 0 0 0 1
         return camera.kind.on(pose, (film.width, film.height), values)
 
     def film_size(self, film: Mapping[str, Any] | None = None) -> tuple[int, int]:
@@ -367,39 +390,39 @@ class Scene:
             SceneError: wrong parameters or film settings, or a camera other than a pinhole.
         """
         self.check(params)
-        merged, size = self.merged(params), settings(self.description, {"film": film or {}}).film
-        matrix = self.camera(size, merged, torch.float64).intrinsics()
+        merged, film_settings = self.merged(params), settings(self.description, {"film": film or {}}).film
+        matrix = self.camera(film_settings, merged, torch.float64).intrinsics()
         if matrix is None:
             raise SceneError(
                 "camera.type", self.description.camera.name, "a camera with an angle of view", self.description.file
             )
-        turn, move = extrinsics(merged["camera.to_world"].double())
-        return PinholeMatrices(matrix.to(dtype), turn.to(dtype), move.to(dtype))
+        rotation, translation = extrinsics(merged["camera.to_world"].double())
+        return PinholeMatrices(matrix.to(dtype), rotation.to(dtype), translation.to(dtype))
 
     def info(self, settings: Settings) -> dict[str, Any]:
-        """Return a description of the scene; see :mod:`torchpt.scene.info`."""
+        """Return what ``torchpt info`` prints about the scene, as nested dicts; see :mod:`torchpt.scene.info`."""
         world, _ = self.world(torch.float32, choice=settings.light_choice)
         threads = None if settings.render.threads == "auto" else int(settings.render.threads)
         return describe(self.description, self._built, world, self.accel(settings.render.accel, threads), settings)
 
     def _assemble(
-        self, params: Mapping[str, Tensor], dtype: torch.dtype, uv: bool, choice: str
+        self, params: Mapping[str, Tensor], dtype: torch.dtype, *, uv: bool, choice: str
     ) -> tuple[World, Geometry]:
         built = self._built
-        return assemble(built.parts, params, built.sources, self._space, dtype, built.copies, uv, choice)
+        return assemble(built.parts, params, built.sources, self._space, dtype, built.copies, uv=uv, choice=choice)
 
     def _refresh(self) -> None:
         """Clear the caches where a parameter other than the camera's was replaced or changed in place."""
-        now, before = self._sources.of(self.params), self._made_of.copy()
+        now, before = self._cache_counter.of(self.params), self._cached_versions.copy()
         changed = changed_versions(before, now)
         gone = any(name not in now and not name.startswith("camera.") for name in before)
         if not changed and not gone:
             return
         for name in changed:
-            if self.spec(name).place and name in before:
+            if self.spec(name).place and name in before:  # moved: it may lie out of reach now
                 self.check_number(name, self.params[name].detach())
-        self._made_of.clear()
-        self._made_of.update(now)
+        self._cached_versions.clear()
+        self._cached_versions.update(now)
         if not gone and all(name.startswith("camera.") for name in changed):  # nothing in the caches depends on it
             return
         self._worlds.clear()

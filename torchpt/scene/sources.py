@@ -1,4 +1,8 @@
-"""Build the lights that are not emissive surfaces; declare and check texture coordinates and normals of meshes."""
+"""Build the lights that are not emissive surfaces; declare and check texture coordinates and normals of meshes.
+
+:func:`torchpt.scene.build.build_parts` calls this module. To *declare* a parameter is to add it to ``scene.params`` by dotted
+name. A *source* is a light without a surface: a delta light or an environment.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +37,7 @@ __all__ = [
 
 
 def declare_vertex_attributes(parts: Sequence[Part], vertex_params: Collection[str], parameters: Parameters) -> None:
-    """Declare the normals and texture coordinates that are named in ``vertex_params`` as parameters."""
+    """Declare the normals and texture coordinates of ``parts`` whose dotted names are in ``vertex_params`` as parameters."""
     for part in parts if vertex_params else ():
         for key, value in (("normals", part.normals), ("uvs", part.uvs)):
             if value is not None and f"{part.name}.{key}" in vertex_params:
@@ -60,7 +64,7 @@ def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str 
     for part in parts:
         if part.kind != "triangle" or part.uvs is not None:
             continue
-        for node in part.material.readings():
+        for node in part.material.readings():  # the uses of textures in the material
             if isinstance(node, ImageNode) and node.texels in stated:
                 expected = f"uvs (texture coordinates) for {part.name}, over which the texels lie"
                 raise SceneError(node.texels, "texels on a mesh without uvs", expected, file)
@@ -72,15 +76,16 @@ def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str 
 def build_lights(description: Description, parameters: Parameters) -> list[Source]:
     """Return the lights of the lights block, and declare their parameters."""
     lights = description.lights
-    around = [name for name, light in lights.items() if light.kind.environment]
-    if len(around) > 1:
-        first, second = around[:2]
+    environments = [name for name, light in lights.items() if light.kind.environment]
+    if len(environments) > 1:
+        first, second = environments[:2]
         expected = f"one environment only ({first} is one)"
         raise SceneError(f"lights.{second}", lights[second].name, expected, description.file)
     for name, light in lights.items():
         key = f"lights.{name}"
         parameters.declare_all(key, light.kind, light.values)
         try:
+            # A kind of light that reads files (an environment map) returns their arrays, which become parameters.
             with description.reading_files() as resolve:
                 arrays = light.kind.files(light.values, partial(_file_of, resolve, key, light))
         except Refused as error:
@@ -99,9 +104,9 @@ def check_light_params(sources: Sequence[Source], given: Collection[str], parame
     """Check replaced parameters of lights against each other.
 
     Args:
-        sources: the scene's.
+        sources: the lights without a surface of the scene.
         given: names of the replaced parameters.
-        parameters: all parameters.
+        parameters: all parameters, replaced ones included.
 
     Raises:
         SceneError: as the ``check`` of the light's kind.
@@ -121,7 +126,18 @@ def check_light_params(sources: Sequence[Source], given: Collection[str], parame
 def build_file_lights(
     lights: list[FileLight], prefix: str, pose: np.ndarray, source: str, parameters: Parameters
 ) -> list[Source]:
-    """Return the lights of a mesh file, transformed to the scene, and declare their parameters."""
+    """Return the lights of a mesh file, transformed to the scene, and declare their parameters.
+
+    Args:
+        lights: the lights in the file's space.
+        prefix: dotted key of the shape.
+        pose: ``(4, 4)`` from the file's space to the scene.
+        source: the file, for errors.
+        parameters: gets the parameters, as ``PREFIX.lights.LABEL.*``.
+
+    Raises:
+        AssetError: a light whose position or direction is not finite in float32.
+    """
     sources = []
     for light, label in zip(lights, unique_labels([light.name for light in lights]), strict=True):
         stem = f"{prefix}.lights.{label}"
@@ -129,26 +145,26 @@ def build_file_lights(
             position, direction = apply_points(pose, light.position), pose[:3, :3] @ light.direction
             direction = direction / np.abs(direction).max()
             # A spot's target lies up to twice as far.
-            held = np.isfinite(np.array([2.0 * position, direction]).astype(np.float32)).all()
-        if not held:
+            is_finite = np.isfinite(np.array([2.0 * position, direction]).astype(np.float32)).all()
+        if not is_finite:
             raise AssetError(source, f"light {light.name!r} has no finite place under the transform of {prefix}")
         direction = direction / np.linalg.norm(direction)
         # The target is as far as the light is from the origin, so that their difference keeps its precision.
         target = position + direction * max(1.0, np.abs(position).max())
-        places = {"position": position, "direction": direction, "target": target}
-        values = {key: places.get(key, light.numbers.get(key)) for key in parameters_of(LIGHTS[light.kind])}
+        vectors = {"position": position, "direction": direction, "target": target}
+        values = {key: vectors.get(key, light.numbers.get(key)) for key in parameters_of(LIGHTS[light.kind])}
         parameters.declare_all(stem, LIGHTS[light.kind], values)
         sources.append(Source(stem, light.kind, values))
     return sources
 
 
 def unique_labels(names: list[str]) -> list[str]:
-    """Return distinct labels without dots for the parts of a mesh."""
+    """Return distinct labels without dots, one a name: names of parts or lights of a file may be empty or alike."""
     labels: dict[str, None] = {}  # an ordered set
     for number, name in enumerate(names):
         base = name.replace(".", "_") or f"part{number}"
-        label, again = base, number
+        label, suffix = base, number
         while label in labels:
-            label, again = f"{base}_{again}", again + 1
+            label, suffix = f"{base}_{suffix}", suffix + 1
         labels[label] = None
     return list(labels)

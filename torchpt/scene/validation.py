@@ -1,4 +1,8 @@
-"""Check parameters of a scene that were replaced or changed in place, once for each change."""
+"""Check parameters of a scene that were replaced or changed in place, once for each change.
+
+A *version* (:class:`~torchpt.scene.versions.VersionCounter`) counts the changes of a parameter; a version that was checked once
+is not checked again.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,14 @@ if TYPE_CHECKING:
 __all__ = ["check_tensor", "inherited_checks", "validate_changes"]
 
 
-def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], texels: bool = False) -> None:
-    """Check that a parameter's value is a dense floating tensor of a shape; ``texels``: errors mention texels as well.
+def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], *, texels: bool = False) -> None:
+    """Check that a parameter's value is a dense floating tensor of a shape.
+
+    Args:
+        name: dotted name of the parameter.
+        value: the value.
+        shape: the shape that the parameter was loaded with.
+        texels: True where errors mention that the parameter takes texels as well.
 
     Raises:
         SceneError: it is not, or it is on the device meta.
@@ -30,9 +40,8 @@ def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], 
             return
         shown = "a tensor on the device meta" if value.is_meta else (tuple(value.shape), value.dtype)
         shown = shown if dense else f"a {value.layout} tensor"
-        or_texels = (
-            "" if floats and value.dim() == 3 else or_texels
-        )  # texels for a parameter that takes them passed before
+        # Texels for a parameter that takes them never come here: a scene with a texture was made for them before.
+        or_texels = "" if floats and value.dim() == 3 else or_texels
     kind = "floating tensor" if dense else "dense floating tensor"  # says dense only where that is what is wrong
     raise SceneError(f"params.{name}", shown, f"a {kind} of shape {tuple(shape)}{or_texels}")
 
@@ -44,7 +53,7 @@ def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:
         SceneError: see :meth:`Scene.check_own`.
     """
     loaded = scene.built.parameters
-    for name in loaded.keys() ^ scene.params.keys():  # removed or added
+    for name in loaded.keys() ^ scene.params.keys():  # names in one of the two: removed or added
         raise SceneError(
             f"params.{name}", "nothing" if name in loaded else name, "the names that the scene was loaded with"
         )
@@ -62,7 +71,7 @@ def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:
 def inherited_checks(made: Scene, scene: Scene, validated_versions: dict[str, int]) -> dict[str, int]:
     """Return the validated versions of a scene ``made`` from another, for the tensors that both share."""
     before, now = scene.versions(), made.versions()
-    # A version of 0 or less cannot be compared, see `changed_versions`.
+    # Versions of 0 or less cannot be compared: torch counts no changes of such tensors.
     return {
         name: version
         for name, version in now.items()

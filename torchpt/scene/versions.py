@@ -1,4 +1,8 @@
-"""Count versions of a scene's tensors, to find those that were replaced or changed in place."""
+"""Count versions of a scene's tensors, to find those that were replaced or changed in place.
+
+A scene checks changed parameters again and rebuilds its caches; a backward pass refuses parameters that changed since the
+picture.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +45,8 @@ class VersionCounter:
     """Counter of versions of named tensors."""
 
     def __init__(self) -> None:
-        self._latest: dict[str, tuple[ref[Tensor], int, int]] = {}  # tensor, torch's version, ours
+        # By name: the tensor, its count of changes by torch (`Tensor._version`; -1 where torch counts none), and our version.
+        self._latest: dict[str, tuple[ref[Tensor], int, int]] = {}
 
     def of(self, params: Mapping[str, Tensor]) -> dict[str, int]:
         """Return version numbers by name; one changes when its tensor is replaced, or changed in place by torch's count.
@@ -53,11 +58,14 @@ class VersionCounter:
             if not isinstance(value, Tensor):
                 found[name] = 0
                 continue
-            version = -1 if value.is_inference() else value._version
+            torch_version = -1 if value.is_inference() else value._version
             before = self._latest.get(name)
-            number = 1 if before is None else before[2]
-            if before is None or before[0]() is not value or before[1] != version:
-                number += before is not None
-                self._latest[name] = ref(value), version, number
-            found[name] = number if version >= 0 else -number
+            if before is None:
+                number = 1
+            else:
+                tensor, before_torch_version, number = before
+                if tensor() is not value or before_torch_version != torch_version:
+                    number += 1
+            self._latest[name] = ref(value), torch_version, number
+            found[name] = number if torch_version >= 0 else -number
         return found

@@ -1,4 +1,4 @@
-"""Views of a scene through another camera."""
+"""Make the attributes of a view: a scene that differs from another in its camera alone (:meth:`Scene.seen_by`)."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ def view_attributes(
     """
     if not isinstance(film, Mapping):
         raise SceneError("film", film, "a mapping")
-    size = description.film | {name: value for name, value in film.items() if value is not None}
-    tensors = DictTensors()
-    chosen = read_camera(tensors.extract(plain({"camera": camera}))["camera"], size, None)
-    description = with_all_intrinsics(replace(description, camera=chosen), tensors)
-    chosen, parameters = description.camera, Parameters()
+    film_keys = description.film | {name: value for name, value in film.items() if value is not None}
+    tensors = DictTensors()  # tensors of the block that require gradients; readers get plain numbers
+    new_camera = read_camera(tensors.extract(plain({"camera": camera}))["camera"], film_keys, None)
+    description = with_all_intrinsics(replace(description, camera=new_camera), tensors)
+    new_camera, parameters = description.camera, Parameters()
     for name, value in built.parameters.items():
         if not name.startswith("camera."):
             parameters.declare(name, value, built.parameters.specs[name])
-    parameters.declare_all("camera", chosen.kind, chosen.values)
+    parameters.declare_all("camera", new_camera.kind, new_camera.values)
     device = next(iter(params.values())).device
-    far = bool(built.centre.any())
-    own = {
+    far = bool(built.centre.any())  # then positions are in float64, as in `Scene`
+    camera_params = {
         name: torch.tensor(
             value, device=device, dtype=torch.float64 if far and parameters.specs[name].place else torch.float32
         )
@@ -61,9 +61,9 @@ def view_attributes(
         if name.startswith("camera.")
     }
     built = replace(built, parameters=parameters)
-    every = {name: value for name, value in params.items() if not name.startswith("camera.")} | own
+    view_params = {name: value for name, value in params.items() if not name.startswith("camera.")} | camera_params
     return {
         "description": description,
         "_built": built,
-        "params": every | params_from_tensors(tensors, description, built, every),
+        "params": view_params | params_from_tensors(tensors, description, built, view_params),
     }

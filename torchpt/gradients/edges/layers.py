@@ -109,7 +109,7 @@ def _interior(asked: Asked, names: tuple[str, ...], params: dict[str, Tensor], w
     scene, settings = asked.scene, asked.settings
     plain = {name: value.detach() for name, value in params.items()}
     with torch.no_grad():
-        still = make_wave(scene, settings, plain, asked.dtype, True, True)
+        still = make_wave(scene, settings, plain, asked.dtype, tape=True, attached=True)
     total = tuple(torch.zeros_like(plain[name]) for name in asked.wanted)
     flat, spp = worth.reshape(len(worth), -1), settings.render.spp
     pixels, samples = flat.shape[1], min(spp, LANES)

@@ -1,4 +1,8 @@
-"""Build a :class:`~torchpt.physics.world.World` of parts and parameters: one differentiable function of the parameters."""
+"""Build a :class:`~torchpt.physics.world.World` of parts and parameters: one differentiable function of the parameters.
+
+Read ``assemble.py`` first. ``primitives.py`` makes the geometry, ``materials.py`` the materials, ``emitters.py`` the light
+table. :meth:`torchpt.scene.scene.Scene.world` calls :func:`assemble` and caches its result.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 """Build a :class:`~torchpt.physics.world.World` of parts and parameters: one differentiable function of the parameters.
 
+:meth:`torchpt.scene.scene.Scene.world` calls :func:`assemble`. A *part* (:class:`~torchpt.physics.parts.Part`) is a set of
+primitives of one kind with one material; a *copy* is an instance of a part. The world has P primitives, and I instances. What a
+surface has of its own (material, opacity, object id) is stored by *slot*: one for each primitive, then one for each instance.
 Features that the scene does not use have no tensors: smooth normals, lights, quadrics, textures and so on are None.
 """
 
@@ -16,7 +19,7 @@ from torchpt.core.tree import leaves
 from torchpt.physics.bsdfs.records import LaneMaterials
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Copy, Part, Source
-from torchpt.physics.shapes.geometry import Geometry, LaneGeometry
+from torchpt.physics.shapes.geometry import KINDS, Geometry, LaneGeometry
 from torchpt.physics.shapes.primitive import Corners
 from torchpt.physics.textures import tables_of
 from torchpt.physics.textures.records import LaneTextures
@@ -47,15 +50,15 @@ def assemble(
     uv: bool = False,
     choice: str = "auto",
 ) -> tuple[World, Geometry]:
-    """Build the world and the geometry for the search.
+    """Build the world that stages read, and the geometry that the search reads.
 
     Args:
-        parts: the parts, ordered by kind as ``records.KINDS``.
+        parts: the parts, ordered by kind as ``geometry.KINDS``.
         parameters: every tensor by dotted name.
         sources: delta lights and environments, in the order of ``lights.sort_key``.
         space: the coordinates of lanes.
         dtype: dtype of the lanes.
-        copies: instances of parts.
+        copies: instances of parts, in the order of their slots.
         uv: True for texture coordinates even where no texture reads them.
         choice: the light sampler, from ``lights.LIGHT_SAMPLERS``.
 
@@ -66,19 +69,22 @@ def assemble(
     corners = corners_of_all(parts, parameters, space, dtype)
     primitives = primitives_of(parts, corners, dtype, device)
     _check_reach(parts, primitives, space)
-    owners: list[Part | Copy] = [*parts, *copies]
+    owners: list[Part | Copy] = [*parts, *copies]  # in the order of slots
+    slot_counts = primitives.sizes + [1] * len(copies)  # number of slots of each owner
     materials = {owner.material.name: _with_scaled_bump(owner.material, space.unit) for owner in owners}
-    made = {name: lane_material(material, parameters, dtype) for name, material in materials.items()}
-    nodes = [node for material in materials.values() for node in material.readings()]
-    tables, places = tables_of(nodes, parameters, dtype, device)
-    groups = groups_of(materials, made, places, parameters, dtype, device)
-    wide = primitives.sizes + [1] * len(copies)
-    opacity = opacity_of(owners, made, wide, dtype, device)
+    lane_materials = {name: lane_material(material, parameters, dtype) for name, material in materials.items()}
+    nodes = [node for material in materials.values() for node in material.readings()]  # uses of textures
+    tables, node_positions = tables_of(nodes, parameters, dtype, device)
+    groups = groups_of(materials, lane_materials, node_positions, parameters, dtype, device)
+    opacity = opacity_of(owners, lane_materials, slot_counts, dtype, device)
+    # (P + I,) 0 where a surface emits, else 1; instances cannot emit.
     dark = primitives.spread([int(part.emission is None) for part in parts] + [1] * len(copies))
     emission_textures = [part.emission_texture for part in parts] + [None] * len(copies)
-    maps = copy_maps(parts, primitives.sizes, copies, parameters, space) if copies else None
-    geometry = primitives.geometry(maps)
-    opacity_mapped = any(part.emission is not None and made[part.material.name].opacity_texture for part in parts)
+    copy_transforms = copy_maps(parts, primitives.sizes, copies, parameters, space) if copies else None
+    geometry = primitives.geometry(copy_transforms)
+    opacity_mapped = any(
+        part.emission is not None and lane_materials[part.material.name].opacity_texture for part in parts
+    )
     lights = lights_of(
         parts,
         sources,
@@ -87,9 +93,9 @@ def assemble(
         parameters,
         space,
         opacity,
-        dark == 0,
-        opacity_mapped,
-        choice,
+        emissive=dark == 0,
+        opacity_mapped=opacity_mapped,
+        choice=choice,
     )
     world = World(
         geometry=LaneGeometry(
@@ -101,18 +107,18 @@ def assemble(
             e2=primitives.e2,
             normal=primitives.normal,
             bound=primitives.bound,
-            flip=primitives.sign if primitives.counts[3] else None,
+            flip=primitives.sign if primitives.counts[KINDS.index("sphere")] else None,
             normals=primitives.normals,
-            **vertex_attributes_of(parts, corners, primitives.sizes, parameters, materials, groups.models, uv),
+            **vertex_attributes_of(parts, corners, primitives.sizes, parameters, materials, groups.models, uv=uv),
             object_id=primitives.spread([owner.object_id for owner in owners]),
             quadrics=primitives.quadrics,
-            copies=None if maps is None else copies_of(maps, copies, dtype),
+            copies=None if copy_transforms is None else copies_of(copy_transforms, copies, dtype),
         ),
         materials=_materials(owners, primitives, groups, dark, opacity),
         textures=LaneTextures(
             tables=tables,
-            opacity=opacity_maps_of(owners, made, places, wide, dtype, device),
-            emission=node_map_of(emission_textures, places, wide, device),
+            opacity=opacity_maps_of(owners, lane_materials, node_positions, slot_counts, dtype, device),
+            emission=node_map_of(emission_textures, node_positions, slot_counts, device),
         ),
         lights=lights,
     )
@@ -120,10 +126,14 @@ def assemble(
 
 
 def _emitter_primitives(parts: Sequence[Part], corners: Sequence[Corners], primitives: Primitives) -> Primitives:
-    """Return the primitives, detached where no emissive part has derivatives: slices of the whole would require gradients."""
+    """Return the primitives for the light table, detached where no emissive part requires gradients.
+
+    Rows of the light table are slices of the tensors of all primitives. If any part requires gradients, so do those tensors,
+    and the light table would be differentiated without need.
+    """
     moving = any(
-        part.emission is not None and any(x.requires_grad for x in leaves(own))
-        for part, own in zip(parts, corners, strict=True)
+        part.emission is not None and any(tensor.requires_grad for tensor in leaves(own_corners))
+        for part, own_corners in zip(parts, corners, strict=True)
     )
     return primitives if moving else primitives.detached()
 
@@ -131,11 +141,15 @@ def _emitter_primitives(parts: Sequence[Part], corners: Sequence[Corners], primi
 def _materials(
     owners: Sequence[Part | Copy], primitives: Primitives, groups: Groups, dark: Tensor, opacity: Tensor | None
 ) -> LaneMaterials:
-    """Return the material of each primitive; ``dark``: ``(P + I,)`` 0 where a surface emits, else 1."""
+    """Return the materials of all slots; ``dark``: ``(P + I,)`` 0 where a surface emits, else 1.
+
+    Lanes are sorted by ``key``: emissive surfaces by group of materials, then other surfaces by group, then rays without a hit.
+    ``key[slot + 1]`` is that of a slot, so that the slot -1 of a ray without a hit finds ``key[0]``.
+    """
     count = len(groups.models)
     group, row = zip(*(groups.place[owner.material.name] for owner in owners), strict=True) if owners else ((), ())
     keys = dark * count + primitives.spread(group)
-    missed = torch.full((1,), 2 * count, device=keys.device)
+    missed = torch.full((1,), 2 * count, device=keys.device)  # the key of a ray without a hit
     return LaneMaterials(
         row=primitives.spread(row),
         key=torch.cat((missed, keys)).to(torch.uint8),
@@ -156,8 +170,9 @@ def _with_scaled_bump(material: ResolvedMaterial, unit: float) -> ResolvedMateri
 
 def _check_reach(parts: Sequence[Part], primitives: Primitives, space: Space) -> None:
     """Raise for parameters that make a part too large or move it too far from the origin."""
+    # (P,) largest coordinate or extent of each primitive, in world units
     reach = torch.stack([x.detach().abs().amax(0) for x in (primitives.p0, primitives.e1, primitives.e2)]).amax(0)
-    if len(reach) and not bool(reach.max() <= MAX_COORDINATE):
+    if len(reach) and not bool(reach.max() <= MAX_COORDINATE):  # True for NaN too
         farthest = int(torch.nan_to_num(reach, nan=torch.inf).argmax())
         part = parts[int(primitives.spread(range(len(parts)))[farthest])]
         expected = (

@@ -1,4 +1,8 @@
-"""Build the light table: a row for each emissive primitive, then one for each delta light and environment."""
+"""Build the light table: a row for each emissive primitive, then one for each delta light and environment.
+
+:func:`torchpt.scene.world.assemble.assemble` calls :func:`lights_of`. K is the number of rows. A *part* is a set of primitives
+of one kind with one material and one emission; a *source* is a light of the scene file that is no surface.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +47,7 @@ def _mean_emission(part: Part, parameters: Mapping[str, Tensor]) -> float:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Columns of :class:`~torchpt.physics.lights.records.Lights` for some rows, and their power."""
+    """Columns of :class:`~torchpt.physics.lights.records.Lights` for some rows, and their power; vectors are ``(3, rows)``."""
 
     kind: list[str]  # of each row
     p0: Tensor
@@ -54,7 +58,7 @@ class _Rows:
     area: Tensor
     bound: Tensor
     radiance: Tensor
-    power: Tensor  # float64, detached
+    power: Tensor  # (rows,) float64, detached: the weight of the row for light samplers
 
 
 def lights_of(
@@ -65,6 +69,7 @@ def lights_of(
     parameters: Mapping[str, Tensor],
     space: Space,
     opacity: Tensor | None,
+    *,
     emissive: Tensor,
     opacity_mapped: bool,
     choice: str = "auto",
@@ -83,12 +88,13 @@ def lights_of(
         opacity_mapped: True where an emissive part has an opacity texture.
         choice: the light sampler, from ``lights.LIGHT_SAMPLERS``.
     """
-    prim = emissive.nonzero().squeeze(1)
+    prim = emissive.nonzero().squeeze(1)  # emissive primitives, in the order of their rows
     if not len(prim) and not sources:
         return None
     dtype, device = primitives.p0.dtype, primitives.p0.device
     emitting = [(part, n) for part, n in zip(parts, primitives.sizes, strict=True) if part.emission is not None and n]
-    groups, column = [], None
+    # emitting: parts with their number of primitives n
+    groups, column = [], None  # column: of each row in the table of quadrics
     if emitting:
         surfaces, column = _surfaces(emitting, primitives, parameters, prim)
         groups.append(surfaces)
@@ -98,32 +104,31 @@ def lights_of(
     names = [name for group in groups for name in group.kind]
     kinds = tuple(dict.fromkeys(names))
     joined = {name: torch.cat([getattr(group, name) for group in groups], -1) for name in (*COLUMNS, "power")}
-    rest = len(names) - len(prim)
-    power, seen = joined.pop("power"), None
+    source_count = len(names) - len(prim)  # rows without a surface, which come last
+    power, row_opacity = joined.pop("power"), None
     if opacity is not None:
-        seen = torch.cat((opacity.index_select(0, prim), opacity.new_ones(rest)))
-        power = power * seen.detach().double()
-    index = None
+        row_opacity = torch.cat((opacity.index_select(0, prim), opacity.new_ones(source_count)))
+        power = power * row_opacity.detach().double()
+    row_of_prim = None  # (P + I,) -1 where a primitive does not emit
     if len(prim):
-        index = torch.full((len(emissive),), -1, dtype=torch.int64, device=device)
-        index[prim] = torch.arange(len(prim), device=device)
+        row_of_prim = torch.full((len(emissive),), -1, dtype=torch.int64, device=device)
+        row_of_prim[prim] = torch.arange(len(prim), device=device)
     if column is not None:
-        column = torch.cat((column, column.new_zeros(rest)))
+        column = torch.cat((column, column.new_zeros(source_count)))
     textured = opacity_mapped or any(part.emission_texture is not None for part, _ in emitting)
-    many = len(names) > 1
     codes = {name: emitter(name).code for name in kinds}
     solid = table_of([codes[name] for name in names], joined["p0"], joined["e1"], joined["e2"])
     lights = Lights(
         choice=None,
         kinds=kinds,
-        kind=torch.tensor([kinds.index(name) for name in names], device=device) if many else None,
+        kind=torch.tensor([kinds.index(name) for name in names], device=device) if len(names) > 1 else None,
         **joined,
-        opacity=seen,
+        opacity=row_opacity,
         environment=next((around for _, around in made if around is not None), None),
-        row_of_prim=index,
+        row_of_prim=row_of_prim,
         quadric=column,
         quadrics=None if column is None else primitives.quadrics,
-        prim=torch.cat((prim, prim.new_zeros(rest))) if textured else None,
+        prim=torch.cat((prim, prim.new_zeros(source_count))) if textured else None,
         solid=solid,
         shapes=shapes_of(solid),
     )
@@ -132,7 +137,7 @@ def lights_of(
 
 
 def _reach(geometry: Geometry) -> Tensor:
-    """Return the radius of the scene: half the diagonal of its bounding box, float64."""
+    """Return the radius ``()`` of the scene: half the diagonal of its bounding box, float64; 1 without surfaces."""
     low, high = (box.double() for box in primitive_bounds(geometry))
     return (high.amax(1) - low.amin(1)).norm() * 0.5 if low.shape[1] else torch.ones((), device=low.device)
 
@@ -140,7 +145,14 @@ def _reach(geometry: Geometry) -> Tensor:
 def _surfaces(
     emitting: Sequence[tuple[Part, int]], primitives: Primitives, parameters: Mapping[str, Tensor], prim: Tensor
 ) -> tuple[_Rows, Tensor | None]:
-    """Return the rows of emissive primitives ``prim``, and their columns in the table of quadrics (None without quadrics)."""
+    """Return the rows of emissive primitives, and their columns in the table of quadrics (None without quadrics).
+
+    Args:
+        emitting: emissive parts with their number of primitives.
+        primitives: all primitives of the scene.
+        parameters: every tensor by dotted name.
+        prim: ids of the emissive primitives, ordered by kind.
+    """
     dtype, device = primitives.p0.dtype, primitives.p0.device
     counts = torch.tensor([n for _, n in emitting], dtype=torch.int64, device=device)
     names = [part.kind for part, n in emitting for _ in range(n)]
@@ -148,6 +160,7 @@ def _surfaces(
         x.index_select(1, prim)
         for x in (primitives.p0, primitives.e1, primitives.e2, primitives.face, primitives.normal)
     )
+    # wholes: areas by which power is estimated, float64; columns: in the table of quadrics
     areas, wholes, columns, needs_quadrics, start = [], [], [], False, 0
     for number, name in enumerate(KINDS):  # the order of primitives
         stop = start + names.count(name)
@@ -161,10 +174,11 @@ def _surfaces(
         columns.append(column if kind.needs_quadrics else torch.zeros_like(column))
         needs_quadrics, start = needs_quadrics or kind.needs_quadrics, stop
     radiance = torch.cat([_emission(part, parameters, dtype)[:, None].expand(3, n) for part, n in emitting], 1)
+    # A diffuse emitter of radiance L and area A has the power pi L A.
     power = math.pi * luminance(radiance.detach().double().abs()) * torch.cat(wholes)
     if any(part.emission_texture is not None for part, _ in emitting):
-        shares = [_mean_emission(part, parameters) for part, _ in emitting]
-        power = power * torch.repeat_interleave(torch.tensor(shares, dtype=torch.float64, device=device), counts)
+        means = [_mean_emission(part, parameters) for part, _ in emitting]
+        power = power * torch.repeat_interleave(torch.tensor(means, dtype=torch.float64, device=device), counts)
     flip, bound = (x.index_select(0, prim) for x in (primitives.sign, primitives.bound))
     made = _Rows(names, p0, e1, e2, normal, flip, torch.cat(areas).to(dtype), bound, radiance, power)
     return made, torch.cat(columns) if needs_quadrics else None
@@ -183,11 +197,11 @@ def _source(
         dtype: dtype of the lanes.
     """
 
-    def given(key: str) -> Tensor:
+    def parameter(key: str) -> Tensor:
         return parameters[f"{source.name}.{key}"]
 
     try:
-        row = LIGHTS[source.kind].row(Setting(given, source.values, space.point, space.unit, reach, dtype))
+        row = LIGHTS[source.kind].row(Setting(parameter, source.values, space.point, space.unit, reach, dtype))
     except Refused as error:
         raise scene_error(error, source.name, None, None) from None
     blank = torch.zeros(3, dtype=torch.float64, device=space.centre.device)

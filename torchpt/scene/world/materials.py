@@ -1,4 +1,11 @@
-"""Build the materials of the world: parameters stacked by BSDF, vertex attributes, textures and opacity by primitive."""
+"""Build the materials of the world: parameters stacked by BSDF, vertex attributes, textures and opacity by primitive.
+
+:func:`torchpt.scene.world.assemble.assemble` calls these functions. Terms of textures (:mod:`torchpt.physics.textures.base`): a
+*node* is one use of a texture; nodes that are looked up by the same code are the rows of a *table*; the *position* of a node is
+its table and its row. A *reading* is the node that stands in place of a parameter. A model is *sheer* if rays pass it as if it
+were not there (``null``). Materials that share BSDF and code for textures form a *group*: its parameters are stacked, one row a
+material.
+"""
 
 from __future__ import annotations
 
@@ -40,42 +47,55 @@ def vertex_attributes_of(
     parameters: Mapping[str, Tensor],
     materials: Mapping[str, ResolvedMaterial],
     models: Sequence[Bsdf],
+    *,
     uv: bool,
 ) -> dict[str, Any]:
-    """Return the vertex attributes of :class:`World` by name; None for those that nothing reads."""
+    """Return the vertex attributes of ``LaneGeometry`` by name; None for those that nothing reads.
+
+    Args:
+        parts: the parts.
+        corners: their corners in the world.
+        sizes: their numbers of primitives.
+        parameters: every tensor by dotted name.
+        materials: all materials by name.
+        models: BSDFs of the groups.
+        uv: True for texture coordinates even where no texture reads them.
+    """
     readings = [reading for material in materials.values() for reading in material.readings()]
-    # Filtered look-ups need the size of texels on the surface.
-    bumpy = any(material.bump_map is not None for material in materials.values())
-    bumpy = bumpy or any(reading.filtered for reading in readings)
-    framed = (
-        bumpy
+    # Bump maps, and filtered look-ups for the size of texels, need both derivatives of the point by texture coordinates.
+    needs_bitangents = any(material.bump_map is not None for material in materials.values())
+    needs_bitangents = needs_bitangents or any(reading.filtered for reading in readings)
+    needs_tangents = (
+        needs_bitangents
         or any(material.normal_map is not None for material in materials.values())
-        or any(m.anisotropic for m in models)
+        or any(model.anisotropic for model in models)
     )
-    imaged = uv or any(reading.reads == "uv" for reading in readings)
-    coloured = any(reading.reads == "colors" for reading in readings)
+    needs_uvs = uv or any(reading.reads == "uv" for reading in readings)
+    needs_colors = any(reading.reads == "colors" for reading in readings)
     pairs = list(zip(parts, corners, strict=True))
     kinds = [PRIMITIVES[part.kind] for part in parts]
-    uvs = [kind.uvs(part, c) for kind, (part, c) in zip(kinds, pairs, strict=True)] if imaged or framed else []
+    uvs = (
+        [kind.uvs(part, c) for kind, (part, c) in zip(kinds, pairs, strict=True)] if needs_uvs or needs_tangents else []
+    )
     found: dict[str, Any] = dict.fromkeys(("tangents", "bitangents", "uvs", "axes", "mirrored", "colors"))
-    if framed:
-        moves = [
+    if needs_tangents:
+        derivatives = [  # of points by u and v, a pair for each part
             kind.moves(part, c, corner, parameters[f"{part.name}.to_world"][:3, :3])
             for kind, (part, c), corner in zip(kinds, pairs, uvs, strict=True)
         ]
-        found["tangents"] = torch.cat([move[0] for move in moves], 1)
-        found["bitangents"] = torch.cat([move[1] for move in moves], 1) if bumpy else None
-    if imaged:
+        found["tangents"] = torch.cat([pair[0] for pair in derivatives], 1)
+        found["bitangents"] = torch.cat([pair[1] for pair in derivatives], 1) if needs_bitangents else None
+    if needs_uvs:
         found["uvs"] = tuple(torch.cat([corner[k] for corner in uvs], 1) for k in range(3))
-        balls = [parameters[f"{part.name}.to_world"] for part in parts if part.kind == "sphere"]
-        if balls:
+        spheres = [parameters[f"{part.name}.to_world"] for part in parts if part.kind == "sphere"]
+        if spheres:
             from torchpt.physics.shapes.primitives.sphere import axes
 
-            found["axes"] = axes(balls, corners[0].p0.dtype)
-    if (imaged or bumpy) and any(c.mirrored and part.kind == "disk" for part, c in pairs):
+            found["axes"] = axes(spheres, corners[0].p0.dtype)
+    if (needs_uvs or needs_bitangents) and any(c.mirrored and part.kind == "disk" for part, c in pairs):
         flags = torch.tensor([c.mirrored for c in corners], device=corners[0].p0.device)
         found["mirrored"] = torch.repeat_interleave(flags, torch.tensor(sizes, device=flags.device))
-    if coloured:
+    if needs_colors:
         colors = [_colors(part, c) for part, c in pairs]
         found["colors"] = tuple(torch.cat([triple[k] for triple in colors], 1) for k in range(3))
     return found
@@ -94,7 +114,7 @@ def _colors(part: Part, c: Corners) -> tuple[Tensor, Tensor, Tensor]:
 
 # ---- Materials on lanes: a BSDF, its parameters, and its opacity
 #
-# Differentiable in the parameters, and computed once per material. A blend with ``null`` is its other half with an opacity.
+# Differentiable in the parameters, and computed once per material. A blend with ``null`` is the other material with an opacity.
 
 
 @dataclass(frozen=True)
@@ -112,8 +132,8 @@ class LaneMaterial:
 
     Attributes:
         model: the BSDF.
-        values: its parameters without textured ones, ``(3, 1)`` or ``(1,)``; nested for a blend.
-        readings: the textures of the others, nested alike.
+        values: parameters without textured ones, ``(3, 1)`` or ``(1,)``; nested under ``a`` and ``b`` for a blend.
+        readings: nodes of textured parameters, nested alike.
         opacity: ``(1,)``; None for 1.
         opacity_texture: the texture by which the opacity is multiplied, or None.
     """
@@ -136,14 +156,14 @@ def lane_material(material: ResolvedMaterial, parameters: Mapping[str, Tensor], 
         found = _blended(type(material.model), values.get("weight"), readings.get("weight"), a, b)
     else:
         device = next(iter(parameters.values())).device
-        nothing = torch.zeros(1, dtype=dtype, device=device) if material.model.sheer else None
-        found = LaneMaterial(material.model, values, nothing, readings)
+        opacity = torch.zeros(1, dtype=dtype, device=device) if material.model.sheer else None
+        found = LaneMaterial(material.model, values, opacity, readings)
     opacity, opacity_texture = found.opacity, found.opacity_texture
     if isinstance(material.opacity, Node):
         opacity_texture = OpacityTexture(material.opacity)
     elif material.opacity != 1.0:  # a number
-        own = parameters[f"{material.name}.opacity"].to(dtype)[None]
-        opacity = own if opacity is None else opacity * own
+        outer = parameters[f"{material.name}.opacity"].to(dtype)[None]
+        opacity = outer if opacity is None else opacity * outer
     if opacity is not None and material.alpha_cutoff is not None and opacity_texture is None:
         opacity = (opacity >= material.alpha_cutoff).to(dtype)
     return LaneMaterial(found.model, found.values, opacity, found.readings, opacity_texture)
@@ -152,14 +172,25 @@ def lane_material(material: ResolvedMaterial, parameters: Mapping[str, Tensor], 
 def _blended(
     kind: Callable[[Bsdf, Bsdf], Bsdf], weight: Tensor | None, reading: Node | None, a: LaneMaterial, b: LaneMaterial
 ) -> LaneMaterial:
-    """Return the blend of two materials; ``weight (1,)``: that of the second. Their opacities go into weight and opacity."""
+    """Return the blend of two materials.
+
+    With opacities o_a and o_b and the weight w of the second, a ray meets the blend with probability (1 - w) o_a + w o_b, and
+    then the second material with probability w o_b over that sum: these are the opacity and the weight of the result.
+
+    Args:
+        kind: class of the blend.
+        weight: ``(1,)`` weight of the second material; None where it is textured.
+        reading: texture of the weight, or None.
+        a: the first material.
+        b: the second material.
+    """
     opacity = None
     if weight is None:  # a texture: only null may have an opacity below 1 beside it
         assert reading is not None
         if a.model.sheer:
             return LaneMaterial(b.model, b.values, None, b.readings, OpacityTexture(reading))
         if b.model.sheer:
-            return LaneMaterial(a.model, a.values, None, a.readings, OpacityTexture(reading, 1.0, -1.0))
+            return LaneMaterial(a.model, a.values, None, a.readings, OpacityTexture(reading, bias=1.0, factor=-1.0))
     elif a.opacity is not None or b.opacity is not None:
         first = (1.0 - weight) * (1.0 if a.opacity is None else a.opacity)
         second = weight * (1.0 if b.opacity is None else b.opacity)
@@ -170,7 +201,7 @@ def _blended(
     if b.model.sheer:
         return LaneMaterial(a.model, a.values, opacity, a.readings)
     values: Parameters = {"a": a.values, "b": b.values}
-    readings = {side: s.readings for side, s in (("a", a), ("b", b)) if s.readings}
+    readings = {side: inner.readings for side, inner in (("a", a), ("b", b)) if inner.readings}
     if weight is None:
         readings["weight"] = reading  # type: ignore[assignment]
     else:
@@ -181,12 +212,12 @@ def _blended(
 # ---- Groups of materials of the same BSDF and textures; opacity by primitive
 
 
-#: Lanes are sorted by 8-bit keys, two for each model.
+#: Most groups. Lanes are sorted by 8-bit keys, two for each group (emissive or not) and one for rays without a hit.
 MOST_MODELS = 120
 
 
-#: Key of a group: the BSDF, and the structure of its textures.
-Kind = tuple[Bsdf, Any]
+#: Key of a group: the BSDF, and the structure of the textures (which parameters have one, and of which form); None without.
+GroupKey = tuple[Bsdf, Any]
 
 
 @dataclass(frozen=True)
@@ -210,56 +241,66 @@ class Groups:
 
 def groups_of(
     materials: Mapping[str, ResolvedMaterial],
-    made: Mapping[str, LaneMaterial],
-    places: Mapping[Node, NodePosition],
+    lane_materials: Mapping[str, LaneMaterial],
+    positions: Mapping[Node, NodePosition],
     parameters: Mapping[str, Tensor],
     dtype: torch.dtype,
     device: torch.device,
 ) -> Groups:
-    """Group materials; ``made``: the same materials on lanes, by name.
+    """Group materials.
+
+    Args:
+        materials: the materials by name.
+        lane_materials: the same materials on lanes, by name.
+        positions: table and row of each node.
+        parameters: every tensor by dotted name.
+        dtype: dtype of the lanes.
+        device: device of the lanes.
 
     Raises:
         SceneError: more than :data:`MOST_MODELS` groups.
     """
-    members: dict[Kind, list[str]] = {}
-    for name, material in made.items():
+    members: dict[GroupKey, list[str]] = {}
+    for name, material in lane_materials.items():
         members.setdefault(_group_key(materials[name], material), []).append(name)
-    if not members:
+    if not members:  # no surfaces: stages expect one group at least
         members[KINDS["diffuse"](), None] = []
     if len(members) > MOST_MODELS:
-        expected = f"at most {MOST_MODELS} models, blends and textured ones counted by what they are made of"
+        expected = f"at most {MOST_MODELS} models, blends and textured ones counted by what they are lane_materials of"
         raise SceneError("materials", len(members), expected)
-    place, stacks, textures, sides = {}, [], [], []
+    place, stacks, textures, two_sided = {}, [], [], []
     for number, ((model, form), names) in enumerate(members.items()):
         place |= {name: (number, row) for row, name in enumerate(names)}
-        if form is None:
-            stacks.append(stacked([model.prepare(made[name].values) for name in names], model.factors))
+        if form is None:  # without textures the BSDF computes once what depends on parameters alone
+            stacks.append(stacked([model.prepare(lane_materials[name].values) for name in names], model.factors))
             textures.append(None)
         else:
-            stacks.append(stacked([_tabulated(model, made[name].values) for name in names], model.factors))
-            read = _textures([materials[name] for name in names], [made[name] for name in names], places, device)
-            strong = [f"{name}.normal_strength" for name in names]
-            if any(name in parameters for name in strong):
+            stacks.append(stacked([_tabulated(model, lane_materials[name].values) for name in names], model.factors))
+            bindings = _textures(
+                [materials[name] for name in names], [lane_materials[name] for name in names], positions, device
+            )
+            strength_names = [f"{name}.normal_strength" for name in names]
+            if any(name in parameters for name in strength_names):
                 one = torch.ones((), dtype=dtype, device=device)
-                strengths = [parameters[name].to(one) if name in parameters else one for name in strong]
-                read = replace(read, strength=torch.stack(strengths))
-            textures.append(read)
-        both = [materials[name].two_sided for name in names]
-        sides.append(None if all(both) else torch.tensor(both, device=device))
-    return Groups(place, tuple(model for model, _ in members), tuple(stacks), tuple(textures), tuple(sides))
+                strengths = [parameters[name].to(one) if name in parameters else one for name in strength_names]
+                bindings = replace(bindings, strength=torch.stack(strengths))
+            textures.append(bindings)
+        flags = [materials[name].two_sided for name in names]
+        two_sided.append(None if all(flags) else torch.tensor(flags, device=device))
+    return Groups(place, tuple(model for model, _ in members), tuple(stacks), tuple(textures), tuple(two_sided))
 
 
 def _tabulated(model: Bsdf, values: Parameters) -> Parameters:
-    """Return values merged with the tables that the BSDF computes from them."""
+    """Return parameters together with the tables that the BSDF computes from them; blends nest both."""
 
-    def merged(a: Parameters, b: Parameters) -> Parameters:
-        inner = {key: merged(a[key], value) for key, value in b.items() if isinstance(value, dict)}
-        return {**a, **b, **inner}
+    def merged(values: Parameters, tables: Parameters) -> Parameters:
+        inner = {key: merged(values[key], table) for key, table in tables.items() if isinstance(table, dict)}
+        return {**values, **tables, **inner}
 
     return merged(values, model.tabulate(values))
 
 
-def _group_key(material: ResolvedMaterial, made: LaneMaterial) -> Kind:
+def _group_key(material: ResolvedMaterial, made: LaneMaterial) -> GroupKey:
     """Return the key of a material's group; materials without textures share that of their BSDF."""
     if not made.readings and material.normal_map is None and material.bump_map is None:
         return made.model, None
@@ -275,15 +316,15 @@ def _group_key(material: ResolvedMaterial, made: LaneMaterial) -> Kind:
 
 def _textures(
     materials: Sequence[ResolvedMaterial],
-    made: Sequence[LaneMaterial],
-    places: Mapping[Node, NodePosition],
+    lane_materials: Sequence[LaneMaterial],
+    positions: Mapping[Node, NodePosition],
     device: torch.device,
 ) -> MaterialTextures:
-    """Return the stacked textures of the materials of one group."""
+    """Return the stacked textures of the materials of one group; a ``column`` holds one slot of all of them."""
 
     def binding(column: Sequence[Node]) -> TextureBinding:
-        rows = torch.tensor([places[node].row for node in column], device=device)
-        table, first = places[column[0]].table, column[0]
+        rows = torch.tensor([positions[node].row for node in column], device=device)
+        table, first = positions[column[0]].table, column[0]  # a group has one form, so all its nodes are in one table
         return TextureBinding(table, rows, first.channel, any(node.filtered for node in column))
 
     def map_binding(column: list[Node | None]) -> TextureBinding | None:
@@ -297,7 +338,7 @@ def _textures(
         return binding(column)
 
     every = [node for material in materials for node in material.readings()]
-    readings = bound([one.readings for one in made])
+    readings = bound([one.readings for one in lane_materials])
     return MaterialTextures(
         readings,
         map_binding([material.normal_map for material in materials]),
@@ -308,34 +349,34 @@ def _textures(
 
 
 def node_map_of(
-    nodes: Sequence[Node | None], places: Mapping[Node, NodePosition], sizes: list[int], device: torch.device
+    nodes: Sequence[Node | None], positions: Mapping[Node, NodePosition], sizes: list[int], device: torch.device
 ) -> NodeMap | None:
-    """Return textures by primitive, for parts with ``sizes`` primitives; None where no part has one."""
+    """Return textures by slot: one node or None a part, repeated for its ``sizes`` slots; None where no part has one."""
     if all(node is None for node in nodes):
         return None
     size = torch.tensor(sizes, dtype=torch.int64, device=device)
-    tables = tuple(sorted({places[node].table for node in nodes if node is not None}))
+    tables = tuple(sorted({positions[node].table for node in nodes if node is not None}))
 
     def spread(values: list[int]) -> Tensor:
         return torch.repeat_interleave(torch.tensor(values, device=device), size)
 
-    rows = spread([-1 if node is None else places[node].row for node in nodes])
+    rows = spread([-1 if node is None else positions[node].row for node in nodes])
     if len(tables) == 1:
         return NodeMap(rows, tables, None)
-    return NodeMap(rows, tables, spread([0 if node is None else tables.index(places[node].table) for node in nodes]))
+    return NodeMap(rows, tables, spread([0 if node is None else tables.index(positions[node].table) for node in nodes]))
 
 
 def opacity_maps_of(
     parts: Sequence[Part | Copy],
-    made: Mapping[str, LaneMaterial],
-    places: Mapping[Node, NodePosition],
+    lane_materials: Mapping[str, LaneMaterial],
+    positions: Mapping[Node, NodePosition],
     sizes: list[int],
     dtype: torch.dtype,
     device: torch.device,
 ) -> OpacityMaps | None:
-    """Return opacity textures by primitive; None where there are none."""
-    textures = [made[part.material.name].opacity_texture for part in parts]
-    maps = node_map_of([None if texture is None else texture.node for texture in textures], places, sizes, device)
+    """Return opacity textures by slot, for parts with ``sizes`` slots; None where there are none."""
+    textures = [lane_materials[part.material.name].opacity_texture for part in parts]
+    maps = node_map_of([None if texture is None else texture.node for texture in textures], positions, sizes, device)
     if maps is None:
         return None
     size = torch.tensor(sizes, dtype=torch.int64, device=device)
@@ -343,11 +384,11 @@ def opacity_maps_of(
     def spread(values: list[Any], kind: torch.dtype) -> Tensor:
         return torch.repeat_interleave(torch.tensor(values, dtype=kind, device=device), size)
 
-    cutoffs = [
+    cutoffs = [  # negative: none
         -1.0 if texture is None or part.material.alpha_cutoff is None else part.material.alpha_cutoff
         for texture, part in zip(textures, parts, strict=True)
     ]
-    return OpacityMaps(
+    return OpacityMaps(  # where no part has a cutoff, stages do not compare
         maps.nodes,
         maps.tables,
         maps.table,
@@ -359,14 +400,14 @@ def opacity_maps_of(
 
 def opacity_of(
     parts: Sequence[Part | Copy],
-    made: Mapping[str, LaneMaterial],
+    lane_materials: Mapping[str, LaneMaterial],
     sizes: list[int],
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tensor | None:
-    """Return the opacity ``(P,)`` of primitives without textures; None where all are opaque."""
-    if all(one.opacity is None and one.opacity_texture is None for one in made.values()):
+    """Return the opacity ``(P + I,)`` by slot, without textures; None where all surfaces are opaque."""
+    if all(one.opacity is None and one.opacity_texture is None for one in lane_materials.values()):
         return None
-    whole = torch.ones(1, dtype=dtype, device=device)
-    found = [made[part.material.name].opacity for part in parts]
-    return torch.cat([(whole if x is None else x).expand(n) for x, n in zip(found, sizes, strict=True)])
+    opaque = torch.ones(1, dtype=dtype, device=device)
+    found = [lane_materials[part.material.name].opacity for part in parts]
+    return torch.cat([(opaque if x is None else x).expand(n) for x, n in zip(found, sizes, strict=True)])
