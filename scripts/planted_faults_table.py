@@ -460,8 +460,8 @@ FAULTS = (
         "scene/settings.py",
         "format cli",
         "Film.check",
-        "crop[0] + crop[2] > wide or crop[1] + crop[3] > high",
-        "crop[2] > wide or crop[3] > high",
+        "left + crop_width > width or top + crop_height > height",
+        "crop_width > width or crop_height > height",
         "an error message lost: a crop that reaches beyond the film is accepted and renders what is not on it",
     ),
     # -- meshes

@@ -142,7 +142,7 @@ class Run:
         """Set films and counts to zero."""
         device, streams = self.device, self.wave.sampler.streams
         splats, channels = self.integrator.splats, [len(x.channels) for x in self.seen.values()]
-        check_film(self.width, self.height, streams.count, channels, device, splats)
+        check_film(self.width, self.height, streams.count, channels, device, splats=splats)
         film = Film(self.width, self.height, streams.count, device, splats=splats)
         layers = {
             name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()

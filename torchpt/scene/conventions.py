@@ -15,7 +15,8 @@ PyTorch3D             x left, y up, looks along +z             world to camera, 
                                                                rows times ``R``
 ====================  =======================================  ==================  ==========================
 
-Gradients flow through tensors in both directions. Numbers, lists and arrays are accepted as well.
+``from_...`` returns a scene's ``camera`` block, ``to_...`` takes a loaded scene. Gradients flow through tensors in both
+directions. Numbers, lists and arrays are accepted as well.
 """
 
 from __future__ import annotations
@@ -74,9 +75,10 @@ def from_opencv(K: Any, R: Any, t: Any, size: Size, first_pixel: float = 0.5) ->
     Raises:
         SceneError: numbers that are not finite or of another shape, an ``R`` that is no rotation, a bad size.
     """
-    inner, wide_and_tall = _with_offset(_tensor(K, "K", (3, 3)), 0.5 - _first_pixel(first_pixel)), size_of(size)
+    intrinsics = _with_offset(_tensor(K, "K", (3, 3)), 0.5 - _first_pixel(first_pixel))
+    sides = size_of(size)
     pose = {"R": _rotation(R), "t": _tensor(t, "t", (3,))}
-    return {"type": "perspective", "K": inner, **pose, "size": wide_and_tall}
+    return {"type": "perspective", "K": intrinsics, **pose, "size": sides}
 
 
 def to_opencv(
@@ -98,8 +100,12 @@ def to_opencv(
     Raises:
         SceneError: no scene, wrong parameters or film settings, or a camera other than a pinhole.
     """
-    inner, rotation, translation = _seen(scene, params, film, dtype)
-    return _with_offset(inner, _first_pixel(first_pixel) - 0.5).to(dtype), rotation.to(dtype), translation.to(dtype)
+    intrinsics, rotation, translation = _pinhole(scene, params, film, dtype)
+    return (
+        _with_offset(intrinsics, _first_pixel(first_pixel) - 0.5).to(dtype),
+        rotation.to(dtype),
+        translation.to(dtype),
+    )
 
 
 def from_opengl(
@@ -130,6 +136,7 @@ def from_opengl(
     if K is not None and size is None:
         raise SceneError("size", size, "[width, height] of the picture that K belongs to")
     pose = _pose(matrix)
+    # The camera space of scenes is this one turned by 180 degrees about y.
     block: Block = {
         "type": "perspective",
         "to_world": affine(pose[:, :3] * pose.new_tensor([-1.0, 1.0, -1.0]), pose[:, 3]),
@@ -151,12 +158,13 @@ def to_opengl(
     dtype: torch.dtype = torch.float32,
 ) -> OpenGLCamera:
     """Return a scene's camera with OpenGL's axes. Arguments and errors as :func:`to_opencv`."""
-    inner, rotation, translation = _seen(scene, params, film, dtype)
+    intrinsics, rotation, translation = _pinhole(scene, params, film, dtype)
     width, height = scene.film_size(film)
+    # The inverse of OpenCV's pose, with the axes y and z turned back.
     matrix = affine(rotation.T * rotation.new_tensor([1.0, -1.0, -1.0]), -(rotation.T @ translation))
-    halves = inner.new_tensor([width, height]) * 0.5
-    fov = torch.atan2(halves, torch.stack((inner[0, 0], inner[1, 1]))) * (360.0 / math.pi)
-    return OpenGLCamera(matrix.to(dtype), inner.to(dtype), fov.to(dtype), (width, height))
+    halves = intrinsics.new_tensor([width, height]) * 0.5
+    fov = torch.atan2(halves, torch.stack((intrinsics[0, 0], intrinsics[1, 1]))) * (360.0 / math.pi)
+    return OpenGLCamera(matrix.to(dtype), intrinsics.to(dtype), fov.to(dtype), (width, height))
 
 
 def from_kornia(camera: PinholeCamera, index: int = 0) -> Block:
@@ -176,9 +184,9 @@ def from_kornia(camera: PinholeCamera, index: int = 0) -> Block:
         index = range(count)[operator.index(index)]
     except (IndexError, TypeError):
         raise SceneError("index", index, f"a whole number below {count}, the number of cameras") from None
-    outer = camera.extrinsics[index]
+    extrinsics = camera.extrinsics[index]
     size: Any = camera.width[index], camera.height[index]
-    return from_opencv(camera.intrinsics[index, :3, :3], outer[:3, :3], outer[:3, 3], size, 0.0)
+    return from_opencv(camera.intrinsics[index, :3, :3], extrinsics[:3, :3], extrinsics[:3, 3], size, first_pixel=0.0)
 
 
 def to_kornia(
@@ -193,11 +201,11 @@ def to_kornia(
     """
     from kornia.geometry.camera import PinholeCamera
 
-    inner, rotation, translation = _seen(scene, params, film, dtype)
-    inner = _with_offset(inner, -0.5)
-    whole = affine(inner, torch.zeros_like(translation))
-    size = [torch.tensor([side], device=rotation.device) for side in scene.film_size(film)]
-    return PinholeCamera(whole[None].to(dtype), affine(rotation, translation)[None].to(dtype), size[1], size[0])
+    intrinsics, rotation, translation = _pinhole(scene, params, film, dtype)
+    intrinsics = _with_offset(intrinsics, -0.5)
+    intrinsics_4x4 = affine(intrinsics, torch.zeros_like(translation))
+    width, height = (torch.tensor([side], device=rotation.device) for side in scene.film_size(film))
+    return PinholeCamera(intrinsics_4x4[None].to(dtype), affine(rotation, translation)[None].to(dtype), height, width)
 
 
 def from_pytorch3d(
@@ -219,7 +227,7 @@ def from_pytorch3d(
     """
     if type(in_ndc) is not bool:
         raise SceneError("in_ndc", in_ndc, "True or False")
-    # The camera space is the same here, and R's columns are its axes in the world.
+    # PyTorch3D's camera space is that of scenes, and R's columns are its axes in the world.
     rotation, translation = _rotation(R), _tensor(T, "T", (3,))
     tall, wide = size_of(_tensor(image_size, "image_size", (2,)), "image_size", "[height, width]")
     focal, point = _tensor(focal_length, "focal_length", None), _tensor(principal_point, "principal_point", (2,))
@@ -227,12 +235,12 @@ def from_pytorch3d(
         raise SceneError("focal_length", f"shape {tuple(focal.shape)}", "one number, or two")
     focal = focal.reshape(-1).expand(2)
     if in_ndc:
-        half = min(wide, tall) * 0.5
+        half = min(wide, tall) * 0.5  # pixels in a unit of NDC, whose axes point left and up
         focal, point = focal * half, point.new_tensor([wide, tall]) * 0.5 - point * half
     zero = torch.zeros_like(focal[0])
-    inner = (focal[0], zero, point[0], zero, focal[1], point[1], zero, zero, torch.ones_like(zero))
+    entries = (focal[0], zero, point[0], zero, focal[1], point[1], zero, zero, torch.ones_like(zero))  # of K, by rows
     pose = affine(rotation, -(rotation @ translation))
-    return {"type": "perspective", "to_world": pose, "K": torch.stack(inner).reshape(3, 3), "size": [wide, tall]}
+    return {"type": "perspective", "to_world": pose, "K": torch.stack(entries).reshape(3, 3), "size": [wide, tall]}
 
 
 def to_pytorch3d(
@@ -242,20 +250,21 @@ def to_pytorch3d(
     dtype: torch.dtype = torch.float32,
 ) -> dict[str, Any]:
     """Return PyTorch3D's arguments of ``PerspectiveCameras`` for a batch of one. Arguments and errors as :func:`to_opencv`."""
-    inner, rotation, translation = _seen(scene, params, film, dtype)
+    intrinsics, rotation, translation = _pinhole(scene, params, film, dtype)
     wide, tall = scene.film_size(film)
+    # From OpenCV's axes (x right, y down) to PyTorch3D's (x left, y up); a unit of NDC is half the shorter side.
     half, flip = min(wide, tall) * 0.5, rotation.new_tensor([-1.0, -1.0, 1.0])
     numbers = {
         "R": rotation.T * flip,
         "T": translation * flip,
-        "focal_length": inner.diagonal()[:2] / half,
-        "principal_point": (inner.new_tensor([wide, tall]) * 0.5 - inner[:2, 2]) / half,
+        "focal_length": intrinsics.diagonal()[:2] / half,
+        "principal_point": (intrinsics.new_tensor([wide, tall]) * 0.5 - intrinsics[:2, 2]) / half,
     }
     found: dict[str, Any] = {key: value[None].to(dtype) for key, value in numbers.items()}
     return {**found, "image_size": torch.tensor([[tall, wide]], device=rotation.device), "in_ndc": True}
 
 
-def _seen(
+def _pinhole(
     scene: Any, params: Mapping[str, Tensor] | None, film: Mapping[str, Any] | None, dtype: Any
 ) -> PinholeMatrices:
     """Return a scene's pinhole matrices in float64, after checking ``dtype``, to which callers convert."""
@@ -268,10 +277,9 @@ def _seen(
 
 def _numbers(value: Any, key: str, expected: str) -> Tensor:
     """Return finite numbers as float64; under a transform of ``torch.func`` values cannot be read and are not checked."""
-    given = value if isinstance(value, Tensor) else None
-    if given is not None and (given.layout is not torch.strided or given.is_complex() or given.is_meta):
+    if isinstance(value, Tensor) and (value.layout is not torch.strided or value.is_complex() or value.is_meta):
         raise SceneError(
-            key, f"a {given.layout} tensor of {given.dtype} on {given.device}", f"{expected}, dense and real"
+            key, f"a {value.layout} tensor of {value.dtype} on {value.device}", f"{expected}, dense and real"
         )
     try:
         found = torch.as_tensor(value, dtype=torch.float64)
@@ -317,12 +325,12 @@ def size_of(size: Any, key: str = "size", sides: str = "[width, height]") -> lis
     expected = f"{sides} in pixels, whole numbers >= 1"
     try:
         found = [] if isinstance(size, str) else [int(side) for side in size]
-        whole = len(found) == 2 and all(
+        is_valid = len(found) == 2 and all(
             side >= 1 and side == given and given is not True for side, given in zip(found, size, strict=True)
         )
     except (TypeError, ValueError, OverflowError):
-        whole, found = False, []
-    if not whole:
+        is_valid, found = False, []
+    if not is_valid:
         raise SceneError(key, size, expected)
     return found
 
@@ -332,8 +340,8 @@ def _pose(matrix: Any) -> Tensor:
     found = _numbers(matrix, "matrix", "a matrix (4, 4) or (3, 4)")
     if found.shape not in ((4, 4), (3, 4)):
         raise SceneError("matrix", f"shape {tuple(found.shape)}", "a matrix (4, 4) or (3, 4)")
-    last = found.new_tensor([0.0, 0.0, 0.0, 1.0])
-    if len(found) == 4 and not is_transformed(found) and not found[3].detach().equal(last):
+    last_row = found.new_tensor([0.0, 0.0, 0.0, 1.0])
+    if len(found) == 4 and not is_transformed(found) and not found[3].detach().equal(last_row):
         raise SceneError("matrix", found[3].tolist(), "a matrix whose last row is 0 0 0 1")
     axes = found[:3, :3]
     lengths = torch.linalg.vector_norm(axes, dim=0)

@@ -1,4 +1,4 @@
-"""Convert names of devices, and choose one for ``auto``."""
+"""Convert names of devices, and choose one for ``auto``; called when a scene is loaded or moved."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def device_of(name: str | torch.device) -> torch.device:
     try:
         device = torch.device(name)
     except (RuntimeError, TypeError):
-        device = None
+        device = None  # torch knows no such name
     if device is None or device.type not in ("cpu", "cuda"):
         raise SceneError("render.device", str(name), "auto, cpu, cuda or cuda:N")
     if device.type == "cuda":

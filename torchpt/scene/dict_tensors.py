@@ -1,5 +1,8 @@
 """Connect tensors in a scene dict to the scene's parameters, so that gradients flow from one to the other.
 
+:func:`torchpt.load` calls :func:`params_from_tensors` once the scene is built from plain numbers. A *key* is the path of a
+tensor in the nested dict, as a tuple of names and list indices: ``("materials", "red", "reflectance")``.
+
 A tensor that has the dtype, shape and device of its parameter becomes the parameter itself. Other parameters are computed
 from the tensors by torch; they keep the values that were read, so only their gradients come from the tensors.
 """
@@ -33,7 +36,7 @@ _EXPECTED = (
 )
 
 #: Arrays of a mesh that are parameters only where they require gradients.
-_CORNERS = ("normals", "uvs")
+_VERTEX_ATTRIBUTES = ("normals", "uvs")
 
 Params = Mapping[str, Tensor]
 
@@ -44,13 +47,17 @@ def with_all_intrinsics(description: Description, tensors: DictTensors) -> Descr
     if not any(key[0] == "K" for key in tensors.under("camera")):
         return description
     values = {**camera.values, **angles(camera["K"], camera["size"])}
-    values |= {key: usual for key, usual in USUAL.items() if values[key] is None}
+    values |= {key: usual for key, usual in USUAL.items() if values[key] is None}  # so that they become parameters
     return replace(description, camera=ParsedParams(camera.kind, values, camera.given))
 
 
 def vertex_attributes_in(tensors: DictTensors) -> set[str]:
     """Return the dotted names of meshes' normals and texture coordinates that require gradients."""
-    return {_dotted(("shapes", *key[:2])) for key in tensors.under("shapes") if len(key) > 1 and key[1] in _CORNERS}
+    return {
+        _dotted(("shapes", *key[:2]))
+        for key in tensors.under("shapes")
+        if len(key) > 1 and key[1] in _VERTEX_ATTRIBUTES
+    }
 
 
 def params_from_tensors(
@@ -67,18 +74,18 @@ def params_from_tensors(
     Raises:
         SceneError: a tensor that requires gradients where no parameter depends on it.
     """
-    read = _Reading(tensors, description, built, params, next(iter(params.values())).device)
+    scene = _BuiltDict(tensors, description, built, params, next(iter(params.values())).device)
     found: dict[str, Tensor] = {}
-    for key in dict.fromkeys(map(_up_to_index, tensors.keys)):
-        made = dict(_dependent_params(key, read))
-        if not made and not _is_unused_texture(key, params):
+    for key in dict.fromkeys(map(_up_to_index, tensors.keys)):  # once for a list with several tensors
+        dependent = dict(_dependent_params(key, scene))
+        if not dependent and not _is_unused_texture(key, params):
             raise SceneError(_dotted(key), "a tensor that requires gradients", _EXPECTED, description.file)
-        found |= made
+        found |= dependent
     return {name: _cast_like(value, params[name]) for name, value in found.items()}
 
 
 @dataclass(frozen=True)
-class _Reading:
+class _BuiltDict:
     """The dict with its tensors, and the scene built from it."""
 
     tensors: DictTensors
@@ -88,7 +95,7 @@ class _Reading:
     device: torch.device
 
     def at(self, key: Key) -> Tensor:
-        """Return the value at a key as a tensor."""
+        """Return the value at a key of the dict as a tensor."""
         written = self.tensors.at(key)
         return written if isinstance(written, Tensor) else tensor_of(written, self.device)
 
@@ -120,63 +127,67 @@ def _cast_like(value: Tensor, own: Tensor) -> Tensor:
     return own + (value - value.detach()).to(own.dtype).expand_as(own)
 
 
-def _dependent_params(key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
+def _dependent_params(key: Key, scene: _BuiltDict) -> Iterator[tuple[str, Tensor]]:
     """Yield the parameters that depend on the value at a key, by name."""
     block = key[0]
     if block == "camera" and len(key) > 1:
-        yield from _camera(str(key[1]), read)
+        yield from _camera_params(str(key[1]), scene)
     elif block == "shapes" and len(key) > 2:
-        yield from _shape(str(key[1]), key, read)
+        yield from _shape_params(str(key[1]), key, scene)
     elif block == "lights" and len(key) > 2 and key[2] == "transform":
-        yield f"lights.{key[1]}.to_world", transform(read.tensors.at(key), read.device)
+        yield f"lights.{key[1]}.to_world", transform(scene.tensors.at(key), scene.device)
     elif block == "lights" and len(key) > 2:
         name = _dotted(key)
-        yield from _named(key, f"{name.removesuffix('.data')}.texels" if key[2] == "data" else name, read)
-        yield from _params_from_defaults(str(key[1]), read)
+        yield from _param_named(key, f"{name.removesuffix('.data')}.texels" if key[2] == "data" else name, scene)
+        yield from _params_from_defaults(str(key[1]), scene)
     elif block in ("materials", "textures"):
-        yield from _named(key, _dotted(key), read)
+        yield from _param_named(key, _dotted(key), scene)
 
 
-def _named(key: Key, name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
+def _param_named(key: Key, name: str, scene: _BuiltDict) -> Iterator[tuple[str, Tensor]]:
     """Yield the parameter of a name, or that of the texture whose ``data`` has the name."""
     for candidate in (name, name.removesuffix(".data")):
-        if candidate in read.params:
-            yield candidate, read.at(key)
+        if candidate in scene.params:
+            yield candidate, scene.at(key)
             return
 
 
-def _camera(name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
-    camera = read.description.camera
+def _camera_params(name: str, scene: _BuiltDict) -> Iterator[tuple[str, Tensor]]:
+    """Yield the parameters that depend on the camera's key ``name``."""
+    camera = scene.description.camera
     specs = parameters_of(camera.kind)
     if name in POSES:
-        yield "camera.to_world", posed(read.tensors.raw["camera"], read.device)
+        yield "camera.to_world", posed(scene.tensors.raw["camera"], scene.device)
     elif name == "K":
-        inner = tensor_of(read.tensors.at(("camera", "K")), read.device)
-        yield from ((f"camera.{number}", value) for number, value in numbers_of(inner, camera["size"]).items())
+        intrinsics = tensor_of(scene.tensors.at(("camera", "K")), scene.device)
+        yield from (
+            (f"camera.{parameter}", value) for parameter, value in numbers_of(intrinsics, camera["size"]).items()
+        )
     elif name in specs and specs[name].differentiable:
-        yield f"camera.{name}", read.at(("camera", name))
+        yield f"camera.{name}", scene.at(("camera", name))
 
 
-def _shape(name: str, key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
-    shape, part, stem = read.description.shapes[name], str(key[2]), f"shapes.{name}"
-    owners = [owner for owner in (*read.built.parts, *read.built.copies) if owner.shape == name]
+def _shape_params(name: str, key: Key, scene: _BuiltDict) -> Iterator[tuple[str, Tensor]]:
+    """Yield the parameters that depend on a key of the shape ``name``; a shape of several parts has several poses."""
+    shape, part, stem = scene.description.shapes[name], str(key[2]), f"shapes.{name}"
+    owners = [owner for owner in (*scene.built.parts, *scene.built.copies) if owner.shape == name]
     if part == "transform" or isinstance(parameters_of(shape.kind).get(part), Size | Place):
-        pose = _pose_of(name, shape, read)
+        pose = _pose_of(name, shape, scene)
         yield from ((f"{owner.name}.to_world", pose) for owner in owners)
-        yield from _file_light_params(stem, pose, read)
+        yield from _file_light_params(stem, pose, scene)
     elif part == "material":
-        rest = _dotted(key[3:])
-        for own in dict.fromkeys(owner.material.name for owner in owners):
-            yield from _named(key, f"{own}.{rest}", read)
-    elif part in ("vertices", *_CORNERS) and shape["displacement"] is None:
-        yield f"{stem}.{part}", read.at(key)
+        parameter = _dotted(key[3:])
+        for material in dict.fromkeys(owner.material.name for owner in owners):
+            yield from _param_named(key, f"{material}.{parameter}", scene)
+    elif part in ("vertices", *_VERTEX_ATTRIBUTES) and shape["displacement"] is None:
+        yield f"{stem}.{part}", scene.at(key)
     elif part == "emission":
-        yield from _named(key, _dotted(key), read)
+        yield from _param_named(key, _dotted(key), scene)
 
 
-def _pose_of(name: str, shape: ParsedParams, read: _Reading) -> Tensor:
+def _pose_of(name: str, shape: ParsedParams, scene: _BuiltDict) -> Tensor:
     """Return a shape's pose: its own size and position, then its transform."""
-    written, device = read.tensors.raw["shapes"][name], read.device
+    written, device = scene.tensors.raw["shapes"][name], scene.device
     operations, specs = written.get("transform"), parameters_of(shape.kind)
     pose = transform([] if operations is None else operations, device)
     sizes = {key: tensor_of(shape[key], device) for key, spec in specs.items() if isinstance(spec, Size | Place)}
@@ -184,25 +195,25 @@ def _pose_of(name: str, shape: ParsedParams, read: _Reading) -> Tensor:
     return pose @ shape.kind.own({**shape.values, **sizes}) if sizes else pose
 
 
-def _file_light_params(stem: str, pose: Tensor, read: _Reading) -> Iterator[tuple[str, Tensor]]:
+def _file_light_params(stem: str, pose: Tensor, scene: _BuiltDict) -> Iterator[tuple[str, Tensor]]:
     """Yield positions and directions of a mesh file's lights, which move with the mesh."""
-    way = pose @ torch.linalg.inv(pose.detach())  # the identity, with the derivative of the pose
-    for source in read.built.sources:
+    motion = pose @ torch.linalg.inv(pose.detach())  # the identity, with the derivative of the pose
+    for source in scene.built.sources:
         if not source.name.startswith(f"{stem}.lights."):
             continue
         for key in ("position", "target", "direction"):
             name = f"{source.name}.{key}"
-            if name in read.params:
-                value = read.params[name].double()
-                yield name, way[:3, :3] @ value + (0.0 if key == "direction" else way[:3, 3])
+            if name in scene.params:
+                value = scene.params[name].double()
+                yield name, motion[:3, :3] @ value + (0.0 if key == "direction" else motion[:3, 3])
 
 
-def _params_from_defaults(name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
+def _params_from_defaults(name: str, scene: _BuiltDict) -> Iterator[tuple[str, Tensor]]:
     """Yield parameters of a light whose defaults are functions of other parameters."""
-    light, written = read.description.lights[name], read.tensors.raw["lights"][name]
-    numbers = {key: value.to(read.device) for key, value in written.items() if isinstance(value, Tensor)}
+    light, written = scene.description.lights[name], scene.tensors.raw["lights"][name]
+    numbers = {key: value.to(scene.device) for key, value in written.items() if isinstance(value, Tensor)}
     for key, spec in parameters_of(light.kind).items():
-        if callable(spec.default) and key not in light.given and f"lights.{name}.{key}" in read.params:
+        if callable(spec.default) and key not in light.given and f"lights.{name}.{key}" in scene.params:
             value = spec.default({**light.values, **numbers})
             if isinstance(value, Tensor) and value.requires_grad:
                 yield f"lights.{name}.{key}", value

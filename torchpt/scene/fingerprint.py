@@ -1,6 +1,7 @@
 """Hash everything that a scene was built from: scenes whose pictures may differ have different hashes.
 
-Besides these hashes a picture depends on the settings only. Files are not read again: their loaded contents are hashed.
+Checkpoints and runs compare them. Besides these hashes a picture depends on the settings only. Files are not read again: their
+loaded contents are hashed.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from torchpt.scene.scene import Scene
 __all__ = ["fingerprint", "fingerprints"]
 
 #: By scene, its build and the hashes of it.
-_known: WeakKeyDictionary[Scene, tuple[SceneBuild, dict[str, str]]] = WeakKeyDictionary()
+_build_hashes_of: WeakKeyDictionary[Scene, tuple[SceneBuild, dict[str, str]]] = WeakKeyDictionary()
 
 
 def fingerprints(scene: Scene, params: Mapping[str, Tensor] | None = None) -> dict[str, str]:
@@ -47,21 +48,24 @@ def fingerprints(scene: Scene, params: Mapping[str, Tensor] | None = None) -> di
 
 def _build_hashes(scene: Scene) -> dict[str, str]:
     """Return the hashes of a scene's build, cached unless it has BSDFs of the caller, which may change."""
-    built, known = scene.built, _known.get(scene)
-    if known is not None and known[0] is built:
-        return known[1]
+    built = scene.built
+    if scene in _build_hashes_of:
+        hashed_build, hashes = _build_hashes_of[scene]
+        if hashed_build is built:
+            return hashes
     parts = {field.name: getattr(built, field.name) for field in fields(built)}
     del parts["parameters"]  # the values as loaded; the present ones are hashed with `params`
     found = _hashes(parts)
     if not scene.own_models:
-        _known[scene] = built, found
+        _build_hashes_of[scene] = built, found
     return found
 
 
 def _hashes(parts: Mapping[str, Any]) -> dict[str, str]:
+    """Return the hash of each part by name, in hexadecimal."""
     return {name: tree.fingerprint(part).hex() for name, part in parts.items()}
 
 
 def fingerprint(scene: Scene) -> str:
-    """Return one hash of a whole scene; see :func:`fingerprints`."""
+    """Return one hash of a whole scene: that of all its :func:`fingerprints`."""
     return tree.fingerprint(fingerprints(scene)).hex()

@@ -1,4 +1,8 @@
-"""Convert ``trimesh.Scene`` objects: meshes, materials, instances, lights and camera."""
+"""Convert ``trimesh.Scene`` objects: meshes, materials, instances, lights and camera.
+
+:func:`from_trimesh` (``torchpt.from_trimesh``) makes a scene dict, as a scene file would have it, and loads that. Trimesh's
+graph places each geometry at one or more nodes: the first becomes a mesh, further ones instances of it.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +26,14 @@ from torchpt.scene.sources import unique_labels
 
 __all__ = ["description_of", "from_trimesh"]
 
+#: Stands for the file in errors.
 _LABEL = "trimesh"
 #: From trimesh's camera space (looks along -z, +x right) to that of scenes (looks along +z, +x left).
 _CAMERA_AXES = np.diag([-1.0, 1.0, -1.0, 1.0])
 #: Field of view in degrees along the film's shorter side, for a source without a camera.
 _FOV = 45.0
+#: Margin about the object in that view, as a factor of its size.
+_MARGIN = 1.1
 
 
 def from_trimesh(
@@ -79,7 +86,7 @@ def description_of(source: Any) -> dict[str, Any]:
         source = trimesh.Scene({"mesh": source})
     if not isinstance(source, trimesh.Scene):
         raise AssetError(_LABEL, f"expected a trimesh.Trimesh or trimesh.Scene, got {type(source).__name__}")
-    shapes, glows = _shapes(source)
+    shapes, emits = _shapes(source)
     if not shapes:
         raise AssetError(_LABEL, "the scene is empty (no mesh with a face)")
     description: dict[str, Any] = {"shapes": shapes, **_view(source)}
@@ -87,29 +94,32 @@ def description_of(source: Any) -> dict[str, Any]:
     if lights:
         names = unique_labels([light.name for light in lights])
         description["lights"] = {name: _light(light) for name, light in zip(names, lights, strict=True)}
-    elif not glows:
+    elif not emits:
         description["lights"] = {"sky": {"type": "constant", "radiance": 1.0}}
     return description
 
 
 def _shapes(source: Any) -> tuple[dict[str, Any], bool]:
     """Return the shapes block, a ``mesh`` for a geometry's first node and ``instance`` for others; True if any emits."""
-    converter, shapes, glows = MaterialConverter(_LABEL), {}, False
-    nodes = list(placed_in(source))
-    first: dict[str, str] = {}
-    known: dict[str, list[MeshPart]] = {}
-    labels = unique_labels(["".join(c if c.isprintable() else "_" for c in node).strip() for node, _, _ in nodes])
+    converter, shapes, any_emits = MaterialConverter(_LABEL), {}, False
+    nodes = list(placed_in(source))  # (name of the node, name of its geometry, its transform)
+    first_label: dict[str, str] = {}  # by name of the geometry
+    parts: dict[str, list[MeshPart]] = {}  # by name of the geometry
+    labels = unique_labels(
+        ["".join(char if char.isprintable() else "_" for char in node).strip() for node, _, _ in nodes]
+    )
     for label, (_, name, matrix) in zip(labels, nodes, strict=True):
-        if name not in known:
-            known[name] = checked(parts_of(source.geometry[name], str(name)[:80], converter), Path(_LABEL))
-        emits = any("emission" in part.material.material for part in known[name] if part.material is not None)
-        glows |= emits
-        if name in first and not emits and is_usable(matrix):
-            shapes[label] = {"type": "instance", "of": first[name], "transform": [{"matrix": matrix.tolist()}]}
+        if name not in parts:
+            parts[name] = checked(parts_of(source.geometry[name], str(name)[:80], converter), Path(_LABEL))
+        emits = any("emission" in part.material.material for part in parts[name] if part.material is not None)
+        any_emits |= emits
+        # Instances cannot emit, and need a transform that has an inverse.
+        if name in first_label and not emits and is_usable(matrix):
+            shapes[label] = {"type": "instance", "of": first_label[name], "transform": [{"matrix": matrix.tolist()}]}
         else:
-            first.setdefault(name, label)
-            shapes[label] = {"type": "mesh", "mesh": known[name], "transform": [{"matrix": matrix.tolist()}]}
-    return shapes, glows
+            first_label.setdefault(name, label)
+            shapes[label] = {"type": "mesh", "mesh": parts[name], "transform": [{"matrix": matrix.tolist()}]}
+    return shapes, any_emits
 
 
 def _view(source: Any) -> dict[str, Any]:
@@ -122,10 +132,10 @@ def _view(source: Any) -> dict[str, Any]:
         matrix = np.array(source.camera_transform, np.float64)
         # A scale in the graph has no effect on a camera.
         matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-300)
-        across, down = (float(length) for length in camera.focal)
+        focal_x, focal_y = (float(length) for length in camera.focal)  # in pixels
         pose: dict[str, Any] = {"type": "perspective", "fov": float(camera.fov[0]), "fov_axis": "x"}
-        if abs(down / across - 1.0) > 1e-9:
-            pose["pixel_aspect"] = down / across
+        if abs(focal_y / focal_x - 1.0) > 1e-9:  # more than rounding
+            pose["pixel_aspect"] = focal_y / focal_x
         return {
             "camera": {**pose, "to_world": (matrix @ _CAMERA_AXES).tolist()},
             "film": {"width": width, "height": height},
@@ -133,7 +143,7 @@ def _view(source: Any) -> dict[str, Any]:
     corners = source.bounds
     if corners is None or not np.isfinite(corners).all():
         corners = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    matrix = look_at(np.array(corners, np.float64), fov=np.array([_FOV, _FOV]), pad=1.1)
+    matrix = look_at(np.array(corners, np.float64), fov=np.array([_FOV, _FOV]), pad=_MARGIN)
     pose = {"type": "perspective", "fov": _FOV, "fov_axis": "smaller"}
     return {"camera": {**pose, "to_world": (matrix @ _CAMERA_AXES).tolist()}}
 
@@ -145,6 +155,7 @@ def _light(light: FileLight) -> dict[str, Any]:
     else:
         place = {"position": light.position.tolist()}
     if light.kind == "spot":
-        far = max(1.0, math.sqrt(float(light.position @ light.position)))
-        place["target"] = (light.position + light.direction * far).tolist()
+        # As far as the light is from the origin, so that the difference of both points keeps the direction's precision.
+        distance = max(1.0, math.sqrt(float(light.position @ light.position)))
+        place["target"] = (light.position + light.direction * distance).tolist()
     return {"type": light.kind, **place, **light.numbers}

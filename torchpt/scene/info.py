@@ -1,4 +1,8 @@
-"""Describe a scene for ``torchpt info``: contents, data structures, and features that it does not use."""
+"""Describe a scene for ``torchpt info``: contents, data structures, and features that it does not use.
+
+:meth:`torchpt.scene.scene.Scene.info` calls :func:`describe`. In a *world*, the tensors that stages read, None stands for a
+feature that the scene does not use.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +30,24 @@ __all__ = ["describe"]
 def describe(
     description: Description, built: SceneBuild, world: World, accel: Accel, settings: Settings
 ) -> dict[str, Any]:
-    """Return a nested dict of plain values: ``scene``, ``shapes``, ``built``, ``left_out``, ``settings``."""
+    """Return a nested dict of plain values: ``scene``, ``shapes``, ``built``, ``left_out``, ``settings``.
+
+    Args:
+        description: the validated scene file.
+        built: parts, instances and lights built from it.
+        world: the world built from those.
+        accel: the search structure.
+        settings: complete settings.
+    """
     lights = world.lights
     shapes: dict[str, Any] = {}
-    brought: dict[str, dict[str, str]] = {}  # lights of mesh files, by shape
+    file_lights: dict[str, dict[str, str]] = {}  # kinds of the lights of mesh files by name, by shape
     for source in built.sources:
-        owner, _, label = source.name.rpartition(".lights.")
+        owner, _, label = source.name.rpartition(
+            ".lights."
+        )  # lights of mesh files are named `shapes.NAME.lights.LABEL`
         if owner:
-            brought.setdefault(owner.removeprefix("shapes."), {})[label] = source.kind
+            file_lights.setdefault(owner.removeprefix("shapes."), {})[label] = source.kind
     for part in built.parts:
         count = len(part.faces) if part.faces is not None else 1
         kind = part.kind if part.quadric is None else part.quadric.name
@@ -44,8 +58,8 @@ def describe(
             row["file"] = part.source
         if part.dropped:
             row["degenerate_faces_dropped"] = part.dropped
-        if part.shape in brought:
-            row["lights"] = brought.pop(part.shape)  # once for a shape of several parts
+        if part.shape in file_lights:
+            row["lights"] = file_lights.pop(part.shape)  # once for a shape of several parts
         if part.ignored:
             row["ignored_in_file"] = list(part.ignored)
         if part.faces is not None:
@@ -59,21 +73,19 @@ def describe(
             "of": copy.of.removeprefix("shapes."),
             "material": copy.material.name,
         }
-    memory = sum(x.numel() * x.element_size() for x in leaves(world))
-    made: dict[str, Any] = {
+    built_rows: dict[str, Any] = {
         "accel": accel.describe(),
         "bsdfs": _groups(world),
         "lights": {} if lights is None else _lights(lights),
-        "scene_bytes": memory,
+        "scene_bytes": _bytes(world),
     }
     reads = sum(table.count for table in world.textures.tables)
     if reads:
-        tensors = leaves(world.textures.tables)
-        made["textures"] = {"reads": reads, "bytes": sum(x.numel() * x.element_size() for x in tensors)}
+        built_rows["textures"] = {"reads": reads, "bytes": _bytes(world.textures.tables)}
     if built.centre.any():
-        made["origin_moved_to"] = built.centre.tolist()
+        built_rows["origin_moved_to"] = built.centre.tolist()
     if built.unit != 1.0:
-        made["unit_of_length"] = built.unit
+        built_rows["unit_of_length"] = built.unit
     return {
         "scene": {
             "file": description.file,
@@ -83,13 +95,19 @@ def describe(
             "parameters": len(built.parameters),
         },
         "shapes": shapes,
-        "built": made,
+        "built": built_rows,
         "left_out": _left_out(description, world, settings),
         "settings": settings.plain(),
     }
 
 
+def _bytes(record: Any) -> int:
+    """Return the bytes of all tensors in nested records."""
+    return sum(tensor.numel() * tensor.element_size() for tensor in leaves(record))
+
+
 def _lights(lights: Lights) -> dict[str, Any]:
+    """Describe the light table; an environment, which has its last row, may have details of its own."""
     found: dict[str, Any] = {"rows": len(lights.area), "kinds": list(lights.kinds)}
     if isinstance(lights.choice, TreeSampler):
         tree = lights.choice.tree
@@ -97,8 +115,8 @@ def _lights(lights: Lights) -> dict[str, Any]:
     elif lights.choice is not None:
         found["choice"] = "a fixed chance for each"
     last = LIGHTS.get(lights.kinds[-1])
-    if last is not None and issubclass(last, Environment) and (told := last.info(lights.environment)):
-        found[last.name] = told
+    if last is not None and issubclass(last, Environment) and (details := last.info(lights.environment)):
+        found[last.name] = details
     return found
 
 
@@ -112,7 +130,7 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
         absent.append("sorting by bsdf (one model)")
     if world.geometry.normals is None:
         absent.append("shading normals (all flat)")
-    if all(both is None for both in world.materials.two_sided):
+    if all(flags is None for flags in world.materials.two_sided):  # of each group: None where all are two-sided
         absent.append("one-sided materials")
     if world.materials.opacity is None:
         absent.append("opacity (every surface is met)")
@@ -160,24 +178,26 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
 
 
 def _groups(world: World) -> dict[str, int]:
-    """Return the number of materials by BSDF name, with the names of textured parameters."""
+    """Return the number of materials of each group, by BSDF name with the names of textured parameters."""
     found: dict[str, int] = {}
     for model, table, textures in zip(
         world.materials.models, world.materials.parameters, world.materials.textures, strict=True
     ):
         name, rows = str(model), _rows(table)
         if textures is not None:
-            maps = ["normal_map"] * (textures.normal is not None) + ["bump_map"] * (textures.bump is not None)
+            maps = ["normal_map"] if textures.normal is not None else []
+            maps += ["bump_map"] if textures.bump is not None else []
             name = f"{name}, textured: {', '.join([*_keys(textures.readings), *maps])}"
             bindings = leaves(textures)
             rows = max([rows, *(len(binding) for binding in bindings)])
-        while name in found:
+        while name in found:  # groups of different kinds of textures may have one name
             name += ", again"
         found[name] = rows
     return found
 
 
 def _keys(readings: dict[str, Any]) -> list[str]:
+    """Return the dotted names of textured parameters; those of a blend are nested."""
     found = []
     for key, value in readings.items():
         found += [f"{key}.{inner}" for inner in _keys(value)] if isinstance(value, dict) else [key]
@@ -187,4 +207,5 @@ def _keys(readings: dict[str, Any]) -> list[str]:
 def _rows(table: bsdfs.Parameters) -> int:
     """Return the number of materials in a model's stacked parameters."""
     found = leaves(table)
+    # Numbers and colours are (M,) or (3, M) for M materials, tables of a BSDF (M, ...).
     return max((value.shape[-1] if value.dim() < 2 or len(value) == 3 else len(value) for value in found), default=1)

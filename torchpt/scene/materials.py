@@ -1,11 +1,15 @@
-"""Resolve materials: open textures, build BSDFs and blends of them, and declare their parameters."""
+"""Resolve materials: open textures, build BSDFs and blends of them, and declare their parameters.
+
+A *slot* is a parameter that may have a texture in place of a number or colour; an opened texture is a *node*. A blend has two
+inner materials, written in place or named.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from torchpt.physics.bsdfs.base import made
+from torchpt.physics.bsdfs.base import made as model_and_values
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Parameters
 from torchpt.physics.textures import Node
@@ -37,21 +41,25 @@ def resolved(
         else resolved(item, f"{name}.{side}", materials, resolve)
         for side, item in inner_of(material).items()
     }
-    model, given = made(material.kind, {**material.values, **{side: slot.model for side, slot in inner.items()}})
+    # A blend takes the models of its inner materials in place of their names.
+    inner_models = {side: resolved_inner.model for side, resolved_inner in inner.items()}
+    model, model_values = model_and_values(material.kind, {**material.values, **inner_models})
 
     def opened(key: str, value: Any) -> Any:
+        """Return a value of the model, with a node in place of a texture; opacity and emission are not filtered."""
         if resolve is None or not isinstance(value, TextureInput):
             return value
         node = resolve(value, f"{name}.{key}")
         return node.at_points() if key in POINTS else node
 
     def common(key: str) -> Any:
+        """Return the value of a parameter that all materials have."""
         return opened(key, material[key])
 
     return ResolvedMaterial(
         model=model,
         name=name,
-        values={key: opened(key, value) for key, value in given.items()},
+        values={key: opened(key, value) for key, value in model_values.items()},
         two_sided=common("two_sided"),
         opacity=common("opacity"),
         alpha_cutoff=common("alpha_cutoff"),
@@ -65,7 +73,7 @@ def resolved(
 
 
 def declare(material: ResolvedMaterial, parameters: Parameters) -> None:
-    """Add a material's numbers to the parameters; opening a texture adds the texture's."""
+    """Add a material's numbers and colours to the parameters; those of its textures were added when they were opened."""
     specs = parameters_of(material.model)
     for key, value in material.own().items():
         if isinstance(value, float | tuple):

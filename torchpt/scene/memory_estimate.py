@@ -1,6 +1,9 @@
 """Estimate the memory of a render beside its scene, in bytes.
 
-The constants are measured (docs/guides/stability.md). :mod:`torchpt.core.memory` handles shortage.
+A render compares the estimate with ``render.max_memory`` before it begins, and cuts its waves (paths traced together) to what
+is left; :mod:`torchpt.core.memory` handles shortage. Stages run in one of three *modes*: ``eager`` (tensor operations),
+``compiled`` (kernels) or ``tape`` (tensor operations recorded by autograd). The constants are measured
+(docs/guides/stability.md).
 """
 
 from __future__ import annotations
@@ -34,25 +37,27 @@ BYTES_PER_LANE = 640
 #: Fewest lanes for which another thread of kernels pays.
 FEWEST_OF_KERNELS = 1024
 #: Bytes of machine code and tables of libraries, loaded on the first call of a process, by mode.
-CODE = {"eager": 75_000_000, "compiled": 54_000_000, "tape": 100_000_000}
-#: Bytes of numba, which only some renders import.
-NUMBA = 60_000_000
+CODE_OF_MODE = {"eager": 75_000_000, "compiled": 54_000_000, "tape": 100_000_000}
+#: Bytes of numba, which renders by tensor operations import for the search.
+CODE_OF_NUMBA = 60_000_000
 #: Bytes of the machine code of a BSDF model, in addition.
 CODE_OF_MODEL = 3_000_000
-#: Bytes of a pixel while the picture is computed from the films: plain, with error probes, adaptive, with variance layers.
-PICTURE, PILOTS, ADAPTIVE, VARIANCE = 64, 225, 160, 160
-#: Bytes of a pixel of the finished pictures; and size of films that is allocated without looking at free memory.
-PICTURES, SMALL = 80, 2**28
-#: Factor and bytes that are added to the estimate.
+#: Bytes of a pixel while the picture is computed from the films: plain, with error probes, adaptive, with the AOV variance.
+PICTURE_BYTES, PROBES_BYTES, ADAPTIVE_BYTES, VARIANCE_BYTES = 64, 225, 160, 160
+#: Bytes of a pixel of the finished pictures.
+FINISHED_BYTES = 80
+#: Bytes of a film that is allocated without looking at free memory.
+SMALL_FILM = 2**28
+#: Factor of the estimate, and bytes added to it: the spread of what was measured.
 SLACK, SPARE = 1.04, 3_000_000
 
 #: Modes that have run in this process, whose code is loaded.
-_ran: set[str] = set()
+_loaded_modes: set[str] = set()
 
 
-def mark_loaded(how: str) -> None:
-    """Record that the code of a mode is loaded."""
-    _ran.add(how)
+def mark_loaded(mode: str) -> None:
+    """Record that the code of a mode (``eager``, ``compiled`` or ``tape``) is loaded."""
+    _loaded_modes.add(mode)
 
 
 @dataclass(frozen=True)
@@ -62,8 +67,8 @@ class MemoryEstimate:
     Attributes:
         films: sums of samples, during the whole render.
         code: code that the render loads.
-        waves: a wave of the fewest lanes.
-        picture: the pictures, at the end.
+        waves: a wave of the fewest lanes that a render uses.
+        picture: the pictures, which are computed at the end, when the wave is gone.
     """
 
     films: int
@@ -76,45 +81,48 @@ class MemoryEstimate:
         return int(SLACK * (held + self.films + self.code + max(self.waves, self.picture))) + SPARE
 
     def backward_bytes(self, held: int) -> int:
-        """Return the smallest limit of a backward pass, which has neither films nor a picture."""
+        """Return the smallest limit of a backward pass, which has neither films nor a picture; ``held`` as in :meth:`least`."""
         return int(SLACK * (held + self.code + self.waves)) + SPARE
 
     def left(self, limit: int, held: int) -> int:
-        """Return the bytes of a limit that are left for waves."""
+        """Return the bytes of a limit that are left for waves, where the process holds ``held`` bytes."""
         return limit - held - self.films - self.code - self.picture
 
 
-def memory_estimate(settings: Settings, device: torch.device, how: str, models: int, rows: int = 0) -> MemoryEstimate:
+def memory_estimate(settings: Settings, device: torch.device, mode: str, models: int, rows: int = 0) -> MemoryEstimate:
     """Estimate the memory of a render.
 
     Args:
         settings: complete.
         device: device of the lanes; other devices than the CPU hold no code.
-        how: the mode: ``eager``, ``compiled`` or ``tape``.
+        mode: the mode: ``eager``, ``compiled`` or ``tape``.
         models: number of BSDF models.
         rows: 32-bit numbers per lane in the workspace of a thread of kernels.
     """
     _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
     pixels = width * height
     channels = [len(layer.channels) for layer in surface_layers(settings).values()]
-    films = Film.bytes_of(1, settings.streams, splats=settings.integrator.splats) + sum(16 * c + 8 for c in channels)
-    picture = PICTURE
+    # Bytes of a pixel, as in `Film.bytes_of`: of each layer two float64 a channel (first samples, sums) and a count.
+    films = Film.bytes_of(1, settings.streams, splats=settings.integrator.splats)
+    films += sum(16 * count + 8 for count in channels)
+    picture = PICTURE_BYTES
     if "variance" in settings.film.aovs:
-        picture = VARIANCE
+        picture = VARIANCE_BYTES
     elif settings.pilots:
-        picture = ADAPTIVE if settings.adaptive else PILOTS
-    picture += sum(8 * c + 4 for c in channels)
-    code = 0 if how in _ran else CODE[how] + (CODE_OF_MODEL * models if how == "compiled" else 0)
-    if how != "compiled" and "numba" not in sys.modules:
-        code += NUMBA
+        picture = ADAPTIVE_BYTES if settings.adaptive else PROBES_BYTES
+    picture += sum(8 * count + 4 for count in channels)
+    code = 0 if mode in _loaded_modes else CODE_OF_MODE[mode] + (CODE_OF_MODEL * models if mode == "compiled" else 0)
+    if mode != "compiled" and "numba" not in sys.modules:
+        code += CODE_OF_NUMBA
     if device.type != "cpu":
         code = 0
-    waves = FEWEST_OF_KERNELS * 4 * rows if how == "compiled" else FIRST_WAVE_LANES * 2 * BYTES_PER_LANE
+    # Kernels have `rows` numbers of 4 bytes a lane. Tensor operations get twice their measured bytes in the first, small wave.
+    waves = FEWEST_OF_KERNELS * 4 * rows if mode == "compiled" else FIRST_WAVE_LANES * 2 * BYTES_PER_LANE
     return MemoryEstimate(pixels * films, code, waves, pixels * picture)
 
 
 def check_film(
-    width: int, height: int, streams: int, layers: Sequence[int], device: torch.device, splats: bool = False
+    width: int, height: int, streams: int, layers: Sequence[int], device: torch.device, *, splats: bool = False
 ) -> None:
     """Raise for a film that does not fit into memory, before it is allocated (the system would kill the process).
 
@@ -133,8 +141,8 @@ def check_film(
     needed = Film.bytes_of(pixels, streams, splats=splats) + sum(
         Film.bytes_of(pixels, 1, channels) for channels in layers
     )
-    needed += PICTURES * pixels
-    if needed < SMALL:
+    needed += FINISHED_BYTES * pixels
+    if needed < SMALL_FILM:
         return
     free = free_memory(device)
     if free is not None and needed > free:

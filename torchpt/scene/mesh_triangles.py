@@ -1,4 +1,8 @@
-"""Load the triangles of mesh shapes, and warn of refracting shapes that touch."""
+"""Load the triangles of mesh shapes, and warn of refracting shapes that touch.
+
+:mod:`torchpt.scene.shapes` loads meshes by this module; :func:`torchpt.scene.build.build_parts` calls the warning once all
+parts exist.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +29,10 @@ __all__ = ["MOST_FACES", "Mesh", "ignored", "mesh_of", "solid", "warn_of_coplana
 # ---- Triangles of a shape: reading, displacement, removal of faces without area
 
 
-#: Most faces of a displaced mesh.
+#: Most faces of a displaced mesh: its arrays take a GiB or more.
 MOST_FACES = 20_000_000
+#: Smallest squared area of a parallelogram whose longest edge coordinate is 1: an angle of 1e-12 between the edges of a face.
+_SMALLEST_SQUARE = 1e-24
 
 
 @dataclass(frozen=True)
@@ -64,7 +70,7 @@ def mesh_of(
         path = description.resolve(triangles.path, f"{key}.path")
         pieces, source = load_mesh(path, materials=materials), str(path)
     elif isinstance(triangles.object, tuple):
-        pieces, source = list(triangles.object), "trimesh"
+        pieces, source = list(triangles.object), "trimesh"  # parts that `from_trimesh` has made already
     elif triangles.object is not None:
         from torchpt.scene.meshes.trimesh_objects import mesh_parts_of
 
@@ -72,7 +78,7 @@ def mesh_of(
     else:
         assert triangles.vertices is not None and triangles.faces is not None
         arrays = (triangles.vertices, triangles.faces, triangles.normals, triangles.uvs)
-        pieces, source = [MeshPart("", *arrays, None)], ""
+        pieces, source = [MeshPart("", *arrays)], ""
     if triangles.displacement is not None:
         pieces = [_displaced(piece, triangles.displacement, key, texture_loader, source) for piece in pieces]
     return Mesh(pieces, source, triangles.flat)
@@ -90,7 +96,7 @@ def _displaced(
             if source
             else SceneError(key, "a mesh without uvs", "uvs beside it", texture_loader.file)
         )
-    faces = len(piece.faces) * 4 ** displacement["subdivisions"]
+    faces = len(piece.faces) * 4 ** displacement["subdivisions"]  # each subdivision splits a face into four
     if faces > MOST_FACES:
         expected = f"at most {MOST_FACES:,} faces ({faces:,} are asked for)"
         raise SceneError(f"{key}.subdivisions", displacement["subdivisions"], expected, texture_loader.file)
@@ -117,8 +123,8 @@ def _camera_text(camera: FileCamera, pose: np.ndarray) -> str:
 
 
 def solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the faces that have an area, and the number of the others."""
-    columns = pose[:3, :3] @ piece.vertices.T
+    """Return the faces ``(F, 3)`` that have an area under ``pose (4, 4)``, and the number of the others."""
+    columns = pose[:3, :3] @ piece.vertices.T  # (3, V); a translation changes no area
     p0, p1, p2 = (columns[:, piece.faces[:, k]] for k in range(3))
     first, second = p1 - p0, p2 - p0
     # Relative to the longest edge, so that the test does not depend on a mesh's size.
@@ -126,7 +132,7 @@ def solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
     safe = np.where(longest > 0, longest, 1.0)
     (ax, ay, az), (bx, by, bz) = first / safe, second / safe
     square = (ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2
-    kept = (longest > 0) & (square > 1e-24)
+    kept = (longest > 0) & (square > _SMALLEST_SQUARE)
     return np.ascontiguousarray(piece.faces[kept]), int((~kept).sum())
 
 
@@ -135,12 +141,14 @@ def solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
 
 Array = NDArray[np.float64]
 
-#: Largest distance of two planes that count as one, relative to the scene's extent; largest difference of their normals.
-NEAR, ALIKE = 1e-6, 1e-5
-#: Most pairs of faces that are tested.
-PAIRS = 2_000_000
-#: Cost of a face in pairs.
-FACE = 100
+#: Largest distance of two planes that count as one, relative to the scene's extent: some times the rounding of float32.
+MAX_PLANE_DISTANCE = 1e-6
+#: Largest difference, by component, of the unit normals of two planes that count as one.
+MAX_NORMAL_DIFFERENCE = 1e-5
+#: Most pairs of faces that are tested for two parts, so that the warning costs little of a load.
+MAX_PAIRS = 2_000_000
+#: The loop over faces takes as long for a face as the test of so many pairs.
+PAIRS_PER_FACE = 100
 #: Corners of a rectangle in its own space.
 _SQUARE = np.array([[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]])
 #: Polygon for a disk in its own space; it deviates from the circle by at most 0.0012 radii.
@@ -161,23 +169,26 @@ def warn_of_coplanar_refraction(parts: Sequence[Part], copies: Sequence[Copy], f
     Warns:
         EnergyWarning: once for each pair of such shapes.
     """
-    faces = list(_refracting(parts, copies))
+    faces = list(_refracting_faces(parts, copies))
     if len({one.shape for one in faces}) < 2:
         return
     points = np.concatenate([one.corners.reshape(-1, 3) for one in faces])
     centre, extent = 0.5 * (points.max(0) + points.min(0)), float(np.ptp(points, axis=0).max())
     if not extent > 0.0:
         return
-    scaled = [_Faces(one.shape, (one.corners - centre) / extent) for one in faces]
+    scaled = [
+        _Faces(one.shape, (one.corners - centre) / extent) for one in faces
+    ]  # in a box of side 1 about the origin
     boxes = [(one.corners.min((0, 1)), one.corners.max((0, 1))) for one in scaled]
-    told: set[tuple[str, str]] = set()
+    warned: set[tuple[str, str]] = set()
     for i, j in combinations(range(len(scaled)), 2):
         pair = scaled[i].shape, scaled[j].shape
-        apart = (boxes[i][0] > boxes[j][1] + NEAR).any() or (boxes[j][0] > boxes[i][1] + NEAR).any()
-        if pair[0] == pair[1] or pair in told or apart:
+        (low_i, high_i), (low_j, high_j) = boxes[i], boxes[j]
+        apart = (low_i > high_j + MAX_PLANE_DISTANCE).any() or (low_j > high_i + MAX_PLANE_DISTANCE).any()
+        if pair[0] == pair[1] or pair in warned or apart:
             continue
         if _overlap(scaled[i].corners, scaled[j].corners):
-            told.add(pair)
+            warned.add(pair)
             where = f"{file}: {pair[0]}" if file else pair[0]
             warn_caller(
                 f"{where}: refracts and lies on {pair[1]}, which refracts too: rays meet one of the two surfaces only, and "
@@ -186,15 +197,16 @@ def warn_of_coplanar_refraction(parts: Sequence[Part], copies: Sequence[Copy], f
             )
 
 
-def _refracting(parts: Sequence[Part], copies: Sequence[Copy]) -> Iterator[_Faces]:
-    known = {part.name: part for part in parts}
+def _refracting_faces(parts: Sequence[Part], copies: Sequence[Copy]) -> Iterator[_Faces]:
+    """Yield the flat faces of all parts and copies that have a refracting material."""
+    part_by_name = {part.name: part for part in parts}
     for part in parts:
         if any(material.model.refracts for material in part.material.all()):
             pose = part.to_world if part.local is None else part.to_world @ part.local
             yield from _faces(part.name, part, pose)
     for copy in copies:
-        if copy.of in known and any(material.model.refracts for material in copy.material.all()):
-            yield from _faces(copy.name, known[copy.of], copy.to_world)
+        if copy.of in part_by_name and any(material.model.refracts for material in copy.material.all()):
+            yield from _faces(copy.name, part_by_name[copy.of], copy.to_world)
 
 
 def _faces(name: str, part: Part, pose: Array) -> Iterator[_Faces]:
@@ -212,7 +224,10 @@ def _moved(corners: Array, pose: Array) -> Array:
 
 
 def _planes(corners: Array) -> Array:
-    """Return unit normals and distances of planes ``(F, 4)``, with the sign of normals made unique."""
+    """Return unit normals and distances from the origin ``(F, 4)`` of the planes of faces ``(F, K, 3)``.
+
+    The largest component of a normal is made positive, so that both sides of a plane give the same numbers.
+    """
     a, b, c = (corners[:, k * corners.shape[1] // 3] for k in range(3))  # corners far apart from each other
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
@@ -223,36 +238,44 @@ def _planes(corners: Array) -> Array:
 
 
 def _overlap(a: Array, b: Array) -> bool:
-    """Return True where a face of ``a`` and one of ``b`` are coplanar and overlap."""
-    low, high = np.maximum(a.min((0, 1)), b.min((0, 1))) - NEAR, np.minimum(a.max((0, 1)), b.max((0, 1))) + NEAR
-    a, b = (x[((x.max(1) >= low) & (x.min(1) <= high)).all(1)] for x in (a, b))  # faces within both boxes
-    budget = PAIRS
-    first, second = _planes(a), _planes(b)
-    order = np.argsort(second[:, 3])
-    b, second = b[order], second[order]
-    starts = np.searchsorted(second[:, 3], first[:, 3] - NEAR)
-    ends = np.searchsorted(second[:, 3], first[:, 3] + NEAR, "right")
+    """Return True where a face of ``a (F, K, 3)`` and one of ``b (G, L, 3)`` are coplanar and overlap.
+
+    Faces of ``b`` are sorted by the distance of their plane, so that those near a face of ``a`` are a slice.
+    """
+    low = np.maximum(a.min((0, 1)), b.min((0, 1))) - MAX_PLANE_DISTANCE
+    high = np.minimum(a.max((0, 1)), b.max((0, 1))) + MAX_PLANE_DISTANCE
+    # Faces within both boxes.
+    a, b = (faces[((faces.max(1) >= low) & (faces.min(1) <= high)).all(1)] for faces in (a, b))
+    budget = MAX_PAIRS
+    a_planes, b_planes = _planes(a), _planes(b)
+    order = np.argsort(b_planes[:, 3])
+    b, b_planes = b[order], b_planes[order]
+    starts = np.searchsorted(b_planes[:, 3], a_planes[:, 3] - MAX_PLANE_DISTANCE)
+    ends = np.searchsorted(b_planes[:, 3], a_planes[:, 3] + MAX_PLANE_DISTANCE, "right")
     for k in np.flatnonzero(ends > starts):
         near = slice(int(starts[k]), int(ends[k]))
-        budget -= near.stop - near.start + FACE
-        alike = np.abs(second[near, :3] - first[k, :3]).max(1) <= ALIKE
-        if alike.any() and _overlaps_any(a[k], b[near][alike], first[k, :3]):
+        budget -= near.stop - near.start + PAIRS_PER_FACE
+        parallel = np.abs(b_planes[near, :3] - a_planes[k, :3]).max(1) <= MAX_NORMAL_DIFFERENCE
+        if parallel.any() and _overlaps_any(a[k], b[near][parallel], a_planes[k, :3]):
             return True
-        if budget < 0:
+        if budget < 0:  # rather no warning than a long load
             break
     return False
 
 
 def _overlaps_any(face: Array, others: Array, normal: Array) -> bool:
-    """Return True where a convex face ``(K, 3)`` overlaps any of ``(M, L, 3)`` in its plane (separating axis test)."""
+    """Return True where a convex face ``(K, 3)`` overlaps any of ``(M, L, 3)`` in its plane (separating axis test).
+
+    Two convex polygons are apart if along the normal of some side of either their projections do not overlap.
+    """
     axis = int(np.abs(normal).argmax())
-    keep = [k for k in range(3) if k != axis]
-    p, q = face[:, keep], others[:, :, keep]
-    parted = np.zeros(len(q), bool)
+    keep = [k for k in range(3) if k != axis]  # project to the coordinate plane that the faces are most parallel to
+    p, q = face[:, keep], others[:, :, keep]  # (K, 2), (M, L, 2)
+    separated = np.zeros(len(q), bool)
     for sides in (np.broadcast_to(np.roll(p, -1, 0) - p, (len(q), *p.shape)), np.roll(q, -1, 1) - q):
         across = np.stack((-sides[..., 1], sides[..., 0]), -1)
         across = across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-30)
         own, their = np.einsum("mkc,jc->mkj", across, p), np.einsum("mkc,mjc->mkj", across, q)
         gap = np.maximum(own.min(-1) - their.max(-1), their.min(-1) - own.max(-1))
-        parted |= (gap >= -NEAR).any(1)
-    return bool((~parted).any())
+        separated |= (gap >= -MAX_PLANE_DISTANCE).any(1)
+    return bool((~separated).any())

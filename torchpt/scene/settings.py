@@ -1,4 +1,10 @@
-"""Settings of a render (film, integrator, sampler, render): built-in default < scene file < override."""
+"""Settings of a render (film, integrator, sampler, render): built-in default < scene file < override.
+
+:func:`merge` makes :class:`Settings` of these three. A setting is declared by a *spec* (:mod:`torchpt.spec`), which has
+default, range and text of the docs. Blocks that name a type (``integrator``, ``sampler``, ``film.filter``) have the parameters
+of that type; the blocks ``film`` and ``render`` are records here. A *role* says whether samples depend on a setting
+(``Role.FREE``: none does), whether it may end a render (``Role.ENDS``), and whether it names files to write (``Role.FILES``).
+"""
 
 from __future__ import annotations
 
@@ -52,15 +58,17 @@ __all__ = [
     "settings_with",
 ]
 
+#: The blocks of settings.
 BLOCKS = ("film", "integrator", "sampler", "render")
+#: Most pixels along a side of the film, and on all of it: 2^28 pixels take some GiB of sums, beyond what a film is used for.
 MAX_SIDE = 65_536
 MAX_PIXELS = 2**28
 #: With the AOV ``variance``, samples are split over four randomizations from this many samples a pixel on, below over two.
 #: More randomizations make Sobol' points less effective (Cornell box, 64 spp: relMSE 0.38, 0.50, 0.58 of independent sampling
 #: for one, two, four), but a pixel's variance less noisy.
 MANY_SAMPLES = 256
-#: The largest `render.seed`.
-MOST_SEED = 2**63 - 1
+#: The largest `render.seed`: seeds are int64.
+MAX_SEED = 2**63 - 1
 
 
 #: Blocks with a type: the table of kinds, and the default type.
@@ -71,8 +79,11 @@ TYPED_BLOCKS: dict[str, tuple[Mapping[str, Any], str]] = {
 }
 
 
+# Readers of single settings: each returns the value in its final form, or raises Refused with what is accepted.
+
+
 def _crop(value: Any) -> tuple[int, int, int, int]:
-    if not isinstance(value, list | tuple) or len(value) != 4 or not all(type(x) is int for x in value):
+    if not isinstance(value, list | tuple) or len(value) != 4 or not all(type(number) is int for number in value):
         raise Refused("[x, y, width, height], whole numbers of pixels")
     x, y, width, height = value
     if x < 0 or y < 0 or width < 1 or height < 1:
@@ -139,14 +150,18 @@ class Film(FrozenConfig):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`FrozenConfig`."""
-        wide, high, crop = values["width"], values["height"], values["crop"]
-        if wide * high > MAX_PIXELS:
-            raise Refused(f"a film of at most {MAX_PIXELS} pixels", [wide, high], ("width",))
-        if crop is not None and (crop[0] + crop[2] > wide or crop[1] + crop[3] > high):
-            raise Refused(f"a crop inside the film of {wide} x {high} pixels", list(crop), ("crop",))
+        """Refuse a film of too many pixels, and a crop that reaches beyond it; see :class:`FrozenConfig`."""
+        width, height, crop = values["width"], values["height"], values["crop"]
+        if width * height > MAX_PIXELS:
+            raise Refused(f"a film of at most {MAX_PIXELS} pixels", [width, height], ("width",))
+        if crop is None:
+            return
+        left, top, crop_width, crop_height = crop
+        if left + crop_width > width or top + crop_height > height:
+            raise Refused(f"a crop inside the film of {width} x {height} pixels", list(crop), ("crop",))
 
 
+#: Names of devices: auto, cpu, cuda, cuda:N.
 _DEVICE = re.compile(r"(auto|cpu|cuda|cuda:[0-9]{1,3})\Z")
 
 
@@ -170,22 +185,25 @@ def _file(value: Any) -> str:
 
 #: Methods for gradients, the default first.
 ADJOINTS = ("replay", "autograd")
+#: Phrases of what is accepted.
 _TYPE = "a type, or a mapping with `type` and its settings"
 _FILE = "null or a file path"
 
 
-def _whole(low: int, doc: str) -> Argument:
+def _whole_number(low: int, doc: str) -> Argument:
+    """Return the spec of an argument that is a whole number, by default None."""
     words = f"a whole number >= {low}"
     return Argument(None, fits=lambda value: type(value) is int and value >= low, words=words, doc=doc)
 
 
-def _truth(default: bool, doc: str) -> Argument:
+def _flag(doc: str, *, default: bool) -> Argument:
+    """Return the spec of an argument that is True or False."""
     return Argument(default, fits=lambda value: type(value) is bool, words="True or False", doc=doc)
 
 
 # The arguments of `render`, and with them the block `render`: each is declared here only. Signatures, `help`, checks, keys of
 # the command line, files of configs/ and tables of the docs are generated from this (`scripts/make_configs.py`,
-# `scripts/make_tables.py`).
+# `scripts/make_tables.py`). A spec of type Argument belongs to Python calls alone; all others are settings of scene files too.
 
 
 class _SampleOptions(TypedDict, total=False):
@@ -262,12 +280,12 @@ class TraceOptions(TypedDict, total=False):
     ]
     seed_grad: Annotated[
         int | None,
-        _whole(
+        _whole_number(
             0, "of the backward pass; none: one of its own, as shared samples would bias the gradient of a squared loss"
         ),
     ]
     spp_grad: Annotated[
-        int | None, _whole(1, "samples a pixel of the backward pass; none: as many as the forward pass took")
+        int | None, _whole_number(1, "samples a pixel of the backward pass; none: as many as the forward pass took")
     ]
 
 
@@ -322,11 +340,11 @@ class BatchOptions(_SampleOptions, TraceOptions, total=False):
         Flag(False, doc="whether to go on from the checkpoint, where there is one", role=Role.FILES | Role.FREE),
     ]
     edges: Annotated[
-        bool, _truth(True, "whether silhouettes and shadow edges that move are differentiated; False warns")
+        bool, _flag("whether silhouettes and shadow edges that move are differentiated; False warns", default=True)
     ]
     edge_spp: Annotated[
         int | None,
-        _whole(1, "samples a pixel of each estimator of edges; none: as many as the backward pass takes"),
+        _whole_number(1, "samples a pixel of each estimator of edges; none: as many as the backward pass takes"),
     ]
     ranks: Annotated[
         Group | None,
@@ -342,7 +360,7 @@ class BatchOptions(_SampleOptions, TraceOptions, total=False):
 class CommonOptions(BatchOptions, total=False):
     """Arguments of :func:`torchpt.render` beside the scene and ``full``."""
 
-    seed: Annotated[int | None, Integer(0, high=MOST_SEED, doc="the same seed gives the same picture")]
+    seed: Annotated[int | None, Integer(0, high=MAX_SEED, doc="the same seed gives the same picture")]
     params: Annotated[
         Mapping[str, Tensor] | None,
         Argument(
@@ -360,7 +378,7 @@ class RenderOptions(CommonOptions, total=False):
 
     full: Annotated[
         bool,
-        _truth(False, "True: a torchpt.Rendering: picture, layers, error, counts and seconds as one object"),
+        _flag("True: a torchpt.Rendering: picture, layers, error, counts and seconds as one object", default=False),
     ]
 
 
@@ -372,7 +390,7 @@ class Render(FrozenConfig):
 
     parameters: ClassVar = {
         **{name: _ARGUMENTS[name] for name in ("spp", "seed")},  # first in tables
-        **{name: s for name, s in _ARGUMENTS.items() if name not in BLOCKS and not isinstance(s, Argument)},
+        **{name: spec for name, spec in _ARGUMENTS.items() if name not in BLOCKS and not isinstance(spec, Argument)},
         "preview": Custom(
             None,
             reader=_file,
@@ -385,8 +403,8 @@ class Render(FrozenConfig):
     @property
     def stops(self) -> dict[str, Any]:
         """Return the stop rules that are set, other than ``spp``, by name."""
-        every = {name: getattr(self, name) for name in settings_with(Role.ENDS)["render"]}
-        return {name: value for name, value in every.items() if value is not None}
+        rules = {name: getattr(self, name) for name in settings_with(Role.ENDS)["render"]}
+        return {name: value for name, value in rules.items() if value is not None}
 
     def without(self, role: Role) -> Render:
         """Return a copy in which the settings of a role have their defaults."""
@@ -396,7 +414,7 @@ class Render(FrozenConfig):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """See :class:`FrozenConfig`."""
+        """Refuse ``resume`` without a checkpoint; see :class:`FrozenConfig`."""
         if values["resume"] and values["checkpoint"] is None:
             raise Refused("false without render.checkpoint, the file to go on from", True, ("resume",))
 
@@ -404,11 +422,11 @@ class Render(FrozenConfig):
 class CallArguments(FrozenConfig):
     """The arguments of :func:`torchpt.render` that are no settings of a scene file."""
 
-    parameters: ClassVar = {name: s for name, s in _ARGUMENTS.items() if isinstance(s, Argument)}
+    parameters: ClassVar = {name: spec for name, spec in _ARGUMENTS.items() if isinstance(spec, Argument)}
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> CallArguments:
-        """Read such arguments.
+        """Read these arguments from all ``options`` of a call by name; others are passed over.
 
         Raises:
             SceneError: a value that is not accepted.
@@ -424,8 +442,8 @@ class CallArguments(FrozenConfig):
 
 def settings_of_call(options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings among the arguments of a call, by block, without the device, which belongs to the scene."""
-    own = {name: options.get(name) for name in Render.parameters if name in _ARGUMENTS and name != "device"}
-    return {**{name: options.get(name) for name in BLOCKS}, "render": own}
+    render = {name: options.get(name) for name in Render.parameters if name in _ARGUMENTS and name != "device"}
+    return {**{name: options.get(name) for name in BLOCKS}, "render": render}
 
 
 #: The blocks without a type.
@@ -435,7 +453,7 @@ UNTYPED_BLOCKS: Mapping[str, type[FrozenConfig]] = {"film": Film, "render": Rend
 def settings_with(role: Role, but: Role = Role.NONE) -> dict[str, tuple[str, ...]]:
     """Return the names of settings with a role, by block, without those that also have the role ``but``."""
     return {
-        block: tuple(name for name, s in parameters_of(record).items() if s.role & role and not s.role & but)
+        block: tuple(name for name, spec in parameters_of(record).items() if spec.role & role and not spec.role & but)
         for block, record in UNTYPED_BLOCKS.items()
     }
 
@@ -463,11 +481,15 @@ class Settings:
 
     @property
     def pilots(self) -> bool:
-        """Return True where error probes are sampled; ``auto``: where adaptive sampling or ``target_error`` needs them."""
+        """Return True where error probes are sampled; ``auto``: where adaptive sampling or ``target_error`` needs them.
+
+        There are none for integrators whose picture is no radiance (``light`` is False) or whose samples light other pixels
+        than their own (``splats``), nor beside the AOV ``variance``, which tells the error by itself.
+        """
         if not self.integrator.light or self.integrator.splats or "variance" in self.film.aovs:
             return False
-        asked = self.adaptive or self.render.target_error is not None
-        return asked if self.render.pilots == "auto" else bool(self.render.pilots)
+        needed = self.adaptive or self.render.target_error is not None
+        return needed if self.render.pilots == "auto" else bool(self.render.pilots)
 
     @property
     def streams(self) -> int:
@@ -482,20 +504,22 @@ class Settings:
 
     def plain(self, without: Mapping[str, Collection[str]] = MappingProxyType({})) -> dict[str, Any]:
         """Return the settings as plain values in the form of a scene file, without the keys ``without``, by block."""
-        told = {name: _plain(getattr(self, name)) for name in BLOCKS}
+        blocks = {name: _plain(getattr(self, name)) for name in BLOCKS}
         return {
-            block: {k: v for k, v in keys.items() if k not in without.get(block, ())} for block, keys in told.items()
+            block: {key: value for key, value in values.items() if key not in without.get(block, ())}
+            for block, values in blocks.items()
         }
 
 
 def _plain(value: Any) -> Any:
+    """Return a record, or a type with its parameters, as a mapping in the form of a scene file; other values unchanged."""
     if not isinstance(value, FrozenConfig | ParsedParams):
         return value
     kind = {"type": value.name} if hasattr(value, "name") else {}
     return kind | {key: _plain(item) for key, item in value.values.items()}
 
 
-def _set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
+def _keys_that_are_set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
     """Return the keys of a block that are not null; a bare name stands for a block of that type."""
     if raw is None:
         return {}
@@ -506,9 +530,9 @@ def _set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
     return {str(name): value for name, value in raw.items() if value is not None}
 
 
-def _overlay(what: str, below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Merge a block over another; where the type changes, keys that the new type does not have are dropped from ``below``."""
-    table, default = TYPED_BLOCKS[what]
+def _merge_typed(block: str, below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Merge a typed block over another; where the type changes, ``below`` loses keys that the new type does not have."""
+    table, default = TYPED_BLOCKS[block]
     before, after = below.get("type", default), above.get("type", below.get("type", default))
     if before != after and isinstance(after, str) and after in table:
         own = parameters_of(table[after])
@@ -527,13 +551,14 @@ def keep_aspect(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str,
     if len(sides) != 1:
         return dict(above)
     side, other = sides[0], "height" if sides == ["width"] else "width"
-    old, along, new = (
-        Film.parameters[name].default if value is None else value
-        for name, value in ((side, below.get(side)), (other, below.get(other)), ("", above[side]))
+    old_side, old_other = (
+        Film.parameters[name].default if below.get(name) is None else below[name] for name in (side, other)
     )
-    if not all(type(value) is int and 1 <= value <= MAX_SIDE for value in (old, along, new)):
-        return dict(above)
-    return {**above, other: max(1, (2 * along * new + old) // (2 * old))}
+    new_side = above[side]
+    if not all(type(value) is int and 1 <= value <= MAX_SIDE for value in (old_side, old_other, new_side)):
+        return dict(above)  # wrong values are reported when the block is read
+    # old_other * new_side / old_side, rounded to the nearest whole number without floats.
+    return {**above, other: max(1, (2 * old_other * new_side + old_side) // (2 * old_side))}
 
 
 def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None) -> Settings:
@@ -543,9 +568,9 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
         SceneError: an unknown block or key, a key that the chosen type does not have, a bad value.
         NotBuiltError: a setting that this version does not support.
     """
-    own = overrides.get("integrator")
-    if isinstance(own, Integrator):  # an instance from Python
-        return _merge({**scene, "integrator": None}, {**overrides, "integrator": None}, file, own)
+    instance = overrides.get("integrator")
+    if isinstance(instance, Integrator):  # made in Python, complete: nothing to merge
+        return _merge({**scene, "integrator": None}, {**overrides, "integrator": None}, file, instance)
     given = {name: _plain_mappings(blocks) for name, blocks in (("scene", scene), ("overrides", overrides))}
     return _merged.get(file, given, lambda: _merge(scene, overrides, file))
 
@@ -559,31 +584,36 @@ def _plain_mappings(blocks: Mapping[str, Any]) -> Any:
 
 
 def _merge(
-    scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None, own: Integrator | None = None
+    scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None, instance: Integrator | None = None
 ) -> Settings:
+    """Merge without the cache; ``instance``: an integrator in place of the block."""
     check_keys(overrides, BLOCKS, "", "the settings", None)
     blocks: dict[str, Any] = {}
     for block in BLOCKS:
-        below, above = _set(scene.get(block), block, file), _set(overrides.get(block), block, None)
+        below, above = (
+            _keys_that_are_set(scene.get(block), block, file),
+            _keys_that_are_set(overrides.get(block), block, None),
+        )
         if block == "film":
             above = keep_aspect(below, above)
-        raw = _overlay(block, below, above) if block in TYPED_BLOCKS else {**below, **above}
+        raw = _merge_typed(block, below, above) if block in TYPED_BLOCKS else {**below, **above}
         if "filter" in raw:
-            inner = [_set(part.get("filter"), "film.filter", name) for part, name in ((below, file), (above, None))]
-            raw["filter"] = _overlay("filter", *inner)
+            below_filter = _keys_that_are_set(below.get("filter"), "film.filter", file)
+            above_filter = _keys_that_are_set(above.get("filter"), "film.filter", None)
+            raw["filter"] = _merge_typed("filter", below_filter, above_filter)
         try:
             if block == "render":
-                _open_end(raw, blocks["sampler"])
-            blocks[block] = own if own is not None and block == "integrator" else _block(block, raw)
+                _check_stop_rules(raw, blocks["sampler"])
+            blocks[block] = instance if instance is not None and block == "integrator" else _read_block(block, raw)
         except SceneError as error:
-            blame = None if _given(overrides, error.key) else file
+            blame = None if _contains(overrides, error.key) else file  # the file is at fault only for its own keys
             raise type(error)(error.key, error.value, error.expected, blame) from None
     settings = Settings(**blocks)
     _check_pilots(settings, file)
     if not settings.integrator.light:
         if settings.film.denoise:
             expected = f"false where integrator is {settings.integrator.name} (it carries no light)"
-            raise SceneError("film.denoise", True, expected, None if _given(overrides, "film.denoise") else file)
+            raise SceneError("film.denoise", True, expected, None if _contains(overrides, "film.denoise") else file)
         for name in settings.film.aovs:
             if LAYERS[name].light:
                 expected = f"no {name} where integrator is {settings.integrator.name} (it carries no light)"
@@ -617,7 +647,7 @@ def _check_pilots(settings: Settings, file: str | None) -> None:
         raise SceneError("render.pilots", True, expected, file)
 
 
-def _open_end(raw: Mapping[str, Any], sampler: ParsedParams) -> None:
+def _check_stop_rules(raw: Mapping[str, Any], sampler: ParsedParams) -> None:
     """Raise for a stop rule other than ``spp`` with a sampler whose points depend on their number."""
     for name in settings_with(Role.ENDS)["render"]:
         if sampler.kind.needs_count and raw.get(name) is not None:
@@ -628,21 +658,23 @@ def _open_end(raw: Mapping[str, Any], sampler: ParsedParams) -> None:
             raise SceneError(dotted("render", name), raw[name], expected)
 
 
-def _given(overrides: Mapping[str, Any], key: str) -> bool:
+def _contains(overrides: Mapping[str, Any], key: str) -> bool:
     """Return True where the overrides contain the key of an error."""
     value: Any = overrides
-    for part in key.split(".")[:3]:
+    for part in key.split(".")[:3]:  # deeper parts of a key lie inside a single value
         if not isinstance(value, Mapping) or value.get(part) is None:
-            return isinstance(value, str)
+            return isinstance(value, str)  # a bare name stands for a block of that type
         value = value[part]
     return True
 
 
-def _block(block: str, raw: dict[str, Any]) -> Any:
+def _read_block(block: str, raw: dict[str, Any]) -> Any:
+    """Return a block in its final form: an integrator, a sampler's parameters, a film or render record."""
     if block in TYPED_BLOCKS:
-        refuse_unused_keys(block, TYPED_BLOCKS[block][0], raw, TYPED_BLOCKS[block][1], None)
-        made = _typed(block, raw, block)
-        return made.kind(**made.values) if block == "integrator" else made
+        table, default = TYPED_BLOCKS[block]
+        refuse_unused_keys(block, table, raw, default, None)
+        parsed = _typed(block, raw, block)
+        return parsed.kind(**parsed.values) if block == "integrator" else parsed
     if block == "film":
         if "filter" in raw:
             raw["filter"] = _typed("filter", raw["filter"], "film.filter")
@@ -650,6 +682,7 @@ def _block(block: str, raw: dict[str, Any]) -> Any:
     return Render(**read_params(Render, raw, block, None, "the render settings").values)
 
 
-def _typed(what: str, raw: dict[str, Any], key: str) -> ParsedParams:
-    """Read a block whose type names its kind."""
-    return read_typed(what, TYPED_BLOCKS[what][0], raw, key, None, TYPED_BLOCKS[what][1])
+def _typed(block: str, raw: dict[str, Any], key: str) -> ParsedParams:
+    """Read a block of :data:`TYPED_BLOCKS`; ``key``: its dotted key, for errors."""
+    table, default = TYPED_BLOCKS[block]
+    return read_typed(block, table, raw, key, None, default)

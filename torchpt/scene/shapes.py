@@ -1,4 +1,9 @@
-"""Build the parts of shapes: resolve materials, read files, declare parameters."""
+"""Build the parts of shapes: resolve materials, read files, declare parameters.
+
+:func:`torchpt.scene.build.build_parts` calls :class:`ShapeBuilder`. A *part* is a set of primitives of one kind with one
+material, a *copy* an instance of a part. To *resolve* a material is to open its textures and build its BSDF; to *declare* a
+parameter is to add it to ``scene.params`` by dotted name.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +39,7 @@ class ShapeEntry:
 
     Attributes:
         name: name in the scene.
-        number: order in the scene, from 1.
+        number: order in the scene, from 1; lanes have it as object id.
         shape: the kind and its values.
     """
 
@@ -44,12 +49,12 @@ class ShapeEntry:
 
     @property
     def key(self) -> str:
-        """Return its dotted key."""
+        """Return the dotted key of the shape."""
         return f"shapes.{self.name}"
 
     @property
     def to_world(self) -> np.ndarray:
-        """Return its transform ``(4, 4)``."""
+        """Return the transform ``(4, 4)`` from the shape's space to the scene."""
         return self.shape.kind.to_world(self.shape.values)
 
 
@@ -63,102 +68,116 @@ class ShapeBuilder:
     def __init__(self, description: Description, parameters: Parameters, texture_loader: TextureLoader) -> None:
         self.description, self.parameters, self.texture_loader = description, parameters, texture_loader
         self.sources: list[Source] = []
-        self._slots: dict[str, ResolvedMaterial] = {}
-        self._declared: set[int] = set()
+        self._named_materials: dict[str, ResolvedMaterial] = {}
+        self._declared: set[int] = set()  # ids of the materials whose parameters are declared
 
-    def parts(self, owner: ShapeEntry) -> list[Part]:
+    def parts(self, entry: ShapeEntry) -> list[Part]:
         """Return the parts of a shape other than an instance."""
-        triangles = owner.shape.kind.triangles(owner.shape.values)
-        return self._primitives(owner) if triangles is None else self._meshes(owner, triangles)
+        # Kinds of shapes are `meshed` (triangles) or a few primitives, for which `triangles` returns None.
+        triangles = entry.shape.kind.triangles(entry.shape.values)
+        return self._primitives(entry) if triangles is None else self._meshes(entry, triangles)
 
-    def copies(self, owner: ShapeEntry, parts: list[Part]) -> list[Copy]:
+    def copies(self, entry: ShapeEntry, parts: list[Part]) -> list[Copy]:
         """Return the copies of an instance, one for each of the ``parts`` of its mesh."""
-        key, file, shapes = owner.key, self.description.file, self.description.shapes
-        of, material = owner.shape["of"], owner.shape["material"]
-        mesh = shapes.get(of)
+        key, file, shapes = entry.key, self.description.file, self.description.shapes
+        mesh_name, own_material = entry.shape["of"], entry.shape["material"]
+        mesh = shapes.get(mesh_name)
         if mesh is None or not mesh.kind.meshed:
             names = [other for other, value in shapes.items() if value.kind.meshed]
             known = f" ({', '.join(names[:8])}{', ...' if len(names) > 8 else ''})" if names else " (there is none)"
-            raise SceneError(f"{key}.of", of, f"the name of a mesh among the shapes{known}", file)
-        self.parameters.declare(f"{key}.to_world", owner.to_world, Pose())
-        if not is_usable(owner.to_world @ np.linalg.inv(mesh.kind.to_world(mesh.values))):
-            expected = f"a way from where {of} lies to where it is copied that can be inverted, {WITHIN}"
-            raise SceneError(f"{key}.transform", owner.to_world.tolist(), expected, file)
-        made = []
-        for part in (part for part in parts if part.shape == of):
-            slot = part.material if material is None else self._material(material, key)
-            if slot.emission is not None:
+            raise SceneError(f"{key}.of", mesh_name, f"the name of a mesh among the shapes{known}", file)
+        self.parameters.declare(f"{key}.to_world", entry.to_world, Pose())
+        if not is_usable(entry.to_world @ np.linalg.inv(mesh.kind.to_world(mesh.values))):
+            expected = f"a way from where {mesh_name} lies to where it is copied that can be inverted, {WITHIN}"
+            raise SceneError(f"{key}.transform", entry.to_world.tolist(), expected, file)
+        copies = []
+        for part in (part for part in parts if part.shape == mesh_name):
+            material = part.material if own_material is None else self._material(own_material, key)
+            if material.emission is not None:
                 raise SceneError(
-                    f"{key}.material", slot.name, "a material that does not emit: an instance cannot", file
+                    f"{key}.material", material.name, "a material that does not emit: an instance cannot", file
                 )
-            declare(slot, self.parameters)
-            flip = owner.shape["flip_normals"] != part.flip
+            declare(material, self.parameters)
+            flip = entry.shape["flip_normals"] != part.flip  # relative to the part
             pose = self.parameters[f"{key}.to_world"]
-            made.append(Copy(key, owner.name, owner.number, part.name, slot, flip, pose))
-        return made
+            copies.append(Copy(key, entry.name, entry.number, part.name, material, flip, pose))
+        return copies
 
-    def _primitives(self, owner: ShapeEntry) -> list[Part]:
+    def _primitives(self, entry: ShapeEntry) -> list[Part]:
         """Return the parts of a shape of primitives, which share its pose."""
-        shape, pose = owner.shape, owner.to_world
-        own = shape.kind.own(shape.values)
-        if own is not None:
-            with np.errstate(over="ignore", invalid="ignore"):
-                pose = pose @ own
+        shape, pose = entry.shape, entry.to_world
+        own_map = shape.kind.own(shape.values)  # (4, 4) by sizes and positions such as `radius`; None: the identity
+        if own_map is not None:
+            with np.errstate(over="ignore", invalid="ignore"):  # `is_usable` finds what is not finite
+                pose = pose @ own_map
             if not is_usable(pose):
                 expected = f"sizes that differ by less than 1e12, and a place: {WITHIN}"
-                raise SceneError(owner.key, pose.tolist(), expected, self.description.file)
+                raise SceneError(entry.key, pose.tolist(), expected, self.description.file)
         surfaces = shape.kind.surfaces(shape.values, pose)
-        self._declare_pose(owner.key, pose, surfaces)
-        slot = self._material(shape["material"], owner.key)
+        self._declare_pose(entry.key, pose, surfaces)
+        material = self._material(shape["material"], entry.key)
         return [
-            self._part(owner, owner.key, slot, surface, pose if surface.local is None else pose @ surface.local)
+            self._part(entry, entry.key, material, surface, pose if surface.local is None else pose @ surface.local)
             for surface in surfaces
         ]
 
     def _declare_pose(self, stem: str, pose: np.ndarray, surfaces: list[Surface]) -> None:
+        """Declare ``STEM.to_world``; some kinds of primitives accept only poses that keep angles."""
         angles = any(PRIMITIVES[surface.kind].angles for surface in surfaces)
         self.parameters.declare(f"{stem}.to_world", pose, Pose(angles=angles))
 
-    def _meshes(self, owner: ShapeEntry, triangles: Triangles) -> list[Part]:
+    def _meshes(self, entry: ShapeEntry, triangles: Triangles) -> list[Part]:
         """Return the parts of a mesh, one for each material of its file."""
-        shape, pose = owner.shape, owner.to_world
-        mesh = mesh_of(triangles, owner.key, self.description, self.texture_loader, materials=shape["material"] is None)
+        shape, pose = entry.shape, entry.to_world
+        mesh = mesh_of(triangles, entry.key, self.description, self.texture_loader, materials=shape["material"] is None)
         lights = [light for piece in mesh.pieces for light in piece.lights]
-        self.sources += build_file_lights(lights, owner.key, pose, mesh.source, self.parameters)
+        self.sources += build_file_lights(lights, entry.key, pose, mesh.source, self.parameters)
         labels = unique_labels([piece.name for piece in mesh.pieces])
         parts: list[Part] = []
-        known: dict[int, ResolvedMaterial] = {}
+        file_materials: dict[int, ResolvedMaterial] = {}  # by id of the file's record
         for piece, label in zip(mesh.pieces, labels, strict=True):
-            stem = owner.key if len(mesh.pieces) == 1 else f"{owner.key}.{label}"
+            stem = entry.key if len(mesh.pieces) == 1 else f"{entry.key}.{label}"
             self.parameters.declare(f"{stem}.vertices", piece.vertices, Vertices())
             self._declare_pose(stem, pose, [])
             own = piece.material if shape["material"] is None else None
             if own is None:
-                slot = self._material(shape["material"], stem)
-            elif id(own) in known:  # parts of one material share its parameters and textures
-                slot = known[id(own)]
+                material = self._material(shape["material"], stem)
+            elif id(own) in file_materials:  # parts of one material share its parameters and textures
+                material = file_materials[id(own)]
             else:
-                slot = known[id(own)] = self._file_material(own, owner.key, f"{stem}.material", mesh.source)
-            part = self._part(owner, stem, slot, Surface("triangle"), pose)
+                material = self._file_material(own, entry.key, f"{stem}.material", mesh.source)
+                file_materials[id(own)] = material
+            part = self._part(entry, stem, material, Surface("triangle"), pose)
             parts.append(_with_triangles(part, piece, mesh))
         if all(len(part.faces) == 0 for part in parts if part.faces is not None):
             problem = "every face is degenerate (without area)"
             if mesh.source:
-                raise AssetError(mesh.source, f"{problem}, named by {owner.key}.path")
-            raise SceneError(f"{owner.key}.faces", "no face with area", "a face with area", self.description.file)
+                raise AssetError(mesh.source, f"{problem}, named by {entry.key}.path")
+            raise SceneError(f"{entry.key}.faces", "no face with area", "a face with area", self.description.file)
         return parts
 
     def _material(self, given: Any, stem: str) -> ResolvedMaterial:
-        """Return the material of a shape: a named one, one in place, or the default grey."""
+        """Return the material of a shape: a named one, one in place, or the default grey.
+
+        Args:
+            given: the value of the shape's key ``material``: a name, a parsed material, or None.
+            stem: dotted prefix of the part's parameters.
+        """
         known = self.description.materials
         if isinstance(given, str):
-            if given not in self._slots:
-                self._slots[given] = resolved(known[given], f"materials.{given}", known, self.texture_loader)
-            return self._slots[given]
+            if given not in self._named_materials:
+                self._named_materials[given] = resolved(known[given], f"materials.{given}", known, self.texture_loader)
+            return self._named_materials[given]
         return resolved(plain_material() if given is None else given, f"{stem}.material", known, self.texture_loader)
 
     def _file_material(self, own: FileMaterial, prefix: str, key: str, source: str) -> ResolvedMaterial:
         """Return a mesh file's own material.
+
+        Args:
+            own: the record of the file's reader.
+            prefix: dotted key of the shape; images are named ``PREFIX.textures.FILE``.
+            key: dotted prefix of the material's parameters.
+            source: the file.
 
         Raises:
             AssetError: a wrong key or value; names the file and the material.
@@ -170,31 +189,37 @@ class ShapeBuilder:
         except SceneError as error:
             raise AssetError(source, f"material {own.name[:80]!r}: {error}") from None
 
-    def _part(self, owner: ShapeEntry, stem: str, slot: ResolvedMaterial, surface: Surface, pose: np.ndarray) -> Part:
-        """Return the part of a surface, without triangles, and declare its emission and the parameters of its material."""
-        if slot is not self._slots.get(slot.name.removeprefix("materials.")) or id(slot) not in self._declared:
-            declare(slot, self.parameters)
-            self._declared.add(id(slot))
-        emission, names = owner.shape["emission"], (f"{owner.key}.emission",)
-        texture = slot.emission if emission is None and isinstance(slot.emission, Node) else None
+    def _part(
+        self, entry: ShapeEntry, stem: str, material: ResolvedMaterial, surface: Surface, pose: np.ndarray
+    ) -> Part:
+        """Return the part of a surface, without triangles, and declare its emission and the parameters of its material.
+
+        Emission is that of the shape, else that of the material; ``names`` are its parameters: radiance and strength.
+        """
+        named = self._named_materials.get(material.name.removeprefix("materials."))
+        if material is not named or id(material) not in self._declared:
+            declare(material, self.parameters)
+            self._declared.add(id(material))
+        emission, names = entry.shape["emission"], (f"{entry.key}.emission",)
+        texture = material.emission if emission is None and isinstance(material.emission, Node) else None
         if emission is not None and names[0] not in self.parameters:
-            self.parameters.declare(names[0], emission, parameters_of(owner.shape.kind)["emission"])
+            self.parameters.declare(names[0], emission, parameters_of(entry.shape.kind)["emission"])
         if texture is not None:
-            emission, names = (1.0, 1.0, 1.0), (f"{slot.name}.emission_strength",)
-        elif emission is None and isinstance(slot.emission, tuple):
-            emission, names = slot.emission, (f"{slot.name}.emission", f"{slot.name}.emission_strength")
+            emission, names = (1.0, 1.0, 1.0), (f"{material.name}.emission_strength",)
+        elif emission is None and isinstance(material.emission, tuple):
+            emission, names = material.emission, (f"{material.name}.emission", f"{material.name}.emission_strength")
         if emission is not None and names[0] not in self.parameters:
             self.parameters[names[0]] = np.asarray(emission, np.float64)
         return Part(
             name=stem,
-            shape=owner.name,
-            object_id=owner.number,
+            shape=entry.name,
+            object_id=entry.number,
             kind=surface.kind,
-            material=slot,
+            material=material,
             emission=emission,
             emission_names=names if emission is not None else (),
             emission_texture=texture,
-            flip=owner.shape["flip_normals"],
+            flip=entry.shape["flip_normals"],
             to_world=pose,
             local=surface.local,
             quadric=surface.quadric,

@@ -1,7 +1,8 @@
 """The coordinates of lanes, in which a scene is rendered: their origin in the scene, and their unit of length.
 
 Searches, areas and densities compute squares and cubes of lengths, and float32 holds cubes of 1e-12 to 1e12 only. So a scene
-whose lengths are far from 1 is rendered in another unit. It is a power of two, so that scaling rounds nothing.
+whose lengths are far from 1 is rendered in another unit. It is a power of two, so that scaling rounds nothing. A *lane* is one
+path of those that are traced together; the tensors of stages hold points in these coordinates.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ __all__ = ["MAX_COORDINATE", "Space", "bounds_center", "bounds_extent", "centre_
 #: The centre of a scene becomes the origin if its distance from the scene's own origin is more than this many times its size.
 RECENTRE_DISTANCE = 8.0
 #: Scenes with all lengths between 1 / UNSCALED_RANGE and UNSCALED_RANGE keep their unit.
-UNSCALED_RANGE = 2.0**30
+UNSCALED_RANGE = 2.0**30  # about 1e9: its cube, 1e27, leaves room for products with other numbers
 #: Largest ratio of the longest length to the smallest shape: with their geometric mean as unit, float32 holds both cubes.
 MAX_RATIO = 2.0**80
 #: Largest coordinate in units: float32 does not hold cubes of larger ones.
@@ -47,7 +48,7 @@ class Space:
     unit: float
 
     def point(self, p: Tensor) -> Tensor:
-        """Transform a point ``(3,)`` of the scene, in float64."""
+        """Return a point ``(3,)`` of the scene in the coordinates of lanes, float64."""
         return (p.double() - self.centre) / self.unit
 
     def pose(self, to_world: Tensor) -> Tensor:
@@ -102,9 +103,10 @@ def centre_and_unit(
     middle = 0.5 * (low + high)
     if np.abs(middle).max() > RECENTRE_DISTANCE * (high - low).max():
         centre = middle
-    reaches = np.abs(boxes - centre).max((1, 2))  # largest coordinate of each shape
-    far, smallest = int(reaches.argmax()), int(sizes.argmin())
-    lengths = [(names[far], float(reaches[far])), *_reaches(sources, parameters, camera, centre)]
+    reaches = np.abs(boxes - centre).max((1, 2))  # (N,) largest coordinate of each part
+    farthest_part, smallest = int(reaches.argmax()), int(sizes.argmin())
+    lengths = [(names[farthest_part], float(reaches[farthest_part]))]
+    lengths += _reaches(sources, parameters, camera, centre)
     return centre, _unit(lengths, (names[smallest], float(sizes[smallest])), file)
 
 
@@ -127,8 +129,8 @@ def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Ar
     in object space.
     """
     cube = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    own: dict[str, Array] = {}
-    found = []
+    mesh_corners: dict[str, Array] = {}  # (8, 3) in the mesh's own space, by name of the part
+    found = []  # name, corners in its own space, and pose of each part and copy
     for part in parts:
         corners = cube
         if part.vertices is not None and part.faces is not None:
@@ -137,15 +139,18 @@ def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Ar
             points = part.vertices[used]  # vertices without a face do not count
             if not len(points):
                 continue
-            corners = own[part.name] = 0.5 * (points.max(0) + points.min(0)) + cube * (0.5 * np.ptp(points, axis=0))
+            corners = mesh_corners[part.name] = 0.5 * (points.max(0) + points.min(0)) + cube * (
+                0.5 * np.ptp(points, axis=0)
+            )
         found.append((part.name, corners, part.to_world))
-    found += [(copy.name, own[copy.of], copy.to_world) for copy in copies if copy.of in own]
+    found += [(copy.name, mesh_corners[copy.of], copy.to_world) for copy in copies if copy.of in mesh_corners]
     if not found:
         return [], np.zeros((0, 8, 3)), np.zeros(0)
     poses = np.stack([pose for _, _, pose in found])
-    turned = np.stack([corners for _, corners, _ in found]) @ poses[:, :3, :3].transpose(0, 2, 1)
+    untranslated = np.stack([corners for _, corners, _ in found]) @ poses[:, :3, :3].transpose(0, 2, 1)
     # Sizes are taken before the translation: far from the origin, differences of corners would lose precision.
-    return [name for name, _, _ in found], turned + poses[:, None, :3, 3], np.ptp(turned, axis=1).max(1)
+    names = [name for name, _, _ in found]
+    return names, untranslated + poses[:, None, :3, 3], np.ptp(untranslated, axis=1).max(1)
 
 
 def _reaches(
@@ -176,12 +181,14 @@ def _unit(lengths: Sequence[tuple[str, float]], smallest: tuple[str, float], fil
     Raises:
         SceneError: the lengths are too far apart for float32.
     """
-    (far, longest), (near, size) = max(lengths, key=lambda item: item[1]), smallest
+    (longest_name, longest), (smallest_name, size) = max(lengths, key=lambda item: item[1]), smallest
     longest = max(longest, size)
     if longest > MAX_RATIO * size:
         least = longest / MAX_RATIO
-        expected = f"a size of at least {least:.3g} beside a length of {longest:.3g} ({far}): float32 holds no more"
-        raise SceneError(near, float(f"{size:.3g}"), expected, file)
+        expected = (
+            f"a size of at least {least:.3g} beside a length of {longest:.3g} ({longest_name}): float32 holds no more"
+        )
+        raise SceneError(smallest_name, float(f"{size:.3g}"), expected, file)
     if longest <= UNSCALED_RANGE and size * UNSCALED_RANGE >= 1.0:
         return 1.0
     return 2.0 ** round(0.5 * (math.log2(longest) + math.log2(size)))

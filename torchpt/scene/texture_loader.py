@@ -1,4 +1,8 @@
-"""Open textures: declare their parameters, and make a texture node for each slot. Every file is read once."""
+"""Open textures: declare their parameters, and make a texture node for each slot. Every file is read once.
+
+A *slot* is a parameter that a texture stands in for; a *node* is one use of a texture, opened for a slot. To *declare* a
+parameter is to add it to ``scene.params``. The builders of shapes and materials call a :class:`TextureLoader`.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +34,10 @@ class TextureLoader:
     def __init__(self, textures: Mapping[str, ParsedParams], description: Description, parameters: Parameters) -> None:
         self._textures, self._description, self._parameters = textures, description, parameters
         self.file = description.file
-        self._pictures: dict[Any, Any] = {}
+        self._pictures: dict[Any, Any] = {}  # images that were read; the kinds of textures choose the keys
         self._nodes: dict[str, Node] = {}  # by key: many shapes may share a material
-        self._shared: dict[str, dict[str, str]] = {}
+        # Of mesh files, by prefix of their images' names: name of each image by its label (its path, or a hash).
+        self._image_names: dict[str, dict[str, str]] = {}
 
     def __call__(self, slot: TextureInput, key: str) -> Node:
         """Return the texture node of the slot ``key``.
@@ -42,11 +47,18 @@ class TextureLoader:
             AssetError: a missing or malformed image.
         """
         if key not in self._nodes:
-            self._nodes[key] = self._opened(slot, key, key, self._parameters)
+            self._nodes[key] = self._open(slot, key, key, self._parameters)
         return self._nodes[key]
 
-    def _opened(self, slot: TextureInput, key: str, name: str, parameters: Parameters) -> Node:
-        """Return the node of a slot; ``name``: dotted name of the parameters of a texture that is written in place."""
+    def _open(self, slot: TextureInput, key: str, name: str, parameters: Parameters) -> Node:
+        """Open the texture of a slot and return its node.
+
+        Args:
+            slot: the texture, named or written in place, and what the slot accepts.
+            key: dotted key of the slot, for errors.
+            name: dotted prefix of the parameters of a texture that is written in place.
+            parameters: gets the texture's parameters.
+        """
         texture, channel = slot.texture, None
         if isinstance(texture, Named):
             name, channel, texture = f"textures.{texture.texture}", texture.channel, self._textures[texture.texture]
@@ -61,29 +73,29 @@ class TextureLoader:
             prefix: dotted prefix of the images' names.
         """
 
-        def opened(slot: TextureInput, key: str) -> Node:
+        def open_shared(slot: TextureInput, key: str) -> Node:
             texture, name = slot.texture, key
             label = None if isinstance(texture, Named) else texture.kind.label(texture.values)
             if label is not None:
-                known = self._shared.setdefault(prefix, {})
-                stem = re.sub(r"\W+", "_", Path(label).stem) or "image"
-                if label not in known:
-                    known[label] = stem if stem not in known.values() else f"{stem}_{len(known)}"
-                name = f"{prefix}.{known[label]}"
-            return self._opened(slot, key, name, self._parameters)
+                names = self._image_names.setdefault(prefix, {})
+                stem = re.sub(r"\W+", "_", Path(label).stem) or "image"  # letters, digits and underscores
+                if label not in names:
+                    names[label] = stem if stem not in names.values() else f"{stem}_{len(names)}"
+                name = f"{prefix}.{names[label]}"
+            return self._open(slot, key, name, self._parameters)
 
-        return opened
+        return open_shared
 
     def values(self, slot: TextureInput, key: str) -> Callable[[np.ndarray], np.ndarray]:
         """Return a number texture as a function from texture coordinates ``(V, 2)`` to values ``(V,)``, float64."""
         own = Parameters()  # used once to displace the mesh: no parameters of the scene
-        node = self._opened(slot, key, key, own).at_points()
-        given = {name: torch.from_numpy(value) for name, value in own.items()}
-        table = node.table([node], given, torch.float64, torch.device("cpu"))
+        node = self._open(slot, key, key, own).at_points()
+        tensors = {name: torch.from_numpy(value) for name, value in own.items()}
+        table = node.table([node], tensors, torch.float64, torch.device("cpu"))  # the node is row 0
 
         def look_up(uvs: np.ndarray) -> np.ndarray:
-            lanes = torch.zeros(len(uvs), dtype=torch.int64)
+            rows = torch.zeros(len(uvs), dtype=torch.int64)
             point = TexturePoint(torch.from_numpy(np.ascontiguousarray(uvs.T)))
-            return table.look_up(lanes, point, False).numpy()
+            return table.look_up(rows, point, coloured=False).numpy()
 
         return look_up

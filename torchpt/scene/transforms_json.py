@@ -30,14 +30,18 @@ if TYPE_CHECKING:
 
 __all__ = ["Frame", "frame_of", "read_transforms", "write_transforms"]
 
-_MOST = 256 * 2**20
+#: Most bytes of a file that is read.
+_MAX_BYTES = 256 * 2**20
+#: Keys of numbers that a frame may have, or the whole file for all frames.
 _NUMBERS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y")
 #: Coefficients of lens distortion, which is not supported: they must be 0.
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+#: Camera models that are read; all are pinholes where the distortion is 0.
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+# A phrase of what is accepted, and the test for it.
 _FOCAL = "a number > 0", lambda x: x > 0.0
 _SIDE = "a whole number in 1..16777216", lambda x: 1.0 <= x <= 2.0**24 and x.is_integer()
-_ANGLE = "an angle above 0 and below pi", lambda x: 1e-30 < x < math.pi
+_ANGLE = "an angle above 0 and below pi", lambda x: 1e-30 < x < math.pi  # the tangent of a smaller one may round to 0
 #: Numbers with a range: the phrase for errors, and the test.
 _RANGES: dict[str, tuple[str, Callable[[float], bool]]] = {
     "fl_x": _FOCAL,
@@ -74,10 +78,10 @@ def frame_of(
     Raises:
         SceneError: no scene or no path, wrong parameters or film settings, or a camera other than a pinhole.
     """
-    name = _file(image, "image")
+    name = _image_path(image, "image")
     with torch.no_grad():
-        matrix, inner, _, size = to_opengl(scene, params, film, torch.float64)
-    return Frame(name, from_opengl(matrix, K=inner, size=size), size)
+        matrix, intrinsics, _, size = to_opengl(scene, params, film, torch.float64)
+    return Frame(name, from_opengl(matrix, K=intrinsics, size=size), size)
 
 
 def read_transforms(path: str | os.PathLike[str]) -> list[Frame]:
@@ -90,15 +94,15 @@ def read_transforms(path: str | os.PathLike[str]) -> list[Frame]:
         AssetError: a missing or malformed file, or a camera with lens distortion.
     """
     try:
-        whole = json.loads(read_regular(as_path(path), _MOST))
+        top = json.loads(read_regular(as_path(path), _MAX_BYTES))
     except OSError as error:
         raise AssetError(path, f"cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError) as error:
         raise AssetError(path, f"is no JSON ({error})") from None
-    frames = whole.get("frames") if isinstance(whole, dict) else None
+    frames = top.get("frames") if isinstance(top, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise AssetError(path, "has no list of frames")
-    return [_frame(path, f"frames.{number}", {**whole, **frame}) for number, frame in enumerate(frames)]
+    return [_read_frame(path, f"frames.{number}", {**top, **frame}) for number, frame in enumerate(frames)]
 
 
 def write_transforms(path: str | os.PathLike[str], frames: Iterable[Frame]) -> None:
@@ -113,27 +117,28 @@ def write_transforms(path: str | os.PathLike[str], frames: Iterable[Frame]) -> N
         SceneError: ``path`` is no path, no frames, a frame without a size, or a wrong camera block.
         OutputError: the file cannot be written.
     """
-    place = as_path(path)
+    target = as_path(path)
     if not isinstance(frames, Iterable):
         raise SceneError("frames", frames, "a sequence of Frames")
-    rows = [_row(frame, f"frames.{number}") for number, frame in enumerate(frames)]
+    rows = [_written_frame(frame, f"frames.{number}") for number, frame in enumerate(frames)]
     if not rows:
         raise SceneError("frames", [], "one frame at least")
     shared = {key: value for key, value in rows[0].items() if key in _NUMBERS}
     shared = {key: value for key, value in shared.items() if all(row.get(key) == value for row in rows)}
-    kept = [{key: value for key, value in row.items() if key not in shared} for row in rows]
-    text = json.dumps({"camera_model": "OPENCV", **shared, "frames": kept}, indent=1, allow_nan=False)
-    beside = Path(f"{place}.part")
+    own_keys = [{key: value for key, value in row.items() if key not in shared} for row in rows]
+    text = json.dumps({"camera_model": "OPENCV", **shared, "frames": own_keys}, indent=1, allow_nan=False)
+    # Written beside and renamed, so that the file is never there in part.
+    partial = Path(f"{target}.part")
     try:
-        beside.write_text(text + "\n", encoding="utf-8")
-        os.replace(beside, path)
+        partial.write_text(text + "\n", encoding="utf-8")
+        os.replace(partial, path)
     except OSError as error:
-        beside.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
         raise OutputError(path, f"cannot be written ({error.strerror})") from None
 
 
 def _number(path: Any, key: str, row: Mapping[str, Any], name: str) -> float | None:
-    """Return a number of a frame; None where it is missing."""
+    """Return the number ``name`` of a frame; None where it is missing. ``path`` and ``key`` name the frame in errors."""
     value = row.get(name)
     if value is None:
         return None
@@ -147,7 +152,7 @@ def _number(path: Any, key: str, row: Mapping[str, Any], name: str) -> float | N
     return found
 
 
-def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
+def _read_frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
     """Convert a frame of the file; ``row``: its keys merged over those at the top."""
     model = row.get("camera_model", _MODELS[0])
     if model not in _MODELS or row.get("is_fisheye"):
@@ -170,7 +175,9 @@ def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
     angle = known.get(f"camera_angle_{axis}")
     if angle is None and not {"fl_x", "fl_y"} & known.keys():
         raise AssetError(path, f"{key}: no fl_x and no camera_angle_x")
-    lens: dict[str, Any] = {"K": _inner(known, size)} if size else {"fov": math.degrees(angle or 0), "fov_axis": axis}
+    lens: dict[str, Any] = (
+        {"K": _intrinsics(known, size)} if size else {"fov": math.degrees(angle or 0), "fov_axis": axis}
+    )
     try:
         camera = from_opengl(matrix, **lens, size=size)
     except SceneError as error:
@@ -178,8 +185,11 @@ def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
     return Frame(image, camera, size)
 
 
-def _inner(known: Mapping[str, float], size: tuple[int, int]) -> list[list[float]]:
-    """Return ``K``; the focal length along an axis is that in pixels, else that of the angle, else that of the other axis."""
+def _intrinsics(known: Mapping[str, float], size: tuple[int, int]) -> list[list[float]]:
+    """Return ``K`` for the numbers of a frame and the size of its image in pixels.
+
+    The focal length along an axis is that in pixels, else that of the angle, else that of the other axis.
+    """
     focal: list[float | None] = []
     for axis, side in zip("xy", size, strict=True):
         angle = known.get(f"camera_angle_{axis}")
@@ -196,7 +206,7 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def _file(image: Any, key: str) -> str:
+def _image_path(image: Any, key: str) -> str:
     """Return the path of an image as text, with forward slashes."""
     found = image.as_posix() if isinstance(image, PurePath) else image
     found = os.fspath(found) if isinstance(found, str | os.PathLike) else None
@@ -205,15 +215,16 @@ def _file(image: Any, key: str) -> str:
     return found
 
 
-def _row(frame: Frame, key: str) -> dict[str, Any]:
+def _written_frame(frame: Frame, key: str) -> dict[str, Any]:
     """Convert a frame to its form in the file."""
     if not isinstance(frame, Frame):
         raise SceneError(key, frame, "a Frame, of frame_of(scene, image) or read_transforms")
     wide, tall = size_of(frame.size, f"{key}.size")
-    image = _file(frame.image, f"{key}.image")
-    inner, pose = _seen(frame.camera, (wide, tall), f"{key}.camera")
-    (fx, fy), (cx, cy) = inner.diagonal()[:2].tolist(), inner[:2, 2].tolist()
-    matrix = pose * pose.new_tensor([-1.0, 1.0, -1.0, 1.0]) + 0.0  # no -0.0
+    image = _image_path(frame.image, f"{key}.image")
+    intrinsics, pose = _read_camera(frame.camera, (wide, tall), f"{key}.camera")
+    (fx, fy), (cx, cy) = intrinsics.diagonal()[:2].tolist(), intrinsics[:2, 2].tolist()
+    # From the scene's camera axes to OpenGL's; adding 0.0 turns -0.0 into 0.0.
+    matrix = pose * pose.new_tensor([-1.0, 1.0, -1.0, 1.0]) + 0.0
     return {
         "file_path": image,
         "transform_matrix": matrix.tolist(),
@@ -228,15 +239,15 @@ def _row(frame: Frame, key: str) -> dict[str, Any]:
     }
 
 
-def _seen(block: Any, size: tuple[int, int], key: str) -> tuple[Tensor, Tensor]:
+def _read_camera(block: Any, size: tuple[int, int], key: str) -> tuple[Tensor, Tensor]:
     """Read a camera block as a scene does; return ``K (3, 3)`` on a film of ``size``, and camera to world ``(4, 4)``."""
     from torchpt.physics.cameras.kinds.perspective import Perspective
 
     if not isinstance(block, Mapping):
         raise SceneError(key, block, "the block of a camera")
     block = {name: _plain(value) for name, value in block.items() if value is not None}
-    placed = "to_world" in block or {"R", "t"} <= block.keys()
-    if not placed or ("K" in block) == ("fov" in block):
+    has_pose = "to_world" in block or {"R", "t"} <= block.keys()
+    if not has_pose or ("K" in block) == ("fov" in block):
         expected = "to_world or R and t, and K or fov: as frame_of and read_transforms give them"
         raise SceneError(key, sorted(map(str, block)), expected)
     if "K" in block:

@@ -55,11 +55,11 @@ def corners_of_all(
     found: list[Corners] = []
     for kind, group in groupby(parts, lambda part: part.kind):
         alike = list(group)
-        at_once = None  # None too where the kind computes its parts one by one
+        batched = None  # None too where the kind computes its parts one by one
         if len(alike) > 1 and alike[0].vertices is None:
             poses = space.pose(torch.stack([_pose_of(part, parameters) for part in alike]))
-            at_once = PRIMITIVES[kind].corners_of_many(poses, dtype)
-        found += at_once or [corners_of(part, parameters, space, dtype) for part in alike]
+            batched = PRIMITIVES[kind].corners_of_many(poses, dtype)
+        found += batched or [corners_of(part, parameters, space, dtype) for part in alike]
     return found
 
 
