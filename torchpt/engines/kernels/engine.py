@@ -1,4 +1,4 @@
-"""The engine of kernels: the stages of a walk on a chunk of lanes, in one thread and in memory of its own.
+"""The engine of kernels: the stages of a walk on a chunk of lanes, in memory of its own.
 
 A chunk is some thousand samples, one path a lane. The path state is stored in an *arena*
 (:mod:`~torchpt.engines.kernels.layout`); `scatter` moves the paths that go on from one arena to the other. Where the search is
@@ -6,6 +6,10 @@ part of the stages (``fused``), paths arrive with their hits and lists of lanes:
 `sort` reads counters. Else rays are searched between stages, and the kernel ``sort_lanes`` adds the contributions of shadow
 rays, lists lanes and ends paths. A path that ends writes its radiance to the *slot* of its sample;
 :mod:`~torchpt.engines.kernels.threads` adds slots to the film.
+
+A stage is a list of *steps*: kernel calls that name the kernel, the memory that it reads and writes, and where its lanes are
+counted. :class:`Calls` runs a step at once, in the calling thread: a count is an int, and steps without lanes are left out.
+Another class may run the same steps elsewhere and leave counts in memory, where kernels read them.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ import ctypes
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any, ClassVar
 
 import numpy as np
@@ -42,6 +47,8 @@ __all__ = ["LANES", "Calls", "Chunk", "ChunkSearch", "Halted", "KernelsEngine", 
 
 
 _WORD = {name: k for k, name in enumerate(HEAD)}
+#: A number of lanes: an int, or an object that is always true where only kernels know the number.
+LaneCount = Any
 
 
 class Halted(Exception):
@@ -81,13 +88,42 @@ class Calls:
         """Use the kernels of another render of the same structure, which has the same memory layout."""
         self.kernels, self._halt = kernels, halt
 
+    def memory(self, rows: int) -> Memory:
+        """Return new memory for kernels."""
+        return Memory(rows)
+
     def clear(self) -> None:
         """Set all counters to 0."""
         self.counters[:] = 0
 
-    def counted(self) -> tuple[int, list[int]]:
+    def counted(self) -> tuple[LaneCount, list[LaneCount]]:
         """Return how many lanes are in the arena, and how many in each list."""
         return int(self.counters[0]), self.counters[1 : self.kernels.models + 3].tolist()
+
+    def lanes(self, count: int) -> LaneCount:
+        """Return a known number of lanes as a count."""
+        return count
+
+    def left(self, step: int) -> LaneCount:
+        """Return how many rays the last kernel left in transit, as counter 0 says; ``step``: number of that kernel, from 0."""
+        return int(self.counters[0])
+
+    def running_sums(self, counts: Sequence[LaneCount]) -> tuple[list[LaneCount], LaneCount]:
+        """Return for each count the sum of those before it, and the sum of all."""
+        sums = [0, *accumulate(counts)]
+        return sums[:-1], sums[-1]
+
+    def write_from(self, start: LaneCount) -> None:
+        """Set the first index that a kernel with a ``shift`` writes to, see :class:`torchpt.compiler.sinks.Sinks`."""
+        self.counters[0] = start
+
+    def known(self, count: LaneCount) -> int:
+        """Return a count as an int."""
+        return count
+
+    def set_chunk(self, numbers: np.ndarray) -> None:
+        """Set the chunk: int32 numbers, see :data:`torchpt.engines.kernels.stages.CHUNK_FIELDS`."""
+        self.place[:] = numbers
 
     def set_dimensions(self, depth: int, step: int = 0) -> None:
         """Set the random dimensions of kernels to those of a vertex, and of a step of transmission before it."""
@@ -99,14 +135,14 @@ class Calls:
     def run(
         self,
         kernel: Kernel,
-        count: int,
+        count: LaneCount,
         source: Memory,
         target: Memory,
         places: Memory | None = None,
         lists: list[Memory] | None = None,
         slots: Memory | None = None,
     ) -> None:
-        """Run a kernel.
+        """Run a kernel: one step.
 
         Args:
             kernel: of the render.
@@ -186,7 +222,7 @@ def bounce_eagerly(
     with torch.no_grad():
         state = path_state(rows.take(source, lanes, rows.state))
         vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
-        context = kernels.wave.context.at(salts(depth, torch.device("cpu")), roulette=roulette)
+        context = kernels.wave.context.at(salts(depth, state.t_max.device), roulette=roulette)
         output = kernels.wave.bounce(context, model, vertex)
         check_output(kernels.wave.integrator, output)
         after, none = output.leaving, no_shadow(output.leaving)
@@ -219,14 +255,15 @@ class ChunkSearch:
 
     def __init__(self, calls: Calls) -> None:
         self.calls, self.kernels = calls, calls.kernels
-        self.passed = [Memory(self.kernels.passed.count) for _ in range(2)] if self.kernels.has_transmission else []
-        self.transmitting = Memory(1)
+        own = range(2 if self.kernels.has_transmission else 0)
+        self.passed = [calls.memory(self.kernels.passed.count) for _ in own]
+        self.transmitting = calls.memory(1)
 
-    def nearest(self, arena: Memory, count: int) -> None:
+    def nearest(self, arena: Memory, count: LaneCount) -> None:
         """Find the nearest hits, opaque or not, of the arena's rays, and write them to the arena."""
         self._trace(arena, self.kernels.state, "o", "d", "t_max", count)
 
-    def transmit(self, arena: Memory, count: int, depth: int, step: int) -> int:
+    def transmit(self, arena: Memory, count: LaneCount, depth: int, step: int) -> LaneCount:
         """Take one step through surfaces or media that rays may pass.
 
         Args:
@@ -244,7 +281,7 @@ class ChunkSearch:
         if step == 0:
             calls.clear()
             calls.run(kernels.list_transmitting(), count, arena, arena, lists=[self.transmitting])
-            some = int(calls.counters[0])
+            some = calls.left(0)
             if not some:
                 return 0
             calls.clear()
@@ -252,18 +289,16 @@ class ChunkSearch:
         else:
             calls.clear()
             calls.run(kernels.transmit(True), count, source, target, slots=arena)
-        left = int(calls.counters[0])
+        left = calls.left(step + 1)
         if left:
             self._trace(target, kernels.passed, "pass_o", "pass_d", "pass_t", left)
         return left
 
-    def light(self, arena: Memory, count: int) -> None:
+    def light(self, arena: Memory, count: LaneCount) -> None:
         """Trace the arena's shadow rays, and write to it whether they are blocked, or their transmittance."""
-        kernels, calls, rows = self.kernels, self.calls, self.kernels.state
+        kernels, calls = self.kernels, self.calls
         if not kernels.packets:
-            o, d, t_max = (_row(arena.floats, rows, f"shadow_{name}", n) for name, n in (("o", 3), ("d", 3), ("t", 1)))
-            blocked = _row(arena.words, rows, "blocked", 1)[0]
-            kernels.wave.accel.blocked(o, d, t_max[0], count, blocked, kernels.non_opaque)
+            self._occluded_outside(arena, count)
         elif not kernels.has_opacity:
             calls.run(kernels.search_occluded(), count, arena, arena)
         if not kernels.has_opacity:
@@ -271,17 +306,24 @@ class ChunkSearch:
         source, target = self.passed
         calls.clear()
         calls.run(kernels.begin_shadow_rays(), count, arena, source, slots=arena)
-        while left := int(calls.counters[0]):
+        step = 0
+        while left := calls.left(step):
             self._trace(source, kernels.passed, "pass_o", "pass_d", "pass_t", left)
             calls.clear()
             calls.run(kernels.attenuate_shadow_rays(), left, source, target, slots=arena)
             source, target = target, source
+            step += 1
 
-    def _trace(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: int) -> None:
+    def _trace(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: LaneCount) -> None:
         """Find the nearest hit, opaque or not, of each ray in the rows ``o, d, t_max``."""
         if self.kernels.packets:
             self.calls.run(self.kernels.search_nearest(rows is self.kernels.passed), count, memory, memory)
-            return
+        else:
+            self._nearest_outside(memory, rows, o, d, t_max, count)
+
+    # -- searches by the acceleration structure, outside of kernels
+
+    def _nearest_outside(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: LaneCount) -> None:
         accel: Accel = self.kernels.wave.accel
         floats, words = memory.floats, memory.words
         accel.nearest(
@@ -294,6 +336,12 @@ class ChunkSearch:
             _row(floats, rows, "u", 1)[0],
             _row(floats, rows, "v", 1)[0],
         )
+
+    def _occluded_outside(self, arena: Memory, count: LaneCount) -> None:
+        kernels, rows = self.kernels, self.kernels.state
+        o, d, t_max = (_row(arena.floats, rows, f"shadow_{name}", n) for name, n in (("o", 3), ("d", 3), ("t", 1)))
+        blocked = _row(arena.words, rows, "blocked", 1)[0]
+        kernels.wave.accel.blocked(o, d, t_max[0], count, blocked, kernels.non_opaque)
 
 
 def _row(memory: np.ndarray, rows: Rows, name: str, count: int) -> np.ndarray:
@@ -340,14 +388,14 @@ class Paths:
     arena: Memory
     lists: list[Memory]
     depth: int = 1
-    count: int = 0
+    count: LaneCount = 0
     arrived: bool = False
     listed: bool = False
     shadows: bool = False
-    in_transit: int = 0
+    in_transit: LaneCount = 0
     step: int = 0
-    groups: Sequence[int] = ()
-    places: Sequence[int] = ()
+    groups: Sequence[LaneCount] = ()
+    places: Sequence[LaneCount] = ()
 
 
 class KernelsEngine:
@@ -356,6 +404,7 @@ class KernelsEngine:
     Args:
         kernels: of the render.
         halt: set to cancel the render; None: it cannot be cancelled.
+        calls: runs the kernels; None: in the calling thread.
 
     Attributes:
         slots: radiance of the chunk's samples.
@@ -366,10 +415,10 @@ class KernelsEngine:
 
     keeps_splats: ClassVar[bool] = True
 
-    def __init__(self, kernels: Kernels, halt: threading.Event | None = None) -> None:
+    def __init__(self, kernels: Kernels, halt: threading.Event | None = None, calls: Any = None) -> None:
         self.kernels, self.wave = kernels, kernels.wave
-        self.calls = Calls(kernels, halt or threading.Event())
-        self.search = ChunkSearch(self.calls)
+        self.calls: Calls = Calls(kernels, halt or threading.Event()) if calls is None else calls
+        self.search = self._search()
         self.slots = self.calls.slots
         self.shown: Memory | None = None
         self.tally = RayCounts()
@@ -377,9 +426,21 @@ class KernelsEngine:
         self._lost: list[np.ndarray] = []  # samples with splats that are not finite
         self._rooms = [self._room() for _ in range(2)]
 
+    def _search(self) -> ChunkSearch:
+        return ChunkSearch(self.calls)
+
     def _room(self) -> Paths:
         """Return new memory for the paths of a vertex."""
-        return Paths(Memory(self.kernels.state.count), [Memory(1) for _ in range(self.kernels.models + 2)])
+        memory = self.calls.memory
+        return Paths(memory(self.kernels.state.count), [memory(1) for _ in range(self.kernels.models + 2)])
+
+    def _count_rays(self, lanes: LaneCount, each: int = 1) -> None:
+        """Add ``each`` rays for each of ``lanes`` to the tally."""
+        self.tally.rays += each * lanes
+
+    def _count_truncated(self, lanes: LaneCount) -> None:
+        """Add truncated paths to the tally."""
+        self.tally.truncated += lanes
 
     def room(self, depth: int) -> Paths:
         """Return the memory for a vertex; two buffers alternate."""
@@ -423,7 +484,7 @@ class KernelsEngine:
         count = chunk.pixels * chunk.samples
         channels = sum(len(LAYERS[name].channels) for name in names)
         if self.shown is None or len(self.shown.words) != channels:
-            self.shown = Memory(channels)
+            self.shown = self.calls.memory(channels)
         self.shown.words[:, :count] = 0
         walk(self, self.spawn(chunk), self.wave.integrator.limits, _Layers(self, names))
         return count
@@ -434,13 +495,11 @@ class KernelsEngine:
         streams = wave.sampler.streams if pixel_set is None else pixel_set.randomizations
         x, y, width, _ = wave.crop
         point, turn = divmod(chunk.first_sample, streams.count)
-        self.calls.place[:] = np.array(
-            (
-                chunk.first_pixel, chunk.pixels, turn, (point + (1 << 31)) % (1 << 32) - (1 << 31),
-                streams.first, streams.count, x, y, width, wave.camera.resolution[0],
-            ),
-            np.int64,
-        ).astype(np.int32)  # fmt: skip
+        numbers = (
+            chunk.first_pixel, chunk.pixels, turn, (point + (1 << 31)) % (1 << 32) - (1 << 31),
+            streams.first, streams.count, x, y, width, wave.camera.resolution[0],
+        )  # fmt: skip
+        self.calls.set_chunk(np.array(numbers, np.int64).astype(np.int32))
 
     def spawn(self, chunk: Chunk) -> Paths:
         """Return the population of a chunk's camera rays, with their first hits if the search is part of the stages."""
@@ -450,27 +509,25 @@ class KernelsEngine:
         count, places = chunk.pixels * chunk.samples, None if chunk.pixel_set is None else chunk.pixel_set.indices
         if given is not None:
             places = given.number
-        paths, source = self._begin(self.room(1), 1, count), self.room(1).arena
+        paths, source = self._begin(self.room(1), 1, calls.lanes(count)), self.room(1).arena
         calls.clear()
         calls.set_dimensions(0)
         own = slice(chunk.first_pixel, chunk.first_pixel + chunk.pixels)
         if places is not None or given is not None:  # the kernel reads them from the arena of the next vertex
             source = self.room(2).arena
         if places is not None:
-            chosen = places[own].numpy().astype(np.int32)
-            source.words[kernels.state.first("prim"), :count] = np.tile(chosen, chunk.samples)
+            source.repeat(kernels.state.first("prim"), places[own][None], chunk.samples)
         if given is not None:
             for name, vectors in (("o", given.o), ("d", given.d)):
-                row = kernels.state.first(name)
-                source.floats[row : row + 3, :count] = np.tile(vectors[:, own].numpy(), chunk.samples)
+                source.repeat(kernels.state.first(name), vectors[:, own], chunk.samples)
         lists = paths.lists if kernels.fused else None
         kernel = kernels.generate(places is not None, given is not None)
-        calls.run(kernel, count, source, paths.arena, lists=lists)
+        calls.run(kernel, paths.count, source, paths.arena, lists=lists)
         if kernels.fused:
-            self.tally.rays += count
+            self._count_rays(paths.count)
         return paths
 
-    def _begin(self, paths: Paths, depth: int, count: int) -> Paths:
+    def _begin(self, paths: Paths, depth: int, count: LaneCount) -> Paths:
         """Initialize the memory of a vertex."""
         paths.depth, paths.count, paths.shadows, paths.groups = depth, count, False, ()
         paths.in_transit = paths.step = 0
@@ -483,7 +540,7 @@ class KernelsEngine:
         """See :class:`torchpt.paths.walk.Engine`."""
         if paths.arrived:
             return False
-        self.tally.rays += paths.count
+        self._count_rays(paths.count)
         self.search.nearest(paths.arena, paths.count)
         paths.in_transit = paths.count if self.kernels.has_transmission else 0
         return self.kernels.has_transmission
@@ -492,7 +549,7 @@ class KernelsEngine:
         """See :class:`torchpt.paths.walk.Engine`."""
         paths.in_transit = self.search.transmit(paths.arena, paths.in_transit, paths.depth, paths.step)
         paths.step += 1
-        return paths.in_transit > 0
+        return bool(paths.in_transit)
 
     def sort(self, paths: Paths) -> Counts:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -528,41 +585,40 @@ class KernelsEngine:
         if not paths.groups:  # not sorted: all paths end
             if paths.listed:  # compacted: paths that had ended are not in the arena
                 paths.count, _ = calls.counted()
-            paths.arena.words[kernels.state.first("prim"), : paths.count] = -1
-            paths.arena.floats[kernels.state.first("t_max"), : paths.count] = 0.0
+            paths.arena.words[kernels.state.first("prim")] = -1
+            paths.arena.floats[kernels.state.first("t_max")] = 0.0
             self._sort_lanes(paths)
             return
         for model, count in enumerate(paths.groups):
             if count:
                 lanes = paths.lists[model] if kernels.listed else None
                 calls.run(kernels.terminate(), count, paths.arena, paths.arena, lanes)
-                self.tally.truncated += count if truncated else 0
+                if truncated:
+                    self._count_truncated(count)
 
     def scatter(self, paths: Paths, roulette: float) -> Paths:
         """See :class:`torchpt.paths.walk.Engine`."""
         kernels, calls = self.kernels, self.calls
-        after = self._begin(self.room(paths.depth + 1), paths.depth + 1, sum(paths.groups))
-        if kernels.fused:
-            self.tally.rays += after.count
+        starts, total = calls.running_sums(paths.groups)
+        after = self._begin(self.room(paths.depth + 1), paths.depth + 1, total)
         calls.clear()
         calls.set_dimensions(paths.depth)
-        done = 0
-        for model, count in enumerate(paths.groups):
+        for model, (count, start) in enumerate(zip(paths.groups, starts, strict=True)):
             if not count:
                 continue
-            if not kernels.fused:
-                calls.counters[0] = done
             lanes = paths.lists[model]
             if model in kernels.eager:
+                known, first = calls.known(count), calls.known(start)
                 self.tally.rays += bounce_eagerly(
-                    kernels, model, roulette, paths.arena, after.arena, lanes, count, done, paths.depth
+                    kernels, model, roulette, paths.arena, after.arena, lanes, known, first, paths.depth
                 )
-            else:
-                kernel = kernels.bounce(model, roulette)
-                lanes = lanes if kernels.listed else None
-                calls.run(kernel, count, paths.arena, after.arena, lanes, lists=after.lists)
-                self.tally.rays += count * kernel.program.shadows
-            done += count
+                continue
+            if not kernels.fused:
+                calls.write_from(start)
+            kernel = kernels.bounce(model, roulette)
+            lanes = lanes if kernels.listed else None
+            calls.run(kernel, count, paths.arena, after.arena, lanes, lists=after.lists)
+            self._count_rays(count, kernel.program.shadows + int(kernels.fused))  # with the rays to the next vertex
         return after
 
     def occlude(self, paths: Paths) -> None:

@@ -98,6 +98,22 @@ class Memory:
         self.floats = self.words.view(np.float32)
         self.address = self.words.ctypes.data
 
+    def repeat(self, first: int, values: Tensor, times: int) -> None:
+        """Write ``values (rows, n)`` to the rows from ``first`` on, ``times`` one after the other."""
+        held = self.floats if values.is_floating_point() else self.words
+        # By numpy: torch would start a team of threads for each thread that renders.
+        held[first : first + len(values), : times * values.shape[1]] = np.tile(values.numpy(), times)
+
+    def take(self, first: int, rows: int, lanes: np.ndarray, dtype: torch.dtype) -> Tensor:
+        """Return ``(rows, lanes)`` of the rows from ``first`` on."""
+        held = self.floats if dtype.is_floating_point else self.words
+        return torch.from_numpy(held[first : first + rows, lanes]).to(dtype)
+
+    def put(self, first: int, start: int, values: Tensor) -> None:
+        """Write ``values (rows, n)`` to the rows from ``first`` on, at lanes from ``start`` on."""
+        held = self.floats if values.is_floating_point() else self.words
+        held[first : first + len(values), start : start + values.shape[1]] = values.numpy()
+
 
 class Rows:
     """Row numbers of an arena by field.
@@ -158,9 +174,7 @@ class Rows:
         for name in names:
             if name in self._fields:
                 shape, ty = self._fields[name]
-                held = memory.floats if ty == "f" else memory.words
-                first = self._first[name]
-                value = torch.from_numpy(held[first : first + math.prod(shape), lanes]).to(_DTYPES[ty])
+                value = memory.take(self._first[name], math.prod(shape), lanes, _DTYPES[ty])
                 values[name] = value.view(*shape, len(lanes))
         return values
 
@@ -168,11 +182,8 @@ class Rows:
         """Write fields of consecutive lanes from tensors; names without rows are ignored."""
         for name, value in values.items():
             if name in self._fields and value is not None:
-                shape, ty = self._fields[name]
-                held = memory.floats if ty == "f" else memory.words
-                first = self._first[name]
-                rows = value.reshape(math.prod(shape), -1)
-                held[first : first + len(rows), start : start + rows.shape[1]] = rows.numpy()
+                shape, _ = self._fields[name]
+                memory.put(self._first[name], start, value.reshape(math.prod(shape), -1))
 
     def nodes(self, tracer: Tracer, **fields: Tensor) -> list[tuple[int, int]]:
         """Return pairs of row and node for results by field; values that all lanes share are broadcast."""
