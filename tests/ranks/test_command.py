@@ -73,9 +73,10 @@ def test_a_signal_to_one_ends_all_with_the_picture_so_far(rank: int, tmp_path: P
     _wait_for(tmp_path / "a.npz", started)
     os.kill(started.children[rank].pid, signal.SIGTERM)
     assert started.codes() == [143, 143]
-    assert started.lines() == [
-        "torchpt: stopped by a signal; a.exr holds the picture so far; render.resume=true goes on"
-    ]
+    *warnings, last = started.lines()
+    assert last == "torchpt: stopped by a signal; a.exr holds the picture so far; render.resume=true goes on"
+    # A slow machine has few samples by then, and says that the error of so few is not known.
+    assert all(line.startswith("torchpt: warning: the picture's error is not known") for line in warnings)
     summary = json.loads(started.output.read_text().splitlines()[-1])
     assert summary["complete"] is False and 0 < summary["spp"] < 1000000
     assert float(torchpt.read_image(tmp_path / "a.exr").mean()) > 0.05
