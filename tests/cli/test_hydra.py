@@ -63,7 +63,10 @@ def test_a_types_file_holds_its_own_keys_and_no_values() -> None:
             "expected only keys of integrator=direct",
             marks=pytest.mark.slow,
         ),
-        (["integrator=direct", "integrator.depth=8"], "integrator.depth: unknown key (did you mean integrator.rr_depth?); known: integrator.type"),
+        (
+            ["integrator=direct", "integrator.depth=8"],
+            "depth: unknown key (did you mean integrator.rr_depth?); known: integrator.type",
+        ),
     ],
 )
 def test_keys_of_another_type_are_refused(
