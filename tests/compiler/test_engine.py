@@ -14,6 +14,7 @@ from forms import one_lane
 
 from torchpt.compiler import cache as shelf
 from torchpt.compiler import cpu
+from torchpt.compiler.target import Target
 from torchpt.native import cache
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners and modes of files here")
@@ -101,7 +102,7 @@ def test_within_a_process_a_kernel_is_made_once(here):
 
 
 def test_targets_have_entries_of_their_own(here):
-    cpu.compile_ir(ir(), cpu.Target("generic", ""))
+    cpu.compile_ir(ir(), Target("generic", ""))
     cpu.compile_ir(ir())
     cpu.compile_ir(ir(), one_lane())  # another form
     assert cpu.counts() == (3, 0) and len(entries(here)) == 3

@@ -22,9 +22,9 @@ from few import few
 from forms import differing, one_lane
 from numpy.typing import NDArray
 
-from torchpt.compiler.cpu import Target
 from torchpt.compiler.function import compile_lanewise
 from torchpt.compiler.functions import FUNCTIONS
+from torchpt.compiler.target import Target
 
 DENSE = np.finfo(np.longdouble).nmant >= 63
 DOCS = Path(__file__).parents[2] / "docs" / "explanations" / "lanes.md"

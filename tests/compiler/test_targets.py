@@ -12,8 +12,8 @@ from forms import differing
 from torch import Tensor
 
 from torchpt.compiler import cpu as engine
-from torchpt.compiler.cpu import Target
 from torchpt.compiler.function import compile_lanewise
+from torchpt.compiler.target import Target
 
 X86 = platform.machine().lower() in ("x86_64", "amd64")
 N = 333

@@ -107,7 +107,7 @@ def stage(x: Tensor, table: Tensor, gain: Tensor) -> list[Tensor]:
 def program(tracer: Tracer, ir: str) -> Program:
     made = cpu.compile_ir(ir)
     parts = tuple(tracer.tables), tuple(tracer.steps), tuple(tracer.constants), tuple(tracer.guards)
-    return Program(made.call, made.key, *parts, (), 0, 0, 1, 2, 0, {})
+    return Program(made, *parts, (), 0, 0, 1, 2, 0, {})
 
 
 def call(made: Program, x: Tensor, results: int, leaves: dict[str, Tensor]) -> list[Tensor]:

@@ -18,6 +18,7 @@ from torch import Tensor
 import torchpt
 from torchpt.compiler import cpu
 from torchpt.compiler.cache import clear_programs
+from torchpt.compiler.target import Target
 from torchpt.math.sampling import cosine_hemisphere, uniform_sphere
 from torchpt.math.vectors import dot
 from torchpt.paths.integrators.base import Limits
@@ -235,7 +236,7 @@ def test_fog_is_the_same_without_avx512(monkeypatch):
     here = torchpt.render(scene, compile="on", threads=1, **keys)
     older = "haswell" if "+avx2" in cpu.host().features.split(",") else "nehalem"
     clear_programs()
-    monkeypatch.setitem(cpu._state, "host", cpu.Target(older, ""))
+    monkeypatch.setitem(cpu._state, "host", Target(older, ""))
     try:
         assert torch.equal(torchpt.render(torchpt.load(furnace(), "cpu"), compile="on", threads=1, **keys), here)
     finally:

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler import cpu
-from torchpt.compiler.cpu import Target
 from torchpt.compiler.form import SCALAR
+from torchpt.compiler.target import Target
 
 __all__ = ["differing", "one_lane"]
 

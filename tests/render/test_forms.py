@@ -20,11 +20,11 @@ from torch import Tensor
 
 import torchpt
 from torchpt.compiler import cache, cpu
-from torchpt.compiler.cpu import Target
 from torchpt.compiler.form import CAPACITY, SCALAR, VECTORS
 from torchpt.compiler.kernel import kernel_ir
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.sinks import Sinks
+from torchpt.compiler.target import Target
 from torchpt.engines.kernels import engine as calls
 from torchpt.engines.kernels.programs import Kernel
 
@@ -38,13 +38,13 @@ def stages(monkeypatch) -> Iterator[dict[str, TracedStage]]:
     found: dict[str, TracedStage] = {}
     compiled = cache.compile_stage
 
-    def noted(stage: TracedStage) -> Any:
-        program = compiled(stage)
+    def noted(stage: TracedStage, target: Target | None = None) -> Any:
+        program = compiled(stage, target)
         found[program.code] = stage
         return program
 
     monkeypatch.setattr(cache, "compile_stage", noted)
-    monkeypatch.setattr(cache, "cache_key", lambda structure: None)
+    monkeypatch.setattr(cache, "cache_key", lambda structure, target: None)
     cache.clear_programs()
     yield found
     cache.clear_programs()
@@ -96,7 +96,7 @@ class ErrorProbes:
         """The kernel on one lane at a time."""
         if id(kernel) not in self._singles:
             made = cpu.compile_ir(kernel_ir(stage, SCALAR), one_lane())
-            single = replace(kernel, program=replace(kernel.program, call=made.call, code=made.key))
+            single = replace(kernel, program=replace(kernel.program, function=made))
             self._singles[id(kernel)] = kernel, single  # both live, so that their ids stay their own
         return self._singles[id(kernel)][1]
 

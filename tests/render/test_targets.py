@@ -11,6 +11,7 @@ from few import few
 import torchpt
 from torchpt.compiler import cache
 from torchpt.compiler import cpu as engine
+from torchpt.compiler.target import Target
 from torchpt.rendering.api import render_scene
 from torchpt.scene.formats.description import settings
 
@@ -30,7 +31,7 @@ def picture(name: str, spp: int) -> torch.Tensor:
 def test_older_machines_show_the_same_picture(monkeypatch, name, cpu):
     own = picture(name, 4)
     made = engine.counts()
-    monkeypatch.setitem(engine._state, "host", engine.Target(cpu, ""))
+    monkeypatch.setitem(engine._state, "host", Target(cpu, ""))
     monkeypatch.setattr(cache, "_programs", {})
     other = picture(name, 4)
     assert engine.counts() != made  # code of its own, made now or read from disk

@@ -18,6 +18,7 @@ from torchpt.compiler.graph import DTYPES
 from torchpt.compiler.kernel import kernel_ir
 from torchpt.compiler.program import Program, TracedStage, guards_hold
 from torchpt.compiler.prologue import Guard, Source, Step, Table
+from torchpt.compiler.target import Target
 from torchpt.native import cache
 from torchpt.native.content import code_of_folder
 
@@ -41,10 +42,13 @@ class _NotKept(Exception):
     """A value that cannot be stored in an entry."""
 
 
-def cache_key(structure: Any) -> str | None:
-    """Return the cache key of a structure; None if it holds objects that exist in this process alone."""
+def cache_key(structure: Any, target: Target | None = None) -> str | None:
+    """Return the cache key of a structure for a target (None: this machine).
+
+    None if the structure holds objects that exist in this process alone.
+    """
     try:
-        content = "\n".join((code_of_folder(), torch.__version__, cpu.identity(), _canonical(structure)))
+        content = "\n".join((code_of_folder(), torch.__version__, cpu.identity(target), _canonical(structure)))
     except _NotKept:
         return None
     return hashlib.sha256(content.encode()).hexdigest()
@@ -62,18 +66,17 @@ def _canonical(value: Any) -> str:
     raise _NotKept
 
 
-def load(key: str) -> Program | None:
-    """Load a program from disk; None if there is no usable entry."""
+def load(key: str, target: Target | None = None) -> Program | None:
+    """Load a program for a target (None: this machine) from disk; None if there is no usable entry."""
     content = cache.read(f"{key[:40]}.json")
     if content is None:
         return None
     facts = json.loads(content)
-    function = cpu.load_function(facts["code"])
+    function = cpu.load_function(facts["code"], target)
     if function is None:
         return None
     return Program(
-        call=function.call,
-        code=function.key,
+        function=function,
         tables=tuple(Table(_source(x), axis) for x, axis in facts["tables"]),
         steps=tuple(_step(x) for x in facts["steps"]),
         constants=tuple(_tensor(x) for x in facts["constants"]),
@@ -162,40 +165,44 @@ def _step(value: list[Any]) -> Step:
 
 #: Most programs that are kept in memory.
 MOST_PROGRAMS = 512
-#: Programs by structure, the newest last.
+#: Programs by structure and target, the newest last.
 _programs: dict[Any, Program] = {}
 _tracing = threading.Lock()
 
 
-def program_of(structure: Any, tensors: Mapping[str, Tensor], traced: Callable[[], TracedStage]) -> Program:
+def program_of(
+    structure: Any, tensors: Mapping[str, Tensor], traced: Callable[[], TracedStage], target: Target | None = None
+) -> Program:
     """Return the program of a structure: from memory, from disk, or traced and compiled now.
 
     Args:
         structure: all that a trace depends on, except for the values of tensors; hashable.
         tensors: the leaves by path; a trace may depend on their values, and then has guards.
         traced: traces the stage.
+        target: machine to compile for; None: this one.
 
     Raises:
         Unsupported: the stage does something that the lane compiler cannot compile.
     """
     with _tracing:  # one at a time in a process: see torchpt.compiler.tracing.tracing
-        program = _programs.get(structure)
-        name = cache_key(structure) if program is None else None
+        key = structure, target
+        program = _programs.get(key)
+        name = cache_key(structure, target) if program is None else None
         if program is None and name is not None:
-            program = load(name)
+            program = load(name, target)
         if program is None or not guards_hold(program, tensors):
-            program = compile_stage(traced())
+            program = compile_stage(traced(), target)
             if name is not None:
                 store(name, program)
-        if _programs.get(structure) is not program:
-            _programs.pop(structure, None)
-            _programs[structure] = program
+        if _programs.get(key) is not program:
+            _programs.pop(key, None)
+            _programs[key] = program
             if len(_programs) > MOST_PROGRAMS:
                 del _programs[next(iter(_programs))]
         return program
 
 
-def compile_stage(stage: TracedStage, target: cpu.Target | None = None) -> Program:
+def compile_stage(stage: TracedStage, target: Target | None = None) -> Program:
     """Compile a traced stage for a target; None is this machine."""
     target = target or cpu.host()
     return Program.of(stage, cpu.compile_ir(kernel_ir(stage, target.form), target))

@@ -1,4 +1,7 @@
-"""Compile LLVM IR to machine code, by llvmlite."""
+"""Compile LLVM IR by llvmlite: to machine code of this CPU that can be called, or to code for another machine.
+
+Code is cached in memory and on disk, by the IR, the target and the version of llvmlite.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,13 @@ import threading
 from dataclasses import dataclass
 from typing import Any
 
-from torchpt.compiler.form import VECTORS, Form
+from torchpt.compiler.ptx import emit_ptx
+from torchpt.compiler.target import Target
 from torchpt.core.memory import check_address_space
 from torchpt.native import cache
 
 __all__ = [
     "Function",
-    "Target",
     "compile_ir",
     "counts",
     "host",
@@ -31,30 +34,20 @@ _machines: dict[Target, Any] = {}
 
 
 @dataclass(frozen=True)
-class Target:
-    """A machine that kernels are compiled for.
+class Function:
+    """A compiled kernel.
 
     Attributes:
-        cpu: LLVM's name of the CPU.
-        features: LLVM's list of CPU features.
-        triple: LLVM's target triple; None: this machine.
-        form: layout of lanes in registers.
+        call: ``call(address of the arguments, lanes)`` runs the kernel without the GIL; None for another machine's code.
+        code: an object file, or the text of PTX.
+        engine: keeps the code in memory.
+        key: cache key of the code.
     """
-
-    cpu: str
-    features: str
-    triple: str | None = None
-    form: Form = VECTORS
-
-
-@dataclass(frozen=True)
-class Function:
-    """A compiled kernel: ``call(address of the arguments, lanes)`` runs it without the GIL."""
 
     call: Any
     code: bytes
-    engine: Any  # keeps the code in memory
-    key: str = ""  # cache key, its file name on disk
+    engine: Any
+    key: str = ""
 
 
 def _llvm() -> Any:
@@ -89,33 +82,39 @@ def compile_ir(ir: str, target: Target | None = None) -> Function:
         key = _key(ir, target)
         function = _functions.get(key)
         if function is None:
-            code = cache.read(f"{key[:40]}.o")
+            code = cache.read(_entry(key, target))
             check_address_space()  # LLVM ends the process where it finds no memory
             if code is None:
-                code = _object(ir, target)
+                code = emit_ptx(_llvm(), ir, target) if target.form.threads else _object(ir, target)
                 _state["compiled"] += 1
-                cache.write(f"{key[:40]}.o", code)
+                cache.write(_entry(key, target), code)
             else:
                 _state["loaded"] += 1
             function = _functions[key] = _loaded(code, target, key)
         return function
 
 
-def load_function(key: str) -> Function | None:
-    """Return a function of this machine by its key, from memory or from disk; None if it is in neither."""
+def load_function(key: str, target: Target | None = None) -> Function | None:
+    """Return a function of a target (None: this machine) by its key, from memory or disk; None if it is in neither."""
     with _lock:
+        target = target or host()
         function = _functions.get(key)
-        code = cache.read(f"{key[:40]}.o") if function is None else None
+        code = cache.read(_entry(key, target)) if function is None else None
         if code is not None:
             check_address_space()
             _state["loaded"] += 1
-            function = _functions[key] = _loaded(code, host(), key)
+            function = _functions[key] = _loaded(code, target, key)
         return function
 
 
-def identity() -> str:
-    """Return text that identifies compiler and machine, as part of cache keys."""
-    return _named(host())
+def identity(target: Target | None = None) -> str:
+    """Return text that identifies compiler and target (None: this machine), as part of cache keys."""
+    return _named(target or host())
+
+
+def _entry(key: str, target: Target) -> str:
+    """Return the name of the cache's entry."""
+    return f"{key[:40]}.{'ptx' if target.form.threads else 'o'}"
 
 
 def _named(target: Target) -> str:

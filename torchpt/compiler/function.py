@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler import cache, operators  # noqa: F401  (the operators register how they are lowered)
-from torchpt.compiler.cpu import Target
 from torchpt.compiler.graph import DTYPES, Unsupported
 from torchpt.compiler.kernel import HEAD
 from torchpt.compiler.program import Program, Tables, TracedStage, bind_tables
 from torchpt.compiler.prologue import without_unused_steps
 from torchpt.compiler.sinks import Sinks, Store
+from torchpt.compiler.target import Target
 from torchpt.compiler.tracing import Tracer, choose_lane_count, tracing
 from torchpt.core.threads import parallel_for, thread_count
 from torchpt.core.tree import leaves, signature

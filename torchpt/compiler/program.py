@@ -65,8 +65,7 @@ class Program:
     """A stage compiled for all records of one structure.
 
     Attributes:
-        call: the machine code, see :class:`torchpt.compiler.cpu.Function`.
-        code: cache key of the machine code.
+        function: the compiled kernel.
         tables: tables that the kernel reads.
         steps: the prologue, which computes some tables from leaves.
         constants: constant tensors.
@@ -81,8 +80,7 @@ class Program:
         sums: parameters whose derivatives are rows of the results, see :mod:`torchpt.engines.kernels.backward`.
     """
 
-    call: Any
-    code: str
+    function: Function
     tables: tuple[Table, ...]
     steps: tuple[Step, ...]
     constants: tuple[Tensor, ...]
@@ -104,8 +102,7 @@ class Program:
             for file in stage.graph.origins[node]:
                 nodes[file] = nodes.get(file, 0) + 1
         return cls(
-            call=function.call,
-            code=function.key,
+            function=function,
             tables=tuple(stage.tables),
             steps=tuple(stage.steps),
             constants=tuple(stage.constants),
@@ -119,6 +116,16 @@ class Program:
             nodes=nodes,
             sums=stage.sums,
         )
+
+    @property
+    def call(self) -> Any:
+        """Return the machine code, see :class:`torchpt.compiler.cpu.Function`."""
+        return self.function.call
+
+    @property
+    def code(self) -> str:
+        """Return the cache key of the machine code."""
+        return self.function.key
 
     def leaves(self) -> frozenset[str]:
         """Return the paths of the leaves that the tables depend on."""

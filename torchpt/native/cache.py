@@ -27,7 +27,7 @@ DAY = 86_400.0
 #: Prefix of the names of entries that are being written.
 _UNFINISHED = "unfinished-"
 #: Files that may be removed: the folder may hold other files.
-_OURS = re.compile(rf"[0-9a-f]{{40}}\.(o|json|nbc)|{_UNFINISHED}.*")
+_OURS = re.compile(rf"[0-9a-f]{{40}}\.(o|json|nbc|ptx)|{_UNFINISHED}.*")
 
 
 def cache_folder() -> Path | None:
