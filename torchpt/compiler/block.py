@@ -164,6 +164,15 @@ class Block:
         """Convert between node types by an LLVM cast ``op``: ``sitofp``, ``bitcast``, ..."""
         return self.op(f"{op} {self.vector(source)} {a} to {self.vector(target)}")
 
+    def to_integer(self, source: str, target: str, a: str) -> str:
+        """Round a float towards zero; NaN and numbers out of range give the least integer, the result of x86."""
+        number = self.convert("fptosi", source, target, a)
+        if not self.form.threads:  # by x86 itself: LLVM leaves the result open, and freezes what the instruction gives
+            return self.op(f"freeze {self.vector(target)} {number}")
+        top = 2.0 ** (63 if target == "L" else 31)
+        low, high = (self.compare(op, source, a, self.constant(source, x)) for op, x in (("oge", -top), ("olt", top)))
+        return self.select(target, self.op(f"and i1 {low}, {high}"), number, self.constant(target, -int(top)))
+
     def polynomial(self, ty: str, x: str, coefficients: tuple[float, ...]) -> str:
         """Evaluate a polynomial by Horner's scheme; coefficients of the highest power first."""
         value = self.constant(ty, coefficients[0])

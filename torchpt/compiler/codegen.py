@@ -99,8 +99,7 @@ def _cast(block: Block, source: str, target: str, a: str) -> str:
     if source in FLOATS and target in FLOATS:
         return block.convert("fpext" if target == "d" else "fptrunc", source, target, a)
     if source in FLOATS:
-        # fptosi of NaN and out of range is poison: frozen to any number, which look-ups clamp.
-        number = block.op(f"freeze {block.vector(target)} {block.convert('fptosi', source, target, a)}")
+        number = block.to_integer(source, target, a)
         return _byte(block, number) if target == "u" else number
     if target in FLOATS:
         return block.convert("sitofp", source, target, a)
@@ -167,7 +166,7 @@ def _quotient(block: Block, ty: str, a: str, b: str, rounding: str) -> str:
     """Divide 32-bit integers in float64, which is exact: CPUs have no integer division of vectors."""
     x, y = (block.convert("sitofp", ty, "d", v) for v in (a, b))
     q = block.call(f"llvm.{rounding}", "d", block.div("d", x, y))
-    return block.op(f"freeze {block.vector(ty)} {block.convert('fptosi', 'd', ty, q)}")
+    return block.to_integer("d", ty, q)
 
 
 def _wide_quotient(block: Block, a: str, b: str) -> tuple[str, str]:
@@ -178,8 +177,7 @@ def _wide_quotient(block: Block, a: str, b: str) -> tuple[str, str]:
     x, y = (block.convert("sitofp", "L", "d", v) for v in (a, b))
 
     def floored(top: str) -> str:
-        whole = block.convert("fptosi", "d", "L", block.call("llvm.floor", "d", block.div("d", top, y)))
-        return block.op(f"freeze {block.vector('L')} {whole}")
+        return block.to_integer("d", "L", block.call("llvm.floor", "d", block.div("d", top, y)))
 
     q = floored(x)
     r = block.sub("L", a, block.mul("L", q, b))
@@ -245,6 +243,8 @@ def _against(block: Block, ty: str, r: str, b: str) -> str:
 
 
 def _fmod(block: Block, ty: str, a: str, b: str) -> str:
+    if ty in FLOATS and block.form.threads:
+        return block.op(f"call {block.vector(ty)} @fmod_{ty}({block.vector(ty)} {a}, {block.vector(ty)} {b})")
     if ty in FLOATS:
         return block.op(f"frem {block.vector(ty)} {a}, {b}")
     return block.sub(ty, a, block.mul(ty, _truncdiv(block, ty, a, b), b))

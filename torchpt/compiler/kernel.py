@@ -16,6 +16,7 @@ from torchpt.compiler.fusing import fused_products
 from torchpt.compiler.graph import Graph, Unsupported
 from torchpt.compiler.packet import binary_searches, packet_search
 from torchpt.compiler.program import TracedStage
+from torchpt.compiler.remainder import float_remainders
 from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 
 __all__ = ["HEAD", "SinkWriter", "argument_words", "kernel_ir", "sink_writer"]
@@ -339,7 +340,7 @@ def kernel_ir(stage: TracedStage, form: Form) -> str:
             names[node] = generate_node(body, graph, node, names)
     ends = sink_writer(body, graph, names, sinks)
     ends.write()
-    inner = [binary_searches(graph, needed, form)]
+    inner = [binary_searches(graph, needed, form), float_remainders(graph, needed, form)]
     if stage.searched is not None:
         inner.append(packet_search(stage.searched, form))
     declarations = set().union(*(block.declarations for block in (body, *inner)))

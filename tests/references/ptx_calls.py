@@ -1,0 +1,326 @@
+"""Kernels as PTX on a machine beside the same kernels on one lane of this CPU at a time, on the same memory.
+
+:class:`DeviceProbes` does that with the calls of real renders, :func:`differing_results` with functions of tensors.
+Everything is compared that a kernel may write, all of its arenas, slots and lists, so a store to a wrong place is seen too.
+Only the order of packed lanes is free: warps append as they come.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from forms import differing, one_lane
+from ptx_machine import WARP, DeviceMemory, PtxMachine
+from torch import Tensor
+
+import torchpt
+from torchpt.compiler import cache, cpu
+from torchpt.compiler import function as functions
+from torchpt.compiler.cpu import Function
+from torchpt.compiler.function import compile_lanewise
+from torchpt.compiler.kernel import HEAD, kernel_ir
+from torchpt.compiler.program import Tables, TracedStage
+from torchpt.compiler.ptx import ptx_target
+from torchpt.compiler.sinks import Sinks
+from torchpt.engines.kernels import engine as calls
+from torchpt.engines.kernels.programs import Kernel
+
+__all__ = ["LANES", "DeviceProbes", "Probe", "differing_results", "probed", "ptx_of", "traced_stages"]
+
+#: Most lanes of a kernel that are compared.
+LANES = 256
+#: Instructions of a PTX text beyond which each thread takes one lane only, to save time.
+LONG = 1500
+
+
+@contextmanager
+def traced_stages() -> Iterator[dict[str, TracedStage]]:
+    """Keep the stages that are compiled meanwhile by the keys of their code; nothing is read from caches of programs."""
+    found: dict[str, TracedStage] = {}
+    compiled = cache.compile_stage
+
+    def noted(stage: TracedStage, target: Any = None) -> Any:
+        program = compiled(stage, target)
+        found[program.code] = stage
+        return program
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "compile_stage", noted)
+        patch.setattr(cache, "cache_key", lambda structure, target=None: None)
+        cache.clear_programs()
+        yield found
+        cache.clear_programs()
+
+
+def ptx_of(stage: TracedStage) -> str:
+    """Return the PTX of a stage."""
+    return cpu.compile_ir(kernel_ir(stage, ptx_target().form), ptx_target()).code.decode()
+
+
+def _grid(lanes: int, machine: PtxMachine) -> tuple[int, int]:
+    """Return blocks and threads of a block; short kernels run in too few threads, so that each takes several lanes."""
+    threads = math.ceil(lanes / WARP) * WARP
+    if sum(machine.instructions.values()) < LONG:
+        threads = max(math.ceil(threads / 2 / WARP) * WARP, WARP)
+    return (threads // (2 * WARP), 2 * WARP) if threads % (2 * WARP) == 0 else (threads // WARP, WARP)
+
+
+def _add_tables(memory: DeviceMemory, tables: Tables) -> None:
+    block, keep = tables.keep
+    memory.add(np.ctypeslib.as_array(block), constant=True)
+    for table in keep:
+        memory.add(table.numpy(), constant=True)
+
+
+# ---- Calls of renders
+
+
+@dataclass
+class Probe:
+    """The comparisons of one kernel.
+
+    Attributes:
+        stage: that it computes.
+        machine: that ran its PTX.
+        ptx: its text.
+        lanes: most lanes of a call that was compared.
+        calls: number of calls.
+        numbers: how many numbers the kernel wrote in them.
+        wrong: descriptions of what differed.
+    """
+
+    stage: TracedStage
+    machine: PtxMachine
+    ptx: str
+    lanes: int = 0
+    calls: int = 0
+    total: int = 0
+    numbers: int = 0
+    wrong: list[str] = field(default_factory=list)
+
+    @property
+    def instructions(self) -> float:
+        """Return the instructions that a lane took."""
+        return sum(self.machine.executed.values()) / self.total
+
+    @property
+    def issues(self) -> float:
+        """Return the instructions that warps issued for a lane, times the threads of a warp."""
+        return WARP * sum(self.machine.issued.values()) / self.total
+
+
+class DeviceProbes:
+    """Makes calls of :meth:`Calls.run` twice more, on at most :data:`LANES` of their lanes.
+
+    The first call of each kernel is compared, and later ones that have more lanes, as long as none had :data:`LANES`.
+
+    Attributes:
+        found: comparisons by kernel.
+    """
+
+    def __init__(self, stages: Mapping[str, TracedStage], patch: pytest.MonkeyPatch) -> None:
+        self.stages, self._kept = stages, calls.Calls.run
+        self.found: dict[str, Probe] = {}
+        self._alternatives: dict[int, tuple[Kernel, Kernel, Kernel]] = {}
+        self._memory = DeviceMemory()
+        patch.setattr(calls.Calls, "run", lambda *given, **named: self._run(*given, **named))
+
+    def _run(
+        self, own: Any, kernel: Kernel, count: int, source: Any, target: Any, places: Any = None, lists: Any = None,
+        slots: Any = None,
+    ) -> None:  # fmt: skip
+        given = source, target, places, lists, slots
+        name = "_".join(map(str, next(key for key, made in own.kernels._made.items() if made is kernel)))
+        probe = self.found.get(name)
+        lanes = min(count, LANES)
+        if lanes and (probe is None or lanes > probe.lanes):
+            self._compare(own, name, kernel, lanes, *given)
+        self._kept(own, kernel, count, *given)
+
+    def _compare(
+        self,
+        own: Any,
+        name: str,
+        kernel: Kernel,
+        lanes: int,
+        source: Any,
+        target: Any,
+        places: Any,
+        lists: Any,
+        slots: Any,
+    ) -> None:
+        single, device = self._others(name, kernel)
+        probe = self.found[name]
+        lists = lists or []
+        written = [target.words, (own.slots if slots is None else slots).words, own.counters, *(x.words for x in lists)]
+        before = [words.copy() for words in written]
+        self._map(own, kernel, source, places, written)
+        results = []
+        for other in (single, device):
+            for words, old in zip(written, before, strict=True):
+                words[:] = old
+            self._kept(own, other, lanes, source, target, places, lists, slots)
+            results.append([words.copy() for words in written])
+        for words, old in zip(written, before, strict=True):
+            words[:] = old
+        probe.lanes, probe.calls, probe.total = lanes, probe.calls + 1, probe.total + lanes
+        if (results[0][2] != results[1][2]).any():
+            probe.wrong.append(f"counters: {results[0][2]} and {results[1][2]}")
+            return
+        for result in results:
+            _sort_packed(probe.stage.sinks, result, before[2])
+        names = ["arena", "slots", "counters", *(f"list {k}" for k in range(len(lists)))]
+        for what, a, b, old in zip(names, *results, before, strict=True):
+            probe.numbers += int((a != old).sum())
+            if what in ("arena", "slots"):
+                a, b = a.view(np.float32), b.view(np.float32)
+            wrong = differing(torch.from_numpy(a), torch.from_numpy(b)).numpy()
+            if wrong.any():
+                first = np.argwhere(wrong)[0]
+                told = f"{a[tuple(first)]!r} and {b[tuple(first)]!r}"
+                probe.wrong.append(f"{int(wrong.sum())} of {what}, first at {first.tolist()}: {told}")
+
+    def _others(self, name: str, kernel: Kernel) -> tuple[Kernel, Kernel]:
+        """Return the kernel by single lanes of this CPU, and by the machine."""
+        if id(kernel) not in self._alternatives:
+            stage = self.stages[kernel.program.code]
+            single = cpu.compile_ir(kernel_ir(stage, one_lane().form), one_lane())
+            ptx = ptx_of(stage)
+            probe = self.found[name] = Probe(stage, PtxMachine(ptx), ptx)
+
+            def call(address: int, lanes: int) -> None:
+                count = np.array([lanes])
+                self._memory.add(count, constant=True)
+                arguments = ctypes.string_at(address, probe.machine.sizes[0]), np.int64(count.ctypes.data).tobytes()
+                probe.machine.launch(self._memory, arguments, *_grid(lanes, probe.machine), seed=lanes)
+
+            device = Function(call, b"", None)
+            others = (replace(kernel, program=replace(kernel.program, function=made)) for made in (single, device))
+            self._alternatives[id(kernel)] = (kernel, *others)  # all live, so that their ids stay their own
+        return self._alternatives[id(kernel)][1:]
+
+    def _map(self, own: Any, kernel: Kernel, source: Any, places: Any, written: Sequence[np.ndarray]) -> None:
+        """Map the memory of a call, and no other."""
+        memory = self._memory = DeviceMemory()
+        for words in written:
+            memory.add(words)
+        for words in (source.words, None if places is None else places.words):
+            if words is not None and all(words is not other for other in written):
+                memory.add(words, constant=True)
+        _add_tables(memory, kernel.tables)
+        memory.add(own.place, constant=True)
+        for salts in own._salts.values():
+            memory.add(salts.numpy(), constant=True)
+        if own.kernels.search is not None:
+            accel = own.kernels.wave.accel
+            memory.add(np.ctypeslib.as_array(own.kernels.search), constant=True)
+            memory.add(accel.table.numpy(), constant=True)
+            memory.add(accel.spheres.numpy(), constant=True)
+
+
+def _sort_packed(sinks: Sinks, result: Sequence[np.ndarray], before: np.ndarray) -> None:
+    """Put the lanes that a kernel packed, and the lists that it wrote, in an order of their own."""
+    target, after, lists = result[0], result[2], result[3:]
+
+    def span(counter: int) -> slice:
+        return slice(int(before[counter]), int(after[counter]))
+
+    for compact in sinks.compact:
+        own, rows = span(compact.counter), [row for row, _ in compact.rows]
+        order = np.lexsort(target[rows, own])
+        places = np.empty(len(order), np.int32)
+        places[order] = np.arange(own.start, own.stop)
+        target[rows, own] = target[rows, own][:, order]
+        for append in compact.appends:
+            entries = lists[append.list][0, span(append.counter)]
+            entries[:] = np.sort(places[entries - own.start])
+    for append in sinks.appends:
+        lists[append.list][0, span(append.counter)].sort()
+
+
+def probed(scene: Any, run: Callable[[Any], Any]) -> dict[str, Probe]:
+    """Return the comparisons of all kernels that ``run(scene)`` calls; ``scene`` is loaded here."""
+    with traced_stages() as stages, pytest.MonkeyPatch.context() as patch:
+        loaded = torchpt.load(scene, "cpu")
+        probes = DeviceProbes(stages, patch)
+        run(loaded)
+    return probes.found
+
+
+# ---- Functions of tensors
+
+
+def differing_results(
+    function: Callable[..., Sequence[Tensor]], given: Sequence[Tensor]
+) -> tuple[int, list[str], PtxMachine]:
+    """Compare a function's results on the machine with those of single lanes.
+
+    Args:
+        function: as for :func:`torchpt.compiler.function.compile_lanewise`.
+        given: its arguments ``(..., N)``.
+
+    Returns:
+        How many numbers were compared, what differs, and the machine.
+    """
+    machines: list[PtxMachine] = []
+    compiled = cache.compile_stage
+
+    def noted(stage: TracedStage, target: Any = None) -> Any:
+        program = compiled(stage, target)
+        machine = PtxMachine(program.function.code.decode())
+        machines.append(machine)
+
+        def call(address: int, lanes: int) -> None:
+            memory, count = DeviceMemory(), np.array([lanes])
+            words = np.frombuffer(ctypes.string_at(address, machine.sizes[0]), np.int64)
+            _add_tables(memory, tables[0])
+            for k, x in enumerate((*arguments[0], *results[0])):
+                assert words[len(HEAD) + 2 * k] == x.data_ptr()
+                memory.add(x.numpy(), constant=k < len(arguments[0]))
+            memory.add(count, constant=True)
+            arguments_of_entry = words.tobytes(), np.int64(count.ctypes.data).tobytes()
+            machine.launch(memory, arguments_of_entry, *_grid(lanes, machine), seed=1)
+
+        return replace(program, function=Function(call, b"", None))
+
+    tables: list[Tables] = []
+    arguments: list[list[Tensor]] = []
+    results: list[list[Tensor]] = []
+    bind, empty = functions.bind_tables, torch.empty
+
+    def bound(*x: Any, **named: Any) -> Tables:
+        tables.append(bind(*x, **named))
+        return tables[-1]
+
+    contiguous = [x.contiguous() for x in given]
+    single = compile_lanewise(function, contiguous, one_lane())(*contiguous)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "compile_stage", noted)
+        patch.setattr(functions, "bind_tables", bound)
+        device = compile_lanewise(function, contiguous, ptx_target())
+        arguments.append(contiguous)
+        results.append([])
+
+        def noted_empty(*shape: Any, **named: Any) -> Tensor:
+            results[0].append(empty(*shape, **named))
+            return results[0][-1]
+
+        patch.setattr(functions.torch, "empty", noted_empty)
+        found = device(*contiguous)
+    wrong = []
+    for k, (a, b) in enumerate(zip(single, found, strict=True)):
+        bad = differing(a, b)
+        if bad.any():
+            at = tuple(torch.nonzero(bad)[0].tolist())
+            wrong.append(
+                f"result {k}: {int(bad.sum())} of {bad.numel()}, first at {at}: {a[at].item()} and {b[at].item()}"
+            )
+    return sum(x.numel() for x in single), wrong, machines[0]
