@@ -31,6 +31,7 @@ from torchpt.compiler.program import Tables, TracedStage
 from torchpt.compiler.ptx import ptx_target
 from torchpt.compiler.sinks import Sinks
 from torchpt.engines.kernels import engine as calls
+from torchpt.engines.kernels import programs
 from torchpt.engines.kernels.programs import Kernel
 
 __all__ = ["LANES", "DeviceProbes", "Probe", "differing_results", "probed", "ptx_of", "traced_stages"]
@@ -43,17 +44,25 @@ LONG = 1500
 
 @contextmanager
 def traced_stages() -> Iterator[dict[str, TracedStage]]:
-    """Keep the stages that are compiled meanwhile by the keys of their code; nothing is read from caches of programs."""
+    """Compile kernels of renders for single lanes meanwhile, and keep their stages by the keys of their code.
+
+    Nothing is read from caches of programs.
+    """
     found: dict[str, TracedStage] = {}
-    compiled = cache.compile_stage
+    compiled, program_of = cache.compile_stage, programs.program_of
 
     def noted(stage: TracedStage, target: Any = None) -> Any:
         program = compiled(stage, target)
         found[program.code] = stage
         return program
 
+    def single(*given: Any) -> Any:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(cache, "compile_stage", lambda stage, target=None: noted(stage, one_lane()))
+            return program_of(*given)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cache, "compile_stage", noted)
+        patch.setattr(programs, "program_of", single)
         patch.setattr(cache, "cache_key", lambda structure, target=None: None)
         cache.clear_programs()
         yield found
@@ -129,7 +138,7 @@ class DeviceProbes:
     def __init__(self, stages: Mapping[str, TracedStage], patch: pytest.MonkeyPatch) -> None:
         self.stages, self._kept = stages, calls.Calls.run
         self.found: dict[str, Probe] = {}
-        self._alternatives: dict[int, tuple[Kernel, Kernel, Kernel]] = {}
+        self._devices: dict[int, tuple[Kernel, Kernel]] = {}
         self._memory = DeviceMemory()
         patch.setattr(calls.Calls, "run", lambda *given, **named: self._run(*given, **named))
 
@@ -157,14 +166,14 @@ class DeviceProbes:
         lists: Any,
         slots: Any,
     ) -> None:
-        single, device = self._others(name, kernel)
+        device = self._on_machine(name, kernel)
         probe = self.found[name]
         lists = lists or []
         written = [target.words, (own.slots if slots is None else slots).words, own.counters, *(x.words for x in lists)]
         before = [words.copy() for words in written]
         self._map(own, kernel, source, places, written)
         results = []
-        for other in (single, device):
+        for other in (kernel, device):
             for words, old in zip(written, before, strict=True):
                 words[:] = old
             self._kept(own, other, lanes, source, target, places, lists, slots)
@@ -188,11 +197,10 @@ class DeviceProbes:
                 told = f"{a[tuple(first)]!r} and {b[tuple(first)]!r}"
                 probe.wrong.append(f"{int(wrong.sum())} of {what}, first at {first.tolist()}: {told}")
 
-    def _others(self, name: str, kernel: Kernel) -> tuple[Kernel, Kernel]:
-        """Return the kernel by single lanes of this CPU, and by the machine."""
-        if id(kernel) not in self._alternatives:
+    def _on_machine(self, name: str, kernel: Kernel) -> Kernel:
+        """Return the kernel with a call that runs its PTX."""
+        if id(kernel) not in self._devices:
             stage = self.stages[kernel.program.code]
-            single = cpu.compile_ir(kernel_ir(stage, one_lane().form), one_lane())
             ptx = ptx_of(stage)
             probe = self.found[name] = Probe(stage, PtxMachine(ptx), ptx)
 
@@ -202,10 +210,9 @@ class DeviceProbes:
                 arguments = ctypes.string_at(address, probe.machine.sizes[0]), np.int64(count.ctypes.data).tobytes()
                 probe.machine.launch(self._memory, arguments, *_grid(lanes, probe.machine), seed=lanes)
 
-            device = Function(call, b"", None)
-            others = (replace(kernel, program=replace(kernel.program, function=made)) for made in (single, device))
-            self._alternatives[id(kernel)] = (kernel, *others)  # all live, so that their ids stay their own
-        return self._alternatives[id(kernel)][1:]
+            device = replace(kernel, program=replace(kernel.program, function=Function(call, b"", None)))
+            self._devices[id(kernel)] = kernel, device  # both live, so that their ids stay their own
+        return self._devices[id(kernel)][1]
 
     def _map(self, own: Any, kernel: Kernel, source: Any, places: Any, written: Sequence[np.ndarray]) -> None:
         """Map the memory of a call, and no other."""
