@@ -1,6 +1,7 @@
 """Kernels as PTX on a machine beside the same kernels on one lane of this CPU at a time, on the same memory.
 
-:class:`DeviceProbes` does that with the calls of real renders, :func:`differing_results` with functions of tensors.
+:class:`DeviceProbes` does that with the calls of real renders, :func:`differing_results` and :func:`differing_kernel` with
+functions of tensors.
 Everything is compared that a kernel may write, all of its arenas, slots and lists, so a store to a wrong place is seen too.
 Only the order of packed lanes is free: warps append as they come.
 """
@@ -27,14 +28,23 @@ from torchpt.compiler import function as functions
 from torchpt.compiler.cpu import Function
 from torchpt.compiler.function import compile_lanewise
 from torchpt.compiler.kernel import HEAD, kernel_ir
-from torchpt.compiler.program import Tables, TracedStage
+from torchpt.compiler.program import Tables, TracedStage, bind_tables
 from torchpt.compiler.ptx import ptx_target
 from torchpt.compiler.sinks import Sinks
 from torchpt.engines.kernels import engine as calls
 from torchpt.engines.kernels import programs
 from torchpt.engines.kernels.programs import Kernel
 
-__all__ = ["LANES", "DeviceProbes", "Probe", "differing_results", "probed", "ptx_of", "traced_stages"]
+__all__ = [
+    "LANES",
+    "DeviceProbes",
+    "Probe",
+    "differing_kernel",
+    "differing_results",
+    "probed",
+    "ptx_of",
+    "traced_stages",
+]
 
 #: Most lanes of a kernel that are compared.
 LANES = 256
@@ -253,16 +263,52 @@ def _sort_packed(sinks: Sinks, result: Sequence[np.ndarray], before: np.ndarray)
         lists[append.list][0, span(append.counter)].sort()
 
 
-def probed(scene: Any, run: Callable[[Any], Any]) -> dict[str, Probe]:
-    """Return the comparisons of all kernels that ``run(scene)`` calls; ``scene`` is loaded here."""
+def probed(scene: Any, run: Callable[[Any], Any], **loading: Any) -> dict[str, Probe]:
+    """Return the comparisons of all kernels that ``run(scene)`` calls; the scene is loaded here, with ``loading``."""
     with traced_stages() as stages, pytest.MonkeyPatch.context() as patch:
-        loaded = torchpt.load(scene, "cpu")
+        loaded = torchpt.load(scene, "cpu", **loading)
         probes = DeviceProbes(stages, patch)
         run(loaded)
     return probes.found
 
 
 # ---- Functions of tensors
+
+
+def differing_kernel(
+    stage: TracedStage,
+    uniforms: Sequence[np.ndarray],
+    inputs: Sequence[np.ndarray],
+    outputs: Sequence[np.ndarray],
+    counters: np.ndarray,
+) -> list[str]:
+    """Run a stage whose tables are constants on tensors ``(rows, N)``, by single lanes and on the machine; return what differs.
+
+    ``outputs`` and ``counters`` are written to.
+    """
+    lanes, start = inputs[0].shape[1], counters.copy()
+    words = [0] * len(HEAD)
+    tables = bind_tables(stage.tables, stage.steps, stage.constants, {})
+    words[HEAD.index("counters")], words[HEAD.index("tables")] = counters.ctypes.data, tables.address
+    words += [x.ctypes.data for x in uniforms]
+    for x in (*inputs, *outputs):
+        words += [x.ctypes.data, x.shape[1]]
+    block = np.array(words)
+    cpu.compile_ir(kernel_ir(stage, one_lane().form), one_lane()).call(block.ctypes.data, lanes)
+    wanted = [x.copy() for x in (*outputs, counters)]
+    for x in outputs:
+        x[:] = 0
+    counters[:] = start
+    memory, count = DeviceMemory(), np.array([lanes])
+    _add_tables(memory, tables)
+    for x in (*outputs, counters):
+        memory.add(x)
+    for x in (*inputs, *uniforms, count):
+        memory.add(x, constant=True)
+    machine = PtxMachine(ptx_of(stage))
+    machine.launch(memory, [block.tobytes(), np.int64(count.ctypes.data).tobytes()], *_grid(lanes, machine))
+    pairs = enumerate(zip(wanted, (*outputs, counters), strict=True))
+    return [f"result {k}" for k, (a, b) in pairs if differing(torch.from_numpy(a), torch.from_numpy(b)).any()]
 
 
 def differing_results(
