@@ -478,7 +478,7 @@ FAULTS = (
         "gltf_turned_back",
         "scene/meshes/gltf_material.py",
         "meshes",
-        "_Rules.texture",
+        "_Converter.texture",
         "-math.degrees(turn)",
         "math.degrees(turn)",
         "wrong sign: KHR_texture_transform turns textures the other way",

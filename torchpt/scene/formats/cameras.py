@@ -1,4 +1,4 @@
-"""Read the camera block of a scene file."""
+"""Read the camera block of a scene file, for scenes and for views of them through another camera."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ def read_camera(raw: Any, film: Mapping[str, Any], file: str | None) -> ParsedPa
     Raises:
         SceneError: a wrong key or value.
     """
+    default = KINDS.names[0]  # the type of a block without one
     if isinstance(raw, Mapping) and raw.get("K") is not None and raw.get("size") is None:
         size = [film.get("width"), film.get("height")]
         raw = raw if None in size else {**raw, "size": size}
-    refuse_unused_keys("camera", KINDS, raw, KINDS.names[0], file)
-    return read_typed("camera", KINDS, raw, "camera", file, KINDS.names[0])
+    refuse_unused_keys("camera", KINDS, raw, default, file)
+    return read_typed("camera", KINDS, raw, "camera", file, default)

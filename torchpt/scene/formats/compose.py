@@ -1,6 +1,7 @@
 """Merge the layers of a scene: the files in its ``defaults``, then its own keys; :mod:`.overrides` come last.
 
-Layers are merged as written, before validation:
+:func:`torchpt.scene.formats.description.read_description` calls :func:`compose`. Layers are merged as written, before
+validation:
 
 - Mappings are merged key by key; lists, numbers and text of a later layer replace those of an earlier one.
 - A mapping that names another ``type`` than the one below it replaces it as a whole. The camera, ``integrator``, ``sampler``
@@ -58,17 +59,20 @@ KEYS = ("version", "defaults", "camera", *BLOCKS, *NAMED)
 PATHS = ("path",)
 #: Most files of a scene, and the greatest depth of their ``defaults``.
 MAX_FILES, MAX_LEVELS = 64, 8
-#: Blocks that keep the keys shared by both types when the type changes: their kinds and their default type.
+#: Blocks that keep the keys shared by both types when the type changes, by their key in the scene: table of kinds, default
+#: type.
 KEEPING: dict[tuple[str, ...], tuple[Mapping[str, Any], str]] = {
     ("camera",): (CAMERAS, CAMERAS.names[0]),
     ("integrator",): TYPED_BLOCKS["integrator"],
     ("sampler",): TYPED_BLOCKS["sampler"],
     ("film", "filter"): TYPED_BLOCKS["filter"],
 }
+#: Table of the kinds of each block of named blocks.
 TABLES: dict[str, Mapping[str, Any]] = {
     "textures": TEXTURES, "materials": MATERIALS, "shapes": SHAPES, "lights": LIGHTS,
 }  # fmt: skip
 
+#: A dotted key as its names in the scene.
 Parts = tuple[str, ...]
 
 
@@ -77,7 +81,8 @@ class Layers:
     """The files of a scene, with the keys that come from each.
 
     Attributes:
-        layers: file and tree of its keys, the lowest layer first; the file of overrides is None.
+        layers: file and tree of its keys (nested mappings without values), the lowest layer first; the file of overrides is
+            None.
     """
 
     layers: tuple[tuple[str | None, Any], ...] = field(default=())
@@ -89,11 +94,11 @@ class Layers:
             key: dotted key.
             otherwise: the file of a scene that has one layer only.
         """
-        found, best = otherwise, -1
+        found, longest = otherwise, -1
         for file, tree in self.layers:
-            known = _known_parts(tree, key)
-            if known >= best:
-                found, best = file, known
+            length = _known_length(tree, key)
+            if length >= longest:
+                found, longest = file, length
         return found
 
     def blame(self, error: SceneError) -> SceneError:
@@ -103,8 +108,8 @@ class Layers:
         return type(error)(error.key, error.value, error.expected, self.file_of(error.key, error.file))
 
 
-def _known_parts(tree: Any, key: str) -> int:
-    """Return the length of the longest prefix of a dotted key that a tree of keys has."""
+def _known_length(tree: Any, key: str) -> int:
+    """Return the number of characters of the longest prefix of a dotted key that a tree of keys has."""
     known = 0
     while isinstance(tree, dict) and key:
         name = next((name for name in prefixes(key) if name in tree), None)
@@ -146,12 +151,12 @@ def compose(
     if "defaults" not in raw:
         return raw, Layers()
     reader = _Reader(base, (*places, configs() / "scene"))
-    merged = reader.merge(raw, file, base, () if file is None else (Path(file).resolve(),))
+    merged = reader.merge(raw, file, base, trail=() if file is None else (Path(file).resolve(),))
     return merged, Layers(tuple(reader.layers))
 
 
 class _Reader:
-    """Reader of the files of one scene.
+    """Reader of the files of one scene; ``layers`` collects them with their keys, the lowest first.
 
     Args:
         base: the folder that relative paths start from once all are merged.
@@ -163,11 +168,22 @@ class _Reader:
         self.layers: list[tuple[str | None, Any]] = []
 
     def merge(self, raw: dict[str, Any], file: str | None, folder: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
+        """Merge a file with those in its ``defaults``.
+
+        Args:
+            raw: the file as written.
+            file: its name for errors.
+            folder: the folder that it lies in.
+            trail: this file after those that lead to it, the scene first; empty for a scene that is no file.
+
+        Raises:
+            SceneError: see :func:`compose`.
+        """
         own = {key: value for key, value in raw.items() if key != "defaults"}
         below: dict[str, Any] = {}
         for index, name in enumerate(_names(raw.get("defaults"), file)):
             key = f"defaults.{index}" if isinstance(raw["defaults"], list) else "defaults"
-            path = self.found(name, folder, key, file, trail)
+            path = self.find_file(name, folder, key, file, trail)
             if path in trail:
                 circle = " -> ".join(_shown(step) for step in (*trail[trail.index(path) :], path))
                 raise SceneError(key, name, f"files that do not name themselves ({circle})", file)
@@ -178,27 +194,30 @@ class _Reader:
             shown = _shown(path)
             part = self.merge(plain(read_yaml(path, shown), shown), shown, path.parent, (*trail, path))
             below = _merge_layers(below, part, shown, strict=False) if below else part
+        # Paths of files in other folders are made absolute; those of the scene start at its own folder.
         if trail and folder.resolve() != self.base:
             own = resolve_paths(own, folder.resolve())
         self.layers.append((file, skeleton(own)))
         return _merge_layers(below, own, file, strict="defaults" in raw)
 
-    def found(self, name: str, folder: Path, key: str, file: str | None, trail: tuple[Path, ...]) -> Path:
+    def find_file(self, name: str, folder: Path, key: str, file: str | None, trail: tuple[Path, ...]) -> Path:
         """Return the file of an entry of ``defaults``: beside the file that has it, or in one of the places."""
-        exact = name.endswith((".yaml", ".yml"))
-        places = [folder / name] if exact else [place / f"{name}.yaml" for place in (folder, *self.places)]
+        is_path = name.endswith((".yaml", ".yml"))
+        places = [folder / name] if is_path else [place / f"{name}.yaml" for place in (folder, *self.places)]
         for place in places:
             path = place.resolve()
-            own = bool(trail) and path == trail[-1] and place is not places[-1]  # a file that extends its namesake
-            if is_regular(path) and not own:
+            # A file that names itself extends a namesake in a later place.
+            is_itself = bool(trail) and path == trail[-1] and place is not places[-1]
+            if is_regular(path) and not is_itself:
                 return path
         known = sorted({path.stem for place in (folder, *self.places) for path in place.glob("*.yaml")})
         hint = did_you_mean(name, known)
-        where = str(places[0]) if exact else f"{places[0]} or a scene that ships"
+        where = str(places[0]) if is_path else f"{places[0]} or a scene that ships"
         raise SceneError(key, name, f"a file that is there: {where}{hint}", file)
 
 
 def _names(value: Any, file: str | None) -> list[str]:
+    """Return the entries of ``defaults``; a single name stands for a list of one."""
     names = [value] if isinstance(value, str) else [] if value is None else value
     expected = "a list of names of scenes or of files ending in .yaml, merged in this order under the scene's own keys"
     if not isinstance(names, list):
@@ -259,14 +278,14 @@ def _merge_layers(
     result = dict(below)
     for block, value in above.items():
         if block in NAMED and isinstance(value, Mapping):
-            result[block] = merge_named(block, below.get(block), value, file, strict)
+            result[block] = merge_named(block, below.get(block), value, file, strict=strict)
         else:
             result[block] = merge_values(below.get(block), value, (block,))
     return result
 
 
-def merge_named(block: str, below: Any, above: Mapping[str, Any], file: str | None, strict: bool) -> dict[str, Any]:
-    """Merge two blocks of :data:`NAMED`; see :func:`_merge_layers`."""
+def merge_named(block: str, below: Any, above: Mapping[str, Any], file: str | None, *, strict: bool) -> dict[str, Any]:
+    """Merge two layers of a block of :data:`NAMED`, e.g. ``materials``; arguments and errors as of :func:`_merge_layers`."""
     result = dict(below) if isinstance(below, Mapping) else {}
     for name, value in above.items():
         if value is not None:
@@ -279,8 +298,8 @@ def merge_named(block: str, below: Any, above: Mapping[str, Any], file: str | No
 
 
 def merge_values(below: Any, above: Any, where: Parts) -> Any:
-    """Merge the values of two layers at the key ``where``."""
-    if where in KEEPING:
+    """Merge the values of two layers at the key ``where``; neither is changed."""
+    if where in KEEPING:  # a bare name stands for a block of that type
         below, above = (({"type": item} if isinstance(item, str) else item) for item in (below, above))
     if not isinstance(above, Mapping) or not isinstance(below, Mapping):
         return above
@@ -289,7 +308,7 @@ def merge_values(below: Any, above: Any, where: Parts) -> Any:
     if where in KEEPING:
         table, default = KEEPING[where]
         below = shared_keys(below, above.get("type") or below.get("type") or default, table, default)
-    elif _identity(above) not in (None, _identity(below)):
+    elif _type_of(above) not in (None, _type_of(below)):
         return above
     result = dict(below)
     for key, value in above.items():
@@ -297,15 +316,22 @@ def merge_values(below: Any, above: Any, where: Parts) -> Any:
     return result
 
 
-def _identity(thing: Mapping[str, Any]) -> Any:
-    """Return the type of a mapping, or ``texture`` for a reference to a texture."""
-    if "type" in thing:
-        return thing["type"] or "null"  # a material that YAML reads as nothing
-    return "texture" if "texture" in thing else None
+def _type_of(block: Mapping[str, Any]) -> Any:
+    """Return the type of a mapping, ``texture`` for a reference to a texture, or None."""
+    if "type" in block:
+        return block["type"] or "null"  # a material that YAML reads as nothing
+    return "texture" if "texture" in block else None
 
 
 def shared_keys(below: Mapping[str, Any], name: Any, table: Mapping[str, Any], default: str) -> dict[str, Any]:
-    """Return the keys of a block that stay when its type changes to ``name``: those that both types read."""
+    """Return the keys of a block that stay when its type changes: those that both types read, and those that no type knows.
+
+    Args:
+        below: the block.
+        name: the new type.
+        table: the kinds of the block.
+        default: the type of a block without one.
+    """
     if name == below.get("type", default) or not isinstance(name, str) or name not in table:
         return dict(below)
     own = parameters_of(table[name])
@@ -317,7 +343,14 @@ def _all_keys(table: Mapping[str, Any]) -> set[str]:
 
 
 def with_size(below: Mapping[str, Any], above: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a layer with the film's size added to a camera with ``K`` in pixels, where a later layer changes the film."""
+    """Return a layer whose camera has the film's size beside ``K``, where a later layer changes the film.
+
+    ``K`` is in pixels of the film that it was written for.
+
+    Args:
+        below: the layer.
+        above: the later layer, by block; only its keys are read.
+    """
     camera, film = below.get("camera"), below.get("film")
     if not isinstance(camera, Mapping) or camera.get("K") is None or camera.get("size") is not None:
         return below

@@ -1,4 +1,10 @@
-"""Read and validate scene files: names, paths and numbers; nothing is built yet."""
+"""Read and validate scene files: names, paths and numbers; nothing is built yet.
+
+:func:`read_description` is the entry: text or dict -> layers merged (:mod:`.compose`, :mod:`.overrides`) -> blocks read and
+checked -> :class:`Description`. A *layer* is one of the files that a scene is merged from. A block that has a ``type`` becomes
+:class:`~torchpt.spec.schema.ParsedParams`: the class of that type (``kind``) and the values of its parameters (``values``, or
+``[name]``).
+"""
 
 from __future__ import annotations
 
@@ -37,6 +43,7 @@ __all__ = [
     "settings",
 ]
 
+#: The environment variable that paths may begin with.
 ASSETS = "$TORCHPT_ASSETS"
 #: Most textures, materials, shapes (instances included) and lights of a scene, of each.
 MAX_ENTRIES = 100_000
@@ -44,6 +51,7 @@ MAX_ENTRIES = 100_000
 T = TypeVar("T")
 #: Types of the first argument of `load`.
 Source = str | os.PathLike[str] | IO[str] | IO[bytes] | Mapping[str, Any]
+#: What errors say is accepted there.
 SOURCES = "a scene's name, a path ending in .yaml, YAML text, an open file, or a mapping"
 
 
@@ -64,8 +72,8 @@ class Description:
         materials: materials by name.
         shapes: shapes by name, in the order of the file.
         lights: lights by name.
-        overrides: overrides of its keys, in the form of the command line.
-        layers: the file that each key comes from.
+        overrides: overrides of the scene's keys, in the form of the command line.
+        layers: the file that each key comes from, for errors.
     """
 
     file: str | None
@@ -126,6 +134,7 @@ class Description:
             problem = (
                 "no such file" if isinstance(error, FileNotFoundError | NotADirectoryError) else str(error.strerror)
             )
+            # Other variables and ~ are taken as they stand.
             hint = f"; only {ASSETS} is expanded" if path.startswith(("$", "~")) and head != ASSETS else ""
             raise AssetError(found, f"{problem}, {self._named_by(key)}{hint}") from None
         return found
@@ -189,7 +198,8 @@ def read_description(
     """
     types = material_types(bsdfs)
 
-    def made(raw: Any, file: str | None, base: Path) -> Description:
+    def describe(raw: Any, file: str | None, base: Path) -> Description:
+        """Merge the layers of a scene and validate the result; ``base``: the folder that relative paths start from."""
         merged, layers = compose(plain(raw, file), file, base, places)
         if overrides:
             merged, layers = overridden_by(merged, overrides, layers, file, base)
@@ -201,24 +211,24 @@ def read_description(
         return replace(found, overrides=override_words(overrides)) if overrides else found
 
     if isinstance(source, Mapping):
-        return made(source, None, Path.cwd())
+        return describe(source, None, Path.cwd())
     if not isinstance(source, str | os.PathLike) and hasattr(source, "read"):
-        named = getattr(source, "name", None)
-        file = named if isinstance(named, str) and is_regular(named) else None
+        name = getattr(source, "name", None)
+        file = name if isinstance(name, str) and is_regular(name) else None
         base = Path.cwd() if file is None else Path(file).resolve().parent
-        return made(read_open(source, file), file, base)
+        return describe(read_open(source, file), file, base)
     if not isinstance(source, str | os.PathLike):
         raise SceneError("scene", source, SOURCES)
     file = os.fspath(source)
     if isinstance(source, str) and "\n" in source:
-        return made(parse_yaml(source), None, Path.cwd())
+        return describe(parse_yaml(source), None, Path.cwd())
     if file.endswith((".yaml", ".yml")):
         path = Path(file)
         _check_exists(path, file, places)
     else:
         path = _named_scene(file, places)
         file = str(path)
-    return made(read_yaml(path, file), file, path.resolve().parent)
+    return describe(read_yaml(path, file), file, path.resolve().parent)
 
 
 def _named_scene(name: str, places: Sequence[Path]) -> Path:
@@ -236,14 +246,23 @@ def _named_scene(name: str, places: Sequence[Path]) -> Path:
 
 
 def _files_by_name(places: Sequence[Path]) -> dict[str, Path]:
-    """Return the scene files that a name alone finds: those of the places, earlier ones first, and those that ship."""
+    """Return scene files by name: those in the folders ``places``, of which earlier ones win, then those that ship."""
     return {
         path.stem: path for place in (configs() / "scene", *reversed(places)) for path in sorted(place.glob("*.yaml"))
     }
 
 
 def _check_exists(path: Path, file: str, places: Sequence[Path]) -> None:
-    """Raise a SceneError for a scene file that is missing, with the closest name beside it or of a scene."""
+    """Check that a scene file exists.
+
+    Args:
+        path: the file.
+        file: the same as the caller wrote it, for the error.
+        places: folders where scenes are looked up by name.
+
+    Raises:
+        SceneError: it is missing; suggests the closest name among the files beside it and the scenes found by name.
+    """
     try:
         os.lstat(path)
     except (FileNotFoundError, NotADirectoryError) as error:
@@ -293,15 +312,31 @@ def overridden(description: Description, overrides: Mapping[str, Mapping[str, An
     Raises:
         SceneError: key such as ``render.spp``.
     """
-    for block, given in overrides.items():
-        own = {key: value for key, value in getattr(description, block).items() if given.get(key, key) is not None}
-        description = replace(description, **{block: own})
+    for block, changes in overrides.items():
+        kept = {
+            key: value
+            for key, value in getattr(description, block).items()
+            if key not in changes or changes[key] is not None
+        }
+        description = replace(description, **{block: kept})
     return description, settings(description, overrides)
 
 
 def _describe(
     raw: dict[str, Any], types: Mapping[str, Kind], file: str | None, base: Path, layers: Layers
 ) -> Description:
+    """Validate a merged scene.
+
+    Args:
+        raw: the scene as plain values.
+        types: the table of material types.
+        file: the scene file, or None.
+        base: the folder that relative paths start from.
+        layers: the files of the scene's keys.
+
+    Raises:
+        SceneError: the first wrong key or value.
+    """
     check_keys(raw, KEYS, "", "a scene", file)
     version = raw.get("version")
     if version is not None and (isinstance(version, bool) or version != 1):
@@ -310,14 +345,14 @@ def _describe(
         raise SceneError("camera", None, "a camera (every scene needs one)", file)
     blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
     camera = read_camera(raw["camera"], blocks["film"], file)
-    run_settings.merge(blocks, {}, file)
-    textures = _named(raw, "textures", file, lambda item, key: read_typed("texture", TEXTURES, item, key, file))
-    materials = _named(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
+    run_settings.merge(blocks, {}, file)  # only checks them; each render merges them with its own overrides
+    textures = _named_items(raw, "textures", file, lambda item, key: read_typed("texture", TEXTURES, item, key, file))
+    materials = _named_items(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
     for name, material in materials.items():
         key = f"materials.{name}"
         check_material(material, key, materials, textures, layers.file_of(key, file))
-    shapes = _named(raw, "shapes", file, lambda item, key: _shape(item, key, materials, textures, types, file))
-    lights = _named(raw, "lights", file, lambda item, key: read_typed("light", LIGHTS, item, key, file))
+    shapes = _named_items(raw, "shapes", file, lambda item, key: _shape(item, key, materials, textures, types, file))
+    lights = _named_items(raw, "lights", file, lambda item, key: read_typed("light", LIGHTS, item, key, file))
     film, integrator, sampler, render = (blocks[name] for name in BLOCKS)
     return Description(
         file,
@@ -337,6 +372,7 @@ def _describe(
 
 
 def _settings_block(raw: Mapping[str, Any], name: str, file: str | None) -> dict[str, Any]:
+    """Return the keys of a block of settings that are not null; refuse those that write files."""
     block = raw.get(name)
     if block is None:
         return {}
@@ -349,7 +385,8 @@ def _settings_block(raw: Mapping[str, Any], name: str, file: str | None) -> dict
     return {key: value for key, value in block.items() if value is not None}
 
 
-def _named(raw: Mapping[str, Any], block: str, file: str | None, read: Callable[[Any, str], T]) -> dict[str, T]:
+def _named_items(raw: Mapping[str, Any], block: str, file: str | None, read: Callable[[Any, str], T]) -> dict[str, T]:
+    """Return the items of a block by name, each read by ``read(item, dotted key)``."""
     items = raw.get(block)
     if items is None:
         return {}
@@ -368,6 +405,19 @@ def _shape(
     types: Mapping[str, Kind],
     file: str | None,
 ) -> ParsedParams:
+    """Read a shape, with its material where that is written in place, and check its references.
+
+    Args:
+        item: the shape as written.
+        key: its dotted key.
+        materials: all materials by name.
+        textures: all textures by name.
+        types: the table of material types.
+        file: scene file, for errors.
+
+    Raises:
+        SceneError: a wrong key or value, an unknown material or texture, emission of both shape and material.
+    """
     if isinstance(item, dict) and isinstance(item.get("material"), dict):
         inline = read_material(item["material"], f"{key}.material", types, file)
         check_material(inline, f"{key}.material", materials, textures, file)

@@ -1,4 +1,8 @@
-"""Read the materials of a scene file, and check references between materials and to textures once all are read."""
+"""Read the materials of a scene file, and check references between materials and to textures once all are read.
+
+A *blend* has two inner materials, each named or written in place under a key of the blend (a *side*: ``a`` and ``b``). A *slot*
+is a parameter that may be a texture. A material is *sheer* if rays pass it as if it were not there (``null``).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from typing import Any
 
 from torchpt.core.errors import EnergyWarning, NotBuiltError, SceneError, did_you_mean, warn_caller
 from torchpt.physics.bsdfs import KINDS, Bsdf
-from torchpt.physics.bsdfs.base import made
+from torchpt.physics.bsdfs.base import made as model_and_values
 from torchpt.physics.bsdfs.specs import Inner
 from torchpt.scene.formats.textures import TextureInput, check_texture, texture_of
 from torchpt.spec import REQUIRED, Refused, Spec, parameters_of, spec_of
@@ -26,7 +30,7 @@ Kind = type[Bsdf] | Bsdf
 MAX_BLENDS = 8
 
 #: Slots whose textures must have texture coordinates, so they cannot be vertex colours.
-_IMAGED = ("opacity", "emission", "normal_map", "bump_map")
+_NEED_COORDINATES = ("opacity", "emission", "normal_map", "bump_map")
 #: Slots whose textures are not filtered by the footprint: emission and opacity must be the same for every ray.
 POINTS = ("opacity", "emission")
 
@@ -51,8 +55,8 @@ def material_types(models: Mapping[str, Bsdf] | None) -> Mapping[str, Kind]:
         if not isinstance(model, Bsdf):
             raise SceneError(key, model, "an instance of a subclass of torchpt.Bsdf")
         _check_own(model, key)
-    own: Mapping[str, Kind] = models or {}
-    return ChainMap(own, KINDS)  # type: ignore[arg-type]
+    own_types: Mapping[str, Kind] = models or {}
+    return ChainMap(own_types, KINDS)  # type: ignore[arg-type]
 
 
 def _check_own(model: Bsdf, key: str) -> None:
@@ -63,19 +67,19 @@ def _check_own(model: Bsdf, key: str) -> None:
     """
     if not isinstance(model.parameters, Mapping):
         raise SceneError(f"{key}.parameters", model.parameters, "a mapping from names to defaults")
-    own = {} if model.parameters is Bsdf.parameters else model.parameters
-    for parameter, value in own.items():
-        at = f"{key}.parameters.{parameter}"
+    declared = {} if model.parameters is Bsdf.parameters else model.parameters
+    for parameter, value in declared.items():
+        where = f"{key}.parameters.{parameter}"
         if not isinstance(parameter, str) or not parameter.isidentifier() or parameter.startswith("_"):
             raise SceneError(f"{key}.parameters", parameter, "names made of letters, digits and underscores")
         if parameter == "type" or parameter in Bsdf.parameters:
-            raise SceneError(at, value, f"another name ({parameter} is taken)")
+            raise SceneError(where, value, f"another name ({parameter} is taken)")
         try:
             spec = spec_of(value)
-            if spec.default not in (REQUIRED, None) and not callable(spec.default):
+            if spec.default not in (REQUIRED, None) and not callable(spec.default):  # a function of other parameters
                 spec.read(spec.default)
         except Refused as error:
-            raise SceneError(at, value.default if isinstance(value, Spec) else value, error.expected) from None
+            raise SceneError(where, value.default if isinstance(value, Spec) else value, error.expected) from None
 
 
 def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | None, depth: int = 0) -> ParsedParams:
@@ -132,7 +136,7 @@ def model_of(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> t
         key: model_of(materials[item] if isinstance(item, str) else item, materials)[0]
         for key, item in inner_of(material).items()
     }
-    return made(material.kind, {**material.values, **models})
+    return model_and_values(material.kind, {**material.values, **models})
 
 
 def check_material(
@@ -171,8 +175,8 @@ def check_material(
     slots = {slot: value for slot, value in material.values.items() if isinstance(value, TextureInput)}
     for slot, value in slots.items():
         # The weight of a blend with a null surface acts as its opacity, so it has the limits of an opacity texture.
-        is_opacity = slot == "weight" and any(item.kind.sheer for item in _sides(material, materials))
-        coordinates, points = slot in _IMAGED or is_opacity, slot in POINTS or is_opacity
+        is_opacity = slot == "weight" and any(item.kind.sheer for item in _inner_materials(material, materials))
+        coordinates, points = slot in _NEED_COORDINATES or is_opacity, slot in POINTS or is_opacity
         check_texture(value, f"{key}.{slot}", textures, file, coordinates=coordinates, points=points)
     model, _ = model_of(material, materials)
     for slot in slots:
@@ -182,7 +186,7 @@ def check_material(
     if "two_sided" in material.given and model.transmits:
         expected = "no two_sided, as light passes through this material (it is for opaque ones only)"
         raise SceneError(f"{key}.two_sided", material["two_sided"], expected, file)
-    if problem := material.kind.energy(material.values):
+    if problem := material.kind.energy(material.values):  # says how the material may gain energy, or ""
         where = f"{file}: {key}" if file else key
         warn_caller(f"{where}: {problem}", EnergyWarning)
 
@@ -212,7 +216,7 @@ def _check_blend(
     if depth > MAX_BLENDS:
         raise SceneError(key, blend.name, f"blends nested at most {MAX_BLENDS} deep", file)
     for side, item in inner_of(blend).items():
-        at, inner_trail = f"{key}.{side}", trail
+        at, inner_trail = f"{key}.{side}", trail  # at: dotted key of the inner material
         if isinstance(item, str):
             if item not in materials:
                 known = ", ".join(materials) or "none is defined"
@@ -256,20 +260,21 @@ def _check_maps(
         SceneError: a normal map or a bump map.
         NotBuiltError: an opacity texture, or a textured weight where ``inner`` has an opacity below 1.
     """
-    for key, advice in (("normal_map", "give it to the blend itself"), ("bump_map", "give it to the blend itself")):
+    for key in ("normal_map", "bump_map"):
         if inner[key] is not None:
-            where = at if isinstance(item, str) else f"{at}.{key}"
-            raise SceneError(where, item if isinstance(item, str) else "a texture", f"no {key} ({advice})", file)
+            where, value = (at, item) if isinstance(item, str) else (f"{at}.{key}", "a texture")
+            raise SceneError(where, value, f"no {key} (give it to the blend itself)", file)
     if isinstance(inner["opacity"], TextureInput):
         where = at if isinstance(item, str) else f"{at}.opacity"
         raise NotBuiltError(where, "an opacity texture inside a blend", "an opacity texture of the blend itself", file)
-    if isinstance(blend.values.get("weight"), TextureInput) and _sheer(inner, materials):
+    # A textured weight can be the opacity of the other side only where one side is `null` itself.
+    if isinstance(blend.values.get("weight"), TextureInput) and _may_pass_rays(inner, materials):
         if not inner.kind.sheer or isinstance(blend["opacity"], TextureInput):
             expected = "an opacity texture instead, or numbers"
             raise NotBuiltError(at, "a blend by a texture with what light passes by chance", expected, file)
 
 
-def _sides(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> Iterator[ParsedParams]:
+def _inner_materials(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> Iterator[ParsedParams]:
     """Yield the existing materials inside a blend."""
     for item in inner_of(material).values():
         if not isinstance(item, str):
@@ -278,8 +283,8 @@ def _sides(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> Ite
             yield materials[item]
 
 
-def _sheer(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> bool:
+def _may_pass_rays(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> bool:
     """Return True where a material may have an opacity below 1."""
     if material.kind.sheer or material["opacity"] != 1.0:
         return True
-    return any(_sheer(side, materials) for side in _sides(material, materials))
+    return any(_may_pass_rays(side, materials) for side in _inner_materials(material, materials))

@@ -1,6 +1,8 @@
 """Apply overrides of a scene's keys by dotted key, from the command line or ``torchpt.load(overrides=...)``.
 
-They are the top layer of a scene, merged by the rules of :mod:`torchpt.scene.formats.compose`.
+They are the top layer of a scene, merged by the rules of :mod:`torchpt.scene.formats.compose`. A *named block* is an entry of
+textures, materials, shapes or lights. The *parts* of a dotted key are its names in the scene, which may hold dots themselves;
+so a key is split while the scene is walked.
 """
 
 from __future__ import annotations
@@ -60,32 +62,34 @@ def overridden_by(
     """
     if not isinstance(overrides, Mapping):
         raise SceneError("overrides", overrides, "a mapping from dotted keys such as camera.fov to values")
-    changes = [_change(name, value) for name, value in overrides.items()]
-    seen: dict[tuple[str, bool], str] = {}
+    changes = [_parsed_change(name, value) for name, value in overrides.items()]
+    seen: dict[tuple[str, bool], str] = {}  # as given, by key and whether it removes: a key may be removed and set anew
     for change in changes:
-        name = change.key, change.sign == "~"
-        if name in seen:
-            raise SceneError(change.key, change.value, f"to be given once (it is given as {seen[name]} too)")
-        seen[name] = change.sign + change.key
+        identity = change.key, change.sign == "~"
+        if identity in seen:
+            raise SceneError(change.key, change.value, f"to be given once (it is given as {seen[identity]} too)")
+        seen[identity] = change.sign + change.key
+    # Relative paths of overrides start at the current folder, those of the scene at `base`.
     if base.resolve() != (here := Path.cwd()):
         for change in changes:
-            inside = any(part in PATHS for part in change.key.split(".")[2:])
-            change.value = resolve_path(change.value, here) if inside else resolve_paths(change.value, here)
+            is_path = any(part in PATHS for part in change.key.split(".")[2:])
+            change.value = resolve_path(change.value, here) if is_path else resolve_paths(change.value, here)
+    # Keys that change, by block: `with_size` asks only which they are.
     blocks: dict[str, dict[str, Any]] = {}
     for change in changes:
         block, _, inner = change.key.partition(".")
         blocks.setdefault(block, {})[inner] = None
     result = dict(with_size(raw, blocks))
-    for change in sorted(changes, key=lambda change: change.turn):
+    for change in sorted(changes, key=lambda change: change.order):
         _apply(result, change)
     sides = {
         change.parts[1]: change.value for change in changes if change.parts in (("film", "width"), ("film", "height"))
     }
     if sides:
         result["film"] |= keep_aspect(raw.get("film") or {}, sides)
-    tree: dict[str, Any] = {}
+    tree: dict[str, Any] = {}  # the keys that overrides give, as a layer of its own
     for change in changes:
-        _note(tree, change.parts, change.value)
+        _add_keys(tree, change.parts, change.value)
     below = layers.layers or ((file, skeleton(raw)),)
     return result, Layers((*below, (None, tree)))
 
@@ -107,18 +111,19 @@ class _Change:
     parts: Parts = ()
 
     @property
-    def turn(self) -> int:
-        """Return its place in the order of application: named blocks first, then types, then all others."""
+    def order(self) -> int:
+        """Return 0 for named blocks and whole blocks, 1 for types, 2 for all others: the order in which changes are applied."""
         block, *inner = self.key.split(".")
         if not inner or (block in NAMED and len(inner) == 1):
             return 0
         return 1 if inner[-1] == "type" else 2
 
 
-def _change(name: Any, value: Any) -> _Change:
+def _parsed_change(name: Any, value: Any) -> _Change:
+    """Split the sign from a key, and check that its first part is a key of scenes."""
     if not isinstance(name, str):
         raise SceneError("overrides", name, "dotted keys such as camera.fov")
-    match = re.match(r"(\+\+|\+|~|)(.*)\Z", name, re.DOTALL)
+    match = re.match(r"(\+\+|\+|~|)(.*)\Z", name, re.DOTALL)  # a sign or none, then the key
     assert match is not None
     sign, key = match.groups()
     parts = key.split(".")
@@ -134,6 +139,7 @@ def _change(name: Any, value: Any) -> _Change:
 
 
 def _near_key(parts: list[str]) -> str:
+    """Return a hint with the closest known key, or ""."""
     known = [key for key in KEYS if key != "defaults"]
     return did_you_mean(parts[0], known, lambda name: ".".join([name, *parts[1:]]))
 
@@ -144,129 +150,134 @@ def _apply(raw: dict[str, Any], change: _Change) -> None:
     Raises:
         SceneError: a key that leads nowhere.
     """
-    place: Any = raw
+    container: Any = raw  # the mapping or list that `remaining_key` starts in
     parts: list[str] = []
-    rest = change.key
+    remaining_key = change.key
     while True:
-        name = _next_part(place, rest)
+        name = _next_part(container, remaining_key)
         parts.append(name)
-        if name == rest:
+        if name == remaining_key:
             break
-        rest = rest[len(name) + 1 :]
-        place = _descend(place, name, tuple(parts), change)
+        remaining_key = remaining_key[len(name) + 1 :]
+        container = _descend(container, name, tuple(parts), change)
     change.parts = tuple(parts)
-    if isinstance(place, list):
-        _put_in_list(place, name, change)
+    if isinstance(container, list):
+        _put_in_list(container, name, change)
         return
-    there = place.get(name) is not None
+    exists = container.get(name) is not None
     if change.sign == "~":
-        if not there:
-            raise SceneError(change.key, name, _absent(place, change.parts, "to be there, as it is removed"))
-        _check_removed(place[name], change)
-        del place[name]
+        if not exists:
+            raise SceneError(change.key, name, _absent(container, change.parts, "to be there, as it is removed"))
+        _check_removed(container[name], change)
+        del container[name]
         return
-    thing = len(parts) == 2 and parts[0] in NAMED
-    if change.sign == "+" and there:
+    is_named_block = len(parts) == 2 and parts[0] in NAMED
+    if change.sign == "+" and exists:
         raise SceneError(
             change.key, change.value, f"a key that is not there yet (it is; {change.key}= without + changes it)"
         )
-    if change.sign == "" and thing and not there:
+    if change.sign == "" and is_named_block and not exists:
         raise SceneError(
-            change.key, change.value, f"{expected_name(parts[0], name, list(place))}; +{change.key}= adds one"
+            change.key, change.value, f"{expected_name(parts[0], name, list(container))}; +{change.key}= adds one"
         )
-    if thing and change.value is None:
-        place.pop(name, None)
+    if is_named_block and change.value is None:
+        container.pop(name, None)
     elif name == "type":
-        _retype(place, change)
+        _retype(container, change)
     elif change.key in NAMED and isinstance(change.value, Mapping):
-        place[name] = merge_named(name, place.get(name), change.value, None, strict=True)
+        container[name] = merge_named(name, container.get(name), change.value, None, strict=True)
     else:
-        place[name] = merge_values(place.get(name), change.value, change.parts)
+        container[name] = merge_values(container.get(name), change.value, change.parts)
 
 
-def _next_part(place: Any, rest: str) -> str:
-    """Return the next name of the rest of a dotted key: existing names may hold dots."""
-    if isinstance(place, dict):
-        for name in prefixes(rest):
-            if name in place:
+def _next_part(container: Any, remaining_key: str) -> str:
+    """Return the next name of a dotted key: the longest one that exists, as names may hold dots, else up to the next dot."""
+    if isinstance(container, dict):
+        for name in prefixes(remaining_key):
+            if name in container:
                 return name
-    return rest.partition(".")[0]
+    return remaining_key.partition(".")[0]
 
 
-def _descend(place: Any, name: str, parts: Parts, change: _Change) -> Any:
-    """Replace an inner mapping or list of the scene by a copy, which may be changed, and return it."""
-    if isinstance(place, list):
-        index = _index(place, name, change)
-        place[index] = _checked(place[index], parts, change)
-        return place[index]
-    value = place.get(name)
+def _descend(container: Any, name: str, parts: Parts, change: _Change) -> Any:
+    """Replace the mapping or list ``name`` in ``container`` by a copy, which may be changed, and return the copy."""
+    if isinstance(container, list):
+        index = _index(container, name, change)
+        container[index] = _copy_of(container[index], parts, change)
+        return container[index]
+    value = container.get(name)
     if value is None:
         if len(parts) == 2 and parts[0] in NAMED:
-            known = [key for key, item in place.items() if item is not None]
+            known = [key for key, item in container.items() if item is not None]
             raise SceneError(
                 ".".join(parts), name, f"{expected_name(parts[0], name, known)}; +{'.'.join(parts)}= adds one"
             )
         if change.sign == "~":
-            raise SceneError(change.key, None, _absent(place, parts, "to be there, as it is removed"))
+            raise SceneError(change.key, None, _absent(container, parts, "to be there, as it is removed"))
         value = {}
     elif isinstance(value, str) and parts in KEEPING:
         value = {"type": value}
-    place[name] = _checked(value, parts, change)
-    return place[name]
+    container[name] = _copy_of(value, parts, change)
+    return container[name]
 
 
-def _checked(value: Any, parts: Parts, change: _Change) -> Any:
+def _copy_of(value: Any, parts: Parts, change: _Change) -> Any:
+    """Return a shallow copy of a mapping or list; raise for any other value, in which no key can be."""
     if isinstance(value, dict | list):
         return value.copy()
     inner = change.key[len(".".join(parts)) + 1 :]
     raise SceneError(change.key, value, f"{'.'.join(parts)} to be a mapping or a list, in which {inner} could be")
 
 
-def _index(place: list[Any], name: str, change: _Change) -> int:
-    if re.fullmatch(r"[0-9]{1,9}", name) and int(name) < len(place):
+def _index(container: list[Any], name: str, change: _Change) -> int:
+    """Return a part of a key as an index of a list; raise where it is none."""
+    if re.fullmatch(r"[0-9]{1,9}", name) and int(name) < len(container):
         return int(name)
-    expected = f"an index 0..{len(place) - 1} of this list" if place else "a list that is not empty"
+    expected = f"an index 0..{len(container) - 1} of this list" if container else "a list that is not empty"
     raise SceneError(change.key, name, expected)
 
 
-def _put_in_list(place: list[Any], name: str, change: _Change) -> None:
-    if change.sign in ("+", "++") and name == str(len(place)):
-        place.append(change.value)
+def _put_in_list(container: list[Any], name: str, change: _Change) -> None:
+    """Carry out an override of an item of a list."""
+    if change.sign in ("+", "++") and name == str(len(container)):
+        container.append(change.value)
         return
-    index = _index(place, name, change)
+    index = _index(container, name, change)
     if change.sign == "+":
-        raise SceneError(change.key, change.value, f"the index {len(place)}, which adds to the end of this list")
+        raise SceneError(change.key, change.value, f"the index {len(container)}, which adds to the end of this list")
     if change.sign == "~":
-        _check_removed(place[index], change)
-        del place[index]
+        _check_removed(container[index], change)
+        del container[index]
     else:
-        place[index] = merge_values(place[index], change.value, change.parts)
+        container[index] = merge_values(container[index], change.value, change.parts)
 
 
 def _check_removed(value: Any, change: _Change) -> None:
-    same = change.value is None or change.value == value
-    if not isinstance(same, bool) or not same:  # nor can arrays be compared
+    """Raise where the value that is removed is not the one that the override names."""
+    is_same = change.value is None or change.value == value
+    if not isinstance(is_same, bool) or not is_same:  # a comparison of arrays is no bool
         raise SceneError(change.key, value, f"{words_of(change.value)}, which is to be removed")
 
 
-def _absent(place: Mapping[str, Any], parts: Parts, expected: str) -> str:
-    known = [name for name, value in place.items() if value is not None]
+def _absent(container: Mapping[str, Any], parts: Parts, expected: str) -> str:
+    """Return the phrase for a key that does not exist, with a suggestion."""
+    known = [name for name, value in container.items() if value is not None]
     if len(parts) == 2 and parts[0] in NAMED:
         return expected_name(parts[0], parts[1], known)
     return f"{dotted(*parts)} {expected}{did_you_mean(parts[-1], known, lambda name: dotted(*parts[:-1], name))}"
 
 
-def _retype(place: dict[str, Any], change: _Change) -> None:
+def _retype(container: dict[str, Any], change: _Change) -> None:
     """Change a type, and drop keys that the new type does not read."""
-    above = change.parts[:-1]
-    if change.value is None and above[0] == "materials":
+    block_key = change.parts[:-1]
+    if change.value is None and block_key[0] == "materials":
         change.value = "null"  # a material that YAML reads as nothing
-    table, default = KEEPING.get(above) or (_table_of(above[0], place.get("type"), change.value), "")
-    if table is not None:
-        keys = shared_keys(place, change.value, table, default)
-        place.clear()
-        place.update(keys)
-    place["type"] = change.value
+    table, default = KEEPING.get(block_key) or (_table_of(block_key[0], container.get("type"), change.value), "")
+    if table is not None:  # else the old keys stay, and those that do not fit are reported
+        keys = shared_keys(container, change.value, table, default)
+        container.clear()
+        container.update(keys)
+    container["type"] = change.value
 
 
 def _table_of(block: str, before: Any, after: Any) -> Mapping[str, Any] | None:
@@ -278,7 +289,8 @@ def _table_of(block: str, before: Any, after: Any) -> Mapping[str, Any] | None:
     return None
 
 
-def _note(tree: dict[str, Any], parts: Parts, value: Any) -> None:
+def _add_keys(tree: dict[str, Any], parts: Parts, value: Any) -> None:
+    """Add a key, and the keys of its value, to a tree of keys."""
     for part in parts[:-1]:
         inner = tree.get(part)
         if not isinstance(inner, dict):
@@ -287,7 +299,9 @@ def _note(tree: dict[str, Any], parts: Parts, value: Any) -> None:
     tree[parts[-1]] = skeleton(value)
 
 
+#: Text that the command line reads as text without quotes: a letter, _ $ . or /, then also digits and -.
 _WORD = re.compile(r"[A-Za-z_$./][\w$./\-]*\Z", re.ASCII)
+#: Words that would be read as other values.
 _SPECIAL = ("true", "false", "null", "inf", "nan")
 
 
@@ -298,6 +312,7 @@ def words_of(value: Any) -> str:
     if isinstance(value, str):
         if _WORD.match(value) and value.lower() not in _SPECIAL:
             return value
+        # Hydra's grammar: backslashes count as escapes only before a quote, where they are doubled, as at the end.
         escaped = re.sub(r"(\\*)(')", r"\1\1\\'", value)
         return "'" + re.sub(r"(\\+)\Z", r"\1\1", escaped) + "'"
     if isinstance(value, int | float):
@@ -306,7 +321,7 @@ def words_of(value: Any) -> str:
         return "{" + ",".join(f"{key}:{words_of(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ",".join(words_of(item) for item in value) + "]"
-    if not getattr(value, "shape", True):
+    if not getattr(value, "shape", True):  # a tensor or array of shape (): a number
         return repr(value.item())
     return f"<{type(value).__name__} {'x'.join(map(str, getattr(value, 'shape', ())))}>"
 

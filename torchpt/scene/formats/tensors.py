@@ -21,9 +21,11 @@ __all__ = ["DictTensors", "Key"]
 #: A position in nested mappings and lists: keys and indices.
 Key = tuple[str | int, ...]
 
-#: One-dimensional arrays up to this length become lists, like the vectors and pairs of a file.
-_LISTED = 64
-_PLAIN = frozenset({int, float, str, bool, type(None)})
+#: One-dimensional arrays up to this length become lists, like the vectors and pairs of a file; longer ones are data, such as
+#: texels.
+_MAX_LISTED = 64
+#: Types of values that need no look inside.
+_PLAIN_TYPES = frozenset({int, float, str, bool, type(None)})
 
 
 class DictTensors:
@@ -39,13 +41,16 @@ class DictTensors:
         self.keys: list[Key] = []
 
     def extract(self, raw: dict[str, Any]) -> dict[str, Any]:
-        """Return the scene with numbers in place of tensors; ``raw`` was bounded by :func:`torchpt.scene.formats.yaml.plain`.
+        """Return a scene dict with numbers in place of tensors, and remember both.
+
+        Args:
+            raw: the dict, bounded by :func:`torchpt.scene.formats.yaml.plain`.
 
         Raises:
             SceneError: a tensor whose numbers cannot be read.
         """
         self.raw, self.keys = raw, []
-        return self._read(raw, ())
+        return self._without_tensors(raw, ())
 
     def at(self, key: Key) -> Any:
         """Return the value of the dict at a key; None where there is none."""
@@ -63,13 +68,14 @@ class DictTensors:
         """Return the keys of tensors that begin with a prefix, without the prefix."""
         return (key[len(prefix) :] for key in self.keys if key[: len(prefix)] == prefix)
 
-    def _read(self, item: Any, key: Key) -> Any:
+    def _without_tensors(self, item: Any, key: Key) -> Any:
+        """Return the value at a key with numbers in place of tensors."""
         if isinstance(item, dict):
-            return {name: self._read(value, (*key, name)) for name, value in item.items()}
+            return {name: self._without_tensors(value, (*key, name)) for name, value in item.items()}
         if isinstance(item, list):
-            if _PLAIN.issuperset(map(type, item)):  # the rows of an inline mesh
+            if _PLAIN_TYPES.issuperset(map(type, item)):  # the rows of an inline mesh
                 return item
-            return [self._read(value, (*key, index)) for index, value in enumerate(item)]
+            return [self._without_tensors(value, (*key, index)) for index, value in enumerate(item)]
         if isinstance(item, Tensor):
             if item.requires_grad:
                 self.keys.append(key)
@@ -84,7 +90,7 @@ def _numbers(tensor: Tensor, key: Key) -> np.ndarray:
         raise SceneError(".".join(map(str, key)), "a tensor under a transform of torch.func", expected)
     try:
         values = tensor.detach()
-        if values.dtype in (torch.float16, torch.bfloat16):
+        if values.dtype in (torch.float16, torch.bfloat16):  # readers take float32 and float64; NumPy has no bfloat16
             values = values.float()
         return np.array(values.cpu().numpy())
     except (RuntimeError, TypeError, NotImplementedError):
@@ -94,4 +100,4 @@ def _numbers(tensor: Tensor, key: Key) -> np.ndarray:
 
 def _listed(array: np.ndarray) -> Any:
     """Convert a scalar array to a number and a short vector to a list."""
-    return array.tolist() if array.ndim == 0 or (array.ndim == 1 and len(array) <= _LISTED) else array
+    return array.tolist() if array.ndim == 0 or (array.ndim == 1 and len(array) <= _MAX_LISTED) else array

@@ -1,6 +1,7 @@
 """Read textures in a scene file, which may stand in place of a number or a colour.
 
-A texture is read for a slot: a *colour* slot takes three channels, a *number* slot one. No file is opened here.
+A texture is read for a *slot*, a parameter that it stands in for: a *colour* slot takes three channels, a *number* slot one. A
+texture is written in place or named (a reference to the block ``textures``). No file is opened here.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import Any
 
 from torchpt.core.errors import SceneError, did_you_mean
 from torchpt.physics.textures import CHANNELS, KINDS, Named, TextureInput
-from torchpt.spec import Moves, Refused, Spec, parameters_of
+from torchpt.spec import Refused, Spec, parameters_of
 from torchpt.spec.reading import as_refused
 from torchpt.spec.schema import ParsedParams, check_keys, dotted, read_typed
 
@@ -44,11 +45,8 @@ def texture_of(raw: Mapping[str, Any], spec: Spec) -> TextureInput:
     Raises:
         Refused: a wrong key or value.
     """
-    low, high = getattr(spec, "bounds")  # noqa: B009  (of numbers and colours)
-    return _input(raw, spec.coloured, low, high, getattr(spec, "linear", True), spec.moves)
-
-
-def _input(raw: Any, coloured: bool, low: float, high: float, linear: bool, moves: Moves) -> TextureInput:
+    low, high = getattr(spec, "bounds")  # noqa: B009  (specs of numbers and colours have them)
+    coloured = spec.coloured
     try:
         texture = read_texture(raw, "", None)
     except SceneError as error:
@@ -58,7 +56,8 @@ def _input(raw: Any, coloured: bool, low: float, high: float, linear: bool, move
         raise Refused("no channel where a colour is wanted", channel, ("channel",))
     if isinstance(texture, ParsedParams):
         texture.kind.check_slot(texture.values, coloured)
-    return TextureInput(texture, coloured, linear, low, high, moves)
+    # `linear`: values are not colours, so images are not decoded from sRGB. `moves`: the geometry that moves with the values.
+    return TextureInput(texture, coloured, getattr(spec, "linear", True), low, high, spec.moves)
 
 
 def check_texture(
@@ -94,6 +93,7 @@ def check_texture(
         texture = textures[texture.texture]
     if coordinates and texture.kind.reads != "uv":
         raise SceneError(key, texture.name, "an image, or another texture that is read by coordinates", file)
+    # `filters`: the words of the parameter `filter` for which the kind averages over footprints.
     if points and texture is slot.texture and texture.values.get("filter") in texture.kind.filters:
         words = getattr(parameters_of(texture.kind)["filter"], "names", ())
         accepted = [word for word in words if word not in texture.kind.filters]

@@ -1,5 +1,7 @@
 """Parse YAML to plain dicts and lists: iterative, bounded, and strict about duplicate keys.
 
+Scene files and dicts pass through :func:`plain` before anything reads them.
+
 The parser is libyaml's (``CSafeLoader``), read event by event: nesting cannot exhaust the stack, keys stay text as
 written, ``1e-3`` is a number (YAML 1.2), and every error knows its line. Anchors, aliases and ``<<`` merges work;
 :func:`plain` bounds what they may expand to.
@@ -17,21 +19,26 @@ from torchpt.core.files import check_regular, read_regular
 
 __all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_KEY", "MAX_VALUES", "parse_yaml", "plain", "read_open", "read_yaml"]
 
+# Limits, far above any scene, within which no file exhausts memory or the stack.
 MAX_BYTES = 256 * 2**20
-MAX_DEPTH = 100
-MAX_KEY = 256
+MAX_DEPTH = 100  # levels of nesting
+MAX_KEY = 256  # characters of a key
 MAX_VALUES = 5_000_000  # after aliases are expanded
 MAX_MERGED = 1_000_000  # keys that `<<` may copy
 
+# Numbers as in YAML 1.2, underscores between digits allowed: decimal, 0x and 0o integers; floats with or without point and
+# exponent; .inf and .nan.
 _INT = re.compile(r"[-+]?(?:[0-9][0-9_]*|0x[0-9a-fA-F_]+|0o[0-7_]+)\Z")
 _FLOAT = re.compile(r"[-+]?(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?\Z")
 _NON_FINITE = re.compile(r"(?:[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))\Z")
+#: Words that are no text: null, and YAML 1.1's booleans, each as written, capitalized and in capitals.
 _WORDS: dict[str, Any] = {"": None, "~": None}
 for _meaning, _words in ((None, ("null",)), (True, ("true", "yes", "on")), (False, ("false", "no", "off"))):
     for _word in _words:
         _WORDS.update(dict.fromkeys((_word, _word.capitalize(), _word.upper()), _meaning))
 _SCALARS = frozenset({int, float, str, bool, type(None)})
 _CONTAINERS = (dict, list, tuple, Mapping)
+#: Tags of plain values. All others name objects, which a scene must not create.
 _CORE_TAGS = {f"tag:yaml.org,2002:{name}" for name in ("str", "int", "float", "bool", "null", "seq", "map")} | {"!"}
 
 
@@ -80,7 +87,7 @@ def parse_yaml(data: bytes | str, file: str | None = None) -> Any:
     import yaml
 
     try:
-        return _Builder(file).run(yaml.parse(data, Loader=yaml.CSafeLoader))
+        return _Builder(file).build(yaml.parse(data, Loader=yaml.CSafeLoader))
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
         problem = getattr(error, "problem", None) or getattr(error, "reason", None) or "unreadable text"
@@ -97,7 +104,15 @@ def _line_of(data: bytes | str, mark: Any) -> str:
 
 
 class _Frame:
-    """A list or mapping under construction."""
+    """A list or mapping under construction.
+
+    Attributes:
+        value: what has been read of it.
+        anchor: the anchor that names it, or None.
+        key: of a mapping, the key whose value comes next; None where a key comes next.
+        lines: of a mapping, the line of each key, to report duplicates.
+        merges: of a mapping, the mappings that ``<<`` merges into it, the first with the highest precedence; None without.
+    """
 
     __slots__ = ("anchor", "key", "lines", "merges", "value")
 
@@ -110,7 +125,7 @@ class _Frame:
 
 
 class _Builder:
-    """Builder of plain objects from parser events."""
+    """Builder of plain objects from libyaml's parser events; ``stack`` holds what is open, the innermost last."""
 
     def __init__(self, file: str | None) -> None:
         self.file = file
@@ -118,9 +133,10 @@ class _Builder:
         self.anchors: dict[str, Any] = {}
         self.root: Any = None
         self.documents = 0
-        self.merged = self.values = 0
+        self.merged = self.values = 0  # keys copied by `<<`, and values, so far
 
-    def run(self, events: Iterator[Any]) -> Any:
+    def build(self, events: Iterator[Any]) -> Any:
+        """Return the root of the document that the events describe."""
         for event in events:
             name = event.__class__.__name__
             if (
@@ -128,17 +144,17 @@ class _Builder:
                 and self.stack
                 and event.tag is None
                 and event.anchor is None
-                and event.implicit[0]
+                and event.implicit[0]  # without quotes
             ):
                 values = self.stack[-1].value
-                if isinstance(values, list):  # numbers by the thousand
+                if isinstance(values, list):  # a short cut for numbers by the thousand
                     values.append(_resolve(event.value))
-                    self.count(event)
+                    self.count_value(event)
                     continue
             if name == "ScalarEvent":
                 self.scalar(event)
             elif name in ("SequenceStartEvent", "MappingStartEvent"):
-                self.open(event, [] if name[0] == "S" else {})
+                self.open(event, [] if name == "SequenceStartEvent" else {})
             elif name in ("SequenceEndEvent", "MappingEndEvent"):
                 self.close(event)
             elif name == "AliasEvent":
@@ -160,16 +176,21 @@ class _Builder:
         return ".".join([part for part in parts if part is not None] + [name] * bool(name))
 
     def scalar(self, event: Any) -> None:
+        """Take a scalar: a key where the innermost mapping expects one, else a value."""
         frame = self.stack[-1] if self.stack else None
         if frame is not None and isinstance(frame.value, dict) and frame.key is None:
-            self.name(frame, event)
+            self.begin_key(frame, event)
             return
         if event.tag is not None and event.tag not in _CORE_TAGS:
             raise SceneError(self.path(), event.tag, "plain YAML without tags that name objects", self.file)
-        plain_style = event.implicit[0] and event.tag is None
-        self.add(event, _resolve(event.value) if plain_style else event.value)
+        is_unquoted = event.implicit[0] and event.tag is None
+        value = _resolve(event.value) if is_unquoted else event.value
+        if event.anchor:
+            self.anchors[event.anchor] = value
+        self.add(event, value)
 
-    def name(self, frame: _Frame, event: Any) -> None:
+    def begin_key(self, frame: _Frame, event: Any) -> None:
+        """Set the key whose value comes next."""
         key, line = event.value, event.start_mark.line + 1
         if key in frame.lines and key != "<<":
             expected = f"a key only once in its block (lines {frame.lines[key]} and {line})"
@@ -180,6 +201,7 @@ class _Builder:
             self.anchors[event.anchor] = key
 
     def open(self, event: Any, value: list[Any] | dict[str, Any]) -> None:
+        """Begin a list or mapping; an alias of it inside itself finds no anchor."""
         if event.tag is not None and event.tag not in _CORE_TAGS:
             raise SceneError(self.path(), event.tag, "plain YAML without tags that name objects", self.file)
         if len(self.stack) >= MAX_DEPTH:
@@ -192,8 +214,10 @@ class _Builder:
         self.stack.append(_Frame(value, event.anchor))
 
     def close(self, event: Any) -> None:
+        """End the innermost list or mapping: merge what ``<<`` names, and add it to the one around it."""
         frame = self.stack.pop()
         if frame.merges is not None and isinstance(frame.value, dict):
+            # Each merge copies the keys of its source and those that are there.
             self.merged += sum(len(source) for source in frame.merges) + len(frame.value) * len(frame.merges)
             if self.merged > MAX_MERGED:
                 raise self.error(event, "<<", f"merges that copy at most {MAX_MERGED} keys in all")
@@ -201,18 +225,17 @@ class _Builder:
                 frame.value = dict(source) | frame.value
         if frame.anchor:
             self.anchors[frame.anchor] = frame.value
-        self.add(event, frame.value, None)
+        self.add(event, frame.value)
 
-    def count(self, event: Any) -> None:
-        """Count a value."""
+    def count_value(self, event: Any) -> None:
+        """Count a value, and raise where there are too many."""
         self.values += 1
         if self.values > MAX_VALUES:
             raise self.error(event, self.values, f"at most {MAX_VALUES} values")
 
-    def add(self, event: Any, value: Any, anchor: str | None = "") -> None:
-        self.count(event)
-        if anchor == "" and getattr(event, "anchor", None) and event.__class__.__name__ == "ScalarEvent":
-            self.anchors[event.anchor] = value
+    def add(self, event: Any, value: Any) -> None:
+        """Add a complete value to the innermost list or mapping, or make it the root."""
+        self.count_value(event)
         if not self.stack:
             self.root = value
             return
@@ -241,7 +264,9 @@ def _resolve(text: str) -> Any:
     if _INT.match(text):
         digits = text.replace("_", "")
         base = 16 if "0x" in digits else 8 if "0o" in digits else 10
-        return int(digits, base) if len(digits) < 400 else text
+        return (
+            int(digits, base) if len(digits) < 400 else text
+        )  # floats end at 1e308, and `int` is slow for many digits
     if _FLOAT.match(text):
         return float(text.replace("_", ""))
     if _NON_FINITE.match(text):
@@ -256,6 +281,7 @@ def plain(source: Any, file: str | None = None) -> Any:
         SceneError: a ``_target_`` key, a key that is not printable text, a structure that contains itself, nesting
             beyond ``MAX_DEPTH`` or more than ``MAX_VALUES`` values once aliases are expanded.
     """
+    # By id of a container: its copy and number of values; None while it is being copied. Aliases share one copy.
     memo: dict[int, tuple[Any, int] | None] = {}
     trail: list[str] = []  # the dotted key of what is being visited
 
@@ -263,7 +289,8 @@ def plain(source: Any, file: str | None = None) -> Any:
         return SceneError(".".join(trail) or "scene", value, expected, file)
 
     def visit(item: Any) -> tuple[Any, int]:
-        known = memo.get(id(item), ())
+        """Return the copy of a container, and the number of values in it."""
+        known = memo.get(id(item), ())  # (): not seen yet
         if known is None:
             raise error("an alias of itself", "a structure that does not contain itself")
         if known:
@@ -273,12 +300,12 @@ def plain(source: Any, file: str | None = None) -> Any:
         if len(trail) > MAX_DEPTH:
             raise error("deeper nesting", f"at most {MAX_DEPTH} levels of nesting")
         memo[id(item)] = None
-        mapped = item.__class__ is dict or isinstance(item, Mapping)
-        copy: Any = {} if mapped else []
+        is_mapping = item.__class__ is dict or isinstance(item, Mapping)
+        copy: Any = {} if is_mapping else []
         count = 1
-        for name, value in item.items() if mapped else enumerate(item):
+        for name, value in item.items() if is_mapping else enumerate(item):
             count += 1
-            if mapped:
+            if is_mapping:
                 if not isinstance(name, str) or not name.strip() or not name.isprintable() or len(name) > MAX_KEY:
                     raise error(name, f"keys that are printable text of at most {MAX_KEY} characters")
                 if name == "_target_":
@@ -286,10 +313,10 @@ def plain(source: Any, file: str | None = None) -> Any:
                     raise error(value, "no `_target_`: a scene never names Python objects")
             if value.__class__ not in _SCALARS and isinstance(value, _CONTAINERS):
                 trail.append(str(name))
-                value, inside = visit(value)
+                value, inner_count = visit(value)
                 trail.pop()
-                count += inside
-            if mapped:
+                count += inner_count
+            if is_mapping:
                 copy[name] = value
             else:
                 copy.append(value)

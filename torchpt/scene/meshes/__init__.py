@@ -1,5 +1,6 @@
 """Read mesh files as plain arrays: OBJ with MTL, PLY, STL and glTF by readers of this package, other formats by trimesh.
 
+Read ``mesh.py`` first: it has the records that all readers return. A file becomes *parts*, one for each of its materials.
 :data:`FORMATS` is the table of formats; a reader is imported when a scene has a file for it.
 """
 
@@ -45,13 +46,13 @@ def load_mesh(path: Path, *, materials: bool = True) -> list[MeshPart]:
         AssetError: the file cannot be read or is malformed; the message names the element.
     """
     path = Path(path)
-    kind = FORMATS.get(path.suffix.lower())
-    if kind is None:
+    format_name = FORMATS.get(path.suffix.lower())
+    if format_name is None:
         raise AssetError(path, f"expected a mesh file ending in {', '.join(FORMATS)}, got {path.suffix or 'no ending'}")
     try:
         data = read_regular(path)
     except OSError as error:
         raise AssetError(path, f"cannot be read ({error.strerror})") from None
-    reader = getattr(import_module(f"{__name__}.{kind}"), f"load_{kind}")
+    reader = getattr(import_module(f"{__name__}.{format_name}"), f"load_{format_name}")
     with np.errstate(all="ignore"):  # `checked` finds numbers that are not finite
         return checked(reader(path, data, materials), path)

@@ -1,4 +1,7 @@
-"""Texture blocks for the materials of mesh files, in the form of a scene file, without default values."""
+"""Write textures of mesh files' materials as blocks of a scene file, without keys that have their defaults.
+
+The readers of MTL and glTF materials use this module.
+"""
 
 from __future__ import annotations
 

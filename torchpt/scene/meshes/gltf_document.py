@@ -1,4 +1,10 @@
-"""Validate the JSON of a glTF file against a schema, and read its buffers and accessors."""
+"""Validate the JSON of a glTF file against a schema, and read its buffers and accessors.
+
+A *buffer* is binary data, a *bufferView* a range of bytes of it, an *accessor* an array in a bufferView: ``count`` rows of a
+*type* (SCALAR, VEC3, ...) whose *component type* is a number of OpenGL. A ``.glb`` file holds JSON and one buffer as *chunks*.
+The readers of glTF ask a :class:`Document` for items of the JSON and for arrays; :class:`NumberReader` checks ranges of single
+numbers.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +38,7 @@ class SchemaError(ValueError):
 
 @dataclass(frozen=True)
 class _Object:
-    """Schema of an object: by key, the required keys, and that of all other keys (None: not checked)."""
+    """Schema of an object: schemas by key, required keys, and the schema of all other keys (None: not checked)."""
 
     keys: Mapping[str, Any] = field(default_factory=dict)
     required: tuple[str, ...] = ()
@@ -41,7 +47,7 @@ class _Object:
 
 @dataclass(frozen=True)
 class _List:
-    """Schema of a list: that of its items, and its length where that is fixed."""
+    """Schema of a list: the schema of its items, and the length where it is fixed."""
 
     items: Any
     length: int | None = None
@@ -52,18 +58,20 @@ _NUMBER, _WHOLE, _TEXT, _ANY = "a number", "a whole number", "text", "anything"
 _TYPES: dict[str, tuple[type, ...]] = {_NUMBER: (int, float), _WHOLE: (int,), _TEXT: (str,)}
 _LARGEST = 1e300  # so that conversion to float cannot fail; the code that reads a number has its range
 
-_OBJECT = _Object()
-_INFO = _Object(
+_OBJECT = _Object()  # whatever is in it
+# A reference to a texture.
+_TEXTURE_INFO = _Object(
     {"extensions": _Object({"KHR_texture_transform": _OBJECT}), "texCoord": _ANY, "index": _WHOLE}, ("index",)
 )
-_LOOK = _Object(  # textures of the core material and of all its extensions
+_TEXTURES = _Object(  # textures of the core material and of all its extensions
     {
-        name: _INFO
+        name: _TEXTURE_INFO
         for name in (
             "baseColorTexture", "metallicRoughnessTexture", "specularTexture", "transmissionTexture", "clearcoatTexture",
         )
     }
 )  # fmt: skip
+# Rows that replace some of an accessor's.
 _SPARSE = _Object(
     {
         "count": _WHOLE,
@@ -106,10 +114,10 @@ BLOCKS: dict[str, _Object] = {
     ),
     "materials": _Object(
         {
-            "pbrMetallicRoughness": _LOOK,
-            "normalTexture": _INFO,
-            "emissiveTexture": _INFO,
-            "extensions": _Object(others=_LOOK),
+            "pbrMetallicRoughness": _TEXTURES,
+            "normalTexture": _TEXTURE_INFO,
+            "emissiveTexture": _TEXTURE_INFO,
+            "extensions": _Object(others=_TEXTURES),
         }
     ),
     "accessors": _Object({"type": _TEXT, "componentType": _WHOLE, "count": _WHOLE, "sparse": _SPARSE}),
@@ -168,6 +176,7 @@ def _brief(value: Any) -> str:
     """Return a short description of a value of JSON."""
     if isinstance(value, dict | list):
         return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)}"
+    # Python refuses to print integers of more than some thousand digits.
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) > 10**40:
         return "a number of very many digits"
     return repr(value)[:60] if value is not None else "null"
@@ -178,10 +187,15 @@ def _brief(value: Any) -> str:
 # Khronos glTF 2.0 specification, 3.6 (binary data), 4.4 (GLB). Every declared size is checked against the bytes that exist.
 
 
+#: Component types of OpenGL as NumPy's; numbers of rows' types.
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 #: Largest count of an accessor with sparse rows only: its zeros are not in the file, so the file's size is no limit.
 _MOST_ZEROS = 2**20
+#: Component types of indices: unsigned integers.
+_INDEX_COMPONENTS = (5121, 5123, 5125)
+#: A GLB file begins with magic, version and length (4 bytes each); each chunk with its length and kind (4 bytes each).
+_GLB_HEADER, _CHUNK_HEADER = 12, 8
 
 
 class Document:
@@ -208,13 +222,17 @@ class Document:
         self._check(self.json, ROOT, "")
         self._checked: set[tuple[str, int]] = set()
         self._buffers: dict[int, bytes] = {}
-        if binary is not None:
+        if binary is not None:  # buffer 0 without a uri is the binary chunk
             first = self.json.get("buffers")
             if isinstance(first, list) and first and isinstance(first[0], dict) and "uri" not in first[0]:
                 self._buffers[0] = binary
 
     def item(self, block: str, index: Any) -> dict[str, Any]:
-        """Return entry `index` of list `block`, checked against the schema on first use."""
+        """Return entry `index` of list `block`, checked against the schema on first use.
+
+        Raises:
+            AssetError: no such entry, or one that does not match the schema.
+        """
         items = self.json.get(block, [])
         if type(index) is not int or not isinstance(items, list) or not 0 <= index < len(items):
             count = len(items) if isinstance(items, list) else 0
@@ -231,7 +249,7 @@ class Document:
             raise AssetError(self.path, f"malformed glTF: {wrong}") from None
 
     def resource(self, uri: Any, where: str) -> bytes:
-        """Return the bytes of a data: URI, or of a file beside the document."""
+        """Return the bytes of a data: URI, or of a file beside the document; ``where``: the element, for errors."""
         if not isinstance(uri, str):
             raise AssetError(self.path, f"{where}: the uri is no text")
         if uri.startswith("data:"):
@@ -247,17 +265,17 @@ class Document:
             raise AssetError(file, f"cannot be read ({error.strerror}), {where} of {self.path}") from None
 
     def file(self, uri: str, where: str) -> Path:
-        """Return the path of the file that a relative URI names."""
+        """Return the path of the file that a relative URI names; ``where``: the element, for errors."""
         if "://" in uri:
             raise AssetError(self.path, f"{where}: only files and data: URIs are read, got {uri[:60]!r}")
-        for name in dict.fromkeys((unquote(uri), uri)):
+        for name in dict.fromkeys((unquote(uri), uri)):  # some exporters write % and blanks unquoted
             file = self.path.parent / name
             if is_regular(file):
                 return file
         raise AssetError(self.path, f"{where}: the file {uri[:80]!r} is missing")
 
     def view(self, number: Any) -> tuple[memoryview, int | None]:
-        """Return the bytes of a bufferView, and its stride or None."""
+        """Return the bytes of a bufferView, and its stride (bytes from row to row) or None where rows are packed."""
         view = self.item("bufferViews", number)
         index = view.get("buffer")
         begin, length = view.get("byteOffset", 0), view.get("byteLength")
@@ -278,7 +296,15 @@ class Document:
         return self._buffers[index]
 
     def accessor(self, number: Any, *kinds: str) -> NDArray[np.float64]:
-        """Return an accessor's rows ``(n, width)`` float64; its type must be in `kinds`; normalized integers become floats."""
+        """Return the rows of an accessor ``(n, width)``, float64; normalized integers become floats of -1..1.
+
+        Args:
+            number: index of the accessor.
+            kinds: accepted types, such as ``VEC3``.
+
+        Raises:
+            AssetError: another type, or data that are missing or reach beyond their buffer.
+        """
         accessor = self.item("accessors", number)
         where = f"accessors {number}"
         kind, code, count = accessor.get("type"), accessor.get("componentType"), accessor.get("count")
@@ -300,12 +326,13 @@ class Document:
         else:
             values = np.zeros((count, width))
         if sparse is not None:
-            self._displace(values, sparse, component, width, where)
+            self._replace_rows(values, sparse, component, width, where)
         if accessor.get("normalized") and component.kind in "iu":
             values = np.maximum(values / np.iinfo(component).max, -1.0)
         return values
 
     def _rows(self, view: Any, offset: Any, count: int, component: np.dtype, width: int, where: str) -> NDArray[Any]:
+        """Return ``count`` rows of ``width`` components that begin ``offset`` bytes into a bufferView."""
         data, stride = self.view(view)
         packed = component.itemsize * width
         stride = packed if stride is None else stride
@@ -317,18 +344,17 @@ class Document:
         if not count:
             return np.zeros((0, width), component)
         raw = np.frombuffer(data, np.uint8, needed - offset, offset)
+        # One row of bytes for each row, which a stride may set apart.
         rows = np.lib.stride_tricks.as_strided(raw, (count, packed), (stride, 1), writeable=False)
         return np.ascontiguousarray(rows).view(component)
 
-    def _displace(self, values: NDArray[np.float64], sparse: Any, component: np.dtype, width: int, where: str) -> None:
+    def _replace_rows(
+        self, values: NDArray[np.float64], sparse: Any, component: np.dtype, width: int, where: str
+    ) -> None:
         """Overwrite rows by those of a sparse accessor (specification 3.6.2.3)."""
         where = f"{where}.sparse"
         count, indices, rows = sparse["count"], sparse["indices"], sparse["values"]
-        if (
-            type(count) is not int
-            or not 0 <= count <= len(values)
-            or indices["componentType"] not in (5121, 5123, 5125)
-        ):
+        if type(count) is not int or not 0 <= count <= len(values) or indices["componentType"] not in _INDEX_COMPONENTS:
             raise AssetError(self.path, f"{where} has a count or a componentType out of range")
         kind = np.dtype(_COMPONENTS[indices["componentType"]])
         at = self._rows(indices["bufferView"], indices.get("byteOffset", 0), count, kind, 1, where).reshape(-1)
@@ -351,6 +377,13 @@ class NumberReader:
 
     def number(self, block: dict[str, Any], key: str, default: float, high: float, low: float = 0.0) -> float:
         """Return a number of the file, in a range.
+
+        Args:
+            block: the object that has the number.
+            key: key of the number.
+            default: its value where it is missing.
+            high: largest accepted value.
+            low: smallest accepted value.
 
         Raises:
             AssetError: not a number, or out of range.
@@ -376,7 +409,7 @@ class NumberReader:
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
     """Return the JSON chunk and the binary chunk of a GLB file."""
-    if len(data) < 20:
+    if len(data) < _GLB_HEADER + _CHUNK_HEADER:
         raise AssetError(path, f"truncated: {len(data)} bytes")
     version, length = (int.from_bytes(data[at : at + 4], "little") for at in (4, 8))
     if version != 2:
@@ -384,11 +417,12 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
     if length > len(data):
         raise AssetError(path, f"truncated: {length} bytes declared, got {len(data)}")
     found: dict[bytes, bytes] = {}
-    at = 12
-    while at + 8 <= length:
-        size, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
-        if at + 8 + size > length:
+    at = _GLB_HEADER
+    while at + _CHUNK_HEADER <= length:
+        size, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + _CHUNK_HEADER]
+        begin = at + _CHUNK_HEADER
+        if begin + size > length:
             raise AssetError(path, f"truncated: a chunk of {size} bytes reaches beyond the file")
-        found.setdefault(kind, data[at + 8 : at + 8 + size])
-        at += 8 + size
+        found.setdefault(kind, data[begin : begin + size])  # the first of each kind
+        at = begin + size
     return found.get(b"JSON", b""), found.get(b"BIN\0", b"")

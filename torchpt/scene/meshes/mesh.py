@@ -1,4 +1,8 @@
-"""Records of what mesh files hold, their validation, and smooth normals, polygon fans and displacement of meshes."""
+"""Records of what mesh files hold, their validation, and smooth normals, polygon fans and displacement of meshes.
+
+Readers of mesh formats return :class:`MeshPart`, in NumPy and float64, row by row: ``(V, 3)`` for V vertices, ``(F, 3)`` for F
+faces of three vertex indices. :func:`checked` is applied to all of them.
+"""
 
 from __future__ import annotations
 
@@ -33,6 +37,10 @@ __all__ = [
 # ---- Smooth vertex normals of meshes that have none
 
 
+#: Sums of unit normals shorter than this count as zero: they are rounding.
+_SHORTEST_SUM = 1e-12
+
+
 def smooth_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return unit vertex normals ``(V, 3)``, computed by :func:`torchpt.physics.shapes.normals.smooth_normals`.
 
@@ -42,8 +50,9 @@ def smooth_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> N
         vertices: ``(V, 3)``.
         faces: ``(F, 3)``.
     """
-    columns = torch.from_numpy(np.ascontiguousarray(np.asarray(vertices, np.float64).T))
-    found = normals.smooth_normals(columns, torch.from_numpy(np.asarray(faces, np.int64)), 1e-12).T.contiguous().numpy()
+    columns = torch.from_numpy(np.ascontiguousarray(np.asarray(vertices, np.float64).T))  # (3, V)
+    found = normals.smooth_normals(columns, torch.from_numpy(np.asarray(faces, np.int64)), _SHORTEST_SUM)
+    found = found.T.contiguous().numpy()
     found[~found.any(1)] = (0.0, 0.0, 1.0)
     return found
 
@@ -54,6 +63,7 @@ def smooth_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> N
 #: Most parts of one file: groups of an OBJ file, primitives of all nodes of a glTF file.
 MOST_PARTS = 100_000
 
+#: Largest number of a vertex or colour: those of scenes become float32.
 _LARGEST = float(np.finfo(np.float32).max)
 
 Rgb = tuple[float, float, float]
@@ -162,7 +172,7 @@ def too_many_parts(path: Path) -> AssetError:
 
 
 def _checked(part: MeshPart, path: Path) -> MeshPart:
-    label = f" of part {part.name}" if part.name else ""
+    label = f" of part {part.name}" if part.name else ""  # for errors
     bad = np.flatnonzero(~(np.abs(part.vertices) <= _LARGEST).all(axis=1))  # NaN compares false
     if len(bad):
         raise AssetError(path, f"vertex {bad[0]}{label} is not finite: {part.vertices[bad[0]].tolist()}")
@@ -176,6 +186,7 @@ def _checked(part: MeshPart, path: Path) -> MeshPart:
         bad = np.flatnonzero(~np.isfinite(normals).all(axis=1))
         if len(bad):
             raise AssetError(path, f"normal {bad[0]}{label} is not finite: {normals[bad[0]].tolist()}")
+        # Divided by the largest component first, whose square could overflow.
         largest = np.abs(normals).max(axis=1, keepdims=True)
         zero = largest[:, 0] == 0
         scaled = normals / np.where(largest > 0, largest, 1.0)
@@ -198,10 +209,10 @@ def polygon_fans(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArra
         starts: index of each polygon's first corner.
         counts: number of corners of each polygon, at least 3. Fans are right for convex polygons, as in most loaders.
     """
-    fans = counts - 2
-    owner = np.repeat(np.arange(len(counts)), fans)
-    step = np.arange(len(owner)) - np.repeat(np.cumsum(fans) - fans, fans)
-    first = starts[owner]
+    fans = counts - 2  # triangles of each polygon
+    polygon = np.repeat(np.arange(len(counts)), fans)  # (F,) polygon of each triangle
+    step = np.arange(len(polygon)) - np.repeat(np.cumsum(fans) - fans, fans)  # (F,) index of a triangle in its polygon
+    first = starts[polygon]
     return np.stack([first, first + step + 1, first + step + 2], axis=1)
 
 
@@ -210,6 +221,7 @@ def transformed(part: MeshPart, matrix: NDArray[np.float64]) -> MeshPart:
     linear = matrix[:3, :3]
     normals, faces = part.normals, part.faces
     if normals is not None:
+        # Normals transform by the cofactor matrix: the inverse transposed, times the determinant.
         cofactors = np.stack([np.cross(linear[(i + 1) % 3], linear[(i + 2) % 3]) for i in range(3)])
         normals = normals @ cofactors.T
     if np.linalg.det(linear) < 0:
@@ -225,6 +237,7 @@ def transformed(part: MeshPart, matrix: NDArray[np.float64]) -> MeshPart:
 # Vertices of the same position (on both sides of a texture seam, say) move together, so that no crack opens.
 
 
+#: ``(V, C)``: a row for each vertex.
 Rows = NDArray[np.float64]
 
 
@@ -242,10 +255,10 @@ def displaced(piece: MeshPart, heights: Callable[[Rows], Rows], subdivisions: in
     for _ in range(subdivisions):
         mesh = subdivided(mesh)
     assert mesh.normals is not None and mesh.uvs is not None
-    place, group = _unique_positions(mesh.vertices)
-    direction = _averaged(_unit(mesh.normals), group, len(place))
-    height = _averaged(heights(mesh.uvs)[:, None], group, len(place))
-    vertices = place + _unit(direction) * height
+    positions, group = _unique_positions(mesh.vertices)
+    direction = _averaged(_unit(mesh.normals), group, len(positions))
+    height = _averaged(heights(mesh.uvs)[:, None], group, len(positions))
+    vertices = positions + _unit(direction) * height
     # One vertex per position, so that the new normals are smooth across texture seams.
     joined = replace(mesh, vertices=vertices, faces=group[mesh.faces], normals=None, uvs=None, colors=None)
     smooth = smooth_normals(joined.vertices, joined.faces)
@@ -254,15 +267,16 @@ def displaced(piece: MeshPart, heights: Callable[[Rows], Rows], subdivisions: in
 
 def subdivided(mesh: MeshPart) -> MeshPart:
     """Return a mesh with every triangle split into four at its edges' midpoints; vertex attributes are interpolated."""
-    a, b, c = mesh.faces.T
+    a, b, c = mesh.faces.T  # (F,) vertices of each face; below ab, bc and ca are the midpoints of the edges
     ends = np.sort(np.concatenate([np.stack([a, b], 1), np.stack([b, c], 1), np.stack([c, a], 1)]), axis=1)
     # Edges as single numbers sort many times faster than pairs.
-    keys, which = np.unique(ends[:, 0] * len(mesh.vertices) + ends[:, 1], return_inverse=True)
+    keys, edge_of_side = np.unique(ends[:, 0] * len(mesh.vertices) + ends[:, 1], return_inverse=True)
     edges = np.stack(np.divmod(keys, len(mesh.vertices)), 1)
-    ab, bc, ca = which.reshape(3, -1) + len(mesh.vertices)
-    faces = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+    ab, bc, ca = edge_of_side.reshape(3, -1) + len(mesh.vertices)  # midpoints come after the old vertices
+    faces = np.concatenate([np.stack(triple, 1) for triple in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
 
     def extended(rows: Rows | None) -> Rows | None:
+        """Return an attribute of old vertices and midpoints."""
         return None if rows is None else np.concatenate([rows, 0.5 * (rows[edges[:, 0]] + rows[edges[:, 1]])])
 
     normals = extended(mesh.normals)
@@ -279,17 +293,20 @@ def subdivided(mesh: MeshPart) -> MeshPart:
 
 
 def _unique_positions(vertices: Rows) -> tuple[Rows, NDArray[np.int64]]:
-    """Return the distinct positions, and the index of each vertex's position."""
+    """Return the distinct positions, and for each vertex the index of its position.
+
+    Positions are found by a 64-bit hash (multipliers of xxHash and of SplitMix64), since sorting rows is many times slower.
+    """
     bits = (np.ascontiguousarray(vertices) + 0.0).view(np.uint64)  # + 0 makes -0 and 0 one
     mixed = bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
     mixed ^= mixed >> np.uint64(29)
     # No `return_index`: `unique` would sort stably for it, which is far slower.
     keys, group = np.unique(mixed.sum(1) * np.uint64(0xBF58476D1CE4E5B9), return_inverse=True)
-    place, group = np.empty((len(keys), 3)), group.reshape(-1)
-    place[group] = vertices
-    if not np.array_equal(place[group], vertices):  # a hash collision: one in 2^64 / V^2 meshes
-        place, group = np.unique(vertices, axis=0, return_inverse=True)
-    return place, group.reshape(-1)
+    positions, group = np.empty((len(keys), 3)), group.reshape(-1)
+    positions[group] = vertices
+    if not np.array_equal(positions[group], vertices):  # a hash collision: one in 2^64 / V^2 meshes
+        positions, group = np.unique(vertices, axis=0, return_inverse=True)
+    return positions, group.reshape(-1)
 
 
 def _averaged(rows: Rows, group: NDArray[np.int64], count: int) -> Rows:
@@ -299,5 +316,6 @@ def _averaged(rows: Rows, group: NDArray[np.int64], count: int) -> Rows:
 
 
 def _unit(rows: Rows) -> Rows:
+    """Return rows of length 1; zeros stay."""
     length = np.linalg.norm(rows, axis=1, keepdims=True)
     return rows / np.where(length > 0, length, 1.0)

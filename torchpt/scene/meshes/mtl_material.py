@@ -1,7 +1,11 @@
 """Convert the materials of MTL files; ``docs/reference/assets.md`` has the rules.
 
 The format was made for Phong's model (Alias Wavefront, *Object Files*, appendix B: MTL 3.0); ``Pr Pm Ps Pc Pcr aniso
-anisor norm`` are the extension of Clara.io's and Blender's exporters, whose meaning is Burley's principled model.
+anisor norm`` are the extension of Clara.io's and Blender's exporters, whose meaning is Burley's principled model: roughness,
+metallic, sheen, clearcoat, its roughness, anisotropy, its rotation, normal map. Of the old format: ``Kd Ks Ke`` diffuse,
+specular and emitted colour, ``Tf`` colour of transmitted emitted, ``Ns`` Phong's exponent, ``Ni`` index of refraction, ``d``
+opacity, ``Tr`` 1 - d, ``illum`` the number of an illumination model: 0 and 1 without highlights, 2 with them, 3, 5 and 8
+mirrors, 4, 6, 7 and 9 glass.
 """
 
 from __future__ import annotations
@@ -17,11 +21,14 @@ __all__ = ["COLORS", "MAPS", "NUMBERS", "Map", "Statements", "coat_gloss", "mate
 
 Rgb = tuple[float, float, float]
 
+#: Keys of statements, lower case: colours, single numbers, images.
 COLORS = ("kd", "ks", "ke", "tf")
 NUMBERS = ("ns", "ni", "d", "tr", "illum", "pr", "pm", "ps", "pc", "pcr", "aniso", "anisor")
 MAPS = ("map_kd", "map_ks", "map_ke", "map_pr", "map_pm", "map_ps", "map_d", "bump", "norm")
 
+#: Statements of the extension: a material with any of them is a principled one.
 _PBR = {"pr", "pm", "ps", "pc", "pcr", "aniso", "map_pr", "map_pm", "map_ps"}
+#: Keys as the format writes them, for messages.
 _NAMES = {"pr": "Pr", "pm": "Pm", "ps": "Ps", "pc": "Pc", "pcr": "Pcr", "ks": "Ks", "kd": "Kd"}
 _GREY = (0.5, 0.5, 0.5)
 _WHITE = (1.0, 1.0, 1.0)
@@ -35,11 +42,11 @@ class Map:
         key: the statement's key as written.
         name: the image file's name as written.
         line: line number.
-        bump: ``-bm``.
-        offset: ``-o``.
+        bump: ``-bm``, the factor of a bump map.
+        offset: ``-o``, added to texture coordinates that ``scale`` has multiplied.
         scale: ``-s``.
-        clamp: ``-clamp on``.
-        channel: channel of ``-imfchan``, or None.
+        clamp: ``-clamp on``, which does not repeat the image.
+        channel: channel of ``-imfchan`` from which a number is read, or None.
         ignored: unsupported options.
     """
 
@@ -65,7 +72,10 @@ class Statements:
 
 
 def coat_gloss(roughness: float) -> float:
-    """Return the ``clearcoat_gloss`` of a roughness (alpha = roughness²; alpha is 0.1 at gloss 0 and 0.001 at gloss 1)."""
+    """Return the ``clearcoat_gloss`` of a roughness.
+
+    The coat's alpha is roughness² here, and 0.1 at gloss 0 to 0.001 at gloss 1 in Burley's model (2012).
+    """
     return min(max((0.1 - roughness * roughness) / 0.099, 0.0), 1.0)
 
 
@@ -76,15 +86,15 @@ def material_of(statements: Statements, files: dict[str, str]) -> tuple[dict[str
         statements: the statements of one material.
         files: absolute path of each map.
     """
-    rules = _Rules(statements, files)
-    material = rules.surface()
-    rules.set_opacity(material)
-    rules.set_normals(material)
-    rules.set_emission(material)
-    return material, rules.ignored
+    converter = _Converter(statements, files)
+    material = converter.surface()
+    converter.set_opacity(material)
+    converter.set_normals(material)
+    converter.set_emission(material)
+    return material, converter.ignored
 
 
-class _Rules:
+class _Converter:
     """Converter of one material; ``ignored`` has the names of unsupported statements."""
 
     def __init__(self, statements: Statements, files: dict[str, str]) -> None:
@@ -101,11 +111,16 @@ class _Rules:
         if _PBR & (self.numbers.keys() | self.maps.keys()):
             return self._principled()
         ks = self.colors.get("ks", (0.0, 0.0, 0.0))
-        shiny = max(ks) > 0 or "map_ks" in self.maps
-        if self.illum in (3, 5, 8) and shiny and "map_kd" not in self.maps and max(self.colors.get("kd", _GREY)) == 0:
+        has_highlight = max(ks) > 0 or "map_ks" in self.maps
+        if (
+            self.illum in (3, 5, 8)
+            and has_highlight
+            and "map_kd" not in self.maps
+            and max(self.colors.get("kd", _GREY)) == 0
+        ):
             return {"type": "conductor", "reflectance": self._color("ks", _WHITE, "map_ks")}
-        if not shiny or self.illum in (0, 1):
-            self.ignored += ["Ks"] * (max(ks) > 0) + ["map_Ks"] * ("map_ks" in self.maps)
+        if not has_highlight or self.illum in (0, 1):
+            self._ignore_specular()
             return {"type": "diffuse", "reflectance": self._color("kd", _GREY, "map_kd")}
         return {
             "type": "principled",
@@ -113,6 +128,13 @@ class _Rules:
             "specular": self._specular(ks),
             "roughness": self._phong_roughness(),
         }
+
+    def _ignore_specular(self) -> None:
+        """Report the specular colour and its map, which the material does not use."""
+        if max(self.colors.get("ks", (0.0,))) > 0:
+            self.ignored.append("Ks")
+        if "map_ks" in self.maps:
+            self.ignored.append("map_Ks")
 
     def _opacity(self) -> float:
         """Return `d`, else 1 - `Tr`; a `Tr` of 1 counts as opaque, since some exporters write `d` under that name."""
@@ -125,14 +147,17 @@ class _Rules:
         return 1.0 - through
 
     def _is_glass(self) -> bool:
+        """Return True for the illumination models of refraction; 6 and 9 also stand for plain transparency by `d`."""
         index = self.numbers.get("ni", 1.0)
-        whole = self.opacity == 1.0 and "map_d" not in self.maps
-        return index != 1.0 and (self.illum in (4, 7) or (self.illum in (6, 9) and (whole or "tf" in self.colors)))
+        is_opaque = self.opacity == 1.0 and "map_d" not in self.maps
+        return index != 1.0 and (self.illum in (4, 7) or (self.illum in (6, 9) and (is_opaque or "tf" in self.colors)))
 
     def _glass(self) -> dict[str, Any]:
+        """Return a dielectric, rough where `Pr` is above 0; indices of refraction are clamped to what it accepts."""
         index = self.numbers["ni"]
         material: dict[str, Any] = {"type": "dielectric", "int_ior": min(max(index, 1e-3), 1e3), "ext_ior": 1.0}
-        self.ignored += ["Ni out of range"] * (material["int_ior"] != index)
+        if material["int_ior"] != index:
+            self.ignored.append("Ni out of range")
         roughness = self._bounded(self.numbers.get("pr", 0.0), "Pr")
         if roughness > 0:
             material |= {"type": "roughdielectric", "roughness": roughness}
@@ -146,14 +171,18 @@ class _Rules:
         return material
 
     def _principled(self) -> dict[str, Any]:
+        """Return Burley's model for the statements of the extension."""
         given = self.numbers
-        rough = self._bounded(given["pr"], "Pr") if "pr" in given else 1.0 if "map_pr" in self.maps else None
-        if rough is None:
-            rough = self._phong_roughness() if "ns" in given else 0.5
+        if "pr" in given:
+            roughness = self._bounded(given["pr"], "Pr")
+        elif "map_pr" in self.maps:
+            roughness = 1.0  # the factor of the map
+        else:
+            roughness = self._phong_roughness()
         material: dict[str, Any] = {
             "type": "principled",
             "base_color": self._color("kd", _GREY, "map_kd"),
-            "roughness": self._number(rough, "map_pr"),
+            "roughness": self._number(roughness, "map_pr"),
         }
         features = {
             "metallic": self._number(self._amount("pm", "map_pm"), "map_pm"),
@@ -167,8 +196,9 @@ class _Rules:
         index = given.get("ni", 1.0)
         if 1.0 < index <= 1e3:
             material["eta"] = index
-        self.ignored += ["Ks"] * (max(self.colors.get("ks", (0.0,))) > 0) + ["map_Ks"] * ("map_ks" in self.maps)
-        self.ignored += ["anisor"] * (given.get("anisor", 0.0) != 0.0)
+        self._ignore_specular()
+        if given.get("anisor", 0.0) != 0.0:
+            self.ignored.append("anisor")
         return material
 
     def _amount(self, key: str, kind: str) -> float:
@@ -191,7 +221,7 @@ class _Rules:
         section 5.2, for Beckmann's distribution), and roughness = sqrt(alpha).
         """
         if "ns" not in self.numbers:
-            return 0.5
+            return 0.5  # the default of the principled model
         return math.sqrt(math.sqrt(2.0 / (max(self.numbers["ns"], 0.0) + 2.0)))
 
     def set_opacity(self, material: dict[str, Any]) -> None:
@@ -199,9 +229,10 @@ class _Rules:
         found = self.maps.get("map_d")
         if found is not None:
             channel = found.channel
+            # The image of the colour again: its alpha is meant, which JPEG files do not have.
             if channel is None and self.files["map_d"] == self.files.get("map_kd"):
                 channel = "a" if PurePath(self.files["map_d"]).suffix.lower() not in (".jpg", ".jpeg") else None
-            opacity = self.opacity if self.opacity > 0 else 1.0
+            opacity = self.opacity if self.opacity > 0 else 1.0  # beside a map exporters write 0 for absent
             material["opacity"] = self._image("map_d", opacity, channel or "luminance")
         elif self.opacity != 1.0:
             material["opacity"] = self.opacity
@@ -229,11 +260,11 @@ class _Rules:
 
     def set_emission(self, material: dict[str, Any]) -> None:
         """Set the emission: `Ke` times `map_Ke`."""
-        light = self.colors.get("ke", (0.0, 0.0, 0.0))
+        emitted = self.colors.get("ke", (0.0, 0.0, 0.0))
         if "map_ke" in self.maps:
-            material["emission"] = self._image("map_ke", plain_scale(light if max(light) > 0 else _WHITE), None)
-        elif max(light) > 0:
-            material["emission"] = list(light)
+            material["emission"] = self._image("map_ke", plain_scale(emitted if max(emitted) > 0 else _WHITE), None)
+        elif max(emitted) > 0:
+            material["emission"] = list(emitted)
 
     def _color(self, key: str, default: Rgb, kind: str) -> Any:
         """Return a colour clamped to 1, times its map. Beside a map black counts as white: exporters write it for absent."""
@@ -249,14 +280,16 @@ class _Rules:
         return self._image(kind, value, self.maps[kind].channel or "luminance")
 
     def _image(self, kind: str, scale: float | list[float], channel: str | None) -> dict[str, Any]:
+        """Return the texture of a map; ``channel``: None for a colour."""
         found = self.maps[kind]
         transform: dict[str, Any] = {}
         if found.scale != (1.0, 1.0):
             transform["scale"] = list(found.scale)
         # The format counts v from the bottom: with v = 1 - v', s v + o becomes s v' + (1 - s - o).
-        move = (found.offset[0], 1.0 - found.scale[1] - found.offset[1])
-        if move != (0.0, 0.0):
-            transform["translate"] = list(move)
+        (offset_u, offset_v), (_, scale_v) = found.offset, found.scale
+        translation = (offset_u, 1.0 - scale_v - offset_v)
+        if translation != (0.0, 0.0):
+            transform["translate"] = list(translation)
         return image_texture(
             self.files[kind],
             scale=scale,
@@ -266,6 +299,7 @@ class _Rules:
         )
 
     def _unit(self, key: str, default: Rgb) -> Rgb:
+        """Return a colour clamped to 1; the parser has refused negative ones."""
         color = self.colors.get(key, default)
         if max(color) > 1:
             self.ignored.append(f"{key.capitalize()} above 1")

@@ -1,7 +1,9 @@
 """Read Wavefront OBJ: polygons with separate indices for position, texture and normal, grouped by material.
 
-Each distinct corner ``v/vt/vn`` becomes a vertex, as in Mitsuba. Polygons are split into fans (right for convex ones).
-Texture v is flipped: the format counts it from the bottom row.
+A *statement* is a line that begins with a key: ``v`` position, ``vt`` texture coordinate, ``vn`` normal, ``f`` face, ``usemtl``
+material of the faces that follow, ``mtllib`` material file. A *corner* of a face is a word ``v/vt/vn`` of indices from 1, of
+which vt and vn may be missing. Each distinct corner becomes a vertex, as in Mitsuba. Polygons are split into fans (right for
+convex ones). Texture v is flipped: the format counts it from the bottom row.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ class _Text:
         face_groups: the number of each face's group.
         groups: numbers of the groups by name of their material.
         libraries: MTL files that the file names.
-        ignored: statements that are not read, and MTL files that are missing.
+        ignored: keys of statements that are not read, and MTL files that are missing.
     """
 
     v: list[str] = field(default_factory=list)
@@ -65,39 +67,49 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     normals = _numbers(text, "vn", 3, path)
     if not text.f:
         return []
-    combos, index, counts = _corners(text, path, (len(positions), len(uvs), len(normals)))
-    triangles = polygon_fans(np.cumsum(counts) - counts, counts)  # (F, 3) into the flat corners
-    owner = np.repeat(np.array(text.face_groups), counts - 2)
+    corners, corner_of_word, counts = _corners(text, path, (len(positions), len(uvs), len(normals)))
+    triangles = polygon_fans(np.cumsum(counts) - counts, counts)  # (F, 3) into the words of all faces
+    group_of_triangle = np.repeat(np.array(text.face_groups), counts - 2)
     uvs[:, 1] = 1.0 - uvs[:, 1]
-    all_positions, all_faces = positions[combos[:, 0]], index[triangles]
-    all_uvs, all_normals = _looked_up(combos[:, 1], uvs), _looked_up(combos[:, 2], normals)
+    # A vertex for each distinct corner.
+    all_positions, all_faces = positions[corners[:, 0]], corner_of_word[triangles]
+    all_uvs, all_normals = _looked_up(corners[:, 1], uvs), _looked_up(corners[:, 2], normals)
     if all_normals is None and len(text.groups) > 1 and np.isfinite(positions).all():
         all_normals = smooth_normals(all_positions, all_faces)  # over the whole file: groups meet without a crease
     if len(text.groups) > MOST_PARTS:
         raise too_many_parts(path)
     parts = []
-    order = np.argsort(owner, kind="stable")  # faces of a group stay in the order of the file
-    ends = np.searchsorted(owner[order], np.arange(1, len(text.groups) + 1))
+    order = np.argsort(group_of_triangle, kind="stable")  # faces of a group stay in the order of the file
+    ends = np.searchsorted(group_of_triangle[order], np.arange(1, len(text.groups) + 1))
     for (name, _), rows in zip(text.groups.items(), np.split(order, ends[:-1]), strict=True):
         faces = all_faces[rows]
-        used, local = np.unique(faces, return_inverse=True)
+        used, local = np.unique(faces, return_inverse=True)  # vertices of the part, and its faces as indices into them
         material = known.get(name)
         if material is None and name and materials:
             material = FileMaterial(name, ignored=("not defined in an MTL file",))
         part_normals = None if all_normals is None else all_normals[used]
         part_uvs = None if all_uvs is None else all_uvs[used]
-        left_out = tuple(dict.fromkeys(text.ignored))
-        faces = local.reshape(-1, 3)
-        parts.append(MeshPart(name, all_positions[used], faces, part_normals, part_uvs, None, material, left_out))
+        parts.append(
+            MeshPart(
+                name=name,
+                vertices=all_positions[used],
+                faces=local.reshape(-1, 3),
+                normals=part_normals,
+                uvs=part_uvs,
+                material=material,
+                ignored=tuple(dict.fromkeys(text.ignored)),
+            )
+        )
     return parts
 
 
 def _split(lines: list[str], path: Path) -> _Text:
+    """Sort the lines of a file into statements; faces without a material before them form the group ""."""
     text = _Text()
     tables = {"v": text.v, "vt": text.vt, "vn": text.vn}
-    group = -1
+    group = -1  # of the faces that follow; -1 before the first `usemtl`
     for number, line in enumerate(lines, 1):
-        key = line[:2].rstrip()
+        key = line[:2].rstrip()  # enough for most lines, and fast
         if key not in ("v", "vt", "vn", "f"):
             key = (line.split(None, 1) or ("",))[0]
         if key in tables:
@@ -113,17 +125,27 @@ def _split(lines: list[str], path: Path) -> _Text:
             text.lines["f"].append(number)
             text.face_groups.append(group)
         elif key == "usemtl":
-            name = line.strip()[6:].strip()
+            name = line.strip().removeprefix("usemtl").strip()
             group = text.groups.setdefault(name, len(text.groups))
         elif key == "mtllib":
-            text.libraries.append(line.strip()[6:].strip())
+            text.libraries.append(line.strip().removeprefix("mtllib").strip())
         elif key in _CURVES:
             text.ignored.append(key)
     return text
 
 
 def _absolute(words: list[str], counts: tuple[int, int, int], path: Path, number: int) -> list[str]:
-    """Replace negative indices of a face, which count back from its statement, by positive ones."""
+    """Replace negative indices of a face, which count back from its statement, by positive ones.
+
+    Args:
+        words: ``f`` and the corners of the face.
+        counts: number of positions, texture coordinates and normals before the statement.
+        path: the file.
+        number: line number, for errors.
+
+    Raises:
+        AssetError: no corner, or one that counts back too far.
+    """
     result = [words[0]]
     for word in words[1:]:
         indices = word.split("/")
@@ -141,6 +163,7 @@ def _absolute(words: list[str], counts: tuple[int, int, int], path: Path, number
 
 
 def _libraries(text: _Text, path: Path) -> dict[str, FileMaterial]:
+    """Return the materials of all MTL files by name; missing files are added to ``text.ignored``."""
     known: dict[str, FileMaterial] = {}
     for name in text.libraries:
         whole = find_file(path, name)  # a name may hold blanks; else blanks separate several names
@@ -154,7 +177,11 @@ def _libraries(text: _Text, path: Path) -> dict[str, FileMaterial]:
 
 
 def _numbers(text: _Text, key: str, columns: int, path: Path) -> NDArray[np.float64]:
-    """Return the first numbers of each statement ``(n, columns)``; a one-number `vt` gets v = 0."""
+    """Return the first ``columns`` numbers of each statement with a key: ``(n, columns)``; a one-number `vt` gets v = 0.
+
+    Raises:
+        AssetError: names the line without that many numbers.
+    """
     rows: list[str] = getattr(text, key)
     words = " ".join(rows).split()
     width = columns + 1
@@ -167,7 +194,7 @@ def _numbers(text: _Text, key: str, columns: int, path: Path) -> NDArray[np.floa
     result = np.zeros((len(rows), columns))
     for index, (number, row) in enumerate(zip(text.lines[key], rows, strict=True)):
         found = row.partition("#")[0].split()
-        if key == "v" and len(found) >= 7:
+        if key == "v" and len(found) >= 7:  # the key and six numbers
             text.ignored.append("v x y z r g b (colours)")
         try:
             values = [float(word) for word in found[1:width]]
@@ -182,14 +209,17 @@ def _numbers(text: _Text, key: str, columns: int, path: Path) -> NDArray[np.floa
 def _corners(
     text: _Text, path: Path, sizes: tuple[int, int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Parse the corners of all faces.
+    """Parse the corners of all faces; ``sizes``: number of positions, texture coordinates and normals of the file.
 
     Returns:
         The distinct corners ``(V, 3)`` as zero-based v, vt, vn (-1: absent); the row of each corner of each face ``(C,)``;
         the number of corners of each face.
+
+    Raises:
+        AssetError: a face of fewer than three corners, a malformed corner, an index out of range.
     """
     words = " ".join(text.f).split()
-    heads = np.array([at for at, word in enumerate(words) if word == "f"])
+    heads = np.array([at for at, word in enumerate(words) if word == "f"])  # where each face begins
     counts = np.diff(heads, append=len(words)) - 1
     if len(heads) != len(text.f) or (counts < 3).any():
         face = int(np.argmax(counts < 3)) if len(heads) == len(text.f) else 0
@@ -202,7 +232,7 @@ def _corners(
     def line_of(word: str) -> int:
         return text.lines["f"][int(np.searchsorted(np.cumsum(counts), corners.index(word), side="right"))]
 
-    table = np.full((len(numbers), 3), -1, dtype=np.int64)
+    table = np.full((len(numbers), 3), -1, dtype=np.int64)  # the index 0, which the format does not have, becomes -2
     for row, word in enumerate(numbers):
         try:
             for slot, part in enumerate(word.split("/")):

@@ -1,5 +1,6 @@
 """Read PLY, ASCII and binary: the elements `vertex` and `face`; other elements are skipped.
 
+A header declares *elements*, tables whose rows have the same *properties*: numbers, or lists with a length before the items.
 Declared sizes are checked against the file's before memory is allocated.
 """
 
@@ -19,17 +20,20 @@ from torchpt.scene.meshes.ply_rows import find_mismatch
 
 __all__ = ["load_ply"]
 
+#: Types of the format, old and new names, and NumPy's without byte order.
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
     **{"double": "f8", "float64": "f8"},
 }
+#: Names that files have for one thing: the list of a face's vertices, colours, texture coordinates.
 _INDICES = ("vertex_indices", "vertex_index")
 _COLORS = ("red", "green", "blue")
 #: The material of vertices with colours.
 _COLORED = {"type": "diffuse", "reflectance": {"type": "vertex_color"}}
 #: Most bytes of a header.
 _MOST_HEADER = 2**20
+#: The last line of a header with its line end, of whichever kind.
 _END = re.compile(rb"(?:^|\r)end_header[ \t]*(?:\r\n|\n|\r(?!\n))", re.MULTILINE)
 _UVS = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))
 
@@ -48,7 +52,8 @@ class _Element:
     properties: list[_Property] = field(default_factory=list)
 
 
-Columns = dict[str, Any]  # scalar property: (n,); list property: (lengths (n,), flat items)
+#: The columns of an element by property: ``(n,)`` for numbers; for lists their lengths ``(n,)`` and all items in a row.
+Columns = dict[str, Any]
 
 
 def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
@@ -57,7 +62,7 @@ def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     Raises:
         AssetError: a truncated or malformed file, or one without vertices.
     """
-    layout, elements, start = _header(path, data)
+    layout, elements, start = _header(path, data)  # start: where the data begin
     reader = _Ascii(path, data, start, elements) if layout == "ascii" else _Binary(path, data, start, layout)
     found: dict[str, Columns] = {}
     for element in elements:
@@ -71,11 +76,23 @@ def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     if "vertex" not in found:
         raise AssetError(path, "no element vertex")
     if isinstance(reader, _Ascii):
-        reader.end()
+        reader.check_end()
     return [_part(path, found["vertex"], found.get("face", {}), elements, materials)]
 
 
 def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], materials: bool) -> MeshPart:
+    """Return the mesh of the columns of both elements.
+
+    Args:
+        path: the file.
+        vertex: columns of the element ``vertex``.
+        face: columns of the element ``face``; empty without it.
+        elements: all elements of the header.
+        materials: True for a material that shows vertex colours.
+
+    Raises:
+        AssetError: a missing property, a face of fewer than three corners.
+    """
     missing = [name for name in "xyz" if not isinstance(vertex.get(name), np.ndarray)]
     if missing:
         problem = f"has a list as its property {missing[0]}, expected a number"
@@ -124,18 +141,22 @@ def _colors(vertex: Columns, elements: list[_Element]) -> NDArray[np.float64] | 
     kinds = {p.name: p.kind for element in elements if element.name == "vertex" for p in element.properties}
     if not all(isinstance(vertex.get(name), np.ndarray) for name in _COLORS):
         return None
-    white = [1.0 if kinds[name][0] == "f" else np.iinfo(kinds[name]).max for name in _COLORS]
-    return np.stack([np.asarray(vertex[c], dtype=np.float64) / w for c, w in zip(_COLORS, white, strict=True)], axis=1)
+    columns = []
+    for name in _COLORS:
+        white = 1.0 if kinds[name][0] == "f" else np.iinfo(kinds[name]).max
+        columns.append(np.asarray(vertex[name], dtype=np.float64) / white)
+    return np.stack(columns, axis=1)
 
 
 def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
+    """Return the format (``ascii``, ``binary_little_endian`` or ``binary_big_endian``), the elements, and the header's size."""
     if not data.startswith(b"ply"):
         raise AssetError(path, "no PLY file (it does not start with ply)")
     found = _END.search(data, 0, _MOST_HEADER)
     if found is None:
-        long = len(data) > _MOST_HEADER
+        is_long = len(data) > _MOST_HEADER
         raise AssetError(
-            path, f"no end_header in its first {_MOST_HEADER} bytes" if long else "truncated: no end_header"
+            path, f"no end_header in its first {_MOST_HEADER} bytes" if is_long else "truncated: no end_header"
         )
     layout, elements = "", []
     for line in data[: found.start()].decode("latin-1").replace("\r", "\n").split("\n"):
@@ -159,16 +180,18 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
 
 
 def _property(words: list[str], problem: AssetError) -> _Property:
+    """Parse ``property TYPE NAME`` or ``property list TYPE_OF_LENGTH TYPE NAME``; raise ``problem`` for others."""
     if len(words) == 5 and words[1] == "list" and words[2] in _TYPES and words[3] in _TYPES:
         if _TYPES[words[2]][0] == "f":
             raise problem
-        return _Property(words[4], _TYPES[words[3]], _TYPES[words[2]])
+        return _Property(words[4], kind=_TYPES[words[3]], count=_TYPES[words[2]])
     if len(words) == 3 and words[1] in _TYPES:
-        return _Property(words[2], _TYPES[words[1]])
+        return _Property(words[2], kind=_TYPES[words[1]])
     raise problem
 
 
 def _truncated(path: Path, element: _Element, row: int | None = None) -> AssetError:
+    """Return the error for a file that ends before the rows that it declares."""
     where = "" if row is None else f" (at {element.name} {row})"
     return AssetError(
         path, f"truncated: {element.size} of element {element.name} declared, the file is too short{where}"
@@ -176,7 +199,7 @@ def _truncated(path: Path, element: _Element, row: int | None = None) -> AssetEr
 
 
 class _Binary:
-    """Reader of the elements of a binary file."""
+    """Reader of the elements of a binary file, which are to be read in order; ``at`` is the offset of the next one."""
 
     def __init__(self, path: Path, data: bytes, start: int, layout: str) -> None:
         self.path, self.data, self.at = path, data, start
@@ -191,19 +214,20 @@ class _Binary:
             return {
                 p.name: (np.zeros(0, np.int64), np.zeros(0, p.kind)) if p.count else np.zeros(0) for p in properties
             }
-        uniform = self.uniform(element)
-        return self.ragged(element) if uniform is None else uniform
+        columns = self.read_uniform(element)
+        return self.read_ragged(element) if columns is None else columns
 
-    def uniform(self, element: _Element) -> Columns | None:
+    def read_uniform(self, element: _Element) -> Columns | None:
         """Read all records at once; None where a list's length differs from that in the first record."""
         lengths, at = [], self.at
         for p in element.properties:
             length = 1
             if p.count:
-                length = self.integer(p.count, at, element, 0)
+                length = self.list_length(p.count, at, element, 0)
                 at += np.dtype(p.count).itemsize
             at += length * np.dtype(p.kind).itemsize
             lengths.append(length)
+        # The type of a whole row: for each property p0, p1, ... its values, and before a list n0, n1, ... its length.
         fields: list[Any] = []
         for slot, (p, length) in enumerate(zip(element.properties, lengths, strict=True)):
             if p.count:
@@ -225,7 +249,7 @@ class _Binary:
         self.at += records.nbytes
         return columns
 
-    def ragged(self, element: _Element) -> Columns:
+    def read_ragged(self, element: _Element) -> Columns:
         """Read record by record, for lists of different lengths."""
         chunks: list[list[Any]] = [[] for _ in element.properties]
         counts: list[list[int]] = [[] for _ in element.properties]
@@ -234,7 +258,7 @@ class _Binary:
             for slot, p in enumerate(element.properties):
                 length = 1
                 if p.count:
-                    length = self.integer(p.count, at, element, row)
+                    length = self.list_length(p.count, at, element, row)
                     at += np.dtype(p.count).itemsize
                 size = length * np.dtype(p.kind).itemsize
                 if length < 0 or at + size > len(self.data):
@@ -249,7 +273,8 @@ class _Binary:
             columns[p.name] = (np.array(counts[slot], dtype=np.int64), values) if p.count else values
         return columns
 
-    def integer(self, kind: str, at: int, element: _Element, row: int) -> int:
+    def list_length(self, kind: str, at: int, element: _Element, row: int) -> int:
+        """Return the length of a list, of the type ``kind``, at an offset; raise where it is negative or beyond the file."""
         raw = self.data[at : at + np.dtype(kind).itemsize]
         if len(raw) < np.dtype(kind).itemsize:
             raise _truncated(self.path, element, row)
@@ -260,7 +285,7 @@ class _Binary:
 
 
 class _Ascii:
-    """Reader of the elements of an ASCII file."""
+    """Reader of the elements of an ASCII file, which are to be read in order; ``at`` is the index of the next word."""
 
     def __init__(self, path: Path, data: bytes, start: int, elements: list[_Element]) -> None:
         self.path, self.data, self.start, self.elements = path, data, start, elements
@@ -293,12 +318,14 @@ class _Ascii:
         return columns
 
     def take(self, size: int, element: _Element, kind: type) -> NDArray[Any]:
+        """Return the next ``size`` words as numbers of a Python type, float or int."""
         if self.at + size > len(self.words):
             raise self.wrong(_truncated(self.path, element).problem)
         self.at += size
         return self.convert(self.words[self.at - size : self.at], element, kind)
 
     def convert(self, words: list[bytes], element: _Element, kind: type) -> NDArray[Any]:
+        """Return words as numbers; raise for the first that is none."""
         try:
             return np.array(list(map(kind, words)), dtype=np.float64 if kind is float else np.int64)
         except (ValueError, OverflowError):
@@ -311,17 +338,18 @@ class _Ascii:
         """Return the error about the first row that does not match the header, else about ``problem``."""
         return AssetError(self.path, find_mismatch(self.data, self.start, self.elements) or problem)
 
-    def end(self) -> None:
+    def check_end(self) -> None:
         """Raise if words are left behind the last faces: then rows were misaligned, although there were enough words."""
         read = [element for element in self.elements if element.size and element.properties]
-        last = next((number for number, element in enumerate(read) if element.name == "face"), len(read))
-        if last >= len(read) - 1 and self.at < len(self.words):
+        face_index = next((index for index, element in enumerate(read) if element.name == "face"), len(read))
+        if face_index >= len(read) - 1 and self.at < len(self.words):
             found = find_mismatch(self.data, self.start, self.elements)
             if found is not None:
                 raise AssetError(self.path, found)
 
 
 def _fits(word: bytes, kind: type) -> bool:
+    """Return True for a word that is a number of the type, of at most 64 bits."""
     try:
         return bool(np.array([kind(word)], dtype=np.float64 if kind is float else np.int64).size)
     except (ValueError, OverflowError):

@@ -12,8 +12,9 @@ from torchpt.scene.meshes.mesh import MeshPart
 
 __all__ = ["load_stl"]
 
+#: A triangle of a binary file: 50 bytes, little-endian.
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-#: Bytes of the header with the number of triangles; each triangle has 50.
+#: Bytes of the header: 80 of any text, then the number of triangles as 32-bit integer.
 _HEADER = 84
 
 
@@ -25,13 +26,14 @@ def load_stl(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     """
     del materials  # the format has none
     declared = int.from_bytes(data[80:84], "little") if len(data) >= _HEADER else -1
+    size = _HEADER + _RECORD.itemsize * declared  # bytes of a binary file of so many triangles
     # Some binary files begin with "solid" too, but have the size that their header declares.
-    if data.lstrip()[:5].lower() == b"solid" and len(data) != _HEADER + 50 * declared:
+    if data.lstrip()[:5].lower() == b"solid" and len(data) != size:
         corners = _ascii(path, data)
     elif declared < 0:
         raise AssetError(path, f"truncated: {len(data)} bytes, an STL file has at least {_HEADER}")
-    elif len(data) < _HEADER + 50 * declared:
-        raise AssetError(path, f"truncated: {declared} triangles need {_HEADER + 50 * declared} bytes, got {len(data)}")
+    elif len(data) < size:
+        raise AssetError(path, f"truncated: {declared} triangles need {size} bytes, got {len(data)}")
     else:
         records = np.frombuffer(data, _RECORD, declared, _HEADER)
         corners = records["corners"].astype(np.float64).reshape(-1, 3)
@@ -42,15 +44,16 @@ def load_stl(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
 
 
 def _ascii(path: Path, data: bytes) -> NDArray[np.float64]:
+    """Return the corners ``(3 F, 3)`` of an ASCII file."""
     words = data.split()
     if b"endsolid" not in words and b"ENDSOLID" not in words:
         raise AssetError(path, "truncated: no endsolid")
     is_vertex = np.array([word.lower() == b"vertex" for word in words])
-    at = np.flatnonzero(is_vertex)  # three numbers follow each
-    if len(at) % 3 or (len(at) and at[-1] + 3 >= len(words)):
-        raise AssetError(path, f"truncated: {len(at)} corners are no whole number of triangles")
+    starts = np.flatnonzero(is_vertex)  # three numbers follow each
+    if len(starts) % 3 or (len(starts) and starts[-1] + 3 >= len(words)):
+        raise AssetError(path, f"truncated: {len(starts)} corners are no whole number of triangles")
     try:
-        flat = [float(words[start + offset]) for start in at.tolist() for offset in (1, 2, 3)]
+        flat = [float(words[start + offset]) for start in starts.tolist() for offset in (1, 2, 3)]
     except ValueError:
         raise AssetError(path, "a vertex statement without three numbers") from None
     return np.array(flat, dtype=np.float64).reshape(-1, 3)

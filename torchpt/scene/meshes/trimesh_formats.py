@@ -1,7 +1,7 @@
 """Read further mesh formats by trimesh: OFF, 3MF, COLLADA, XAML, 3DXML.
 
-Files are untrusted: archives are limited in size, COLLADA may not declare a document type, and images are read only from the
-file's folder and below; nothing is executed or fetched.
+:data:`torchpt.scene.meshes.FORMATS` sends their files here. Files are untrusted: archives are limited in size, COLLADA may not
+declare a document type, and images are read only from the file's folder and below; nothing is executed or fetched.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ from torchpt.scene.meshes.trimesh_objects import Notes, mesh_parts_of
 
 __all__ = ["load_trimesh_formats"]
 
+#: The start of XML: a byte order mark of UTF-8 or UTF-16 or none, blanks, and a tag.
 _BEGINS = re.compile(rb"(?:\xef\xbb\xbf|\xff\xfe|\xfe\xff)?\s*<")
+#: The encoding in an XML declaration.
 _ENCODING = re.compile(rb"<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)")
+#: Encodings in which ASCII bytes stand for themselves, once the zeros of UTF-16 are gone.
 _ENCODINGS = (
     b"utf-8",
     b"utf8",
@@ -62,6 +65,7 @@ def load_trimesh_formats(path: Path, data: bytes, materials: bool) -> list[MeshP
     except (AssetError, MemoryError):
         raise
     except Exception as error:
+        # Parsers of other packages raise anything for a malformed file: the first line is shown.
         reason = (str(error).strip().splitlines() or [""])[0][:120]
         raise AssetError(path, f"malformed {kind} ({type(error).__name__}: {reason})") from None
     if missing_files and materials:
@@ -79,6 +83,8 @@ def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
     missing_files: list[str] = []
 
     class Beside(FilePathResolver):
+        """Reader of the files that a file names, from its folder and below; notes those that are missing."""
+
         def absolute(self, name: str) -> Path:
             path = super().absolute(name)
             if path.exists():
@@ -99,8 +105,9 @@ def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
 
 def _check_safe(path: Path, data: bytes) -> None:
     """Raise for archives that decompress to too many bytes, and for XML that declares entities."""
+    # The COLLADA documents, which trimesh's parser would expand entities of.
     texts = [data] if path.suffix.lower() == ".dae" else []
-    if data.startswith(b"PK"):
+    if data.startswith(b"PK"):  # a ZIP archive
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(info.file_size for info in archive.infolist())
             if size > MAX_UNPACKED:
@@ -110,8 +117,7 @@ def _check_safe(path: Path, data: bytes) -> None:
         plain = text.replace(b"\0", b"")  # of UTF-16
         declared = _ENCODING.search(plain[:200])
         if not _BEGINS.match(plain) or (declared and declared[1].lower() not in _ENCODINGS):
-            raise AssetError(
-                path, "is no XML in UTF-8, UTF-16, ASCII or Latin-1"
-            )  # other encodings could hide a DOCTYPE
+            # Other encodings could hide a DOCTYPE.
+            raise AssetError(path, "is no XML in UTF-8, UTF-16, ASCII or Latin-1")
         if b"<!DOCTYPE" in plain or b"<!ENTITY" in plain:
             raise AssetError(path, "declares a document type, which is not read")

@@ -1,4 +1,9 @@
-"""Convert trimesh objects to mesh parts, with their materials, lights and cameras."""
+"""Convert trimesh objects to mesh parts, with their materials, lights and cameras.
+
+Scenes with objects of trimesh, files that trimesh reads (:mod:`.trimesh_formats`) and :func:`torchpt.from_trimesh` use this
+module. A ``trimesh.Scene`` has *geometries* by name, and a graph whose nodes place each of them any number of times. Its
+materials and lights are written as those of glTF or MTL files, whose readers convert them.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +11,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -39,10 +45,11 @@ __all__ = ["MaterialConverter", "Placed", "lights_of", "mesh_parts_of", "parts_o
 # ---- Materials of trimesh objects: converted as those of glTF (``PBRMaterial``) and MTL (``SimpleMaterial``)
 
 
+#: Attributes of ``PBRMaterial``, named as the keys of glTF: factors and images.
 _FACTORS = ("metallicFactor", "roughnessFactor")
 _PICTURES = ("baseColorTexture", "metallicRoughnessTexture", "normalTexture", "occlusionTexture", "emissiveTexture")
 #: Keys of the block ``pbrMetallicRoughness`` of a glTF material.
-_INNER = (*_FACTORS, "baseColorFactor", "baseColorTexture", "metallicRoughnessTexture")
+_METALLIC_ROUGHNESS = (*_FACTORS, "baseColorFactor", "baseColorTexture", "metallicRoughnessTexture")
 #: Pillow's modes that a PNG file holds.
 _MODES = ("1", "L", "LA", "RGB", "RGBA", "I;16", "I")
 #: Trimesh's defaults of ``SimpleMaterial``: the grey of its colours, and its exponent.
@@ -57,13 +64,14 @@ class MaterialConverter:
         wanted: False to leave out all materials.
     """
 
-    def __init__(self, label: str, wanted: bool = True) -> None:
+    def __init__(self, label: str, *, wanted: bool = True) -> None:
         self.label, self.wanted = label, wanted
-        # The objects are stored too: an id is unique only while its object lives.
+        # By id of trimesh's object, which is stored too, since an id is unique only while its object lives. Materials also by
+        # whether the vertices have colours; with them goes the colour (1, 3) by which those are multiplied, or None.
         self._materials: dict[tuple[int, bool], tuple[Any, FileMaterial | None, NDArray[np.float64] | None]] = {}
         self._pictures: dict[int, tuple[Any, EncodedImage]] = {}
 
-    def of(
+    def convert(
         self, material: Any, colors: NDArray[np.float64] | None
     ) -> tuple[FileMaterial | None, NDArray[np.float64] | None]:
         """Return a material, and the vertex colours ``(V, 3)``, multiplied by the base colour where they take its place.
@@ -75,16 +83,18 @@ class MaterialConverter:
             return None, colors
         key = id(material), colors is not None
         if key not in self._materials:
-            one = None if colors is None else np.ones((1, 3))
-            made, tint = self._simple(material) if hasattr(material, "glossiness") else self._physical(material, one)
-            self._materials[key] = material, made, tint
-        _, made, tint = self._materials[key]
-        return made, colors if colors is None or tint is None else colors * tint
+            # White in place of the vertex colours comes back as the colour that multiplies them.
+            white = None if colors is None else np.ones((1, 3))
+            is_simple = hasattr(material, "glossiness")  # of SimpleMaterial
+            converted, tint = self._simple(material) if is_simple else self._physical(material, white)
+            self._materials[key] = material, converted, tint
+        _, converted, tint = self._materials[key]
+        return converted, colors if colors is None or tint is None else colors * tint
 
     def _physical(
-        self, material: Any, one: NDArray[np.float64] | None
+        self, material: Any, white: NDArray[np.float64] | None
     ) -> tuple[FileMaterial | None, NDArray[np.float64] | None]:
-        """Convert a ``PBRMaterial`` or None by way of a glTF material."""
+        """Convert a ``PBRMaterial`` or None by way of a glTF material; ``white (1, 3)``: vertex colours, or None without."""
         block: dict[str, Any] = {}
         images: dict[int, str | EncodedImage] = {}
         if material is not None:
@@ -101,12 +111,13 @@ class MaterialConverter:
                 if picture is not None:
                     block[key] = {"index": len(images)}
                     images[len(images)] = self.picture(picture, key)
-            block["pbrMetallicRoughness"] = {key: block.pop(key) for key in _INNER if key in block}
+            block["pbrMetallicRoughness"] = {key: block.pop(key) for key in _METALLIC_ROUGHNESS if key in block}
+        # A document of this one material, whose texture n is image n.
         count = len(images)
-        text = {"materials": [block], "textures": [{"source": n} for n in range(count)], "images": [{}] * count}
-        rules = Materials(Document(Path(self.label), json.dumps(text).encode()))
-        rules.images = images
-        return rules.of(None if material is None else 0, one)
+        document = {"materials": [block], "textures": [{"source": n} for n in range(count)], "images": [{}] * count}
+        converter = Materials(Document(Path(self.label), json.dumps(document).encode()))
+        converter.images = images
+        return converter.convert(None if material is None else 0, white)
 
     def _simple(self, material: Any) -> tuple[FileMaterial, None]:
         """Convert a ``SimpleMaterial`` by way of the statements of an MTL file.
@@ -124,15 +135,15 @@ class MaterialConverter:
         if material.glossiness != _DEFAULT_EXPONENT:
             statements.numbers["ns"] = float(material.glossiness)
         if material.image is not None:
-            statements.maps["map_kd"] = Map("map_Kd", "", 0)
+            statements.maps["map_kd"] = Map(key="map_Kd", name="", line=0)
             files["map_kd"] = self.picture(material.image, "image")
-        made, ignored = material_of(statements, files)
+        converted, ignored = material_of(statements, files)
         extra = [str(key)[:80] for key in material.kwargs if key not in ("kd", "ka", "ks", "ns")]
         name = str(material.name or "material")[:80]
-        return FileMaterial(name, made, tuple(dict.fromkeys([*ignored, *extra]))), None
+        return FileMaterial(name, converted, tuple(dict.fromkeys([*ignored, *extra]))), None
 
     def picture(self, image: Any, what: str) -> EncodedImage:
-        """Encode a Pillow image (or an array) as a PNG file in memory, named by a hash of its content.
+        """Encode a Pillow image (or an array) as a PNG file in memory, named by ``what`` and a hash of its content.
 
         Raises:
             AssetError: an image that is too large, broken, or of an unsupported mode.
@@ -142,6 +153,7 @@ class MaterialConverter:
         return self._pictures[id(image)][1]
 
     def _encoded(self, image: Any, what: str) -> EncodedImage:
+        """Encode an image without the cache."""
         from PIL import Image
 
         try:
@@ -150,7 +162,7 @@ class MaterialConverter:
             if width * height > MAX_PIXELS:
                 limit = f"more than {MAX_PIXELS / 2**20:g} Mpixel are not read"
                 raise AssetError(self.label, f"{what}: {width} x {height} pixels: {limit}")
-            if pillow.mode in ("P", "PA"):
+            if pillow.mode in ("P", "PA"):  # with a palette
                 pillow = pillow.convert("RGBA" if pillow.mode == "PA" or "transparency" in pillow.info else "RGB")
             if pillow.mode not in _MODES:
                 expected = "expected grey or RGB"
@@ -193,12 +205,12 @@ def mesh_parts_of(
     """
     import trimesh
 
-    converter = MaterialConverter(label, materials)
+    converter = MaterialConverter(label, wanted=materials)
     if isinstance(source, trimesh.Trimesh):
         return checked(parts_of(source, "", converter), Path(label))
     if not isinstance(source, trimesh.Scene):
         raise AssetError(label, f"expected a trimesh.Trimesh or trimesh.Scene, got {type(source).__name__}")
-    known: dict[str, list[MeshPart]] = {}
+    parts_by_geometry: dict[str, list[MeshPart]] = {}
     parts: list[MeshPart] = []
     total = 0
     for _, name, matrix in placed_in(source):
@@ -206,32 +218,34 @@ def mesh_parts_of(
         total += max(len(geometry.vertices), len(geometry.faces))
         if total > most:
             raise AssetError(label, f"more than {most} vertices or faces once nodes are placed")
-        if name not in known:
-            known[name] = parts_of(geometry, str(name)[:80] if len(source.geometry) > 1 else "", converter)
+        if name not in parts_by_geometry:
+            parts_by_geometry[name] = parts_of(geometry, str(name)[:80] if len(source.geometry) > 1 else "", converter)
         if len(parts) > MOST_PARTS:
             raise too_many_parts(Path(label))
-        stays = np.array_equal(matrix, np.eye(4))
-        parts += known[name] if stays else [transformed(part, matrix) for part in known[name]]
+        own = parts_by_geometry[name]
+        parts += own if np.array_equal(matrix, np.eye(4)) else [transformed(part, matrix) for part in own]
     parts = checked(parts, Path(label))
     others = [
-        f"{type(geometry).__name__} {name}"[:80] for name, geometry in source.geometry.items() if not _solid(geometry)
+        f"{type(geometry).__name__} {name}"[:80]
+        for name, geometry in source.geometry.items()
+        if not _has_faces(geometry)
     ]
     lights, ignored = lights_of(source, label)
     first = parts[0]
     ignored = tuple(dict.fromkeys((*first.ignored, *others, *ignored)))
-    fields = {**vars(first), "lights": tuple(lights), "cameras": tuple(_cameras(source)), "ignored": ignored}
-    return [MeshPart(**fields), *parts[1:]]
+    first = replace(first, lights=tuple(lights), cameras=tuple(_cameras(source)), ignored=ignored)
+    return [first, *parts[1:]]
 
 
 def placed_in(scene: Any) -> Iterator[Placed]:
     """Yield the nodes of a ``trimesh.Scene`` that have a mesh, in the order of its graph."""
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
-        if name in scene.geometry and _solid(scene.geometry[name]):
+        if name in scene.geometry and _has_faces(scene.geometry[name]):
             yield str(node), name, np.array(matrix, np.float64)
 
 
-def _solid(geometry: Any) -> bool:
+def _has_faces(geometry: Any) -> bool:
     """Return True for a geometry with faces, unlike points and paths."""
     return len(getattr(geometry, "faces", ())) > 0
 
@@ -247,9 +261,8 @@ def parts_of(mesh: Any, name: str, converter: MaterialConverter) -> list[MeshPar
         raise AssetError(converter.label, f"a face has an index outside 0..{len(vertices) - 1}")
     visual = mesh.visual
     normals: Matrix | None = None
-    if (
-        "vertex_normals" in mesh._cache.cache
-    ):  # as in trimesh's exporters: else trimesh would compute them from the faces
+    # As in trimesh's exporters: asked for normals that it does not have, trimesh would compute them from the faces.
+    if "vertex_normals" in mesh._cache.cache:
         normals = np.array(mesh.vertex_normals, np.float64)
         normals = normals if normals.shape == vertices.shape else None
     if visual.kind == "face":
@@ -257,13 +270,17 @@ def parts_of(mesh: Any, name: str, converter: MaterialConverter) -> list[MeshPar
         normals = smooth_normals(vertices, faces) if normals is None else normals
         corners = faces.reshape(-1)
         colors = np.repeat(_linear(visual.face_colors), 3, axis=0)
-        material, colors = converter.of(None, colors)
+        material, colors = converter.convert(None, colors)
         faces = np.arange(len(corners)).reshape(-1, 3)
-        return [MeshPart(name, vertices[corners], faces, normals[corners], None, colors, material)]
+        return [
+            MeshPart(
+                name, vertices[corners], faces, normals=normals[corners], uvs=None, colors=colors, material=material
+            )
+        ]
     if visual.kind != "texture":
         colors = _linear(visual.vertex_colors) if visual.kind == "vertex" else None
-        material, colors = converter.of(None, colors)
-        return [MeshPart(name, vertices, faces, normals, None, colors, material)]
+        material, colors = converter.convert(None, colors)
+        return [MeshPart(name, vertices, faces, normals=normals, uvs=None, colors=colors, material=material)]
     uvs = visual.uv
     if uvs is not None and len(uvs) == len(vertices) and uvs.shape[1] >= 2:
         uvs = np.stack((uvs[:, 0], 1.0 - uvs[:, 1]), axis=1).astype(np.float64)  # trimesh counts v from the bottom row
@@ -273,13 +290,14 @@ def parts_of(mesh: Any, name: str, converter: MaterialConverter) -> list[MeshPar
     colors = _linear(colors) if colors is not None and np.shape(colors)[:1] == (len(vertices),) else None
     several = getattr(visual.material, "materials", None)
     if several is None:
-        material, colors = converter.of(visual.material, colors)
+        material, colors = converter.convert(visual.material, colors)
         return [MeshPart(name, vertices, faces, normals, uvs, colors, material)]
-    which = np.asarray(visual.face_materials)
+    material_of_face = np.asarray(visual.face_materials)  # (F,) index into `several`
     parts = []
-    for number, each in enumerate(several):
-        material, tinted = converter.of(each, colors)
-        parts.append(MeshPart(f"{name}{number}", vertices, faces[which == number], normals, uvs, tinted, material))
+    for number, trimesh_material in enumerate(several):
+        material, tinted = converter.convert(trimesh_material, colors)
+        faces_of_material = faces[material_of_face == number]
+        parts.append(MeshPart(f"{name}{number}", vertices, faces_of_material, normals, uvs, tinted, material))
     return parts
 
 
@@ -297,7 +315,7 @@ def lights_of(scene: Any, label: str) -> tuple[list[FileLight], list[str]]:
     """
     lights: list[FileLight] = []
     left_out: list[str] = []
-    for light in vars(scene).get("_lights") or ():
+    for light in vars(scene).get("_lights") or ():  # the property `lights` would make some up
         try:
             matrix = np.array(scene.graph[light.name][0], np.float64)
         except (KeyError, ValueError):
@@ -311,6 +329,7 @@ def lights_of(scene: Any, label: str) -> tuple[list[FileLight], list[str]]:
             block["spot"] = {"innerConeAngle": light.innerConeAngle, "outerConeAngle": light.outerConeAngle}
         if light.radius is not None:
             block["range"] = light.radius
+        # Trimesh's lights are those of glTF's extension: they are converted as a document of one light.
         text = json.dumps({"extensions": {PUNCTUAL: {"lights": [block]}}})
         node = {"extensions": {PUNCTUAL: {"light": 0}}}
         lights.append(light_at(Document(Path(label), text.encode()), node, matrix, left_out))
