@@ -162,7 +162,7 @@ def _lane_rays(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
     _check_rays("d", d, torch.isfinite(d).all(0) & (d != 0).any(0), "a direction that is finite and not zero")
     unit = normalize(d)
     # Directions of unit length up to rounding keep their bits; their gradients are still those of `normalize`.
-    is_unit = (dot(d, d) - 1.0).abs() < 8.0 * torch.finfo(dtype).eps  # the error of three squares and two sums, doubled
+    is_unit = (dot(d, d) - 1.0).abs() < 8.0 * torch.finfo(dtype).eps  # a few roundings
     unit = unit + torch.where(is_unit, d - unit, 0.0).detach()
     return Rays(origin, unit.to(dtype).contiguous())
 

@@ -493,7 +493,7 @@ class Settings:
 
     @property
     def streams(self) -> int:
-        """Return the number of randomizations of a pixel: one, or more for the AOV ``variance``."""
+        """Return the number of independent randomizations (streams) of a pixel: one, or more for the AOV ``variance``."""
         spp = self.render.spp
         return min(spp, 4 if spp >= MANY_SAMPLES else 2) if "variance" in self.film.aovs else 1
 
@@ -580,6 +580,7 @@ _merged: ResultCache[Settings] = ResultCache(256)
 
 
 def _plain_mappings(blocks: Mapping[str, Any]) -> Any:
+    """Return blocks with dicts in place of mappings of other types, which the cache does not take."""
     return {name: dict(value) if isinstance(value, Mapping) else value for name, value in blocks.items()}
 
 
@@ -590,10 +591,8 @@ def _merge(
     check_keys(overrides, BLOCKS, "", "the settings", None)
     blocks: dict[str, Any] = {}
     for block in BLOCKS:
-        below, above = (
-            _keys_that_are_set(scene.get(block), block, file),
-            _keys_that_are_set(overrides.get(block), block, None),
-        )
+        below = _keys_that_are_set(scene.get(block), block, file)
+        above = _keys_that_are_set(overrides.get(block), block, None)
         if block == "film":
             above = keep_aspect(below, above)
         raw = _merge_typed(block, below, above) if block in TYPED_BLOCKS else {**below, **above}

@@ -264,9 +264,7 @@ def _resolve(text: str) -> Any:
     if _INT.match(text):
         digits = text.replace("_", "")
         base = 16 if "0x" in digits else 8 if "0o" in digits else 10
-        return (
-            int(digits, base) if len(digits) < 400 else text
-        )  # floats end at 1e308, and `int` is slow for many digits
+        return int(digits, base) if len(digits) < 400 else text  # beyond any float; Python refuses thousands of digits
     if _FLOAT.match(text):
         return float(text.replace("_", ""))
     if _NON_FINITE.match(text):

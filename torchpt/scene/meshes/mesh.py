@@ -37,7 +37,7 @@ __all__ = [
 # ---- Smooth vertex normals of meshes that have none
 
 
-#: Sums of unit normals shorter than this count as zero: they are rounding.
+#: Sums of a vertex's face normals, weighted by angle, that are no longer than this count as zero: they are rounding.
 _SHORTEST_SUM = 1e-12
 
 

@@ -50,14 +50,14 @@ class _Rows:
     """Columns of :class:`~torchpt.physics.lights.records.Lights` for some rows, and their power; vectors are ``(3, rows)``."""
 
     kind: list[str]  # of each row
-    p0: Tensor
-    e1: Tensor
+    p0: Tensor  # corner or position
+    e1: Tensor  # edges
     e2: Tensor
-    normal: Tensor
-    flip: Tensor
-    area: Tensor
-    bound: Tensor
-    radiance: Tensor
+    normal: Tensor  # unit normal or direction
+    flip: Tensor  # (rows,) -1 where normals are flipped, else 1
+    area: Tensor  # (rows,)
+    bound: Tensor  # (rows,) rounding bound
+    radiance: Tensor  # without an emission texture
     power: Tensor  # (rows,) float64, detached: the weight of the row for light samplers
 
 
@@ -92,15 +92,18 @@ def lights_of(
     if not len(prim) and not sources:
         return None
     dtype, device = primitives.p0.dtype, primitives.p0.device
+    # Emissive parts, each with its number of primitives n.
     emitting = [(part, n) for part, n in zip(parts, primitives.sizes, strict=True) if part.emission is not None and n]
-    # emitting: parts with their number of primitives n
-    groups, column = [], None  # column: of each row in the table of quadrics
+    groups, column = [], None  # groups of rows; column: column of each row in the table of quadrics
     if emitting:
         surfaces, column = _surfaces(emitting, primitives, parameters, prim)
         groups.append(surfaces)
-    reach = _reach(geometry) if sources else torch.ones((), device=device)
-    made = [_source(source, parameters, space, reach, dtype) for source in sources]
-    groups += [row for row, _ in made]
+    radius = _scene_radius(geometry) if sources else torch.ones((), device=device)
+    environments = []
+    for source in sources:
+        row, environment = _source(source, parameters, space, radius, dtype)
+        groups.append(row)
+        environments.append(environment)
     names = [name for group in groups for name in group.kind]
     kinds = tuple(dict.fromkeys(names))
     joined = {name: torch.cat([getattr(group, name) for group in groups], -1) for name in (*COLUMNS, "power")}
@@ -116,6 +119,7 @@ def lights_of(
     if column is not None:
         column = torch.cat((column, column.new_zeros(source_count)))
     textured = opacity_mapped or any(part.emission_texture is not None for part, _ in emitting)
+    # Data of the lights that are sampled by solid angle; `code` says which shape of these a kind has.
     codes = {name: emitter(name).code for name in kinds}
     solid = table_of([codes[name] for name in names], joined["p0"], joined["e1"], joined["e2"])
     lights = Lights(
@@ -124,10 +128,11 @@ def lights_of(
         kind=torch.tensor([kinds.index(name) for name in names], device=device) if len(names) > 1 else None,
         **joined,
         opacity=row_opacity,
-        environment=next((around for _, around in made if around is not None), None),
+        environment=next((environment for environment in environments if environment is not None), None),
         row_of_prim=row_of_prim,
         quadric=column,
         quadrics=None if column is None else primitives.quadrics,
+        # Stages look up textures by primitive.
         prim=torch.cat((prim, prim.new_zeros(source_count))) if textured else None,
         solid=solid,
         shapes=shapes_of(solid),
@@ -136,7 +141,7 @@ def lights_of(
     return replace(lights, choice=light_sampler(lights, power, (low, high), choice))
 
 
-def _reach(geometry: Geometry) -> Tensor:
+def _scene_radius(geometry: Geometry) -> Tensor:
     """Return the radius ``()`` of the scene: half the diagonal of its bounding box, float64; 1 without surfaces."""
     low, high = (box.double() for box in primitive_bounds(geometry))
     return (high.amax(1) - low.amin(1)).norm() * 0.5 if low.shape[1] else torch.ones((), device=low.device)
@@ -185,7 +190,7 @@ def _surfaces(
 
 
 def _source(
-    source: Source, parameters: Mapping[str, Tensor], space: Space, reach: Tensor, dtype: torch.dtype
+    source: Source, parameters: Mapping[str, Tensor], space: Space, radius: Tensor, dtype: torch.dtype
 ) -> tuple[_Rows, Any]:
     """Return the row of a delta light or environment, and the environment's data or None.
 
@@ -193,7 +198,7 @@ def _source(
         source: the light.
         parameters: every tensor by dotted name.
         space: the coordinates of lanes.
-        reach: radius of the scene, float64.
+        radius: radius of the scene, float64.
         dtype: dtype of the lanes.
     """
 
@@ -201,7 +206,7 @@ def _source(
         return parameters[f"{source.name}.{key}"]
 
     try:
-        row = LIGHTS[source.kind].row(Setting(parameter, source.values, space.point, space.unit, reach, dtype))
+        row = LIGHTS[source.kind].row(Setting(parameter, source.values, space.point, space.unit, radius, dtype))
     except Refused as error:
         raise scene_error(error, source.name, None, None) from None
     blank = torch.zeros(3, dtype=torch.float64, device=space.centre.device)
