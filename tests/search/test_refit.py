@@ -460,4 +460,7 @@ def test_a_scene_keeps_no_structure_that_cannot_be_refitted():
     _, own = scene.world(torch.float32)
     for kind in ("torch", "numba"):
         a, b = (scene.accel(kind, 1, own) for _ in range(2))
-        assert a is not b and (a in scene._latest.values(), b in scene._latest.values()) == (False, kind == "numba")
+        assert a is not b and (a in scene._latest_accels.values(), b in scene._latest_accels.values()) == (
+            False,
+            kind == "numba",
+        )

@@ -145,7 +145,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     from torchpt.images.movie import check_movie, write_movie
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
-    from torchpt.scene.settings import MOST_SEED
+    from torchpt.scene.settings import MAX_SEED
 
     gc_pause.resume()
     start = time.perf_counter()
@@ -162,7 +162,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
                 if key == "denoise":
                     what = "false: torchpt orbit writes frames as rendered (denoised one by one they flicker)"
                 raise SceneError(f"{group}.{key}", job.overrides[group][key], what)
-        if run_settings.render.seed > (last := MOST_SEED - turn.frames + 1):
+        if run_settings.render.seed > (last := MAX_SEED - turn.frames + 1):
             expected = f"a whole number 0..{last} where frames={turn.frames} (frame k has the seed render.seed + k)"
             raise SceneError("render.seed", run_settings.render.seed, expected)
         outs = _outputs(job)
