@@ -170,7 +170,7 @@ TOY = {
         '    enough: Annotated[int | None, Integer(None, low=1, doc="samples that are enough", role=Role.ENDS)]\n',
     ),
     "rendering/stopping.py": (
-        "        self.share = min(",
+        "        self.progress = min(",
         '        if self.render.enough is not None:\n            done["enough"] = taken / self.render.enough\n',
     ),
 }

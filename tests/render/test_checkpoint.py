@@ -358,7 +358,7 @@ def test_passes_of_a_render_that_ends_by_its_error(spp: int, box: torchpt.Scene)
     run = Run(box, settings(box.description, {"render": {"target_error": 1.0, "spp": 10**6}}), None, torch.float32)
     ends, end = set(), 0
     while end < 128:
-        ends.add(end := end + run.stop.step(end))
+        ends.add(end := end + run.stop_rules.next_pass_spp(end))
     assert ends_a_pass(run, spp) == (spp in ends)
 
 

@@ -139,9 +139,9 @@ def test_the_backward_pass_takes_what_the_forward_pass_took(scene: torchpt.Scene
     taken: list[int] = []
     gradients = adjoint.gradients
 
-    def spied(scene: Any, settings: Any, *rest: Any) -> Any:
+    def spied(scene: Any, settings: Any, *rest: Any, **more: Any) -> Any:
         taken.append(settings.render.spp)
-        return gradients(scene, settings, *rest)
+        return gradients(scene, settings, *rest, **more)
 
     monkeypatch.setattr(adjoint, "gradients", spied)
     name = "materials.grey.reflectance"

@@ -214,10 +214,10 @@ def test_the_same_bits(scene_of, monkeypatch, name, mode):
         assert same(shot(scene, wish, mode, **changed), whole), column
     if mode == "compiled":
         with monkeypatch.context() as patched:
-            patched.setattr(StopRules, "step", one_by_one)
+            patched.setattr(StopRules, "next_pass_spp", one_by_one)
             assert same(shot(scene, wish, mode), whole), "passes"
     else:
-        monkeypatch.setattr(StopRules, "step", one_by_one)
+        monkeypatch.setattr(StopRules, "next_pass_spp", one_by_one)
     part = shot(scene, wish, mode, {"crop": [4, 2, 11, 9]})
     assert torch.equal(part.image, whole.image[2:11, 4:15]), "crop"
     assert all(torch.equal(part.layers[layer], whole.layers[layer][2:11, 4:15]) for layer in part.layers), "crop"

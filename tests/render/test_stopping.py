@@ -43,7 +43,7 @@ def rule(**wishes: Any) -> StopRules:
 def steps(stop: StopRules, pace: float, error: Any = None) -> list[int]:
     """Passes until the end, with every sample of the picture taking ``pace`` seconds."""
     taken, out = 0, []
-    while size := stop.step(taken):
+    while size := stop.next_pass_spp(taken):
         out.append(size)
         taken += size
         stop.update(taken, pace * taken, None if error is None else error(taken))
@@ -68,7 +68,7 @@ def test_a_time_limit_holds_on_a_machine_that_others_slow(pace, seed):
     """By a clock that runs twice as fast now and then, and at the end above all."""
     g = torch.Generator().manual_seed(seed)
     stop, taken, seconds = rule(spp=100_000, time_limit=10.0), 0, 0.0
-    while size := stop.step(taken):
+    while size := stop.next_pass_spp(taken):
         slow = float(torch.rand((), generator=g)) < (0.3 if seconds < 8.0 else 0.7)
         taken, seconds = taken + size, seconds + pace * size * (2.0 if slow else 1.0)
         stop.update(taken, seconds, None)
@@ -78,7 +78,7 @@ def test_a_time_limit_holds_on_a_machine_that_others_slow(pace, seed):
 
 def test_time_for_a_second_look_is_kept():
     stop = rule(spp=100_000, time_limit=10.0)
-    stop.after = 0.1
+    stop.resampling_share = 0.1
     taken = sum(steps(stop, 0.01))
     assert stop.reason == "time_limit" and 9.6 <= 0.01 * 1.1 * taken <= 10.3
 

@@ -278,10 +278,10 @@ def _denoised_files(settings: Any, outs: list[str]) -> list[str]:
     if not settings.film.denoise:
         return []
     from torchpt.images.denoiser import check_denoiser
-    from torchpt.rendering.result import beside
+    from torchpt.rendering.result import denoised_path
 
     check_denoiser()
-    return [beside(path) for path in outs]
+    return [denoised_path(path) for path in outs]
 
 
 def _preview_files(preview: str) -> list[str]:

@@ -15,7 +15,7 @@ from torchpt.engines.kernels.programs import Kernels
 from torchpt.engines.kernels.threads import KernelsForward
 from torchpt.engines.tensors import hits, layers, radiance, seen, trace, weighted_radiance
 from torchpt.engines.tensors_forward import TensorsForward
-from torchpt.engines.work import TASKS, Block, TaskResult
+from torchpt.engines.work import TASKS, Block, SampleRange, TaskResult
 from torchpt.paths.walk import Engine, Population
 from torchpt.paths.wave import Wave
 
@@ -31,6 +31,7 @@ __all__ = [
     "Block",
     "Forward",
     "Kernels",
+    "SampleRange",
     "TaskResult",
     "Tasks",
     "backward_kernels",

@@ -8,6 +8,9 @@
 ``edges/``          boundary terms of silhouettes and shadow edges that move
 ==================  ==========================================================================================
 
+``rendering/requests.py`` calls :func:`gradients` when autograd goes back through a picture. A cotangent is the derivative of
+the loss with respect to a value; gradient sums collect those of parameters, in the order of samples.
+
 May import: ``scene`` and what lies below.
 """
 
@@ -40,13 +43,14 @@ def gradients(
     params: Mapping[str, Tensor],
     wanted: tuple[str, ...],
     dtype: torch.dtype,
+    *,
     attached: bool,
-    kind: str,
+    method: str,
     cotangent: Tensor,
     film_space: bool = False,
     ranks: Group | None = None,
     rays: tuple[Tensor, Tensor] | None = None,
-    by_rays: bool = False,
+    differentiates_rays: bool = False,
 ) -> list[Tensor]:
     """Return gradients of parameters ``wanted``, of rays, and of the weights of the user's own models, in this order.
 
@@ -57,12 +61,12 @@ def gradients(
         wanted: names of the parameters to differentiate.
         dtype: of the lanes.
         attached: True: geometry is differentiated.
-        kind: ``replay`` or ``autograd``.
+        method: ``replay`` or ``autograd``.
         cotangent: derivatives of the loss with respect to the pixels ``(3, H W)``.
         film_space: True: first hits stay in place while the camera moves, see :func:`film_space_applies`.
         ranks: processes that share the pixels; arguments are the same on all of them.
         rays: rays in place of camera rays, see :func:`torchpt.scene.prepare.make_wave`.
-        by_rays: True: gradients of their origins and directions are returned too.
+        differentiates_rays: True: gradients of their origins and directions are returned too.
 
     Raises:
         SceneError: ``render.max_memory`` is too small for it.
@@ -77,13 +81,29 @@ def gradients(
         raise NotBuiltError("integrator.type", integrator.name, expected)
     with limited_threads(settings.render.threads):
         attached = needs_direction_gradients(scene, wanted) if film_space else attached
-        scene_tape = SceneTape(scene, settings, params, wanted, scene.weights(), dtype, attached, ranks, rays, by_rays)
+        scene_tape = SceneTape(
+            scene,
+            settings,
+            params,
+            wanted,
+            scene.weights(),
+            dtype,
+            attached=attached,
+            ranks=ranks,
+            rays=rays,
+            differentiates_rays=differentiates_rays,
+        )
         if settings.render.max_memory is not None:
             need = memory_estimate(settings, scene.device, "tape", len(scene_tape.wave.context.world.materials.models))
             check_memory(settings.render.max_memory, scene.device, need.backward_bytes, 0)
-        carried = any(not own.whole for own in integrator.fields)
-        if kind == "replay" and integrator.has_own_transmit and (carried or scene_tape.differentiates_opacity):
-            what = "its fields" if carried else "opacity"
+        # Fields are what an integrator carries along a path; those of whole numbers have no derivatives.
+        differentiates_fields = any(not own.whole for own in integrator.fields)
+        if (
+            method == "replay"
+            and integrator.has_own_transmit
+            and (differentiates_fields or scene_tape.differentiates_opacity)
+        ):
+            what = "its fields" if differentiates_fields else "opacity"
             raise NotBuiltError(
                 "adjoint",
                 "replay",
@@ -93,7 +113,7 @@ def gradients(
         # Integrators that end at the first surface have a single vertex: a tape is enough.
         if film_space:
             film_space_backward(scene_tape, settings, cotangent, sums)
-        elif kind == "replay" and isinstance(scene_tape.wave.integrator, PathIntegrator):
+        elif method == "replay" and isinstance(scene_tape.wave.integrator, PathIntegrator):
             replay_paths(scene, scene_tape, settings, cotangent, sums)
         else:
             tape(scene_tape, settings, cotangent, sums)

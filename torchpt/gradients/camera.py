@@ -47,11 +47,15 @@ from torchpt.spec import Moves
 
 __all__ = ["film_space_applies", "film_space_backward", "needs_direction_gradients"]
 
-#: Xor mask that gives these paths a seed of their own.
-_OTHER = 0x2545F491
+#: Xor mask that gives the paths of borders and splats a seed of their own.
+_BORDER_SEED = 0x2545F491
+#: A border has 1 / BORDER_FRACTION of a pixel's samples: of two borders a pixel, half as many paths as for the pixels.
+BORDER_FRACTION = 4
+#: Intervals by which the integral of a filter's profile is computed.
+FILTER_STEPS = 1 << 12
 
-#: Maps samples ``(3, ...)`` to their values in pixels: finite, and clamped.
-Count = Callable[[Tensor], Tensor]
+#: Maps samples ``(3, ...)`` to the values that are added to pixels: finite, and clamped.
+SampleValue = Callable[[Tensor], Tensor]
 
 
 def film_space_applies(scene: Scene, settings: Settings, wanted: Iterable[str]) -> bool:
@@ -86,27 +90,31 @@ def film_space_backward(scene_tape: SceneTape, settings: Settings, cotangent: Te
         RenderError: not even the tape of a single lane fits in memory.
     """
     primal, wave, spp = scene_tape.wave, scene_tape.taped, settings.render.spp
-    count = partial(clamped_samples, settings)
+    sample_value = partial(clamped_samples, settings)
 
-    def inner(span: Span) -> tuple[Tensor, Tensor]:
-        return count(interior(primal, wave, span)).sum(1) / spp, cotangent[:, span[0] : span[0] + span[1]]
+    # Each returns the values of a chunk, which depend on the leaves of the tape, and their cotangents.
 
-    def splat(span: Span) -> tuple[Tensor, Tensor]:
-        values = splats(primal, wave, span, spp, cotangent, count)
+    def interior_loss(span: Span) -> tuple[Tensor, Tensor]:
+        first_pixel, pixel_count, _, _ = span
+        pixels = sample_value(interior(primal, wave, span)).sum(1) / spp
+        return pixels, cotangent[:, first_pixel : first_pixel + pixel_count]
+
+    def splat_loss(span: Span) -> tuple[Tensor, Tensor]:
+        values = splats(primal, wave, span, spp, cotangent, sample_value)
         return values, torch.ones_like(values)
 
-    def border(vertical: bool, each: int, span: Span) -> tuple[Tensor, Tensor]:
-        values = borders(primal, wave, vertical, span, each, cotangent, count)
+    def border_loss(vertical: bool, border_spp: int, span: Span) -> tuple[Tensor, Tensor]:
+        values = borders(primal, wave, span, border_spp, cotangent, sample_value, vertical=vertical)
         return values, torch.ones_like(values)
 
     _, _, width, height = primal.crop
     if not primal.filter.jumps:
-        chunk_by_chunk(scene_tape, settings, sums, splat, cells(primal), spp)
+        chunk_by_chunk(scene_tape, settings, sums, splat_loss, cells(primal), spp)
         return
-    each = -(-spp // 4)
-    chunk_by_chunk(scene_tape, settings, sums, inner, width * height, spp)
+    border_spp = -(-spp // BORDER_FRACTION)
+    chunk_by_chunk(scene_tape, settings, sums, interior_loss, width * height, spp)
     for vertical, number in borders_of(primal):
-        chunk_by_chunk(scene_tape, settings, sums, partial(border, vertical, each), number, each)
+        chunk_by_chunk(scene_tape, settings, sums, partial(border_loss, vertical, border_spp), number, border_spp)
 
 
 @dataclass(frozen=True)
@@ -129,36 +137,47 @@ def interior(primal: Wave, wave: Wave, span: Span) -> Tensor:
     """
     with torch.no_grad():
         state = primal.rays(*span)
-    seen = _hold_points(primal, wave, state)
-    return (_radiance(wave, seen.state) * seen.stretch).view(3, span[3], span[1])
+    held = _hold_points(primal, wave, state)
+    _, pixel_count, _, spp = span
+    return (_radiance(wave, held.state) * held.stretch).view(3, spp, pixel_count)
 
 
 def borders(
-    primal: Wave, wave: Wave, vertical: bool, span: Span, samples: int, cotangent: Tensor, count: Count
+    primal: Wave,
+    wave: Wave,
+    span: Span,
+    samples: int,
+    cotangent: Tensor,
+    sample_value: SampleValue,
+    *,
+    vertical: bool,
 ) -> Tensor:
     """Return the loss of light that moves through borders of pixels ``(3, N)``: the values are 0, their derivatives are not.
 
     Args:
         primal: the wave with detached parameters.
         wave: the same wave on a tape.
-        vertical: True: borders between neighbours in a row. False: in a column.
         span: first border, number of borders, first sample, number of samples.
         samples: number of samples of each border over all spans.
         cotangent: of the pixels ``(3, H W)``.
-        count: see :data:`Count`.
+        sample_value: see :data:`SampleValue`.
+        vertical: True: borders between neighbours in a row. False: in a column.
     """
-    x0, y0, width, _ = primal.crop
+    left, top, width, _ = primal.crop
     columns = width + 1 if vertical else width
     column, row, offset, key = _cells(primal, span, columns, samples, int(vertical))
-    along = offset[0]
+    along = offset[0]  # position on the border, 0..1
     with torch.no_grad():
-        state = _rays(primal, column + x0 + (0.0 if vertical else along), row + y0 + (along if vertical else 0.0), key)
-        radiance = count(_radiance(primal, state))
-        before = _of_pixel(cotangent, column - (1 if vertical else 0), row - (0 if vertical else 1), width)
-        film_cotangent = _of_pixel(cotangent, column, row, width) - before
-    seen = _hold_points(primal, wave, state)
-    at = seen.x if vertical else seen.y
-    return film_cotangent.to(radiance.dtype) * radiance * (at - at.detach()) / samples
+        state = _rays(
+            primal, column + left + (0.0 if vertical else along), row + top + (along if vertical else 0.0), key
+        )
+        radiance = sample_value(_radiance(primal, state))
+        # What the loss gains where light moves from the pixel before the border to the one behind it.
+        before = _pixel_cotangents(cotangent, column - (1 if vertical else 0), row - (0 if vertical else 1), width)
+        film_cotangent = _pixel_cotangents(cotangent, column, row, width) - before
+    held = _hold_points(primal, wave, state)
+    across = held.x if vertical else held.y
+    return film_cotangent.to(radiance.dtype) * radiance * (across - across.detach()) / samples
 
 
 def borders_of(primal: Wave) -> tuple[tuple[bool, int], ...]:
@@ -167,7 +186,7 @@ def borders_of(primal: Wave) -> tuple[tuple[bool, int], ...]:
     return (True, (width + 1) * height), (False, width * (height + 1))
 
 
-def splats(primal: Wave, wave: Wave, span: Span, samples: int, cotangent: Tensor, count: Count) -> Tensor:
+def splats(primal: Wave, wave: Wave, span: Span, samples: int, cotangent: Tensor, sample_value: SampleValue) -> Tensor:
     """Return the loss of samples all over the film ``(3, N)``, for filters that are continuous at their radius.
 
     Each path is added to all pixels whose filters cover it, so that the slopes of neighbouring filters cancel.
@@ -178,63 +197,72 @@ def splats(primal: Wave, wave: Wave, span: Span, samples: int, cotangent: Tensor
         span: first cell, number of cells, first sample, number of samples; see :func:`cells`.
         samples: number of samples of each cell over all spans.
         cotangent: of the pixels ``(3, H W)``.
-        count: see :data:`Count`.
+        sample_value: see :data:`SampleValue`.
     """
-    x0, y0, width, _ = primal.crop
-    beyond = _beyond(primal)
+    left, top, width, _ = primal.crop
+    beyond = _pixels_beyond(primal)
     column, row, offset, key = _cells(primal, span, width + 2 * beyond, samples, 0)
-    column, row = column - beyond, row - beyond
+    column, row = column - beyond, row - beyond  # of the picture's pixels, or beyond them
     with torch.no_grad():
-        state = _rays(primal, column + x0 + offset[0], row + y0 + offset[1], key)
-    seen = _hold_points(primal, wave, state)
-    radiance = count(_radiance(wave, seen.state) * seen.stretch)
+        state = _rays(primal, column + left + offset[0], row + top + offset[1], key)
+    held = _hold_points(primal, wave, state)
+    radiance = sample_value(_radiance(wave, held.state) * held.stretch)
     reach = range(-beyond, beyond + 1)
-    across = [_filter(primal, seen.x - (column + (x0 + k + 0.5))) for k in reach]
-    down = [_filter(primal, seen.y - (row + (y0 + k + 0.5))) for k in reach]
+    # Filter weights of the pixels around, by their distance in columns and in rows.
+    across = [_filter(primal, held.x - (column + (left + k + 0.5))) for k in reach]
+    down = [_filter(primal, held.y - (row + (top + k + 0.5))) for k in reach]
     film_cotangent = torch.zeros_like(radiance)
-    for i, along in zip(reach, down, strict=True):
-        for k, weight in zip(reach, across, strict=True):
-            film_cotangent = film_cotangent + _of_pixel(cotangent, column + k, row + i, width).to(
+    for i, row_weight in zip(reach, down, strict=True):
+        for k, column_weight in zip(reach, across, strict=True):
+            film_cotangent = film_cotangent + _pixel_cotangents(cotangent, column + k, row + i, width).to(
                 film_cotangent.dtype
-            ) * (weight * along)
+            ) * (column_weight * row_weight)
     return radiance * film_cotangent / samples
 
 
 def cells(primal: Wave) -> int:
     """Return the number of cells of a pixel's size that the filter of any pixel covers."""
     _, _, width, height = primal.crop
-    return (width + 2 * _beyond(primal)) * (height + 2 * _beyond(primal))
+    return (width + 2 * _pixels_beyond(primal)) * (height + 2 * _pixels_beyond(primal))
 
 
-def _beyond(primal: Wave) -> int:
+def _pixels_beyond(primal: Wave) -> int:
     """Return how many pixels a filter extends beyond its own."""
     return math.ceil(primal.filter.radius - 0.5)
 
 
 def _filter(primal: Wave, away: Tensor) -> Tensor:
     """Return the normalized profile of the filter ``(N,)`` at distances ``away``, differentiable."""
-    filter, place = primal.filter, away.detach().cpu().double().numpy()
-    ends = np.linspace(-filter.radius, filter.radius, (1 << 12) + 1, dtype=np.float64)
+    filter, distance = primal.filter, away.detach().cpu().double().numpy()
+    ends = np.linspace(-filter.radius, filter.radius, FILTER_STEPS + 1, dtype=np.float64)
     middle = 0.5 * (ends[1:] + ends[:-1])
-    whole, step = filter.profile(middle).mean() * 2.0 * filter.radius, 1e-5 * filter.radius
-    slope = (filter.profile(place + step) - filter.profile(place - step)) / (2.0 * step * whole)
-    value = torch.from_numpy(filter.profile(place) / whole).to(away)
+    integral, step = filter.profile(middle).mean() * 2.0 * filter.radius, 1e-5 * filter.radius
+    slope = (filter.profile(distance + step) - filter.profile(distance - step)) / (2.0 * step * integral)
+    value = torch.from_numpy(filter.profile(distance) / integral).to(away)
     return value + torch.from_numpy(slope).to(away) * (away - away.detach())
 
 
-def _of_pixel(cotangent: Tensor, column: Tensor, row: Tensor, width: int) -> Tensor:
+def _pixel_cotangents(cotangent: Tensor, column: Tensor, row: Tensor, width: int) -> Tensor:
     """Return the cotangents ``(3, N)`` of pixels; 0 outside the picture."""
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < cotangent.shape[1] // width)
     return torch.where(inside, take(cotangent, torch.where(inside, row * width + column, 0)), 0.0)
 
 
 def _cells(primal: Wave, span: Span, columns: int, samples: int, stream: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return columns and rows ``(N,)`` of cells or borders, random offsets in them ``(2, N)``, and sampler keys."""
-    first, count, start, several = span
+    """Return columns and rows ``(N,)`` of cells or borders, random offsets in them ``(2, N)``, and sampler keys.
+
+    Args:
+        primal: the wave with detached parameters.
+        span: first cell, number of cells, first sample, number of samples.
+        columns: number of cells in a row.
+        samples: number of samples of each cell over all spans.
+        stream: 0 or 1, for independent random numbers of horizontal and vertical borders.
+    """
+    first, count, first_sample, sample_count = span
     device = primal.centre.device
-    cell = torch.arange(first, first + count, device=device).repeat(several)
-    sample = torch.arange(start, start + several, device=device).repeat_interleave(count)
-    sampler = replace(primal.sampler, seed=primal.sampler.seed ^ _OTHER, spp=samples, randomizations=1)
+    cell = torch.arange(first, first + count, device=device).repeat(sample_count)
+    sample = torch.arange(first_sample, first_sample + sample_count, device=device).repeat_interleave(count)
+    sampler = replace(primal.sampler, seed=primal.sampler.seed ^ _BORDER_SEED, spp=samples, randomizations=1)
     key = sampler.key(2 * cell + stream, sample)
     offset = Draws(sampler.points, key, salts(0, device)).two(Dimension.PIXEL).to(primal.context.plan.dtype)
     return cell % columns, cell // columns, offset, key
@@ -258,14 +286,14 @@ def _hold_points(primal: Wave, wave: Wave, state: PathState) -> _HeldPoints:
     with torch.no_grad():
         hit = hits(primal, state)
         missed = hit.prim < 0
-        at = interact(world, state.o, state.d, replace(hit, prim=hit.prim.clamp_min(0)), True)
+        at = interact(world, state.o, state.d, replace(hit, prim=hit.prim.clamp_min(0)), follow_ray=True)
         p, n = torch.where(missed, 0.0, at.p), torch.where(missed, 0.0, at.ng)
     origin = wave.camera.origin()
     offset = torch.where(missed, state.d, p - origin)  # infinitely far points do not move with the camera
     x, y, scale = wave.camera.project(offset)
     area = scale * torch.where(missed, 1.0, dot(n, offset).abs())
-    value = area.detach()
-    stretch = torch.where(value > 0, area / torch.where(value > 0, value, 1.0), 1.0)
+    primal_area = area.detach()
+    stretch = torch.where(primal_area > 0, area / torch.where(primal_area > 0, primal_area, 1.0), 1.0)
     towards = normalize(offset)
     o = state.o + (origin - origin.detach())
     return _HeldPoints(replace(state, o=o, d=state.d + (towards - towards.detach())), x, y, stretch)

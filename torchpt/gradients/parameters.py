@@ -1,7 +1,8 @@
 """From parameters to the tensors of waves, and back once a backward pass; and which parameters move geometry.
 
 :mod:`torchpt.scene.world` builds world and camera from the parameters on an autograd tape. Chunks of lanes are differentiated
-with respect to the tensors of the world; their gradient sums are pulled back to the parameters once, at the end.
+with respect to the tensors of the world; their gradient sums are pulled back to the parameters once, at the end. Those tensors,
+cut from the tape of the parameters, are the leaves; their detached twins are the primals.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ def attached(scene: Scene, names: Iterable[str]) -> bool:
     # Materials with smooth refraction: their index of refraction sets the direction of the refracted ray.
     bending = {material.name for owner in owners for material in owner.material.all() if material.bends}
 
-    def moves(name: str) -> bool:
-        moved = scene.spec(name).moves
-        if moved is Moves.RAYS:  # of a bending material, or of a texture that it may read
+    def is_attached(name: str) -> bool:
+        moves = scene.spec(name).moves
+        if moves is Moves.RAYS:  # of a bending material, or of a texture that it may read
             return any(name.startswith(f"{own}.") for own in bending) or bool(bending and "textures." in name)
-        return moved is Moves.SURFACES
+        return moves is Moves.SURFACES
 
-    return any(map(moves, names))
+    return any(map(is_attached, names))
 
 
 # ---- From parameters to the tensors of waves, and back once a backward pass
@@ -60,7 +61,7 @@ class SceneTape(Tape):
         attached: True: geometry is differentiated.
         ranks: processes that share the pixels; None: a single process.
         rays: rays in place of camera rays, see :func:`torchpt.scene.prepare.make_wave`.
-        by_rays: True: rays are differentiated too.
+        differentiates_rays: True: rays are differentiated too.
     """
 
     # `_inputs`: autograd leaves, the wanted parameters and then the rays. `_outputs`: the tensors of the wave that depend on
@@ -74,24 +75,25 @@ class SceneTape(Tape):
         wanted: Sequence[str],
         captured: Sequence[Tensor],
         dtype: torch.dtype,
+        *,
         attached: bool,
         ranks: Group | None = None,
         rays: tuple[Tensor, Tensor] | None = None,
-        by_rays: bool = False,
+        differentiates_rays: bool = False,
     ) -> None:
         self._ranks = ranks
         self._inputs = [params[name].detach().requires_grad_() for name in wanted]
         if rays is not None:
-            o, d = (tensor.detach().requires_grad_(by_rays) for tensor in rays)
+            o, d = (tensor.detach().requires_grad_(differentiates_rays) for tensor in rays)
             rays = o, d
-            self._inputs += [o, d] if by_rays else []
+            self._inputs += [o, d] if differentiates_rays else []
         # The inputs may end with the rays, which have no name.
         given = {name: value.detach() for name, value in params.items()} | dict(zip(wanted, self._inputs, strict=False))
         with torch.enable_grad():
-            made = make_wave(scene, settings, given, dtype, tape=True, attached=attached, rays=rays)
+            taped_wave = make_wave(scene, settings, given, dtype, tape=True, attached=attached, rays=rays)
         self._outputs: list[Tensor] = []
-        primals: dict[int, Tensor] = {}
-        leaves: dict[int, Tensor] = {}
+        primals: dict[int, Tensor] = {}  # by id of the tensor on the tape
+        leaves: dict[int, Tensor] = {}  # by id of the primal
 
         def detached(tensor: Tensor) -> Tensor:
             # Other leaves are weights of modules: they are in `captured`, and stages read the modules' own tensors.
@@ -106,12 +108,12 @@ class SceneTape(Tape):
             return leaves.get(id(tensor), tensor)
 
         inputs = {id(tensor) for tensor in self._inputs}
-        wave = _over(made, detached)
+        wave = _map_tensors(taped_wave, detached)
         detached_outputs = [primals[id(tensor)] for tensor in self._outputs]
         leaves |= {id(primal): primal.detach().requires_grad_() for primal in detached_outputs}
         super().__init__(
             wave=wave,
-            taped=_over(wave, leaf),
+            taped=_map_tensors(wave, leaf),
             leaves=[leaves[id(primal)] for primal in detached_outputs],
             primals=detached_outputs,
             captured=tuple(captured),
@@ -121,15 +123,18 @@ class SceneTape(Tape):
         """Return the blocks of consecutive pixels, first and number, of this process; the same for all engines."""
         return blocks(pixels, samples, self._ranks)
 
-    def through(self, budget: Budget, work: Callable[[Span], None], pixels: int, samples: int) -> None:
-        """Call ``work`` with the chunks of this process's :meth:`blocks`, as large as the budget allows."""
+    def run_in_chunks(self, budget: Budget, work: Callable[[Span], None], pixels: int, samples: int) -> None:
+        """Call ``work`` with the chunks of this process's :meth:`blocks`, as large as the budget allows.
+
+        A chunk is first pixel, number of pixels, first sample and number of samples of each.
+        """
         for start, count in self.blocks(pixels, samples):
 
-            def moved(span: Span, start: int = start) -> None:
-                first_pixel, count, first_sample, samples = span  # the pixel counts from the block's first
+            def work_in_block(span: Span, start: int = start) -> None:
+                first_pixel, count, first_sample, samples = span  # pixels count from the first of the block
                 work((start + first_pixel, count, first_sample, samples))
 
-            for _ in budget.run_in_chunks(moved, count, 0, samples):
+            for _ in budget.run_in_chunks(work_in_block, count, 0, samples):
                 pass  # running the iterator calls `work`
 
     def sums(self) -> GradientSums:
@@ -138,18 +143,18 @@ class SceneTape(Tape):
 
     def gradients(self, sums: GradientSums) -> list[Tensor]:
         """Return gradients of parameters, rays and captured tensors from the gradient sums of the leaves."""
-        found = sums.gradients()  # of the leaves, then of the captured tensors
-        pairs = [(y, g) for y, g in zip(self._outputs, found, strict=False) if g is not None]
-        of_inputs: Sequence[Tensor | None] = [None] * len(self._inputs)
+        leaf_grads = sums.gradients()  # of the leaves, then of the captured tensors
+        pairs = [(output, grad) for output, grad in zip(self._outputs, leaf_grads, strict=False) if grad is not None]
+        input_grads: Sequence[Tensor | None] = [None] * len(self._inputs)
         if pairs and self._inputs:
-            outputs, cotangents = [y for y, _ in pairs], [g for _, g in pairs]
-            of_inputs = torch.autograd.grad(outputs, self._inputs, cotangents, allow_unused=True)
-        of_captured = found[len(self.leaves) :]
-        results = zip((*self._inputs, *self.captured), (*of_inputs, *of_captured), strict=True)
+            outputs, cotangents = [output for output, _ in pairs], [grad for _, grad in pairs]
+            input_grads = torch.autograd.grad(outputs, self._inputs, cotangents, allow_unused=True)
+        captured_grads = leaf_grads[len(self.leaves) :]
+        results = zip((*self._inputs, *self.captured), (*input_grads, *captured_grads), strict=True)
         return [torch.zeros_like(tensor) if gradient is None else gradient for tensor, gradient in results]
 
 
-def _over(wave: Wave, change: Callable[[Tensor], Tensor]) -> Wave:
+def _map_tensors(wave: Wave, change: Callable[[Tensor], Tensor]) -> Wave:
     """Return the wave with ``change`` applied to all of its tensors."""
     context = wave.context
     records = context.world, context.pixel, wave.camera, wave.first_surface, wave.start_rays

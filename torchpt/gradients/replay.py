@@ -5,6 +5,9 @@ from the last to the first. If a walk has more vertices than an engine keeps, it
 state), and each part is traced again; a part that is still too long is split in turn. With at most :data:`MARKS` marks a level,
 memory grows with the logarithm of the depth.
 
+A population is an engine's record of all paths of a chunk at one vertex; a chunk, or span, is first pixel, number of pixels,
+first sample and number of samples.
+
 Vicini, Speierer, Jakob 2021, *Path Replay Backpropagation*; for the marks Griewank, Walther 2000, *Revolve*.
 """
 
@@ -35,9 +38,9 @@ __all__ = ["replay_paths"]
 
 #: Lanes of a chunk of tensors, by device. Fixed, since sums over other chunks would round differently.
 LANES = {"cpu": 1 << 16, "cuda": 1 << 20}
-#: Bytes of a lane at a vertex that is kept: state, hit and groups.
+#: Bytes of a lane at a vertex that is kept: path state, hit, and its lists of lanes by model.
 BYTES_PER_VERTEX = 240
-#: Greatest number of marks of a walk.
+#: Greatest number of marks of a walk; where there are more, every other one is dropped.
 MARKS = 8
 
 
@@ -54,19 +57,19 @@ class VertexRecorder(Observer[Any]):
     """
 
     def __init__(self, engine: Backward[Any, Any, Any], first: int, mark: Any) -> None:
-        self.kept: list[Any] = []
-        self.marks: list[tuple[int, Any]] = []
-        self._engine, self._first, self._mark, self._step = engine, first, mark, KEPT
+        self.kept: list[Any] = []  # populations by vertex
+        self.marks: list[tuple[int, Any]] = []  # vertex and state
+        self._engine, self._first_vertex, self._first_mark, self._vertices_per_mark = engine, first, mark, KEPT
 
     def on_hits(self, paths: Population) -> bool:
         """See :class:`Observer`."""
-        past = paths.depth - self._first
-        if past > 0 and past % self._step == 0:
-            self.marks = self.marks or [(self._first, self._mark)]
+        vertices = paths.depth - self._first_vertex
+        if vertices > 0 and vertices % self._vertices_per_mark == 0:
+            self.marks = self.marks or [(self._first_vertex, self._first_mark)]
             self.marks.append((paths.depth, self._engine.mark(paths)))
             self.kept.clear()
             if len(self.marks) > MARKS:
-                self.marks, self._step = self.marks[::2], 2 * self._step
+                self.marks, self._vertices_per_mark = self.marks[::2], 2 * self._vertices_per_mark
         return False
 
     def on_sorted(self, paths: Population, counts: Counts) -> bool:
@@ -95,28 +98,28 @@ class Chunk:
         """Add the gradients of the chunk for cotangents ``pixels (3, H W)`` of the picture."""
         first, count, _, samples = self.span
         with torch.no_grad():
-            keeper = self._forward(1, None, None)
+            recorder = self._trace(first=1, mark=None, end=None)
             radiance = self.engine.radiance_of_samples().view(3, samples, -1)
             cotangent = sample_cotangents(self.settings, radiance, pixels[:, first : first + count].to(radiance.dtype))
             self.engine.receive(cotangent.reshape(3, -1))
-            self._back(keeper, None)
+            self._differentiate(recorder, end=None)
             self.engine.vjp_rays()
 
-    def _forward(self, first: int, mark: Any, end: int | None) -> VertexRecorder:
-        """Trace paths from a mark (None: from the camera) to vertex ``end`` (None: to their ends)."""
+    def _trace(self, *, first: int, mark: Any, end: int | None) -> VertexRecorder:
+        """Trace paths from vertex ``first`` and its mark (None: from the camera) to vertex ``end`` (None: to their ends)."""
         paths = self.engine.begin(self.span, self.sums) if mark is None else self.engine.resume(mark)
-        keeper = VertexRecorder(self.engine, first, mark)
-        walk(self.engine, paths, self.engine.wave.integrator.limits, keeper, end)
-        return keeper
+        recorder = VertexRecorder(self.engine, first, mark)
+        walk(self.engine, paths, self.engine.wave.integrator.limits, recorder, end)
+        return recorder
 
-    def _back(self, keeper: VertexRecorder, end: int | None) -> None:
-        """Differentiate the recorded vertices, or replay the walk from mark to mark."""
-        for paths in reversed(keeper.kept):
+    def _differentiate(self, recorder: VertexRecorder, *, end: int | None) -> None:
+        """Differentiate the recorded vertices, last first, or replay the walk from mark to mark, up to vertex ``end``."""
+        for paths in reversed(recorder.kept):
             self.engine.vjp(paths)
-        keeper.kept.clear()
-        while keeper.marks:
-            first, mark = keeper.marks.pop()
-            self._back(self._forward(first, mark, end), end)
+        recorder.kept.clear()
+        while recorder.marks:
+            first, mark = recorder.marks.pop()
+            self._differentiate(self._trace(first=first, mark=mark, end=end), end=end)
             end = first
 
 
@@ -142,61 +145,72 @@ def replay_paths(
         RenderError: not even a single lane fits in memory.
     """
     wave = scene_tape.wave
-    share = cotangent / settings.render.spp if wave.integrator.splats else None
-    if _compiled(scene_tape, settings):
-        kernels = backward_kernels(scene_tape, own_models(scene, wave), share)
-        reason = _over_threads(kernels, scene_tape, settings, cotangent, sums)
+    # A splat reaches a pixel by itself: its cotangent is the pixel's over spp.
+    splat_cotangent = cotangent / settings.render.spp if wave.integrator.splats else None
+    if _uses_kernels(scene_tape, settings):
+        kernels = backward_kernels(scene_tape, own_models(scene, wave), splat_cotangent)
+        reason = _replay_on_threads(kernels, scene_tape, settings, cotangent, sums)
         models = wave.context.world.materials.models
-        for stage, why in kernels.eager_vjps.items():
-            model = f" at {models[stage[1]]}" if stage[0] == "bounce" else ""
+        for (stage, *details), why in kernels.eager_vjps.items():
+            model = f" at {models[details[0]]}" if stage == "bounce" else ""
             warn_once(
-                f"torchpt: {stage[0]}{model} is differentiated by tensor operations, as no kernel can be made of {why}"
+                f"torchpt: {stage}{model} is differentiated by tensor operations, as no kernel can be made of {why}"
             )
         if not reason:
             return
         warn_once(f"torchpt: gradients of this scene are taken by tensor operations, as {reason}")
         sums.clear()
 
-    def whole(span: Span) -> None:
-        sums.join(chunk_sums(scene_tape, settings, cotangent, share, span))
+    def add_chunk(span: Span) -> None:
+        sums.join(chunk_sums(scene_tape, settings, cotangent, splat_cotangent, span))
 
     budget = _budget_of_tensors(wave.centre.device, settings)
-    scene_tape.through(budget, whole, wave.crop[2] * wave.crop[3], settings.render.spp)
+    _, _, width, height = wave.crop
+    scene_tape.run_in_chunks(budget, add_chunk, width * height, settings.render.spp)
 
 
 def chunk_sums(
-    scene_tape: SceneTape, settings: Settings, cotangent: Tensor, share: Tensor | None, span: Span
+    scene_tape: SceneTape, settings: Settings, cotangent: Tensor, splat_cotangent: Tensor | None, span: Span
 ) -> GradientSums:
-    """Return the gradient sums of a chunk, by tensor operations."""
+    """Return the gradient sums of a chunk, by tensor operations.
+
+    Args:
+        scene_tape: the wave and its leaves.
+        settings: of the backward pass.
+        cotangent: of the pixels ``(3, H W)``.
+        splat_cotangent: of a splat to each pixel ``(3, H W)``; None: the integrator makes none.
+        span: pixels and samples of the chunk.
+    """
     sums = scene_tape.sums()
-    engine = backward_tensors(scene_tape, share)
+    engine = backward_tensors(scene_tape, splat_cotangent)
     Chunk(engine, settings, span, sums).run(cotangent)
     return sums
 
 
-def _over_threads(
+def _replay_on_threads(
     kernels: BackwardKernels, scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums
 ) -> str:
     """Replay all chunks by kernels on threads; return why that is not possible, or ""."""
     wave, cotangent = scene_tape.wave, cotangent.float()
     budget = _budget_of_kernels(kernels, settings)
-    blocks = scene_tape.blocks(wave.crop[2] * wave.crop[3], settings.render.spp)
-    engines: list[Backward[Any, Any, Any]] = []
+    _, _, width, height = wave.crop
+    blocks = scene_tape.blocks(width * height, settings.render.spp)
+    engines: list[Backward[Any, Any, Any]] = []  # those that no thread uses
     lock = threading.Lock()
 
     def task(span: Span) -> ChunkGradientSums:
         with lock:
             engine = engines.pop() if engines else kernels.engine()
-        found = ChunkGradientSums(scene_tape.tables, sums if budget.threads == 1 else None)
-        Chunk(engine, settings, span, found).run(cotangent)
+        chunk = ChunkGradientSums(scene_tape.tables, sums if budget.threads == 1 else None)
+        Chunk(engine, settings, span, chunk).run(cotangent)
         with lock:
             engines.append(engine)
-        return found
+        return chunk
 
-    def merge(part: ChunkGradientSums | None) -> bool:
-        if part is not None:
-            sums.merge(part)
-        return False
+    def merge(chunk: ChunkGradientSums | None) -> bool:
+        if chunk is not None:
+            sums.merge(chunk)
+        return False  # True would stop the threads
 
     while True:
         try:
@@ -223,6 +237,7 @@ def _budget_of_tensors(device: torch.device, settings: Settings) -> Budget:
 
 
 def _kept_vertices(settings: Settings) -> int:
+    """Return the greatest number of vertices that are kept at once."""
     depth = settings.integrator.limits.max_depth
     return min(depth, KEPT) if depth >= 0 else KEPT
 
@@ -247,7 +262,7 @@ def _budget_of_kernels(kernels: BackwardKernels, settings: Settings) -> Budget:
     return budget
 
 
-def _compiled(scene_tape: SceneTape, settings: Settings) -> bool:
+def _uses_kernels(scene_tape: SceneTape, settings: Settings) -> bool:
     """Return True if kernels support this: a CPU, float32, no gradients with respect to weights of modules or opacity."""
     wave = scene_tape.wave
     if wave.centre.device.type != "cpu" or wave.context.plan.dtype != torch.float32 or settings.render.compile == "off":

@@ -1,4 +1,8 @@
-"""``adjoint=autograd``: chunks of lanes rendered again on an autograd tape. The reference, for any integrator."""
+"""``adjoint=autograd``: chunks of lanes rendered again on an autograd tape. The reference, for any integrator.
+
+A chunk, or span, is what is on the tape at once: first pixel, number of pixels, first sample, number of samples of each. The
+scene's tape (``parameters.py``) has the wave (world, camera, integrator) whose tensors are the leaves of these tapes.
+"""
 
 from __future__ import annotations
 
@@ -41,13 +45,13 @@ def sample_cotangents(settings: Settings, radiance: Tensor, pixels: Tensor) -> T
     if clamp is None:
         return cotangent
     values = torch.where(finite, radiance, 0.0)
-    # VJP of v c / m, with the clamp c, where m is the largest channel in magnitude: `cotangent * scale` through v, and `back`
-    # through the channel that is m.
-    most, channel = values.abs().max(0, keepdim=True)
-    scale = (clamp / most.clamp_min(clamp)).squeeze(0)
-    back = (cotangent * values).sum(0, keepdim=True) * scale / most.clamp_min(clamp)
-    back = torch.where(most > clamp, back * values.gather(0, channel).sign(), 0.0)
-    return (cotangent * scale).scatter_add(0, channel, -back)
+    # VJP of v c / m, with the clamp c, where m is the largest channel in magnitude: `cotangent * scale` through v, and
+    # `through_largest` through the channel that is m.
+    largest, channel = values.abs().max(0, keepdim=True)
+    scale = (clamp / largest.clamp_min(clamp)).squeeze(0)
+    through_largest = (cotangent * values).sum(0, keepdim=True) * scale / largest.clamp_min(clamp)
+    through_largest = torch.where(largest > clamp, through_largest * values.gather(0, channel).sign(), 0.0)
+    return (cotangent * scale).scatter_add(0, channel, -through_largest)
 
 
 def clamped_samples(settings: Settings, values: Tensor) -> Tensor:
@@ -89,17 +93,17 @@ def tape(scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: Gra
         splats: list[Splats] = []
         first_pixel, pixel_count, _, _ = span
         radiance = radiance_of(wave, *span, splats=splats)
-        of_pixels = cotangent[:, first_pixel : first_pixel + pixel_count].to(radiance.dtype)
-        of_samples = sample_cotangents(settings, radiance.detach(), of_pixels)
+        pixel_cotangents = cotangent[:, first_pixel : first_pixel + pixel_count].to(radiance.dtype)
+        cotangents = sample_cotangents(settings, radiance.detach(), pixel_cotangents)
         # Samples that are not finite are 0, since NaN times a cotangent of 0 is NaN.
         values = torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0)
         if not wave.integrator.splats:
-            return values, of_samples
+            return values, cotangents
         # A splat is clamped on the tape, so its cotangent is that of its pixel over spp.
         splatted = [clamped_samples(settings, splat.value) for splat in splats]
         pixels = torch.cat([values.new_zeros(0, dtype=torch.int64), *(splat.pixel for splat in splats)])
-        of_splats = take(cotangent, pixels).to(of_samples.dtype) / settings.render.spp
-        return torch.cat((values.flatten(1), *splatted), 1), torch.cat((of_samples.flatten(1), of_splats), 1)
+        splat_cotangents = take(cotangent, pixels).to(cotangents.dtype) / settings.render.spp
+        return torch.cat((values.flatten(1), *splatted), 1), torch.cat((cotangents.flatten(1), splat_cotangents), 1)
 
     _, _, width, height = wave.crop
     chunk_by_chunk(scene_tape, settings, sums, chunk_loss, count=width * height, samples=settings.render.spp)
@@ -125,20 +129,20 @@ def chunk_by_chunk(
     def add(span: Span) -> None:
         sums.join(chunk_sums(scene_tape, chunk_loss, span))
 
-    scene_tape.through(_budget(settings, scene_tape), add, count, samples)
+    scene_tape.run_in_chunks(_budget(settings, scene_tape), add, count, samples)
 
 
 def chunk_sums(scene_tape: SceneTape, chunk_loss: ChunkLoss, span: Span) -> GradientSums:
     """Return the gradient sums of a chunk."""
-    found = scene_tape.sums()
+    chunk = scene_tape.sums()
     # Backward passes of gathers from the leaves add to the sums directly; autograd returns the other gradients.
-    with torch.enable_grad(), recording_gathers(found):
+    with torch.enable_grad(), recording_gathers(chunk):
         values, cotangent = chunk_loss(span)
     if values.requires_grad:  # False: nothing in these pixels depends on the parameters
         leaves = [*scene_tape.leaves, *scene_tape.captured]
         with one_thread():  # several threads would round sums over lanes in another way
-            found.add_each(torch.autograd.grad(values, leaves, cotangent.to(values.dtype), allow_unused=True))
-    return found
+            chunk.add_each(torch.autograd.grad(values, leaves, cotangent.to(values.dtype), allow_unused=True))
+    return chunk
 
 
 def _budget(settings: Settings, scene_tape: SceneTape) -> Budget:

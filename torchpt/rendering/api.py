@@ -87,14 +87,15 @@ def trace(
     request = prepare_trace_request(scene, o, d, spp=spp, seed=seed, params=params, **options)
     assert request.rays is not None
     o, d = request.rays
-    return execute_request(request).image.reshape(o.shape) if o.numel() else (o + d).to(request.call.dtype)
+    if not o.numel():  # no rays: an empty result, on which gradients of both depend
+        return (o + d).to(request.call.dtype)
+    return execute_request(request).image.reshape(o.shape)
 
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:
     """Return AOVs ``(H, W, C)`` of the first surface at one sample a pixel, by name: a quick preview."""
-    film = settings.film.but(
-        aovs=names, denoise=False, filter=ParsedParams(FILTERS["box"], {})
-    )  # one sample fills no wider filter
+    box = ParsedParams(FILTERS["box"], {})  # one sample fills no wider filter
+    film = settings.film.but(aovs=names, denoise=False, filter=box)
     quick = replace(
         settings,
         film=film,

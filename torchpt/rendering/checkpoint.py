@@ -1,4 +1,9 @@
-"""Checkpoints: write films and counts to a file, read and validate them, and decide which renders may resume from it."""
+"""Checkpoints: write films and counts to a file, read and validate them, and decide which renders may resume from it.
+
+:class:`~torchpt.rendering.run.Run` writes one between passes (a pass takes some samples of every pixel), and the first of
+several ranks does it for all. The state of a render is its films (sums and counts of samples by pixel)
+and a few facts (numbers).
+"""
 
 from __future__ import annotations
 
@@ -50,7 +55,10 @@ __all__ = [
 # ---- Read an ``.npz`` archive from an untrusted source: arrays of numbers only, none larger than the file
 
 
+#: First bytes of every ``.npy`` file.
 _MAGIC = b"\x93NUMPY"
+#: Most bytes of the header of one; NumPy writes about a hundred.
+_LONGEST_HEADER = 10_000
 
 
 def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
@@ -63,14 +71,14 @@ def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
         zipfile.BadZipFile: the archive is damaged.
     """
     found: dict[str, np.ndarray] = {}
-    whole = file.seek(0, 2)
+    file_bytes = file.seek(0, os.SEEK_END)
     with zipfile.ZipFile(file) as archive:
         members = archive.infolist()
-        if sum(member.compress_size for member in members) > whole:
+        if sum(member.compress_size for member in members) > file_bytes:
             raise ValueError("its members overlap")
         for member in members:
             name = member.filename
-            if member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1:
+            if member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1:  # bit 0: encrypted
                 raise ValueError(f"{name[:80]!r} is compressed or encrypted")
             if member.file_size != member.compress_size:
                 raise ValueError(f"{name[:80]!r} has two sizes")
@@ -87,19 +95,21 @@ def _array(data: bytes) -> np.ndarray:
     """Return the array in the bytes of a ``.npy`` file (NumPy enhancement proposal 1)."""
     if not data.startswith(_MAGIC):
         raise ValueError("no array")
+    # Byte 6 is the format's version; the length of the header follows it in two bytes, from version 2 on in four.
     size, start = (
         (struct.unpack_from("<H", data, 8)[0], 10) if data[6] == 1 else (struct.unpack_from("<I", data, 8)[0], 12)
     )
-    if size > 10_000:
+    if size > _LONGEST_HEADER:
         raise ValueError("a header that long")
     header = ast.literal_eval(data[start : start + size].decode("latin-1").strip())
-    kind, shape = np.dtype(header["descr"]), header["shape"]
-    if kind.kind not in "biuf" or not isinstance(shape, tuple) or not all(type(n) is int and n >= 0 for n in shape):
+    dtype, shape = np.dtype(header["descr"]), header["shape"]
+    # Booleans, integers, unsigned integers, floats.
+    if dtype.kind not in "biuf" or not isinstance(shape, tuple) or not all(type(n) is int and n >= 0 for n in shape):
         raise ValueError("no numbers")
-    values = np.frombuffer(data, kind, offset=start + size).reshape(
+    values = np.frombuffer(data, dtype, offset=start + size).reshape(
         shape, order="F" if header["fortran_order"] else "C"
     )
-    return np.array(values, kind.newbyteorder("="), order="C")
+    return np.array(values, dtype.newbyteorder("="), order="C")  # in this machine's byte order
 
 
 # ---- Save the state of a render between passes, and resume from it
@@ -115,7 +125,10 @@ EVERY, PATIENCE = 5.0, 20.0
 FREE = settings_with(Role.FREE)
 #: Name of the JSON text among the arrays.
 _FACTS = "facts"
+#: Version of the file format; files of others are refused.
 _FORMAT = 3
+#: Counts and seconds below this are plausible.
+_HUGE = 2**62
 
 
 @dataclass
@@ -151,16 +164,16 @@ class CheckpointFile:
 
     Args:
         path: of the file.
-        of: the render's :func:`identity`; None where only the path is checked.
+        render_identity: the render's :func:`identity`; None where only the path is checked.
 
     Attributes:
         seconds: spent on writing so far.
     """
 
-    def __init__(self, path: str, of: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, path: str, render_identity: Mapping[str, Any] | None = None) -> None:
         self.path, self.seconds = Path(path).expanduser(), 0.0
-        self._of = dict(of or {})
-        self._last, self._took = time.perf_counter(), 0.0
+        self._identity = dict(render_identity or {})
+        self._last_write_at, self._last_write_seconds = time.perf_counter(), 0.0
 
     def check(self, resume: bool) -> None:
         """Check before a long render that its checkpoints can be written.
@@ -172,9 +185,9 @@ class CheckpointFile:
         if not resume and self.path.exists():
             raise OutputError(self.path, "is there already; render.resume=true goes on from it, or remove it first")
 
-    def due(self) -> bool:
+    def is_due(self) -> bool:
         """Return True if it is time for another checkpoint."""
-        return time.perf_counter() - self._last >= max(EVERY, PATIENCE * self._took)
+        return time.perf_counter() - self._last_write_at >= max(EVERY, PATIENCE * self._last_write_seconds)
 
     def write(self, state: RenderState) -> None:
         """Replace the checkpoint.
@@ -186,14 +199,14 @@ class CheckpointFile:
         try:
             self._write(state)
         finally:
-            self._last = time.perf_counter()
-            self._took = self._last - begun
-            self.seconds += self._took
+            self._last_write_at = time.perf_counter()
+            self._last_write_seconds = self._last_write_at - begun
+            self.seconds += self._last_write_seconds
 
     def _write(self, state: RenderState) -> None:
         destination = output_path(self.path, (self.path.suffix.lower(),))
         temporary = temporary_beside(destination)
-        text = json.dumps({"format": _FORMAT, "of": self._of, **state.facts})
+        text = json.dumps({"format": _FORMAT, "of": self._identity, **state.facts})
         arrays = {name: value.detach().cpu().numpy() for name, value in state.arrays.items()}
         try:
             with open(temporary, "xb") as file:
@@ -207,12 +220,12 @@ class CheckpointFile:
             with suppress(OSError):  # it is only there after a failure
                 temporary.unlink()
 
-    def read(self, like: RenderState, check: Callable[[RenderState], None] | None = None) -> RenderState | None:
+    def read(self, like: RenderState, check: Callable[[RenderState], object] | None = None) -> RenderState | None:
         """Return the checkpoint, its ``render.spp`` among the facts; None if there is no file.
 
         Args:
             like: a state of this render, whose names, types and shapes the checkpoint must have.
-            check: is called with the facts before arrays are compared, and may raise.
+            check: called with the state before its arrays are compared with ``like``; may raise.
 
         Raises:
             AssetError: the file is damaged, or is the checkpoint of another render.
@@ -227,7 +240,7 @@ class CheckpointFile:
             if facts["format"] != _FORMAT or not isinstance(facts["of"], dict):
                 raise ValueError("another format")
             facts["spp"] = facts["of"]["render"].pop("spp")
-            if type(facts["spp"]) is not int or not 1 <= facts["spp"] < 2**62:
+            if type(facts["spp"]) is not int or not 1 <= facts["spp"] < _HUGE:
                 raise ValueError("spp")
         except (
             OSError,
@@ -240,10 +253,15 @@ class CheckpointFile:
             RuntimeError,
             zipfile.BadZipFile,
         ) as problem:
-            raise AssetError(self.path, f"is no whole checkpoint ({_said(problem)})") from None
-        of = {**self._of, "render": {name: value for name, value in self._of["render"].items() if name != "spp"}}
-        for key, there, here in _differences(facts.pop("of"), of):
-            said = f"its {key} are others" if key.startswith("scene.") else f"{key}: {there} there, {here} here"
+            raise AssetError(self.path, f"is no whole checkpoint ({_first_line(problem)})") from None
+        # The samples a pixel may differ: check_samples decides.
+        here = {
+            **self._identity,
+            "render": {name: value for name, value in self._identity["render"].items() if name != "spp"},
+        }
+        for key, in_file, of_render in _differences(facts.pop("of"), here):
+            is_hash = key.startswith("scene.")
+            said = f"its {key} are others" if is_hash else f"{key}: {in_file} there, {of_render} here"
             raise AssetError(self.path, f"is the checkpoint of another render ({said})")
         state = RenderState(facts, {name: torch.from_numpy(value) for name, value in arrays.items()})
         _check_facts(state, like, self.path)
@@ -257,14 +275,14 @@ def _check_facts(state: RenderState, like: RenderState, path: Path) -> None:
     """Raise AssetError where a fact is missing or has another type than in ``like``."""
     for name, value in like.facts.items():
         there: Any = state.facts.get(name)
-        if name == "lost":
+        if name == "lost":  # the non-finite samples, a nested list
             try:
                 NonFinite.read(there)
             except ValueError as problem:
                 raise AssetError(path, f"is no whole checkpoint ({problem})") from None
             continue
-        kind = isinstance(there, int | type(value)) and not isinstance(there, bool)
-        if not kind or not 0 <= there < 2**62:
+        has_type = isinstance(there, int | type(value)) and not isinstance(there, bool)
+        if not has_type or not 0 <= there < _HUGE:
             raise AssetError(path, f"is no whole checkpoint ({name} is {str(there)[:40]})")
 
 
@@ -276,7 +294,8 @@ def _check_arrays(state: RenderState, like: RenderState, path: Path) -> None:
             raise AssetError(path, f"is no whole checkpoint (the numbers {name} are missing, or others)")
 
 
-def _said(problem: Exception) -> str:
+def _first_line(problem: Exception) -> str:
+    """Return the first line of an error's text, or its type."""
     return str(problem).split("\n", 1)[0] or type(problem).__name__
 
 
@@ -298,17 +317,18 @@ def check_samples(run: Run, state: RenderState, path: Path) -> None:
     Raises:
         AssetError: gives the reason.
     """
-    settings, there, taken = run.settings, state.facts["spp"], state.facts["taken"]
+    settings, there, taken = run.settings, state.facts["spp"], state.facts["taken"]  # samples a pixel
     here, reason = settings.render.spp, ""
     if here == there:
         return
-    before = replace(settings, render=settings.render.but(spp=there))
+    settings_there = replace(settings, render=settings.render.but(spp=there))
     if settings.sampler.kind.needs_count:
         reason = f"where {settings.sampler.name} points lie depends on how many there are"
-    elif before.streams != settings.streams:
-        reason = f"the variance is of {before.streams} streams there, of {settings.streams} here"
+    elif settings_there.streams != settings.streams:
+        reason = f"the variance is of {settings_there.streams} streams there, of {settings.streams} here"
     elif taken > here:
         reason = f"it holds {taken} samples a pixel already"
+    # `cut`: spp or the time limit made a round less than double.
     elif settings.adaptive and taken >= FIRST_ROUND and (here < there or state.facts["cut"]):
         reason = "a round of adaptive sampling was as long as spp let it be"
     elif settings.render.target_error is not None and not ends_a_pass(run, taken):
@@ -321,10 +341,12 @@ def check_samples(run: Run, state: RenderState, path: Path) -> None:
 
 def ends_a_pass(run: Run, taken: int) -> bool:
     """Return True if ``target_error`` is checked after ``taken`` samples a pixel in a render without a time limit."""
-    stop = StopRules(run.settings.render.but(spp=taken + BLOCK, time_limit=None), run.picture.randomizations.count)
+    stop_rules = StopRules(
+        run.settings.render.but(spp=taken + BLOCK, time_limit=None), run.picture.randomizations.count
+    )
     end = taken - taken % (4 * BLOCK)  # passes from here on are whole blocks
     while end < taken:
-        end += stop.step(end)
+        end += stop_rules.next_pass_spp(end)
     return end == taken
 
 
@@ -337,23 +359,25 @@ def check_plausible(run: Run, state: RenderState, path: Path) -> None:
         AssetError: names the first such number.
     """
     facts, arrays = state.facts, state.arrays
-    taken, done, lost = facts["taken"], facts["done"], NonFinite.read(facts["lost"])
+    taken, done, nonfinite = facts["taken"], facts["done"], NonFinite.read(facts["lost"])
     counts = {name: arrays[f"{name}.counts"] for name in run.films()}
-    rounds = run.settings.adaptive and taken >= FIRST_ROUND
+    adaptive = run.settings.adaptive and taken >= FIRST_ROUND  # pixels differ in their number of samples
     problems: dict[str, bool] = {
-        "taken": not (taken <= facts["spp"] and (taken == FIRST_ROUND or not rounds)),
+        "taken": not (taken <= facts["spp"] and (taken == FIRST_ROUND or not adaptive)),
         "cut": facts["cut"] > 1,
         "light": not _finite([arrays["light"]]),
     }
     for name, film in run.films().items():
-        light = not name.startswith("layers.")
-        samples = taken if run.integrator.light or not light else 0
+        is_light = not name.startswith("layers.")
+        samples = taken if run.integrator.light or not is_light else 0
+        # Sample i of a pixel belongs to randomization i modulo their number.
         least = torch.tensor([len(range(k, samples, film.randomizations)) for k in range(film.randomizations)])[:, None]
-        problems[f"{name}.counts"] = bool((counts[name] < least).any() if rounds else (counts[name] != least).any())
-        problems[f"{name}.sums"] = light and not _finite(arrays[f"{name}.{key}"] for key in ("sums", "first"))
+        problems[f"{name}.counts"] = bool((counts[name] < least).any() if adaptive else (counts[name] != least).any())
+        problems[f"{name}.sums"] = is_light and not _finite(arrays[f"{name}.{key}"] for key in ("sums", "first"))
+    # Integrators without light leave the picture's film empty; films of AOVs have the counts then.
     seen = counts["picture"] if run.integrator.light else next(iter(c for n, c in counts.items() if n != "picture"))
     total = int(seen.sum())
-    if rounds:
+    if adaptive:
         assert run.probes is not None and run.probes.pixel_set.indices is not None
         pilots = seen.sum(0)[run.probes.pixel_set.indices.cpu()]
         problems["pilots.counts"] |= bool((counts["pilots"].sum(0) != pilots).any())
@@ -364,7 +388,9 @@ def check_plausible(run: Run, state: RenderState, path: Path) -> None:
         total += int(counts["pilots"].sum())
     problems["done"] = done != total
     problems["truncated"] = facts["truncated"] > done
-    problems["lost"] = lost.count > done or not all(_is_taken(run, place, int(seen.max())) for place in lost.samples)
+    problems["lost"] = nonfinite.count > done or not all(
+        _is_taken(run, sample_id, int(seen.max())) for sample_id in nonfinite.samples
+    )
     for name, wrong in problems.items():
         if wrong:
             raise AssetError(path, f"is no whole checkpoint (no render comes to its {name})")
@@ -374,11 +400,11 @@ def _finite(values: Iterable[Tensor]) -> bool:
     return all(bool(torch.isfinite(value).all()) for value in values)
 
 
-def _is_taken(run: Run, place: SampleId, samples: int) -> bool:
+def _is_taken(run: Run, sample_id: SampleId, samples: int) -> bool:
     """Return True if the render takes this sample, in the picture or in its error probes."""
-    x, y, width, height = run.wave.crop
+    x, y, width, height = run.wave.crop  # pixels
     pixel_sets = [run.picture] if run.probes is None else [run.picture, run.probes.pixel_set]
-    inside = x <= place.x < x + width and y <= place.y < y + height and place.sample < samples
-    return inside and (place.first_randomization, place.randomizations) in [
+    inside = x <= sample_id.x < x + width and y <= sample_id.y < y + height and sample_id.sample < samples
+    return inside and (sample_id.first_randomization, sample_id.randomizations) in [
         (pixel_set.randomizations.first, pixel_set.randomizations.count) for pixel_set in pixel_sets
     ]

@@ -33,13 +33,14 @@ from torchpt.scene.versions import AFTER, check_unchanged
 
 __all__ = ["as_custom_op", "reuse_rendering", "with_graph_break"]
 
+#: Parameters and result of a wrapped function.
 P = ParamSpec("P")
 R = TypeVar("R")
 
 #: Types of arguments that can be written as text. (Older torch traces no unions of types, but tuples of them.)
-_LISTS, _PLAIN = (list, tuple), (bool, int, str)
+_LIST_TYPES, _PLAIN_TYPES = (list, tuple), (bool, int, str)
 #: While an operator runs: a list that gets, or in the backward pass has, the rendering of the forward pass. None outside.
-_known: ContextVar[list[Rendering] | None] = ContextVar("reuse_rendering", default=None)
+_forward_rendering: ContextVar[list[Rendering] | None] = ContextVar("reuse_rendering", default=None)
 
 
 def reuse_rendering(make: Callable[[], Rendering]) -> Rendering:
@@ -47,12 +48,12 @@ def reuse_rendering(make: Callable[[], Rendering]) -> Rendering:
 
     Inside an operator's forward pass the result is also stored for the operator, which returns its number of samples.
     """
-    made = _known.get()
-    if made:
-        return made[0]
+    known = _forward_rendering.get()
+    if known:
+        return known[0]
     rendering = make()
-    if made is not None:
-        made.append(rendering)
+    if known is not None:
+        known.append(rendering)
     return rendering
 
 
@@ -61,22 +62,22 @@ def as_custom_op(render: Callable[P, R]) -> Callable[P, R]:
     _register(render)
 
     @wraps(render)
-    def call(*args: Any, **options: Any) -> Any:
+    def eager_or_operator(*args: Any, **options: Any) -> Any:
         return in_graph(*args, **options) if torch.compiler.is_compiling() else render(*args, **options)
 
     in_graph = partial(_in_graph, render)
-    return call
+    return eager_or_operator
 
 
 def with_graph_break(call: Callable[P, R]) -> Callable[P, R]:
     """Return a function that calls ``call`` in eager code and breaks the graph while one is traced."""
 
     @wraps(call)
-    def either(*args: P.args, **options: P.kwargs) -> R:
-        made: Any = torch.compiler.disable(call) if torch.compiler.is_compiling() else call
-        return made(*args, **options)
+    def eager_or_break(*args: P.args, **options: P.kwargs) -> R:
+        outside: Any = torch.compiler.disable(call) if torch.compiler.is_compiling() else call
+        return outside(*args, **options)
 
-    return either
+    return eager_or_break
 
 
 def _in_graph(
@@ -97,40 +98,41 @@ def _in_graph(
         for name, value in scene.params.items():
             if value.requires_grad and name not in given:
                 given[name] = value
-    wanted = [name for name in given if given[name].requires_grad]
-    text = _text([options, list(given), wanted, dtype is torch.float64])  # read by _OperatorCall.read
+    differentiated = [name for name in given if given[name].requires_grad]
+    text = _to_text([options, list(given), differentiated, dtype is torch.float64])  # read by _OperatorCall.read
     seed_number = -1 if seed is None else seed
-    return torch.ops.torchpt.render(scene.number, text, seed_number, list(given.values()))[0]
+    picture, _ = torch.ops.torchpt.render(scene.number, text, seed_number, list(given.values()))
+    return picture
 
 
 def _fits_graph(params: Any, seed: Any, dtype: Any, options: Mapping[str, Any]) -> bool:
     """Return True if the arguments can be part of a graph; others, also invalid ones, are rendered outside of it."""
     is_float = dtype is torch.float32 or dtype is torch.float64
-    number = isinstance(seed, int) and not isinstance(seed, bool)
+    is_number = isinstance(seed, int) and not isinstance(seed, bool)
     if params is not None and not (
         isinstance(params, Mapping) and all([isinstance(value, Tensor) for value in params.values()])
     ):
         return False
-    return is_float and (seed is None or (number and 0 <= seed < 1 << 63)) and _plain(options)
+    return is_float and (seed is None or (is_number and 0 <= seed < 1 << 63)) and _is_plain(options)
 
 
-def _plain(value: Any) -> bool:
+def _is_plain(value: Any) -> bool:
     """Return True for nested mappings and lists of finite numbers, strings and None."""
     if isinstance(value, Mapping):
-        return all([isinstance(key, str) and _plain(value[key]) for key in value])
-    if isinstance(value, _LISTS):
-        return all([_plain(item) for item in value])
+        return all([isinstance(key, str) and _is_plain(value[key]) for key in value])
+    if isinstance(value, _LIST_TYPES):
+        return all([_is_plain(item) for item in value])
     if isinstance(value, float):
         return -math.inf < value < math.inf
-    return value is None or isinstance(value, _PLAIN)
+    return value is None or isinstance(value, _PLAIN_TYPES)
 
 
-def _text(value: Any) -> str:
+def _to_text(value: Any) -> str:
     """Return the source text of nested plain values, for ``ast.literal_eval``."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join([repr(key) + ": " + _text(value[key]) for key in value]) + "}"
-    if isinstance(value, _LISTS):
-        return "[" + ", ".join([_text(item) for item in value]) + "]"
+        return "{" + ", ".join([repr(key) + ": " + _to_text(value[key]) for key in value]) + "}"
+    if isinstance(value, _LIST_TYPES):
+        return "[" + ", ".join([_to_text(item) for item in value]) + "]"
     return repr(value)
 
 
@@ -141,13 +143,13 @@ class _OperatorCall(NamedTuple):
         scene: the scene.
         options: arguments of ``render``.
         names: dotted names of the operator's tensors.
-        wanted: the names that are differentiated.
+        differentiated: the names that are differentiated.
     """
 
     scene: Scene
     options: dict[str, Any]
     names: list[str]
-    wanted: list[str]
+    differentiated: list[str]
 
     @classmethod
     def read(cls, number: int, text: str, seed: int) -> _OperatorCall:
@@ -155,7 +157,7 @@ class _OperatorCall(NamedTuple):
 
         Args:
             number: number of the scene.
-            text: options, names, wanted names, and whether the dtype is float64.
+            text: options, names, differentiated names, and whether the dtype is float64.
             seed: the seed; -1: the scene's.
 
         Raises:
@@ -164,15 +166,15 @@ class _OperatorCall(NamedTuple):
         scene = scene_by_number(int(number))
         if scene is None:
             raise RenderError("the scene that this compiled graph renders is gone: keep a reference to it")
-        options, names, wanted, double = ast.literal_eval(text)
-        options |= {"dtype": torch.float64 if double else torch.float32, "seed": None if seed < 0 else int(seed)}
-        return cls(scene, options, names, wanted)
+        options, names, differentiated, is_double = ast.literal_eval(text)
+        options |= {"dtype": torch.float64 if is_double else torch.float32, "seed": None if seed < 0 else int(seed)}
+        return cls(scene, options, names, differentiated)
 
     def versions(self) -> dict[str, int]:
         """Return the versions of the scene's own parameters, without those that are passed as tensors."""
         return {name: version for name, version in self.scene.versions().items() if name not in self.names}
 
-    def like(self) -> Tensor:
+    def empty_picture(self) -> Tensor:
         """Return an uninitialized picture of the right size, dtype and device."""
         blocks = {name: self.options.get(name) for name in BLOCKS if name != "render"}
         film = settings(self.scene.description, blocks).film
@@ -180,12 +182,12 @@ class _OperatorCall(NamedTuple):
         return torch.empty(height, width, 3, dtype=self.options["dtype"], device=self.scene.device)
 
 
-def _in_thread(work: Callable[[], R], made: list[Rendering], device: torch.device) -> R:
+def _in_thread(work: Callable[[], R], known: list[Rendering], device: torch.device) -> R:
     """Return ``work()``, run in another thread: in the operator's own thread autograd would not record it.
 
     Args:
         work: renders.
-        made: list for :func:`reuse_rendering`: empty in the forward pass, which adds its rendering, else with that rendering.
+        known: list for :func:`reuse_rendering`: empty in the forward pass, which adds its rendering, else with that rendering.
         device: of the scene; the work runs on the current CUDA stream of the calling thread.
     """
     stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
@@ -193,7 +195,7 @@ def _in_thread(work: Callable[[], R], made: list[Rendering], device: torch.devic
     failed: list[BaseException] = []
 
     def run() -> None:
-        _known.set(made)
+        _forward_rendering.set(known)
         try:
             with torch.cuda.stream(stream):
                 found.append(work())
@@ -216,7 +218,7 @@ def _register(render: Callable[..., Any]) -> None:
     """
 
     def picture(number: int, text: str, seed: int, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        request, made = _OperatorCall.read(number, text, seed), []
+        request, known = _OperatorCall.read(number, text, seed), list[Rendering]()
 
         def work() -> Tensor:
             given = {name: value.detach() for name, value in zip(request.names, tensors, strict=True)}
@@ -224,13 +226,13 @@ def _register(render: Callable[..., Any]) -> None:
                 return render(request.scene, params=given, **request.options).contiguous()
 
         versions = request.versions().values()
-        return _in_thread(work, made, request.scene.device), torch.tensor([made[0].spp, *versions])
+        image = _in_thread(work, known, request.scene.device)
+        return image, torch.tensor([known[0].spp, *versions])
 
     def like_picture(number: int, text: str, seed: int, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        request = _OperatorCall.read(
-            number, text, seed=0
-        )  # any will do; to compare a symbolic seed would bind the graph to it
-        return request.like(), torch.empty(1 + len(request.versions()), dtype=torch.int64)
+        # Any seed will do; to compare a symbolic one would bind the graph to it.
+        request = _OperatorCall.read(number, text, seed=0)
+        return request.empty_picture(), torch.empty(1 + len(request.versions()), dtype=torch.int64)
 
     def gradients(
         number: int, text: str, seed: int, tensors: Sequence[Tensor], facts: Tensor, cotangent: Tensor
@@ -239,34 +241,36 @@ def _register(render: Callable[..., Any]) -> None:
         spp, *versions = facts.tolist()
         now = request.versions()
         check_unchanged(dict(zip(now, versions, strict=True)), now, AFTER)
-        made = [Rendering(request.like(), spp=spp)]  # stands in for the picture
+        known = [Rendering(request.empty_picture(), spp=spp)]  # stands in for the picture
 
         def work() -> list[Tensor]:
             given = {name: value.detach() for name, value in zip(request.names, tensors, strict=True)}
-            leaves = {name: given[name].requires_grad_() for name in request.wanted}
+            leaves = {name: given[name].requires_grad_() for name in request.differentiated}
             image = render(request.scene, params=given, **request.options)
             grads = dict(zip(leaves, torch.autograd.grad(image, list(leaves.values()), cotangent), strict=True))
             every = (grads.get(name, torch.zeros_like(value)) for name, value in given.items())
             return [value.detach().contiguous() for value in every]
 
-        return _in_thread(work, made, request.scene.device)
+        return _in_thread(work, known, request.scene.device)
 
     def like_gradients(
         number: int, text: str, seed: int, tensors: Sequence[Tensor], facts: Tensor, cotangent: Tensor
     ) -> list[Tensor]:
         return [torch.empty_like(value, memory_format=torch.contiguous_format) for value in tensors]
 
-    def keep(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+    def save_for_backward(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
         *ctx.call, tensors = inputs  # ctx.call: scene number, text, seed
-        ctx.mark_non_differentiable(output[1])
-        ctx.save_for_backward(output[1], *tensors)
+        _, facts = output
+        ctx.mark_non_differentiable(facts)
+        ctx.save_for_backward(facts, *tensors)
 
-    def go_back(ctx: Any, cotangent: Tensor, _: Any) -> tuple[Any, ...]:
+    def backward(ctx: Any, cotangent: Tensor, _: Any) -> tuple[Any, ...]:
         facts, *tensors = ctx.saved_tensors
-        return None, None, None, back(*ctx.call, tensors, facts, cotangent)
+        # None for the number, the text and the seed.
+        return None, None, None, gradients_operator(*ctx.call, tensors, facts, cotangent)
 
-    forth = torch.library.custom_op("torchpt::render", picture, mutates_args=())
-    forth.register_fake(like_picture)
-    forth.register_autograd(go_back, setup_context=keep)
-    back = torch.library.custom_op("torchpt::render_gradients", gradients, mutates_args=())
-    back.register_fake(like_gradients)
+    render_operator = torch.library.custom_op("torchpt::render", picture, mutates_args=())
+    render_operator.register_fake(like_picture)
+    render_operator.register_autograd(backward, setup_context=save_for_backward)
+    gradients_operator = torch.library.custom_op("torchpt::render_gradients", gradients, mutates_args=())
+    gradients_operator.register_fake(like_gradients)

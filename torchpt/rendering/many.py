@@ -1,4 +1,8 @@
-"""Render several pictures on one thread pool; the next ones are prepared while its threads trace."""
+"""Render several pictures on one thread pool; the next ones are prepared while its threads trace.
+
+``torchpt.render_batch`` calls :func:`render_many`. A task renders one block, some pixels of a picture, on any thread of the
+pool; results come back to the calling thread, which adds them to their render.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ from torchpt.rendering.run import Run
 
 __all__ = ["QueuedRender", "render_many"]
 
-#: Renders for each thread that are prepared in advance.
+#: Renders for each thread whose tasks may wait in the queue: enough that threads do not wait for the next render.
 PREFETCH = 2
 
 
@@ -28,20 +32,20 @@ class QueuedRender:
     Attributes:
         device: of the scene.
         make: prepares the render for a number of threads; called shortly before it begins.
-        done: is called with the rendering.
-        failed: is called with an error instead, and may raise another one.
+        on_done: called with the rendering.
+        on_error: called with an error instead, and may raise another one.
         run: the prepared render.
-        left: number of its tasks that are not finished.
-        rest: blocks put back when memory ran out.
+        tasks_left: number of its tasks that are not finished.
+        unfinished: blocks put back when memory ran out.
     """
 
     device: torch.device
     make: Callable[[int], Run]
-    done: Callable[[Rendering], None]
-    failed: Callable[[BaseException], None]
+    on_done: Callable[[Rendering], None]
+    on_error: Callable[[BaseException], None]
     run: Run = field(init=False)
-    left: int = field(init=False, default=0)
-    rest: list[Block] = field(init=False, default_factory=list)
+    tasks_left: int = field(init=False, default=0)
+    unfinished: list[Block] = field(init=False, default_factory=list)
 
 
 def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
@@ -52,13 +56,13 @@ def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
 
     Args:
         entries: the renders, taken one by one.
-        tasks: the number of tasks that a render is cut into, at most.
+        tasks: the number of tasks that each pixel set of a render is cut into, at most.
 
     Raises:
-        Exception: the error that an entry's ``failed`` raises; all other renders are cancelled.
+        Exception: the error that an entry's ``on_error`` raises; all other renders are cancelled.
     """
     queue = TaskQueue[QueuedRender, TaskResult](torch.get_num_threads())
-    waiting, begun = iter(entries), dict[int, QueuedRender]()
+    waiting, started = iter(entries), dict[int, QueuedRender]()  # started: by id, while tasks are unfinished
     try:
         while True:
             with _single_threaded(queue):
@@ -69,23 +73,23 @@ def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
                 entry.run = entry.make(queue.threads)
                 spans = entry.run.all_spans()
             if spans is None:
-                _collect(queue, begun, 0)
+                _collect(queue, started, most=0)
                 with without_autocast(entry.device), _errors_to(entry):
-                    entry.done(entry.run.sample_all(None))
+                    entry.on_done(entry.run.sample_all(None))
                 del entry.run
                 continue
             with _errors_to(entry):
                 engine = entry.run.tasks
                 assert engine is not None
-                begun[id(entry)] = entry
+                started[id(entry)] = entry
                 blocks = engine.blocks(spans, tasks)
-                entry.left = len(blocks)
+                entry.tasks_left = len(blocks)
                 for block in blocks:
                     queue.add(entry, partial(engine.task, block))
-            _collect(queue, begun, PREFETCH * queue.threads * tasks)
-        _collect(queue, begun, 0)
+            _collect(queue, started, most=PREFETCH * queue.threads * tasks)
+        _collect(queue, started, most=0)
     finally:
-        for entry in begun.values():  # unfinished renders stop at their next kernel
+        for entry in started.values():  # unfinished renders stop at their next kernel
             if entry.run.tasks is not None:
                 entry.run.tasks.halt()
         queue.close()
@@ -100,15 +104,15 @@ def _single_threaded(queue: TaskQueue[QueuedRender, TaskResult]) -> Iterator[Non
 
 @contextmanager
 def _errors_to(entry: QueuedRender) -> Iterator[None]:
-    """Pass errors raised within to the entry's ``failed``."""
+    """Pass errors raised within to the entry's ``on_error``."""
     try:
         yield
     except Exception as error:
-        entry.failed(error)
+        entry.on_error(error)
         raise
 
 
-def _collect(queue: TaskQueue[QueuedRender, TaskResult], begun: dict[int, QueuedRender], most: int) -> None:
+def _collect(queue: TaskQueue[QueuedRender, TaskResult], started: dict[int, QueuedRender], *, most: int) -> None:
     """Collect results of the pool until at most ``most`` tasks are pending."""
     while True:
         found = queue.next(wait=queue.pending > most)
@@ -116,19 +120,19 @@ def _collect(queue: TaskQueue[QueuedRender, TaskResult], begun: dict[int, Queued
             if queue.pending <= most:
                 return
             continue
-        entry, share = found
-        entry.left -= 1
+        entry, result = found
+        entry.tasks_left -= 1
         with without_autocast(entry.device), _errors_to(entry), _single_threaded(queue):
-            if isinstance(share, Unsupported):
-                entry.run.unsupported = share
+            if isinstance(result, Unsupported):
+                entry.run.unsupported = result
                 assert entry.run.tasks is not None
                 entry.run.tasks.halt()
-            elif isinstance(share, BaseException):
-                raise share
+            elif isinstance(result, BaseException):
+                raise result
             else:
-                entry.rest += share.rest
-                entry.run.task_finished(share)
-            if entry.left == 0:
-                del begun[id(entry)]
-                entry.done(entry.run.finish(entry.rest))
+                entry.unfinished += result.rest
+                entry.run.task_finished(result)
+            if entry.tasks_left == 0:
+                del started[id(entry)]
+                entry.on_done(entry.run.finish(entry.unfinished))
                 del entry.run

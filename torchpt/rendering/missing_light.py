@@ -1,4 +1,7 @@
-"""Find light that no sample met, which the error estimate cannot know of.
+"""Find light that no sample met, which the error estimate cannot know of: it sees only how samples differ.
+
+``picture.py`` asks after a render with an error estimate. Light is missing where the scene has none, where a delta light
+(point, spot, directional) is behind glass, or where the picture stays black although surfaces reflect.
 
 A black pixel may miss all of its true radiance r. Its squared error over ``r² + 0.01`` is below 1 for any r, so dark pixels add
 at most their share of the picture to relMSE.
@@ -29,12 +32,14 @@ from torchpt.search.bounds import primitive_bounds
 
 __all__ = ["MissingLight", "find_missing_light"]
 
-#: Largest share of dark pixels at which the rest still gives an error estimate.
-DARK = 0.05
-#: Number of dark pixels for which one camera ray tests whether it meets a surface that reflects.
+#: Largest share of dark pixels at which the others still give an error estimate.
+LARGEST_DARK_SHARE = 0.05
+#: Number of black pixels for which one camera ray tests whether it meets a surface that reflects.
 DARK_PIXELS = 256
-#: Rays traced from a light; directions traced from the surface of each dark pixel.
-RAYS, DIRECTIONS = 512, 8
+#: Rays traced from a light, and directions traced from the surface of each dark pixel: few, as one hit is enough.
+LIGHT_RAYS, SURFACE_DIRECTIONS = 512, 8
+#: Angle between consecutive points of a Fibonacci lattice, in radians.
+GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
 @dataclass(frozen=True)
@@ -43,11 +48,11 @@ class MissingLight:
 
     Attributes:
         reason: why the error is not known; "" where it is.
-        dark: share of pixels that are black although their surface reflects light.
+        dark_share: share of pixels that are black although their surface reflects light.
     """
 
     reason: str
-    dark: float
+    dark_share: float
 
 
 @torch.no_grad()
@@ -75,14 +80,14 @@ def find_missing_light(
     black = (picture == 0.0).all(2).reshape(-1)
     if bool(black.all()):
         return MissingLight("no sample met any light", 1.0)
-    dark = _dark_share(search, black)
-    if dark > min(DARK, relmse):
-        return MissingLight(f"no sample met any light in {100.0 * dark:.2g} % of the picture", dark)
-    return MissingLight("", dark)
+    dark_share = _share_of_dark_pixels(search, black)
+    if dark_share > min(LARGEST_DARK_SHARE, relmse):
+        return MissingLight(f"no sample met any light in {100.0 * dark_share:.2g} % of the picture", dark_share)
+    return MissingLight("", dark_share)
 
 
 class _Search:
-    """The render's search structure for a few rays; an LBVH where its kernels would have to be compiled for them."""
+    """The render's search structure for a few rays; an LBVH in place of brute force, whose kernels must be compiled."""
 
     def __init__(self, wave: Wave, geometry: Callable[[], Geometry]) -> None:
         self._wave, self.geometry = wave, geometry
@@ -101,38 +106,38 @@ class _Search:
         return replace(self._wave, accel=self._own)
 
 
-def _dark_share(search: _Search, black: Tensor) -> float:
+def _share_of_dark_pixels(search: _Search, black: Tensor) -> float:
     """Return the share of pixels that are ``black (pixels,)`` although their first camera ray meets a surface that reflects.
 
     With direct light only, shadows are black and their error is known: each sample evaluated a light.
     """
-    places, integrator = black.nonzero()[:, 0], search.integrator
-    count = len(places)
+    pixels, integrator = black.nonzero()[:, 0], search.integrator
+    count = len(pixels)
     if not count or not integrator.light or 0 <= integrator.limits.max_depth <= 2:
         return 0.0
     wave = search.wave
-    asked = places[torch.linspace(0, count - 1, min(count, DARK_PIXELS), dtype=torch.float64).round().long()].to(
-        wave.centre.device
-    )
-    state = _camera_rays(wave, asked)
+    chosen = (
+        torch.linspace(0, count - 1, min(count, DARK_PIXELS), dtype=torch.float64).round().long()
+    )  # evenly among them
+    state = _camera_rays(wave, pixels[chosen].to(wave.centre.device))
     hit = hits(wave, state)
-    reflects = hit.prim >= 0
+    reflects = hit.prim >= 0  # (n,), True where a surface was hit
     with suppress(NotImplementedError):  # a model of the caller's own without an albedo
         reflects = seen(wave, ("albedo",), state)["albedo"].abs().amax(0) > 0
-    on = reflects.nonzero()[:, 0]
-    if not len(on) or not _any_surface_visible(wave, rows(state, on), rows(hit, on)):
+    lanes = reflects.nonzero()[:, 0]
+    if not len(lanes) or not _any_surface_visible(wave, rows(state, lanes), rows(hit, lanes)):
         return 0.0
     return float(reflects.double().mean()) * count / len(black)
 
 
-def _camera_rays(wave: Wave, places: Tensor) -> PathState:
-    """Return camera rays from the centre of the lens through the centres of pixels ``places (n,)``."""
-    x0, y0, width, _ = wave.crop
-    x, y = places % width + x0, places // width + y0
+def _camera_rays(wave: Wave, pixels: Tensor) -> PathState:
+    """Return camera rays from the centre of the lens through the centres of pixels ``pixels (n,)``."""
+    left, top, width, _ = wave.crop
+    x, y = pixels % width + left, pixels // width + top  # on the whole film
     dtype, camera = wave.context.plan.dtype, wave.camera
-    lens = torch.full((2, len(places)), 0.5, dtype=dtype, device=places.device) if camera.lens else None
+    lens = torch.full((2, len(pixels)), 0.5, dtype=dtype, device=pixels.device) if camera.lens else None
     o, d = camera.rays(x.to(dtype) + 0.5, y.to(dtype) + 0.5, lens)
-    key = wave.sampler.key(y * camera.resolution[0] + x, torch.zeros_like(places))  # for surfaces of some opacity
+    key = wave.sampler.key(y * camera.resolution[0] + x, torch.zeros_like(pixels))  # for surfaces of some opacity
     return camera_state(o.expand_as(d), d, key)
 
 
@@ -142,35 +147,38 @@ def _any_surface_visible(wave: Wave, state: PathState, hit: Hit) -> bool:
     Otherwise, as with a single ball in the sun, all paths have one vertex, and light sampling has found all there is.
     """
     world = wave.context.world
-    for model, _ in partition(world, hit)[1]:
+    _, lanes_by_model = partition(world, hit)
+    for model, _ in lanes_by_model:
         if world.materials.models[model].transmits:
             return True
     at = interact(world, state.o, state.d, hit)
-    near = torch.where(dot(at.ng, state.d) < 0.0, 1.0, -1.0) * at.ng
-    for k in range(DIRECTIONS):
-        d = _sphere(torch.arange(len(hit.t), device=near.device) * DIRECTIONS + k, len(hit.t) * DIRECTIONS).to(
-            near.dtype
-        )
-        d = torch.where(dot(d, near) < 0.0, -d, d)
-        prim = wave.accel.intersect(offset_origin(world, at, d), d, torch.full_like(hit.t, math.inf))[1]
+    near_normal = torch.where(dot(at.ng, state.d) < 0.0, 1.0, -1.0) * at.ng  # on the side of the camera
+    lanes, count = torch.arange(len(hit.t), device=near_normal.device), len(hit.t) * SURFACE_DIRECTIONS
+    for k in range(SURFACE_DIRECTIONS):
+        d = _fibonacci_sphere(lanes * SURFACE_DIRECTIONS + k, count).to(near_normal.dtype)
+        d = torch.where(dot(d, near_normal) < 0.0, -d, d)
+        _, prim, *_ = wave.accel.intersect(offset_origin(world, at, d), d, torch.full_like(hit.t, math.inf))
         if bool((prim >= 0).any()):
             return True
     return False
 
 
-def _sphere(k: Tensor, count: int) -> Tensor:
+def _fibonacci_sphere(k: Tensor, count: int) -> Tensor:
     """Return directions ``(3, n)`` with indices ``k (n,)`` of ``count`` on a Fibonacci lattice, float64."""
-    turn, height = math.pi * (3.0 - math.sqrt(5.0)) * k.double(), 1.0 - (2.0 * k.double() + 1.0) / count
+    angle, height = GOLDEN_ANGLE * k.double(), 1.0 - (2.0 * k.double() + 1.0) / count
     radius = (1.0 - height.square()).sqrt()
-    return torch.stack((radius * turn.cos(), radius * turn.sin(), height))
+    return torch.stack((radius * angle.cos(), radius * angle.sin(), height))
 
 
 def _delta_lights(lights: Lights) -> list[tuple[int, str]]:
-    """Return row and kind of each delta light with power."""
+    """Return row in the table of lights and kind of each delta light with power."""
+    # `lights.kind` is None where all lights are of one kind.
     kinds = [lights.kinds[0]] if lights.kind is None else [lights.kinds[k] for k in lights.kind.tolist()]
-    bright = lights.radiance.abs().amax(0).tolist()
+    intensities = lights.radiance.abs().amax(0).tolist()
     return [
-        (row, kind) for row, kind in enumerate(kinds) if kind in ("point", "spot", "directional") and bright[row] > 0
+        (row, kind)
+        for row, kind in enumerate(kinds)
+        if kind in ("point", "spot", "directional") and intensities[row] > 0
     ]
 
 
@@ -180,46 +188,52 @@ def _why_unreachable(search: _Search, names: Names, lights: Lights, row: int, ki
     A path finds a delta light by light sampling at a surface that the light reaches directly and whose BSDF is not all deltas.
     """
     integrator, world = search.integrator, search.world
-    cannot = f"cannot be found by integrator {integrator.name}"
+    cannot_be_found = f"cannot be found by integrator {integrator.name}"
     if not isinstance(integrator, PathIntegrator):
         return ""
     if integrator.strategy in ("bsdf", "uniform"):
-        return f"a {kind} light {cannot} with strategy {integrator.strategy}"
+        return f"a {kind} light {cannot_be_found} with strategy {integrator.strategy}"
     models = world.materials.models
+    # Smooth: a BSDF of deltas alone, such as glass. Sheer: shadow rays pass straight through.
     if not any(model.smooth and model.transmits and not model.sheer for model in models):
         return ""
-    o, d = _rays(search, lights, row, kind)
-    prim = search.wave.accel.intersect(o, d, torch.full_like(o[0], math.inf))[1].long()
-    slot = world.geometry.slot(prim[prim >= 0])
+    o, d = _light_rays(search, lights, row, kind)
+    _, prim, *_ = search.wave.accel.intersect(o, d, torch.full_like(o[0], math.inf))
+    prim = prim.long()
+    slot = world.geometry.slot(prim[prim >= 0])  # surface of each hit: the index of its material and shape
     opacity = world.materials.opacity
     if opacity is not None and bool((opacity[slot] < 1.0).any()):
         return ""
-    number = world.materials.key[slot + 1].long() % len(models)  # see path.partition
-    met = [models[k] for k in number.tolist()]
-    passing = [k for k, model in enumerate(met) if model.transmits]
-    if not passing or not all(model.smooth for model in met):
+    number = world.materials.key[slot + 1].long() % len(models)  # index of the model, see path.partition
+    hit_models = [models[k] for k in number.tolist()]
+    transmitting = [k for k, model in enumerate(hit_models) if model.transmits]
+    if not transmitting or not all(model.smooth for model in hit_models):
         return ""
-    shape, material = names.shape(int(slot[passing[0]]))
-    return f"a {kind} light {'inside' if len(met) == RAYS else 'behind'} {shape} ({material}) {cannot}"
+    shape, material = names.shape(int(slot[transmitting[0]]))
+    return f"a {kind} light {'inside' if len(hit_models) == LIGHT_RAYS else 'behind'} {shape} ({material}) {cannot_be_found}"
 
 
-def _rays(search: _Search, lights: Lights, row: int, kind: str) -> tuple[Tensor, Tensor]:
-    """Return rays ``o, d (3, RAYS)`` from a light, evenly distributed on a Fibonacci lattice."""
-    k = torch.arange(RAYS, dtype=torch.float64, device=lights.p0.device)
-    turn, share = math.pi * (3.0 - math.sqrt(5.0)) * k, (k + 0.5) / RAYS
+def _light_rays(search: _Search, lights: Lights, row: int, kind: str) -> tuple[Tensor, Tensor]:
+    """Return rays ``o, d (3, LIGHT_RAYS)`` float32 from a delta light, evenly distributed on a Fibonacci lattice.
+
+    A directional light sends them along its axis from a disk outside of the scene's bounding sphere.
+    """
+    k = torch.arange(LIGHT_RAYS, dtype=torch.float64, device=lights.p0.device)
+    angle, fraction = GOLDEN_ANGLE * k, (k + 0.5) / LIGHT_RAYS
     axis = lights.normal[:, row : row + 1].double()
     if kind == "directional":
         low, high = (box.double() for box in primitive_bounds(search.geometry()))
         low, high = low.amin(1, keepdim=True), high.amax(1, keepdim=True)
-        reach = 0.5 * (high - low).norm()
+        reach = 0.5 * (high - low).norm()  # radius of the bounding sphere
         frame = Frame.about(axis)
-        aside = share.sqrt() * (turn.cos() * frame.s + turn.sin() * frame.t)
-        o, d = 0.5 * (low + high) + reach * (aside - 2.0 * axis), axis.expand(3, RAYS)
+        on_disk = fraction.sqrt() * (angle.cos() * frame.s + angle.sin() * frame.t)
+        o, d = 0.5 * (low + high) + reach * (on_disk - 2.0 * axis), axis.expand(3, LIGHT_RAYS)
     else:
-        d = _sphere(k, RAYS)
+        d = _fibonacci_sphere(k, LIGHT_RAYS)
         if kind == "spot":
-            height, frame = 1.0 - (1.0 - math.cos(float(lights.e1[0, row]))) * share, Frame.about(axis)
+            cutoff_angle = float(lights.e1[0, row])  # radians
+            height, frame = 1.0 - (1.0 - math.cos(cutoff_angle)) * fraction, Frame.about(axis)
             radius = (1.0 - height.square()).clamp_min(0.0).sqrt()
-            d = radius * (turn.cos() * frame.s + turn.sin() * frame.t) + height * frame.n
-        o = lights.p0[:, row : row + 1].double().expand(3, RAYS)
+            d = radius * (angle.cos() * frame.s + angle.sin() * frame.t) + height * frame.n
+        o = lights.p0[:, row : row + 1].double().expand(3, LIGHT_RAYS)
     return o.float().contiguous(), d.float().contiguous()

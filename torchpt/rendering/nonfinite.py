@@ -1,4 +1,8 @@
-"""Report non-finite samples: count them by cause and describe the first."""
+"""Report non-finite samples: count them by cause and describe the first.
+
+A render notes the pixel and the index of its first NaN or infinite samples. These are traced again by tensor operations, with
+an observer that tells which quantity stopped being finite.
+"""
 
 from __future__ import annotations
 
@@ -20,52 +24,55 @@ if TYPE_CHECKING:  # what traces samples again is imported once there are such
 __all__ = ["causes_of", "describe_sample"]
 
 
-def causes_of(scene: Scene, wave: Wave, lost: NonFinite) -> tuple[dict[str, int], str]:
+def causes_of(scene: Scene, wave: Wave, nonfinite: NonFinite) -> tuple[dict[str, int], str]:
     """Return the number of non-finite samples by cause, largest first, and a sentence about the first; ``{}, ""`` if none.
 
     Only the first :data:`~torchpt.paths.nonfinite.KEPT` are traced again. Others count as ``nan, not traced`` and
-    ``infinite, not traced``; all add up to ``lost.count``.
+    ``infinite, not traced``; all add up to ``nonfinite.count``.
 
     Args:
         scene: what was rendered.
         wave: the wave of the render.
-        lost: the non-finite samples.
+        nonfinite: the non-finite samples.
     """
-    if not lost.count:
+    if not nonfinite.count:
         return {}, ""
     from torchpt.paths.explain import causes_of_samples
 
-    faults = causes_of_samples(_trace, wave, lost.samples)
-    causes = Counter(fault.name for fault in faults)
-    nans = sum(place.nan for place in lost.samples)
-    causes["nan, not traced"] = lost.nan - nans
-    causes["infinite, not traced"] = lost.infinite - (len(lost.samples) - nans)
-    first = f"{_named(wave, lost.samples[0])}: {_said(scene, wave, faults[0])}"
-    return {name: count for name, count in causes.most_common() if count}, first
+    causes = causes_of_samples(_trace, wave, nonfinite.samples)
+    counts = Counter(cause.name for cause in causes)
+    traced_nans = sum(sample_id.nan for sample_id in nonfinite.samples)
+    counts["nan, not traced"] = nonfinite.nan - traced_nans
+    counts["infinite, not traced"] = nonfinite.infinite - (len(nonfinite.samples) - traced_nans)
+    first = f"{_sample_name(wave, nonfinite.samples[0])}: {_cause_phrase(scene, wave, causes[0])}"
+    return {name: count for name, count in counts.most_common() if count}, first
 
 
-def describe_sample(scene: Scene, wave: Wave, place: SampleId) -> str:
+def describe_sample(scene: Scene, wave: Wave, sample_id: SampleId) -> str:
     """Return a sentence about one non-finite sample and its cause."""
     from torchpt.paths.explain import causes_of_samples
 
-    return f"{_named(wave, place)} is not finite: {_said(scene, wave, causes_of_samples(_trace, wave, [place])[0])}"
+    (cause,) = causes_of_samples(_trace, wave, [sample_id])
+    return f"{_sample_name(wave, sample_id)} is not finite: {_cause_phrase(scene, wave, cause)}"
 
 
 def _trace(wave: Wave, state: PathState, observer: Any) -> Tensor:
+    """Return the samples ``(3, n)`` of paths, which an observer watches."""
     return weighted_radiance(wave, state, observer=observer)
 
 
-def _named(wave: Wave, place: SampleId) -> str:
+def _sample_name(wave: Wave, sample_id: SampleId) -> str:
     """Return the name of a sample: its index and pixel or ray, and whether it is a second value of an error probe."""
     if wave.start_rays is not None:
-        return f"sample {place.sample} of ray {place.y * wave.crop[2] + place.x}"
-    return str(place) + (" (its second value)" if place.first_randomization else "")
+        return f"sample {sample_id.sample} of ray {sample_id.y * wave.crop[2] + sample_id.x}"
+    return str(sample_id) + (" (its second value)" if sample_id.first_randomization else "")
 
 
-def _said(scene: Scene, wave: Wave, fault: NonFiniteCause) -> str:
-    if fault.cause == "not repeated":
+def _cause_phrase(scene: Scene, wave: Wave, cause: NonFiniteCause) -> str:
+    """Return a cause with its depth, and the shape and material where it is one's."""
+    if cause.cause == "not repeated":
         return "traced again by tensor operations it is finite"
-    depth = f" at depth {fault.depth}" if fault.depth else ""
-    if fault.slot < 0:
-        return fault.name + depth
-    return f"{fault.name}{depth} ({Names(scene.built, wave.context.world).owner(fault.slot)})"
+    depth = f" at depth {cause.depth}" if cause.depth else ""
+    if cause.slot < 0:
+        return cause.name + depth
+    return f"{cause.name}{depth} ({Names(scene.built, wave.context.world).owner(cause.slot)})"

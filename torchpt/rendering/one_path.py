@@ -1,4 +1,8 @@
-"""Trace one path of a render and describe it vertex by vertex; it is the path of the picture's sample, to the bit."""
+"""Trace one path of a render and describe it vertex by vertex; it is the path of the picture's sample, to the bit.
+
+``torchpt debug`` prints the result. An :class:`~torchpt.paths.explain.Explainer` records the events of the path as it is traced
+(camera ray, intersection, emitter hit, scattering), in lanes of one; :class:`_PathBuilder` puts those of one depth together.
+"""
 
 from __future__ import annotations
 
@@ -199,11 +203,12 @@ class _PathBuilder:
         self.names = Names(scene.built, self.world)
         self.centre, self.unit = scene.space.centre, scene.space.unit
 
-    def build(self, settings: Settings, pixel: tuple[int, int], sample: int, brought: Tensor) -> Path:
-        left = self.events[0]
-        assert isinstance(left, CameraRay)
+    def build(self, settings: Settings, pixel: tuple[int, int], sample: int, sample_value: Tensor) -> Path:
+        """Return the path; ``sample_value (3, 1)``: its radiance, weighted by the filter."""
+        camera_ray = self.events[0]
+        assert isinstance(camera_ray, CameraRay)
         vertices = tuple(self._vertices())
-        value = torch.where(torch.isfinite(brought).all(0), brought, 0.0)
+        value = torch.where(torch.isfinite(sample_value).all(0), sample_value, 0.0)
         clamp = settings.integrator.clamp
         if clamp is not None:
             value = value * clamp_scale(value, clamp)
@@ -212,8 +217,8 @@ class _PathBuilder:
             pixel=pixel,
             sample=sample,
             seed=settings.render.seed,
-            origin=self._scene_point(left.state.o),
-            direction=_first_lane(left.state.d),
+            origin=self._scene_point(camera_ray.state.o),
+            direction=_first_lane(camera_ray.state.d),
             vertices=vertices,
             ended=self._why_ended(),
             radiance=vertices[-1].radiance,
@@ -226,30 +231,38 @@ class _PathBuilder:
 
     def _vertices(self) -> Iterator[Vertex]:
         """Yield a vertex for each ray that was traced, whether it hit a surface or escaped."""
-        for k, met in enumerate(self.events):
-            if not isinstance(met, Intersection) or float(met.state.t_max) == 0.0:  # ended paths have rays of length 0
+        for k, intersection in enumerate(self.events):
+            # Ended paths have rays of length 0.
+            if not isinstance(intersection, Intersection) or float(intersection.state.t_max) == 0.0:
                 continue
-            here = [event for event in self.events[k:] if not isinstance(event, CameraRay) and event.depth == met.depth]
-            shone = next((event for event in here if isinstance(event, EmitterHit)), None)
-            yield self._vertex(met, shone, next((event for event in here if isinstance(event, Scattering)), None))
+            later = [event for event in self.events[k:] if not isinstance(event, CameraRay)]
+            events = [event for event in later if event.depth == intersection.depth]
+            emitter_hit = next((event for event in events if isinstance(event, EmitterHit)), None)
+            scattering = next((event for event in events if isinstance(event, Scattering)), None)
+            yield self._vertex(intersection, emitter_hit, scattering)
 
-    def _vertex(self, met: Intersection, shone: EmitterHit | None, bounced: Scattering | None) -> Vertex:
-        radiance = met.state.radiance if shone is None else met.state.radiance + shone.light.brought
-        light, output = None, None if bounced is None else bounced.output
-        if bounced is not None and bounced.transmittance is not None:
-            output = bounced.output
+    def _vertex(
+        self, intersection: Intersection, emitter_hit: EmitterHit | None, scattering: Scattering | None
+    ) -> Vertex:
+        """Return the vertex of a ray, whose events these are."""
+        radiance = intersection.state.radiance
+        if emitter_hit is not None:
+            radiance = radiance + emitter_hit.light.brought
+        light, output = None, None if scattering is None else scattering.output
+        if scattering is not None and scattering.transmittance is not None:
+            output = scattering.output
             assert output.direct is not None and output.shadow is not None
-            light = self._light_sample(output.direct, output.shadow.radiance, bounced.transmittance)
-            radiance = torch.addcmul(output.leaving.radiance, output.shadow.radiance, bounced.transmittance)
-        wo, escaped = _first_lane(-met.state.d), int(met.hit.prim) < 0
-        emission = None if shone is None else self._emission(shone)
+            light = self._light_sample(output.direct, output.shadow.radiance, scattering.transmittance)
+            radiance = torch.addcmul(output.leaving.radiance, output.shadow.radiance, scattering.transmittance)
+        wo, escaped = _first_lane(-intersection.state.d), int(intersection.hit.prim) < 0
+        emission = None if emitter_hit is None else self._emission(emitter_hit)
         if escaped:
-            return Vertex(depth=met.depth, wo=wo, emission=emission, radiance=_first_lane(radiance))
-        at = interact(self.world, met.state.o, met.state.d, met.hit)
+            return Vertex(depth=intersection.depth, wo=wo, emission=emission, radiance=_first_lane(radiance))
+        at = interact(self.world, intersection.state.o, intersection.state.d, intersection.hit)
         found = self.names.surface(int(at.slot), int(at.prim))
         normal = at.ns if output is None or output.surface is None else output.surface.frame.n
         return Vertex(
-            depth=met.depth,
+            depth=intersection.depth,
             position=self._scene_point(at.p),
             shape=found.shape,
             kind=found.kind,
@@ -265,14 +278,15 @@ class _PathBuilder:
             radiance=_first_lane(radiance),
         )
 
-    def _emission(self, shone: EmitterHit) -> EmissionRecord:
+    def _emission(self, emitter_hit: EmitterHit) -> EmissionRecord:
+        """Return the emission of a light that a ray hit."""
         lights = self.world.lights
         assert lights is not None
         row = len(lights.area) - 1  # the environment
-        if shone.slot is not None:
+        if emitter_hit.slot is not None:
             assert lights.row_of_prim is not None
-            row = int(lights.row_of_prim[shone.slot])
-        light = shone.light
+            row = int(lights.row_of_prim[emitter_hit.slot])
+        light = emitter_hit.light
         return EmissionRecord(
             self.names.light(row),
             _first_lane(light.radiance),
@@ -281,7 +295,7 @@ class _PathBuilder:
             _first_lane(light.brought),
         )
 
-    def _light_sample(self, direct: DirectLight, brought: Tensor, transmittance: Tensor) -> LightSampleRecord:
+    def _light_sample(self, direct: DirectLight, unoccluded: Tensor, transmittance: Tensor) -> LightSampleRecord:
         sample, reflected = direct.sample, direct.reflected
         return LightSampleRecord(
             light=self.names.light(0 if sample.row is None else int(sample.row)),
@@ -290,8 +304,8 @@ class _PathBuilder:
             arriving=_first_lane(direct.radiance * sample.weight),
             bsdf=_first_lane(reflected if direct.share is None else reflected * direct.share),
             mis_weight=1.0 if direct.weight is None else float(direct.weight),
-            visible=float(transmittance) if bool((brought != 0).any()) else None,
-            contribution=_first_lane(brought * transmittance),
+            visible=float(transmittance) if bool((unoccluded != 0).any()) else None,
+            contribution=_first_lane(unoccluded * transmittance),
         )
 
     def _why_ended(self) -> str:
@@ -303,15 +317,18 @@ class _PathBuilder:
         assert output.drawn is not None and output.carried is not None
         if not bool(torch.isfinite(output.carried).all()):
             return "not finite"
+        # A valid sample (`least` above 0) that still carried light: nothing but roulette ends it.
         if float(output.drawn.least) > 0.0 and bool((output.carried > 0).any()):
             return "roulette"
         return "absorbed"
 
 
 def _bsdf_sample(output: VertexOutput) -> BsdfSampleRecord:
-    drawn, carried, chance, after = output.drawn, output.carried, output.chance, output.leaving
+    """Return the BSDF sample of a vertex."""
+    # carried: throughput before roulette; chance: its survival probability; leaving: path state of the next ray.
+    drawn, carried, chance, leaving = output.drawn, output.carried, output.chance, output.leaving
     assert drawn is not None and carried is not None and output.surface is not None
-    goes_on, weight, perturbed_normal = float(after.t_max) > 0.0, drawn.weight, output.surface.perturbed_normal
+    goes_on, weight, perturbed_normal = float(leaving.t_max) > 0.0, drawn.weight, output.surface.perturbed_normal
     if perturbed_normal is not None:
         weight = weight * perturbed_normal.shadowing(drawn.d)
     return BsdfSampleRecord(
@@ -320,7 +337,7 @@ def _bsdf_sample(output: VertexOutput) -> BsdfSampleRecord:
         weight=_first_lane(weight),
         eta=None if drawn.eta is None else float(drawn.eta),
         survival=None if chance is None else float(chance),
-        throughput=_first_lane(after.throughput if goes_on else carried),
+        throughput=_first_lane(leaving.throughput if goes_on else carried),
     )
 
 

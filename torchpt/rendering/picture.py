@@ -1,4 +1,8 @@
-"""Make a :class:`Rendering` of a render's films: picture, AOVs and error estimate."""
+"""Make a :class:`Rendering` of a render's films: picture, AOVs and error estimate.
+
+A :class:`~torchpt.rendering.run.Run` calls it at the end, and in between for previews. A film holds sums and counts of samples
+by pixel; AOVs of first surfaces (such as depth) have films of their own, others (such as variance) come from the picture's.
+"""
 
 from __future__ import annotations
 
@@ -23,35 +27,38 @@ __all__ = ["error_estimate_of", "finished_rendering", "rendering_of"]
 
 def finished_rendering(run: Run) -> Rendering:
     """Return the finished rendering, with the causes of its non-finite samples."""
-    size = mb(run.need.picture)
+    size = mb(run.memory_need.picture)
     return retry_out_of_memory(
-        lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}", lambda: _told(run)
+        lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}",
+        lambda: _with_nonfinite_causes(run),
     )
 
 
-def _told(run: Run) -> Rendering:
+def _with_nonfinite_causes(run: Run) -> Rendering:
+    """Return the rendering with the causes of its non-finite samples."""
     rendering = rendering_of(run)
-    rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(run.scene, run.wave, run.lost)
+    rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(run.scene, run.wave, run.nonfinite)
     return rendering
 
 
 def rendering_of(run: Run) -> Rendering:
     """Return the rendering of the films as they are; of several ranks they must have been joined."""
-    radiant, film = run.integrator.light, run.picture.film
+    estimates_light, film = run.integrator.light, run.picture.film
     layers = _layers(run)
     estimate, unknown = None, ""
-    if radiant:
+    if estimates_light:
         values = film.mean() if run.probes is None else run.probes.picture(film)
         image, (estimate, unknown) = values.to(run.dtype), error_estimate_of(run, values)
     else:
-        shown = layers[next(iter(run.seen))]
+        # The picture is the first AOV: one channel as grey, two with a blank blue.
+        shown = layers[next(iter(run.surface_layers))]
         blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))
         image = shown.expand(-1, -1, 3).contiguous() if shown.shape[2] == 1 else torch.cat((shown, blank), -1)
     clamped = None
-    if radiant and run.integrator.clamp is not None:
-        before, after = run.light.tolist()
+    if estimates_light and run.integrator.clamp is not None:
+        before, after = run.clamp_sums.tolist()  # sums of radiance before and after the clamp
         clamped = 1.0 - after / before if before > 0 else 0.0
-    counts = (film if radiant else next(iter(run.picture.layers.values()))).counts
+    counts = (film if estimates_light else next(iter(run.picture.layers.values()))).counts
     names = run.settings.film.aovs or run.integrator.layers
     meter = MemoryMeter(run.device)
     return Rendering(
@@ -65,19 +72,19 @@ def rendering_of(run: Run) -> Rendering:
         render_seconds=run.seconds_of_sampling(),
         write_seconds=run.write_seconds(),
         paths=run.done,
-        rays=run.tally.rays,
-        nonfinite_samples=run.lost.count,
-        truncated_paths=run.tally.truncated,
+        rays=run.ray_counts.rays,
+        nonfinite_samples=run.nonfinite.count,
+        truncated_paths=run.ray_counts.truncated,
         clamped=clamped,
         relmse=None if estimate is None or unknown else estimate.relmse,
         relmse_interval=None if estimate is None or unknown else estimate.interval,
         relmse_unknown=unknown,
         heavy_tailed=estimate is not None and estimate.heavy_tailed,
-        stopped_by=run.stop.reason,
-        complete=bool(run.stop.reason) and not run.ended,
+        stopped_by=run.stop_rules.reason,
+        complete=bool(run.stop_rules.reason) and not run.stopped_by_caller,
         peak_memory=max(meter.peak() - meter.base(), 0),
         lanes=run.engine.budget.lanes if run.engine.budget.has_shrunk and not run.engine.compiled else None,
-        eager=tuple(run.eager),
+        eager=tuple(run.eager_reasons),
         scene=run.name,
         overrides=run.scene.description.overrides,
         settings=run.settings,
@@ -96,12 +103,13 @@ def error_estimate_of(run: Run, picture: Tensor) -> tuple[ErrorEstimate | None, 
         return estimate, ""
     from torchpt.rendering.missing_light import find_missing_light
 
-    lacks = find_missing_light(run.scene, run.wave, run.geometry, picture, estimate.relmse)
-    if lacks.reason:
-        return estimate, lacks.reason
+    missing = find_missing_light(run.scene, run.wave, run.geometry, picture, estimate.relmse)
+    if missing.reason:
+        return estimate, missing.reason
     if estimate.interval is not None:
         low, high = estimate.interval
-        estimate = replace(estimate, interval=(low, high + lacks.dark))
+        # A dark pixel adds at most 1 to the sum over pixels, so its share of the picture bounds what it adds.
+        estimate = replace(estimate, interval=(low, high + missing.dark_share))
     return estimate, ""
 
 
@@ -109,13 +117,14 @@ def _layers(run: Run) -> dict[str, Tensor]:
     """Return the AOVs by name: those of first surfaces, and those computed from the film."""
     layers = {}
     film = run.picture.film
-    for name, layer in run.seen.items():
+    for name, layer in run.surface_layers.items():
         seen = run.picture.layers[name]
+        # Lengths were added in world units.
         values = seen.mean() * (run.unit if layer.length else 1.0) if layer.averaged else seen.first_samples()
         layers[name] = values.to(run.dtype)
     for name in run.settings.film.aovs:
-        if name not in run.seen:
-            made: Any = LAYERS[name]  # a FilmLayer
+        if name not in run.surface_layers:
+            film_layer: Any = LAYERS[name]
             counts = film.counts if run.probes is None else run.probes.counts(film)
-            layers[name] = made.of(film, counts).to(run.dtype)
+            layers[name] = film_layer.of(film, counts).to(run.dtype)
     return layers

@@ -1,4 +1,10 @@
-"""From the arguments of ``render`` to a rendering: validate and complete them, then render, with autograd where needed."""
+"""From the arguments of ``render`` to a rendering: validate and complete them, then render, with autograd where needed.
+
+``api.py`` and ``batches`` prepare a :class:`RenderRequest` and execute it. Settings are the keys of a scene file; a call's
+other options (``params``, ``ranks``...) are its ``CallArguments``.
+Versions are counters of in-place changes, as PyTorch has them: a backward pass refuses a scene that was changed since its
+forward pass.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +27,7 @@ from torchpt.rendering.graphs import reuse_rendering
 from torchpt.rendering.result import denoise_rendering
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
-from torchpt.scene.formats.description import settings as complete
+from torchpt.scene.formats.description import settings as complete_settings
 from torchpt.scene.settings import SAMPLERS, CallArguments, CommonOptions, Settings, settings_of_call
 from torchpt.scene.texel_params import update_texels, with_texel_params
 from torchpt.scene.versions import AFTER, check_unchanged
@@ -30,6 +36,8 @@ from torchpt.spec import Role
 __all__ = ["RenderRequest", "execute_request", "prepare_request", "prepare_trace_request"]
 
 _FLOATS = (torch.float32, torch.float64)
+#: Flips bits of a seed, so that backward passes by default draw other numbers than forward passes. (The multiplier of drand48.)
+_BACKWARD_SEED = 0x5DEECE66D
 
 
 @dataclass(frozen=True)
@@ -37,7 +45,7 @@ class RenderRequest:
     """A validated request for one picture.
 
     Attributes:
-        given: the scene that the caller passed.
+        caller_scene: the scene that the caller passed.
         scene: the scene to render: the same, or a copy that reads texels where ``params`` replace numbers by images.
         settings: the complete settings.
         call: options of this call that are no settings.
@@ -46,7 +54,7 @@ class RenderRequest:
         rays: origins and directions ``(..., 3)``, the pixels of a film of one row; None: the camera's rays.
     """
 
-    given: Scene
+    caller_scene: Scene
     scene: Scene
     settings: Settings
     call: CallArguments
@@ -55,7 +63,7 @@ class RenderRequest:
     rays: tuple[Tensor, Tensor] | None = None
 
     @property
-    def wanted(self) -> tuple[str, ...]:
+    def differentiated(self) -> tuple[str, ...]:
         """Names of the parameters that are differentiated."""
         return tuple(name for name, value in self.params.items() if wants_gradients(value))
 
@@ -67,12 +75,12 @@ class RenderRequest:
     @property
     def needs_gradients(self) -> bool:
         """Return True if the picture requires gradients."""
-        return torch.is_grad_enabled() and bool(self.wanted or self.differentiates_rays or self.scene.weights())
+        return torch.is_grad_enabled() and bool(self.differentiated or self.differentiates_rays or self.scene.weights())
 
     def with_versions(self) -> RenderRequest:
         """Return a copy that records versions of parameters for :meth:`check_unchanged`."""
-        now = self.given.versions()
-        return replace(self, versions={name: edition for name, edition in now.items() if name not in self.params})
+        now = self.caller_scene.versions()
+        return replace(self, versions={name: version for name, version in now.items() if name not in self.params})
 
     def check_unchanged(self, since: str) -> None:
         """Raise if the scene changed since its versions were recorded; ``since`` is a phrase for the error.
@@ -80,8 +88,8 @@ class RenderRequest:
         Raises:
             RenderError: a parameter of the scene was replaced, or changed in place.
         """
-        check_unchanged(self.versions, self.given.versions(), since)
-        update_texels(self.scene, self.given, self.params)
+        check_unchanged(self.versions, self.caller_scene.versions(), since)
+        update_texels(self.scene, self.caller_scene, self.params)
 
 
 def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) -> RenderRequest:
@@ -93,8 +101,8 @@ def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) 
     """
     scene = as_scene(scene)
     call = CallArguments.of({**options, "full": full})
-    _check(scene, call, options.get("device"))
-    settings = complete(scene.description, settings_of_call(options))
+    _check_call(scene, call, options.get("device"))
+    settings = complete_settings(scene.description, settings_of_call(options))
     if not full:
         settings = _without_aovs(settings, options.get("film"))
     elif settings.film.denoise:
@@ -113,22 +121,22 @@ def prepare_trace_request(scene: Scene, o: Tensor, d: Tensor, **options: Unpack[
         SceneError: an argument is not accepted.
     """
     as_scene(scene)
-    o, d = _broadcast(scene, o, d)
+    o, d = _broadcast_rays(scene, o, d)
     options["edges"] = False
-    request = prepare_request(scene, False, **options)
+    request = prepare_request(scene, full=False, **options)
     settings, sampler = request.settings, request.settings.sampler
     if not settings.integrator.light:
-        radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
+        names_with_light = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
         raise SceneError(
-            "integrator.type", settings.integrator.name, f"one of {radiant}: along rays there is light alone"
+            "integrator.type", settings.integrator.name, f"one of {names_with_light}: along rays there is light alone"
         )
     if settings.integrator.splats:
         raise SceneError("integrator.type", settings.integrator.name, "one without splats, which rays have no film for")
-    if sampler.kind.of_film:
+    if sampler.kind.of_film:  # its points are spread over the pixels of a film
         others = ", ".join(name for name in SAMPLERS if not SAMPLERS[name].of_film)
         raise SceneError("sampler.type", sampler.name, f"one of {others}: rays have no places on a film")
-    wished = options.get("sampler")
-    if isinstance(wished, Mapping) and wished.get("adaptive"):
+    requested = options.get("sampler")
+    if isinstance(requested, Mapping) and requested.get("adaptive"):
         raise SceneError("sampler.adaptive", True, "false: rays have the same number of samples")
     if seen := [name for name in options.get("params") or {} if name.startswith("camera.")]:
         raise SceneError("params", seen[0], "none of the camera's, which rays do not come from")
@@ -144,16 +152,16 @@ def prepare_trace_request(scene: Scene, o: Tensor, d: Tensor, **options: Unpack[
     return request.with_versions() if request.needs_gradients else request
 
 
-def _broadcast(scene: Scene, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+def _broadcast_rays(scene: Scene, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
     """Return origins and directions of rays, broadcast to one shape ``(..., 3)``.
 
     Raises:
         SceneError: not two tensors of floats on the scene's device that broadcast.
     """
     for key, vectors in (("o", o), ("d", d)):
-        form = (vectors.dtype, tuple(vectors.shape)) if isinstance(vectors, Tensor) else vectors
+        description = (vectors.dtype, tuple(vectors.shape)) if isinstance(vectors, Tensor) else vectors
         if not isinstance(vectors, Tensor) or vectors.dtype not in _FLOATS or vectors.shape[-1:] != (3,):
-            raise SceneError(key, form, "a tensor (..., 3) of float32 or float64")
+            raise SceneError(key, description, "a tensor (..., 3) of float32 or float64")
         if vectors.device != scene.device:
             raise SceneError(key, str(vectors.device), f"a tensor on the scene's device {scene.device}")
     try:
@@ -181,10 +189,10 @@ def _parameters(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -
     return {name: value for name, value in scene.params.items() if getattr(value, "requires_grad", False)} | given
 
 
-def execute_request(request: RenderRequest, made: list[Rendering] | None = None) -> Rendering:
+def execute_request(request: RenderRequest, rendered: list[Rendering] | None = None) -> Rendering:
     """Render a request: with autograd where it requires gradients, denoised where its film asks for that.
 
-    ``made``: a list with the rendering that was already made without gradients; it is popped.
+    ``rendered``: a list with the rendering that was already made without gradients; it is removed from the list.
 
     Raises:
         SceneError: a parameter is not accepted.
@@ -192,13 +200,13 @@ def execute_request(request: RenderRequest, made: list[Rendering] | None = None)
     scene, settings, call = request.scene, request.settings, request.call
 
     def render(params: Mapping[str, Tensor], rays: tuple[Tensor, ...]) -> Rendering:
-        if made:
-            return made.pop()
+        if rendered:
+            return rendered.pop()
         with nullcontext() if call.ranks is None else call.ranks.together():
             scene.check(params)
-        given = _pair(rays)
+        pair = _rays_or_none(rays)
         return reuse_rendering(
-            lambda: render_scene(scene, settings, params=params, dtype=call.dtype, ranks=call.ranks, rays=given)
+            lambda: render_scene(scene, settings, params=params, dtype=call.dtype, ranks=call.ranks, rays=pair)
         )
 
     if request.needs_gradients:
@@ -231,7 +239,7 @@ def _without_aovs(settings: Settings, film: Mapping[str, Any] | None) -> Setting
     return replace(settings, film=settings.film.but(denoise=False, aovs=aovs))
 
 
-def _check(scene: Scene, call: CallArguments, device: str | torch.device | None) -> None:
+def _check_call(scene: Scene, call: CallArguments, device: str | torch.device | None) -> None:
     """Raise SceneError for arguments of :func:`render` that do not fit the scene."""
     for name in call.params or {}:
         if not isinstance(name, str):
@@ -249,44 +257,48 @@ def _same_device(requested: str | torch.device, own: torch.device) -> bool:
     return device.type == own.type and device.index in (None, own.index or 0)
 
 
-def _pair(rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor] | None:
+def _rays_or_none(rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor] | None:
     """Return origins and directions of rays; None for none."""
     return (rays[0], rays[1]) if rays else None
 
 
-#: Renders given parameters and rays, without gradients.
-_Make = Callable[[Mapping[str, Tensor], tuple[Tensor, ...]], Rendering]
+#: Renders given parameters, and no or two tensors of rays, without gradients.
+_RenderWithoutGradients = Callable[[Mapping[str, Tensor], tuple[Tensor, ...]], Rendering]
 
 
-def _differentiable(request: RenderRequest, render: _Make) -> Rendering:
+def _differentiable(request: RenderRequest, render: _RenderWithoutGradients) -> Rendering:
     """Return a rendering whose picture has gradients with respect to parameters and rays; ``render`` makes it without."""
     from torchpt import gradients as adjoint
     from torchpt.gradients import edges
 
     scene, settings, call, params = request.scene, request.settings, request.call, request.params
-    wanted, dtype, ranks = request.wanted, call.dtype, call.ranks
-    seed = settings.render.seed ^ 0x5DEECE66D if call.seed_grad is None else call.seed_grad
+    wanted, dtype, ranks = request.differentiated, call.dtype, call.ranks
+    seed = settings.render.seed ^ _BACKWARD_SEED if call.seed_grad is None else call.seed_grad
     if not settings.integrator.light:
-        radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
-        raise SceneError("integrator.type", settings.integrator.name, f"one of {radiant} where gradients are wanted")
+        names_with_light = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
+        raise SceneError(
+            "integrator.type", settings.integrator.name, f"one of {names_with_light} where gradients are wanted"
+        )
     if settings.render.checkpoint is not None:
         raise SceneError("render.checkpoint", settings.render.checkpoint, "null where gradients are wanted")
     differentiates_rays = request.differentiates_rays
+    # Geometry is differentiated: directions and distances along paths need derivatives.
     attached = differentiates_rays or adjoint.attached(scene, wanted)
     if differentiates_rays or edges.concerns(scene, wanted):
-        _warn_of_edges(edges.left_out(scene, settings), not call.edges)
+        _warn_of_edges(edges.left_out(scene, settings), all_edges=not call.edges)
     for name in edges.without_gradient(scene, wanted):
         said = f"{name} changes the picture by jumps alone, which are not differentiated: its gradient is 0"
         warn_caller(said, EdgeWarning)
-    names = (*wanted, *(name for name in params if name not in wanted))
+    names = (*wanted, *(name for name in params if name not in wanted))  # of the tensors, before the rays
+    # Lists of one, which the closures below fill and read.
     made: list[Rendering] = []
-    taken: list[int] = []
+    forward_spp: list[int] = []
 
-    def given_by(*tensors: Tensor) -> dict[str, Tensor]:
-        return dict(zip(names, tensors, strict=False))  # rays follow
+    def params_of(*tensors: Tensor) -> dict[str, Tensor]:
+        return dict(zip(names, tensors, strict=False))  # without the rays, which follow
 
     def forward(*tensors: Tensor) -> tuple[Tensor]:
-        made.append(render(given_by(*tensors), tensors[len(names) :]))
+        made.append(render(params_of(*tensors), tensors[len(names) :]))
         return (made[-1].image,)
 
     def backward_pass(cotangents: tuple[Tensor, ...], *tensors: Tensor) -> list[Tensor | None]:
@@ -296,59 +308,63 @@ def _differentiable(request: RenderRequest, render: _Make) -> Rendering:
             return gradients(cotangent, *tensors)
 
     def gradients(cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:
-        given, of_edges = given_by(*tensors), edges_taken()
+        given, edge_spp = params_of(*tensors), edge_samples()
         # A backward pass with the seed and samples of the forward pass is the exact derivative of its estimator.
-        own = again().render
-        exact = own.seed == settings.render.seed and own.spp == taken[0]
-        held = not exact and adjoint.film_space_applies(scene, settings, wanted)
-        rays = _pair(tensors[len(names) :])
-        found = adjoint.gradients(
+        backward = backward_settings().render
+        exact = backward.seed == settings.render.seed and backward.spp == forward_spp[0]
+        # Otherwise first hits may be held in place while the camera moves (gradients/camera.py).
+        film_space = not exact and adjoint.film_space_applies(scene, settings, wanted)
+        rays = _rays_or_none(tensors[len(names) :])
+        grads = adjoint.gradients(
             scene,
-            again(),
+            backward_settings(),
             given,
             wanted,
             dtype,
-            attached,
-            call.adjoint,
-            cotangent,
-            held,
-            ranks,
-            rays,
-            differentiates_rays,
+            attached=attached,
+            method=call.adjoint,
+            cotangent=cotangent,
+            film_space=film_space,
+            ranks=ranks,
+            rays=rays,
+            differentiates_rays=differentiates_rays,
         )
-        if of_edges and edges.concerns(scene, wanted):
+        if edge_spp and edges.concerns(scene, wanted):
             _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
-            moved = edges.add_gradients(
-                scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges, held, ranks
+            on_film = cotangent.T.reshape(height, width, 3)
+            edge_grads = edges.add_gradients(
+                scene, backward_settings(spp=1), given, wanted, dtype, on_film, edge_spp, film_space, ranks
             )
-            found[: len(wanted)] = [a if b is None else a + b for a, b in zip(found, moved, strict=False)]
-        still = [None] * (len(tensors) - len(wanted) - (2 if differentiates_rays else 0))
-        return [*found[: len(wanted)], *still, *found[len(wanted) :]]
+            grads[: len(wanted)] = [a if b is None else a + b for a, b in zip(grads, edge_grads, strict=False)]
+        no_grads = [None] * (len(tensors) - len(wanted) - (2 if differentiates_rays else 0))
+        return [*grads[: len(wanted)], *no_grads, *grads[len(wanted) :]]
 
-    def again(spp: int | None = None) -> Settings:
-        spp = spp or call.spp_grad or taken[0]
+    def backward_settings(spp: int | None = None) -> Settings:
+        """Return the settings of the backward pass: its seed, and its samples a pixel."""
+        spp = spp or call.spp_grad or forward_spp[0]
         return replace(settings, render=settings.render.but(seed=seed, spp=spp))
 
-    def edges_taken() -> int:
-        return (call.edge_spp or call.spp_grad or taken[0]) if call.edges else 0
+    def edge_samples() -> int:
+        """Return the samples a pixel for visibility edges; 0: none."""
+        return (call.edge_spp or call.spp_grad or forward_spp[0]) if call.edges else 0
 
-    def asked() -> edges.Asked:
+    def edge_request() -> edges.Asked:
         request.check_unchanged(AFTER)
-        return edges.Asked(scene, again(), wanted, dtype, edges_taken())
+        return edges.Asked(scene, backward_settings(), wanted, dtype, edge_samples())
 
     tensors = (*(params[name] for name in names), *(request.rays or ()))
     (image,) = custom_vjp(forward, backward_pass, tensors, scene.weights())
     rendering = made[-1]
     made.clear()  # autograd keeps the closures alive: they must not hold pictures
-    taken.append(max(rendering.spp, 1))
+    forward_spp.append(max(rendering.spp, 1))
     layers = edges.followed(settings)
     if layers:
         values = {name: rendering.layers[name] for name in layers}
-        rendering.layers |= edges.differentiable(values, tensors, asked, given_by)
+        rendering.layers |= edges.differentiable(values, tensors, edge_request, params_of)
     return replace(rendering, image=image)
 
 
-def _constant(request: RenderRequest, render: _Make) -> Rendering:
+def _constant(request: RenderRequest, render: _RenderWithoutGradients) -> Rendering:
     """Return a rendering without gradients; parameters and rays may be wrapped by transforms of ``torch.func``."""
     params, made = request.params, list[Rendering]()
 
@@ -360,10 +376,10 @@ def _constant(request: RenderRequest, render: _Make) -> Rendering:
     return replace(made[-1], image=image)
 
 
-def _warn_of_edges(missing: Sequence[str], every: bool) -> None:
-    """Warn of the visibility edges that a gradient leaves out: all (``every``), or those in ``missing``."""
+def _warn_of_edges(missing: Sequence[str], *, all_edges: bool) -> None:
+    """Warn of the visibility edges that a gradient leaves out: all (``all_edges``), or those in ``missing``."""
     edges = "all visibility edges (silhouettes and shadow edges that move)"
-    if not every:
+    if not all_edges:
         if not missing:
             return
         edges = f"some edges: {'; '.join(missing)}"

@@ -21,16 +21,14 @@ from torchpt.images.colour import display
 from torchpt.scene.settings import Settings
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from torchpt.scene.settings import Film
 
 
 __all__ = [
     "Progress",
     "Rendering",
-    "beside",
     "denoise_rendering",
+    "denoised_path",
     "html_of",
     "png_of",
     "table_of",
@@ -126,7 +124,7 @@ class Rendering:
         return self.layers.get("variance")
 
     @property
-    def _open(self) -> bool:
+    def _has_open_spp(self) -> bool:
         """Return True if anything else than ``render.spp`` decides the number of samples a pixel."""
         if self.settings is None:
             return False
@@ -176,7 +174,7 @@ class Rendering:
         film = Film() if self.settings is None else self.settings.film
         write_rendered(path, self, film)
         if self.denoised is not None:
-            write_denoised(beside(path), self, film)
+            write_denoised(denoised_path(path), self, film)
 
     def header(self) -> dict[str, str | int | float]:
         """Return the facts for the header of an EXR file, by name; :func:`torchpt.read_header` reads them back."""
@@ -186,7 +184,7 @@ class Rendering:
         facts: dict[str, str | int | float | None] = {
             "version": __version__,
             "scene": self.scene if self.scene.isprintable() else None,
-            "overrides": " ".join(_short(word) for word in self.overrides if word.isprintable()),
+            "overrides": " ".join(_shortened(word) for word in self.overrides if word.isprintable()),
             "spp": self.spp,
             "relmse": self.relmse,
             "relmse_low": low,
@@ -210,6 +208,7 @@ class Rendering:
                 "integrator": self.settings.integrator.name,
                 "sampler": self.settings.sampler.name,
             }
+        # A header has no infinite numbers and no empty text.
         return {
             name: value
             for name, value in facts.items()
@@ -260,7 +259,7 @@ class Rendering:
             facts["nonfinite_first"] = self.nonfinite_first
         if self.heavy_tailed:
             facts["heavy_tailed"] = True
-        if self.stopped_by and (self.stopped_by != "spp" or self._open):
+        if self.stopped_by and (self.stopped_by != "spp" or self._has_open_spp):
             facts["stopped_by"] = self.stopped_by
         if self.truncated_paths:
             facts["truncated_paths"] = self.truncated_paths
@@ -273,7 +272,8 @@ class Rendering:
         return facts
 
 
-def _short(word: str, most: int = 200) -> str:
+def _shortened(word: str, most: int = 200) -> str:
+    """Return a word, cut to ``most`` characters: headers of EXR files stay readable."""
     return word if len(word) <= most else f"{word[: most - 3]}..."
 
 
@@ -302,11 +302,11 @@ class Progress:
 
 
 #: Longest side of a picture in a notebook, in pixels; larger ones are scaled down.
-LONGEST = 768
+LONGEST_SIDE = 768
 
 
 def png_of(image: Tensor, film: Any) -> bytes:
-    """Return a picture ``(H, W, 3)`` as PNG, tone-mapped and scaled down to ``LONGEST``.
+    """Return a picture ``(H, W, 3)`` as PNG, tone-mapped and scaled down to ``LONGEST_SIDE``.
 
     Args:
         image: linear radiance.
@@ -317,7 +317,7 @@ def png_of(image: Tensor, film: Any) -> bytes:
     options = {} if film is None else {"exposure": film.exposure, "tonemap": film.tonemap, "gamma": film.gamma}
     shown = display(image.detach().cpu().float(), **options)
     picture = Image.fromarray((shown * 255 + 0.5).byte().numpy())
-    picture.thumbnail((LONGEST, LONGEST), Image.Resampling.BOX)  # leaves what is smaller as it is
+    picture.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.BOX)  # leaves what is smaller as it is
     encoded = BytesIO()
     picture.save(encoded, "PNG")
     return encoded.getvalue()
@@ -334,7 +334,7 @@ def table_of(rendering: Rendering) -> dict[str, str]:
             doubt = ", not to be trusted: few pixels carry the error" if rendering.heavy_tailed else ""
             facts["relMSE"] += f" ({low:.3g} to {high:.3g}{doubt})"
     parts = {"load": rendering.load_seconds, "build": rendering.build_seconds, "compile": rendering.compile_seconds}
-    others = ", ".join(f"{name} {value:.2f}" for name, value in parts.items() if value >= 0.005)
+    others = ", ".join(f"{name} {value:.2f}" for name, value in parts.items() if value >= 0.005)  # 0.01 when rounded
     facts["seconds"] = f"{rendering.render_seconds:.2f} of sampling" + (f" ({others})" if others else "")
     facts["rays"] = f"{rendering.rays:,}"
     if rendering.layers:
@@ -357,7 +357,7 @@ def html_of(rendering: Rendering) -> str:
     shown = {"rendered": rendering.image}
     if rendering.denoised is not None:
         shown["denoised"] = rendering.denoised
-    pictures = "".join(_figure(name, image, film, len(shown) > 1) for name, image in shown.items())
+    pictures = "".join(_figure(name, image, film, with_title=len(shown) > 1) for name, image in shown.items())
     rows = "".join(
         f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(value)}</td></tr>'
         for name, value in table_of(rendering).items()
@@ -365,9 +365,10 @@ def html_of(rendering: Rendering) -> str:
     return f"<div>{pictures}<table>{rows}</table></div>"
 
 
-def _figure(name: str, image: Tensor, film: Any, titled: bool) -> str:
+def _figure(name: str, image: Tensor, film: Any, *, with_title: bool) -> str:
+    """Return a picture as HTML, with its PNG inside."""
     data = b64encode(png_of(image, film)).decode("ascii")
-    title = f"<figcaption>{name}</figcaption>" if titled else ""
+    title = f"<figcaption>{name}</figcaption>" if with_title else ""
     picture = f'<img alt="{name} picture" style="max-width:100%" src="data:image/png;base64,{data}">'
     return f'<figure style="display:inline-block;margin:0 8px 0 0">{picture}{title}</figure>'
 
@@ -375,7 +376,7 @@ def _figure(name: str, image: Tensor, film: Any, titled: bool) -> str:
 # ---- A rendering as files: the picture with AOVs and header, and the denoised picture
 
 
-def beside(path: str | PathLike[str]) -> str:
+def denoised_path(path: str | PathLike[str]) -> str:
     """Return the path of a denoised picture: ``a.denoised.exr`` for ``a.exr``."""
     file = as_path(path)
     return str(file.with_name(f"{file.stem}.denoised{file.suffix}"))

@@ -1,4 +1,9 @@
-"""One forward render: passes of samples, stop rules, checkpoints and the error estimate."""
+"""One forward render: passes of samples, stop rules, checkpoints and the error estimate.
+
+``render_scene`` is called by ``requests.py`` and the command line; ``many.py`` drives a :class:`Run` task by task. A pass takes
+some samples of every pixel. A span is what an engine takes at once: a pixel set, its first sample and the number of samples.
+Error probes are pixels that are sampled twice; outliers are pixels that are sampled a third time at the end (``error.py``).
+"""
 
 from __future__ import annotations
 
@@ -15,7 +20,7 @@ from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import LostRankError, OutputError, RenderError, SceneError, warn_once
 from torchpt.core.memory import Budget, MemoryMeter, check_memory, explain_out_of_memory, mb, retry_out_of_memory
 from torchpt.core.threads import limited_threads, without_autocast
-from torchpt.engines.engine import Block, Forward, TaskResult, Tasks, forward_tensors
+from torchpt.engines.engine import Block, Forward, SampleRange, TaskResult, Tasks, forward_tensors
 from torchpt.native import compile_time
 from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts, Wave
@@ -47,7 +52,8 @@ __all__ = ["Run", "render_scene"]
 # ---- One forward render
 
 
-#: A last adaptive round of less than 1 / SMALL_ROUND of the samples is not kept: the checkpoint before it serves any spp.
+#: A last adaptive round of less than 1 / SMALL_ROUND of the samples so far gets no checkpoint: it is cheap to repeat, and from
+#: the checkpoint before it a render with any other ``render.spp`` may go on.
 SMALL_ROUND = 8
 
 
@@ -59,22 +65,33 @@ def _upper_bound(estimate: ErrorEstimate | None) -> float:
 class Run:
     """One forward render, by one process or by the ranks of ``group``.
 
-    ``like``, ``rays``: see :func:`torchpt.scene.prepare.make_wave`. ``threads``: number of worker threads; None: torch's.
+    Args:
+        scene: the scene.
+        settings: the complete settings.
+        params: tensors in place of the scene's, by dotted name, without gradients.
+        dtype: dtype of the picture and of all lanes.
+        group: the ranks that share the render; None: this process alone.
+        like: wave of an earlier render of the scene, whose world, search and kernels are reused where they fit.
+        threads: number of worker threads; None: torch's.
+        rays: origins and directions ``(..., 3)`` in place of the camera's rays.
 
     Attributes:
-        picture: films of the picture and its AOVs.
+        picture: the pixel set of the picture, with its film and those of AOVs.
+        surface_layers: the AOVs of first surfaces, by name.
         probes: the error probes; None without an error estimate.
         engine: traces the paths; ``tasks`` is the same engine if it is compiled, else None.
+        unsupported: why a stage cannot be compiled; None: all can, as far as is known.
         taken: samples a pixel of the finished passes.
         done: number of paths traced, by all ranks.
-        left: number of paths of this pass that are not traced yet.
-        lost: the non-finite samples.
-        light: sum of all samples before and after the firefly clamp ``(2,)`` float64.
-        stop: the stop rules.
-        ended: True once ``on_progress`` stopped the render.
-        keeps: True if the render has a checkpoint, which the first rank writes.
-        split: this rank's share; None for a single process.
-        eager: why stages run by tensor operations although kernels were requested.
+        ray_counts: rays traced, and paths cut off at the hard limit of depth.
+        paths_left: number of paths of this pass that are not traced yet.
+        nonfinite: the non-finite samples.
+        clamp_sums: sum of all samples before and after the firefly clamp ``(2,)`` float64.
+        stop_rules: the stop rules.
+        stopped_by_caller: True once ``on_progress`` stopped the render.
+        has_checkpoint: True if the render has a checkpoint, which the first rank writes.
+        distributed: this rank's share; None for a single process.
+        eager_reasons: why stages run by tensor operations although kernels were requested.
     """
 
     def __init__(
@@ -89,131 +106,149 @@ class Run:
         rays: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         self.start = time.perf_counter()
-        self._compiled_before = compile_time.seconds()
-        self._kernels = 0.0  # seconds of compiling for an engine that was given up
-        self.split = None if group is None or group.size == 1 else DistributedRender(group)
-        self.shared: tuple[int, int] = 0, 1  # samples before this pass, and the number of ranks that share it
-        self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
+        self._compile_seconds_before = compile_time.seconds()
+        self._discarded_compile_seconds = 0.0  # seconds of compiling for an engine that was given up
+        self.distributed = None if group is None or group.size == 1 else DistributedRender(group)
+        self.done_before_pass, self.sharing_ranks = 0, 1  # paths of all ranks before this pass; ranks that share it
+        self.settings, self.device = settings, scene.device
+        self.unit = scene.space.unit  # length of the world's unit, in scene units
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
         meter, limit = MemoryMeter(self.device), settings.render.max_memory
-        before = 0 if limit is None else meter.peak()
+        peak_before = 0 if limit is None else meter.peak()  # bytes
         compiled = uses_kernels(settings, self.device, dtype)
         self.wave = retry_out_of_memory(
             lambda: f"a scene of {scene.size_phrase}",
             lambda: make_wave(scene, settings, params, dtype, like=like, rays=rays),
         )
-        built = before if limit is None else meter.peak()
+        peak_built = peak_before if limit is None else meter.peak()
         _, _, self.width, self.height = self.wave.crop
         self.params, self.dtype = params, dtype
         self.integrator = settings.integrator
-        self.seen = surface_layers(settings)
+        self.surface_layers = surface_layers(settings)
         self.on_progress: Callable[[Progress], bool | None] | None = None
-        self.eager: list[str] = []
+        self.eager_reasons: list[str] = []
         self.unsupported: Unsupported | None = None
         self.checkpoint_file: CheckpointFile | None = None
-        self.warned = False  # of a checkpoint that cannot be written
-        self.keeps = settings.render.checkpoint is not None
+        self._warned_of_checkpoint = False  # that one cannot be written
+        self.has_checkpoint = settings.render.checkpoint is not None
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
             self.checkpoint_file = CheckpointFile(settings.render.checkpoint, identity(scene, settings, params, dtype))
             self.checkpoint_file.check(settings.render.resume)
-        self.tasks: Tasks | None = kernel_engine(scene, self.wave, self.eager, threads) if compiled else None
-        self.engine: Forward = self._by_tensors() if self.tasks is None else self.tasks
-        rows = self.engine.rows(self.seen)
-        how = "compiled" if self.engine.compiled else "eager"
-        self.need = memory_estimate(settings, self.device, how, len(self.wave.context.world.materials.models), rows)
+        self.tasks: Tasks | None = kernel_engine(scene, self.wave, self.eager_reasons, threads) if compiled else None
+        self.engine: Forward = self._tensor_engine() if self.tasks is None else self.tasks
+        words_per_lane = self.engine.rows(self.surface_layers)  # 32-bit words of a lane in a worker's memory
+        models = len(self.wave.context.world.materials.models)
+        self.memory_need = memory_estimate(settings, self.device, self._how(), models, words_per_lane)
         if limit is not None:
-            loading = max(scene.peak, built - meter.base() if built > before else 0)
-            check_memory(limit, self.device, self.need.least, loading)
+            loading = max(scene.peak, peak_built - meter.base() if peak_built > peak_before else 0)
+            check_memory(limit, self.device, self.memory_need.least, loading)
             if self.engine.compiled:
-                self.engine.budget.fit(self.need.left(limit, meter.above()), 4 * rows, FEWEST_OF_KERNELS)
-        films = mb(self.need.films)
-        retry_out_of_memory(lambda: f"films of {self.width} x {self.height} pixels, which take {films}", self._begin)
-        self._compiled = self.compile_seconds()
-        self.build_seconds = time.perf_counter() - self.start - self._compiled
+                self.engine.budget.fit(
+                    self.memory_need.left(limit, meter.above()), 4 * words_per_lane, FEWEST_OF_KERNELS
+                )
+        films = mb(self.memory_need.films)
+        retry_out_of_memory(lambda: f"films of {self.width} x {self.height} pixels, which take {films}", self._reset)
+        self._setup_compile_seconds = self.compile_seconds()  # those before the first sample
+        self.build_seconds = time.perf_counter() - self.start - self._setup_compile_seconds
 
-    def _by_tensors(self) -> Forward:
+    def _how(self) -> str:
+        """Return how the render runs: ``compiled`` or ``eager``."""
+        return "compiled" if self.engine.compiled else "eager"
+
+    def _tensor_engine(self) -> Forward:
+        """Return an engine of tensor operations, with as many lanes at once as memory allows."""
         lanes = LANES.get(self.device.type, LANES["cpu"])
         limit, what = self.settings.render.max_memory, "a wave of a single lane"
         return forward_tensors(
             self.wave, Budget(self.device, lanes, what=what, limit=limit, bytes_per_lane=BYTES_PER_LANE)
         )
 
-    def _begin(self) -> None:
+    def _reset(self) -> None:
         """Set films and counts to zero."""
-        device, streams = self.device, self.wave.sampler.streams
-        splats, channels = self.integrator.splats, [len(x.channels) for x in self.seen.values()]
-        check_film(self.width, self.height, streams.count, channels, device, splats=splats)
-        film = Film(self.width, self.height, streams.count, device, splats=splats)
+        device, randomizations, splats = self.device, self.wave.sampler.streams, self.integrator.splats
+        channels = [len(layer.channels) for layer in self.surface_layers.values()]
+        check_film(self.width, self.height, randomizations.count, channels, device, splats=splats)
+        film = Film(self.width, self.height, randomizations.count, device, splats=splats)
         layers = {
-            name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()
+            name: Film(self.width, self.height, 1, device, len(layer.channels))
+            for name, layer in self.surface_layers.items()
         }
-        self.picture = PixelSet(film, layers, streams)
+        self.picture = PixelSet(film, layers, randomizations)
         self.probes = error_probes(self.wave, self.settings, device) if self.settings.pilots else None
-        self.tally, self.done, self.left, self.taken, self.ended = RayCounts(), 0, 0, 0, False
-        self._final_checkpoint_written = False  # later samples are taken again after a resume
-        self.cut = False  # True once spp or the time limit shortened an adaptive round
-        self.before = 0.0  # seconds of sampling before the checkpoint that was resumed
-        bounded = self.keeps or self.split is not None  # a lost rank is noticed between passes
-        self.stop = StopRules(self.settings.render, streams.count, EVERY if bounded else None)
+        self.ray_counts, self.done, self.paths_left, self.taken, self.stopped_by_caller = RayCounts(), 0, 0, 0, False
+        self._final_checkpoint_written = False  # no more are written: a resume repeats the samples after it
+        self.round_was_shortened = False  # True once spp or the time limit made an adaptive round less than double
+        self.seconds_before_resume = 0.0  # seconds of sampling before the checkpoint that was resumed
+        # Checkpoints are written, and lost ranks noticed, between passes: so these must not be long.
+        bounded = self.has_checkpoint or self.distributed is not None
+        self.stop_rules = StopRules(
+            self.settings.render, randomizations.count, longest_pass_seconds=EVERY if bounded else None
+        )
         if self.probes is not None:
-            self.stop.after = self.probes.resampling_share(self.width * self.height)
-        if self.split is not None:
-            self.split.begin()
-        self.lost = NonFinite()
-        self._before_resampling: tuple[dict[str, Any], Tensor] = (
-            {},
-            torch.empty(0),
-        )  # counts before outliers were resampled
-        self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
-        self.begun: float | None = None
+            self.stop_rules.resampling_share = self.probes.resampling_share(self.width * self.height)
+        if self.distributed is not None:
+            self.distributed.forget_parts()
+        self.nonfinite = NonFinite()
+        # Counts, and light before and after the clamp, as they were before outliers were resampled.
+        self._before_resampling: tuple[dict[str, Any], Tensor] = ({}, torch.empty(0))
+        self.clamp_sums = torch.zeros(2, dtype=torch.float64, device=device)
+        self.sampling_start: float | None = None  # of the clock; None before the first sample
 
     def sample_all(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, until a stop rule or ``on_progress`` ends the render, and return the rendering."""
         self.on_progress = on_progress
-        self.stop.watched = on_progress is not None or self.settings.adaptive or self.keeps or self.split is not None
+        self.stop_rules.picture_is_watched = (
+            on_progress is not None or self.settings.adaptive or self.has_checkpoint or self.distributed is not None
+        )
         try:
             with explain_out_of_memory("a render"):
-                self._all()
-                self._join()
+                self._sample_with_fallback()
+                self._join_films()
         except LostRankError as error:
-            if not self.keeps:
+            if not self.has_checkpoint:
                 raise
             raise LostRankError(f"{error}; render.resume=true goes on from the last checkpoint") from None
-        return self._final()
+        return self._finish()
 
-    def all_spans(self) -> list[tuple[PixelSet, int, int]] | None:
-        """Return the spans of the whole render; their results go to :meth:`task_finished`, and then :meth:`finish` ends it.
+    def all_spans(self) -> list[SampleRange] | None:
+        """Return the spans of the whole render, for a caller (``many.py``) that schedules their tasks.
 
-        None if it must run by :meth:`sample_all`: without kernels, with stop rules besides ``spp``, or in bounded memory.
+        The caller passes each result to :meth:`task_finished`, and then calls :meth:`finish`. None if the render must run by
+        :meth:`sample_all`: without kernels, with stop rules besides ``spp``, or in bounded memory.
         """
-        ends = self.keeps or self.stop.open or self.probes is not None or self.split is not None
-        if self.tasks is None or ends or self.settings.render.max_memory is not None:
+        works_between_passes = (
+            self.has_checkpoint
+            or self.stop_rules.has_other_rules
+            or self.probes is not None
+            or self.distributed is not None
+        )
+        if self.tasks is None or works_between_passes or self.settings.render.max_memory is not None:
             return None
-        self.begun = time.perf_counter()
+        self.sampling_start = time.perf_counter()
         return [(self.picture, 0, self.settings.render.spp)]
 
-    def finish(self, rest: list[Block]) -> Rendering:
-        """Return the rendering of :meth:`all_spans`, after taking the blocks in ``rest``, put back when memory ran out."""
+    def finish(self, unfinished: list[Block]) -> Rendering:
+        """Return the rendering of :meth:`all_spans`, after taking the ``unfinished`` blocks, for which memory ran out."""
         with explain_out_of_memory("a render"):
             if self.unsupported is not None:
                 self._restart_by_tensors(self.unsupported)
             else:
-                if rest:
+                if unfinished:
                     assert self.tasks is not None
-                    self.tasks.retry_blocks(rest, self.task_finished)
+                    self.tasks.retry_blocks(unfinished, self.task_finished)
                 self.taken = self.settings.render.spp
-                self.stop.update(self.taken, self.seconds_of_sampling(), None)
-        return self._final()
+                self.stop_rules.update(self.taken, self.seconds_of_sampling(), None)
+        return self._finish()
 
-    def _final(self) -> Rendering:
-        mark_loaded("compiled" if self.engine.compiled else "eager")
+    def _finish(self) -> Rendering:
+        mark_loaded(self._how())
         self.engine.release_workers(keeps=self.settings.render.max_memory is None)
         return finished_rendering(self)
 
-    def _all(self) -> None:
-        """Take all samples; by tensor operations if kernels cannot be made."""
+    def _sample_with_fallback(self) -> None:
+        """Take all samples; start again by tensor operations where a kernel cannot be made."""
         try:
-            self._complete()
+            self._sample_and_resample()
         except Unsupported as error:
             if not self.engine.compiled:
                 raise
@@ -227,84 +262,86 @@ class Run:
         """
         if self.settings.render.compile == "on":
             raise SceneError("render.compile", "on", f"auto or off (no kernel can be made of {error})")
-        self.eager.append(f"all stages: {error}")
+        self.eager_reasons.append(f"all stages: {error}")
         warn_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
-        self._kernels += self.engine.seconds
-        self.tasks, self.engine = None, self._by_tensors()
-        self._begin()
-        self._complete()
+        self._discarded_compile_seconds += self.engine.seconds
+        self.tasks, self.engine = None, self._tensor_engine()
+        self._reset()
+        self._sample_and_resample()
 
     # -- passes
 
-    def _complete(self) -> None:
+    def _sample_and_resample(self) -> None:
         """Take the samples of the picture, and then those of outliers for the error estimate."""
         self._resume()
-        self._sample()
-        self._join()
-        if not self.ended:
+        self._sample_picture()
+        self._join_films()
+        if not self.stopped_by_caller:
             self._resample_outliers()
 
     def _resample_outliers(self) -> None:
         """Resample outliers for the error estimate, unless that was done at this number of samples."""
-        if self.probes is None or self.probes.resampled_at == self._mean():
+        if self.probes is None or self.probes.resampled_at == self._mean_spp():
             return
-        self._before_resampling = self._counted()
-        again = self.probes.resample_outliers(self.picture.film, None if self.split is None else self.split.places)
-        if not self._take(again):
+        self._before_resampling = self._counts_and_light()
+        from_first_rank = None if self.distributed is None else self.distributed.from_first_rank
+        if not self._take_samples(self.probes.resample_outliers(self.picture.film, from_first_rank)):
             self.probes.resampled = None
-        self._join()
+        self._join_films()
 
-    def _sample(self) -> None:
+    def _sample_picture(self) -> None:
         """Take passes until a rule ends the render."""
-        self.begun = time.perf_counter()
-        while not self._adapts() and (size := self.stop.step(self.taken)):
-            if self.settings.adaptive:  # the first round is the same whatever spp and the seconds of a pass
-                size = min(size, FIRST_ROUND - self.taken)
-            spans = [(self.picture, self.taken, size)]
+        self.sampling_start = time.perf_counter()
+        while not self._is_adaptive_round() and (spp := self.stop_rules.next_pass_spp(self.taken)):
+            if self.settings.adaptive:  # the first round is the same whatever render.spp and the seconds of a pass
+                spp = min(spp, FIRST_ROUND - self.taken)
+            spans = [(self.picture, self.taken, spp)]
             if self.probes is not None:
-                spans.append((self.probes.pixel_set, self.taken, size))
-            if not self._take(spans):
+                spans.append((self.probes.pixel_set, self.taken, spp))
+            if not self._take_samples(spans):
                 return
-            self.taken += size
-            self._reached(self.taken, self.seconds_of_sampling())
-            self._keep()
-        if self._adapts():
-            self._adapt()
-        if not self.ended:
-            self._keep(last=True)
+            self.taken += spp
+            self._update_stop_rules(self.taken, self.seconds_of_sampling())
+            self._write_checkpoint_if_due()
+        if self._is_adaptive_round():
+            self._sample_adaptively()
+        if not self.stopped_by_caller:
+            self._write_checkpoint_if_due(last=True)
 
-    def _adapts(self) -> bool:
+    def _is_adaptive_round(self) -> bool:
         """Return True once error probes decide where samples go."""
         return self.probes is not None and self.settings.adaptive and self.taken >= FIRST_ROUND
 
-    def _adapt(self) -> None:
+    def _sample_adaptively(self) -> None:
         """Take adaptive rounds, each of which doubles the samples."""
         assert self.probes is not None
-        self._join()
+        self._join_films()
         allocation = SampleAllocation(
-            self.probes.pilots, self.picture.film, None if self.split is None else self.split.places
+            self.probes.pilots,
+            self.picture.film,
+            None if self.distributed is None else self.distributed.from_first_rank,
         )
-        mean = self._mean()
-        while self.stop.should_continue(mean):
+        mean = self._mean_spp()
+        while self.stop_rules.should_continue(mean):  # mean samples a pixel so far
             requested = min(2.0 * mean, float(self.settings.render.spp)) - mean
-            more = self.stop.affordable(requested)
+            more = self.stop_rules.affordable_spp(requested)  # mean samples a pixel of this round
             last = more == requested and more < mean and mean + more >= self.settings.render.spp
-            spans = allocation.spans(self.picture, self.probes, mean + more, last)
+            spans = allocation.spans(self.picture, self.probes, mean + more, last=last)
             if not spans:  # not enough samples are left for one block
-                self.stop.reason = "spp" if more == requested else "time_limit"
+                self.stop_rules.reason = "spp" if more == requested else "time_limit"
                 break
-            if last and SMALL_ROUND * more < mean and not self.cut:  # cheap to repeat, with any spp
-                self._keep(last=True)
+            if last and SMALL_ROUND * more < mean and not self.round_was_shortened:  # cheap to repeat, with any spp
+                self._write_checkpoint_if_due(last=True)
                 self._final_checkpoint_written = True
-            self.cut |= more < mean
-            whole = self._take(spans)
-            self._join()
+            self.round_was_shortened |= more < mean
+            all_taken = self._take_samples(spans)
+            self._join_films()
             allocation.merge()
-            if not whole:
+            if not all_taken:
                 break
-            mean = self._mean()
-            self._reached(mean, self.seconds_of_sampling())
-            self._keep()
+            mean = self._mean_spp()
+            self._update_stop_rules(mean, self.seconds_of_sampling())
+            self._write_checkpoint_if_due()
 
     # -- checkpoints
 
@@ -314,91 +351,100 @@ class Run:
         films |= {f"layers.{name}": film for name, film in self.picture.layers.items()}
         return films if self.probes is None else films | {"pilots": self.probes.pixel_set.film}
 
-    def _keep(self, last: bool = False) -> None:
-        """Write a checkpoint if one is due."""
-        if not self.keeps or self._final_checkpoint_written:
+    def _write_checkpoint_if_due(self, *, last: bool = False) -> None:
+        """Write a checkpoint if the first rank is due to; ``last``: no samples follow, so it is due."""
+        if not self.has_checkpoint or self._final_checkpoint_written:
             return
-        due = self.checkpoint_file is not None and (last or self.checkpoint_file.due())
-        if due if self.split is None else self.split.due(due):
-            self._join()
+        due = self.checkpoint_file is not None and (last or self.checkpoint_file.is_due())
+        if due if self.distributed is None else self.distributed.is_due(due):
+            self._join_films()
             if self.checkpoint_file is not None:
-                self._write(self.checkpoint_file)
+                self._write_checkpoint(self.checkpoint_file)
 
-    def _write(self, checkpoint_file: CheckpointFile) -> None:
+    def _write_checkpoint(self, checkpoint_file: CheckpointFile) -> None:
         """Write a checkpoint; if that fails, warn and go on: the picture may still be written elsewhere."""
         try:
-            checkpoint_file.write(self._state())
+            checkpoint_file.write(self._render_state())
         except OutputError as problem:
-            if not self.warned:
+            if not self._warned_of_checkpoint:
                 print(f"torchpt: {problem}; the render goes on without it", file=sys.stderr, flush=True)
-            self.warned = True
+            self._warned_of_checkpoint = True
 
-    def _state(self) -> RenderState:
+    def _render_state(self) -> RenderState:
         """Return the state for a checkpoint."""
-        resampled_at = (
-            self.probes is not None and self.probes.resampled_at == self._mean()
-        )  # outliers are resampled after a resume
-        counted, light = self._before_resampling if resampled_at else self._counted()
-        facts = {"taken": self.taken, "seconds": self.seconds_of_sampling(), "cut": int(self.cut), **counted}
+        # Third values are not saved: after a resume outliers are resampled, so their counts are left out here.
+        is_resampled = self.probes is not None and self.probes.resampled_at == self._mean_spp()
+        counted, light = self._before_resampling if is_resampled else self._counts_and_light()
+        # `cut` in the file: `round_was_shortened`.
+        facts = {
+            "taken": self.taken,
+            "seconds": self.seconds_of_sampling(),
+            "cut": int(self.round_was_shortened),
+            **counted,
+        }
         arrays = {f"{name}.{key}": value for name, film in self.films().items() for key, value in film.state().items()}
         return RenderState(facts, arrays | {"light": light})
 
-    def _counted(self) -> tuple[dict[str, Any], Tensor]:
+    def _counts_and_light(self) -> tuple[dict[str, Any], Tensor]:
         """Return the counts by name, and the light before and after the clamp."""
-        counts = {"done": self.done, "rays": self.tally.rays, "truncated": self.tally.truncated}
-        return {**counts, "lost": self.lost.plain()}, self.light.clone()
+        counts = {"done": self.done, "rays": self.ray_counts.rays, "truncated": self.ray_counts.truncated}
+        return {**counts, "lost": self.nonfinite.plain()}, self.clamp_sums.clone()
 
-    def _mean(self) -> float:
+    def _mean_spp(self) -> float:
         """Return the mean samples a pixel of the picture."""
         return float(self.picture.film.counts.double().mean())
 
     def _resume(self) -> None:
         """Restore the checkpoint if ``render.resume`` is set and there is one."""
-        if not self.keeps or not self.settings.render.resume:
+        if not self.has_checkpoint or not self.settings.render.resume:
             return
-        state = None if self.checkpoint_file is None else self._kept(self.checkpoint_file)
+        state = None if self.checkpoint_file is None else self._read_checkpoint(self.checkpoint_file)
         if state is None and self.checkpoint_file is not None:
             warn_once(f"torchpt: there is no checkpoint {self.checkpoint_file.path} yet: the render starts anew")
-        if self.split is not None:
-            state = self.split.state(state, self._state())
+        if self.distributed is not None:
+            state = self.distributed.broadcast_state(state, self._render_state())
         if state is None:
             return
         for name, film in self.films().items():
             film.restore({key: state.arrays[f"{name}.{key}"].to(self.device) for key in film.state()})
-        self.lost, self.light = NonFinite.read(state.facts["lost"]), state.arrays["light"].to(self.device)
-        self.taken, self.done, self.before = (state.facts[name] for name in ("taken", "done", "seconds"))
-        self.tally.rays, self.tally.truncated = state.facts["rays"], state.facts["truncated"]
-        self.cut = bool(state.facts["cut"])
-        mean = self._mean() if self._adapts() else self.taken
-        self._reached(mean, self.before)
+        self.nonfinite, self.clamp_sums = NonFinite.read(state.facts["lost"]), state.arrays["light"].to(self.device)
+        self.taken, self.done, self.seconds_before_resume = (state.facts[name] for name in ("taken", "done", "seconds"))
+        self.ray_counts.rays, self.ray_counts.truncated = state.facts["rays"], state.facts["truncated"]
+        self.round_was_shortened = bool(state.facts["cut"])
+        mean = self._mean_spp() if self._is_adaptive_round() else self.taken
+        self._update_stop_rules(mean, self.seconds_before_resume)
 
-    def _kept(self, checkpoint_file: CheckpointFile) -> RenderState | None:
+    def _read_checkpoint(self, checkpoint_file: CheckpointFile) -> RenderState | None:
         """Return the validated checkpoint; None if there is none."""
-        state = checkpoint_file.read(self._state(), lambda state: check_samples(self, state, checkpoint_file.path))
+        state = checkpoint_file.read(
+            self._render_state(), lambda state: check_samples(self, state, checkpoint_file.path)
+        )
         if state is not None:
             check_plausible(self, state, checkpoint_file.path)
         return state
 
-    def _reached(self, mean: float, seconds: float) -> None:
+    def _update_stop_rules(self, mean: float, seconds: float) -> None:
         """Update the stop rules with the samples, seconds and error so far, as the first rank has them."""
         if self.settings.render.target_error is not None:
-            self._join()
-        error = self._probe_error_bound() if self.stop.checks_error(mean, self._adapts()) else None
-        if self.split is not None:
-            seconds, error = self.split.broadcast_numbers(seconds, error)
+            self._join_films()
+        checks_error = self.stop_rules.checks_error(mean, adaptive=self._is_adaptive_round())
+        error = self._probe_error_bound() if checks_error else None
+        if self.distributed is not None:
+            seconds, error = self.distributed.broadcast_numbers(seconds, error)
         target = self.settings.render.target_error
+        # Resampling takes samples: only where the probes alone say that the target is reached.
         if error is not None and target is not None and error <= target:
             error = self._error_bound()
-            if self.split is not None:
-                _, error = self.split.broadcast_numbers(seconds, error)
-            if (error is None or error > target) and not self.ended:
+            if self.distributed is not None:
+                _, error = self.distributed.broadcast_numbers(seconds, error)
+            if (error is None or error > target) and not self.stopped_by_caller:
                 self._undo_resampling()
-        self.stop.update(mean, seconds, error)
+        self.stop_rules.update(mean, seconds, error)
 
-    def _join(self) -> None:
+    def _join_films(self) -> None:
         """Make the films whole on every rank."""
-        if self.split is not None:
-            self.split.join()
+        if self.distributed is not None:
+            self.distributed.join()
 
     def _probe_error_bound(self) -> float:
         """Return the upper end of the interval of relMSE that the error probes give."""
@@ -410,14 +456,14 @@ class Run:
         assert self.probes is not None
         self._resample_outliers()
         estimate, unknown = error_estimate_of(self, self.probes.picture(self.picture.film))
-        return math.inf if self.ended or unknown else _upper_bound(estimate)
+        return math.inf if self.stopped_by_caller or unknown else _upper_bound(estimate)
 
     def _undo_resampling(self) -> None:
         """Restore the counts before outliers were resampled: the picture gets more samples, and they will be again."""
         assert self.probes is not None
-        counts, self.light = self._before_resampling
-        self.done, self.tally = counts["done"], RayCounts(counts["rays"], counts["truncated"])
-        self.lost = NonFinite.read(counts["lost"])
+        counts, self.clamp_sums = self._before_resampling
+        self.done, self.ray_counts = counts["done"], RayCounts(counts["rays"], counts["truncated"])
+        self.nonfinite = NonFinite.read(counts["lost"])
         self.probes.resampled, self.probes.resampled_at = None, None
 
     def geometry(self) -> Geometry:
@@ -427,14 +473,20 @@ class Run:
 
     def seconds_of_sampling(self) -> float:
         """Return the seconds of sampling, without compiling kernels and writing checkpoints."""
-        if self.begun is None:
+        if self.sampling_start is None:
             return 0.0
-        made = self.compile_seconds() - self._compiled
-        return self.before + max(time.perf_counter() - self.begun - made - self.write_seconds(), 0.0)
+        compiling = self.compile_seconds() - self._setup_compile_seconds  # kernels made at their first call
+        elapsed = time.perf_counter() - self.sampling_start
+        return self.seconds_before_resume + max(elapsed - compiling - self.write_seconds(), 0.0)
 
     def compile_seconds(self) -> float:
         """Return the seconds of compiling kernels since the start: of stages and of the search."""
-        return self._kernels + self.engine.seconds + compile_time.seconds() - self._compiled_before
+        return (
+            self._discarded_compile_seconds
+            + self.engine.seconds
+            + compile_time.seconds()
+            - self._compile_seconds_before
+        )
 
     def write_seconds(self) -> float:
         """Return the seconds of writing checkpoints."""
@@ -442,68 +494,76 @@ class Run:
 
     # -- samples of a pass
 
-    def _take(self, spans: list[tuple[PixelSet, int, int]]) -> bool:
+    def _take_samples(self, spans: list[SampleRange]) -> bool:
         """Take the samples of spans (pixels, first sample, count); return True if all were taken."""
         if not spans:
             return True
-        if self.split is None:
+        if self.distributed is None:
             return self.take_alone(spans)
-        whole = self.split.take(self, spans)
+        all_taken = self.distributed.take(self, spans)
         if self.settings.render.preview is not None:
-            self._join()
-            self._advanced(0, True)
-        return whole
+            self._join_films()
+            self._report_progress(0, pass_finished=True)
+        return all_taken
 
-    def take_alone(self, spans: list[tuple[PixelSet, int, int]]) -> bool:
+    def take_alone(self, spans: list[SampleRange]) -> bool:
         """Take the samples of spans in this process; return True if all were taken."""
-        self.left = sum(pixel_set.film.width * pixel_set.film.height * samples for pixel_set, _, samples in spans)
+        self.paths_left = sum(pixel_set.film.width * pixel_set.film.height * samples for pixel_set, _, samples in spans)
         return self.engine.run(spans, self.task_finished)
 
-    def task_finished(self, share: TaskResult | None) -> bool:
-        """Add the counts of a finished task; return True if the render is to stop."""
-        if share is None:
-            return self._advanced(0, False)
-        self.tally.rays += share.tally.rays
-        self.tally.truncated += share.tally.truncated
-        self._count(share.lost)
+    def task_finished(self, result: TaskResult | None) -> bool:
+        """Add the counts of a finished task (None: none finished for a while); return True if the render is to stop."""
+        if result is None:
+            return self._report_progress(0, pass_finished=False)
+        self.ray_counts.rays += result.tally.rays
+        self.ray_counts.truncated += result.tally.truncated
+        self._add_nonfinite(result.lost)
         if self.integrator.clamp is not None:
-            self.light += torch.tensor(share.light, dtype=torch.float64, device=self.device)
-        self.left -= share.samples
-        return self._advanced(share.samples, self.left == 0 and self.split is None)
+            self.clamp_sums += torch.tensor(result.light, dtype=torch.float64, device=self.device)
+        self.paths_left -= result.samples
+        pass_finished = self.paths_left == 0 and self.distributed is None
+        return self._report_progress(result.samples, pass_finished=pass_finished)
 
-    def _advanced(self, samples: int, ends: bool) -> bool:
-        """Count samples and call ``on_progress``; return True if the render is to stop."""
-        self.done += samples
-        if self.on_progress is None or self.ended:  # other threads' tasks still finish after a stop
-            return self.ended
+    def _report_progress(self, paths: int, *, pass_finished: bool) -> bool:
+        """Count ``paths`` as done and call ``on_progress``; return True if the render is to stop."""
+        self.done += paths
+        if self.on_progress is None or self.stopped_by_caller:  # other threads' tasks still finish after a stop
+            return self.stopped_by_caller
         seconds = time.perf_counter() - self.start
-        before, ranks = self.shared  # other ranks have taken about as many
-        done = before + ranks * (self.done - before)
-        state = Progress(done, max(self._total(), done), self.tally.rays, seconds, ends, self.result)
-        requested = bool(self.on_progress(state))
-        if samples or ranks > 1 or self.split is None:  # ranks stop together, after a pass
-            self.ended = requested and self.done < self.asked()
-        return self.ended
+        # Other ranks have traced about as many paths of this pass as this one.
+        done = self.done_before_pass + self.sharing_ranks * (self.done - self.done_before_pass)
+        state = Progress(
+            done=done,
+            total=max(self._expected_paths(), done),
+            rays=self.ray_counts.rays,
+            seconds=seconds,
+            pass_finished=pass_finished,
+            snapshot=self.snapshot,
+        )
+        stop_requested = bool(self.on_progress(state))
+        if paths or self.sharing_ranks > 1 or self.distributed is None:  # ranks stop together, after a pass
+            self.stopped_by_caller = stop_requested and self.done < self.requested_paths()
+        return self.stopped_by_caller
 
-    def _total(self) -> int:
+    def _expected_paths(self) -> int:
         """Return the expected number of paths: fewer than ``spp`` gives where time or error end the render."""
-        asked = self.asked()
-        if not self.stop.open or self.stop.share <= 0.0:
-            return max(asked, self.done)
-        return max(min(asked, round(self.done / self.stop.share)), self.done)
+        requested = self.requested_paths()
+        if not self.stop_rules.has_other_rules or self.stop_rules.progress <= 0.0:
+            return max(requested, self.done)
+        return max(min(requested, round(self.done / self.stop_rules.progress)), self.done)
 
-    def asked(self) -> int:
+    def requested_paths(self) -> int:
         """Return the number of paths of ``render.spp`` samples, error probes included."""
         pixels = self.width * self.height + (0 if self.probes is None else len(self.probes.pilots))
         return pixels * self.settings.render.spp
 
-    def _count(self, lost: NonFinite) -> None:
-        """Count non-finite samples; with ``integrator.strict`` raise RenderError at the first one."""
-        if lost.count and self.integrator.strict:
-            raise RenderError(f"integrator.strict: {describe_sample(self.scene, self.wave, lost.samples[0])}")
-        self.lost.add(lost)
+    def _add_nonfinite(self, found: NonFinite) -> None:
+        """Add the non-finite samples of a task; with ``integrator.strict`` raise RenderError at the first one."""
+        if found.count and self.integrator.strict:
+            raise RenderError(f"integrator.strict: {describe_sample(self.scene, self.wave, found.samples[0])}")
+        self.nonfinite.add(found)
 
-    def result(self) -> Rendering:
+    def snapshot(self) -> Rendering:
         """Return the rendering so far."""
         return rendering_of(self)
 
@@ -525,7 +585,8 @@ def render_scene(
     Args:
         scene: the scene.
         settings: the complete settings.
-        on_progress: called after every chunk; a return value of True ends the render with the picture so far.
+        on_progress: called after every chunk (the samples that are traced at once); a return value of True ends the render with
+            the picture so far.
         params: tensors in place of the scene's, without gradients.
         dtype: dtype of the picture and of all lanes.
         ranks: processes that share the work; each returns the whole picture.

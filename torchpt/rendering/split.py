@@ -1,5 +1,8 @@
 """Share a render's passes among ranks: each samples some pixels of every pixel set, then films are joined.
 
+A :class:`torchpt.rendering.run.Run` with more than one rank calls a :class:`DistributedRender` in place of its engine. A
+rank is one of the processes of ``torch.distributed`` that render the same picture.
+
 The pixels of a rank are a pixel set with films of their own. Their sums continue those of the whole film, sample by sample, so
 a joined film has the bits of a render by one process.
 """
@@ -16,6 +19,7 @@ from torch import Tensor
 from torchpt.compiler.graph import Unsupported
 from torchpt.core import tree
 from torchpt.core.version import __version__
+from torchpt.engines.engine import SampleRange
 from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts
 from torchpt.physics.film import Film
@@ -29,10 +33,7 @@ from torchpt.spec import Role
 if TYPE_CHECKING:
     from torchpt.rendering.run import Run
 
-__all__ = ["DistributedRender", "Span", "render_fingerprint"]
-
-#: Pixels, first sample, number of samples.
-Span = tuple[PixelSet, int, int]
+__all__ = ["DistributedRender", "render_fingerprint"]
 
 
 class DistributedRender:
@@ -44,42 +45,46 @@ class DistributedRender:
 
     def __init__(self, group: Group) -> None:
         self.group = group
-        self._parts: list[tuple[PixelSet, PixelSet]] = []
+        self._parts: list[tuple[PixelSet, PixelSet]] = []  # a pixel set of the render, and this rank's pixels of it
 
-    def begin(self) -> None:
-        """Forget the pixels of an earlier start."""
+    def forget_parts(self) -> None:
+        """Forget the films of an attempt that is started again."""
         self._parts.clear()
 
-    def take(self, run: Run, spans: list[Span]) -> bool:
-        """Take the samples of this rank, and add the counts of all; return True if all samples were taken.
+    def take(self, run: Run, spans: list[SampleRange]) -> bool:
+        """Take this rank's samples of a pass, add the counts of all ranks to ``run``, and return True if all were taken.
 
         Raises:
             Unsupported: a rank cannot make a kernel.
         """
-        done, rays, truncated = run.done, run.tally.rays, run.tally.truncated
-        lost, light = run.lost, run.light
-        run.lost, run.light, run.shared = NonFinite(), torch.zeros_like(light), (done, self.group.size)
+        done, rays, truncated = run.done, run.ray_counts.rays, run.ray_counts.truncated
+        nonfinite, clamp_sums = run.nonfinite, run.clamp_sums
+        run.nonfinite, run.clamp_sums = NonFinite(), torch.zeros_like(clamp_sums)  # those of this rank and pass
+        run.done_before_pass, run.sharing_ranks = done, self.group.size
         reason = ""
         try:
             run.take_alone([(self._part(pixel_set), first, count) for pixel_set, first, count in spans])
         except Unsupported as error:
             reason = str(error) or "unsupported"
-        own = run.done - done, run.tally.rays - rays, run.tally.truncated - truncated, run.lost.count
-        every = self.group.all_gather_numbers("a pass", *own, run.ended, bool(reason))
+        own = run.done - done, run.ray_counts.rays - rays, run.ray_counts.truncated - truncated, run.nonfinite.count
+        # Of each rank: paths, rays, truncated paths, non-finite samples, stopped by the caller, failed.
+        every = self.group.all_gather_numbers("a pass", *own, run.stopped_by_caller, bool(reason))
         if any(failed for *_, failed in every):
             raise Unsupported(reason or "what another rank met")
-        run.done, run.shared = done + sum(int(n) for n, *_ in every), (0, 1)
-        run.tally = RayCounts(
+        run.done = done + sum(int(paths) for paths, *_ in every)
+        run.done_before_pass, run.sharing_ranks = 0, 1
+        run.ray_counts = RayCounts(
             rays + sum(int(said[1]) for said in every), truncated + sum(int(said[2]) for said in every)
         )
         if any(said[3] for said in every):
-            lost.add(self._of_all(run.lost))
-        run.lost = lost
-        for part in self.group.gather(run.light) if run.integrator.clamp is not None else ():
-            light = light + part
-        run.light = light
-        run.ended = any(said[4] for said in every) and run.done < run.asked()
-        return not any(said[4] for said in every)
+            nonfinite.add(self._gather_nonfinite(run.nonfinite))
+        run.nonfinite = nonfinite
+        for part in self.group.gather(run.clamp_sums) if run.integrator.clamp is not None else ():
+            clamp_sums = clamp_sums + part
+        run.clamp_sums = clamp_sums
+        stopped = any(said[4] for said in every)
+        run.stopped_by_caller = stopped and run.done < run.requested_paths()
+        return not stopped
 
     def join(self) -> None:
         """Make films whole on every rank."""
@@ -93,16 +98,21 @@ class DistributedRender:
         seconds, known, error_there = self.group.broadcast_numbers("seconds", seconds, error is not None, error or 0.0)
         return seconds, error_there if known else None
 
-    def due(self, due: bool) -> bool:
-        """Return True if a checkpoint is due on the first rank."""
+    def is_due(self, due: bool) -> bool:
+        """Return True if a checkpoint is due on the first rank; ``due``: it is on this rank."""
         return bool(self.group.broadcast_numbers("a checkpoint", due)[0])
 
-    def places(self, own: Tensor) -> Tensor:
-        """Return the integers of the first rank; other processors may have rounded differently."""
+    def from_first_rank(self, own: Tensor) -> Tensor:
+        """Return the integers ``(n,)`` of the first rank in place of ``own``: other processors may round differently."""
         return self.group.first(own)
 
-    def state(self, own: RenderState | None, like: RenderState) -> RenderState | None:
-        """Return the state that the first rank read from a checkpoint, of the form of ``like``; None if it read none."""
+    def broadcast_state(self, own: RenderState | None, like: RenderState) -> RenderState | None:
+        """Return the state that the first rank read from a checkpoint; None if it read none.
+
+        Args:
+            own: what this rank read: None on all but the first.
+            like: a state whose arrays have the names, shapes and dtypes of the checkpoint's.
+        """
         text = "" if own is None else json.dumps(own.facts)
         sent = bytes(self.group.first(torch.tensor(list(text.encode()), dtype=torch.uint8)).tolist())
         if not sent:
@@ -119,27 +129,28 @@ class DistributedRender:
             if whole is pixel_set:
                 return part
         device = pixel_set.film.sums.device
-        places = dealt(pixel_set.film.width * pixel_set.film.height, self.group.rank, self.group.size).to(device)
-        layers = {name: film.extract(places) for name, film in pixel_set.layers.items()}
-        pixels = places if pixel_set.indices is None else pixel_set.indices[places]
-        part = PixelSet(pixel_set.film.extract(places), layers, pixel_set.randomizations, pixels)
+        pixels = dealt(pixel_set.film.width * pixel_set.film.height, self.group.rank, self.group.size).to(device)
+        layers = {name: film.extract(pixels) for name, film in pixel_set.layers.items()}
+        picture_pixels = pixels if pixel_set.indices is None else pixel_set.indices[pixels]
+        part = PixelSet(pixel_set.film.extract(pixels), layers, pixel_set.randomizations, picture_pixels)
         self._parts.append((pixel_set, part))
         return part
 
     def _join(self, whole: Film, own: Film) -> None:
         """Gather the pixels of all ranks into a film."""
+        # Sums are float64, counts int64: the bits of all travel as one int64 tensor.
         sent = torch.cat([value.reshape(-1).view(torch.int64) for value in own.state().values()])
         for rank, values in enumerate(self.group.gather(sent)):
-            places = dealt(whole.width * whole.height, rank, self.group.size).to(sent.device)
-            part = whole.empty_part(len(places))
+            pixels = dealt(whole.width * whole.height, rank, self.group.size).to(sent.device)
+            part = whole.empty_part(len(pixels))
             state, first = {}, 0
             for name, value in part.state().items():
                 state[name] = values[first : first + value.numel()].view(value.dtype).view(value.shape)
                 first += value.numel()
             part.restore(state)
-            whole.write_back(places, part)
+            whole.write_back(pixels, part)
 
-    def _of_all(self, own: NonFinite) -> NonFinite:
+    def _gather_nonfinite(self, own: NonFinite) -> NonFinite:
         """Return the non-finite samples of all ranks."""
         text = json.dumps(own.plain()).encode()
         every = NonFinite()
@@ -149,6 +160,7 @@ class DistributedRender:
 
 
 def _films(pixel_set: PixelSet) -> list[Film]:
+    """Return the film of a pixel set, and those of its AOVs."""
     return [pixel_set.film, *pixel_set.layers.values()]
 
 

@@ -1,4 +1,8 @@
-"""Render scenes by cameras in one call; each picture is that of ``render``, to the bit."""
+"""Render scenes by cameras in one call; each picture is that of ``render``, to the bit.
+
+For each picture :func:`render_batch` prepares a request (checked arguments of one ``render``); the pictures are rendered
+without gradients from one queue of tasks, and autograd wraps each afterwards where its request needs gradients.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ from torchpt.core.threads import limited_threads, outside_inference_mode
 from torchpt.engines.engine import TASKS
 from torchpt.paths.wave import Wave
 from torchpt.rendering import QueuedRender, Rendering, Run, render_many
-from torchpt.rendering.batches.inputs import Cameras, Seeds, cameras_of, named, params_of, scenes_of, seeds_of
+from torchpt.rendering.batches.inputs import Cameras, Seeds, cameras_of, naming_errors, params_of, scenes_of, seeds_of
 from torchpt.rendering.requests import RenderRequest, execute_request, prepare_request
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
@@ -67,24 +71,25 @@ class _Picture:
     request: RenderRequest
 
 
-Pictures = Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]] | None
+#: Tensors with a leading dimension for scenes, by name; or a mapping for each scene.
+BatchParams = Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]] | None
 
 
 @overload
 def render_batch(
-    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: Pictures = None, *, seed: Seeds = None,
+    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: BatchParams = None, *, seed: Seeds = None,
     on_progress: Callable[[int, int | None], None] | None = None, full: Literal[False] = False, **options: Unpack[BatchOptions],
 ) -> Tensor: ...  # fmt: skip
 @overload
 def render_batch(
-    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: Pictures = None, *, seed: Seeds = None,
+    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: BatchParams = None, *, seed: Seeds = None,
     on_progress: Callable[[int, int | None], None] | None = None, full: Literal[True], **options: Unpack[BatchOptions],
 ) -> Renderings: ...  # fmt: skip
 @expand_signature
 def render_batch(
     scenes: Scene | Iterable[Scene],
     cameras: Cameras = None,
-    params: Pictures = None,
+    params: BatchParams = None,
     *,
     seed: Seeds = None,
     on_progress: Callable[[int, int | None], None] | None = None,
@@ -124,41 +129,57 @@ def render_batch(
     checkpoint = options.get("checkpoint")
     if checkpoint is not None:
         raise SceneError("render.checkpoint", checkpoint, "null for a batch")
-    sets = params_of(params, scenes)
-    views = cameras_of(cameras)
-    size = len(sets or [None]) if isinstance(scenes, Scene) else len(scenes) if isinstance(scenes, Sequence) else None
-    seeds = seeds_of(seed, size, len(views))
-    several = isinstance(scenes, Scene)
-    pictures = _pictures(repeat(scenes, size or 1) if several else scenes, several, views, sets, seeds, full, options)
+    param_sets = params_of(params, scenes)
+    camera_list = cameras_of(cameras)
+    # Number of scenes; None for an iterator.
+    size = (
+        len(param_sets or [None])
+        if isinstance(scenes, Scene)
+        else len(scenes)
+        if isinstance(scenes, Sequence)
+        else None
+    )
+    shares_scene = isinstance(scenes, Scene)
+    pictures = _pictures(
+        repeat(scenes, size or 1) if shares_scene else scenes,
+        camera_list,
+        param_sets,
+        seeds_of(seed, size, len(camera_list)),
+        options,
+        shares_scene=shares_scene,
+        full=full,
+    )
     first = next(pictures, None)
     if first is None:
         raise SceneError("scenes", 0, "one scene at least")
-    total = None if size is None else size * len(views)
-    found: dict[tuple[int, int], tuple[RenderRequest | None, Rendering]] = {}
+    total = None if size is None else size * len(camera_list)
+    found: dict[tuple[int, int], tuple[RenderRequest | None, Rendering]] = {}  # by scene and camera
     with limited_threads(first.request.settings.render.threads):
+        # As many tasks for all pictures together as one render has.
         tasks = 1 if total is None else -(-TASKS * torch.get_num_threads() // total)
         _check_memory(first.request, total)
-        render_many(_entries(chain([first], pictures), found, on_progress, total), tasks)
+        render_many(_queued_renders(chain([first], pictures), found, on_progress, total), tasks)
     count = 1 + max(s for s, _ in found)
-    for key, given in (("params", sets), ("seed", seed)):
+    for key, given in (("params", param_sets), ("seed", seed)):
         if isinstance(given, Sequence | Tensor | np.ndarray) and len(given) != count:
             raise SceneError(key, len(given), f"as many as there are scenes, {count}")
     # Gradients last: autograd wraps pictures that are rendered already.
-    rows = tuple(tuple(_taped(found.pop((s, c))) for c in range(len(views))) for s in range(count))
-    image = _stacked([[r.image for r in row] for row in rows])
+    rows = tuple(tuple(_with_gradients(found.pop((s, c))) for c in range(len(camera_list))) for s in range(count))
+    image = _stack([[r.image for r in row] for row in rows])
     if not full:
         return image
-    layers = {name: _stacked([[r.layers[name] for r in row] for row in rows]) for name in rows[0][0].layers}
+    layers = {name: _stack([[r.layers[name] for r in row] for row in rows]) for name in rows[0][0].layers}
     smooth = [[r.denoised for r in row if r.denoised is not None] for row in rows]
-    return Renderings(image, layers, _stacked(smooth) if smooth[0] else None, rows)
+    return Renderings(image, layers, _stack(smooth) if smooth[0] else None, rows)
 
 
-def _stacked(rows: list[list[Tensor]]) -> Tensor:
+def _stack(rows: list[list[Tensor]]) -> Tensor:
+    """Return pictures ``(H, W, C)`` of scenes by cameras as one tensor ``(scenes, cameras, H, W, C)``."""
     with outside_inference_mode():
         return torch.stack([torch.stack(row) for row in rows])
 
 
-def _taped(found: tuple[RenderRequest | None, Rendering]) -> Rendering:
+def _with_gradients(found: tuple[RenderRequest | None, Rendering]) -> Rendering:
     """Return a rendering with autograd; without a request it needs none."""
     request, rendering = found
     return rendering if request is None else execute_request(request, [rendering])
@@ -166,45 +187,61 @@ def _taped(found: tuple[RenderRequest | None, Rendering]) -> Rendering:
 
 def _pictures(
     scenes: Iterable[Scene],
-    several: bool,
     cameras: Sequence[Mapping[str, Any] | Tensor | None],
-    sets: Sequence[Mapping[str, Tensor]] | None,
-    seeds: Any,
-    full: bool,
+    param_sets: Sequence[Mapping[str, Tensor]] | None,
+    seeds: Callable[[int, int], Any],
     options: BatchOptions,
+    *,
+    shares_scene: bool,
+    full: bool,
 ) -> Iterator[_Picture]:
-    """Yield the pictures, those of a scene together; ``several``: they share one scene with different parameters."""
-    like: dict[str, Any] = {}
+    """Yield the pictures, those of a scene together.
+
+    Args:
+        scenes: the scenes, in order.
+        cameras: the cameras; None: the scene's own.
+        param_sets: parameters of each scene; None: none.
+        seeds: returns the seed of scene ``s`` and camera ``c``.
+        options: arguments of ``render`` for all pictures.
+        shares_scene: True: all scenes are one, with different parameters.
+        full: as for :func:`render_batch`.
+
+    Raises:
+        SceneError: an argument is not accepted, or a film differs from that of the first picture.
+    """
+    first_facts: dict[str, Any] = {}
     versions: WeakKeyDictionary[Scene, dict[str, int]] = WeakKeyDictionary()
-    for s, each in enumerate(scenes):
-        scene = as_scene(each, f"scenes[{s}]")
-        if not several:  # earlier pictures of the scene may still be in work
-            with named(f"scenes[{s}]", None):
+    for s, candidate in enumerate(scenes):
+        scene = as_scene(candidate, f"scenes[{s}]")
+        if not shares_scene:  # earlier pictures of the scene may still be in work
+            with naming_errors(f"scenes[{s}]", None):
                 now = scene.versions()
                 check_unchanged(versions.setdefault(scene, now), now, "while the batch has it")
-        if sets is not None and s >= len(sets):
-            raise SceneError("params", len(sets), "as many as there are scenes")
+        if param_sets is not None and s >= len(param_sets):
+            raise SceneError("params", len(param_sets), "as many as there are scenes")
         for c, camera in enumerate(cameras):
-            name = ("" if sets is None else f"params[{s}]") if several else f"scenes[{s}]"
-            with named(name, c if camera is not None else None):
-                request = _ordered(scene, camera, {} if sets is None else sets[s], seeds(s, c), full, options)
+            name = ("" if param_sets is None else f"params[{s}]") if shares_scene else f"scenes[{s}]"
+            with naming_errors(name, c if camera is not None else None):
+                params = {} if param_sets is None else param_sets[s]
+                request = _request(scene, camera, params, seeds(s, c), options, full=full)
                 film = request.settings.film
                 _, _, *size = film.crop or (0, 0, film.width, film.height)
-                asked = {"width": size} | ({"aovs": list(film.aovs), "denoise": film.denoise} if full else {})
-                like = like or asked
-                for key, value in asked.items():
-                    if value != like[key]:
-                        raise SceneError(f"film.{key}", value, f"{like[key]}, as of the first picture")
+                film_facts = {"width": size} | ({"aovs": list(film.aovs), "denoise": film.denoise} if full else {})
+                first_facts = first_facts or film_facts
+                for key, value in film_facts.items():
+                    if value != first_facts[key]:
+                        raise SceneError(f"film.{key}", value, f"{first_facts[key]}, as of the first picture")
             yield _Picture(s, c, name, request)
 
 
-def _ordered(
+def _request(
     scene: Scene,
     camera: Mapping[str, Any] | Tensor | None,
     params: Mapping[str, Tensor],
     seed: int | None,
-    full: bool,
     options: BatchOptions,
+    *,
+    full: bool,
 ) -> RenderRequest:
     """Return the request for one picture."""
     if isinstance(camera, Tensor):
@@ -222,7 +259,7 @@ def _ordered(
     return request.with_versions()
 
 
-def _entries(
+def _queued_renders(
     pictures: Iterable[_Picture],
     found: dict[tuple[int, int], tuple[RenderRequest | None, Rendering]],
     on_progress: Callable[[int, int | None], None] | None,
@@ -231,31 +268,34 @@ def _entries(
     """Return the renders of pictures; they put requests that need gradients, and renderings, into ``found``."""
     latest: list[tuple[int, Wave]] = []  # index and wave of the latest scene
 
-    def entry(picture: _Picture) -> QueuedRender:
-        request, place = picture.request, (picture.scene, picture.camera)
+    def queued_render(picture: _Picture) -> QueuedRender:
+        request, indices = picture.request, (picture.scene, picture.camera)
         needs_gradients = request.needs_gradients  # read before gradients are disabled
 
         def make(threads: int) -> Run:
-            like = next((wave for scene, wave in latest if scene == picture.scene), None)
+            same_scene = next((wave for scene, wave in latest if scene == picture.scene), None)
             plain = {name: value.detach() for name, value in request.params.items()}
-            run = Run(request.scene, request.settings, plain, request.call.dtype, request.call.ranks, like, threads)
+            call = request.call
+            run = Run(
+                request.scene, request.settings, plain, call.dtype, group=call.ranks, like=same_scene, threads=threads
+            )
             latest[:] = [(picture.scene, run.wave)]
             return run
 
-        def done(rendering: Rendering) -> None:
+        def on_done(rendering: Rendering) -> None:
             request.check_unchanged("while the batch has it")
             # A request keeps its scene alive, and there may be many.
-            found[place] = (request, rendering) if needs_gradients else (None, execute_request(request, [rendering]))
+            found[indices] = (request, rendering) if needs_gradients else (None, execute_request(request, [rendering]))
             if on_progress is not None:
                 on_progress(len(found), total)
 
-        def failed(error: BaseException) -> None:
-            with named(picture.name, None):
+        def on_error(error: BaseException) -> None:
+            with naming_errors(picture.name, None):
                 raise error
 
-        return QueuedRender(request.scene.device, make, done, failed)
+        return QueuedRender(request.scene.device, make, on_done, on_error)
 
-    return map(entry, pictures)
+    return map(queued_render, pictures)
 
 
 def _check_memory(request: RenderRequest, total: int | None) -> None:
@@ -263,6 +303,6 @@ def _check_memory(request: RenderRequest, total: int | None) -> None:
     limit, film = request.settings.render.max_memory, request.settings.film
     _, _, width, height = film.crop or (0, 0, film.width, film.height)
     bytes_each = torch.finfo(request.call.dtype).bits // 8
-    held = 2 * 3 * width * height * bytes_each * (total or 1)  # single pictures, and the stacked ones
+    picture_bytes = 2 * 3 * width * height * bytes_each * (total or 1)  # single pictures, and the stacked ones
     if limit is not None:
-        check_limit(limit, held, f"more than the {mb(held)} that the pictures alone take")
+        check_limit(limit, picture_bytes, f"more than the {mb(picture_bytes)} that the pictures alone take")

@@ -14,7 +14,7 @@ from torchpt.core.errors import AssetError, NotBuiltError, RenderError, SceneErr
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
 
-__all__ = ["Cameras", "Seeds", "cameras_of", "named", "params_of", "scenes_of", "seeds_of"]
+__all__ = ["Cameras", "Seeds", "cameras_of", "naming_errors", "params_of", "scenes_of", "seeds_of"]
 
 #: Camera blocks as in scene files, poses ``(4, 4)`` (also as lists), or a tensor of poses ``(C, 4, 4)``.
 Cameras = Tensor | Sequence[Mapping[str, Any] | Tensor] | None
@@ -22,7 +22,7 @@ Cameras = Tensor | Sequence[Mapping[str, Any] | Tensor] | None
 Seeds = int | Sequence[int] | Sequence[Sequence[int]] | None
 
 #: Keys of a camera block that position it: at least one must be given.
-_PLACES = frozenset({"origin", "target", "to_world", "R", "t"})
+_POSE_KEYS = frozenset({"origin", "target", "to_world", "R", "t"})
 
 
 def scenes_of(scenes: Any) -> Scene | Iterable[Scene]:
@@ -61,11 +61,11 @@ def cameras_of(cameras: Cameras) -> Sequence[Mapping[str, Any] | Tensor | None]:
     for c, camera in enumerate(cameras):
         if not isinstance(camera, Mapping | Tensor | np.ndarray | list | tuple):
             raise SceneError(f"cameras[{c}]", camera, expected)
-        if isinstance(camera, Mapping) and not _PLACES & camera.keys():
-            whole = (
+        if isinstance(camera, Mapping) and not _POSE_KEYS & camera.keys():
+            expected_block = (
                 "a whole camera block, with origin and target, to_world, or R and t; hand single numbers over as params"
             )
-            raise SceneError(f"cameras[{c}]", dict(camera), f"{whole}, such as camera.fov")
+            raise SceneError(f"cameras[{c}]", dict(camera), f"{expected_block}, such as camera.fov")
         found.append(camera if isinstance(camera, Mapping) else _pose(f"cameras[{c}]", camera, "a pose (4, 4), dense"))
     return found
 
@@ -135,25 +135,25 @@ def seeds_of(seed: Seeds, scenes: int | None, cameras: int) -> Callable[[int, in
     """
     if seed is None or isinstance(seed, int):
         return lambda s, c: seed
-    whole = seed.tolist() if isinstance(seed, Tensor | np.ndarray) else seed
+    nested = seed.tolist() if isinstance(seed, Tensor | np.ndarray) else seed
     expected = f"a whole number, a sequence of {scenes or 'as many as there are scenes'}, or of sequences of {cameras}"
-    if not isinstance(whole, Sequence) or isinstance(whole, str) or (scenes is not None and len(whole) != scenes):
-        raise SceneError("seed", whole, expected)
-    for row in whole:
+    if not isinstance(nested, Sequence) or isinstance(nested, str) or (scenes is not None and len(nested) != scenes):
+        raise SceneError("seed", nested, expected)
+    for row in nested:
         if isinstance(row, Sequence) and (isinstance(row, str) or len(row) != cameras):
-            raise SceneError("seed", whole, expected)
+            raise SceneError("seed", nested, expected)
 
-    def of(s: int, c: int) -> Any:
-        if s >= len(whole):
-            raise SceneError("seed", len(whole), "as many as there are scenes")
-        row = whole[s]
+    def seed_of(s: int, c: int) -> Any:
+        if s >= len(nested):
+            raise SceneError("seed", len(nested), "as many as there are scenes")
+        row = nested[s]
         return row[c] if isinstance(row, Sequence) else row
 
-    return of
+    return seed_of
 
 
 @contextmanager
-def named(scene: str, camera: int | None) -> Iterator[None]:
+def naming_errors(scene: str, camera: int | None) -> Iterator[None]:
     """Make errors raised within name the scene of a batch and, for camera blocks, the camera.
 
     Args:
@@ -168,10 +168,10 @@ def named(scene: str, camera: int | None) -> Iterator[None]:
             key = f"cameras[{camera}]{key.removeprefix('params.camera.to_world').removeprefix('camera')}"
         elif scene and not key.startswith(("scenes[", "params[", "cameras[", "seed")):
             key = f"{scene}.{key}"
-        made = NotBuiltError if isinstance(error, NotBuiltError) else SceneError
-        raise made(key, error.value, error.expected, error.file) from None
+        error_type = NotBuiltError if isinstance(error, NotBuiltError) else SceneError
+        raise error_type(key, error.value, error.expected, error.file) from None
     except AssetError as error:
         raise AssetError(error.file, f"{error.problem} ({scene})" if scene else error.problem) from None
     except RenderError as error:
-        known = not scene or str(error).startswith(scene)
-        raise RenderError(str(error) if known else f"{scene}: {error}") from None
+        is_named = not scene or str(error).startswith(scene)
+        raise RenderError(str(error) if is_named else f"{scene}: {error}") from None
