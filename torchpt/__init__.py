@@ -71,7 +71,7 @@ __all__ = [
 ]
 
 # public name -> module that defines it
-_LAZY = {
+_LAZY_NAMES = {
     "Bsdf": "torchpt.physics.bsdfs",
     "Rendering": "torchpt.rendering",
     "Renderings": "torchpt.rendering.batches",
@@ -88,7 +88,7 @@ _LAZY = {
     "write_image": "torchpt.images",
 }
 
-#: Public modules.
+# public module -> its dotted name
 _MODULES = {
     "cameras": "torchpt.cameras",
     "data": "torchpt.data",
@@ -101,14 +101,17 @@ _MODULES = {
 }
 
 
+# Python calls these two for names that the module does not have (yet), and for dir().
+
+
 def __getattr__(name: str) -> Any:
     from importlib import import_module
 
     if name in _MODULES:
         return import_module(_MODULES[name])
-    if name not in _LAZY:
+    if name not in _LAZY_NAMES:
         raise AttributeError(f"module 'torchpt' has no attribute {name!r}")
-    value = getattr(import_module(_LAZY[name]), name)
+    value = getattr(import_module(_LAZY_NAMES[name]), name)
     globals()[name] = value
     return value
 

@@ -23,12 +23,16 @@ from torchpt.spec.arguments import check_names
 
 __all__ = ["Made", "RenderDataset", "RenderStream"]
 
-#: A scene or a mapping of the scene format, optionally with arguments of ``torchpt.render``.
+#: What ``make`` returns: a scene or a mapping of the scene format, optionally with arguments of ``torchpt.render``.
 Made = Scene | Mapping[str, Any] | tuple[Scene | Mapping[str, Any], Mapping[str, Any]]
 
 
 class _ItemRenderer:
-    """Renders the items of a data set."""
+    """Renders the items of a data set.
+
+    Arguments are those of :class:`RenderDataset`; ``call`` is its name for errors, ``latest`` index, scene and options of the
+    latest scene.
+    """
 
     def __init__(
         self,
@@ -54,52 +58,56 @@ class _ItemRenderer:
             raise SceneError("layers", layers, "a sequence of names of layers")
         self.make, self.layers, self.seed, self.device, self.options = make, tuple(layers), seed, device, dict(options)
         self.spp = spp
-        self.cameras = _cameras(cameras)
+        self.cameras = _camera_params(cameras)
         self.latest: tuple[int, Scene, dict[str, Any]] | None = None
 
     def item(self, index: int) -> dict[str, Tensor]:
-        """See :class:`RenderDataset`."""
-        number, view = divmod(index, max(len(self.cameras), 1))
-        scene, own = self._scene(number)
-        options: dict[str, Any] = {**self.options, **own}
+        """Return the item of an index, as :class:`RenderDataset` describes it."""
+        scene_index, camera_index = divmod(index, max(len(self.cameras), 1))
+        scene, scene_options = self._scene(scene_index)
+        options: dict[str, Any] = {**self.options, **scene_options}
         film = {
             **(self.options.get("film") or {}),
-            **(own.get("film") or {}),
+            **(scene_options.get("film") or {}),
             "aovs": list(self.layers),
             "denoise": False,
         }
-        params = {**(self.cameras[view] if self.cameras else {}), **(options.pop("params", None) or {})}
-        own_types = {name: value.dtype for name, value in scene.params.items()}
-        params = {n: _tensor(f"params.{n}", value, own_types.get(n, torch.float32)) for n, value in params.items()}
+        params = {**(self.cameras[camera_index] if self.cameras else {}), **(options.pop("params", None) or {})}
+        dtypes = {name: value.dtype for name, value in scene.params.items()}
+        params = {
+            name: _tensor(f"params.{name}", value, dtypes.get(name, torch.float32)) for name, value in params.items()
+        }
         if get_worker_info() is not None:
             options.setdefault("threads", 1)  # the workers share the cores
         options = {"spp": self.spp, "seed": self.seed + index, **options, "film": film}
         with torch.no_grad():
-            found = render(scene, params=params, full=True, **options)
-            exact = own_types["camera.to_world"]  # float64 far from the origin
-            world = scene.merged(params)["camera.to_world"].to(exact)
-            item = {"image": found.image, **{name: found.layers[name] for name in self.layers}, "to_world": world}
+            rendering = render(scene, params=params, full=True, **options)
+            pose_dtype = dtypes["camera.to_world"]  # float64 far from the origin
+            to_world = scene.merged(params)["camera.to_world"].to(pose_dtype)
+            layers = {name: rendering.layers[name] for name in self.layers}
+            item = {"image": rendering.image, **layers, "to_world": to_world}
             if "camera.fov" in scene.params:
-                seen = {name: value for name, value in params.items() if name.startswith("camera.")}
-                matrices = scene.pinhole(seen, film, exact)
+                camera = {name: value for name, value in params.items() if name.startswith("camera.")}
+                matrices = scene.pinhole(camera, film, pose_dtype)
                 item |= {"K": matrices.K, "R": matrices.R, "t": matrices.t}
         return {**{name: value.detach() for name, value in item.items()}, "index": torch.tensor(index)}
 
-    def _scene(self, number: int) -> tuple[Scene, dict[str, Any]]:
+    def _scene(self, index: int) -> tuple[Scene, dict[str, Any]]:
         """Return a scene and its arguments of ``render``; the latest is cached for its next camera."""
-        if self.latest is None or self.latest[0] != number:
-            made = self.make(number)
-            source, own = made if isinstance(made, tuple) and len(made) == 2 else (made, {})
-            if not isinstance(source, Scene | Mapping) or not isinstance(own, Mapping):
+        if self.latest is None or self.latest[0] != index:
+            made = self.make(index)
+            source, options = made if isinstance(made, tuple) and len(made) == 2 else (made, {})
+            if not isinstance(source, Scene | Mapping) or not isinstance(options, Mapping):
                 expected = (
                     "a scene from torchpt.load, a mapping of the scene format, or (one of them, arguments of render)"
                 )
-                raise SceneError(f"make({number})", made, expected)
-            check_names("render", own, RenderOptions)
-            _check_options(own, f"make({number}).")
+                raise SceneError(f"make({index})", made, expected)
+            check_names("render", options, RenderOptions)
+            _check_options(options, f"make({index}).")
             scene = source if isinstance(source, Scene) else load(dict(source), self.device)
-            self.latest = number, scene, dict(own)
-        return self.latest[1], dict(self.latest[2])
+            self.latest = index, scene, dict(options)
+        _, scene, options = self.latest
+        return scene, dict(options)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "latest": None}  # each worker makes its own scene
@@ -148,10 +156,8 @@ class RenderDataset(Dataset):
     ) -> None:
         if type(scenes) is not int or scenes < 0:
             raise SceneError("scenes", scenes, "a whole number >= 0")
-        self._items, self.scenes = (
-            _ItemRenderer("RenderDataset", make, cameras, spp, layers, seed, device, options),
-            scenes,
-        )
+        self._items = _ItemRenderer("RenderDataset", make, cameras, spp, layers, seed, device, options)
+        self.scenes = scenes
 
     def __len__(self) -> int:
         return self.scenes * max(len(self._items.cameras), 1)
@@ -210,14 +216,15 @@ class RenderStream(IterableDataset):
         self._items = _ItemRenderer("RenderStream", make, cameras, spp, layers, seed, device, options)
         self.scenes = scenes
         self.start, self.shard = start, shard
-        self.seen: tuple[int, int] | None = None  # rank and world of the process that started this worker
+        self.starter_ranks: tuple[int, int] | None = None  # rank and world of the process that started this worker
 
     def indices(self) -> Iterator[int]:
         """Yield the indices of the items of this process, in order."""
-        rank, world = self.shard or self.seen or _ranks()
+        rank, world = self.shard or self.starter_ranks or _rank_and_world()
         worker = get_worker_info()
-        mine, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        index = self.start + (rank - self.start) % world + world * mine
+        worker_id, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        # The first index from `start` on that this rank has, and then that this worker of it has.
+        index = self.start + (rank - self.start) % world + world * worker_id
         end = None if self.scenes is None else self.scenes * max(len(self._items.cameras), 1)
         while end is None or index < end:
             yield index
@@ -227,7 +234,10 @@ class RenderStream(IterableDataset):
         return (self._items.item(index) for index in self.indices())
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "seen": self.seen or _ranks()}  # spawned workers have no process group
+        return {
+            **self.__dict__,
+            "starter_ranks": self.starter_ranks or _rank_and_world(),
+        }  # spawned workers have no process group
 
 
 def _check_options(options: Mapping[str, Any], where: str = "") -> None:
@@ -247,7 +257,7 @@ def _check_options(options: Mapping[str, Any], where: str = "") -> None:
         raise SceneError(f"{where}film.denoise", film["denoise"], expected)
 
 
-def _cameras(cameras: Any) -> list[Mapping[str, Any]]:
+def _camera_params(cameras: Any) -> list[Mapping[str, Any]]:
     """Return each camera as parameters of a scene."""
     if isinstance(cameras, str | Mapping) or not isinstance(cameras, Iterable):
         raise SceneError("cameras", cameras, "a sequence of poses (4, 4) or of mappings of camera.* parameters")
@@ -275,7 +285,7 @@ def _tensor(key: str, value: Any, dtype: torch.dtype) -> Tensor:
         raise SceneError(key, value, "numbers, or a floating tensor") from None
 
 
-def _ranks() -> tuple[int, int]:
+def _rank_and_world() -> tuple[int, int]:
     """Return rank and number of ranks; ``(0, 1)`` without a process group."""
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()

@@ -15,7 +15,7 @@ from torchpt.images.metrics import FLOOR, relative, symmetric
 __all__ = ["l1", "l2", "relmse", "smape", "unbiased_relmse", "unbiased_squared_error"]
 
 
-def _same(*pictures: Tensor) -> None:
+def _check_pictures(*pictures: Tensor) -> None:
     """Raise unless all pictures are floating tensors of one shape, so that none is broadcast."""
     for picture in pictures:
         if not isinstance(picture, Tensor):
@@ -37,13 +37,13 @@ def l2(image: Tensor, target: Tensor) -> Tensor:
         ValueError: the shapes differ (all losses raise it).
         TypeError: not a floating tensor, for example a :class:`torchpt.Rendering` (all losses raise it).
     """
-    _same(image, target)
+    _check_pictures(image, target)
     return (image - target).square().mean()
 
 
 def l1(image: Tensor, target: Tensor) -> Tensor:
     """Return the mean of ``|x - t|``. For a noisy picture its gradient points to the median of a pixel, not to its mean."""
-    _same(image, target)
+    _check_pictures(image, target)
     return (image - target).abs().mean()
 
 
@@ -52,13 +52,13 @@ def relmse(image: Tensor, target: Tensor, floor: float = FLOOR) -> Tensor:
 
     The denominator has the target alone, so this is quadratic in the picture (Rousselle et al. 2011, section 4.2).
     """
-    _same(image, target)
+    _check_pictures(image, target)
     return relative((image - target).square(), target, floor).mean()
 
 
 def smape(image: Tensor, target: Tensor, floor: float = FLOOR) -> Tensor:
     """Return the mean of ``|x - t| / (|x| + |t| + floor)``: bounded, so fireflies count little; biased for noisy pictures."""
-    _same(image, target)
+    _check_pictures(image, target)
     return symmetric(image, target, floor).mean()
 
 
@@ -68,7 +68,7 @@ def unbiased_squared_error(a: Tensor, b: Tensor, target: Tensor) -> Tensor:
     As the renders are independent, its expectation is ``(E x - t)²``, and its gradient is an unbiased estimate of the gradient
     of that. It may be negative.
     """
-    _same(a, b, target)
+    _check_pictures(a, b, target)
     return ((a - target) * (b - target)).mean()
 
 
@@ -84,5 +84,5 @@ def unbiased_relmse(a: Tensor, b: Tensor, target: Tensor, scale: Tensor | None =
         floor: keeps black pixels finite.
     """
     scale = target if scale is None else scale
-    _same(a, b, target, scale)
+    _check_pictures(a, b, target, scale)
     return relative((a - target) * (b - target), scale.detach(), floor).mean()

@@ -246,12 +246,12 @@ def _is_colour(layer: str, channels: int) -> bool:
 
 
 def _refuse_colour_keys(options: CompareOptions, layer: str) -> None:
-    from torchpt.images.comparison import OF_COLOURS
+    from torchpt.images.comparison import COLOUR_METRICS
 
     for key in _SHOWN:
         if key in options.given:
             raise UsageError(f"{key}: the layer {layer} holds no colours, so it is not shown on a screen")
-    if options.given.get("metric") in OF_COLOURS:
+    if options.given.get("metric") in COLOUR_METRICS:
         raise UsageError(f"metric: the layer {layer} holds no colours; expected relmse, mse or smape")
 
 

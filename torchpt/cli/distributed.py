@@ -41,7 +41,7 @@ def group() -> Group | None:
 
 def say(line: str, about: str = "") -> None:
     """Print a line on stderr from one rank only: the first rank that reports on the topic ``about`` (default: the line)."""
-    if _started is None or _started.first_to_say(about or line):
+    if _started is None or _started.is_first_to_say(about or line):
         print(line, file=_stderr or sys.stderr, flush=True)
 
 
@@ -98,7 +98,7 @@ def _ended(main: Callable[[list[str]], int], words: list[str]) -> int:
         say(f"torchpt: {problem}")
     code = 2 if problem is not None else main(words)
     own = _started.group
-    if not own.over:
+    if not own.has_ended:
         try:
             code = own.end(code)
             _started.disconnect()

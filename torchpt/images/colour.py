@@ -21,10 +21,11 @@ from torchpt.core.threads import map_in_pieces
 __all__ = ["TONEMAPS", "display", "linear_to_srgb", "srgb_to_linear"]
 
 # Above this every curve is white; below it no curve overflows float32 when it squares.
-_BRIGHTEST = 1e9
+_LARGEST_RADIANCE = 1e9
 
 
 def _power(x: Tensor, exponent: float) -> Tensor:
+    """Return ``x ** exponent``, computed in pieces on several threads."""
     return map_in_pieces(lambda piece: piece**exponent, x)
 
 
@@ -53,6 +54,7 @@ def _filmic(x: Tensor) -> Tensor:
     """Apply Hable 2010, "Filmic tonemapping operators" (Uncharted 2), with exposure bias 2 and white point 11.2."""
 
     def curve(v: Tensor) -> Tensor:
+        # Hable's names: shoulder strength, linear strength, linear angle, toe strength, toe numerator, toe denominator.
         a, b, c, d, e, f = 0.15, 0.50, 0.10, 0.20, 0.02, 0.30
         return (v * (a * v + c * b) + d * e) / (v * (a * v + b) + d * f) - e / f
 
@@ -87,6 +89,6 @@ def display(image: Tensor, exposure: float = 0.0, tonemap: str = "none", gamma: 
         raise SceneError("film.tonemap", tonemap, f"one of {', '.join(TONEMAPS)}")
     if gamma != "srgb" and (isinstance(gamma, str) or not gamma > 0):
         raise SceneError("film.gamma", gamma, "'srgb' or an exponent > 0")
-    x = torch.nan_to_num(image, nan=0.0, posinf=_BRIGHTEST).clamp(0, _BRIGHTEST)
-    x = TONEMAPS[tonemap]((x * 2.0**exposure).clamp(max=_BRIGHTEST)).clamp(0, 1)
+    x = torch.nan_to_num(image, nan=0.0, posinf=_LARGEST_RADIANCE).clamp(0, _LARGEST_RADIANCE)
+    x = TONEMAPS[tonemap]((x * 2.0**exposure).clamp(max=_LARGEST_RADIANCE)).clamp(0, 1)
     return linear_to_srgb(x) if gamma == "srgb" else _power(x, float(gamma))

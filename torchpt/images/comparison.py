@@ -14,14 +14,14 @@ from torchpt.images.metrics import METRICS, error_map
 __all__ = ["Comparison", "DisplayTransform", "compare", "comparison_map"]
 
 #: Metrics of display values.
-OF_SHOWN = ("psnr", "ssim")
+DISPLAY_METRICS = ("psnr", "ssim")
 #: Metrics that are defined for colours only.
-OF_COLOURS = (*OF_SHOWN, "flip")
+COLOUR_METRICS = (*DISPLAY_METRICS, "flip")
 
 
 @dataclass(frozen=True)
 class DisplayTransform:
-    """Exposure, tone curve and gamma for the metrics of `OF_SHOWN`: see `colour.display`."""
+    """Exposure, tone curve and gamma for the metrics of `DISPLAY_METRICS`: see `colour.display`."""
 
     exposure: float = 0.0
     tonemap: str = "none"
@@ -70,15 +70,16 @@ def compare(
         raise ValueError(f"images differ in shape: {tuple(image.shape)} and {tuple(reference.shape)}")
     values: dict[str, float] = {}
     reasons: dict[str, str] = {}
-    fit = [torch.isfinite(picture).all(-1) for picture in (image, reference)]
+    finite = [torch.isfinite(picture).all(-1) for picture in (image, reference)]
     for name in METRICS:
         values[name] = math.nan
-        if not colours and name in OF_COLOURS:
+        if not colours and name in COLOUR_METRICS:
             reasons[name] = "a measure of colours, which this layer is not"
             continue
         try:
-            values[name] = METRICS[name](*_seen(name, image, reference, shown or DisplayTransform()))
+            values[name] = METRICS[name](*_as_metric_takes(name, image, reference, shown or DisplayTransform()))
         except (ImportError, ValueError) as problem:
+            # Without the name of the metric, which the caller prints.
             reasons[name] = (
                 str(problem).removeprefix("torchpt.metrics.").removeprefix(f"{name}: ").removeprefix(f"{name} ")
             )
@@ -87,12 +88,12 @@ def compare(
             continue
         equal = values[name] == math.inf and name == "psnr"
         reasons[name] = "infinite: a screen shows both alike" if equal else "a picture holds values that are not finite"
-    both = fit[0] & fit[1]
-    means = [picture[both].double().mean(0) for picture in (image, reference)]
+    finite_in_both = finite[0] & finite[1]
+    means = [picture[finite_in_both].double().mean(0) for picture in (image, reference)]
     totals = [float(mean.mean()) for mean in means]
     return Comparison(
         metrics=values,
-        nonfinite=(int((~fit[0]).sum()), int((~fit[1]).sum())),
+        nonfinite=(int((~finite[0]).sum()), int((~finite[1]).sum())),
         means=(means[0].tolist(), means[1].tolist()),
         ratio=totals[0] / totals[1] if totals[1] else math.nan,
         reasons=reasons,
@@ -101,11 +102,11 @@ def compare(
 
 def comparison_map(name: str, image: Tensor, reference: Tensor, shown: DisplayTransform | None = None) -> Tensor:
     """Return the error map ``(H, W)`` of a metric, with the display transform of `compare`: see `metrics.error_map`."""
-    return error_map(name, *_seen(name, image, reference, shown or DisplayTransform()))
+    return error_map(name, *_as_metric_takes(name, image, reference, shown or DisplayTransform()))
 
 
-def _seen(name: str, image: Tensor, reference: Tensor, shown: DisplayTransform) -> tuple[Tensor, Tensor]:
+def _as_metric_takes(name: str, image: Tensor, reference: Tensor, shown: DisplayTransform) -> tuple[Tensor, Tensor]:
     """Return both images as a metric takes them: with three channels, or as display values."""
-    if name in OF_COLOURS and image.shape[-1] == 1:
+    if name in COLOUR_METRICS and image.shape[-1] == 1:
         image, reference = image.expand(*image.shape[:2], 3), reference.expand(*image.shape[:2], 3)
-    return (shown.of(image), shown.of(reference)) if name in OF_SHOWN else (image, reference)
+    return (shown.of(image), shown.of(reference)) if name in DISPLAY_METRICS else (image, reference)

@@ -28,7 +28,7 @@ FLOAT_FORMATS = (".exr", ".hdr")
 INTEGER_FORMATS = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tga")
 READABLE = FLOAT_FORMATS + INTEGER_FORMATS
 
-_CHANNELS = 16  # largest number of channels of an image with the largest number of pixels
+_MOST_CHANNELS = 16  # largest number of channels of an image with the largest number of pixels
 _SIGNATURES = {
     b"\x89PNG\r\n\x1a\n": ".png",
     b"\xff\xd8\xff": ".jpg",
@@ -40,7 +40,7 @@ _SIGNATURES = {
 # Most pixels that one byte of a file can encode: 8 of a 1-bit PNG, deflated by at most 1032 (zlib's technical notes); JPEG,
 # TGA, BMP and PNM encode fewer.
 _PIXELS_PER_BYTE = 8 * 1032
-_BAND = 2**20  # values read at a time, so that a truncated file fails before all of its memory is touched
+_VALUES_PER_BAND = 2**20  # values read at a time, so that a truncated file fails before all of its memory is touched
 
 
 @dataclass(frozen=True)
@@ -110,28 +110,28 @@ def decode_image(source: Path | EncodedImage, max_pixels: int) -> Pixels:
     label = str(source) if isinstance(source, Path) else source.label
     try:
         data = _head(source)
-        kind = next((kind for magic, kind in _SIGNATURES.items() if data.startswith(magic)), None)
-        if kind is None:
-            kind = source.suffix.lower() if isinstance(source, Path) else f".{source.kind.lower()}"
-        if kind not in READABLE:
+        ending = next((ending for magic, ending in _SIGNATURES.items() if data.startswith(magic)), None)
+        if ending is None:
+            ending = source.suffix.lower() if isinstance(source, Path) else f".{source.kind.lower()}"
+        if ending not in READABLE:
             known = " ".join(READABLE)
-            raise AssetError(label, f"unknown kind of image {kind.strip('.')!r}; known: {known}")
+            raise AssetError(label, f"unknown kind of image {ending.strip('.')!r}; known: {known}")
         # byte 24 of a PNG: bits a value; byte 25: what they mean. Pillow keeps 8 bits of 16-bit colours.
-        if kind == ".png" and data[24:26] in (b"\x10\x02", b"\x10\x04", b"\x10\x06"):
+        if ending == ".png" and data[24:26] in (b"\x10\x02", b"\x10\x04", b"\x10\x06"):
             whole = read_regular(source) if isinstance(source, Path) else source.data
             width, height = (int.from_bytes(whole[at : at + 4], "big") for at in (16, 20))
             _check_size(label, width, height, 4, max_pixels, len(whole))
             source = EncodedImage(label, sanitize_png(whole), "png")
-            return _through_oiio(source, label, kind, "uint16", max_pixels)
-        if kind in FLOAT_FORMATS:
-            return _through_oiio(source, label, kind, "float", max_pixels)
-        return _through_pillow(source, label, kind, max_pixels)
+            return _decode_by_oiio(source, label, ending, "uint16", max_pixels)
+        if ending in FLOAT_FORMATS:
+            return _decode_by_oiio(source, label, ending, "float", max_pixels)
+        return _decode_by_pillow(source, label, ending, max_pixels)
     except AssetError:
         raise
     except OSError as error:
         raise AssetError(label, f"cannot be read ({error.strerror or error})") from None
     except Exception as problem:  # SyntaxError, ValueError, struct.error, zlib.error, text that is no UTF-8, ...
-        raise AssetError(label, f"cannot be read ({_brief(problem)})") from None
+        raise AssetError(label, f"cannot be read ({_first_line(problem)})") from None
 
 
 def _head(source: Path | EncodedImage) -> bytes:
@@ -145,20 +145,20 @@ def _check_size(label: str, width: int, height: int, channels: int, max_pixels: 
     """Raise an AssetError for an image that is empty, too large, or larger than a file of ``size`` bytes can encode."""
     if width < 1 or height < 1 or channels < 1:
         raise AssetError(label, f"has no pixels ({width} x {height}, {channels} channels)")
-    if width * height > max_pixels or width * height * channels > _CHANNELS * max_pixels:
+    if width * height > max_pixels or width * height * channels > _MOST_CHANNELS * max_pixels:
         limit = f"{max_pixels / 2**20:g} Mpixel" if max_pixels >= 2**20 else f"{max_pixels} pixels"
         raise AssetError(label, f"{width} x {height} pixels, {channels} channels: more than {limit} are not read")
     if size is not None and width * height > _PIXELS_PER_BYTE * size:
         raise AssetError(label, f"cannot be read ({width} x {height} pixels declared in {size} bytes)")
 
 
-def _through_oiio(source: Path | EncodedImage, label: str, kind: str, stored: str, max_pixels: int) -> Pixels:
+def _decode_by_oiio(source: Path | EncodedImage, label: str, ending: str, stored: str, max_pixels: int) -> Pixels:
     """Decode all channels of the first part of a file with OpenImageIO."""
     if isinstance(source, EncodedImage):  # OpenImageIO reads files only
-        with tempfile.NamedTemporaryFile(suffix=kind) as file:
+        with tempfile.NamedTemporaryFile(suffix=ending) as file:
             file.write(source.data)
             file.flush()
-            return _through_oiio(Path(file.name), label, kind, stored, max_pixels)
+            return _decode_by_oiio(Path(file.name), label, ending, stored, max_pixels)
     import OpenImageIO as oiio
 
     options = oiio.ImageSpec()
@@ -178,7 +178,7 @@ def _through_oiio(source: Path | EncodedImage, label: str, kind: str, stored: st
             if values is None:
                 raise AssetError(label, f"cannot be read ({oiio_error(picture) or 'truncated'})")
             return Pixels(values.reshape(spec.height, spec.width, spec.nchannels), 65535, tuple(spec.channelnames))
-        step = max(1, _BAND // (spec.width * spec.nchannels))
+        step = max(1, _VALUES_PER_BAND // (spec.width * spec.nchannels))
         for start in range(0, spec.height, step):
             end = min(start + step, spec.height)
             band = picture.read_scanlines(0, 0, spec.y + start, spec.y + end, 0, 0, spec.nchannels, stored)
@@ -193,7 +193,7 @@ def _through_oiio(source: Path | EncodedImage, label: str, kind: str, stored: st
         picture.close()
 
 
-def _through_pillow(source: Path | EncodedImage, label: str, kind: str, max_pixels: int) -> Pixels:
+def _decode_by_pillow(source: Path | EncodedImage, label: str, ending: str, max_pixels: int) -> Pixels:
     """Decode a file of an integer format with Pillow."""
     from PIL.BmpImagePlugin import BmpImageFile
     from PIL.JpegImagePlugin import JpegImageFile
@@ -208,7 +208,7 @@ def _through_pillow(source: Path | EncodedImage, label: str, kind: str, max_pixe
     data = read_regular(source) if isinstance(source, Path) else source.data
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow warns of odd metadata, which is not used
-        return _pillow_pixels(plugin[kind](BytesIO(data)), label, len(data), max_pixels)
+        return _pillow_pixels(plugin[ending](BytesIO(data)), label, len(data), max_pixels)
 
 
 def _pillow_pixels(picture: Any, label: str, size: int, max_pixels: int) -> Pixels:
@@ -234,15 +234,15 @@ _MODES = {
 }
 
 
-def oiio_error(teller: Any) -> str:
+def oiio_error(source: Any) -> str:
     """Return the error message of OpenImageIO, or of one of its inputs, as one line; empty: none."""
     try:
-        found = teller.geterror()
+        found = source.geterror()
     except UnicodeDecodeError:  # the message quotes bytes of the file
         return "malformed"
-    return _brief(found) if found.strip() else ""
+    return _first_line(found) if found.strip() else ""
 
 
-def _brief(problem: object) -> str:
+def _first_line(problem: object) -> str:
     """Return the first line of a decoder's message, shortened."""
     return (str(problem).strip().splitlines() or [type(problem).__name__])[0][:120]

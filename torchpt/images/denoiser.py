@@ -24,8 +24,10 @@ GUIDES = ("albedo", "normal")
 #: Width of a mirrored margin around the picture, in pixels. The network sees black beyond the edge and changes the brightness
 #: near it: of a grey picture of 33 x 17 pixels by up to 13 %, with the margin by 0.1 %.
 MARGIN = 16
-_LOWEST, _HIGHEST = 2.0**-126, float(np.finfo(np.float32).max)
+#: Smallest and largest normal numbers of float32.
+_SMALLEST, _LARGEST = 2.0**-126, float(np.finfo(np.float32).max)
 
+#: ``(H, W, 3)``, contiguous.
 Picture = NDArray[np.float32]
 
 
@@ -64,15 +66,15 @@ def denoise(image: Tensor, albedo: Tensor | None = None, normal: Tensor | None =
     """
     if normal is not None and albedo is None:
         raise ValueError("normal: the denoiser takes it beside albedo only")
-    for name, given in (("image", image), ("albedo", albedo), ("normal", normal)):
-        if given is None:
+    for name, layer in (("image", image), ("albedo", albedo), ("normal", normal)):
+        if layer is None:
             continue
-        if given.ndim != 3 or given.shape[2] != 3 or 0 in given.shape or given.shape != image.shape:
+        if layer.ndim != 3 or layer.shape[2] != 3 or 0 in layer.shape or layer.shape != image.shape:
             expected = "(H, W, 3)" if name == "image" else f"the picture's {tuple(image.shape)}"
-            raise ValueError(f"{name}: expected {expected}, got {tuple(given.shape)}")
-        if not given.is_floating_point():
-            raise ValueError(f"{name}: expected a floating type, got {given.dtype}")
-        if given.requires_grad:
+            raise ValueError(f"{name}: expected {expected}, got {tuple(layer.shape)}")
+        if not layer.is_floating_point():
+            raise ValueError(f"{name}: expected a floating type, got {layer.dtype}")
+        if layer.requires_grad:
             raise ValueError(f"{name}: requires gradients, and a denoised picture has none; hand over {name}.detach()")
     library = _library()
     pixels = image.cpu().double().numpy()
@@ -80,15 +82,15 @@ def denoise(image: Tensor, albedo: Tensor | None = None, normal: Tensor | None =
     if bad:
         raise RenderError(f"denoising: expected finite values, got {bad} pixels that are not")
     scale = _scale(pixels)
-    inputs = {"color": _framed(np.clip(pixels / scale, 0.0, _HIGHEST))}
+    inputs = {"color": _with_margin(np.clip(pixels / scale, 0.0, _LARGEST))}
     for name, guide, low in (("albedo", albedo, 0.0), ("normal", normal, -1.0)):
         if guide is not None:
             values = np.nan_to_num(guide.cpu().double().numpy(), nan=0.0)
-            inputs[name] = _filtered(library, {name: _framed(np.clip(values, low, 1.0))}, flags={})
+            inputs[name] = _run_filter(library, {name: _with_margin(np.clip(values, low, 1.0))}, flags={})
     # cleanAux: the guides are free of noise, as they have been filtered.
-    made = _filtered(library, inputs, flags={"hdr": True, "cleanAux": albedo is not None})
-    inside = made[MARGIN:-MARGIN, MARGIN:-MARGIN].astype(np.float64) * scale
-    return torch.from_numpy(inside.clip(0.0, _HIGHEST)).to(image.device, image.dtype)
+    denoised = _run_filter(library, inputs, flags={"hdr": True, "cleanAux": albedo is not None})
+    inside = denoised[MARGIN:-MARGIN, MARGIN:-MARGIN].astype(np.float64) * scale
+    return torch.from_numpy(inside.clip(0.0, _LARGEST)).to(image.device, image.dtype)
 
 
 def _library() -> Any:
@@ -111,17 +113,17 @@ def _library() -> Any:
 def _scale(pixels: NDArray[np.float64]) -> float:
     """Return a power of two near the geometric mean of the non-black pixels: the library treats values below 1e-8 as black."""
     brightness = pixels.max(2)
-    lit = brightness[brightness > _LOWEST]
+    lit = brightness[brightness > _SMALLEST]
     return float(np.exp2(np.round(np.log2(lit).mean()))) if lit.size else 1.0
 
 
-def _framed(values: NDArray[np.float64]) -> Picture:
+def _with_margin(values: NDArray[np.float64]) -> Picture:
     """Return the picture with a mirrored margin, float32 and contiguous."""
     around = ((MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0))
     return np.ascontiguousarray(np.pad(values.astype(np.float32), around, mode="symmetric"))
 
 
-def _filtered(library: Any, inputs: dict[str, Picture], flags: dict[str, bool]) -> Picture:
+def _run_filter(library: Any, inputs: dict[str, Picture], flags: dict[str, bool]) -> Picture:
     """Run the filter on one layer alone, or on a picture with its layers.
 
     Args:
@@ -137,13 +139,13 @@ def _filtered(library: Any, inputs: dict[str, Picture], flags: dict[str, bool]) 
         device.set_int("numThreads", torch.get_num_threads())
         device.set_bool("setAffinity", False)  # do not pin threads of this process
         device.commit()
-        with library.Filter(device) as work:
+        with library.Filter(device) as denoise_filter:
             for name, values in {**inputs, "output": output}.items():
-                work.set_image(name, values, library.OIDN_FORMAT_FLOAT3)
+                denoise_filter.set_image(name, values, library.OIDN_FORMAT_FLOAT3)
             for name, flag in flags.items():
-                work.set_bool(name, flag)
-            work.commit()
-            work.execute()
+                denoise_filter.set_bool(name, flag)
+            denoise_filter.commit()
+            denoise_filter.execute()
         problem = device.get_error()
     if problem is not None:
         raise RenderError(f"denoising: {' '.join(problem.split())}")

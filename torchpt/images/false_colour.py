@@ -26,6 +26,6 @@ def false_colour(values: Tensor, top: float) -> Tensor:
     from matplotlib import colormaps
 
     finite = torch.isfinite(values)
-    place = torch.where(finite, values.double() / top, 0.0).clamp(0.0, 1.0)
-    colours = torch.from_numpy(colormaps[MAP](place.cpu().numpy())[..., :3])
+    fraction = torch.where(finite, values.double() / top, 0.0).clamp(0.0, 1.0)
+    colours = torch.from_numpy(colormaps[MAP](fraction.cpu().numpy())[..., :3])
     return torch.where(finite.cpu()[..., None], colours, torch.tensor(NOT_FINITE, dtype=torch.float64)).float()

@@ -15,12 +15,17 @@ from torchpt.images.decode import existing_image, oiio_error
 
 __all__ = ["Fact", "checked_header", "put_header", "read_header"]
 
+#: A value of the metadata.
 Fact = str | int | float
 
+#: Of the attributes' names.
 PREFIX = "torchpt:"
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}\Z")
-_SMALL = 2**31
-_DIGITS = re.compile(r"-?[1-9][0-9]{9,}\Z")
+# An identifier of at most 100 letters, digits and underscores.
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}\Z")
+# 32-bit integers are below it.
+_INT32_END = 2**31
+# Ten digits or more, with or without a sign: text that may be an integer beyond 32 bits.
+_LONG_INTEGER = re.compile(r"-?[1-9][0-9]{9,}\Z")
 
 
 def checked_header(header: Mapping[str, Fact]) -> dict[str, Fact]:
@@ -30,7 +35,7 @@ def checked_header(header: Mapping[str, Fact]) -> dict[str, Fact]:
         ValueError: a name that is not an identifier, or a value that is not printable text, a number or a bool.
     """
     for name, value in header.items():
-        if not isinstance(name, str) or not _NAME.match(name):
+        if not isinstance(name, str) or not _IDENTIFIER.match(name):
             raise ValueError(f"header: expected names of letters, digits and _, got {name!r}")
         if not isinstance(value, str | int | float):
             raise ValueError(f"header: {name}: expected text or a number, got {value!r}")
@@ -43,7 +48,7 @@ def put_header(spec: Any, header: Mapping[str, Fact]) -> None:
     """Add metadata to an ``OpenImageIO.ImageSpec``."""
     for name, value in header.items():
         if isinstance(value, int):  # bools too
-            value = int(value) if -_SMALL <= value < _SMALL else str(value)
+            value = int(value) if -_INT32_END <= value < _INT32_END else str(value)
         spec.attribute(PREFIX + name, value)
 
 
@@ -67,7 +72,7 @@ def read_header(path: str | PathLike[str]) -> dict[str, Fact]:
     path = existing_image(path)
     try:
         with path.open("rb") as file:
-            if file.read(4) != b"\x76\x2f\x31\x01":
+            if file.read(4) != b"\x76\x2f\x31\x01":  # the magic number of OpenEXR
                 return {}
     except OSError as error:
         raise AssetError(path, f"cannot be read ({error.strerror or error})") from None
@@ -77,17 +82,17 @@ def read_header(path: str | PathLike[str]) -> dict[str, Fact]:
     if picture is None:
         raise AssetError(path, f"cannot be read ({oiio_error(oiio) or 'unknown format'})")
     try:
-        found = [_told(item) for item in picture.spec().extra_attribs]
+        found = [_name_and_value(item) for item in picture.spec().extra_attribs]
     finally:
         picture.close()
     return {
-        name.removeprefix(PREFIX): _read(value)
+        name.removeprefix(PREFIX): _decoded(value)
         for name, value in found
         if name.startswith(PREFIX) and isinstance(value, str | int | float)
     }
 
 
-def _told(item: Any) -> tuple[str, Any]:
+def _name_and_value(item: Any) -> tuple[str, Any]:
     """Return name and value of an attribute; empty for one that is not UTF-8, which torchpt does not write."""
     try:
         return item.name, item.value
@@ -95,8 +100,8 @@ def _told(item: Any) -> tuple[str, Any]:
         return "", None
 
 
-def _read(value: Fact) -> Fact:
+def _decoded(value: Fact) -> Fact:
     """Return a value as it was before writing: text of ten digits or more was an integer beyond 32 bits."""
-    if isinstance(value, str) and _DIGITS.match(value) and not -_SMALL <= int(value) < _SMALL:
+    if isinstance(value, str) and _LONG_INTEGER.match(value) and not -_INT32_END <= int(value) < _INT32_END:
         return int(value)
     return value

@@ -19,21 +19,21 @@ _ORDER = "RGBXYZUVA"
 def channel_names(layer: str, components: int) -> tuple[str, ...]:
     """Return the names of the EXR channels of a layer with ``components`` components."""
     if layer == "image":
-        known = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
-        return known.get(components) or tuple(f"image.{i}" for i in range(components))
+        usual = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+        return usual.get(components) or tuple(f"image.{i}" for i in range(components))
     # Imported by name, and only when a layer is written: package `paths` imports this one.
-    own = import_module("torchpt.paths.layers").LAYERS.get(layer)
-    if own is not None and len(own.channels) == components:
-        return own.channels
+    aov = import_module("torchpt.paths.layers").LAYERS.get(layer)
+    if aov is not None and len(aov.channels) == components:
+        return aov.channels
     if components == 1:
         return (layer,)
     suffixes = _SUFFIXES.get(components) or [str(i) for i in range(components)]
     return tuple(f"{layer}.{s}" for s in suffixes)
 
 
-def _rank(channel: str) -> tuple[int, int, str]:
+def _component_order(channel: str) -> tuple[int, int, str]:
     """Return the sort key of a channel among the components of its layer: numbers first, then letters by _ORDER."""
-    last = channel.rpartition(".")[2]
+    _, _, last = channel.rpartition(".")
     if last.isdecimal() and last.isascii():
         return 0, int(last), last
     return 1, _ORDER.find(last) if len(last) == 1 else -1, last
@@ -44,9 +44,9 @@ def group_channels(channels: tuple[str, ...] | list[str]) -> dict[str, list[int]
     groups: dict[str, list[int]] = {}
     for index, channel in enumerate(channels):
         prefix, _, last = channel.rpartition(".")
-        if not prefix and last == "Z":
+        if not prefix and last == "Z":  # the usual name of depth
             prefix = "depth"
         elif not prefix:
             prefix = "image" if last in ("R", "G", "B", "A", "Y") else last
         groups.setdefault(prefix, []).append(index)
-    return {name: sorted(indices, key=lambda i: _rank(channels[i])) for name, indices in groups.items()}
+    return {name: sorted(indices, key=lambda i: _component_order(channels[i])) for name, indices in groups.items()}

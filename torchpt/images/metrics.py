@@ -38,6 +38,8 @@ __all__ = [
 FLOOR = 1e-2
 #: Fraction of the pixels that :func:`relmse_trimmed` leaves out.
 TRIMMED = 1e-3
+#: Width of the windows of SSIM, in pixels (Wang et al. 2004).
+SSIM_WINDOW = 11
 
 
 def relative(squared: Tensor | float, radiance: Tensor, floor: float = FLOOR) -> Tensor:
@@ -53,24 +55,28 @@ def symmetric(image: Tensor, reference: Tensor, floor: float = FLOOR) -> Tensor:
     return (image - reference).abs() / (image.abs() + reference.abs() + floor)
 
 
-def _pair(image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
+def _float64_pair(image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
+    """Return both images on the CPU in float64, without gradients; raise ValueError if their shapes differ."""
     if image.shape != reference.shape:
         raise ValueError(f"images differ in shape: {tuple(image.shape)} and {tuple(reference.shape)}")
     return image.detach().cpu().double(), reference.detach().cpu().double()
 
 
 def _squared(image: Tensor, reference: Tensor) -> Tensor:
-    x, ref = _pair(image, reference)
+    """Return squared errors, value by value."""
+    x, ref = _float64_pair(image, reference)
     return (x - ref).square()
 
 
 def _relative(image: Tensor, reference: Tensor, floor: float = FLOOR) -> Tensor:
-    x, ref = _pair(image, reference)
+    """Return relative squared errors, value by value."""
+    x, ref = _float64_pair(image, reference)
     return relative((x - ref).square(), ref, floor)
 
 
 def _symmetric(image: Tensor, reference: Tensor, floor: float = FLOOR) -> Tensor:
-    return symmetric(*_pair(image, reference), floor)
+    """Return symmetric relative errors, value by value."""
+    return symmetric(*_float64_pair(image, reference), floor)
 
 
 def mse(image: Tensor, reference: Tensor) -> float:
@@ -133,11 +139,11 @@ def psnr(image: Tensor, reference: Tensor, peak: float = 1.0) -> float:
     """Return the peak signal-to-noise ratio in decibels, of values 0..``peak``; infinite for equal images."""
     from kornia.metrics import psnr as kornia_psnr
 
-    x, ref = _pair(image, reference)
+    x, ref = _float64_pair(image, reference)
     return float(kornia_psnr(x, ref, float(peak)))
 
 
-def ssim(image: Tensor, reference: Tensor, peak: float = 1.0, window: int = 11) -> float:
+def ssim(image: Tensor, reference: Tensor, peak: float = 1.0, window: int = SSIM_WINDOW) -> float:
     """Return the mean structural similarity of values 0..``peak`` (Wang et al. 2004): 1 for equal images.
 
     The mean is over all windows of ``window`` pixels (odd) inside the image, with a Gaussian of 1.5 pixels.
@@ -145,14 +151,14 @@ def ssim(image: Tensor, reference: Tensor, peak: float = 1.0, window: int = 11) 
     Raises:
         ValueError: an image smaller than the window.
     """
-    return float(_similar(image, reference, peak, window, "valid").mean())
+    return float(_ssim_map(image, reference, peak, window, "valid").mean())
 
 
-def _similar(image: Tensor, reference: Tensor, peak: float, window: int, padding: str) -> Tensor:
+def _ssim_map(image: Tensor, reference: Tensor, peak: float, window: int, padding: str) -> Tensor:
     """Return the structural similarity ``(H, W, C)`` of each pixel; ``padding``: "same" mirrors at the edges, "valid" crops."""
     from kornia.metrics import ssim as kornia_ssim
 
-    x, ref = _pair(image, reference)
+    x, ref = _float64_pair(image, reference)
     if min(x.shape[:2]) < window:
         raise ValueError(f"ssim looks through windows of {window} pixels, more than the picture has: {tuple(x.shape)}")
     x, ref = x.movedim(-1, 0)[None], ref.movedim(-1, 0)[None]
@@ -169,12 +175,13 @@ def flip(image: Tensor, reference: Tensor) -> float:
         ImportError: the package ``flip-evaluator`` (extra ``compare``) is not installed.
         ValueError: a reference that is black: it has no exposure.
     """
-    return _flip(image, reference)[1]
+    _, mean = _flip(image, reference)
+    return mean
 
 
 def _flip(image: Tensor, reference: Tensor) -> tuple[Tensor, float]:
     """Return the FLIP error ``(H, W)`` and its mean."""
-    x, ref = _pair(image, reference)
+    x, ref = _float64_pair(image, reference)
     if not (torch.isfinite(x).all() and torch.isfinite(ref).all()):
         return torch.full(x.shape[:2], math.nan, dtype=x.dtype), math.nan
     try:
@@ -206,7 +213,7 @@ MAPS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "relmse": lambda image, reference: _relative(image, reference).mean(-1),
     "mse": lambda image, reference: _squared(image, reference).mean(-1),
     "smape": lambda image, reference: _symmetric(image, reference).mean(-1),
-    "ssim": lambda image, reference: 1.0 - _similar(image, reference, 1.0, 11, "same").mean(-1),
+    "ssim": lambda image, reference: 1.0 - _ssim_map(image, reference, 1.0, SSIM_WINDOW, "same").mean(-1),
     "flip": lambda image, reference: _flip(image, reference)[0],
 }
 

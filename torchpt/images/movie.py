@@ -19,6 +19,7 @@ from torchpt.images.write import check_writable, open_pillow_writer, output_path
 
 __all__ = ["MOVIES", "check_movie", "write_movie"]
 
+#: ``(H, W, 3)`` display values.
 Frame = NDArray[np.uint8]
 
 #: Most frames a second by format. Players slow down a GIF whose frames last less than 2 hundredths of a second.
@@ -37,11 +38,13 @@ def check_movie(path: str | PathLike[str], fps: float) -> None:
         OutputError: an unsupported ending, too many frames a second for the format, a package that is not installed, or a path
             that cannot be written.
     """
-    place = check_writable(path, tuple(MOVIES))
-    kind = place.suffix.lower()
-    if fps > _FASTEST[kind]:
-        raise OutputError(path, f"{kind} shows at most {_FASTEST[kind]:g} frames a second, fps={fps:g} are asked for")
-    if kind == ".mp4" and not find_spec("imageio_ffmpeg"):
+    destination = check_writable(path, tuple(MOVIES))
+    ending = destination.suffix.lower()
+    if fps > _FASTEST[ending]:
+        raise OutputError(
+            path, f"{ending} shows at most {_FASTEST[ending]:g} frames a second, fps={fps:g} are asked for"
+        )
+    if ending == ".mp4" and not find_spec("imageio_ffmpeg"):
         how = "pip install '.[video]' in the checkout of torchpt (.gif needs nothing)"
         raise OutputError(path, f"writing .mp4 needs the package imageio-ffmpeg: {how}")
 
@@ -67,7 +70,8 @@ def write_movie(path: str | PathLike[str], frames: Iterable[Frame], fps: float) 
             temporary.unlink()
 
 
-def _gif(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
+def _write_gif(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
+    """Write frames as a GIF."""
     encoded = BytesIO()
     durations: list[int] = []  # milliseconds, by frame
     with open_pillow_writer(encoded) as writer:
@@ -81,7 +85,8 @@ def _gif(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
     temporary.write_bytes(encoded.getvalue())
 
 
-def _mp4(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
+def _write_mp4(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
+    """Write frames as H.264 in an MP4, which needs even widths and heights."""
     import imageio.v2 as iio
 
     codec = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "macro_block_size": 1}
@@ -94,4 +99,4 @@ def _mp4(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
 
 
 #: Writers by file ending.
-MOVIES: dict[str, Callable[[Path, Iterable[Frame], float], None]] = {".gif": _gif, ".mp4": _mp4}
+MOVIES: dict[str, Callable[[Path, Iterable[Frame], float], None]] = {".gif": _write_gif, ".mp4": _write_mp4}

@@ -40,7 +40,7 @@ def read_image(path: str | PathLike[str], linear: bool = False) -> Tensor:
     image /= pixels.white
     if linear:
         return image
-    colours = image.shape[-1] - (1 if image.shape[-1] in (2, 4) else 0)
+    colours = image.shape[-1] - (1 if image.shape[-1] in (2, 4) else 0)  # number of channels without alpha
     return torch.cat([srgb_to_linear(image[..., :colours]), image[..., colours:]], dim=-1)
 
 
@@ -67,4 +67,5 @@ def read_layers(path: str | PathLike[str]) -> dict[str, Tensor]:
 
 
 def _tensor(pixels: np.ndarray) -> Tensor:
+    """Return an array as a float32 tensor."""
     return torch.from_numpy(np.ascontiguousarray(pixels, dtype=np.float32))

@@ -19,7 +19,7 @@ from torchpt.images.layers import group_channels
 from torchpt.spec import Refused
 
 __all__ = [
-    "TEXELS",
+    "ACCEPTED_TEXELS",
     "Texels",
     "check_source",
     "has_alpha",
@@ -29,8 +29,8 @@ __all__ = [
     "texels_to_radiance",
 ]
 
-#: What is accepted.
-TEXELS = "texels (H, W, C), channels last, or (H, W), C from 1 to 4: finite numbers, or 8 bits a value (uint8)"
+#: What is accepted as an array of texels, for errors.
+ACCEPTED_TEXELS = "texels (H, W, C), channels last, or (H, W), C from 1 to 4: finite numbers, or 8 bits a value (uint8)"
 
 
 @dataclass(frozen=True)
@@ -81,21 +81,21 @@ def texels_from_array(value: Any) -> Texels:
         Refused: another shape, values that are not finite in float32, or too many pixels.
     """
     if not isinstance(value, np.ndarray | list | tuple):
-        raise Refused(TEXELS)
+        raise Refused(ACCEPTED_TEXELS)
     try:
         array = np.asarray(value)
     except (OverflowError, TypeError, ValueError, RuntimeError):
-        raise Refused(TEXELS, "rows of different lengths") from None
+        raise Refused(ACCEPTED_TEXELS, "rows of different lengths") from None
     if array.dtype.kind not in "iuf" or array.ndim not in (2, 3):
-        raise Refused(TEXELS, f"{array.dtype} of shape {array.shape}")
+        raise Refused(ACCEPTED_TEXELS, f"{array.dtype} of shape {array.shape}")
     array = array if array.ndim == 3 else array[..., None]
     if not array.size or array.shape[2] > 4 or array.shape[0] * array.shape[1] > MAX_PIXELS:
-        raise Refused(TEXELS, f"shape {array.shape}")
+        raise Refused(ACCEPTED_TEXELS, f"shape {array.shape}")
     with np.errstate(over="ignore"):
         values = np.array(array, np.float32, order="C")
     bad = np.flatnonzero(~np.isfinite(values).all(axis=(1, 2)))
     if len(bad):
-        raise Refused(TEXELS, f"a value that is not finite (row {bad[0]})")
+        raise Refused(ACCEPTED_TEXELS, f"a value that is not finite (row {bad[0]})")
     if array.dtype in (np.uint8, np.uint16):
         values /= np.float32(np.iinfo(array.dtype).max)
     return Texels(values, array.dtype == np.uint8)
@@ -140,8 +140,9 @@ def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:
         return False
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         return False
-    if data[25:26] in (b"\x04", b"\x06"):
+    if data[25:26] in (b"\x04", b"\x06"):  # colour types grey and RGB with alpha
         return True
+    # A transparent colour is a chunk tRNS before the pixels (IDAT). A chunk is size, name, data and checksum.
     chunk = 8
     while chunk + 8 <= len(data) and data[chunk + 4 : chunk + 8] not in (b"IDAT", b"tRNS"):
         chunk += 12 + int.from_bytes(data[chunk : chunk + 4], "big")
@@ -153,7 +154,7 @@ def select_picture(pixels: Pixels) -> NDArray:
     if not pixels.channels or pixels.values.dtype.kind != "f":
         return pixels.values
     groups = group_channels(pixels.channels)
-    picked = groups.get("image", next(iter(groups.values())))
-    if picked == list(range(pixels.values.shape[-1])):
+    channels = groups.get("image", next(iter(groups.values())))
+    if channels == list(range(pixels.values.shape[-1])):
         return pixels.values
-    return pixels.values[..., picked]
+    return pixels.values[..., channels]

@@ -38,6 +38,7 @@ __all__ = [
     "write_image",
 ]
 
+#: Supported endings of file names.
 WRITABLE = (".exr", ".hdr", ".png", ".jpg", ".jpeg", ".ppm")
 
 
@@ -74,23 +75,23 @@ def write_image(
         ValueError: an image or layer of another shape, or a header that cannot be stored.
     """
     destination = output_path(path)
-    pixels, facts = _pixels("image", image), checked_header(header or {})
+    pixels, facts = _checked_pixels("image", image), checked_header(header or {})
     temporary = temporary_beside(destination)
     if temporary.suffix == ".exr":
-        named = {"image": pixels} | {name: _pixels(name, layer) for name, layer in (layers or {}).items()}
-        for name, layer in named.items():
+        by_name = {"image": pixels} | {name: _checked_pixels(name, layer) for name, layer in (layers or {}).items()}
+        for name, layer in by_name.items():
             if layer.shape[:2] != pixels.shape[:2]:
                 raise ValueError(f"layer {name!r} is {tuple(layer.shape[:2])}, the picture {tuple(pixels.shape[:2])}")
-        channels = [channel for name, layer in named.items() for channel in channel_names(name, layer.shape[2])]
-        twice = sorted({channel for channel in channels if channels.count(channel) > 1})
-        if twice:
-            raise ValueError(f"two layers have the channel {twice[0]} (a picture of 4 channels has its alpha: A)")
-        encode = partial(_encode_float, temporary, np.concatenate(list(named.values()), axis=2), channels, facts)
+        channels = [channel for name, layer in by_name.items() for channel in channel_names(name, layer.shape[2])]
+        duplicates = sorted({channel for channel in channels if channels.count(channel) > 1})
+        if duplicates:
+            raise ValueError(f"two layers have the channel {duplicates[0]} (a picture of 4 channels has its alpha: A)")
+        encode = partial(_encode_float, temporary, np.concatenate(list(by_name.values()), axis=2), channels, facts)
     elif temporary.suffix == ".hdr":  # RGBE has no sign: the encoder would wrap around
         rgb = np.nan_to_num(_rgb(pixels), nan=0.0, posinf=1e30).clip(0, 1e30)
         encode = partial(_encode_float, temporary, rgb, ["R", "G", "B"], {})
     else:
-        levels = _levels(pixels, temporary.suffix == ".png", exposure, tonemap, gamma)
+        levels = _display_bytes(pixels, exposure, tonemap, gamma, with_alpha=temporary.suffix == ".png")
         encode = partial(_encode_integer, temporary, levels)
     try:
         encode()
@@ -141,12 +142,12 @@ def output_path(path: str | PathLike[str], endings: tuple[str, ...] = WRITABLE) 
         problem = f"cannot write the kind {destination.suffix!r}" if destination.suffix else "needs an ending"
         raise OutputError(path, f"{problem}; accepted: {' '.join(endings)}")
     try:
-        found = Path(os.path.realpath(destination))  # replace the target of a link, not the link
-        if found.exists() and not (found.is_file() or found.is_dir()):
+        target = Path(os.path.realpath(destination))  # replace the target of a link, not the link
+        if target.exists() and not (target.is_file() or target.is_dir()):
             raise OutputError(path, "is a device or pipe, no file that could be replaced")
     except (OSError, ValueError) as problem:
         raise OutputError(path, write_error(problem, destination)) from problem
-    return found
+    return target
 
 
 def temporary_beside(destination: Path) -> Path:
@@ -161,7 +162,8 @@ def write_error(problem: Exception, destination: Path) -> str:
     return f"cannot be written ({getattr(problem, 'strerror', None) or problem})"
 
 
-def _pixels(name: str, image: Tensor) -> np.ndarray:
+def _checked_pixels(name: str, image: Tensor) -> np.ndarray:
+    """Return an image or layer as float32 ``(H, W, C)``; ``name``: ``image`` or the layer's, for errors."""
     if not isinstance(image, Tensor) or not image.is_floating_point():
         hint = "; hand over its .image" if hasattr(image, "image") else ""
         got = f"numbers of {image.dtype}" if isinstance(image, Tensor) else type(image).__name__
@@ -177,32 +179,38 @@ def _pixels(name: str, image: Tensor) -> np.ndarray:
 
 
 def _rgb(pixels: np.ndarray) -> np.ndarray:
+    """Return three channels: grey repeated, alpha dropped."""
     return np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3]
 
 
 #: Held while OpenEXR has threads.
-_encoding = Lock()
+_openexr_lock = Lock()
 
 
 @contextmanager
-def _threads_of_openexr() -> Iterator[None]:
+def _openexr_threads() -> Iterator[None]:
     """Let OpenEXR have its threads, and end them afterwards.
 
     A process that is forked while they are there has none of them, and waits for them for ever as soon as it writes a file.
     """
     import OpenImageIO as oiio
 
-    with _encoding:
-        wanted = oiio.get_int_attribute("exr_threads")
+    with _openexr_lock:
+        thread_count = oiio.get_int_attribute("exr_threads")
         try:
             yield
         finally:
             oiio.attribute("exr_threads", -1)  # none
             oiio.ImageOutput.create("picture.exr")  # which heeds it
-            oiio.attribute("exr_threads", wanted)
+            oiio.attribute("exr_threads", thread_count)
 
 
 def _encode_float(temporary: Path, pixels: np.ndarray, channels: list[str], facts: dict[str, Fact]) -> None:
+    """Write an EXR or HDR file; ``facts`` go into the header of an EXR.
+
+    Raises:
+        OSError: with the encoder's or the system's reason.
+    """
     import OpenImageIO as oiio
 
     height, width, count = pixels.shape
@@ -211,20 +219,21 @@ def _encode_float(temporary: Path, pixels: np.ndarray, channels: list[str], fact
     if temporary.suffix == ".exr":
         spec.attribute("compression", "zip")
         put_header(spec, facts)
-    with _threads_of_openexr():
+    with _openexr_threads():
         encoder = oiio.ImageOutput.create("picture" + temporary.suffix)
         if encoder is None:
             raise OSError(oiio.geterror())
         opened = encoder.open(str(temporary), spec)
         written = opened and encoder.write_image(np.ascontiguousarray(pixels))
-        done = encoder.close() and written
-    if not done:
-        _try_bytes(temporary, pixels.nbytes + 64 * height + 2**16)
-        said = encoder.geterror() or "the encoder failed"
-        raise OSError(said.replace(str(temporary), "the file"))
+        succeeded = encoder.close() and written
+    if not succeeded:
+        # About what an uncompressed file takes: pixels, an offset and a header for each row, the file's header.
+        _write_zeros(temporary, pixels.nbytes + 64 * height + 2**16)
+        reason = encoder.geterror() or "the encoder failed"
+        raise OSError(reason.replace(str(temporary), "the file"))
 
 
-def _try_bytes(path: Path, size: int) -> None:
+def _write_zeros(path: Path, size: int) -> None:
     """Write zeros of the size of the image, to get the system's reason for the failure of an encoder that reports none.
 
     Raises:
@@ -237,6 +246,7 @@ def _try_bytes(path: Path, size: int) -> None:
 
 
 def _encode_integer(temporary: Path, levels: np.ndarray) -> None:
+    """Write bytes ``(H, W, 3 or 4)`` as PNG, PPM or JPEG, by the file's ending."""
     kind = {".png": "PNG", ".ppm": "PPM"}.get(temporary.suffix, "JPEG")
     options: dict[str, Any] = {"quality": 95} if kind == "JPEG" else {}
     encoded = BytesIO()
@@ -259,10 +269,12 @@ def open_pillow_writer(encoded: BytesIO) -> Any:
         return iio.imopen(encoded, "w", plugin="pillow")
 
 
-def _levels(pixels: np.ndarray, alpha: bool, exposure: float, tonemap: str, gamma: str | float) -> np.ndarray:
-    """Return display values as bytes ``(H, W, 3)``, or ``(H, W, 4)`` if the image and the format (``alpha``) have alpha."""
+def _display_bytes(
+    pixels: np.ndarray, exposure: float, tonemap: str, gamma: str | float, *, with_alpha: bool
+) -> np.ndarray:
+    """Return display values as bytes ``(H, W, 3)``; ``(H, W, 4)`` if the image has alpha and ``with_alpha`` asks for it."""
     shown = display(torch.from_numpy(_rgb(pixels)), exposure, tonemap, gamma)
-    if alpha and pixels.shape[2] == 4:
+    if with_alpha and pixels.shape[2] == 4:
         coverage = torch.nan_to_num(torch.from_numpy(pixels[..., 3:]), nan=0.0).clamp(0, 1)
         shown = torch.cat([shown, coverage], dim=-1)
     return (shown * 255 + 0.5).to(torch.uint8).numpy()

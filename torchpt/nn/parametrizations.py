@@ -1,5 +1,7 @@
 """Map unconstrained numbers to the ranges of parameters, so that an optimizer may take any step.
 
+``renderer.py`` chooses one for each parameter by its spec (:func:`parametrization_of`). ``x``: the numbers that are optimized.
+
 =============  ======================================  =============================================================
 kind           range                                   parameter
 =============  ======================================  =============================================================
@@ -29,11 +31,11 @@ from torchpt.spec import Pose, Spec
 __all__ = ["Bounded", "LowerBounded", "Parametrization", "RigidMotion", "Unbounded", "parametrization_of"]
 
 #: Overshoot of a closed end, as a share of the range.
-STRETCH = 0.05
+OVERSHOOT = 0.05
 #: Closest distance to an open end, as a share of the range.
-CLOSEST = 1e-6
+OPEN_END_MARGIN = 1e-6
 #: A range that is wider than the parameter by more than this factor counts as open-ended.
-WIDE = 100.0
+OPEN_ENDED_FACTOR = 100.0
 
 
 class _ProjectedClamp(torch.autograd.Function):
@@ -83,23 +85,28 @@ class Unbounded(Parametrization):
 class Bounded(Parametrization):
     """A range between two ends; ``open_low`` and ``open_high``: True for an end that is excluded."""
 
-    def __init__(self, low: float, high: float, open_low: bool, open_high: bool) -> None:
+    def __init__(self, low: float, high: float, *, open_low: bool, open_high: bool) -> None:
         super().__init__()
         self.low, self.high = low, high
-        self.below, self.over = (0.0 if open_end else STRETCH for open_end in (open_low, open_high))
-        self.least, self.most = (CLOSEST if open_low else 0.0), 1.0 - (CLOSEST if open_high else 0.0)
+        self.overshoot_low, self.overshoot_high = (0.0 if open_end else OVERSHOOT for open_end in (open_low, open_high))
+        self.lowest_share, self.highest_share = (
+            (OPEN_END_MARGIN if open_low else 0.0),
+            1.0 - (OPEN_END_MARGIN if open_high else 0.0),
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
         share: Any = _ProjectedClamp.apply(
-            (1.0 + self.below + self.over) * x.sigmoid() - self.below, self.least, self.most
+            (1.0 + self.overshoot_low + self.overshoot_high) * x.sigmoid() - self.overshoot_low,
+            self.lowest_share,
+            self.highest_share,
         )
         return self.low + (self.high - self.low) * share
 
     def inverse(self, value: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
-        share = ((value.double() - self.low) / (self.high - self.low)).clamp(self.least, self.most)
-        return ((share + self.below) / (1.0 + self.below + self.over)).logit().to(value)
+        share = ((value.double() - self.low) / (self.high - self.low)).clamp(self.lowest_share, self.highest_share)
+        return ((share + self.overshoot_low) / (1.0 + self.overshoot_low + self.overshoot_high)).logit().to(value)
 
 
 class LowerBounded(Parametrization):
@@ -107,22 +114,23 @@ class LowerBounded(Parametrization):
 
     scale: Tensor
 
-    def __init__(self, low: float, high: float, open_low: bool, start: Tensor) -> None:
+    def __init__(self, low: float, high: float, *, open_low: bool, start: Tensor) -> None:
         super().__init__()
         self.low, self.high = low, high
-        self.below, self.least = (0.0, CLOSEST) if open_low else (STRETCH, 0.0)
+        self.overshoot_low, self.lowest_share = (0.0, OPEN_END_MARGIN) if open_low else (OVERSHOOT, 0.0)
         scale = (start.double() - low).abs().mean()
         self.register_buffer("scale", (scale if scale > 0 else torch.ones_like(scale)).to(start))
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
-        above: Any = _ProjectedClamp.apply(nn.functional.softplus(x) - self.below, self.least, math.inf)
+        above: Any = _ProjectedClamp.apply(nn.functional.softplus(x) - self.overshoot_low, self.lowest_share, math.inf)
         value: Any = _ProjectedClamp.apply(self.low + self.scale * above, -math.inf, self.high)
         return value
 
     def inverse(self, value: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
-        y = ((value.double() - self.low) / self.scale.double()).clamp(min=self.least) + self.below
+        # The inverse of softplus is log(exp(y) - 1), written so that neither large nor small y lose digits.
+        y = ((value.double() - self.low) / self.scale.double()).clamp(min=self.lowest_share) + self.overshoot_low
         return (y + torch.log(-torch.expm1(-y))).to(value)
 
 
@@ -142,12 +150,13 @@ class RigidMotion(Parametrization):
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
+        # Rodrigues' rotation: the exponential of the cross-product matrix of axis times angle.
         a, b, c = x[:3].double().unbind()  # large angles lose their digits in float32
         zero = torch.zeros_like(a)
-        across = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).reshape(3, 3)  # cross-product matrix
-        turned = (torch.linalg.matrix_exp(across) @ self.frame.double()).to(x.dtype)
+        cross_matrix = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).reshape(3, 3)
+        rotated = (torch.linalg.matrix_exp(cross_matrix) @ self.frame.double()).to(x.dtype)
         last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=x.dtype, device=x.device)
-        return torch.cat((torch.cat((turned, self.length * x[3:, None]), 1), last))
+        return torch.cat((torch.cat((rotated, self.length * x[3:, None]), 1), last))
 
     def inverse(self, value: Tensor) -> Tensor:
         """See :class:`Parametrization`.
@@ -157,13 +166,16 @@ class RigidMotion(Parametrization):
         """
         from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
-        turn = value[:3, :3].double() @ torch.linalg.inv(self.frame.double())
-        if not torch.allclose(turn @ turn.T, torch.eye(3).to(turn), atol=1e-4) or torch.linalg.det(turn) < 0:
+        rotation = value[:3, :3].double() @ torch.linalg.inv(self.frame.double())
+        if (
+            not torch.allclose(rotation @ rotation.T, torch.eye(3).to(rotation), atol=1e-4)
+            or torch.linalg.det(rotation) < 0
+        ):
             raise ValueError("expected the pose at first, turned and moved")
-        return torch.cat((rotation_matrix_to_axis_angle(turn[None])[0].to(value), value[:3, 3] / self.length))
+        return torch.cat((rotation_matrix_to_axis_angle(rotation[None])[0].to(value), value[:3, 3] / self.length))
 
 
-def parametrization_of(spec: Spec, start: Tensor, rigid: bool = True, length: float = 1.0) -> Parametrization:
+def parametrization_of(spec: Spec, start: Tensor, *, rigid: bool = True, length: float = 1.0) -> Parametrization:
     """Return the range of a parameter with initial value ``start``.
 
     ``rigid``: poses move rigidly; ``length``: size of the scene.
@@ -179,6 +191,6 @@ def parametrization_of(spec: Spec, start: Tensor, rigid: bool = True, length: fl
     if low is None:
         return Unbounded()
     largest = float((start.double() - low).abs().max()) if start.numel() else 0.0
-    if high is None or high - low > WIDE * max(largest, 1.0):
-        return LowerBounded(low, math.inf if high is None else high, open_low, start)
-    return Bounded(low, high, open_low, open_high)
+    if high is None or high - low > OPEN_ENDED_FACTOR * max(largest, 1.0):
+        return LowerBounded(low, math.inf if high is None else high, open_low=open_low, start=start)
+    return Bounded(low, high, open_low=open_low, open_high=open_high)

@@ -78,8 +78,8 @@ class Renderer(nn.Module):
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
             ranges = [
-                parametrization_of(scene.spec(n), start, rigid, scene.length)
-                for n, start in zip(self.names, starts, strict=True)
+                parametrization_of(scene.spec(name), start, rigid=rigid, length=scene.length)
+                for name, start in zip(self.names, starts, strict=True)
             ]
             free = {
                 _key(name): nn.Parameter(found.inverse(start).clone())
@@ -108,11 +108,11 @@ class Renderer(nn.Module):
         Returns:
             The picture ``(H, W, 3)``; with ``full=True`` a :class:`torchpt.Rendering`.
         """
-        given: BatchOptions = {**self.options, **options}
+        all_options: BatchOptions = {**self.options, **options}
         if seed is None:
-            seed = self._next_seed(given.get("ranks") is not None)
+            seed = self._next_seed(all_options.get("ranks") is not None)
         full = self.full if full is None else full
-        return render(self.scene, params={**self.values(), **(params or {})}, seed=seed, full=full, **given)
+        return render(self.scene, params={**self.values(), **(params or {})}, seed=seed, full=full, **all_options)
 
     def values(self) -> dict[str, Tensor]:
         """Return the parameters in their ranges by dotted name, for ``torchpt.render(params=...)``; gradients flow."""
@@ -146,11 +146,11 @@ class Renderer(nn.Module):
         for name, value in self.values().items():
             self.scene.params[name] = value.detach().clone()
 
-    def _next_seed(self, together: bool) -> int:
+    def _next_seed(self, shares_picture: bool) -> int:
         if not self.training:
             return self.seed
         rank, world = 0, 1
-        if not together and torch.distributed.is_available() and torch.distributed.is_initialized():
+        if not shares_picture and torch.distributed.is_available() and torch.distributed.is_initialized():
             rank, world = torch.distributed.get_rank(), torch.distributed.get_world_size()
         seed = self.seed + int(self.steps) * world + rank
         self.steps += 1

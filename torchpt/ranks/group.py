@@ -2,7 +2,7 @@
 
 Ranks take the same steps in the same order. Before each step they exchange its name, so that an error of one rank is reported
 by all, and a tensor is never read as another. Decisions that may differ (by the clock, or by the rounding of another processor)
-are made by the first rank.
+are made by the first rank. ``rendering/split.py`` and gradients share their work through a :class:`Group`.
 """
 
 from __future__ import annotations
@@ -25,15 +25,17 @@ __all__ = ["TIMEOUT", "Group", "together"]
 #: Seconds until a silent rank is given up. Ranks wait for the slowest one, which may have much to load.
 TIMEOUT = 1800.0
 #: Largest timeout in seconds that torch can count in milliseconds.
-LONGEST = 1e6
-#: Numbers in a message.
-WORDS = 8
+LONGEST_TIMEOUT = 1e6
+#: Numbers in a message: a status, a step, and up to six of the caller's.
+MESSAGE_LENGTH = 8
 #: Seconds between two checks for answers, at first and at most: signals are handled in between.
-SOON, LATE = 5e-5, 5e-3
-#: Names of the last message of a rank, and of the message after an error.
+SHORTEST_PAUSE, LONGEST_PAUSE = 5e-5, 5e-3
+#: Names of the steps at which a rank sends its last message, and a message after an error.
 END, FAILED = "end", "failed"
+#: Status of a rank that failed: the exit code of the command line after an error.
+FAILED_STATUS = 2
 #: Attribute of an error that the other ranks know of.
-_TOLD = "_torchpt_other_ranks_know"
+_KNOWN_MARK = "_torchpt_other_ranks_know"
 
 
 class Group:
@@ -47,7 +49,7 @@ class Group:
         rank: rank of this process, from 0.
         size: number of ranks.
         timeout: the timeout in seconds.
-        over: True once communication has ended, or a rank is lost.
+        has_ended: True once communication has ended, or a rank is lost.
 
     Raises:
         SceneError: not a process group, or not such a number.
@@ -57,8 +59,8 @@ class Group:
     def __init__(self, process_group: Any = None, timeout: float = TIMEOUT) -> None:
         import torch.distributed as dist
 
-        if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not 0.0 < timeout <= LONGEST:
-            raise SceneError("timeout", timeout, f"a number of seconds above 0, at most {LONGEST:.0f}")
+        if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not 0.0 < timeout <= LONGEST_TIMEOUT:
+            raise SceneError("timeout", timeout, f"a number of seconds above 0, at most {LONGEST_TIMEOUT:.0f}")
         if not dist.is_available() or not dist.is_initialized():
             raise RenderError("ranks: there is no process group; call torch.distributed.init_process_group first")
         members = _members(dist, process_group)
@@ -76,8 +78,13 @@ class Group:
             raise LostRankError(f"ranks: no connection between all of them ({_first_line(error)})") from None
         assert isinstance(own, dist.ProcessGroup)
         self._dist, self._process_group = dist, own
-        self._work: Any = None
-        self.rank, self.size, self.timeout, self.over = members.index(dist.get_rank()), len(members), timeout, False
+        self._transfer: Any = None
+        self.rank, self.size, self.timeout, self.has_ended = (
+            members.index(dist.get_rank()),
+            len(members),
+            timeout,
+            False,
+        )
 
     # -- a few numbers
 
@@ -98,30 +105,35 @@ class Group:
     def end(self, code: int) -> int:
         """Send the exit code of this finished rank; return the highest code of all ranks."""
         every = self._exchange(END, code, ())
-        self.over = True
+        self.has_ended = True
         return max(status for status, _, _ in every)
 
     def _exchange_step(self, what: str, status: int, numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
-        every = self._exchange(what, status, numbers)
+        """Return the numbers of every rank; raise unless all are at the same step.
+
+        ``status``: 0, or after an error of this rank another number.
+        """
+        messages = self._exchange(what, status, numbers)
         if status:
             return []
-        number = zlib.crc32(what.encode())
-        for rank, (code, at, _) in enumerate(every):
-            if at == number:
+        own_step = zlib.crc32(what.encode())
+        for rank, (other_status, step, _) in enumerate(messages):
+            if step == own_step:
                 continue
-            self.over = at != zlib.crc32(FAILED.encode())
-            if code:
-                raise OtherRankError(f"ranks: rank {rank} ended with an error of its own", code)
+            self.has_ended = step != zlib.crc32(FAILED.encode())
+            if other_status:
+                raise OtherRankError(f"ranks: rank {rank} ended with an error of its own", other_status)
             raise RenderError(f"ranks: rank {rank} does something else than rank {self.rank}, which is at: {what}")
-        return [said for _, _, said in every]
+        return [numbers for _, _, numbers in messages]
 
     def _exchange(self, what: str, status: int, numbers: tuple[float, ...]) -> list[tuple[int, int, tuple[float, ...]]]:
-        """Return status, step and numbers of every rank."""
-        own = torch.zeros(WORDS, dtype=torch.float64)
+        """Return status, step (the CRC-32 of its name) and numbers of every rank."""
+        own = torch.zeros(MESSAGE_LENGTH, dtype=torch.float64)
         own[: 2 + len(numbers)] = torch.tensor([status, zlib.crc32(what.encode()), *numbers], dtype=torch.float64)
         every = [torch.empty_like(own) for _ in range(self.size)]
         self._wait(lambda: self._dist.all_gather(every, own, group=self._process_group, async_op=True))
-        return [(int(said[0]), int(said[1]), tuple(said[2 : 2 + len(numbers)].tolist())) for said in every]
+        lists = [message[: 2 + len(numbers)].tolist() for message in every]
+        return [(int(status), int(step), tuple(rest)) for status, step, *rest in lists]
 
     def broadcast_numbers(self, what: str, *numbers: float) -> tuple[float, ...]:
         """Return the numbers of the first rank; NaN is allowed."""
@@ -144,9 +156,9 @@ class Group:
         except (LostRankError, OtherRankError):
             raise
         except Exception as error:
-            if not self.over and not getattr(error, _TOLD, False):
+            if not self.has_ended and not getattr(error, _KNOWN_MARK, False):
                 with suppress(LostRankError):
-                    self._exchange_step(FAILED, 2, ())
+                    self._exchange_step(FAILED, FAILED_STATUS, ())
                 _mark_known(error)
             raise
 
@@ -200,29 +212,30 @@ class Group:
         self._wait(lambda: self._dist.broadcast(sent, group=self._process_group, group_src=rank, async_op=True))
         return sent.to(values.device)
 
-    def _wait(self, begin: Any) -> None:
-        """Wait for a transfer until the timeout, and let signals in."""
-        end, pause = time.monotonic() + self.timeout, SOON
+    def _wait(self, begin: Callable[[], Any]) -> None:
+        """Start a transfer and wait for it until the timeout, in short pauses between which Python handles signals."""
+        end, pause = time.monotonic() + self.timeout, SHORTEST_PAUSE
         try:
             # Kept until the next transfer: gloo's thread needs Python to free it, which may be about to end.
-            self._work = work = begin()
-            while not work.is_completed():
+            self._transfer = transfer = begin()
+            while not transfer.is_completed():
                 if time.monotonic() > end:
-                    self.over = True
-                    raise self._silent()
+                    self.has_ended = True
+                    raise self._silence_error()
                 time.sleep(pause)
-                pause = min(1.5 * pause, LATE)
-            work.wait()
+                pause = min(1.5 * pause, LONGEST_PAUSE)  # short transfers end soon, long ones may wait
+            transfer.wait()
         except BaseException as error:
-            _leak(self._work)
+            _keep_forever(self._transfer)
             if not isinstance(error, RuntimeError):
                 raise
-            self.over = True
+            self.has_ended = True
             if time.monotonic() > end:  # gloo's own timeout came first
-                raise self._silent() from None
+                raise self._silence_error() from None
             raise LostRankError("ranks: another rank has ended, or cannot be reached any more") from None
 
-    def _silent(self) -> LostRankError:
+    def _silence_error(self) -> LostRankError:
+        """Return the error for a rank that did not answer in time."""
         return LostRankError(f"ranks: another rank did not answer for {self.timeout:g} s")
 
 
@@ -258,16 +271,17 @@ def _members(dist: Any, group: Any) -> list[int]:
     raise SceneError("process_group", group, "a process group of torch.distributed, or None")
 
 
-def _leak(work: Any) -> None:
+def _keep_forever(transfer: Any) -> None:
     """Never free a pending transfer: gloo's thread would free its tensors after Python has ended, and abort."""
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(work))
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(transfer))
 
 
 def _mark_known(error: Exception) -> Exception:
     """Mark an error that all ranks know of."""
-    setattr(error, _TOLD, True)
+    setattr(error, _KNOWN_MARK, True)
     return error
 
 
 def _first_line(error: Exception) -> str:
+    """Return the first line of an error's text."""
     return str(error).strip().split("\n", 1)[0]

@@ -16,9 +16,9 @@ from torchpt.ranks.group import TIMEOUT, Group
 __all__ = ["LaunchedProcess"]
 
 #: Seconds between two checks for signals.
-PAUSE = 0.02
+SIGNAL_PAUSE = 0.02
 #: Environment variables that must be set.
-NAMES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+REQUIRED_VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 
 class LaunchedProcess:
@@ -40,7 +40,7 @@ class LaunchedProcess:
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # torch warns of every connection that ends
         import torch.distributed as dist
 
-        missing = [name for name in NAMES if not os.environ.get(name)]
+        missing = [name for name in REQUIRED_VARIABLES if not os.environ.get(name)]
         if missing:
             size, names = os.environ["WORLD_SIZE"], ", ".join(missing)
             raise RenderError(f"WORLD_SIZE is {size}, but there is no {names}: start it by torchrun")
@@ -60,21 +60,21 @@ class LaunchedProcess:
         """
         failed: list[Exception] = []
 
-        def work() -> None:
+        def connect_or_fail() -> None:
             try:
                 self._connect()
             except TorchptError as error:
                 failed.append(error)
             except (RuntimeError, ValueError) as error:
-                said = str(error).strip().split("\n", 1)[0]
-                failed.append(LostRankError(f"ranks: not all of them came ({said})"))
+                reason = str(error).strip().split("\n", 1)[0]
+                failed.append(LostRankError(f"ranks: not all of them came ({reason})"))
 
         # In a thread: a call that waits inside torch handles no signals.
-        thread = threading.Thread(target=work, name="torchpt_ranks", daemon=True)
+        thread = threading.Thread(target=connect_or_fail, name="torchpt_ranks", daemon=True)
         thread.start()
         while thread.is_alive():
             check()
-            thread.join(PAUSE)
+            thread.join(SIGNAL_PAUSE)
         if failed:
             raise failed[0]
 
@@ -87,16 +87,18 @@ class LaunchedProcess:
         timeout = timedelta(seconds=self._timeout)
         store, rank, size = next(iter(rendezvous("env://", timeout=timeout)))
         # torchrun keeps its store when it restarts all ranks, with the addresses of the old ones.
-        own: Any = PrefixStore(f"torchpt/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
-        self._store = own.clone()  # a second connection: a waiting call blocks its own
+        own_store: Any = PrefixStore(f"torchpt/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
+        self._store = own_store.clone()  # a second connection: a waiting call blocks its own
         with _output_to_errors():
-            dist.init_process_group("gloo", store=own, rank=rank, world_size=size, timeout=timeout)
+            dist.init_process_group("gloo", store=own_store, rank=rank, world_size=size, timeout=timeout)
             self.group = Group(timeout=self._timeout)
-        local = os.environ.get("LOCAL_RANK", "")
-        if torch.cuda.is_available() and local.isdigit():  # `auto` and `cuda` mean one GPU for each rank of a machine
-            torch.cuda.set_device(int(local) % torch.cuda.device_count())
+        local_rank = os.environ.get("LOCAL_RANK", "")
+        if (
+            torch.cuda.is_available() and local_rank.isdigit()
+        ):  # `auto` and `cuda` mean one GPU for each rank of a machine
+            torch.cuda.set_device(int(local_rank) % torch.cuda.device_count())
 
-    def first_to_say(self, line: str) -> bool:
+    def is_first_to_say(self, line: str) -> bool:
         """Return True if no other rank said this line before, or none can be asked."""
         with suppress(RuntimeError):
             return self._store is None or self._store.add(f"said/{zlib.crc32(line.encode())}", 1) == 1
@@ -113,14 +115,14 @@ class LaunchedProcess:
 def _output_to_errors() -> Iterator[None]:
     """Redirect stdout to stderr within: gloo of older torch (2.8 to 2.10) prints there while it connects."""
     try:
-        kept = os.dup(1)
+        stdout_copy = os.dup(1)
     except OSError:  # stdout is closed
         yield
         return
     try:
         with suppress(OSError):
-            os.dup2(2, 1)
+            os.dup2(2, 1)  # file descriptors: 1 is stdout, 2 stderr
         yield
     finally:
-        os.dup2(kept, 1)
-        os.close(kept)
+        os.dup2(stdout_copy, 1)
+        os.close(stdout_copy)

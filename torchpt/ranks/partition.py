@@ -1,4 +1,8 @@
-"""Partition pixels and items among ranks: a function of their numbers alone, without communication."""
+"""Partition pixels and items among ranks: a function of their numbers alone, without communication.
+
+Forward renders deal pixels out (:func:`dealt`), backward passes blocks of them (:func:`blocks`); boundary terms share chunks of
+edge samples, and callers their own items (:func:`share`).
+"""
 
 from __future__ import annotations
 
@@ -14,14 +18,15 @@ from torchpt.ranks.group import Group
 __all__ = ["blocks", "dealt", "share"]
 
 #: Consecutive pixels that stay together: neighbours tend to hit the same surfaces.
-TOGETHER = 64
+PIXELS_TOGETHER = 64
 #: Lanes of a block, and the least number of blocks of a rank.
-LANES, FEWEST = 1 << 16, 4
+LANES_PER_BLOCK, FEWEST_BLOCKS = 1 << 16, 4
 
+#: Type of an item.
 T = TypeVar("T")
 
 
-def _mine(count: int, rank: int, size: int) -> range | list[int]:
+def _indices_of_rank(count: int, rank: int, size: int) -> range | list[int]:
     """Return the indices below ``count`` of a rank.
 
     Each round gives an index to every rank; rounds begin with different ranks, so that no rank gets a column of pixels.
@@ -40,9 +45,12 @@ def dealt(pixels: int, rank: int, size: int) -> Tensor:
         rank: the rank.
         size: number of ranks.
     """
-    starts = torch.tensor(list(_mine(-(-pixels // TOGETHER), rank, size)), dtype=torch.int64) * TOGETHER
-    places = (starts[:, None] + torch.arange(TOGETHER)).reshape(-1)
-    return places[places < pixels]
+    starts = (
+        torch.tensor(list(_indices_of_rank(-(-pixels // PIXELS_TOGETHER), rank, size)), dtype=torch.int64)
+        * PIXELS_TOGETHER
+    )
+    numbers = (starts[:, None] + torch.arange(PIXELS_TOGETHER)).reshape(-1)
+    return numbers[numbers < pixels]
 
 
 def blocks(count: int, samples: int, group: Group | None) -> list[tuple[int, int]]:
@@ -55,9 +63,9 @@ def blocks(count: int, samples: int, group: Group | None) -> list[tuple[int, int
     """
     if group is None or group.size == 1:
         return [(0, count)]
-    each = max(min(LANES // max(samples, 1), -(-count // (FEWEST * group.size))), 1)
-    starts = (each * number for number in _mine(-(-count // each), group.rank, group.size))
-    return [(start, min(each, count - start)) for start in starts]
+    block_pixels = max(min(LANES_PER_BLOCK // max(samples, 1), -(-count // (FEWEST_BLOCKS * group.size))), 1)
+    starts = (block_pixels * number for number in _indices_of_rank(-(-count // block_pixels), group.rank, group.size))
+    return [(start, min(block_pixels, count - start)) for start in starts]
 
 
 def share(items: Sequence[T], group: Group | None) -> list[tuple[int, T]]:
@@ -72,4 +80,4 @@ def share(items: Sequence[T], group: Group | None) -> list[tuple[int, T]]:
         return list(enumerate(items))
     if not hasattr(group, "rank"):
         raise SceneError("group", group, "a torchpt.ranks.Group, or None")
-    return [(number, items[number]) for number in _mine(len(items), group.rank, group.size)]
+    return [(number, items[number]) for number in _indices_of_rank(len(items), group.rank, group.size)]

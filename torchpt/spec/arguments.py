@@ -1,7 +1,8 @@
 """Declare keyword arguments once, in a ``TypedDict``: a static type and, by ``Annotated``, a spec for each.
 
 A function takes them as ``**options: Unpack[Form]``. Type checkers read the form; the run-time signature
-(``inspect.signature``, ``help``), checks and tables are made from it here.
+(``inspect.signature``, ``help``), checks and tables are made from it here. ``Form`` stands for such a ``TypedDict``, as
+:class:`torchpt.scene.settings.CommonOptions`.
 """
 
 from __future__ import annotations
@@ -98,19 +99,22 @@ def arguments_of(form: Any) -> dict[str, DeclaredArgument]:
 def expand_signature(function: F) -> F:
     """Spell out ``**options: Unpack[Form]`` in a function's run-time signature and at the end of its docstring."""
     signature = inspect.signature(function, eval_str=True)
-    *own, rest = signature.parameters.values()
-    arguments = arguments_of(get_args(rest.annotation)[0])
-    every = [
+    *named, var_keyword = signature.parameters.values()  # the last is `**options`
+    (form,) = get_args(var_keyword.annotation)
+    arguments = arguments_of(form)
+    expanded = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=argument.default, annotation=argument.type)
         for name, argument in arguments.items()
     ]
-    function.__signature__ = signature.replace(parameters=[*own, *every])  # pyright: ignore[reportFunctionMemberAccess]
+    function.__signature__ = signature.replace(parameters=[*named, *expanded])  # pyright: ignore[reportFunctionMemberAccess]
     if function.__doc__:
         lines = [
             f"    {name}: {item.spec.doc} ({'; '.join(filter(None, (item.accepted, item.stands_for)))})"
             for name, item in arguments.items()
         ]
-        function.__doc__ = "\n".join([f"{inspect.cleandoc(function.__doc__)}\n\n{rest.name.capitalize()}:", *lines])
+        function.__doc__ = "\n".join(
+            [f"{inspect.cleandoc(function.__doc__)}\n\n{var_keyword.name.capitalize()}:", *lines]
+        )
     return function
 
 

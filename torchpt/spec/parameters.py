@@ -1,4 +1,9 @@
-"""Specs of the parameters that kinds declare: numbers, colours, points, poses, choices; each reads and checks its values."""
+"""Specs of the parameters that kinds declare: numbers, colours, points, poses, choices; each reads and checks its values.
+
+A spec says what a key of a scene file accepts, its default, and what depends on it. ``read`` takes a value from a file,
+``check`` a tensor that a caller puts into ``scene.params``; both raise :class:`Refused`, which ``schema.py`` turns into an
+error that names the key.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +22,6 @@ from torchpt.spec.reading import LARGEST, Refused
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    pass
 
 __all__ = [
     "REQUIRED",
@@ -144,6 +147,12 @@ class Spec:
 # ---- Specs of numbers in a range: scalars, colours, the texels of an image
 
 
+#: Relative tolerance of bounds for tensors: some roundings of float32.
+TOLERANCE = 1e-6
+#: Most numbers of a refused tensor that an error prints; of a larger one it prints the first that is wrong.
+MOST_SHOWN = 16
+
+
 @dataclass(frozen=True)
 class _Numbers(Spec):
     """Numbers in a range.
@@ -174,6 +183,7 @@ class _Numbers(Spec):
 
     @property
     def _range(self) -> str:
+        """Return the bounds as words that follow "a finite number", with a space before them."""
         low, high = self.low, self.high
         if self.above is None and self.below is None and low is not None and high is not None:
             return f" in {low:g}..{high:g}"
@@ -202,14 +212,14 @@ class _Numbers(Spec):
         low, high = self.bounds
         # Rounding on the way here must not get a value refused.
         slack = getattr(self, "slack", 0.0)
-        bad = (value < low - 1e-6 * abs(low) - slack) | (value > high + 1e-6 * abs(high) + slack)
+        bad = (value < low - TOLERANCE * abs(low) - slack) | (value > high + TOLERANCE * abs(high) + slack)
         rounded = value.float()
         if self.above is not None:
             bad = bad | (rounded <= self.above)
         if self.below is not None:
             bad = bad | (rounded >= self.below)
         if bool(bad.any()):
-            shown = value.tolist() if value.numel() <= 16 else float(value[bad].reshape(-1)[0])
+            shown = value.tolist() if value.numel() <= MOST_SHOWN else float(value[bad].reshape(-1)[0])
             raise Refused(f"{self.words or self.accepted} (clamp before rendering)", shown)
 
 
@@ -340,6 +350,10 @@ def spec_of(value: Any) -> Spec:
 # ---- Specs of geometry: points, directions, poses, and the vertices of a mesh
 
 
+#: Tolerance of a pose in a tensor, relative to its scale: steps of an optimizer in float32 drift from a rotation.
+POSE_TOLERANCE = 1e-4
+
+
 @dataclass(frozen=True)
 class _Vector(Spec):
     """Three numbers."""
@@ -460,9 +474,9 @@ class Pose(Spec):
             raise Refused("numbers finite in float32", "a value that is not finite in float32")
         if not is_usable(matrix):
             raise Refused(f"a matrix that can be inverted, {WITHIN}", matrix.tolist())
-        if abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-4:
+        if abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > POSE_TOLERANCE:
             raise Refused("a transform whose last row is 0 0 0 1", matrix[3].tolist())
-        if self.angles and similarity_scale(matrix, 1e-4) is None:
+        if self.angles and similarity_scale(matrix, POSE_TOLERANCE) is None:
             raise Refused(self.expected, matrix.tolist())
         if self.rigid and not is_rigid(matrix):
             raise Refused("a pose without scale or shear (torchpt.nn.Renderer keeps one so)", matrix.tolist())

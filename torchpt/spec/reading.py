@@ -35,6 +35,7 @@ __all__ = [
     "vector",
 ]  # fmt: skip
 
+#: Largest number of float32.
 LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -118,8 +119,9 @@ def text(value: Any) -> str:
 
 def transform(value: Any, device: torch.device | None = None) -> Any:
     """Return the ``(4, 4)`` of a matrix or of a list of operations as in :func:`torchpt.math.transforms.compose`."""
-    rows = list | np.ndarray | Tensor
-    if isinstance(value, np.ndarray | Tensor) or (isinstance(value, list) and value and isinstance(value[0], rows)):
+    row_types = list | np.ndarray | Tensor
+    is_nested = isinstance(value, list) and value and isinstance(value[0], row_types)
+    if isinstance(value, np.ndarray | Tensor) or is_nested:
         return matrix(value) if device is None else transforms.matrix4(value, "", device)
     try:
         return transforms.compose(value, device)
@@ -143,10 +145,10 @@ def rows(value: Any, columns: int, what: str) -> NDArray[np.float64]:
     expected = f"a list of {what}, finite numbers each"
     if isinstance(value, list | tuple):
         if not value or not set(map(type, value)) <= {list, tuple} or set(map(len, value)) != {columns}:
-            _first_bad(value, columns, expected)
+            _refuse_first_bad_row(value, columns, expected)
             raise Refused(expected)
         if not set(map(type, chain.from_iterable(value))) <= {int, float}:
-            _first_bad(value, columns, expected)
+            _refuse_first_bad_row(value, columns, expected)
     try:
         found = np.array(value, dtype=np.float64)
     except (OverflowError, TypeError, ValueError, RuntimeError):
@@ -161,7 +163,7 @@ def rows(value: Any, columns: int, what: str) -> NDArray[np.float64]:
     return found
 
 
-def _first_bad(value: Any, columns: int, expected: str) -> None:
+def _refuse_first_bad_row(value: Any, columns: int, expected: str) -> None:
     """Raise for the first row of a list that is not ``columns`` numbers."""
     for index, row in enumerate(value):
         if not isinstance(row, list | tuple) or len(row) != columns or not all(type(x) in (int, float) for x in row):
@@ -192,7 +194,8 @@ def faces(value: Any) -> NDArray[np.int64]:
     return found.astype(np.int64)
 
 
-_SIZE = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([kKMGT]?)(i?)[bB]?\s*\Z")
+# A number, a decimal prefix (k K M G T), `i` for a binary one, `b` or `B`: 4GB, 512 MiB, 1.5g is refused.
+_MEMORY_SIZE = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([kKMGT]?)(i?)[bB]?\s*\Z")
 
 
 def memory_size(value: Any) -> int | None:
@@ -201,11 +204,12 @@ def memory_size(value: Any) -> int | None:
     if value is None:
         return None
     if isinstance(value, str):
-        match = _SIZE.match(value)
+        match = _MEMORY_SIZE.match(value)
         if not match:
             raise Refused(expected)
         base = 1024 if match[3] else 1000
-        value = int(float(match[1]) * base ** " KMGT".index(match[2].upper() or " "))
+        number, prefix, _ = match.groups()
+        value = int(float(number) * base ** " KMGT".index(prefix.upper() or " "))  # the exponent is the prefix's index
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 2**60:
         raise Refused(expected)
     return value

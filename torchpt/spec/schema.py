@@ -1,4 +1,9 @@
-"""Find kinds by name, collect the parameters that they declare, and read whole blocks of a scene file by them."""
+"""Find kinds by name, collect the parameters that they declare, and read whole blocks of a scene file by them.
+
+A kind is a class that a ``type`` in a scene file names, such as ``sphere``; its ``parameters`` are a :class:`Spec` by name. A
+block is a mapping of a scene file whose keys are the parameters of one kind. The scene format and the settings read theirs by
+:func:`read_typed` and :func:`read_params`.
+"""
 
 from __future__ import annotations
 
@@ -61,9 +66,9 @@ class Kinds(Mapping[str, type[K]], Generic[K]):
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Return the names of all kinds, without importing their files."""
-        found = find_spec(self.package)
-        assert found is not None and found.submodule_search_locations is not None
-        every = [module.name for module in iter_modules(list(found.submodule_search_locations))]
+        package_spec = find_spec(self.package)
+        assert package_spec is not None and package_spec.submodule_search_locations is not None
+        every = [module.name for module in iter_modules(list(package_spec.submodule_search_locations))]
         rest = sorted(name for name in every if not name.startswith("_") and name not in self._first)
         return (*self._first, *rest)
 
@@ -72,7 +77,11 @@ class Kinds(Mapping[str, type[K]], Generic[K]):
             if name not in self.names:
                 raise KeyError(name)
             module = import_module(f"{self.package}.{name}")
-            own = [value for value in vars(module).values() if isinstance(value, type) and _named(value, module, name)]
+            own = [
+                value
+                for value in vars(module).values()
+                if isinstance(value, type) and _defines_kind(value, module, name)
+            ]
             if len(own) != 1:
                 raise TypeError(f"{module.__name__} has to define one class with name = {name!r}")
             self._known[name] = own[0]
@@ -92,7 +101,8 @@ class Kinds(Mapping[str, type[K]], Generic[K]):
         return Path(str(import_module(f"{self.package}.{name}").__file__))
 
 
-def _named(kind: type[Any], module: Any, name: str) -> bool:
+def _defines_kind(kind: type[Any], module: Any, name: str) -> bool:
+    """Return True for the class of that name that the module itself defines."""
     return kind.__module__ == module.__name__ and vars(kind).get("name") == name
 
 
@@ -102,15 +112,16 @@ def parameters_of(kind: Any) -> dict[str, Spec]:
     Args:
         kind: a class, or an instance that declares parameters of its own.
     """
-    own = kind if isinstance(kind, type) else type(kind)
-    found = dict(_of_class(own))
-    if kind is not own:
+    cls = kind if isinstance(kind, type) else type(kind)
+    found = dict(_class_parameters(cls))
+    if kind is not cls:
         found |= _specs_in(vars(kind) if hasattr(kind, "__dict__") else {})
     return found
 
 
 @lru_cache(maxsize=1024)
-def _of_class(own: type[Any]) -> dict[str, Spec]:
+def _class_parameters(own: type[Any]) -> dict[str, Spec]:
+    """Return the parameters of a class, those of its bases first."""
     found: dict[str, Spec] = {}
     for base in reversed(own.__mro__):
         found |= _specs_in(vars(base))
@@ -118,8 +129,9 @@ def _of_class(own: type[Any]) -> dict[str, Spec]:
 
 
 def _specs_in(names: Mapping[str, Any]) -> dict[str, Spec]:
-    layer = names.get("parameters", {})
-    return {name: spec_of(value) for name, value in layer.items()} if isinstance(layer, Mapping) else {}
+    """Return the parameters among the attributes of a class or instance."""
+    declared = names.get("parameters", {})
+    return {name: spec_of(value) for name, value in declared.items()} if isinstance(declared, Mapping) else {}
 
 
 @dataclass(frozen=True)
@@ -157,12 +169,15 @@ class FrozenConfig:
         specs = parameters_of(type(self))
         if foreign := values.keys() - specs.keys():
             raise TypeError(f"{type(self).__name__} has no {', '.join(sorted(foreign))}")
-        whole = {name: values.get(name, spec.default) for name, spec in specs.items()}
-        for name, value in whole.items():
+        all_values = {name: values.get(name, spec.default) for name, spec in specs.items()}
+        for name, value in all_values.items():
             if value is REQUIRED:
                 raise TypeError(f"{type(self).__name__} needs {name}")
-        computed = {name: value(whole) for name, value in whole.items() if name not in values and callable(value)}
-        self.__dict__.update(whole | computed)
+        # A default that is a function follows from the values of the others.
+        computed = {
+            name: value(all_values) for name, value in all_values.items() if name not in values and callable(value)
+        }
+        self.__dict__.update(all_values | computed)
 
     if TYPE_CHECKING:
 
@@ -206,24 +221,24 @@ class FrozenConfig:
 
 T = TypeVar("T")
 #: Longer lists are bulk data, which costs more to hash than to read.
-LONGEST = 64
+LONGEST_HASHED = 64
 #: Types whose values are hashed together with the type: 1, 1.0 and true are different.
-_PLAIN = frozenset((int, bool, str, type(None)))
+_HASHED_WITH_TYPE = frozenset((int, bool, str, type(None)))
 
 
 def frozen(value: Any) -> Hashable:
     """Return a cache key that two values share only where their types and numbers are equal to the bit.
 
     Raises:
-        TypeError: anything but plain values in lists and dicts, or a list longer than :data:`LONGEST`.
+        TypeError: anything but plain values in lists and dicts, or a list longer than :data:`LONGEST_HASHED`.
     """
     kind = type(value)
-    if kind in _PLAIN:
+    if kind in _HASHED_WITH_TYPE:
         return kind, value
     if kind is float:
         return repr(value)
     if kind is list or kind is tuple:
-        if len(value) <= LONGEST:
+        if len(value) <= LONGEST_HASHED:
             return kind, tuple([frozen(item) for item in value])
     elif kind is dict:
         return kind, tuple([(key, frozen(item)) for key, item in value.items()])
@@ -286,19 +301,19 @@ def scene_error(error: Refused, key: str, value: Any, file: str | None) -> Scene
 
 
 def refuse_not_built(
-    raw: Mapping[str, Any], later: Mapping[str, object], key: str, available: str, file: str | None
+    raw: Mapping[str, Any], unsupported_keys: Mapping[str, object], key: str, available: str, file: str | None
 ) -> dict[str, Any]:
-    """Return the mapping without the keys of ``later``, which the format knows and this version does not support.
+    """Return the mapping without the keys of ``unsupported_keys``, which the format knows and this version does not support.
 
     Raises:
         NotBuiltError: such a key with a value that is neither null nor its neutral value.
     """
-    for name, nothing in later.items():
+    for name, neutral in unsupported_keys.items():
         value = raw.get(name)
-        same = type(value) in (int, float, bool) and isinstance(value, bool) == isinstance(nothing, bool)
-        if value is not None and not (same and value == nothing):
+        same = type(value) in (int, float, bool) and isinstance(value, bool) == isinstance(neutral, bool)
+        if value is not None and not (same and value == neutral):
             raise NotBuiltError(dotted(key, name), value, available, file)
-    return {name: value for name, value in raw.items() if name not in later}
+    return {name: value for name, value in raw.items() if name not in unsupported_keys}
 
 
 # ---- Reading of blocks: the kind that ``type`` names, and the values of its parameters
@@ -356,22 +371,22 @@ def read_typed(
         SceneError: no mapping, an unknown type, an unknown key, a bad value.
         NotBuiltError: a type or key that the format knows and this version does not support.
     """
-    planned = unsupported.TYPES.get(what, {})
-    types = ", ".join([*table, *planned])
+    not_built = unsupported.TYPES.get(what, {})
+    types = ", ".join([*table, *not_built])
     if not isinstance(raw, Mapping):
         raise SceneError(key, raw, f"a mapping with a type of {types}", file)
     name = raw.get("type", default or None)
-    if not isinstance(name, str) or (name not in table and name not in planned):
-        hint = did_you_mean(name, [*table, *planned])
+    if not isinstance(name, str) or (name not in table and name not in not_built):
+        hint = did_you_mean(name, [*table, *not_built])
         raise SceneError(dotted(key, "type"), name, f"a known {what} type{hint}: {types}", file)
     words = f"{what} type {name}"
-    if name in planned:
-        check_keys(raw, ("type", *planned[name]), key, words, file)
+    if name in not_built:
+        check_keys(raw, ("type", *not_built[name]), key, words, file)
         raise NotBuiltError(dotted(key, "type"), name, ", ".join(table), file)
     kind = table[name]
 
     def read() -> ParsedParams:
-        return _read(what, kind, name, raw, key, file, texture)
+        return _read_kind(what, kind, name, raw, key, file, texture)
 
     if not isinstance(kind, type):  # an instance may change between calls
         return read()
@@ -383,15 +398,15 @@ def read_typed(
 _known: ResultCache[ParsedParams] = ResultCache(4096)
 
 
-def _read(
+def _read_kind(
     what: str, kind: Any, name: str, raw: Mapping[str, Any], key: str, file: str | None, texture: ReadTexture | None
 ) -> ParsedParams:
     """Read a mapping whose kind is known."""
     words = f"{what} type {name}"
     names = list(parameters_of(kind))
-    later = {**unsupported.KEYS.get(what, {}), **unsupported.KEYS.get(name, {})}
-    check_keys({k: v for k, v in raw.items() if k not in later}, ("type", *names), key, words, file)
-    rest = refuse_not_built(raw, later, key, ", ".join(names), file)
+    unsupported_keys = {**unsupported.KEYS.get(what, {}), **unsupported.KEYS.get(name, {})}
+    check_keys({k: v for k, v in raw.items() if k not in unsupported_keys}, ("type", *names), key, words, file)
+    rest = refuse_not_built(raw, unsupported_keys, key, ", ".join(names), file)
     values = {k: value for k, value in rest.items() if k != "type"}
     return read_params(kind, values, key, file, words, texture)
 
@@ -468,7 +483,7 @@ def _read_value(spec: Spec, value: Any, texture: ReadTexture | None) -> Any:
         Refused: the value is not accepted.
     """
     if isinstance(spec, Block):
-        return _block(spec, texture, value)
+        return _read_block(spec, texture, value)
     if spec.texture and texture is not None:
         if isinstance(value, str) and isinstance(spec, Map):
             value = {"texture": value}
@@ -479,7 +494,8 @@ def _read_value(spec: Spec, value: Any, texture: ReadTexture | None) -> Any:
     return spec.read(value)
 
 
-def _block(spec: Block, texture: ReadTexture | None, value: Any) -> ParsedParams | None:
+def _read_block(spec: Block, texture: ReadTexture | None, value: Any) -> ParsedParams | None:
+    """Return a nested mapping; errors have keys relative to it."""
     if value is None:
         return None
     if not isinstance(value, Mapping):
