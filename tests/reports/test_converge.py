@@ -199,7 +199,7 @@ def test_another_study_has_a_folder_of_its_own(
 def test_progress_is_told_in_lines_where_no_terminal_shows_a_bar(
     no_plots: None, there: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(progress, "EVERY", 0.0)
+    monkeypatch.setattr(progress, "SECONDS_PER_LINE", 0.0)
     words = ["scene=s.yaml", "spp=[1,2]", "seeds=2", "reference=theirs.exr", "render.compile=off", "metrics=mse"]
     assert main(["converge", *words, "out=told"]) == 0
     lines = capfd.readouterr().err.splitlines()

@@ -28,19 +28,22 @@ __all__ = [
     "path_keys",
 ]
 
+#: Config groups: the blocks of run settings.
 GROUPS = ("film", "integrator", "sampler", "render")
 #: Blocks of a scene file that are not run settings; their keys depend on the scene.
 SCENE_BLOCKS = ("version", "camera", "textures", "materials", "shapes", "lights")
 #: Keys of `torchpt orbit` only.
 TURN_KEYS = ("frames", "degrees", "fps", "keep")
-_TURN = re.compile(rf"({'|'.join(TURN_KEYS)})=(.*)\Z", re.DOTALL)
+_TURN_WORD = re.compile(rf"({'|'.join(TURN_KEYS)})=(.*)\Z", re.DOTALL)
 #: Keys of `torchpt render` only: print one path instead of rendering a picture.
 DEBUG_KEYS = ("debug.pixel", "debug.sample")
-_DEBUG = re.compile(r"\+{0,2}(debug\.[^=]*)=(.*)\Z", re.DOTALL)
-_TAKEN = re.compile(r"\+{0,2}([\w.]+)=(.*)\Z", re.DOTALL)
+_DEBUG_WORD = re.compile(r"\+{0,2}(debug\.[^=]*)=(.*)\Z", re.DOTALL)
+# KEY=VALUE with an optional + or ++.
+_KEY_VALUE = re.compile(r"\+{0,2}([\w.]+)=(.*)\Z", re.DOTALL)
+# A sign (+, ++, ~ or none) and a block of a scene, alone or with a key or a value behind it.
 _SCENE_WORD = re.compile(rf"(?:\+\+|\+|~|)(?:{'|'.join(SCENE_BLOCKS)})(?:[.=]|\Z)")
 #: A line of a config file that ``scripts/make_configs.py`` writes for a setting that is a file name.
-_PATH = re.compile(r"^(\w+): .*\(null or a file path\)$", re.MULTILINE)
+_PATH_SETTING = re.compile(r"^(\w+): .*\(null or a file path\)$", re.MULTILINE)
 
 # option -> (its other name, whether a value follows)
 _OPTIONS = {
@@ -54,8 +57,9 @@ _OPTIONS = {
     "--help": ("-h", False),  # handled in main.py
     "--hydra-help": ("", False),
 }
-_CHOICE = re.compile(r"[A-Za-z_][\w,-]*\Z|\[[\w,-]+\]\Z|\{")
-_CONFIGS = ("job", "hydra", "all")
+# What may follow the name of a config group: file names between commas, a list of them, or a mapping.
+_FILE_CHOICE = re.compile(r"[A-Za-z_][\w,-]*\Z|\[[\w,-]+\]\Z|\{")
+_CFG_VALUES = ("job", "hydra", "all")
 
 
 class UsageError(TorchptError):
@@ -108,7 +112,9 @@ class Arguments:
 def path_keys() -> tuple[str, ...]:
     """Return the dotted keys of the settings that are file names, read from the config files as in `torchpt.cli.keys`."""
     files = [(group, configs() / group / "default.yaml") for group in GROUPS]
-    return tuple(f"{group}.{key}" for group, file in files for key in _PATH.findall(file.read_text(encoding="utf-8")))
+    return tuple(
+        f"{group}.{key}" for group, file in files for key in _PATH_SETTING.findall(file.read_text(encoding="utf-8"))
+    )
 
 
 def parse(command: str, words: list[str]) -> Arguments:
@@ -118,47 +124,49 @@ def parse(command: str, words: list[str]) -> Arguments:
         UsageError: an unknown option, a word that is not ``key=value``, or a key given twice.
     """
     arguments = Arguments(command)
-    taken: dict[str, str] = {}
-    swept: list[str] = []
+    value_of_key: dict[str, str] = {}
+    swept_words: list[str] = []
     rest = iter(words)
     for word in rest:
         if word.startswith("-"):
-            _option(arguments, word, rest)
+            _add_option(arguments, word, rest)
             continue
         if is_scene_word(word):
-            swept += _scene_word(arguments, word)
+            swept_words += _add_scene_key(arguments, word)
             continue
-        match = _TAKEN.match(word)
+        match = _KEY_VALUE.match(word)
         if match is None or match[1] not in ("scene", "out", *path_keys()):
-            match = _TURN.match(word) if arguments.command == "orbit" else _DEBUG.match(word)
+            match = _TURN_WORD.match(word) if arguments.command == "orbit" else _DEBUG_WORD.match(word)
         if match is None:
-            _override(arguments, word)
+            _add_override(arguments, word)
             continue
         key, value = match.groups()
-        if key in taken:
-            raise UsageError(f"{key}: given twice, as {taken[key]!r} and {value!r}")
+        if key in value_of_key:
+            raise UsageError(f"{key}: given twice, as {value_of_key[key]!r} and {value!r}")
         if not value:
             raise UsageError(f"{key}: expected a name, got nothing")
-        taken[key] = value
+        value_of_key[key] = value
         if key == "scene":
             arguments.overrides.append("scene")  # placeholder: the order of overrides is the order of the sweep
     arguments.multirun |= any(word.replace(" ", "") == "hydra.mode=MULTIRUN" for word in arguments.overrides)
-    if swept and not arguments.multirun:
-        raise UsageError(f"{swept[0]}: expected one value or a list [..,..] (--multirun sweeps over several)")
+    if swept_words and not arguments.multirun:
+        raise UsageError(f"{swept_words[0]}: expected one value or a list [..,..] (--multirun sweeps over several)")
     if arguments.multirun and arguments.only_shows:
         raise UsageError("--multirun: cannot be combined with --cfg or --hydra-help")
-    arguments.debug = _debug(arguments, taken)
+    arguments.debug = _checked_debug_keys(arguments, value_of_key)
     if arguments.json and arguments.command != "info" and not arguments.debug:
         raise UsageError(
             "--json: only `torchpt info`, `torchpt compare` and `torchpt render debug.pixel=[x,y]` take it; "
             f"the last line of `torchpt {arguments.command}` is JSON anyway"
         )
-    if arguments.command == "info" and "out" in taken:
+    if arguments.command == "info" and "out" in value_of_key:
         raise UsageError("out: `torchpt info` writes no picture")
-    arguments.scenes = _scenes(taken.get("scene"), arguments.multirun)
-    arguments.outs = _names("out", taken.get("out"))
-    arguments.paths = {key: None if taken[key] == "null" else taken[key] for key in path_keys() if key in taken}
-    arguments.turn = {key: taken[key] for key in TURN_KEYS if key in taken}
+    arguments.scenes = _split_scenes(value_of_key.get("scene"), arguments.multirun)
+    arguments.outs = _split_names("out", value_of_key.get("out"))
+    arguments.paths = {
+        key: None if value_of_key[key] == "null" else value_of_key[key] for key in path_keys() if key in value_of_key
+    }
+    arguments.turn = {key: value_of_key[key] for key in TURN_KEYS if key in value_of_key}
     sweep = f"+scene_number={','.join(map(str, range(len(arguments.scenes))))}"
     arguments.overrides = [sweep if word == "scene" else word for word in arguments.overrides]
     if arguments.only_shows:  # Hydra does not show scenes
@@ -168,7 +176,7 @@ def parse(command: str, words: list[str]) -> Arguments:
     return arguments
 
 
-def _scene_word(arguments: Arguments, word: str) -> list[str]:
+def _add_scene_key(arguments: Arguments, word: str) -> list[str]:
     """Add an override of a scene key to `arguments`; return ``[word]`` if it sweeps, else ``[]``."""
     from torchpt.cli.grammar import read_word
 
@@ -186,9 +194,9 @@ def is_scene_word(word: str) -> bool:
     return _SCENE_WORD.match(word) is not None
 
 
-def _debug(arguments: Arguments, taken: dict[str, str]) -> dict[str, str]:
-    """Return the ``debug.*`` values among `taken`, after a check that they fit the other words."""
-    found = {key: value for key, value in taken.items() if key.startswith("debug.")}
+def _checked_debug_keys(arguments: Arguments, value_of_key: dict[str, str]) -> dict[str, str]:
+    """Return the ``debug.*`` values among `value_of_key`, after a check that they fit the other words."""
+    found = {key: value for key, value in value_of_key.items() if key.startswith("debug.")}
     for key in found:
         if key not in DEBUG_KEYS:
             raise UsageError(f"{key}: unknown key; known: {', '.join(DEBUG_KEYS)}")
@@ -196,7 +204,7 @@ def _debug(arguments: Arguments, taken: dict[str, str]) -> dict[str, str]:
             raise UsageError(f"{key}: only `torchpt render` takes it")
     if "debug.sample" in found and "debug.pixel" not in found:
         raise UsageError("debug.sample: expected debug.pixel=[x,y] beside it, whose sample it is")
-    if found and "out" in taken:
+    if found and "out" in value_of_key:
         raise UsageError("out: no picture is rendered where debug.pixel is given")
     return found
 
@@ -230,34 +238,37 @@ def parse_study(words: list[str]) -> tuple[dict[str, str], list[str]]:
     return study, changes
 
 
-def _option(arguments: Arguments, word: str, rest: object) -> None:
+def _add_option(arguments: Arguments, word: str, rest: object) -> None:
+    """Add an option to ``arguments``; its value may be the next of the words in iterator ``rest``."""
     name, _, value = word.partition("=")
-    long = next((option for option, (short, _) in _OPTIONS.items() if name in (option, short)), None)
-    if long is None:
+    option = next((option for option, (short, _) in _OPTIONS.items() if name in (option, short)), None)
+    if option is None:
         raise UsageError(f"{word}: unknown option; known: {', '.join(_OPTIONS)}")
-    if _OPTIONS[long][1]:
+    _, takes_value = _OPTIONS[option]
+    if takes_value:
         value = value or next(rest, "")  # type: ignore[call-overload]
-        if long == "--cfg" and value not in _CONFIGS:
-            raise UsageError(f"--cfg: expected one of {', '.join(_CONFIGS)}, got {value!r}")
-        if long == "--config-dir":
+        if option == "--cfg" and value not in _CFG_VALUES:
+            raise UsageError(f"--cfg: expected one of {', '.join(_CFG_VALUES)}, got {value!r}")
+        if option == "--config-dir":
             if not Path(value).is_dir():
                 raise UsageError(f"--config-dir: expected a folder that is there, got {value!r}")
             arguments.config_dir = value = os.path.abspath(value)
-        if long == "--config-name" and not re.match(r"[\w-]+\Z", value):
+        if option == "--config-name" and not re.match(r"[\w-]+\Z", value):
             raise UsageError(
                 f"--config-name: expected the name of a .yaml file in the folder of --config-dir, got {value!r}"
             )
-        arguments.options += [long, value]
+        arguments.options += [option, value]
     elif value:
-        raise UsageError(f"{word}: {long} takes no value")
-    elif long == "--json":
+        raise UsageError(f"{word}: {option} takes no value")
+    elif option == "--json":
         arguments.json = True
     else:
-        arguments.multirun |= long == "--multirun"
-        arguments.options.append(long)
+        arguments.multirun |= option == "--multirun"
+        arguments.options.append(option)
 
 
-def _override(arguments: Arguments, word: str) -> None:
+def _add_override(arguments: Arguments, word: str) -> None:
+    """Add a word to the overrides for Hydra, after checks that Hydra does not make."""
     if "=" not in word and not word.startswith("~"):
         raise UsageError(
             f"{word}: expected key=value, for example scene={word if word.isidentifier() else 'cornell_box'}"
@@ -267,25 +278,27 @@ def _override(arguments: Arguments, word: str) -> None:
     key, _, value = word.lstrip("+~").partition("=")
     if not key.strip() or key == "out" or re.match(r"scene(\b|_number|_key_)", key):
         raise UsageError(f"{word}: expected key=value")
-    if key in GROUPS and (value == "null" or not _CHOICE.match(value)):  # no path out of the group's folder
+    if key in GROUPS and (value == "null" or not _FILE_CHOICE.match(value)):  # no path out of the group's folder
         raise UsageError(f"{key}: expected the name of a file in configs/{key}, got {value!r}")
     arguments.overrides.append(word)
 
 
-def _scenes(value: str | None, multirun: bool) -> list[str]:
+def _split_scenes(value: str | None, multirun: bool) -> list[str]:
+    """Return the names of scenes in the value of ``scene=``; commas separate them in a sweep only."""
     if value is None:
         return []
     if not multirun or "," not in value or Path(value).exists():
         return [value]
-    return _names("scene", f"[{value}]")
+    return _split_names("scene", f"[{value}]")
 
 
-def _names(key: str, value: str | None) -> list[str]:
+def _split_names(key: str, value: str | None) -> list[str]:
     """Split a value into names: ``a b.exr`` is one, ``[a.exr, 'b,c.png']`` is a list; names with commas are quoted."""
     if value is None:
         return []
     if not (value.startswith("[") and value.endswith("]")):
         return [value]
+    # Text in double or single quotes, or without commas; then a comma or the end.
     parts = re.findall(r"""\s*("[^"]*"|'[^']*'|[^,]*?)\s*(?:,|\Z)""", value[1:-1])
     names = [part[1:-1] if part[:1] in "'\"" and part[:1] == part[-1:] and len(part) > 1 else part for part in parts]
     if len(names) > 1 and not names[-1]:

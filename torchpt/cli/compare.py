@@ -41,9 +41,10 @@ torchpt compare TEST REFERENCE [--json] [map=FILE.png|FILE.exr] [key=value ...]
 flip needs the extra `compare`. Exit codes: 0 compared, however far apart; 2 bad input.
 """
 _KEYS = ("map", "metric", "range", "layer", "exposure", "tonemap", "gamma")
+# KEY=VALUE of a key above; the value may hold line breaks.
 _KEY = re.compile(rf"({'|'.join(_KEYS)})=(.*)\Z", re.DOTALL)
-_MAPS = (".exr", ".png")
-_SHOWN = ("exposure", "tonemap", "gamma")
+_MAP_ENDINGS = (".exr", ".png")
+_DISPLAY_KEYS = ("exposure", "tonemap", "gamma")
 #: Metrics whose values are at most 1.
 _UP_TO_ONE = ("smape", "ssim", "flip")
 
@@ -102,7 +103,7 @@ class CompareOptions:
 
 
 @dataclass(frozen=True)
-class _Map:
+class _MapRequest:
     """The error map to write: file, metric, and the error that gets the brightest colour (None: automatic)."""
 
     file: str
@@ -120,15 +121,15 @@ def run(words: list[str], interrupt: Interrupt) -> int:
     from torchpt.images.comparison import compare as measure
 
     gc_pause.resume()
-    shown, chart = _shown(options.given), _map(options)
+    shown, map_request = _display_transform(options.given), _map_request(options)
     layer = options.given.get("layer")
-    (name, first), (_, second) = (_picture(path, layer) for path in options.pictures)
-    _agree(options.pictures, first, second)
+    (name, first), (_, second) = (_read_layer(path, layer) for path in options.pictures)
+    _check_same_size(options.pictures, first, second)
     height, width, channels = first.shape
     colours = _is_colour(name, channels)
     if not colours:
         _refuse_colour_keys(options, name)
-    (image, alpha), (reference, other) = (_apart(picture, colours) for picture in (first, second))
+    (image, alpha), (reference, other) = (_split_alpha(picture, colours) for picture in (first, second))
     found = measure(image, reference, shown, colours)
     facts: dict[str, Any] = {"test": options.pictures[0], "reference": options.pictures[1], "layer": name}
     facts |= {"width": width, "height": height, "channels": channels, "metrics": found.metrics}
@@ -139,17 +140,17 @@ def run(words: list[str], interrupt: Interrupt) -> int:
         facts["display"] = vars(shown)
     if alpha is not None and other is not None:
         facts["largest_alpha_difference"] = float((alpha.double() - other.double()).abs().max())
-    if chart is not None:
-        facts["map"] = _write_map(chart, image, reference, shown)
+    if map_request is not None:
+        facts["map"] = _write_map(map_request, image, reference, shown)
     with flushed_stdout():
         if options.json:
             print(json.dumps(plain(facts), allow_nan=False))
         else:
-            _print(facts, found)
+            _print_tables(facts, found)
     return 0
 
 
-def _shown(given: dict[str, str]) -> DisplayTransform:
+def _display_transform(given: dict[str, str]) -> DisplayTransform:
     """Parse ``exposure=``, ``tonemap=`` and ``gamma=``, which take the same values as ``film.*``.
 
     Raises:
@@ -160,9 +161,9 @@ def _shown(given: dict[str, str]) -> DisplayTransform:
     from torchpt.spec.reading import Refused
 
     values: dict[str, Any] = {}
-    for key in _SHOWN:
+    for key in _DISPLAY_KEYS:
         if key in given:
-            number = _number(given[key])
+            number = _float_or_nan(given[key])
             try:
                 values[key] = Film.parameters[key].read(given[key] if math.isnan(number) else number)
             except Refused as refused:
@@ -170,14 +171,15 @@ def _shown(given: dict[str, str]) -> DisplayTransform:
     return DisplayTransform(**values)
 
 
-def _number(text: str) -> float:
+def _float_or_nan(text: str) -> float:
+    """Return a number, or NaN for text that is none."""
     try:
         return float(text)
     except ValueError:
         return math.nan
 
 
-def _map(options: CompareOptions) -> _Map | None:
+def _map_request(options: CompareOptions) -> _MapRequest | None:
     """Return the error map to write, checked before the pictures are read; None without ``map=``.
 
     Raises:
@@ -192,20 +194,20 @@ def _map(options: CompareOptions) -> _Map | None:
     metric = given.get("metric", "relmse")
     if metric not in MAPS:
         raise SceneError("metric", metric, f"one of {', '.join(MAPS)}")
-    place = check_writable(given["map"], _MAPS)
-    if str(place) in map(os.path.realpath, options.pictures):
+    map_path = check_writable(given["map"], _MAP_ENDINGS)
+    if str(map_path) in map(os.path.realpath, options.pictures):
         raise OutputError(given["map"], "is one of the pictures that are compared; give map= another name")
     if "range" not in given:
-        return _Map(given["map"], metric, None)
-    if place.suffix.lower() == ".exr":
+        return _MapRequest(given["map"], metric, None)
+    if map_path.suffix.lower() == ".exr":
         raise UsageError("range: an .exr map holds the numbers themselves; only .png has a range")
-    top = _number(given["range"])
+    top = _float_or_nan(given["range"])
     if not 0.0 < top < math.inf:
         raise SceneError("range", given["range"], "a number above 0")
-    return _Map(given["map"], metric, top)
+    return _MapRequest(given["map"], metric, top)
 
 
-def _picture(path: str, layer: str | None) -> tuple[str, Tensor]:
+def _read_layer(path: str, layer: str | None) -> tuple[str, Tensor]:
     """Read a layer of a file: return its name and values ``(H, W, C)``. Default: the picture, or the only layer.
 
     Raises:
@@ -227,7 +229,8 @@ def _picture(path: str, layer: str | None) -> tuple[str, Tensor]:
     return wanted, layers[wanted]
 
 
-def _agree(paths: list[str], first: Tensor, second: Tensor) -> None:
+def _check_same_size(paths: list[str], first: Tensor, second: Tensor) -> None:
+    """Raise AssetError unless two pictures have the same size and number of channels."""
     sizes = [f"{picture.shape[1]} x {picture.shape[0]}" for picture in (first, second)]
     if sizes[0] != sizes[1]:
         raise AssetError(paths[0], f"is {sizes[0]} pixels, and {paths[1]} is {sizes[1]}: sizes must agree")
@@ -248,21 +251,21 @@ def _is_colour(layer: str, channels: int) -> bool:
 def _refuse_colour_keys(options: CompareOptions, layer: str) -> None:
     from torchpt.images.comparison import COLOUR_METRICS
 
-    for key in _SHOWN:
+    for key in _DISPLAY_KEYS:
         if key in options.given:
             raise UsageError(f"{key}: the layer {layer} holds no colours, so it is not shown on a screen")
     if options.given.get("metric") in COLOUR_METRICS:
         raise UsageError(f"metric: the layer {layer} holds no colours; expected relmse, mse or smape")
 
 
-def _apart(picture: Tensor, colours: bool) -> tuple[Tensor, Tensor | None]:
+def _split_alpha(picture: Tensor, colours: bool) -> tuple[Tensor, Tensor | None]:
     """Split a picture into its colours and its alpha channel (None if it has none)."""
     if colours and picture.shape[2] in (2, 4):
         return picture[..., :-1], picture[..., -1]
     return picture, None
 
 
-def _write_map(chart: _Map, image: Tensor, reference: Tensor, shown: DisplayTransform) -> dict[str, Any]:
+def _write_map(map_request: _MapRequest, image: Tensor, reference: Tensor, shown: DisplayTransform) -> dict[str, Any]:
     """Write the error map and return its facts: file, metric, largest error, range of the colours.
 
     Raises:
@@ -275,21 +278,21 @@ def _write_map(chart: _Map, image: Tensor, reference: Tensor, shown: DisplayTran
     from torchpt.images.false_colour import false_colour
 
     try:
-        errors = comparison_map(chart.metric, image, reference, shown)
+        errors = comparison_map(map_request.metric, image, reference, shown)
     except (ImportError, ValueError) as problem:
-        raise OutputError(chart.file, f"there is no such map: {problem}") from None
+        raise OutputError(map_request.file, f"there is no such map: {problem}") from None
     finite = errors[torch.isfinite(errors)]
-    most = float(finite.max()) if finite.numel() else math.nan
-    facts = {"file": chart.file, "metric": chart.metric, "largest": most}
-    if chart.file.lower().endswith(".exr"):
-        write_image(chart.file, errors[..., None])
+    largest = float(finite.max()) if finite.numel() else math.nan
+    facts = {"file": map_request.file, "metric": map_request.metric, "largest": largest}
+    if map_request.file.lower().endswith(".exr"):
+        write_image(map_request.file, errors[..., None])
         return facts
-    top = chart.top or (1.0 if chart.metric in _UP_TO_ONE else _most_of(finite))
-    write_image(chart.file, false_colour(errors, top), gamma=1.0)
+    top = map_request.top or (1.0 if map_request.metric in _UP_TO_ONE else _top_of_range(finite))
+    write_image(map_request.file, false_colour(errors, top), gamma=1.0)
     return facts | {"range": [0.0, top]}
 
 
-def _most_of(values: Tensor) -> float:
+def _top_of_range(values: Tensor) -> float:
     """Return the 99th percentile of the values; if it is 0 their maximum, and 1 if that is 0 too."""
     if not values.numel():
         return 1.0
@@ -297,67 +300,79 @@ def _most_of(values: Tensor) -> float:
     return float(ordered[math.ceil(0.99 * len(ordered)) - 1]) or float(ordered[-1]) or 1.0
 
 
-def _print(facts: dict[str, Any], found: Comparison) -> None:
+def _print_tables(facts: dict[str, Any], found: Comparison) -> None:
     """Print a table of the metrics, a table of the means, and notes about them."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    class Piped(Console):
+    class PipeConsole(Console):
         def on_broken_pipe(self) -> None:  # rich's own version exits the process
             raise BrokenPipeError
 
-    console = Piped(highlight=False, width=None if sys.stdout.isatty() else 120)
+    console = PipeConsole(highlight=False, width=None if sys.stdout.isatty() else 120)
 
-    def say(text: str) -> None:
+    def print_line(text: str) -> None:
         code = console.encoding  # a file name may contain characters that the encoding lacks
         console.print(Text(text.encode(code, "backslashreplace").decode(code)), soft_wrap=True)
 
-    def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
-        drawn = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    def print_table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+        rich_table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False)
         for index, title in enumerate(head):
-            drawn.add_column(title, justify="right" if 0 < index < 4 else "left")
+            rich_table.add_column(title, justify="right" if 0 < index < 4 else "left")
         for row in rows:
-            drawn.add_row(*map(Text, row))
+            rich_table.add_row(*map(Text, row))
         console.print()
-        console.print(drawn)
+        console.print(rich_table)
 
-    say(f"test       {facts['test']}\nreference  {facts['reference']}")
-    say(f"           {facts['layer']}, {facts['width']} x {facts['height']} pixels, channels: {facts['channels']}")
-    table(("measure", "value"), [(name, _told(value)) for name, value in found.metrics.items()])
-    table(("", "test", "reference", "ratio"), _means(facts, found))
-    say("")
+    print_line(f"test       {facts['test']}\nreference  {facts['reference']}")
+    print_line(
+        f"           {facts['layer']}, {facts['width']} x {facts['height']} pixels, channels: {facts['channels']}"
+    )
+    print_table(("measure", "value"), [(name, _format_value(value)) for name, value in found.metrics.items()])
+    print_table(("", "test", "reference", "ratio"), _mean_rows(facts, found))
+    print_line("")
     for reason in dict.fromkeys(found.reasons.values()):
-        say(f"{', '.join(name for name in found.reasons if found.reasons[name] == reason)}: {reason}")
+        print_line(f"{', '.join(name for name in found.reasons if found.reasons[name] == reason)}: {reason}")
     if display := facts.get("display"):
-        say(
+        print_line(
             "psnr, ssim: of what a screen shows; "
-            + ", ".join(f"{key} {_told(value)}" for key, value in display.items())
+            + ", ".join(f"{key} {_format_value(value)}" for key, value in display.items())
         )
     if "largest_alpha_difference" in facts:
-        say(f"alpha is in no measure; its largest difference is {_told(facts['largest_alpha_difference'])}")
-    if chart := facts.get("map"):
-        shows = (
-            f"; black 0, brightest {_told(chart['range'][1])} and more, green not finite" if "range" in chart else ""
+        print_line(
+            f"alpha is in no measure; its largest difference is {_format_value(facts['largest_alpha_difference'])}"
         )
-        say(f"map: {chart['metric']}, largest {_told(chart['largest'])}{shows}, in {chart['file']}")
+    if map_request := facts.get("map"):
+        shows = (
+            f"; black 0, brightest {_format_value(map_request['range'][1])} and more, green not finite"
+            if "range" in map_request
+            else ""
+        )
+        print_line(
+            f"map: {map_request['metric']}, largest {_format_value(map_request['largest'])}{shows}, in {map_request['file']}"
+        )
 
 
-def _means(facts: dict[str, Any], found: Comparison) -> list[tuple[str, ...]]:
+def _mean_rows(facts: dict[str, Any], found: Comparison) -> list[tuple[str, ...]]:
     """Return table rows: the mean over all channels, the mean of each, and the number of pixels that are not finite."""
-    one, two = found.means
-    names = ("red", "green", "blue") if len(one) == 3 and "display" in facts else [str(k) for k in range(len(one))]
+    test_means, reference_means = found.means
+    names = (
+        ("red", "green", "blue")
+        if len(test_means) == 3 and "display" in facts
+        else [str(k) for k in range(len(test_means))]
+    )
     rows = [
-        (f"mean, {name}", _told(a), _told(b), _told(a / b if b else math.nan))
-        for name, a, b in zip(names, one, two, strict=True)
+        (f"mean, {name}", _format_value(a), _format_value(b), _format_value(a / b if b else math.nan))
+        for name, a, b in zip(names, test_means, reference_means, strict=True)
     ]
-    whole = (sum(one) / len(one), sum(two) / len(two))
-    rows = [("mean", *map(_told, whole), _told(found.ratio)), *(rows if len(one) > 1 else [])]
+    overall = (sum(test_means) / len(test_means), sum(reference_means) / len(reference_means))
+    rows = [("mean", *map(_format_value, overall), _format_value(found.ratio)), *(rows if len(test_means) > 1 else [])]
     return [*rows, ("pixels not finite", *(f"{count:,}" for count in found.nonfinite), "")]
 
 
-def _told(value: float | str) -> str:
+def _format_value(value: float | str) -> str:
     if isinstance(value, str):
         return value
     if math.isinf(value):

@@ -13,17 +13,17 @@ from typing import Any
 from torchpt.cli import gc_pause, keys
 from torchpt.cli.arguments import UsageError, parse_study
 from torchpt.cli.interrupt import Interrupt, Interrupted
-from torchpt.cli.notices import notices
+from torchpt.cli.notices import printed_scene_warnings
 from torchpt.cli.progress import Bar
 from torchpt.cli.streams import flushed_stdout
 from torchpt.core.errors import OutputError, SceneError
 
 __all__ = ["HELP", "converge", "raw_study", "run"]
 
-#: What a folder says that it is of.
-_STUDY = "study.json"
-#: Keys by which the report shows the same runs otherwise.
-_SHOWN = ("title", "metrics", "target", "extra")
+#: File in the output folder with all that the study's runs depend on, by which the same study is known again.
+_STUDY_FILE = "study.json"
+#: Keys that change how the report shows the runs, not the runs.
+_PRESENTATION_KEYS = ("title", "metrics", "target", "extra")
 
 HELP = """\
 torchpt converge scene=NAME|[A,B] [out=FOLDER] [key=value|key=[a,b] ...]
@@ -82,11 +82,11 @@ def raw_study(words: Mapping[str, str], changes: Sequence[str] = ()) -> tuple[di
         if key == "study":
             continue
         if key == "scene":
-            value: Any = _names(text)
+            value: Any = _scene_names(text)
         elif key == "title" or (key == "reference" and not text.startswith("{")):
             value = text  # a file name may contain characters that YAML interprets
         else:
-            value = _value(key, text)
+            value = _parse_value(key, text)
         head, _, name = key.partition(".")
         if head == "reference" and name:
             before = raw.get("reference")
@@ -94,11 +94,11 @@ def raw_study(words: Mapping[str, str], changes: Sequence[str] = ()) -> tuple[di
         else:
             raw[key] = value
     if changes or "overrides" in raw:
-        raw["overrides"] = _changes(raw.get("overrides") or {}, file) | _read(changes)
+        raw["overrides"] = _file_overrides(raw.get("overrides") or {}, file) | _command_line_overrides(changes)
     return raw, file
 
 
-def _changes(written: Any, file: str | None) -> dict[str, list[Any]]:
+def _file_overrides(written: Any, file: str | None) -> dict[str, list[Any]]:
     """Return the values of a study file's ``overrides`` by key; text is parsed as on the command line (``a,b``: two values)."""
     from torchpt.cli.grammar import read_value
 
@@ -110,7 +110,7 @@ def _changes(written: Any, file: str | None) -> dict[str, list[Any]]:
     }
 
 
-def _read(words: Sequence[str]) -> dict[str, list[Any]]:
+def _command_line_overrides(words: Sequence[str]) -> dict[str, list[Any]]:
     """Parse overrides of the command line: values by key."""
     found: dict[str, list[Any]] = {}
     for word in words:
@@ -123,7 +123,7 @@ def _read(words: Sequence[str]) -> dict[str, list[Any]]:
     return found
 
 
-def _value(key: str, text: str) -> Any:
+def _parse_value(key: str, text: str) -> Any:
     """Parse a value as YAML."""
     from torchpt.scene.formats.yaml import parse_yaml, plain
 
@@ -134,7 +134,7 @@ def _value(key: str, text: str) -> Any:
     return plain({key: parsed})[key]
 
 
-def _names(text: str) -> list[str]:
+def _scene_names(text: str) -> list[str]:
     if Path(text).exists() or not (text.startswith("[") and text.endswith("]")):
         return [text]
     return [name.strip().strip("'\"") for name in text[1:-1].split(",")]
@@ -160,14 +160,14 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
     gc_pause.resume()
     start = time.perf_counter()
     raw, file = raw_study({key: text for key, text in words.items() if key != "out"}, changes)
-    with notices():
+    with printed_scene_warnings():
         study = study_of(raw, file)
-        told = _told(raw, study.options)
-        folder, note = _folder(words.get("out"), f"{_stem(study.scenes, file)}_converge", told)
+        identity = _study_identity(raw, study.options)
+        folder, note = _output_folder(words.get("out"), f"{_default_stem(study.scenes, file)}_converge", identity)
         prepared = prepare(study)
         check_files(study, prepared)
         store = Store(folder / "runs")
-        write_whole(folder / _STUDY, json.dumps(told, indent=1).encode())
+        write_whole(folder / _STUDY_FILE, json.dumps(identity, indent=1).encode())
     if note:
         print(f"torchpt: {note}", file=sys.stderr)
     interrupt.check()
@@ -214,13 +214,13 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
     return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
 
 
-def _folder(out: str | None, name: str, told: dict[str, Any]) -> tuple[Path, str]:
+def _output_folder(out: str | None, name: str, identity: dict[str, Any]) -> tuple[Path, str]:
     """Return the output folder of a study, and a message if that or the default folder holds another study.
 
     Args:
         out: value of ``out=``, or None.
         name: default folder; if it holds another study, ``NAME_2``, ``NAME_3``, ... are tried.
-        told: result of :func:`_told`.
+        identity: result of :func:`_study_identity`.
 
     Raises:
         OutputError: the path is a file.
@@ -228,29 +228,29 @@ def _folder(out: str | None, name: str, told: dict[str, Any]) -> tuple[Path, str
     first = Path(name if out is None else out).expanduser()
     if first.exists() and not first.is_dir():
         raise OutputError(first, "is a file; expected a folder")
-    if not _holds_another(first, told):
+    if not _holds_another(first, identity):
         return first, ""
     if out is not None:
         return first, f"{first} holds the report of another study, which this one's replaces; its runs stay"
-    later = (first.with_name(f"{first.name}_{number}") for number in count(2))
-    folder = next(path for path in later if not _holds_another(path, told))
+    numbered_folders = (first.with_name(f"{first.name}_{number}") for number in count(2))
+    folder = next(path for path in numbered_folders if not _holds_another(path, identity))
     return folder, f"{first} holds another study; this one is in {folder} (out= names another folder)"
 
 
-def _holds_another(folder: Path, told: dict[str, Any]) -> bool:
+def _holds_another(folder: Path, identity: dict[str, Any]) -> bool:
     """Return True if a folder holds another study. A study with fewer steps or seeds, else equal, is the same one."""
-    note = folder / _STUDY
-    if not note.exists():
+    study_file = folder / _STUDY_FILE
+    if not study_file.exists():
         return (folder / "report.html").exists() or (folder.exists() and not folder.is_dir())
     try:
-        known = json.loads(note.read_text(encoding="utf-8"))
-        grown = set(known["spp"]) <= set(told["spp"]) and known["seeds"] <= told["seeds"]
+        known = json.loads(study_file.read_text(encoding="utf-8"))
+        has_same_or_more_steps = set(known["spp"]) <= set(identity["spp"]) and known["seeds"] <= identity["seeds"]
     except (OSError, ValueError, KeyError, TypeError):  # not written by torchpt
         return True
-    return {**known, "spp": 0, "seeds": 0} != {**told, "spp": 0, "seeds": 0} or not grown
+    return {**known, "spp": 0, "seeds": 0} != {**identity, "spp": 0, "seeds": 0} or not has_same_or_more_steps
 
 
-def _told(raw: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
+def _study_identity(raw: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """Return everything that the runs of a study depend on, as values for JSON.
 
     Args:
@@ -259,11 +259,11 @@ def _told(raw: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """
     from torchpt.reports.report import plain
 
-    told = {key: value for key, value in raw.items() if key not in _SHOWN}
-    return json.loads(json.dumps(plain({**told, "spp": options["spp"], "seeds": options["seeds"]}), sort_keys=True))
+    identity = {key: value for key, value in raw.items() if key not in _PRESENTATION_KEYS}
+    return json.loads(json.dumps(plain({**identity, "spp": options["spp"], "seeds": options["seeds"]}), sort_keys=True))
 
 
-def _stem(scenes: tuple[str, ...], file: str | None) -> str:
+def _default_stem(scenes: tuple[str, ...], file: str | None) -> str:
     if file is not None:
         return Path(file).stem
     return "_".join(Path(name).stem if name.endswith((".yaml", ".yml")) else name for name in scenes)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from torchpt.cli import gc_pause
 from torchpt.cli.arguments import UsageError
 from torchpt.cli.interrupt import Interrupt
-from torchpt.cli.notices import notices
+from torchpt.cli.notices import printed_scene_warnings
 from torchpt.cli.render import Job, scene_and_settings
 from torchpt.cli.streams import flushed_stdout
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PathRequest", "debug", "lines"]
 
+# [x,y] or x,y: two whole numbers of at most nine digits.
 _PIXEL = re.compile(r"\[?\s*(\d{1,9})\s*,\s*(\d{1,9})\s*\]?\Z")
 _SAMPLE = re.compile(r"\d{1,18}\Z")
 
@@ -52,7 +53,7 @@ class PathRequest:
         return PathRequest((int(pixel[1]), int(pixel[2])), int(sample))
 
 
-def debug(job: Job, request: PathRequest, interrupt: Interrupt, as_json: bool = False) -> int:
+def debug(job: Job, request: PathRequest, interrupt: Interrupt, *, as_json: bool = False) -> int:
     """Load the scene, trace the path, print it and return the exit code.
 
     Raises:
@@ -64,22 +65,22 @@ def debug(job: Job, request: PathRequest, interrupt: Interrupt, as_json: bool = 
     from torchpt.scene.scene import Scene
 
     gc_pause.resume()
-    with notices():
+    with printed_scene_warnings():
         description, settings = scene_and_settings(job)
         scene = Scene(description, device_of(settings.render.device))
         path = one_path(scene, settings, request.pixel, request.sample)
     interrupt.check()
     with flushed_stdout():
-        print(json.dumps(_plain(asdict(path)), allow_nan=False) if as_json else "\n".join(lines(path)))
+        print(json.dumps(_json_value(asdict(path)), allow_nan=False) if as_json else "\n".join(lines(path)))
     return 0
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     """Convert a value for JSON, which has no NaN and no infinity: they become text."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_json_value(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value
@@ -89,67 +90,74 @@ def lines(path: Path) -> Iterator[str]:
     """Yield the lines that describe a path."""
     x, y = path.pixel
     yield f"scene {path.scene}, pixel ({x}, {y}), sample {path.sample}, seed {path.seed}"
-    yield f"camera at {_three(path.origin)}, looking along {_three(path.direction)}"
+    yield f"camera at {_triple_text(path.origin)}, looking along {_triple_text(path.direction)}"
     for vertex in path.vertices:
-        yield from _vertex(vertex)
+        yield from _vertex_lines(vertex)
     yield f"ended: {path.ended}"
-    yield f"radiance {_three(path.radiance, 9)}"
+    yield f"radiance {_triple_text(path.radiance, 9)}"
     if path.value != path.radiance:
-        yield f"in the picture {_three(path.value, 9)}"
+        yield f"in the picture {_triple_text(path.value, 9)}"
 
 
-def _vertex(vertex: Vertex) -> Iterator[str]:
+def _vertex_lines(vertex: Vertex) -> Iterator[str]:
+    """Yield the lines of one vertex."""
     if vertex.position is None:
         yield f"{vertex.depth}  escaped"
     else:
         assert vertex.normal is not None and vertex.geometric_normal is not None
         where = f"{vertex.shape}, {vertex.kind} {vertex.primitive}"
         yield f"{vertex.depth}  {where}, material {vertex.material} ({vertex.model})"
-        yield _row("position", _three(vertex.position))
-        yield _row("normal", f"{_three(vertex.normal)}, geometric {_three(vertex.geometric_normal)}")
-        yield _row("wo", _three(vertex.wo))
+        yield _labelled_line("position", _triple_text(vertex.position))
+        yield _labelled_line(
+            "normal", f"{_triple_text(vertex.normal)}, geometric {_triple_text(vertex.geometric_normal)}"
+        )
+        yield _labelled_line("wo", _triple_text(vertex.wo))
     if vertex.emission is not None:
-        yield _row("emission" if vertex.position else "environment", _emission(vertex.emission))
+        yield _labelled_line("emission" if vertex.position else "environment", _emission_text(vertex.emission))
     if vertex.light is not None:
-        yield _row("light", _light(vertex.light))
+        yield _labelled_line("light", _light_sample_text(vertex.light))
     if vertex.scattered is not None:
-        yield from _scattered(vertex.scattered)
-    yield _row("radiance", _three(vertex.radiance))
+        yield from _bsdf_sample_lines(vertex.scattered)
+    yield _labelled_line("radiance", _triple_text(vertex.radiance))
 
 
-def _emission(found: EmissionRecord) -> str:
-    parts = f"radiance {_three(found.radiance)}, pdf {_number(found.pdf)}, MIS weight {_number(found.mis_weight)}"
-    return f"{found.light}: {parts}, contribution {_three(found.contribution)}"
+def _emission_text(record: EmissionRecord) -> str:
+    radiance, pdf = _triple_text(record.radiance), _number_text(record.pdf)
+    parts = f"radiance {radiance}, pdf {pdf}, MIS weight {_number_text(record.mis_weight)}"
+    return f"{record.light}: {parts}, contribution {_triple_text(record.contribution)}"
 
 
-def _light(light: LightSampleRecord) -> str:
-    seen = "not asked" if light.visible is None else _number(light.visible)
+def _light_sample_text(light: LightSampleRecord) -> str:
+    visible = "not asked" if light.visible is None else _number_text(light.visible)
     return (
-        f"{light.light}: wi {_three(light.wi)}, {_density(light.pdf)}, radiance/pdf {_three(light.arriving)}, "
-        f"bsdf {_three(light.bsdf)}, MIS weight {_number(light.mis_weight)}, visible {seen}, "
-        f"contribution {_three(light.contribution)}"
+        f"{light.light}: wi {_triple_text(light.wi)}, {_pdf_text(light.pdf)}, radiance/pdf {_triple_text(light.arriving)}, "
+        f"bsdf {_triple_text(light.bsdf)}, MIS weight {_number_text(light.mis_weight)}, visible {visible}, "
+        f"contribution {_triple_text(light.contribution)}"
     )
 
 
-def _scattered(found: BsdfSampleRecord) -> Iterator[str]:
-    eta = "" if found.eta is None else f", eta {_number(found.eta)}"
-    yield _row("scattered", f"wi {_three(found.wi)}, {_density(found.pdf)}, weight {_three(found.weight)}{eta}")
-    if found.survival is not None:
-        yield _row("roulette", f"survives with {_number(found.survival)}")
-    yield _row("throughput", _three(found.throughput))
+def _bsdf_sample_lines(record: BsdfSampleRecord) -> Iterator[str]:
+    """Yield the lines of a BSDF sample."""
+    eta = "" if record.eta is None else f", eta {_number_text(record.eta)}"
+    yield _labelled_line(
+        "scattered", f"wi {_triple_text(record.wi)}, {_pdf_text(record.pdf)}, weight {_triple_text(record.weight)}{eta}"
+    )
+    if record.survival is not None:
+        yield _labelled_line("roulette", f"survives with {_number_text(record.survival)}")
+    yield _labelled_line("throughput", _triple_text(record.throughput))
 
 
-def _row(name: str, text: str) -> str:
+def _labelled_line(name: str, text: str) -> str:
     return f"   {name:11} {text}"
 
 
-def _density(pdf: float) -> str:
-    return "pdf inf (a delta)" if pdf == math.inf else f"pdf {_number(pdf)}"
+def _pdf_text(pdf: float) -> str:
+    return "pdf inf (a delta)" if pdf == math.inf else f"pdf {_number_text(pdf)}"
 
 
-def _number(value: float, digits: int = 6) -> str:
-    return f"{value + 0.0:.{digits}g}"  # prints -0 as 0
+def _number_text(value: float, digits: int = 6) -> str:
+    return f"{value + 0.0:.{digits}g}"  # -0.0 + 0.0 is 0.0: prints no minus sign
 
 
-def _three(values: Sequence[float], digits: int = 6) -> str:
-    return f"({', '.join(_number(value, digits) for value in values)})"
+def _triple_text(values: Sequence[float], digits: int = 6) -> str:
+    return f"({', '.join(_number_text(value, digits) for value in values)})"

@@ -20,11 +20,12 @@ if TYPE_CHECKING:
     from torchpt.ranks import Group
     from torchpt.ranks.launch import LaunchedProcess
 
-__all__ = ["group", "is_distributed", "run_on_ranks", "say"]
+__all__ = ["group", "is_distributed", "print_once", "run_on_ranks"]
 
 #: Words that ask for a sweep, and those that only print a help or a version.
-_SWEEPS, _SHOWN = ("-m", "--multirun"), ("-h", "--help", "help", "--version")
+_SWEEP_OPTIONS, _HELP_WORDS = ("-m", "--multirun"), ("-h", "--help", "help", "--version")
 
+#: This process as one of several ranks, and its stderr before that was silenced; None in a run of one process.
 _started: LaunchedProcess | None = None
 _stderr: Any = None
 
@@ -39,7 +40,7 @@ def group() -> Group | None:
     return None if _started is None else _started.group
 
 
-def say(line: str, about: str = "") -> None:
+def print_once(line: str, about: str = "") -> None:
     """Print a line on stderr from one rank only: the first rank that reports on the topic ``about`` (default: the line)."""
     if _started is None or _started.is_first_to_say(about or line):
         print(line, file=_stderr or sys.stderr, flush=True)
@@ -49,7 +50,7 @@ def report_lost_rank(error: LostRankError | OtherRankError) -> int:
     """Report that a rank was lost, unless another rank has reported its own error; return the exit code."""
     if isinstance(error, OtherRankError):
         return error.code  # that rank says what happened
-    say(f"torchpt: {error}", about="lost")
+    print_once(f"torchpt: {error}", about="lost")
     return 2
 
 
@@ -61,7 +62,7 @@ def run_on_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
         words: the command line.
     """
     global _started, _stderr
-    first = os.environ.get("RANK", "0") == "0"
+    is_first_rank = os.environ.get("RANK", "0") == "0"
     try:
         with Interrupt() as interrupt:
             from torchpt.ranks.launch import LaunchedProcess
@@ -69,46 +70,46 @@ def run_on_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
             _started = LaunchedProcess()
             _started.connect(interrupt.check)
     except LostRankError as error:
-        _leave(report_lost_rank(error))
+        _exit_now(report_lost_rank(error))
     except TorchptError as error:  # a bad environment variable, the same on all ranks
-        if first:
+        if is_first_rank:
             print(f"torchpt: {error}", file=sys.stderr)
         return 2
     except BaseException as error:
         interrupted = interruption(error)
         if interrupted is None:
             raise
-        say("torchpt: stopped by a signal, before all ranks were there", about="lost")
-        _leave(interrupted.exit_code)
+        print_once("torchpt: stopped by a signal, before all ranks were there", about="lost")
+        _exit_now(interrupted.exit_code)
     _stderr = sys.stderr
-    if not first:
+    if not is_first_rank:
         sys.stdout = sys.stderr = open(os.devnull, "w")  # to the end of the process
     try:
-        return _ended(main, words)
+        return _run_and_agree(main, words)
     except BaseException:
         traceback.print_exc(file=_stderr)
-        _leave(1)
+        _exit_now(1)
 
 
-def _ended(main: Callable[[list[str]], int], words: list[str]) -> int:
+def _run_and_agree(main: Callable[[list[str]], int], words: list[str]) -> int:
     """Run the command line, wait for all ranks and return their common exit code."""
     assert _started is not None
-    problem = _not_for_ranks(words)
+    problem = _why_not_on_ranks(words)
     if problem is not None:
-        say(f"torchpt: {problem}")
+        print_once(f"torchpt: {problem}")
     code = 2 if problem is not None else main(words)
-    own = _started.group
-    if not own.has_ended:
+    ranks = _started.group
+    if not ranks.has_ended:
         try:
-            code = own.end(code)
+            code = ranks.end(code)
             _started.disconnect()
             return code
         except LostRankError as error:  # for example while rank 0 wrote the picture
             code = report_lost_rank(error)
-    _leave(code)
+    _exit_now(code)
 
 
-def _leave(code: int) -> NoReturn:
+def _exit_now(code: int) -> NoReturn:
     """Exit the process at once: threads of broken connections could keep it alive."""
     for stream in (sys.stdout, sys.stderr, _stderr):
         if stream is not None:
@@ -116,12 +117,12 @@ def _leave(code: int) -> NoReturn:
     os._exit(code)
 
 
-def _not_for_ranks(words: list[str]) -> str | None:
+def _why_not_on_ranks(words: list[str]) -> str | None:
     """Return why a command line cannot run on several ranks, or None if it can."""
-    if words[:1] != ["render"] and words[:1] and words[0] not in _SHOWN:
+    if words[:1] != ["render"] and words[:1] and words[0] not in _HELP_WORDS:
         return f"{words[0]}: runs in one process; `torchpt render` alone is shared by several"
     for word in words:
-        if word in _SWEEPS or word.replace(" ", "") == "hydra.mode=MULTIRUN":
+        if word in _SWEEP_OPTIONS or word.replace(" ", "") == "hydra.mode=MULTIRUN":
             return f"{word}: a sweep runs in one process, or by a launcher of Hydra; several share one render"
         if word.lstrip("+").startswith("debug."):
             return f"{word}: one path is traced by one process"

@@ -12,11 +12,12 @@ from typing import Any
 
 from torchpt.cli.arguments import UsageError
 
-__all__ = ["MAX_VALUES", "read_value", "read_word", "reason"]
+__all__ = ["MAX_VALUES", "parse_failure", "read_value", "read_word"]
 
 #: Largest number of values that one override may sweep over.
 MAX_VALUES = 10_000
-_WORD = re.compile(r"(\+\+|\+|~|)([^=]*)(?:=(.*))?\Z", re.DOTALL)
+# Sign, key, and the value after `=` where there is one.
+_OVERRIDE = re.compile(r"(\+\+|\+|~|)([^=]*)(?:=(.*))?\Z", re.DOTALL)
 
 
 def read_word(word: str) -> tuple[str, list[Any], bool]:
@@ -25,7 +26,7 @@ def read_word(word: str) -> tuple[str, list[Any], bool]:
     Raises:
         UsageError: a word that Hydra's grammar does not accept.
     """
-    match = _WORD.match(word)
+    match = _OVERRIDE.match(word)
     assert match is not None
     sign, key, text = match.groups()
     if text is None:
@@ -64,7 +65,7 @@ def read_value(key: str, text: str) -> tuple[list[Any], bool]:
                 f"{key}: expected values a,b or choice(a,b) or range(a,b), got {text!r} ({kind} is no list of values)"
             )
     except HydraException as error:
-        raise UsageError(f"{key}={text}: expected key=value ({reason(error)})") from error
+        raise UsageError(f"{key}={text}: expected key=value ({parse_failure(error)})") from error
     if len(values) > MAX_VALUES:
         raise UsageError(f"{key}: expected at most {MAX_VALUES} values, got {text!r}")
     for item in values:
@@ -72,7 +73,7 @@ def read_value(key: str, text: str) -> tuple[list[Any], bool]:
     return values, sweeps
 
 
-def reason(error: Exception) -> str:
+def parse_failure(error: Exception) -> str:
     """Return in one line why Hydra cannot parse a word."""
     found = next((line for line in str(error).splitlines() if "evaluating" in line), "")
     return found.partition(": ")[2] or "quote what holds blanks, brackets or commas, as in key='a b'"

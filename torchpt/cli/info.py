@@ -11,7 +11,7 @@ from typing import Any
 from torchpt.cli import gc_pause
 from torchpt.cli.arguments import Arguments
 from torchpt.cli.interrupt import Interrupt
-from torchpt.cli.notices import notices, which_job
+from torchpt.cli.notices import print_job, printed_scene_warnings
 from torchpt.cli.render import Job, plain, scene_and_settings, with_error_pilots
 from torchpt.cli.streams import flushed_stdout
 from torchpt.core.errors import TorchptError
@@ -31,10 +31,10 @@ torchpt info scene=NAME|FILE.yaml [--json] [key=value ...]
 
 def run(job: Job, arguments: Arguments, interrupt: Interrupt) -> int:
     """Run `torchpt info` for one job and return the exit code."""
-    return info(job, interrupt, arguments.json)
+    return info(job, interrupt, as_json=arguments.json)
 
 
-def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
+def info(job: Job, interrupt: Interrupt, *, as_json: bool = False) -> int:
     """Load and build a scene, print its facts and return the exit code.
 
     Raises:
@@ -46,15 +46,15 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
     from torchpt.scene.scene import Scene
 
     gc_pause.resume()
-    with notices():
+    with printed_scene_warnings():
         description, settings = scene_and_settings(job)
         scene = Scene(description, device_of(settings.render.device))
         facts = scene.info(settings)
         facts["built"]["loop"] = describe_engine(scene, settings)
         facts = {**job.facts(), **facts}
         if settings.render.max_memory is not None:
-            facts["memory"] = _memory(scene, settings)
-    which_job(job)
+            facts["memory"] = _memory_facts(scene, settings)
+    print_job(job)
     interrupt.check()
     if "refused" in facts.get("memory", ()):
         print(f"torchpt: warning: no render could run: {facts['memory']['refused']}", file=sys.stderr)
@@ -74,7 +74,7 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
     return 0
 
 
-def _memory(scene: Any, settings: Any) -> dict[str, Any]:
+def _memory_facts(scene: Any, settings: Any) -> dict[str, Any]:
     """Return whether ``render.max_memory`` suffices for a render, and the error message if it does not."""
     import torch
 
@@ -101,14 +101,15 @@ def lines(facts: dict[str, Any], depth: int = 0) -> Iterator[tuple[str, str]]:
             yield f"{pad}{key}:", ""
             for item in value:
                 if isinstance(item, dict):
-                    yield f"{pad}  - ", ", ".join(f"{name}: {_shown(part)}" for name, part in item.items())
+                    yield f"{pad}  - ", ", ".join(f"{name}: {_format_value(part)}" for name, part in item.items())
                 else:
-                    yield f"{pad}  - ", _shown(item)
+                    yield f"{pad}  - ", _format_value(item)
         else:
-            yield f"{pad}{key}:", f" {_shown(value)}"
+            yield f"{pad}{key}:", f" {_format_value(value)}"
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
+    """Return a value as a reader sees it: yes and no, thousands with commas, six digits."""
     value = plain(value)
     if value is None or value == {} or value == []:
         return "none"
@@ -119,5 +120,5 @@ def _shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list):
-        return ", ".join(_shown(item) for item in value)
+        return ", ".join(_format_value(item) for item in value)
     return str(value)

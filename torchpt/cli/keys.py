@@ -15,7 +15,7 @@ from torchpt.cli.arguments import GROUPS, SCENE_BLOCKS
 from torchpt.core.errors import did_you_mean
 from torchpt.core.files import configs
 
-__all__ = ["known_keys", "listed", "options", "scenes", "types", "unknown"]
+__all__ = ["keys_help", "known_keys", "options", "scenes_help", "types", "unknown_key_error"]
 
 
 def options(group: str) -> list[str]:
@@ -38,21 +38,22 @@ def types(group: str) -> list[str]:
     return [name for name in options(group) if name != "default"]
 
 
-def listed() -> str:
+def keys_help() -> str:
     """List all keys for the help, group by group; where types have different keys, a line for each type."""
     lines: list[str] = []
     for group in GROUPS:
+        # Keys by type, without the first, which is `type` itself.
         own = {name: " ".join(known_keys(group, name)[1:]) for name in types(group)}
         if len(set(own.values())) > 1:
-            wide = max(map(len, own))
-            rows = [f"type={name:{wide}}  {keys}" for name, keys in own.items()]
+            width = max(map(len, own))
+            rows = [f"type={name:{width}}  {keys}" for name, keys in own.items()]
         else:
             rows = [" ".join(known_keys(group)) + (f" (type: {', '.join(own)})" if own else "")]
         lines += [f"{group + '.' if k == 0 else '':12}{row}".rstrip() for k, row in enumerate(rows)]
     return "\n".join(lines)
 
 
-def unknown(key: str, words: Iterable[str] = ()) -> str:
+def unknown_key_error(key: str, words: Iterable[str] = ()) -> str:
     """Return the error message for a key that is unknown, or unknown to the type that the command line chooses.
 
     Args:
@@ -84,7 +85,7 @@ def unknown(key: str, words: Iterable[str] = ()) -> str:
     return f"{key}: unknown key{hint}; known: scene, out, {ours}, and the scene's own: {', '.join(SCENE_BLOCKS[1:])}"
 
 
-def scenes() -> str:
+def scenes_help() -> str:
     """Return the names of the shipped scenes, wrapped for the help."""
     names = ", ".join(options("scene"))
     return textwrap.fill(names, 110, initial_indent=" " * 11, subsequent_indent=" " * 11, break_on_hyphens=False)

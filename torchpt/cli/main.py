@@ -78,13 +78,13 @@ def main(argv: list[str] | None = None) -> int:
     with Interrupt() as interrupt:
         try:
             if argv[:1] in ([], ["-h"], ["--help"], ["help"]):
-                return _say(_help(HELP))
+                return _print_text(_filled_help(HELP))
             if argv == ["--version"]:
-                return _say(f"torchpt {__version__}\n")
-            _check_place()
+                return _print_text(f"torchpt {__version__}\n")
+            _check_working_folder()
             command = _command(argv)
             if _asks_for_help(argv[1:]):
-                return _say(_help(command.help))
+                return _print_text(_filled_help(command.help))
             return command.run(argv[1:], interrupt)
         except Interrupted as interrupted:
             return interrupted.exit_code
@@ -92,7 +92,7 @@ def main(argv: list[str] | None = None) -> int:
             wrapped = interruption(error)
             if wrapped is not None:
                 return wrapped.exit_code
-            return _refuse(str(error)) if isinstance(error, TorchptError) else _out_of_memory(error)
+            return _print_error(str(error)) if isinstance(error, TorchptError) else _out_of_memory(error)
 
 
 def _out_of_memory(error: Exception) -> int:
@@ -101,7 +101,7 @@ def _out_of_memory(error: Exception) -> int:
 
     if not is_out_of_memory(error):
         raise error
-    return _refuse("not enough memory: a smaller film, or render.max_memory, needs less")
+    return _print_error("not enough memory: a smaller film, or render.max_memory, needs less")
 
 
 def _command(argv: list[str]) -> Command:
@@ -123,7 +123,7 @@ def _asks_for_help(words: list[str]) -> bool:
     return "--help" in options or "-h" in options
 
 
-def _check_place() -> None:
+def _check_working_folder() -> None:
     """Check that the working folder exists: relative paths start there.
 
     Raises:
@@ -135,14 +135,16 @@ def _check_place() -> None:
         raise UsageError("the working folder is not there any more: change to one that is") from None
 
 
-def _say(text: str) -> int:
+def _print_text(text: str) -> int:
+    """Print text on stdout and return exit code 0."""
     with flushed_stdout():
         print(text, end="")
     return 0
 
 
-def _refuse(line: str) -> int:
-    distributed.say("torchpt: " + " ".join(line.split("\n")))
+def _print_error(line: str) -> int:
+    """Print an error on stderr as one line and return exit code 2."""
+    distributed.print_once("torchpt: " + " ".join(line.split("\n")))
     return 2
 
 
@@ -185,7 +187,7 @@ class _Task:
             except (LostRankError, OtherRankError) as error:
                 return distributed.report_lost_rank(error)
             except TorchptError as error:
-                return _refuse(str(error))
+                return _print_error(str(error))
             except Interrupted as interrupted:
                 return interrupted.exit_code
             except Exception as error:
@@ -213,29 +215,29 @@ class _Task:
         chosen = {f"scene_key_{k}": key for k, key in enumerate(self.arguments.scene_keys)}
         changes = {key: values[composed.pop(name)] for name, (key, values) in chosen.items()}
         words = list(hydra.overrides.task)
-        overrides = _given(composed, words)
-        told = {"scene_number": f"scene={scene}"} if len(self.arguments.scenes) > 1 else {}
+        overrides = _chosen_settings(composed, words)
+        word_of_key = {"scene_number": f"scene={scene}"} if len(self.arguments.scenes) > 1 else {}
         if changes:
             from torchpt.scene.formats.overrides import override_words
 
-            told |= dict(zip(chosen, override_words(changes), strict=True))
-        words = [told.get(word.lstrip("+").partition("=")[0], word) for word in words]
+            word_of_key |= dict(zip(chosen, override_words(changes), strict=True))
+        words = [word_of_key.get(word.lstrip("+").partition("=")[0], word) for word in words]
         for key, path in self.arguments.paths.items():
             group, _, name = key.partition(".")
             overrides.setdefault(group, {})[name] = path
         return Job(
-            scene,
-            overrides,
-            tuple(self.arguments.outs),
-            number,
-            tuple(words),
-            changes,
-            self.folder,
-            self.arguments.config_dir,
+            scene=scene,
+            overrides=overrides,
+            outs=tuple(self.arguments.outs),
+            number=number,
+            words=tuple(words),
+            changes=changes,
+            folder=self.folder,
+            config_dir=self.arguments.config_dir,
         )
 
 
-def _given(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, Any]]:
+def _chosen_settings(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, Any]]:
     """Return the settings that are not null, or that the command line sets to null explicitly.
 
     Raises:
@@ -246,17 +248,17 @@ def _given(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, An
     given: dict[str, dict[str, Any]] = {}
     for group, block in composed.items():
         if group not in GROUPS:
-            raise UsageError(keys.unknown(str(group)))
+            raise UsageError(keys.unknown_key_error(str(group)))
         if block is None:
             continue
         if not isinstance(block, dict):
             raise UsageError(f"{group}: expected a file of configs/{group} or keys below it, got {block!r}")
-        kept = {key: _pruned(value) for key, value in block.items()}
+        kept = {key: _without_nulls(value) for key, value in block.items()}
         given[group] = {key: value for key, value in kept.items() if value is not None or f"{group}.{key}" in unset}
     return given
 
 
-def _pruned(value: Any) -> Any:
+def _without_nulls(value: Any) -> Any:
     """Return a nested block without its nulls, or None if nothing is left."""
     if not isinstance(value, dict):
         return value
@@ -282,14 +284,22 @@ def _compose_and_run(
     from hydra.core.global_hydra import GlobalHydra
 
     task = _Task(job, arguments)
-    own = arguments.config_dir is not None or "--config-name" in arguments.options
-    words = [*arguments.options, *(_QUIET if "--config-name" in arguments.options else ()), *arguments.overrides]
-    single = not arguments.multirun and not any("hydra" in word for word in words)
+    has_user_config = arguments.config_dir is not None or "--config-name" in arguments.options
+    words = [
+        *arguments.options,
+        *(_HYDRA_SETTINGS if "--config-name" in arguments.options else ()),
+        *arguments.overrides,
+    ]
+    is_single_run = not arguments.multirun and not any("hydra" in word for word in words)
     with sweep_folder() if arguments.multirun else nullcontext() as folder:
         if folder is not None:
             words.append(f"hydra.sweep.dir={_quoted(folder)}")
             task.folder = folder
-        with hydra_process(words), _composed_once() if single else nullcontext(), _checked() if own else nullcontext():
+        with (
+            hydra_process(words),
+            _composed_once() if is_single_run else nullcontext(),
+            _callbacks_refused() if has_user_config else nullcontext(),
+        ):
             try:
                 hydra.main(version_base="1.3", config_path=str(_configs()), config_name="config")(task)()
             except SystemExit as end:
@@ -326,14 +336,14 @@ def _composed_once() -> Iterator[None]:
 
 
 #: Hydra's own settings in configs/config.yaml, also applied to a user's configuration.
-_QUIET = (
+_HYDRA_SETTINGS = (
     "hydra.run.dir=.", "hydra.output_subdir=null", "hydra.job.chdir=false",
     "hydra/job_logging=none", "hydra/hydra_logging=none",
 )  # fmt: skip
 
 
 @contextmanager
-def _checked() -> Iterator[None]:
+def _callbacks_refused() -> Iterator[None]:
     """Refuse Hydra callbacks inside the context: a user's configuration must not name Python objects to call."""
     from hydra._internal.callbacks import Callbacks
 
@@ -360,17 +370,18 @@ def _check_grammar(words: list[str]) -> None:
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
-    from torchpt.cli.grammar import reason
+    from torchpt.cli.grammar import parse_failure
 
     parser = OverridesParser.create()
     for word in words:
         try:
             parser.parse_override(word)
         except HydraException as error:
-            raise UsageError(f"{word}: expected key=value ({reason(error)})") from error
+            raise UsageError(f"{word}: expected key=value ({parse_failure(error)})") from error
 
 
 def _quoted(text: str) -> str:
+    """Return text in quotes, as Hydra's grammar has them."""
     return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
@@ -390,7 +401,7 @@ def _one_line(error: Exception, words: list[str]) -> str:
     """Shorten an error of Hydra or OmegaConf to one line: the key, its value and what is accepted."""
     text = str(error)
     if match := re.search(r"Could not override '([^']+)'", text):
-        return keys.unknown(match[1], words)
+        return keys.unknown_key_error(match[1], words)
     if match := re.search(r"Could not (?:find|load) '(.+?)/([^/']+)'", text):
         group, name = match[1], match[2]
         options = re.findall(r"^\t([\w-]+)$", text, re.MULTILINE) or keys.options(group)
@@ -406,6 +417,7 @@ def _one_line(error: Exception, words: list[str]) -> str:
 
 
 def _first_line(error: object) -> str:
+    """Return the first three lines of an error that say something, joined to one."""
     lines = [" ".join(line.split()) for line in str(error).splitlines()]
     kept = [line for line in lines if line and not line.startswith(("See http", "full_key", "object_type", "^"))]
     return "; ".join(kept[:3])
@@ -419,18 +431,23 @@ def _configs() -> Path:
 
 def help_of(name: str) -> str:
     """Return the help of a command, or of ``torchpt`` itself if `name` is empty."""
-    return _help(next(command.help for command in COMMANDS if command.name == name) if name else HELP)
+    return _filled_help(next(command.help for command in COMMANDS if command.name == name) if name else HELP)
 
 
-def _help(text: str) -> str:
-    wide = max(len(f"{command.name} {command.example}") for command in COMMANDS)
-    lines = [f"  torchpt {f'{command.name} {command.example}':{wide}}   {command.line}" for command in COMMANDS]
+def _filled_help(text: str) -> str:
+    width = max(len(f"{command.name} {command.example}") for command in COMMANDS)
+    lines = [f"  torchpt {f'{command.name} {command.example}':{width}}   {command.line}" for command in COMMANDS]
     return text.format(
-        scenes=keys.scenes(), keys=keys.listed().replace("\n", "\n  "), commands="\n".join(lines), changes=CHANGES
+        scenes=keys.scenes_help(),
+        keys=keys.keys_help().replace("\n", "\n  "),
+        commands="\n".join(lines),
+        changes=CHANGES,
     )
 
 
-def _composed(name: str, job: Callable[[Job, Arguments, Interrupt], int]) -> Callable[[list[str], Interrupt], int]:
+def _command_with_settings(
+    name: str, job: Callable[[Job, Arguments, Interrupt], int]
+) -> Callable[[list[str], Interrupt], int]:
     """Return the ``run`` of a command whose settings Hydra composes; `job` runs each composed job."""
 
     def command(words: list[str], interrupt: Interrupt) -> int:
@@ -450,21 +467,21 @@ COMMANDS = (
         "scene=cornell_box render.spp=64 out=cornell.exr",
         "render a picture",
         render.HELP,
-        _composed("render", render.run),
+        _command_with_settings("render", render.run),
     ),
     Command(
         "orbit",
         "scene=cornell_box frames=48 out=turn.gif",
         "turn the camera about it: .gif, .mp4",
         orbit.HELP,
-        _composed("orbit", orbit.run),
+        _command_with_settings("orbit", orbit.run),
     ),
     Command(
         "info",
         "scene=cornell_box",
         "what the scene holds, what was built, what left out",
         info.HELP,
-        _composed("info", info.run),
+        _command_with_settings("info", info.run),
     ),
     Command(
         "compare",

@@ -13,11 +13,11 @@ from torchpt.core.errors import EnergyWarning
 if TYPE_CHECKING:
     from torchpt.cli.render import Job
 
-__all__ = ["not_finite", "notices", "unknown_error", "which_job"]
+__all__ = ["print_job", "printed_scene_warnings", "warn_nonfinite", "warn_unknown_error"]
 
 
 @contextmanager
-def notices() -> Iterator[None]:
+def printed_scene_warnings() -> Iterator[None]:
     """Collect scene warnings (`EnergyWarning`) inside the context and print them at its end, unless it raised.
 
     Other warnings are shown by Python as usual.
@@ -27,7 +27,7 @@ def notices() -> Iterator[None]:
         warnings.simplefilter("always", EnergyWarning)
         show = warnings.showwarning
 
-        def keep(
+        def collect_or_show(
             message: Warning | str,
             category: type[Warning],
             filename: str,
@@ -40,20 +40,20 @@ def notices() -> Iterator[None]:
             else:
                 show(message, category, filename, lineno, file, line)
 
-        warnings.showwarning = keep
+        warnings.showwarning = collect_or_show
         yield
     for text in dict.fromkeys(lines):
         print(text, file=sys.stderr)
 
 
-def which_job(job: Job, outs: Sequence[str] = ()) -> None:
+def print_job(job: Job, outs: Sequence[str] = ()) -> None:
     """Print the number, overrides and output files of a sweep job on stderr; nothing outside a sweep."""
     if job.number is not None:
         files = f" -> {', '.join(outs)}" if outs else ""
         print(f"torchpt: job {job.number}: {' '.join(job.words)}{files}", file=sys.stderr)
 
 
-def not_finite(facts: Mapping[str, Any]) -> None:
+def warn_nonfinite(facts: Mapping[str, Any]) -> None:
     """Warn on stderr about samples that are not finite: how many, their causes, and where the first is.
 
     Args:
@@ -62,15 +62,15 @@ def not_finite(facts: Mapping[str, Any]) -> None:
     causes = facts.get("nonfinite_causes")
     if not causes:
         return
-    told = "; ".join(f"{count:,} {name}" for name, count in causes.items())
+    listed = "; ".join(f"{count:,} {name}" for name, count in causes.items())
     print(
-        f"torchpt: warning: {facts['nonfinite_samples']:,} samples are not finite and count as black ({told}); the first is "
+        f"torchpt: warning: {facts['nonfinite_samples']:,} samples are not finite and count as black ({listed}); the first is "
         f"{facts['nonfinite_first']}; debug.pixel=[x,y] debug.sample=k prints a path",
         file=sys.stderr,
     )
 
 
-def unknown_error(facts: Mapping[str, Any]) -> None:
+def warn_unknown_error(facts: Mapping[str, Any]) -> None:
     """Warn on stderr that the error of a picture was requested but is not known, and why.
 
     Args:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from torchpt.cli import gc_pause
 from torchpt.cli.arguments import Arguments
 from torchpt.cli.interrupt import Interrupt, Interrupted
-from torchpt.cli.notices import notices, which_job
+from torchpt.cli.notices import print_job, printed_scene_warnings
 from torchpt.cli.progress import Bar
 from torchpt.cli.render import Job, check_distinct, numbered, plain, scene_and_settings, with_error_pilots
 from torchpt.cli.streams import flushed_stdout
@@ -107,12 +107,12 @@ def poses(scene: Scene, turn: Turn) -> Iterator[NDArray[np.float64]]:
 
     from torchpt.math.transforms import look_at, rotate
 
-    told = scene.description.camera.values
+    camera = scene.description.camera.values
     start = np.asarray(scene.built.parameters["camera.to_world"], np.float64)
-    aimed = told["target"] is not None
-    if aimed:
-        axis = np.asarray(told["up"] or (0.0, 1.0, 0.0), np.float64)
-        centre = np.asarray(told["target"], np.float64)
+    has_target = camera["target"] is not None
+    if has_target:
+        axis = np.asarray(camera["up"] or (0.0, 1.0, 0.0), np.float64)
+        centre = np.asarray(camera["target"], np.float64)
     else:
         nearest = int(np.abs(start[:3, 1]).argmax())
         axis, centre = np.sign(start[nearest, 1]) * np.eye(3)[nearest], scene.center()
@@ -120,13 +120,13 @@ def poses(scene: Scene, turn: Turn) -> Iterator[NDArray[np.float64]]:
         if frame * turn.degrees % (360.0 * turn.frames) == 0.0:
             yield start
             continue
-        by = rotate({"axis": axis.tolist(), "angle": turn.degrees * frame / turn.frames})[:3, :3]
-        place = centre + by @ ((np.asarray(told["origin"]) if aimed else start[:3, 3]) - centre)
-        if aimed:
-            yield look_at(place.tolist(), centre.tolist(), axis.tolist(), key="")
+        rotation = rotate({"axis": axis.tolist(), "angle": turn.degrees * frame / turn.frames})[:3, :3]
+        position = centre + rotation @ ((np.asarray(camera["origin"]) if has_target else start[:3, 3]) - centre)
+        if has_target:
+            yield look_at(position.tolist(), centre.tolist(), axis.tolist(), key="")
             continue
         pose = start.copy()
-        pose[:3, :3], pose[:3, 3] = by @ start[:3, :3], place
+        pose[:3, :3], pose[:3, 3] = rotation @ start[:3, :3], position
         yield pose
 
 
@@ -149,7 +149,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
 
     gc_pause.resume()
     start = time.perf_counter()
-    with notices():
+    with printed_scene_warnings():
         description, run_settings = scene_and_settings(job)
         for group, key in (
             ("render", "preview"),
@@ -170,19 +170,19 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
         for path in outs:
             check_movie(path, turn.fps)
         scene = Scene(description, device_of(run_settings.render.device))
-        frames = Frames(Path(f"{outs[0]}.frames"), _facts(scene, run_settings, turn))
-        before = frames.count(turn.frames)
+        frames = Frames(Path(f"{outs[0]}.frames"), _frame_dependencies(scene, run_settings, turn))
+        already_rendered = frames.count(turn.frames)
     load_seconds = time.perf_counter() - start
-    which_job(job, outs)
+    print_job(job, outs)
     interrupt.check()
     interrupt.deferred = True
-    totals = _render(job, scene, turn, frames, interrupt)
+    totals = _render_missing_frames(job, scene, turn, frames, interrupt)
     ready = frames.count(turn.frames)
     facts: dict[str, Any] = {
         "out": outs[0] if len(outs) == 1 else outs,
         **job.facts(),
         "frames": turn.frames,
-        "rendered": ready - before,
+        "rendered": ready - already_rendered,
     }
     facts |= {"load_seconds": round(load_seconds, 4), **totals}
     if ready == turn.frames:
@@ -211,7 +211,7 @@ def _outputs(job: Job) -> list[str]:
     return [numbered(str(Path(out).expanduser()), job.number) for out in job.outs or (f"{name}.gif",)]
 
 
-def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Interrupt) -> dict[str, Any]:
+def _render_missing_frames(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Interrupt) -> dict[str, Any]:
     """Render the missing frames until a signal arrives; return their total rays and non-finite samples."""
     import torch
 
@@ -234,8 +234,8 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
                 break
             if frames.has(number):
                 continue
-            once = {**job.overrides, "render": {**job.overrides.get("render", {}), "seed": seed + number}}
-            run_settings = with_error_pilots(settings(scene.description, once))  # as `torchpt render`
+            frame_overrides = {**job.overrides, "render": {**job.overrides.get("render", {}), "seed": seed + number}}
+            run_settings = with_error_pilots(settings(scene.description, frame_overrides))  # as `torchpt render`
             # In a scene file these settings are meant for `torchpt render`.
             film, render = run_settings.film.but(denoise=False), run_settings.render.but(checkpoint=None, resume=False)
             run_settings = replace(run_settings, film=film, render=render)
@@ -263,17 +263,17 @@ class Frames:
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
         self.folder = folder
-        note = folder / _MANIFEST
+        manifest = folder / _MANIFEST
         try:
             if not folder.exists():
                 folder.mkdir()
-            if not note.exists():
+            if not manifest.exists():
                 if any(folder.iterdir()):
                     raise OutputError(folder, f"is in the way: it holds no {_MANIFEST}, so it is no folder of frames")
                 unfinished = folder / f".{_MANIFEST}"
                 unfinished.write_text(json.dumps(facts, indent=1))
-                unfinished.replace(note)
-            known = json.loads(note.read_text())
+                unfinished.replace(manifest)
+            known = json.loads(manifest.read_text())
         except ValueError:
             raise OutputError(folder, f"{_MANIFEST} is malformed; remove the folder to begin anew") from None
         except OSError as error:
@@ -321,7 +321,7 @@ class Frames:
             self.folder.rmdir()
 
 
-def _facts(scene: Scene, run_settings: Settings, turn: Turn) -> dict[str, Any]:
+def _frame_dependencies(scene: Scene, run_settings: Settings, turn: Turn) -> dict[str, Any]:
     """Return everything that frames depend on, by dotted name: the turn, the settings, a hash of the scene."""
     from torchpt.scene.fingerprint import fingerprint
     from torchpt.scene.settings import settings_with

@@ -12,10 +12,11 @@ if TYPE_CHECKING:
 __all__ = ["Bar"]
 
 #: Seconds between two progress lines.
-EVERY = 10.0
+SECONDS_PER_LINE = 10.0
 
 
-def _short(count: float) -> str:
+def _format_count(count: float) -> str:
+    """Return a number with three digits and a decimal prefix, such as 1.23M."""
     for unit in ("", "k", "M"):
         if count < 1000:
             return f"{count:.3g}{unit}"
@@ -31,9 +32,9 @@ class Bar:
         lines: if stderr is not a terminal, print a line every ten seconds instead (for work that takes many minutes).
     """
 
-    def __init__(self, name: str, lines: bool = False) -> None:
+    def __init__(self, name: str, *, lines: bool = False) -> None:
         self.name, self.lines = name, lines
-        self.begun = self.told = time.monotonic()
+        self._start = self._last_line_at = time.monotonic()
         self._progress: Progress | None = None
         self._task: TaskID | None = None
 
@@ -64,13 +65,14 @@ class Bar:
         """Show the progress: `done` of `total` camera samples, `rays` traced in `seconds`."""
         if self._progress is None or self._task is None:
             now = time.monotonic()
-            if self.lines and now - self.told >= EVERY:
-                self.told = now
-                part, passed = 100 * done // max(total, 1), now - self.begun
+            if self.lines and now - self._last_line_at >= SECONDS_PER_LINE:
+                self._last_line_at = now
+                percent, elapsed = 100 * done // max(total, 1), now - self._start
                 print(
-                    f"torchpt: {self.name}: {part} % of {_short(total)} samples after {passed:.0f} s", file=sys.stderr
+                    f"torchpt: {self.name}: {percent} % of {_format_count(total)} samples after {elapsed:.0f} s",
+                    file=sys.stderr,
                 )
             return
         rate = rays / seconds if seconds > 0 else 0.0
-        work = f"{_short(done)}/{_short(total)} samples, {_short(rate)} rays/s"
+        work = f"{_format_count(done)}/{_format_count(total)} samples, {_format_count(rate)} rays/s"
         self._progress.update(self._task, completed=done, total=total, work=work)

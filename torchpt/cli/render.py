@@ -18,10 +18,10 @@ from typing import Any
 from torchpt.cli import distributed, gc_pause
 from torchpt.cli.arguments import Arguments
 from torchpt.cli.interrupt import Interrupt, Interrupted
-from torchpt.cli.notices import not_finite, notices, unknown_error, which_job
+from torchpt.cli.notices import print_job, printed_scene_warnings, warn_nonfinite, warn_unknown_error
 from torchpt.cli.progress import Bar
 from torchpt.cli.streams import flushed_stdout
-from torchpt.cli.sweep_table import brief, error_of, record_job
+from torchpt.cli.sweep_table import error_of, record_job, two_digits
 from torchpt.core.errors import OutputError, RenderError, SceneError, TorchptError
 
 __all__ = [
@@ -109,7 +109,7 @@ def run(job: Job, arguments: Arguments, interrupt: Interrupt) -> int:
         return render(job, interrupt)
     from torchpt.cli.debug import PathRequest, debug
 
-    return debug(job, PathRequest.read(arguments.debug), interrupt, arguments.json)
+    return debug(job, PathRequest.read(arguments.debug), interrupt, as_json=arguments.json)
 
 
 def render(job: Job, interrupt: Interrupt) -> int:
@@ -130,7 +130,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     start = time.perf_counter()
     group = distributed.group()
     writes_files = group is None or group.rank == 0
-    with notices():
+    with printed_scene_warnings():
         description, settings = scene_and_settings(job)
         settings = with_error_pilots(settings)
         outs = _outputs(job, settings)
@@ -157,15 +157,15 @@ def render(job: Job, interrupt: Interrupt) -> int:
         scene = Scene(description, device_of(settings.render.device))
     scene.load_seconds = time.perf_counter() - start
     if writes_files:
-        which_job(job, outs)  # prints
+        print_job(job, outs)  # prints
     if preview and writes_files:
         hits = first_hit(scene, settings)
         # The last of the three files is the picture, which is written after each pass.
         for path, name in zip(previews, ("albedo", "normal"), strict=False):
             _write_layer(path, name, hits[name])
 
-    shared: dict[str, Any] = {} if group is None else {"ranks": group}
-    with Bar(_name(job.scene)) as bar:
+    rank_options: dict[str, Any] = {} if group is None else {"ranks": group}
+    with Bar(_scene_name(job.scene)) as bar:
 
         def on_progress(state: Any) -> bool:
             # ``done`` and ``total`` count paths. Returning True stops the render.
@@ -174,17 +174,19 @@ def render(job: Job, interrupt: Interrupt) -> int:
                 write_rendered(preview, state.snapshot(), settings.film)
             return interrupt.signum is not None
 
-        rendering = _keeping(interrupt, lambda: render_scene(scene, settings, on_progress=on_progress, **shared))
+        rendering = _with_deferred_signals(
+            interrupt, lambda: render_scene(scene, settings, on_progress=on_progress, **rank_options)
+        )
     if group is not None:  # a signal to one rank stops all; 0: no signal
         interrupt.signum = int(max(group.all_gather_numbers("signals", interrupt.signum or 0))[0]) or None
     if not writes_files:
         return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
     facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, settings)
-    summary = {"out": _names(outs), **job.facts(), **facts, **rendering.summary()}
+    summary = {"out": _one_or_list(outs), **job.facts(), **facts, **rendering.summary()}
     if not rendering.complete:
         summary["complete"] = False
-    not_finite(summary)  # both print warnings, where there are any
-    unknown_error(summary)
+    warn_nonfinite(summary)  # both print warnings, where there are any
+    warn_unknown_error(summary)
     summary = plain(summary, digits=6)
     height, width = rendering.image.shape[:2]
     with flushed_stdout():  # one print, as the jobs of a sweep may share stdout; the last line is the summary
@@ -219,14 +221,14 @@ def with_error_pilots(settings: Any) -> Any:
     return replace(settings, render=render.but(pilots=True)) if with_pilots else settings
 
 
-def _keeping(interrupt: Interrupt, work: Callable[[], Any]) -> Any:
+def _with_deferred_signals(interrupt: Interrupt, work: Callable[[], Any]) -> Any:
     """Return the result of `work`; from now on a signal does not raise but ends the work early."""
     interrupt.check()
     interrupt.deferred = True
     return work()
 
 
-def _name(scene: str) -> str:
+def _scene_name(scene: str) -> str:
     """Return the name of a scene, without the folder and ending of its file."""
     path = Path(scene)
     return path.stem if path.suffix in (".yaml", ".yml") else path.name
@@ -240,7 +242,7 @@ def _outputs(job: Job, settings: Any) -> list[str]:
     layers = list(settings.film.aovs or ())
     outs = [str(Path(path).expanduser()) for path in job.outs]
     if not outs:
-        outs = [_name(job.scene) + (".exr" if layers else ".png")]
+        outs = [_scene_name(job.scene) + (".exr" if layers else ".png")]
     if layers and "aovs" in job.overrides.get("film", {}) and not any(_is_exr(path) for path in outs):
         raise SceneError("film.aovs", layers, "a picture ending in .exr among out= (no other format keeps layers)")
     return [numbered(path, job.number) for path in outs]
@@ -255,14 +257,14 @@ def check_distinct(files: Sequence[tuple[str, str]]) -> None:
     Raises:
         SceneError: two are the same; names the key and path of the later one, and the file that it would replace.
     """
-    seen: dict[str, tuple[str, str]] = {}
+    key_and_path_of_file: dict[str, tuple[str, str]] = {}
     for key, path in files:
         with suppress(OSError, ValueError):  # an invalid path is reported when it is written
-            place = os.path.normcase(os.path.realpath(path))
-            if place in seen:
-                other_key, other_path = seen[place]
+            real_path = os.path.normcase(os.path.realpath(path))
+            if real_path in key_and_path_of_file:
+                other_key, other_path = key_and_path_of_file[real_path]
                 raise SceneError(key, path, f"another file than {other_path!r} of {other_key}")
-            seen[place] = key, path
+            key_and_path_of_file[real_path] = key, path
 
 
 def _is_exr(path: str) -> bool:
@@ -300,13 +302,16 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, settings: 
         try:
             write_rendered(path, rendering, settings.film)
         except OutputError as error:
-            elsewhere = _written_elsewhere(path, rendering, settings)
+            elsewhere = _write_elsewhere(path, rendering, settings)
             if elsewhere is not None:
                 error = OutputError(path, f"{error.problem}; the picture is in {elsewhere}")
             failed.append(error)
     try:
         if denoised:  # after the rendered pictures are on disk
-            facts = {"denoised": _names(denoised), "denoise_seconds": round(denoise_rendering(rendering, settings), 4)}
+            facts = {
+                "denoised": _one_or_list(denoised),
+                "denoise_seconds": round(denoise_rendering(rendering, settings), 4),
+            }
             for path in denoised:
                 try:
                     write_denoised(path, rendering, settings.film)
@@ -321,7 +326,7 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, settings: 
     return facts
 
 
-def _written_elsewhere(path: str, rendering: Any, settings: Any) -> str | None:
+def _write_elsewhere(path: str, rendering: Any, settings: Any) -> str | None:
     """Write a picture to the home or temporary folder under a new name and return its path, or None if that fails too."""
     from torchpt.rendering.result import write_rendered
 
@@ -343,7 +348,7 @@ def _write_layer(path: str, name: str, layer: Any) -> None:
     write_image(path, shown, gamma=1.0 if name == "normal" else "srgb")
 
 
-def _names(paths: list[str]) -> str | list[str]:
+def _one_or_list(paths: list[str]) -> str | list[str]:
     """Return the paths as the summary shows them: a single one as text, several as a list."""
     return paths[0] if len(paths) == 1 else paths
 
@@ -358,7 +363,7 @@ def sentence(facts: Mapping[str, Any], width: int, height: int) -> str:
     """
     out, spp = facts["out"], facts["spp"]
     text = f"{out if isinstance(out, str) else ', '.join(out)}: {width} x {height} pixels, "
-    text += f"{spp} sample{'' if spp == 1 else 's'} a pixel, {brief(facts['seconds'])} s"
+    text += f"{spp} sample{'' if spp == 1 else 's'} a pixel, {two_digits(facts['seconds'])} s"
     if error := error_of(facts):
         text += f"; relative error {error}"
     if denoised := facts.get("denoised"):

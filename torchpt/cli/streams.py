@@ -30,10 +30,10 @@ def open_streams() -> None:
     for name, number in (("stdin", 0), ("stdout", 1), ("stderr", 2)):
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))
-    sys.stderr = _Lenient(sys.stderr)
+    sys.stderr = _ErrorIgnoringStream(sys.stderr)
 
 
-class _Lenient:
+class _ErrorIgnoringStream:
     """A text stream that ignores write errors."""
 
     def __init__(self, stream: Any) -> None:
@@ -65,13 +65,13 @@ def flushed_stdout() -> Iterator[None]:
         yield
         sys.stdout.flush()
     except BrokenPipeError:
-        _mute()
+        _redirect_stdout_to_null()
     except OSError as error:
-        _mute()
+        _redirect_stdout_to_null()
         raise OutputError("standard output", f"cannot be written ({error.strerror or error})") from None
 
 
-def _mute() -> None:
+def _redirect_stdout_to_null() -> None:
     """Redirect standard output to the null device: Python would report the failed flush at exit."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())

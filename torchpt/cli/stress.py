@@ -129,44 +129,44 @@ def run(words: list[str], interrupt: Interrupt) -> int:
     from torchpt.stress.table import facts, heading, line
 
     gc_pause.resume()
-    topics, benches, folder = _topics(options), _benches(options), _folder(options)
-    quick, begun = options.given.get("quick") == "true", time.perf_counter()
+    topics, harnesses, folder = _topics(options), _harnesses(options), _folder(options)
+    quick, start = options.given.get("quick") == "true", time.perf_counter()
     found: dict[str, dict[str, list[Outcome]]] = {}
-    for number, (label, harness) in enumerate(benches.items()):
-        _tell(options, f"{label}\n{heading()}")
+    for number, (label, harness) in enumerate(harnesses.items()):
+        _print_unless_json(options, f"{label}\n{heading()}")
         for topic, cases in topics.items():
             for case in cases:
                 if number and not case.backend:
                     continue  # does not depend on the backend
                 outcome = outcome_of(case, harness, quick)
                 found.setdefault(label, {}).setdefault(topic, []).append(outcome)
-                _tell(options, line(outcome))
+                _print_unless_json(options, line(outcome))
     every = [one for by_topic in found.values() for row in by_topic.values() for one in row]
     failed, refused = sum(not one.passed for one in every), sum(one.refused > 0 for one in every)
-    told = {
+    results = {
         "cases": len(every),
         "failed": failed,
         "refused": refused,
-        "seconds": round(time.perf_counter() - begun, 1),
+        "seconds": round(time.perf_counter() - start, 1),
         "runs": {label: facts(by_topic) for label, by_topic in found.items()},
     }
     if folder is not None:
-        _keep(folder, told, found)
-    beside = f", {refused} refused wholly or in part by the search" if refused else ""
-    _tell(options, f"{len(every)} cases, {failed} failed{beside}")
+        _write_results(folder, results, found)
+    refused_text = f", {refused} refused wholly or in part by the search" if refused else ""
+    _print_unless_json(options, f"{len(every)} cases, {failed} failed{refused_text}")
     if options.json:
         with flushed_stdout():
-            print(json.dumps(told, allow_nan=False))
+            print(json.dumps(results, allow_nan=False))
     return 1 if failed else 0
 
 
-def _tell(options: StressOptions, text: str) -> None:
+def _print_unless_json(options: StressOptions, text: str) -> None:
     if not options.json:
         with flushed_stdout():
             print(text)
 
 
-def _benches(options: StressOptions) -> dict[str, Harness]:
+def _harnesses(options: StressOptions) -> dict[str, Harness]:
     """Return a bench for each combination of ``accel=`` and ``compile=``, by label."""
     import torch
 
@@ -215,13 +215,13 @@ def _folder(options: StressOptions) -> Path | None:
     return folder
 
 
-def _keep(folder: Path, told: dict[str, Any], found: dict[str, dict[str, list[Outcome]]]) -> None:
+def _write_results(folder: Path, results: dict[str, Any], found: dict[str, dict[str, list[Outcome]]]) -> None:
     """Write the figures, the table, and a picture of each topic by the first backend."""
     from torchpt.reports.runs import write_whole
     from torchpt.stress.plots import draw
     from torchpt.stress.table import markdown
 
-    write_whole(folder / "stress.json", json.dumps(told, indent=1, allow_nan=False).encode())
+    write_whole(folder / "stress.json", json.dumps(results, indent=1, allow_nan=False).encode())
     pages = [f"### {label}\n\n{markdown(by_topic)}\n" for label, by_topic in found.items()]
     write_whole(folder / "stress.md", "\n".join(pages).encode())
     for topic, outcomes in next(iter(found.values())).items():

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torchpt.cli.render import Job
 
-__all__ = ["brief", "error_of", "print_jobs", "record_job"]
+__all__ = ["error_of", "print_jobs", "record_job", "two_digits"]
 
 _HEADING = ("job", "overrides", "out", "error", "seconds")
 
@@ -26,14 +26,14 @@ def record_job(job: Job, facts: Mapping[str, Any]) -> None:
         facts: its summary.
     """
     if job.folder is not None:
-        told = {
+        results = {
             name: facts[name]
             for name in ("out", "relmse", "relmse_interval", "heavy_tailed", "seconds")
             if name in facts
         }
-        told |= {"job": job.number, "overrides": list(job.words)}
+        results |= {"job": job.number, "overrides": list(job.words)}
         with suppress(OSError):  # the job may run on another machine
-            (Path(job.folder) / f"torchpt-job-{job.number}.json").write_text(json.dumps(told))
+            (Path(job.folder) / f"torchpt-job-{job.number}.json").write_text(json.dumps(results))
 
 
 def print_jobs(folder: str) -> None:
@@ -52,9 +52,9 @@ def table(jobs: list[dict[str, Any]]) -> list[str]:
         words = " ".join(word for word in job["overrides"] if word not in common)
         out = job.get("out", "")
         names = out if isinstance(out, str) else ", ".join(out)
-        rows.append((str(job["job"]), words, names, error_of(job) or "-", brief(job.get("seconds", math.nan))))
-    wide = [max(len(row[column]) for row in rows) for column in range(len(_HEADING))]
-    return ["  ".join(text.ljust(width) for text, width in zip(row, wide, strict=True)).rstrip() for row in rows]
+        rows.append((str(job["job"]), words, names, error_of(job) or "-", two_digits(job.get("seconds", math.nan))))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADING))]
+    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def error_of(facts: Mapping[str, Any]) -> str:
@@ -70,9 +70,9 @@ def error_of(facts: Mapping[str, Any]) -> str:
 
 def _percent(relmse: float) -> str:
     """Return the relative error in percent, the root of relMSE."""
-    return brief(100.0 * math.sqrt(max(relmse, 0.0)))
+    return two_digits(100.0 * math.sqrt(max(relmse, 0.0)))
 
 
-def brief(value: float) -> str:
+def two_digits(value: float) -> str:
     """Format a number to two significant digits, or as a whole number from 10 on."""
     return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"
