@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.threads import sum_all
-from torchpt.images.texels import TEXELS, check_source, read_texels, texels_from_array, texels_to_radiance
+from torchpt.images.texels import ACCEPTED_TEXELS, check_source, read_texels, texels_from_array, texels_to_radiance
 from torchpt.math.sampling import Distribution2D, invert_linear
 from torchpt.math.vectors import azimuth, dot, luminance, safe_reciprocal, take
 from torchpt.physics.ibl.equirect import Cell, angles
@@ -269,7 +269,7 @@ class Envmap(Environment):
         "data": Custom(
             None,
             reader=texels_from_array,
-            words=TEXELS,
+            words=ACCEPTED_TEXELS,
             doc="array, tensor or rows of numbers in place of a file, the top row first; linear, except uint8 (sRGB)",
         ),
         "scale": Scalar(1.0, doc="factor of the radiance"),

@@ -12,7 +12,7 @@ from torchpt.core.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, Texels, read_texels
 from torchpt.images.colour import srgb_to_linear
 from torchpt.images.decode import MAX_PIXELS
-from torchpt.images.texels import TEXELS, check_source, texels_from_array
+from torchpt.images.texels import ACCEPTED_TEXELS, check_source, texels_from_array
 from torchpt.physics.textures.atlas import WRAPS, ImageNode
 from torchpt.physics.textures.base import CHANNELS, Mapped, Node, Opening
 from torchpt.spec import Choice, Color, Custom, Integer, Path, Refused
@@ -42,7 +42,7 @@ class Image(Mapped):
         "data": Custom(
             None,
             reader=texels_from_array,
-            words=TEXELS,
+            words=ACCEPTED_TEXELS,
             doc="array, tensor or rows of numbers in place of a file, the top row first; linear, except uint8: `colorspace`",
         ),
         "wrap": Choice("repeat", names=WRAPS, doc="how the image continues beyond its edges"),
