@@ -213,7 +213,7 @@ def _replaced(description: Description) -> tuple[Description, dict[str, str]]:
 
 def lets_pass(scene: Scene) -> bool:
     """Return True if light passes a surface of the scene undeflected, which Mitsuba counts as a bounce."""
-    slots = [slot for part in scene.built.parts for slot in part.material.all()]
+    slots = [slot for part in scene.built.parts for slot in part.material.with_inner()]
     return any(slot.model.name == "null" or slot.opacity != 1.0 for slot in slots)
 
 

@@ -86,9 +86,9 @@ FAULTS = (
         "radiance_across_glass",
         "physics/bsdfs/lobes.py",
         "bsdfs integrators",
-        "polished",
-        "ratio * side.eta_ti * side.eta_ti",
-        "share * side.eta_it * side.eta_it",
+        "sample_smooth_interface",
+        "weight_of_choice * side.eta_ti * side.eta_ti",
+        "weight_of_choice * side.eta_it * side.eta_it",
         "eta the wrong way round: what is seen from within glass or water is too bright by the fourth power of its index",
     ),
     Fault(

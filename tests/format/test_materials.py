@@ -32,7 +32,7 @@ from torchpt.physics.bsdfs.kinds.roughconductor import RoughConductor
 from torchpt.physics.bsdfs.kinds.roughdielectric import RoughDielectric
 from torchpt.physics.bsdfs.kinds.roughplastic import RoughPlastic
 from torchpt.physics.bsdfs.kinds.thindielectric import ThinDielectric
-from torchpt.physics.bsdfs.presets import INDICES, METALS, metal
+from torchpt.physics.bsdfs.presets import INDICES, METALS, metal_index
 from torchpt.physics.bsdfs.records import BsdfSample
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.scene.formats.description import Description, read_description
@@ -559,7 +559,11 @@ def test_either_may_emit() -> None:
 
 def test_presets_have_names_of_their_own() -> None:
     assert {"Au", "Ag", "Al", "Cu", "Cr", "Fe"} <= METALS.keys()
-    assert metal("Ni") == metal("Ni_palik") and metal("Cu") != metal("Cu_palik") and metal("ni") is None
+    assert (
+        metal_index("Ni") == metal_index("Ni_palik")
+        and metal_index("Cu") != metal_index("Cu_palik")
+        and metal_index("ni") is None
+    )
     assert all(name == name.lower() for name in INDICES)
 
 

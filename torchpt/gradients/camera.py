@@ -73,7 +73,7 @@ def film_space_applies(scene: Scene, settings: Settings, wanted: Iterable[str]) 
 def needs_direction_gradients(scene: Scene, wanted: Iterable[str]) -> bool:
     """Return True if directions need derivatives in film space: behind delta lobes, or for parameters of other objects."""
     owners = [*scene.built.parts, *scene.built.copies]
-    bent = any(material.model.delta for owner in owners for material in owner.material.all())
+    bent = any(material.model.delta for owner in owners for material in owner.material.with_inner())
     return bent or attached(scene, [name for name in wanted if not name.startswith("camera.")])
 
 

@@ -34,7 +34,9 @@ def attached(scene: Scene, names: Iterable[str]) -> bool:
     """Return True if a parameter moves surfaces or the camera, or changes the direction of rays behind delta lobes."""
     owners = [*scene.built.parts, *scene.built.copies]
     # Materials with smooth refraction: their index of refraction sets the direction of the refracted ray.
-    bending = {material.name for owner in owners for material in owner.material.all() if material.bends}
+    bending = {
+        material.name for owner in owners for material in owner.material.with_inner() if material.refracts_as_delta
+    }
 
     def is_attached(name: str) -> bool:
         moves = scene.spec(name).moves

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from torchpt.physics.bsdfs.base import made as model_and_values
+from torchpt.physics.bsdfs.base import model_and_values
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Parameters
 from torchpt.physics.textures import Node
@@ -75,7 +75,7 @@ def resolved(
 def declare(material: ResolvedMaterial, parameters: Parameters) -> None:
     """Add a material's numbers and colours to the parameters; those of its textures were added when they were opened."""
     specs = parameters_of(material.model)
-    for key, value in material.own().items():
+    for key, value in material.own_values().items():
         if isinstance(value, float | tuple):
             parameters.declare(f"{material.name}.{key}", value, specs[key])
     for inner in material.inner:

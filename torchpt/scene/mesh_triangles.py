@@ -201,11 +201,11 @@ def _refracting_faces(parts: Sequence[Part], copies: Sequence[Copy]) -> Iterator
     """Yield the flat faces of all parts and copies that have a refracting material."""
     part_by_name = {part.name: part for part in parts}
     for part in parts:
-        if any(material.model.refracts for material in part.material.all()):
+        if any(material.model.refracts for material in part.material.with_inner()):
             pose = part.to_world if part.local is None else part.to_world @ part.local
             yield from _faces(part.name, part, pose)
     for copy in copies:
-        if copy.of in part_by_name and any(material.model.refracts for material in copy.material.all()):
+        if copy.of in part_by_name and any(material.model.refracts for material in copy.material.with_inner()):
             yield from _faces(copy.name, part_by_name[copy.of], copy.to_world)
 
 

@@ -64,7 +64,7 @@ def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str 
     for part in parts:
         if part.kind != "triangle" or part.uvs is not None:
             continue
-        for node in part.material.readings():  # the uses of textures in the material
+        for node in part.material.textures():  # the uses of textures in the material
             if isinstance(node, ImageNode) and node.texels in stated:
                 expected = f"uvs (texture coordinates) for {part.name}, over which the texels lie"
                 raise SceneError(node.texels, "texels on a mesh without uvs", expected, file)

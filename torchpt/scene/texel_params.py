@@ -130,7 +130,7 @@ def _build_with_texels(scene: Scene, texels: Mapping[str, Tensor]) -> SceneBuild
     parameters.stated |= before.parameters.stated | texels.keys()
     texture_loader = TextureLoader({}, scene.description, parameters)
     materials = {
-        material.name: material for owner in (*before.parts, *before.copies) for material in owner.material.all()
+        material.name: material for owner in (*before.parts, *before.copies) for material in owner.material.with_inner()
     }
     nodes: dict[str, dict[str, Node]] = {}  # texture nodes by name of the material and of the parameter
     for name, value in texels.items():

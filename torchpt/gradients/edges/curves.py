@@ -405,11 +405,11 @@ def _found(scene: Scene, settings: Settings) -> Iterator[str]:
     elif scene.camera(settings.film, scene.params, torch.float64).film_of(_point(scene.device)) is None:
         yield f"those that a camera of kind {camera.name} sees"
     materials = [owner.material for owner in (*built.parts, *built.copies)]
-    if any(part.model.delta for material in materials for part in material.all()):
+    if any(part.model.delta for material in materials for part in material.with_inner()):
         yield "those seen in mirrors and clear glass, and of light that these send on"
     if any(material.opacity != 1.0 for material in materials):
         yield "those of surfaces that are not opaque"
-    nodes = [node for material in materials for node in material.readings()]
+    nodes = [node for material in materials for node in material.textures()]
     if any(getattr(node, "nearest", False) and not node.filtered for node in nodes):
         yield "those within textures that are not interpolated"
     if any(part.quadric is not None and not known(part.quadric.form) for part in built.parts):
@@ -428,7 +428,12 @@ def _point(device: torch.device) -> Tensor:
 def without_gradient(scene: Scene, wanted: Iterable[str]) -> list[str]:
     """Those of the parameters of which pictures depend by jumps alone, so that their gradients are 0."""
     owners = [*scene.built.parts, *scene.built.copies]
-    cut = {material.name for owner in owners for material in owner.material.all() if material.alpha_cutoff is not None}
+    cut = {
+        material.name
+        for owner in owners
+        for material in owner.material.with_inner()
+        if material.alpha_cutoff is not None
+    }
     rims = {f"{source.name}.{key}" for source in scene.built.sources if source.kind == "spot" for key in _RIM}
     return [
         name

@@ -1,6 +1,8 @@
 """BSDF models, one a file, in ``kinds/``. Read ``base.py`` first: it states the conventions.
 
-Stages group lanes by model, so that each call of a model has lanes of this model alone.
+Stages group lanes (paths that are traced together) by model, so that each call of a model has lanes of this model alone.
+``resolved.py`` has a material as its file gives it, ``records.py`` what lanes read; ``lobes.py``, ``rough.py``, ``metal.py``
+and ``specs.py`` have what several models share. Other rooms import the names below, the records and the specs.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from torchpt.spec import Kinds
 
 __all__ = ["KINDS", "Bsdf", "Parameters", "Table", "gather", "stacked", "variants"]
 
-#: The types of materials.
+#: The types of materials by name; a module of ``kinds/`` is imported when its type is first looked up.
 KINDS: Kinds[Bsdf] = Kinds(
     "torchpt.physics.bsdfs.kinds",
     (

@@ -1,5 +1,9 @@
 """The base class of BSDFs, their conventions of frames and densities, and 1-D tables for them.
 
+A model's values change form three times. A scene file gives ``Values``: numbers, colours, textures. Each material becomes one
+row of ``Parameters``: tensors ``(3, 1)`` or ``(1,)``. The rows of all materials of a model are :func:`stacked`, and
+:func:`gather` reads, for each of N lanes (paths that are traced together), the row of the material that it hit.
+
 Directions are local: ``+z`` is the shading normal; ``wo`` points toward the previous vertex, ``wi`` is sampled. Both leave
 the surface. ``eval`` includes ``|cos(theta_i)|``, ``pdf`` is in solid angle, ``weight = eval / pdf``, and ``pdf = 0`` means
 that the sample failed. ``eval`` and ``pdf`` leave out delta lobes; ``sample`` returns ``pdf = inf`` for them.
@@ -21,7 +25,7 @@ from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.specs import Heights, Normals, fraction
 from torchpt.spec import Color, Flag, Refused, Scalar, Spec, parameters_of
 
-__all__ = ["Bsdf", "Parameters", "Table", "Values", "diffuse_split_sum", "gather", "made", "stacked"]
+__all__ = ["Bsdf", "Parameters", "Table", "Values", "diffuse_split_sum", "gather", "model_and_values", "stacked"]
 
 #: Values by parameter name: a tensor ``(3, N)`` or ``(N,)``, a :class:`Table`, a nested mapping, or None if absent.
 Parameters = dict[str, Any]
@@ -33,16 +37,17 @@ Values = Mapping[str, Any]
 class Bsdf:
     """A BSDF model: pure tensor functions of texture-free parameters.
 
-    One instance is called for one group of lanes. A subclass defines :meth:`sample` and either :meth:`eval_pdf`, or
+    An instance holds no numbers of a material, only which variant of the model it is: materials with equal instances share one
+    call. A subclass defines :meth:`sample` and either :meth:`eval_pdf`, or
     :meth:`eval` and :meth:`pdf`. Its ``parameters`` are added to those of this class, which every material has.
 
     Attributes:
         name: the ``type`` in a scene file.
         parameters: parameters of this type: specs, or plain defaults (a number, or three for a colour).
-        factors: parameters that scale a lobe. A material without one counts as 1 beside materials that have it.
+        factors: parameters that scale a lobe. Where materials of one model are stacked, one without such a factor gets 1.
         tabulated: parameters that :meth:`tabulate` reads; they cannot be textures.
-        sheer: whether rays pass as through a null surface, without counting a bounce.
-        lobed: whether ``sample`` reads ``lobe``; otherwise no number is drawn for it.
+        sheer: whether the surface is invisible, as ``null`` is: rays pass it without counting a bounce.
+        lobed: whether ``sample`` reads ``lobe``, the number that chooses a lobe; otherwise none is drawn.
         delta: whether ``sample`` may give ``pdf = inf``.
         smooth: whether all lobes are deltas: then no light is sampled.
         transmits: whether light passes through. Other models get ``wo.z >= 0`` only: callers flip the frame on the back, or
@@ -81,15 +86,15 @@ class Bsdf:
     anisotropic: bool = False
 
     def __init_subclass__(cls, part: bool = False, **kwargs: Any) -> None:
-        """Check that the subclass can be evaluated; with ``part`` it is a mixin, not a model."""
+        """Check that the subclass can be evaluated; with ``part=True`` it is a mixin, not a model."""
         super().__init_subclass__(**kwargs)
         if not part and cls.eval_pdf is Bsdf.eval_pdf and (cls.eval is Bsdf.eval or cls.pdf is Bsdf.pdf):
             raise TypeError(f"{cls.__name__} has to define eval_pdf, or eval and pdf")
 
     def has(self, **traits: Any) -> None:
-        """Set class attributes that depend on fields of the variant. Called from ``__post_init__``."""
+        """Set attributes of this class that depend on fields of the variant. Called from ``__post_init__``."""
         for name, value in traits.items():
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, value)  # variants are frozen dataclasses
 
     @classmethod
     def check(cls, values: Values, given: frozenset[str]) -> None:
@@ -106,22 +111,25 @@ class Bsdf:
             raise Refused("an opacity beside alpha_cutoff", values["alpha_cutoff"], ("alpha_cutoff",))
         if values["normal_map"] is not None and values["bump_map"] is not None:
             raise Refused("either normal_map or bump_map, not both", values["bump_map"], ("bump_map",))
-        for key, whole in (("normal_strength", "normal_map"), ("emission_strength", "emission")):
-            if key in given and values[whole] is None:
-                raise Refused(f"{'an' if whole[0] in 'aeiou' else 'a'} {whole} beside {key}", values[key], (key,))
+        for key, scaled in (("normal_strength", "normal_map"), ("emission_strength", "emission")):
+            if key in given and values[scaled] is None:
+                raise Refused(f"{'an' if scaled[0] in 'aeiou' else 'a'} {scaled} beside {key}", values[key], (key,))
 
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
         """Return the model in the variant for a material, and its values as from :meth:`given`.
 
         Args:
-            values: values of all parameters; models in place of inner materials.
+            values: values of all parameters, None where absent; models in place of inner materials.
         """
         return cls(), cls.given(values)
 
     @classmethod
     def given(cls, values: Values) -> dict[str, Any]:
-        """Return the values that the model itself reads: its own numbers, colours and textures, without None."""
+        """Return the values that the model itself reads: its own numbers, colours and textures, without None.
+
+        Those that every material has, such as opacity, and those that choose a variant are left out.
+        """
         specs = parameters_of(cls)
         return {
             key: value
@@ -140,7 +148,7 @@ class Bsdf:
         return (cls(),)
 
     def tabulate(self, values: Parameters) -> Parameters:
-        """Return tables that :meth:`prepare` reads, computed once a material: integrals over directions."""
+        """Return tables that :meth:`prepare` reads as further values, computed once a material: integrals over directions."""
         return {}
 
     def prepare(self, values: Parameters) -> Parameters:
@@ -156,9 +164,9 @@ class Bsdf:
 
         Args:
             parameters: values from :meth:`prepare`, per lane.
-            wo: ``(3, N)``.
-            lobe: ``(N,)`` in [0, 1); None unless ``lobed``.
-            u: ``(2, N)`` in [0, 1).
+            wo: ``(3, N)`` local, unit.
+            lobe: uniform number ``(N,)`` in [0, 1) that chooses a lobe; None unless ``lobed``.
+            u: uniform numbers ``(2, N)`` in [0, 1) that choose the direction.
         """
         raise NotImplementedError
 
@@ -187,7 +195,7 @@ class Bsdf:
         return shade(self.split_sum(parameters))
 
     def weights(self) -> Iterator[Tensor]:
-        """Yield the trainable tensors of the modules in :meth:`held`, which receive gradients."""
+        """Yield the trainable tensors of the ``torch.nn`` modules of the model, which receive gradients."""
         for module in self.held():
             yield from torch.nn.Module.parameters(module)
 
@@ -202,8 +210,8 @@ class Bsdf:
         return f"{self.name} ({', '.join(variants)})" if variants else self.name
 
 
-def made(kind: Any, values: Values) -> tuple[Bsdf, dict[str, Any]]:
-    """Return model and values as from :meth:`Bsdf.of`; ``kind`` is a class, or an instance that the caller made."""
+def model_and_values(kind: Any, values: Values) -> tuple[Bsdf, dict[str, Any]]:
+    """Return model and values as from :meth:`Bsdf.of`; ``kind`` is a class, or an instance that the user passed."""
     return kind.of(values) if isinstance(kind, type) else (kind, kind.given(values))
 
 
@@ -230,17 +238,17 @@ class Table:
     def at(self, x: Tensor) -> Tensor:
         """Return the values ``(N,)`` at ``x (N,)``, clamped to [0, 1]."""
         last = self.count - 1
-        place = x.clamp(0.0, 1.0) * last
-        below = place.detach().to(torch.int64).clamp_max(last - 1)
+        position = x.clamp(0.0, 1.0) * last  # in steps of the table
+        below = position.detach().to(torch.int64).clamp_max(last - 1)
         start = below if self.row is None else self.row * self.count + below
         low = take(self.values, start)
-        return low + (take(self.values, start + 1) - low) * (place - below)
+        return low + (take(self.values, start + 1) - low) * (position - below)
 
 
 def gather(rows: Parameters, row: Tensor) -> Parameters:
-    """Return a model's stacked parameters per lane, read at rows ``(N,)``."""
+    """Return a model's parameters per lane: those of :func:`stacked` read at rows ``(N,)``."""
 
-    def at(value: Any) -> Any:
+    def per_lane(value: Any) -> Any:
         if value is None:
             return None
         if isinstance(value, dict):
@@ -249,7 +257,7 @@ def gather(rows: Parameters, row: Tensor) -> Parameters:
             return replace(value, row=row)
         return take(value, row)
 
-    return {name: at(value) for name, value in rows.items()}
+    return {name: per_lane(value) for name, value in rows.items()}
 
 
 def stacked(prepared: Sequence[Parameters], factors: Sequence[str] = Bsdf.factors) -> Parameters:
@@ -260,12 +268,12 @@ def stacked(prepared: Sequence[Parameters], factors: Sequence[str] = Bsdf.factor
         like = next((value for value in column if value is not None), None)
         if like is None:
             out[name] = None
-        elif isinstance(like, dict):
+        elif isinstance(like, dict):  # parameters of an inner material of a blend
             out[name] = stacked([value or {} for value in column], factors)
         elif isinstance(like, Table):
-            values = torch.cat([torch.zeros_like(like.values) if t is None else t.values for t in column])
+            values = torch.cat([torch.zeros_like(like.values) if table is None else table.values for table in column])
             out[name] = Table(values, like.count)
         else:
-            nothing = torch.ones_like(like) if name in factors else torch.zeros_like(like)
-            out[name] = torch.cat([nothing if t is None else t for t in column], -1)
+            absent = torch.ones_like(like) if name in factors else torch.zeros_like(like)
+            out[name] = torch.cat([absent if value is None else value for value in column], -1)
     return out

@@ -1,4 +1,8 @@
-"""Lobes and parameters that several models share: dielectric interfaces, coats, cosine powers, GGX over a diffuse base."""
+"""Lobes and parameters that several models share: dielectric interfaces, coats, cosine powers, GGX over a diffuse base.
+
+Directions are local, ``(3, N)``; values, cosines, probabilities and masks are ``(N,)``, colours ``(3, N)``. Sampling is
+detached: probabilities and directions are constants under differentiation, and only what ``eval`` returns is differentiated.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,7 @@ from torchpt.math.sampling import cosine_hemisphere
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
 from torchpt.physics.bsdfs.presets import INDICES
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
-from torchpt.physics.bsdfs.specs import GREY, index, reflectance
+from torchpt.physics.bsdfs.specs import GREY, reflectance, refraction_index
 from torchpt.spec import Flag, Scalar
 
 __all__ = [
@@ -23,7 +27,7 @@ __all__ = [
     "Glass",
     "Glossy",
     "PhongBase",
-    "choose",
+    "choose_reflection",
     "coat_parameters",
     "coated_split_sum",
     "cosine_power",
@@ -34,9 +38,9 @@ __all__ = [
     "mean",
     "mixture_sample",
     "phong_split_sum",
-    "polished",
     "reflectance_at_normal",
     "sample_cosine_power",
+    "sample_smooth_interface",
     "tinted",
     "with_delta",
 ]
@@ -47,10 +51,10 @@ __all__ = [
 
 def in_upper_hemisphere(*directions: Tensor) -> Tensor:
     """Return 1 where all directions ``(3, N)`` lie in the upper hemisphere, else 0: ``(N,)``."""
-    least = directions[0][2]
+    lowest = directions[0][2]
     for w in directions[1:]:
-        least = torch.minimum(least, w[2])
-    return (least > 0).to(least.dtype)
+        lowest = torch.minimum(lowest, w[2])
+    return (lowest > 0).to(lowest.dtype)
 
 
 def cosine_power(one_minus_cos: Tensor, exponent: Tensor) -> Tensor:
@@ -96,8 +100,8 @@ def mixture_sample(
         model: the BSDF that evaluates the weight.
         parameters: values per lane.
         wo: ``(3, N)``.
-        wi: ``(3, N)``.
-        valid: ``(N,)`` 0 where sampling failed although the directions look valid.
+        wi: ``(3, N)`` as some lobe of the model has drawn it.
+        valid: ``(N,)`` 0 where sampling failed although ``wi`` looks valid, else 1; None: 1 everywhere.
     """
     wi = wi.detach()
     value, pdf = model.eval_pdf(parameters, wo, wi)
@@ -123,17 +127,17 @@ class Glass(Bsdf, part=True):
     """Mixin of dielectrics: two indices of refraction, and factors of reflection and transmission."""
 
     parameters: ClassVar = {
-        "int_ior": index(INDICES["bk7"], "index of refraction behind the normal"),
-        "ext_ior": index(INDICES["air"], "index of refraction in front of the surface"),
+        "int_ior": refraction_index(INDICES["bk7"], "index of refraction behind the normal"),
+        "ext_ior": refraction_index(INDICES["air"], "index of refraction in front of the surface"),
         "specular_reflectance": reflectance(None, "factor of reflected light, 1 by default"),
         "specular_transmittance": reflectance(None, "factor of transmitted light, 1 by default"),
     }
 
 
 def dielectric_parameters(values: Parameters) -> Parameters:
-    """Return ``eta``, the index below over the one above, and the two factors, None where absent."""
-    tints = {name: values.get(name) for name in ("specular_reflectance", "specular_transmittance")}
-    return {"eta": values["int_ior"] / values["ext_ior"], **tints}
+    """Return ``eta``, the index below over the one above, and the two factors of :class:`Glass`, None where absent."""
+    factors = {name: values.get(name) for name in ("specular_reflectance", "specular_transmittance")}
+    return {"eta": values["int_ior"] / values["ext_ior"], **factors}
 
 
 def tinted(amount: Tensor, tint: Tensor | None) -> Tensor:
@@ -141,26 +145,38 @@ def tinted(amount: Tensor, tint: Tensor | None) -> Tensor:
     return amount.expand(3, -1) if tint is None else amount * tint
 
 
-def choose(reflectance: Tensor, lobe: Tensor) -> tuple[Tensor, Tensor]:
-    """Choose reflection or refraction; return a mask ``(N,)`` and a weight ``(N,)`` of 1 that carries the derivative."""
-    r = reflectance.detach()
-    reflects = lobe < r
-    amount = torch.where(reflects, reflectance, 1.0 - reflectance)
-    probability = torch.where(reflects, r, 1.0 - r)
-    return reflects, amount / torch.where(probability > 0, probability, 1.0)
+def choose_reflection(reflectance: Tensor, lobe: Tensor) -> tuple[Tensor, Tensor]:
+    """Choose reflection with probability ``reflectance (N,)``, else refraction, by a uniform number ``lobe (N,)``.
+
+    Returns:
+        A mask ``(N,)`` of reflection, and the weight ``(N,)``: the value over its detached probability, 1 in value, with the
+        derivative of the value.
+    """
+    reflect_probability = reflectance.detach()
+    reflects = lobe < reflect_probability
+    value = torch.where(reflects, reflectance, 1.0 - reflectance)
+    probability = torch.where(reflects, reflect_probability, 1.0 - reflect_probability)
+    return reflects, value / torch.where(probability > 0, probability, 1.0)
 
 
-def polished(parameters: Parameters, wo: Tensor, lobe: Tensor) -> BsdfSample:
-    """Sample reflection or refraction at a smooth dielectric interface."""
+def sample_smooth_interface(parameters: Parameters, wo: Tensor, lobe: Tensor) -> BsdfSample:
+    """Sample reflection or refraction at a smooth dielectric interface.
+
+    Args:
+        parameters: from :func:`dielectric_parameters`, per lane.
+        wo: ``(3, N)`` on either side.
+        lobe: ``(N,)`` in [0, 1), chooses between the two.
+    """
+    # The squared sine is given too, since 1 - cos^2 would round it.
     side = fresnel_dielectric(wo[2], parameters["eta"], torch.addcmul(wo[0] * wo[0], wo[1], wo[1]))
-    reflects, ratio = choose(side.reflectance, lobe)
+    reflects, weight_of_choice = choose_reflection(side.reflectance, lobe)
     # Nothing is refracted under total internal reflection, where the reflectance is 1.
     sideways = torch.where(reflects, -1.0, -side.eta_ti)
     wi = torch.stack((wo[0] * sideways, wo[1] * sideways, torch.where(reflects, wo[2], side.cos_t)))
     weight = torch.where(
         reflects,
-        tinted(ratio, parameters["specular_reflectance"]),
-        tinted(ratio * side.eta_ti * side.eta_ti, parameters["specular_transmittance"]),
+        tinted(weight_of_choice, parameters["specular_reflectance"]),
+        tinted(weight_of_choice * side.eta_ti * side.eta_ti, parameters["specular_transmittance"]),
     )
     return BsdfSample(
         wi,
@@ -174,21 +190,21 @@ def dielectric_split_sum(parameters: Parameters, roughness: Tensor, f0: Tensor, 
     """Return the split-sum material of a dielectric interface.
 
     Args:
-        parameters: values per lane.
+        parameters: from :func:`dielectric_parameters`, per lane.
         roughness: ``(N,)``.
         f0: reflectance at normal incidence ``(N,)``.
         eta: index below over the one above ``(N,)``; None where light passes straight on.
     """
     one = torch.ones_like(f0)
-    reflects, passes = parameters["specular_reflectance"], parameters["specular_transmittance"]
+    reflected, transmitted = parameters["specular_reflectance"], parameters["specular_transmittance"]
     return SplitSumMaterial(
-        torch.zeros_like(one).expand(3, -1),
-        tinted(f0, reflects),
-        tinted(one, reflects),
-        roughness,
-        f0,
-        tinted(one, passes),
-        eta,
+        diffuse=torch.zeros_like(one).expand(3, -1),
+        f0=tinted(f0, reflected),
+        f90=tinted(one, reflected),
+        roughness=roughness,
+        over=f0,
+        through=tinted(one, transmitted),
+        eta=eta,
     )
 
 
@@ -200,30 +216,36 @@ class Coat(Bsdf, part=True):
 
     parameters: ClassVar = {
         "diffuse_reflectance": reflectance(GREY, "colour of the base"),
-        "int_ior": index(INDICES["polypropylene"], "index of refraction of the coat"),
-        "ext_ior": index(INDICES["air"], "index of refraction in front of the surface"),
+        "int_ior": refraction_index(INDICES["polypropylene"], "index of refraction of the coat"),
+        "ext_ior": refraction_index(INDICES["air"], "index of refraction in front of the surface"),
         "specular_reflectance": reflectance(None, "factor of light that the coat reflects, 1 by default"),
         "nonlinear": Flag(False, doc="whether internally reflected light is multiplied by the base's colour again"),
     }
 
 
-def coat_parameters(values: Parameters, eta: Tensor, passed: Tensor, nonlinear: bool) -> Parameters:
+def coat_parameters(values: Parameters, eta: Tensor, transmittance: Tensor, *, nonlinear: bool) -> Parameters:
     """Return the lane parameters that both plastics read.
 
     Args:
         values: values of the material.
         eta: ``(1,)`` index of the coat over the one outside.
-        passed: ``(1,)`` fraction of diffuse light from the base that leaves through the coat.
+        transmittance: ``(1,)`` fraction of diffuse light from the base that leaves through the coat.
         nonlinear: whether internally reflected light is multiplied by the base's colour again, which saturates it.
+
+    Returns:
+        ``base``: what multiplies the coat's transmittances of ``wo`` and ``wi``, and the cosine over pi. ``coat_weight``: the
+        mean of the coat's tint over the sum of that and of the base's mean, by which the lobe is chosen.
     """
     diffuse, specular = values["diffuse_reflectance"], values.get("specular_reflectance")
-    diffuse_mean, again = mean(diffuse), diffuse if nonlinear else 1.0
+    diffuse_mean, bounced = mean(diffuse), diffuse if nonlinear else 1.0
     return {
         "eta": eta,
-        "base": diffuse / ((1.0 - again + again * passed) * eta * eta),
+        # Light that the coat reflects back, 1 - transmittance, meets the base again and again: a geometric series. The
+        # index squared is that of radiance which leaves the coat.
+        "base": diffuse / ((1.0 - bounced + bounced * transmittance) * eta * eta),
         "diffuse_reflectance": diffuse,
         "specular_reflectance": specular,
-        "specular_share": lobe_probability(
+        "coat_weight": lobe_probability(
             torch.ones_like(diffuse_mean) if specular is None else mean(specular), diffuse_mean
         ),
     }
@@ -235,7 +257,7 @@ def coated_split_sum(parameters: Parameters, roughness: Tensor) -> SplitSumMater
     one = torch.ones_like(eta)
     base = parameters["base"] * diffuse_transmittance(eta)
     f0 = reflectance_at_normal(eta)
-    return SplitSumMaterial(base, tinted(f0, factor), tinted(one, factor), roughness, f0)
+    return SplitSumMaterial(diffuse=base, f0=tinted(f0, factor), f90=tinted(one, factor), roughness=roughness, over=f0)
 
 
 # ---- Phong models: a Lambertian lobe and a power of a cosine
@@ -245,7 +267,7 @@ class PhongBase(Bsdf, part=True):
     """Mixin of Phong models: a diffuse and a glossy reflectance, and the exponent.
 
     Attributes:
-        max_albedo: largest albedo of the glossy lobe for ``specular`` 1.
+        max_albedo: largest albedo of the glossy lobe for ``specular`` 1, over exponents and directions.
     """
 
     parameters: ClassVar = {
@@ -258,12 +280,12 @@ class PhongBase(Bsdf, part=True):
 
     @classmethod
     def energy(cls, values: Values) -> str:
-        """See :meth:`Bsdf.energy`."""
+        """Return a warning where both lobes may sum to an albedo above 1; "" where they do not, or have textures."""
         diffuse, specular = values["diffuse"], values["specular"]
         if not isinstance(diffuse, tuple) or not isinstance(specular, tuple):
             return ""
         albedo = max(kd + cls.max_albedo * ks for kd, ks in zip(diffuse, specular, strict=True))
-        if albedo <= 1.0 + 1e-6:
+        if albedo <= 1.0 + 1e-6:  # decimals such as 0.8 + 0.2 may round above 1
             return ""
         terms = "diffuse + specular" if cls.max_albedo == 1.0 else f"diffuse + {cls.max_albedo:g} specular"
         return f"{terms} is {albedo:.4g}: above 1 it may reflect more light than it receives"
@@ -279,12 +301,13 @@ def phong_split_sum(parameters: Parameters, alpha2: Tensor, peak: Tensor | float
     """
     specular = parameters["specular"] * peak
     roughness = alpha2.clamp(0.0, 1.0).sqrt().sqrt()
-    return SplitSumMaterial(parameters["diffuse"], specular, specular, roughness, None)
+    return SplitSumMaterial(diffuse=parameters["diffuse"], f0=specular, f90=specular, roughness=roughness, over=None)
 
 
 # ---- A diffuse base under GGX facets with the approximate masking ``G1(v) = nv / (nv (1 - k) + k)``, ``k = (r + 1)^2 / 8``
 #
-# Karis, *Real Shading in Unreal Engine 4*, 2013. Two models share it, with different factors of the lobes.
+# Karis, *Real Shading in Unreal Engine 4*, 2013: nv is the cosine of v and the normal, r the roughness. Two models share it,
+# with different factors of the lobes.
 
 
 class Glossy(Bsdf):
@@ -302,7 +325,10 @@ class Glossy(Bsdf):
         return torch.where(parameters["smooth"], 0.0, parameters["alpha"].sqrt())
 
     def prepare(self, values: Parameters) -> Parameters:
-        """Return the values with ``alpha``, ``k`` and ``smooth`` (a mirror, below the least alpha) for ``roughness``."""
+        """Return the values with ``alpha``, ``k`` (of the masking) and ``smooth`` in place of ``roughness``.
+
+        ``smooth`` is True where alpha is so small that the facets are a mirror: then the specular lobe is a delta.
+        """
         values = dict(values)
         roughness = values.pop("roughness")
         alpha = roughness * roughness
@@ -320,7 +346,7 @@ class Glossy(Bsdf):
         diffuse, specular = self.lobe_factors(parameters, wo)
         diffuse_probability = lobe_probability(mean(diffuse), mean(specular))
         cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].clamp_min(0.0)
-        facets = microfacet.reflection(wo, wi, alpha, alpha, microfacet.BOUNDED)
+        facets = microfacet.reflection(wo, wi, alpha, alpha, bounded=microfacet.BOUNDED)
         # Divides Smith's masking out, to put the approximation in its place.
         smith = (cos_o + microfacet.stretched_length(wo, alpha, alpha)) * (
             cos_i + microfacet.stretched_length(wi, alpha, alpha)
@@ -337,11 +363,13 @@ class Glossy(Bsdf):
         alpha = parameters["alpha"]
         diffuse, specular = self.lobe_factors(parameters, wo)
         diffuse_probability = lobe_probability(mean(diffuse), mean(specular))
-        shiny = lobe >= diffuse_probability
-        m = microfacet.sample_normal(wo, alpha, alpha, u, microfacet.BOUNDED)
-        about = microfacet.reflect(wo, m, wo[0] * m[0] + wo[1] * m[1] + wo[2] * m[2])
-        drawn = mixture_sample(self, parameters, wo, torch.where(shiny, about, cosine_hemisphere(u)))
+        is_specular = lobe >= diffuse_probability
+        m = microfacet.sample_normal(wo, alpha, alpha, u, bounded=microfacet.BOUNDED)
+        reflected = microfacet.reflect(wo, m, wo[0] * m[0] + wo[1] * m[1] + wo[2] * m[2])
+        drawn = mixture_sample(self, parameters, wo, torch.where(is_specular, reflected, cosine_hemisphere(u)))
         mirror = torch.stack((-wo[0], -wo[1], wo[2]))
-        masking = wo[2] / (wo[2] - wo[2] * parameters["k"] + parameters["k"])
-        weight = specular * (masking * masking / torch.where(shiny, 1.0 - diffuse_probability, 1.0))
-        return with_delta(drawn, shiny & parameters["smooth"] & (wo[2] > 0), mirror, weight)
+        masking = wo[2] / (
+            wo[2] - wo[2] * parameters["k"] + parameters["k"]
+        )  # of wo, and of wi: it has the same cosine
+        weight = specular * (masking * masking / torch.where(is_specular, 1.0 - diffuse_probability, 1.0))
+        return with_delta(drawn, is_specular & parameters["smooth"] & (wo[2] > 0), mirror, weight)

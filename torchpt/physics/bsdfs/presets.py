@@ -10,11 +10,11 @@ The list of media is Mitsuba 3's: measured at 589 nm and 0 to 20 degrees Celsius
 
 from __future__ import annotations
 
-__all__ = ["INDICES", "METALS", "metal"]
+__all__ = ["INDICES", "METALS", "metal_index"]
 
 Rgb = tuple[float, float, float]
 
-#: Name of a metal (or of another material with a complex index) to eta and k.
+#: Name of a metal (or of another material with a complex index) to eta and k, the real and the imaginary part.
 METALS: dict[str, tuple[Rgb, Rgb]] = {
     "a-C": ((2.94405, 2.22714, 1.96816), (0.887465, 0.799299, 0.81529)),
     "Ag": ((0.155276, 0.116728, 0.138388), (4.82835, 3.12222, 2.1469)),
@@ -88,6 +88,6 @@ INDICES: dict[str, float] = {
 }
 
 
-def metal(name: str) -> tuple[Rgb, Rgb] | None:
+def metal_index(name: str) -> tuple[Rgb, Rgb] | None:
     """Return ``(eta, k)`` of a metal, or None if the name is unknown. Mitsuba's suffix ``_palik`` is optional."""
     return METALS.get(name) or METALS.get(name.removesuffix("_palik"))

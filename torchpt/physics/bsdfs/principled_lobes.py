@@ -1,5 +1,9 @@
 """Terms of the principled BSDF alone: Schlick's weight, tint, the diffuse lobes, the clearcoat.
 
+Main lobes are the GGX reflection and refraction; beside them there are the diffuse lobe (with sheen) and the clearcoat.
+"Upper side" is that of the shading normal; all lanes of an opaque model, and those of a transmissive one after
+:func:`flip_to_upper`, have ``wo`` there. Cosines, weights and alphas are ``(N,)``, directions and colours ``(3, N)``.
+
 Burley, *Physically Based Shading at Disney*, 2012 (below: 2012), and *Extending the Disney BRDF to a BSDF with Integrated
 Subsurface Scattering*, 2015 (below: 2015).
 """
@@ -41,17 +45,19 @@ class Facet(NamedTuple):
     interface: Interface  # for the index of the far side over the one of wo's side
     cos: Tensor  # (N,) dot(wo, m) >= 0
     schlick: Tensor  # (N,) Schlick's weight for this cosine
-    reflected: Tensor  # (3, N)
-    refracted: Tensor | None  # (3, N), without the radiance factor; None where nothing refracts
+    reflected: Tensor  # (3, N) factor of the reflection lobe
+    refracted: (
+        Tensor | None
+    )  # (3, N) factor of the refraction lobe, without the 1 / eta^2 of radiance; None: opaque model
 
 
 class Probabilities(NamedTuple):
     """Probabilities of the lobes, each ``(N,)`` and detached. Only the ratio of the last two depends on the facet."""
 
     diffuse: Tensor
-    clearcoat: Tensor | None
+    clearcoat: Tensor | None  # None: no material of the model has a clearcoat
     reflect: Tensor
-    refract: Tensor | None
+    refract: Tensor | None  # None: opaque model
 
 
 class MainLobes(NamedTuple):
@@ -60,8 +66,8 @@ class MainLobes(NamedTuple):
     m: Tensor  # (3, N) half vector
     cos: Tensor  # dot(wo, m) >= 0
     reflection: Tensor  # f cos(theta_i)
-    reflection_pdf: Tensor
-    refraction: Tensor  # an opaque model repeats the reflection here, unused
+    reflection_pdf: Tensor  # per steradian
+    refraction: Tensor  # f cos(theta_i); an opaque model repeats the reflection here, unused
     refraction_pdf: Tensor
 
 
@@ -79,9 +85,9 @@ def schlick_weight(cos: Tensor) -> Tensor:
 
 def tint(base_color: Tensor) -> Tensor:
     """Return the colour scaled to luminance 1, white for black: ``(3, N) -> (3, N)``."""
-    y = luminance(base_color)
-    lit = y > 0
-    return torch.where(lit, base_color / torch.where(lit, y, 1.0), 1.0)
+    brightness = luminance(base_color)
+    is_lit = brightness > 0
+    return torch.where(is_lit, base_color / torch.where(is_lit, brightness, 1.0), 1.0)
 
 
 def retro_diffuse(roughness: Tensor, fresnel_o: Tensor, fresnel_i: Tensor, cos_d: Tensor) -> Tensor:
@@ -101,16 +107,19 @@ def retro_diffuse(roughness: Tensor, fresnel_o: Tensor, fresnel_i: Tensor, cos_d
 def fake_subsurface(
     roughness: Tensor, fresnel_o: Tensor, fresnel_i: Tensor, cos_d: Tensor, cos_o: Tensor, cos_i: Tensor
 ) -> Tensor:
-    """Return the fake subsurface lobe, times pi ``(N,)`` (2012, section 5.3, after Hanrahan and Krueger)."""
+    """Return the fake subsurface lobe, times pi ``(N,)`` (2012, section 5.3, after Hanrahan and Krueger).
+
+    Arguments as for :func:`retro_diffuse`; ``cos_o`` and ``cos_i`` are the cosines of ``wo`` and ``wi``, at least 0.
+    """
     grazing = roughness * cos_d * cos_d
     both = lerp(1.0, grazing, fresnel_o) * lerp(1.0, grazing, fresnel_i)
-    sum_ = cos_o + cos_i
-    apart = sum_ > 0
-    return 1.25 * (both * (1.0 / torch.where(apart, sum_, 1.0) - 0.5) + 0.5)
+    cosines = cos_o + cos_i
+    usable = cosines > 0
+    return 1.25 * (both * (1.0 / torch.where(usable, cosines, 1.0) - 0.5) + 0.5)
 
 
 def clearcoat_alpha(gloss: Tensor) -> Tensor:
-    """Return alpha of the clearcoat: 0.1 at gloss 0, 0.001 at gloss 1."""
+    """Return alpha of the clearcoat: 0.1 at gloss 0, 0.001 at gloss 1 (2012)."""
     return lerp(0.1, 0.001, gloss)
 
 
@@ -122,7 +131,7 @@ def gtr1(m: Tensor, alpha: Tensor) -> Tensor:
 
 
 def sample_gtr1(alpha: Tensor, u: Tensor) -> Tensor:
-    """Sample normals ``(3, N)`` with density ``D cos`` (2012, appendix B.2, equation 2)."""
+    """Sample normals ``(3, N)`` with density ``D cos`` from ``u (2, N)`` (2012, appendix B.2, equation 2)."""
     a2 = alpha * alpha
     sin2 = a2 * torch.expm1(-u[1] * torch.log(a2)) / (1.0 - a2)
     sin2 = sin2.clamp(0.0, 1.0)
@@ -147,7 +156,7 @@ def wide_ggx(m: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
 
 
 def up(like: Tensor) -> Tensor:
-    """Return +z in every lane, in place of a half vector that does not exist."""
+    """Return +z ``(3, N)``, shaped as ``like``, to stand for half vectors that do not exist."""
     zero = torch.zeros_like(like[0])
     return torch.stack((zero, zero, torch.ones_like(zero)))
 
@@ -158,7 +167,11 @@ def or_zero(value: Tensor | None, like: Tensor) -> Tensor:
 
 
 def flip_to_upper(wo: Tensor, wi: Tensor, eta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Flip both directions so that ``wo`` is above; return them, the far index over the near one, and 1 where not flipped."""
+    """Flip both directions so that ``wo`` is above, and the relative index ``eta``, below over above, with them.
+
+    Returns:
+        ``wo`` and ``wi``; the index of the far side over that of ``wo``'s side ``(N,)``; 1 where not flipped, else 0 ``(N,)``.
+    """
     side = torch.copysign(torch.ones_like(wo[2]), wo[2])
     front = (side > 0).to(side.dtype)
     wo, wi = (torch.stack((w[0], w[1], w[2] * side)) for w in (wo, wi))

@@ -1,4 +1,8 @@
-"""Records of materials: BSDF samples, tables of materials for lanes, split-sum materials."""
+"""Records of materials: BSDF samples, tables of materials for lanes, split-sum materials.
+
+A lane is one path of those that are traced together: the last axis of a tensor, of length N. These records are pure data,
+so that rooms may name them without importing the models.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +30,14 @@ class BsdfSample:
 
 @dataclass(frozen=True)
 class LaneMaterials:
-    """Materials of all primitives and instances: M models, each with a row of parameters for every material of it."""
+    """Materials of P primitives and I instances: M models, each with a row of parameters for every material of it.
+
+    A lane reads the entry of its ``slot`` (:class:`~torchpt.physics.shapes.geometry.Interaction`): its primitive, or ``P`` and
+    more for an instance, which may have another material than its mesh.
+    """
 
     row: Tensor  # (P + I,) int64 row in the parameters of the model
-    key: Tensor  # (P + I + 1,) uint8 sort key of lanes, shifted by one so that a miss reads the first entry
+    key: Tensor  # (P + I + 1,) uint8 sort key of lanes, shifted by one so that a miss (slot -1) reads the first entry
     models: tuple[Bsdf, ...]
     parameters: tuple[Parameters, ...]  # stacked, by model; before Bsdf.prepare where the model reads textures
     textures: tuple[MaterialTextures | None, ...]  # by model; None without textures
@@ -39,13 +47,13 @@ class LaneMaterials:
 
 @dataclass(frozen=True)
 class SplitSumMaterial:
-    """Parameters of split-sum shading, see :mod:`torchpt.physics.ibl`.
+    """Parameters of split-sum shading: radiance from prefiltered environment maps (:mod:`torchpt.physics.ibl`).
 
     Attributes:
         diffuse: albedo of the diffuse lobe ``(3, N)``: base colour times ``1 - metallic``.
         f0: reflectance of the specular lobe at normal incidence, ``(3, N)`` or ``(N,)``.
         f90: reflectance at grazing incidence, shaped as ``f0``.
-        roughness: ``(N,)`` from 0 to 1.
+        roughness: square root of GGX's alpha, ``(N,)`` from 0 to 1.
         over: reflectance at normal incidence, shaped as ``f0``, of a specular layer above the diffuse lobe, which loses
             that light; None: the lobes are added.
         through: colour of transmitted light ``(3, N)``; None if opaque. Needs ``over``.

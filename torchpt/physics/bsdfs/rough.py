@@ -1,4 +1,9 @@
-"""Roughness parameters of GGX microfacets, and tables of the energy lost between facets."""
+"""Roughness parameters of GGX microfacets, and tables of the energy lost between facets.
+
+GGX's alpha is the width of the distribution of facet normals: 0 a mirror, 1 very rough. It may differ along the surface's
+tangents u and v (``alpha_u``, ``alpha_v``). Single-scattering models lose the light that meets more than one facet; a table
+of their directional albedo, made once for each material, lets a model scale it back.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +18,11 @@ from torchpt.physics.bsdfs.base import Bsdf, Parameters, Table, Values
 from torchpt.physics.bsdfs.specs import fraction
 from torchpt.spec import Flag, Refused
 
-__all__ = ["Anisotropic", "Rough", "alphas", "energy_at", "energy_table", "mean_roughness", "rough"]
+__all__ = ["Anisotropic", "Rough", "alphas", "energy_at", "energy_table", "mean_roughness", "roughness_parameters"]
 
-_ALPHA = 0.1  # the default
+_DEFAULT_ALPHA = 0.1  # as in Mitsuba
 
-#: Entries of an energy table: cosines, equidistant in their square roots, and azimuths for anisotropic surfaces.
+#: Entries of an energy table: cosines, equidistant in their square roots, times azimuths if the surface is anisotropic.
 _COSINES, _COSINES_ANISOTROPIC, _AZIMUTHS = 64, 32, 17
 
 
@@ -25,7 +30,7 @@ class Rough(Bsdf, part=True):
     """Mixin of isotropic microfacet models: roughness."""
 
     parameters: ClassVar = {
-        "alpha": fraction(None, f"GGX alpha of the facets; {_ALPHA:g} by default"),
+        "alpha": fraction(None, f"GGX alpha of the facets; {_DEFAULT_ALPHA:g} by default"),
         "roughness": fraction(None, "square root of `alpha`, in its place"),
     }
 
@@ -33,17 +38,18 @@ class Rough(Bsdf, part=True):
     def check(cls, values: Values, given: frozenset[str]) -> None:
         """Refuse more than one of the three ways to specify roughness."""
         super().check(values, given)
-        said = [key for key in ("alpha", "roughness", "alpha_u", "alpha_v") if values.get(key) is not None]
-        if len(said) > 1 and said != ["alpha_u", "alpha_v"]:
-            raise Refused(f"either {said[0]} or {said[1]}, not both", values[said[1]], (said[1],))
-        if said in (["alpha_u"], ["alpha_v"]):
-            raise Refused("alpha_u and alpha_v together", None, ("alpha_v" if said == ["alpha_u"] else "alpha_u",))
+        present = [key for key in ("alpha", "roughness", "alpha_u", "alpha_v") if values.get(key) is not None]
+        if len(present) > 1 and present != ["alpha_u", "alpha_v"]:
+            first, second, *_ = present
+            raise Refused(f"either {first} or {second}, not both", values[second], (second,))
+        if present in (["alpha_u"], ["alpha_v"]):
+            raise Refused("alpha_u and alpha_v together", None, ("alpha_v" if present == ["alpha_u"] else "alpha_u",))
 
     @classmethod
     def given(cls, values: Values) -> dict[str, Any]:
         """Return the values, with the default ``alpha`` if no roughness is set."""
         found = super().given(values)
-        return found if found.keys() & {"alpha", "roughness", "alpha_u"} else {**found, "alpha": _ALPHA}
+        return found if found.keys() & {"alpha", "roughness", "alpha_u"} else {**found, "alpha": _DEFAULT_ALPHA}
 
 
 class Anisotropic(Rough, part=True):
@@ -62,8 +68,8 @@ class Anisotropic(Rough, part=True):
             self.has(tabulated=("alpha", "roughness", "alpha_u", "alpha_v", "int_ior", "ext_ior"), reciprocal=False)
 
 
-def rough(values: Parameters, anisotropic: bool) -> Parameters:
-    """Return ``alpha_u``, ``alpha_v`` (None if isotropic), and the mask ``smooth``.
+def roughness_parameters(values: Parameters, *, anisotropic: bool) -> Parameters:
+    """Return ``alpha_u``, ``alpha_v`` (None if isotropic), and the mask ``smooth``: alphas so small that facets are a mirror.
 
     Args:
         values: ``alpha``, or ``roughness`` (its square root), or ``alpha_u`` and ``alpha_v``.
@@ -81,7 +87,7 @@ def rough(values: Parameters, anisotropic: bool) -> Parameters:
 
 
 def alphas(parameters: Parameters) -> tuple[Tensor, Tensor]:
-    """Return ``alpha_u`` and ``alpha_v`` from the parameters of :func:`rough`."""
+    """Return ``alpha_u`` and ``alpha_v``, each ``(N,)``, from :func:`roughness_parameters`."""
     u, v = parameters["alpha_u"], parameters["alpha_v"]
     return u, u if v is None else v
 
@@ -89,29 +95,33 @@ def alphas(parameters: Parameters) -> tuple[Tensor, Tensor]:
 def energy_table(parameters: Parameters, etas: Sequence[Tensor | None]) -> Table:
     """Return the directional albedo of a lossless microfacet surface as one row of a table, for :func:`energy_at`.
 
+    Entries run over cosines first, then over azimuths, then over ``etas``.
+
     Args:
-        parameters: from :func:`rough`, for one material.
+        parameters: from :func:`roughness_parameters`, for one material.
         etas: relative indices, or None for a mirror; each gives one block of the table.
     """
-    u, v = alphas(parameters)
-    au, av = u.double(), v.double()
+    alpha_u, alpha_v = alphas(parameters)
+    au, av = alpha_u.double(), alpha_v.double()
     isotropic = parameters["alpha_v"] is None
     steps = torch.linspace(0, 1, _COSINES if isotropic else _COSINES_ANISOTROPIC, dtype=au.dtype, device=au.device)
-    cos = steps.square().clamp_min(1e-7)
-    # Azimuths at equal steps of the roughness seen along them.
+    cos = steps.square().clamp_min(1e-7)  # of wo; at 0 the albedo is not defined
+    # Azimuths at equal steps of alpha(phi) = sqrt((au cos phi)^2 + (av sin phi)^2): au at phi 0, av at a right angle.
     step = torch.linspace(0, 1, 1 if isotropic else _AZIMUTHS, dtype=au.dtype, device=au.device)
     sin2_phi = (step * (2.0 * au + step * (av - au)) / (au + av)).clamp(1e-12, 1.0 - 1e-12)
     z = cos.repeat(len(step))
     r = (1.0 - z * z).clamp_min(0.0).sqrt()
+    # The cosine and the sine of the azimuth.
     x, y = (1.0 - sin2_phi).sqrt().repeat_interleave(len(cos)), sin2_phi.sqrt().repeat_interleave(len(cos))
     wo = torch.stack((r, torch.zeros_like(r), z)) if isotropic else torch.stack((r * x, r * y, z))
     blocks = []
     for eta in etas:
-        # Total internal reflection has an edge that needs more nodes; with many azimuths they would be too many.
+        # Gauss-Legendre nodes an axis. The albedo has a kink where total internal reflection begins, which needs twice as
+        # many; for anisotropic surfaces, whose tables are larger, that would take too long.
         nodes = 64 if isotropic and eta is not None else 32
         index = None if eta is None else eta.double()
         blocks.append(microfacet.directional_albedo(wo, au, None if isotropic else av, index, nodes, nodes))
-    values = torch.cat(blocks).clamp_max(1.0).to(u.dtype)
+    values = torch.cat(blocks).clamp_max(1.0).to(alpha_u.dtype)
     return Table(values, len(values))
 
 
@@ -122,28 +132,28 @@ def energy_at(table: Table, parameters: Parameters, wo: Tensor, block: Tensor | 
         table: from :func:`energy_table`.
         parameters: values per lane.
         wo: ``(3, N)``.
-        block: ``(N,)`` 0 or 1, index into the two relative indices; None for one.
+        block: ``(N,)`` 0 or 1, which of two ``etas`` of :func:`energy_table`; None if there is one.
     """
     isotropic = parameters["alpha_v"] is None
     cosines, azimuths = (_COSINES, 1) if isotropic else (_COSINES_ANISOTROPIC, _AZIMUTHS)
-    last = cosines * azimuths * (1 if block is None else 2) - 1
-    place = wo[2].abs().clamp(1e-12, 1.0).sqrt() * (cosines - 1)
+    last = cosines * azimuths * (1 if block is None else 2) - 1  # the table's x runs from 0 to 1 over entries 0 to last
+    entry = wo[2].abs().clamp(1e-12, 1.0).sqrt() * (cosines - 1)  # fractional, as the table interpolates
     if block is not None:
-        place = place + block * (cosines * azimuths)
+        entry = entry + block * (cosines * azimuths)
     if isotropic:
-        return table.at(place * (1.0 / last))
+        return table.at(entry * (1.0 / last))
     au, av = alphas(parameters)
     r2 = torch.addcmul(wo[0] * wo[0], wo[1], wo[1]).clamp_min(1e-12)
     x, y = wo[0] * au, wo[1] * av
-    seen = (torch.addcmul(x * x, y, y).clamp_min(1e-20) / r2).sqrt()
-    # (seen - au) / (av - au), also where both roughnesses are the same.
-    step = ((au + av) * (wo[1] * wo[1] / r2) / (seen + au)).clamp(0.0, 1.0) * (azimuths - 1)
+    alpha_phi = (torch.addcmul(x * x, y, y).clamp_min(1e-20) / r2).sqrt()  # alpha along the azimuth of wo
+    # (alpha_phi - au) / (av - au), also where both alphas are the same.
+    step = ((au + av) * (wo[1] * wo[1] / r2) / (alpha_phi + au)).clamp(0.0, 1.0) * (azimuths - 1)
     below = step.detach().floor().clamp_max(azimuths - 2)
-    low = table.at((place + below * cosines) * (1.0 / last))
-    return low + (table.at((place + (below + 1.0) * cosines) * (1.0 / last)) - low) * (step - below)
+    low = table.at((entry + below * cosines) * (1.0 / last))
+    return low + (table.at((entry + (below + 1.0) * cosines) * (1.0 / last)) - low) * (step - below)
 
 
 def mean_roughness(parameters: Parameters) -> Tensor:
     """Return ``(alpha_u alpha_v)^(1/4)`` ``(N,)``: ``sqrt(alpha)`` if isotropic; 0 where the surface is smooth."""
-    u, v = alphas(parameters)
-    return torch.where(parameters["smooth"], 0.0, (u * v).sqrt().sqrt())
+    alpha_u, alpha_v = alphas(parameters)
+    return torch.where(parameters["smooth"], 0.0, (alpha_u * alpha_v).sqrt().sqrt())

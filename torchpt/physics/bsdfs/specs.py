@@ -1,4 +1,8 @@
-"""Specs of material parameters: fractions, indices of refraction, normal and bump maps, inner materials."""
+"""Specs of material parameters: fractions, indices of refraction, normal and bump maps, inner materials.
+
+A spec declares one key of a scene file: default, range, documentation, and ``read``, which checks a value of the file and
+returns it or raises ``Refused``. Models list theirs in ``Bsdf.parameters``.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +14,19 @@ from torchpt.physics.bsdfs.presets import INDICES
 from torchpt.spec import REQUIRED, Color, Custom, Index, Refused, Scalar, Spec
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["GREY", "WHITE", "Heights", "Inner", "Normals", "fraction", "index", "reflectance", "smooth"]
+__all__ = [
+    "GREY",
+    "WHITE",
+    "Heights",
+    "Inner",
+    "Normals",
+    "fraction",
+    "no_roughness",
+    "reflectance",
+    "refraction_index",
+]
 
-GREY, WHITE = (0.5, 0.5, 0.5), (1.0, 1.0, 1.0)
+GREY, WHITE = (0.5, 0.5, 0.5), (1.0, 1.0, 1.0)  # linear RGB
 
 
 def fraction(default: Any, doc: str) -> Scalar:
@@ -25,20 +39,22 @@ def reflectance(default: Any, doc: str) -> Color:
     return Color(default, high=1.0, texture=True, doc=doc)
 
 
-def index(default: float, doc: str) -> Index:
+def refraction_index(default: float, doc: str) -> Index:
     """Return the spec of an index of refraction: a number, the name of a medium, or a texture."""
     return Index(default, texture=True, media=INDICES, doc=doc)
 
 
-def smooth(rough: str) -> Custom:
-    """Return the spec of roughness for a smooth type: 0 without effect, else an error that suggests the type ``rough``."""
-    words = f"0, as this type is smooth (use {rough})"
+def no_roughness(rough_type: str) -> Custom:
+    """Return the spec of roughness for a smooth type: 0 has no effect, others are refused with ``rough_type`` as advice."""
+    words = f"0, as this type is smooth (use {rough_type})"
 
-    def read(value: Any) -> None:
-        if isinstance(value, bool | Mapping) or value != 0:
+    def read_zero(value: Any) -> None:
+        if isinstance(value, bool | Mapping) or value != 0:  # a bool would equal 0; a texture comes as a mapping
             raise Refused(words)
 
-    return Custom(None, reader=read, words=words, doc="no effect: allows a rough type to be replaced by a smooth one")
+    return Custom(
+        None, reader=read_zero, words=words, doc="no effect: allows a rough type to be replaced by a smooth one"
+    )
 
 
 @dataclass(frozen=True)
@@ -50,15 +66,15 @@ class Normals(Color):
     texture: bool = field(default=True, kw_only=True)
 
     differentiable: ClassVar[bool] = False
-    linear: ClassVar[bool] = True
+    linear: ClassVar[bool] = True  # the image's numbers are read as they are, without the sRGB curve
 
     @property
     def expected(self) -> str:
-        """See :attr:`Spec.expected`."""
+        """Return the words of an error for what the key accepts."""
         return "a texture whose colours hold normals: {type: image, path: FILE} or {texture: NAME}"
 
     def read(self, value: Any) -> Any:
-        """Refuse everything: textures are read before this is called."""
+        """Refuse everything: a texture never gets here, as textures are opened before other values are read."""
         raise Refused(self.expected)
 
 
@@ -74,11 +90,11 @@ class Heights(Scalar):
 
     @property
     def expected(self) -> str:
-        """See :attr:`Spec.expected`."""
+        """Return the words of an error for what the key accepts."""
         return "a texture of heights in the scene's units: {type: image, path: FILE, scale: UNITS} or {texture: NAME}"
 
     def read(self, value: Any) -> Any:
-        """Refuse everything: textures are read before this is called."""
+        """Refuse everything: a texture never gets here, as textures are opened before other values are read."""
         raise Refused(self.expected)
 
 
@@ -90,11 +106,11 @@ class Inner(Spec):
 
     @property
     def accepted(self) -> str:
-        """See :attr:`Spec.accepted`."""
+        """Return the phrase for what the key accepts, without textures."""
         return "the name of a material, or a material"
 
     def read(self, value: Any) -> Any:
-        """See :meth:`Spec.read`."""
+        """Return the value if it names a material or is one whose parameters were parsed; refuse anything else."""
         if isinstance(value, ParsedParams) or (isinstance(value, str) and value):
             return value
         raise Refused(self.expected)

@@ -12,7 +12,7 @@ from typing import Any
 
 from torchpt.core.errors import EnergyWarning, NotBuiltError, SceneError, did_you_mean, warn_caller
 from torchpt.physics.bsdfs import KINDS, Bsdf
-from torchpt.physics.bsdfs.base import made as model_and_values
+from torchpt.physics.bsdfs.base import model_and_values
 from torchpt.physics.bsdfs.specs import Inner
 from torchpt.scene.formats.textures import TextureInput, check_texture, texture_of
 from torchpt.spec import REQUIRED, Refused, Spec, parameters_of, spec_of

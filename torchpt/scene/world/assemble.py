@@ -73,7 +73,7 @@ def assemble(
     slot_counts = primitives.sizes + [1] * len(copies)  # number of slots of each owner
     materials = {owner.material.name: _with_scaled_bump(owner.material, space.unit) for owner in owners}
     lane_materials = {name: lane_material(material, parameters, dtype) for name, material in materials.items()}
-    nodes = [node for material in materials.values() for node in material.readings()]  # uses of textures
+    nodes = [node for material in materials.values() for node in material.textures()]  # uses of textures
     tables, node_positions = tables_of(nodes, parameters, dtype, device)
     groups = groups_of(materials, lane_materials, node_positions, parameters, dtype, device)
     opacity = opacity_of(owners, lane_materials, slot_counts, dtype, device)

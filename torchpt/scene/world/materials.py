@@ -61,7 +61,7 @@ def vertex_attributes_of(
         models: BSDFs of the groups.
         uv: True for texture coordinates even where no texture reads them.
     """
-    readings = [reading for material in materials.values() for reading in material.readings()]
+    readings = [reading for material in materials.values() for reading in material.textures()]
     # Bump maps, and filtered look-ups for the size of texels, need both derivatives of the point by texture coordinates.
     needs_bitangents = any(material.bump_map is not None for material in materials.values())
     needs_bitangents = needs_bitangents or any(reading.filtered for reading in readings)
@@ -337,7 +337,7 @@ def _textures(
             return {key: bound([item[key] for item in column]) for key in first}
         return binding(column)
 
-    every = [node for material in materials for node in material.readings()]
+    every = [node for material in materials for node in material.textures()]
     readings = bound([one.readings for one in lane_materials])
     return MaterialTextures(
         readings,

@@ -1,4 +1,7 @@
-"""The mixture of two BSDFs: ``f = (1 - weight) a + weight b``, either of any type, blends included."""
+"""The mixture of two BSDFs: ``f = (1 - weight) a + weight b``, either of any type, blends included.
+
+Parameters nest: those of a blend have, beside ``weight``, one mapping ``a`` and one ``b`` with those of the inner models.
+"""
 
 from __future__ import annotations
 
@@ -52,8 +55,8 @@ class Blend(Bsdf):
 
         kinds: dict[str, Any] = {name: KINDS[name] for name in KINDS}  # Any: the models' constructors differ
         matt, rough, glass = kinds["diffuse"](), kinds["roughconductor"](), kinds["dielectric"]()
-        inner = cls(matt, kinds["conductor"](schlick=True))
-        return cls(matt, rough), cls(glass, matt), cls(inner, kinds["roughdielectric"]())
+        inner = cls(a=matt, b=kinds["conductor"](schlick=True))
+        return cls(a=matt, b=rough), cls(a=glass, b=matt), cls(a=inner, b=kinds["roughdielectric"]())
 
     def __post_init__(self) -> None:
         a, b = self.a, self.b
@@ -69,11 +72,11 @@ class Blend(Bsdf):
         )
 
     def tabulate(self, values: Parameters) -> Parameters:
-        """See :meth:`Bsdf.tabulate`."""
+        """Return the tables of both models."""
         return {"a": self.a.tabulate(values["a"]), "b": self.b.tabulate(values["b"])}
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :meth:`Bsdf.prepare`."""
+        """Return the weight and the parameters of both models."""
         return {"weight": values["weight"], "a": self.a.prepare(values["a"]), "b": self.b.prepare(values["b"])}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
@@ -89,7 +92,8 @@ class Blend(Bsdf):
         weight = parameters["weight"].clamp(0.0, 1.0)
         second_probability = weight.detach()
         second = lobe < second_probability
-        # Given the choice, the number rescaled to [0, 1) is uniform again.
+        # `lobe` was drawn from [0, 1). Given the choice it lies in an interval from `low`, `width` long; rescaled to [0, 1) it
+        # is uniform again, for the choice of a lobe within the model.
         low, width = (
             torch.where(second, 0.0, second_probability),
             torch.where(second, second_probability, 1.0 - second_probability),  # also the probability of the choice
@@ -106,7 +110,7 @@ class Blend(Bsdf):
         eta = None
         if self.refracts:
             unrefracted = torch.ones_like(lobe)
-            eta_a, eta_b = (unrefracted if drawn.eta is None else drawn.eta for drawn in (a, b))
+            eta_a, eta_b = (unrefracted if inner.eta is None else inner.eta for inner in (a, b))
             eta = torch.where(second, eta_b, eta_a)
         return replace(drawn, eta=eta)
 
@@ -130,25 +134,25 @@ class Blend(Bsdf):
 
     def _facing(self, inner: Bsdf) -> Bsdf:
         """Return the model; beside one that transmits, an opaque model made two-sided."""
-        return _Mirrored(inner) if self.transmits and not inner.transmits else inner
+        return _TwoSided(inner) if self.transmits and not inner.transmits else inner
 
 
 @dataclass(frozen=True)
-class _Mirrored(Bsdf):
+class _TwoSided(Bsdf):
     """An opaque model made two-sided: directions are flipped where ``wo`` is below the surface."""
 
     inner: Bsdf
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         side = torch.copysign(torch.ones_like(wo[2]), wo[2])
-        return self.inner.eval_pdf(parameters, _turned(wo, side), _turned(wi, side))
+        return self.inner.eval_pdf(parameters, _flipped(wo, side), _flipped(wi, side))
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         side = torch.copysign(torch.ones_like(wo[2]), wo[2])
-        drawn = self.inner.sample(parameters, _turned(wo, side), lobe, u)
-        return BsdfSample(_turned(drawn.wi, side), drawn.pdf, drawn.weight, drawn.eta)
+        drawn = self.inner.sample(parameters, _flipped(wo, side), lobe, u)
+        return BsdfSample(_flipped(drawn.wi, side), drawn.pdf, drawn.weight, drawn.eta)
 
 
-def _turned(w: Tensor, side: Tensor) -> Tensor:
-    """Return local directions with z multiplied by ``side``, 1 or -1."""
+def _flipped(w: Tensor, side: Tensor) -> Tensor:
+    """Return local directions ``w (3, N)`` with z multiplied by ``side (N,)``, 1 or -1."""
     return torch.stack((w[0], w[1], w[2] * side))

@@ -1,7 +1,8 @@
 """Blinn's model with Phong's normalization, as published: ``f = kd / pi + ks (n + 2) / (2 pi) (h . n)^n``.
 
 Blinn, *Models of Light Reflection for Computer Synthesized Pictures*, 1977. It creates energy: at normal incidence the
-specular lobe alone reflects up to ``4 ks``.
+specular lobe alone reflects up to ``4 ks``. ``h`` is the half vector, ``n`` the exponent (within ``h . n`` the normal), ``kd``
+and ``ks`` are the parameters ``diffuse`` and ``specular``.
 """
 
 from __future__ import annotations
@@ -60,13 +61,13 @@ class BlinnPhong(PhongBase):
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Bsdf.eval_pdf`."""
         exponent, diffuse_probability = parameters["exponent"], parameters["lobe_probability"]
-        seen = in_upper_hemisphere(wo, wi)
+        seen = in_upper_hemisphere(wo, wi)  # 1 or 0
         cosine = wi[2] * seen
         s = wo + wi  # along the half vector, 2 cos(wo, h) long
         square = dot(s, s)
         usable = square > 0
         square = torch.where(usable, square, 1.0)
-        # (h . n)^n = (1 - sin^2)^(n/2)
+        # (h . n)^n = (1 - sin^2)^(n/2), with the sine between h and the normal
         peak = cosine_power((s[0] * s[0] + s[1] * s[1]) / square, 0.5 * exponent) * usable * (0.5 / math.pi)
         value = torch.addcmul(
             parameters["diffuse"] * (cosine * (1.0 / math.pi)), parameters["specular"], (exponent + 2.0) * peak * cosine
@@ -80,7 +81,7 @@ class BlinnPhong(PhongBase):
         """Choose a lobe; the half vector has density ``(n + 1) / (2 pi) (h . n)^n``. A ``wi`` below the surface fails."""
         assert lobe is not None
         one_minus_cos = sample_cosine_power(u[0], parameters["exponent"])
-        r = (one_minus_cos * (2.0 - one_minus_cos)).clamp_min(0.0).sqrt()
+        r = (one_minus_cos * (2.0 - one_minus_cos)).clamp_min(0.0).sqrt()  # sine between h and the normal
         phi = (2.0 * math.pi) * u[1]
         h = torch.stack((r * torch.cos(phi), r * torch.sin(phi), 1.0 - one_minus_cos))
         wi = torch.where(lobe < parameters["lobe_probability"], cosine_hemisphere(u), h * (2.0 * dot(wo, h)) - wo)
@@ -93,4 +94,5 @@ class BlinnPhong(PhongBase):
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Return facets of GGX alpha ``sqrt(2 / (n + 2))``, with the lobe's albedo at normal incidence."""
         n = parameters["exponent"]
-        return phong_split_sum(parameters, 2.0 / (n + 2.0), 4.0 * (n + torch.exp(-0.34657359 * n)) / (n + 4.0))
+        peak = 4.0 * (n + torch.exp(-0.34657359 * n)) / (n + 4.0)  # as in prepare; the number is log(2) / 2
+        return phong_split_sum(parameters, alpha2=2.0 / (n + 2.0), peak=peak)

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
-from torchpt.physics.bsdfs.metal import Metal, by_reflectance, metal, metal_colour, metal_split_sum
+from torchpt.physics.bsdfs.metal import Metal, by_reflectance, metal_colour, metal_parameters, metal_split_sum
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
-from torchpt.physics.bsdfs.specs import smooth
+from torchpt.physics.bsdfs.specs import no_roughness
 
 __all__ = ["Conductor"]
 
@@ -26,7 +26,7 @@ class Conductor(Metal):
     """
 
     name = "conductor"
-    parameters: ClassVar = dict.fromkeys(("alpha", "roughness", "alpha_u", "alpha_v"), smooth("roughconductor"))
+    parameters: ClassVar = dict.fromkeys(("alpha", "roughness", "alpha_u", "alpha_v"), no_roughness("roughconductor"))
     delta = True
     smooth = True
 
@@ -35,7 +35,7 @@ class Conductor(Metal):
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
         """See :meth:`Bsdf.of`."""
-        return cls(by_reflectance(values)), cls.given(values)
+        return cls(schlick=by_reflectance(values)), cls.given(values)
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
@@ -43,8 +43,8 @@ class Conductor(Metal):
         return cls(), cls(schlick=True)
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :meth:`Bsdf.prepare`."""
-        return metal(values)
+        """Return the parameters of one material, or of all lanes, from its values; see :meth:`Bsdf.prepare`."""
+        return metal_parameters(values)
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """Return zeros: deltas are left out."""
@@ -60,11 +60,11 @@ class Conductor(Metal):
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Return the reflectance at normal incidence."""
-        some = parameters["eta"] if parameters["reflectance"] is None else parameters["reflectance"]
-        colour = metal_colour(parameters, torch.ones_like(some[0]))
+        present = parameters["eta"] if parameters["reflectance"] is None else parameters["reflectance"]
+        colour = metal_colour(parameters, cos=torch.ones_like(present[0]))
         return colour if parameters["specular_reflectance"] is None else colour * parameters["specular_reflectance"]
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Return a mirror."""
-        like = next(parameters[key] for key in ("reflectance", "eta") if parameters[key] is not None)
-        return metal_split_sum(parameters, torch.zeros_like(like[0]))
+        present = parameters["eta"] if parameters["reflectance"] is None else parameters["reflectance"]
+        return metal_split_sum(parameters, roughness=torch.zeros_like(present[0]))

@@ -13,11 +13,11 @@ from torchpt.physics.bsdfs.lobes import (
     Glass,
     dielectric_parameters,
     dielectric_split_sum,
-    polished,
     reflectance_at_normal,
+    sample_smooth_interface,
 )
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
-from torchpt.physics.bsdfs.specs import smooth
+from torchpt.physics.bsdfs.specs import no_roughness
 
 __all__ = ["Dielectric"]
 
@@ -27,15 +27,15 @@ class Dielectric(Glass):
     """A polished boundary between two clear media."""
 
     name = "dielectric"
-    parameters: ClassVar = dict.fromkeys(("alpha", "roughness"), smooth("roughdielectric"))
-    lobed = True
+    parameters: ClassVar = dict.fromkeys(("alpha", "roughness"), no_roughness("roughdielectric"))
+    lobed = True  # `sample` reads a number `lobe`, which chooses between reflection and refraction
     delta = True
     smooth = True
     transmits = True
     refracts = True
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :meth:`Bsdf.prepare`."""
+        """Return the relative index and the two factors."""
         return dielectric_parameters(values)
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
@@ -45,7 +45,7 @@ class Dielectric(Glass):
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """Reflect or refract, by the Fresnel reflectance."""
         assert lobe is not None
-        return polished(parameters, wo, lobe)
+        return sample_smooth_interface(parameters, wo, lobe)
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Return white, as nothing is absorbed."""
@@ -54,4 +54,4 @@ class Dielectric(Glass):
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Return a smooth interface."""
         eta = parameters["eta"]
-        return dielectric_split_sum(parameters, torch.zeros_like(eta), reflectance_at_normal(eta), eta)
+        return dielectric_split_sum(parameters, roughness=torch.zeros_like(eta), f0=reflectance_at_normal(eta), eta=eta)

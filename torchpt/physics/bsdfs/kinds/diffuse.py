@@ -25,7 +25,7 @@ class Diffuse(Bsdf):
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Bsdf.eval_pdf`."""
-        density = wi[2].clamp_min(0.0) * (1.0 / math.pi)
+        density = wi[2].clamp_min(0.0) * (1.0 / math.pi)  # callers see to wo.z >= 0, as the model transmits nothing
         return parameters["reflectance"] * density, density
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:

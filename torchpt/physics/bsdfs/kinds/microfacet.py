@@ -1,5 +1,6 @@
 """The microfacet material of the GAMES101 course: ``f = ks D F G / (4 cos_o cos_i) + (1 - F) kd / pi``.
 
+``D`` is the GGX distribution of normals, ``G`` the masking, ``ks`` and ``kd`` are the parameters ``specular`` and ``diffuse``.
 ``F`` is the dielectric Fresnel reflectance for the angle between ``wo`` and the surface normal, not the half vector.
 """
 
@@ -14,7 +15,7 @@ from torchpt.math.microfacet import fresnel_dielectric
 from torchpt.physics.bsdfs.base import Parameters
 from torchpt.physics.bsdfs.lobes import Glossy, reflectance_at_normal
 from torchpt.physics.bsdfs.records import SplitSumMaterial
-from torchpt.physics.bsdfs.specs import GREY, WHITE, fraction, index, reflectance
+from torchpt.physics.bsdfs.specs import GREY, WHITE, fraction, reflectance, refraction_index
 
 __all__ = ["Microfacet"]
 
@@ -31,12 +32,12 @@ class Microfacet(Glossy):
         "diffuse": reflectance(GREY, "colour of the diffuse base"),
         "specular": reflectance(WHITE, "factor of light that the facets reflect"),
         "roughness": fraction(0.4, "roughness of the facets: the square root of GGX's alpha"),
-        "ior": index(1.85, "index of refraction of the facets"),
+        "ior": refraction_index(1.85, "index of refraction of the facets"),
     }
     reciprocal = False
 
     def lobe_factors(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
-        """See :meth:`Glossy.lobe_factors`."""
+        """Return ``(1 - F) kd`` and ``F ks``."""
         f = fresnel_dielectric(wo[2].clamp_min(0.0), parameters["ior"]).reflectance
         return (1.0 - f) * parameters["diffuse"], f * parameters["specular"]
 
@@ -48,4 +49,10 @@ class Microfacet(Glossy):
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Return facets over the diffuse base."""
         specular, f0 = parameters["specular"], reflectance_at_normal(parameters["ior"])
-        return SplitSumMaterial(parameters["diffuse"], f0 * specular, specular, self.roughness(parameters), f0)
+        return SplitSumMaterial(
+            diffuse=parameters["diffuse"],
+            f0=f0 * specular,
+            f90=specular,
+            roughness=self.roughness(parameters),
+            over=f0,
+        )

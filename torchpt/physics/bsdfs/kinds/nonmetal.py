@@ -27,16 +27,18 @@ class Nonmetal(Glossy):
     }
 
     def lobe_factors(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
-        """See :meth:`Glossy.lobe_factors`."""
+        """Return ``1 - s`` times the base colour, and ``s``."""
         s = parameters["specular"]
         return (1.0 - s) * parameters["base_color"], s.expand_as(parameters["base_color"])
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Return the sum of both lobes."""
-        diffuse, specular = self.lobe_factors(parameters, parameters["base_color"])
+        # The factors depend on no direction: any tensor will do as wo.
+        diffuse, specular = self.lobe_factors(parameters, wo=parameters["base_color"])
         return diffuse + specular
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Return facets with the same reflectance at every angle, over the diffuse base."""
         s = parameters["specular"]
-        return SplitSumMaterial(parameters["base_color"], s, s, self.roughness(parameters), s)
+        roughness = self.roughness(parameters)
+        return SplitSumMaterial(diffuse=parameters["base_color"], f0=s, f90=s, roughness=roughness, over=s)

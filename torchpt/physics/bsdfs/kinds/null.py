@@ -20,7 +20,7 @@ class Null(Bsdf):
     """Nothing: light passes as if the surface were not there."""
 
     name = "null"
-    sheer = True
+    sheer = True  # rays pass without counting a bounce
     delta = True
     smooth = True
     transmits = True
@@ -35,7 +35,7 @@ class Null(Bsdf):
                 raise Refused(f"no {key}, as {why}", values[key], (key,))
 
     def prepare(self, values: Parameters) -> Parameters:
-        """Return one flag, so that the model has a row although it has no parameters."""
+        """Return one flag ``(1,)``, from which other methods take the number of lanes, as there are no parameters."""
         return {"row": torch.ones(1, dtype=torch.bool)}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,4 +53,5 @@ class Null(Bsdf):
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Return a material that transmits all light."""
         none = torch.zeros(3, len(parameters["row"]), device=parameters["row"].device)
-        return SplitSumMaterial(none, none[0], none[0], none[0], none[0], none + 1.0)
+        zero = none[0]
+        return SplitSumMaterial(diffuse=none, f0=zero, f90=zero, roughness=zero, over=zero, through=none + 1.0)

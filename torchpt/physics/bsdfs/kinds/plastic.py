@@ -22,7 +22,7 @@ from torchpt.physics.bsdfs.lobes import (
     with_delta,
 )
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
-from torchpt.physics.bsdfs.specs import smooth
+from torchpt.physics.bsdfs.specs import no_roughness
 
 __all__ = ["Plastic"]
 
@@ -38,8 +38,8 @@ class Plastic(Coat):
     """
 
     name = "plastic"
-    parameters: ClassVar = dict.fromkeys(("alpha", "roughness"), smooth("roughplastic"))
-    lobed = True
+    parameters: ClassVar = dict.fromkeys(("alpha", "roughness"), no_roughness("roughplastic"))
+    lobed = True  # `sample` reads a number `lobe`, which chooses between coat and base
     delta = True
 
     nonlinear: bool = False
@@ -47,7 +47,7 @@ class Plastic(Coat):
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
         """See :meth:`Bsdf.of`."""
-        return cls(values["nonlinear"]), cls.given(values)
+        return cls(nonlinear=values["nonlinear"]), cls.given(values)
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
@@ -55,27 +55,31 @@ class Plastic(Coat):
         return cls(), cls(nonlinear=True)
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :meth:`Bsdf.prepare`."""
+        """Return the parameters of one material, or of all lanes, from its values; see :meth:`Bsdf.prepare`."""
         eta = values["int_ior"] / values["ext_ior"]
-        return coat_parameters(values, eta, diffuse_transmittance(1.0 / eta), self.nonlinear)
+        # The inverse: light of the base meets the coat from within.
+        return coat_parameters(values, eta, diffuse_transmittance(1.0 / eta), nonlinear=self.nonlinear)
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """Return the base, attenuated by the coat on the way in and out; the coat itself is a delta."""
-        f_o = fresnel_dielectric(wo[2], parameters["eta"]).reflectance
+        f_o = fresnel_dielectric(wo[2], parameters["eta"]).reflectance  # of the coat, for wo and wi
         f_i = fresnel_dielectric(wi[2], parameters["eta"]).reflectance
+        # Over pi; 0 where wo is not above the surface.
         cosine = wi[2].clamp_min(0.0) * (1.0 / math.pi) * wo[2].sign().clamp_min(0.0)
         value = parameters["base"] * ((1.0 - f_o) * (1.0 - f_i) * cosine)
-        return value, (1.0 - self._specular(parameters, f_o)) * cosine
+        return value, (1.0 - self._coat_probability(parameters, f_o)) * cosine
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """Reflect at the coat, or sample the base by the cosine."""
         assert lobe is not None
         f_o = fresnel_dielectric(wo[2], parameters["eta"]).reflectance
-        specular = self._specular(parameters, f_o)
+        coat_probability = self._coat_probability(parameters, f_o)
         drawn = mixture_sample(self, parameters, wo, cosine_hemisphere(u))
-        chosen = (lobe < specular) & (wo[2] > 0)
+        chosen = (lobe < coat_probability) & (wo[2] > 0)
         mirror = torch.stack((-wo[0], -wo[1], wo[2]))
-        weight = tinted(f_o / torch.where(specular > 0, specular, 1.0), parameters["specular_reflectance"])
+        weight = tinted(
+            f_o / torch.where(coat_probability > 0, coat_probability, 1.0), parameters["specular_reflectance"]
+        )
         return with_delta(drawn, chosen, mirror, weight)
 
     def albedo(self, parameters: Parameters) -> Tensor:
@@ -86,7 +90,7 @@ class Plastic(Coat):
         """Return a mirror over the base."""
         return coated_split_sum(parameters, torch.zeros_like(parameters["eta"]))
 
-    def _specular(self, parameters: Parameters, f_o: Tensor) -> Tensor:
-        """Return the probability of choosing the coat."""
-        weight = parameters["specular_share"]
+    def _coat_probability(self, parameters: Parameters, f_o: Tensor) -> Tensor:
+        """Return the probability of choosing the coat ``(N,)``, for its reflectance ``f_o (N,)`` at ``wo``."""
+        weight = parameters["coat_weight"]
         return lobe_probability(f_o * weight, (1.0 - f_o) * (1.0 - weight))

@@ -3,6 +3,9 @@
 Burley, *Physically Based Shading at Disney*, 2012, and *Extending the Disney BRDF to a BSDF with Integrated Subsurface
 Scattering*, 2015. It does not conserve energy: rough white creates energy at grazing angles, and sheen and clearcoat are
 added without attenuating the lobes below.
+
+The formulas of single lobes are in ``principled_lobes.py``; here they are weighted and chosen. "Front" is the upper side, that
+of the shading normal; only a transmissive model is seen from the back.
 """
 
 from __future__ import annotations
@@ -47,9 +50,12 @@ __all__ = ["Principled"]
 
 #: Least alpha of the main lobes, as in Mitsuba.
 ALPHA_MIN = 1e-3
-#: Parameters that every material of the model has, and those without effect unless another one is above 0.
-_ALWAYS = ("base_color", "roughness", "specular", "eta")
-_PART_OF = {"sheen_tint": "sheen", "clearcoat_gloss": "clearcoat"}
+#: Parameters that are kept even where they are 0.
+_ALWAYS_KEPT = ("base_color", "roughness", "specular", "eta")
+#: Parameters without effect, to the parameter that has to be above 0 for them to have one.
+_DEPENDS_ON = {"sheen_tint": "sheen", "clearcoat_gloss": "clearcoat"}
+#: Fresnel reflectance of the clearcoat at normal incidence: polyurethane, of index 1.5 (2012).
+_COAT_F0 = 0.04
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,8 @@ class Principled(Bsdf):
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
         """See :meth:`Bsdf.of`."""
-        return cls(values["spec_trans"] != 0.0, values["anisotropic"] != 0.0), cls.given(values)
+        variant = cls(transmissive=values["spec_trans"] != 0.0, anisotropic=values["anisotropic"] != 0.0)
+        return variant, cls.given(values)
 
     @classmethod
     def given(cls, values: Values) -> dict[str, Any]:
@@ -101,10 +108,10 @@ class Principled(Bsdf):
         found = super().given(values)
         if "specular" not in found and "eta" not in found:
             found["specular"] = 0.5
-        for feature, whole in _PART_OF.items():
-            if found[whole] == 0.0:
-                found[feature] = 0.0
-        return {key: value for key, value in found.items() if key in _ALWAYS or value != 0.0}
+        for dependent, feature in _DEPENDS_ON.items():
+            if found[feature] == 0.0:
+                found[dependent] = 0.0
+        return {key: value for key, value in found.items() if key in _ALWAYS_KEPT or value != 0.0}
 
     def __post_init__(self) -> None:
         self.has(transmits=self.transmissive, refracts=self.transmissive)
@@ -112,7 +119,11 @@ class Principled(Bsdf):
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
         """See :meth:`Bsdf.variants`."""
-        return tuple(cls(transmissive, anisotropic) for anisotropic in (False, True) for transmissive in (False, True))
+        return tuple(
+            cls(transmissive=transmissive, anisotropic=anisotropic)
+            for anisotropic in (False, True)
+            for transmissive in (False, True)
+        )
 
     def prepare(self, values: Parameters) -> Parameters:
         """Return ``alpha_u`` and ``alpha_v`` for ``roughness``, ``eta`` for ``specular``, None for features that are absent.
@@ -129,19 +140,20 @@ class Principled(Bsdf):
             specular = values["specular"] if "specular" in values else torch.full_like(roughness, 0.5)
             if self.transmissive:
                 specular = torch.where(specular < 1e-6, 1e-3, specular)
-            some = specular > 0
-            root = torch.where(some, (0.08 * torch.where(some, specular, 1.0)).sqrt(), 0.0)
+            # The inner `where` keeps the infinite derivative of a root at 0 from becoming 0 * inf.
+            positive = specular > 0
+            root = torch.where(positive, (0.08 * torch.where(positive, specular, 1.0)).sqrt(), 0.0)
             eta = 2.0 / (1.0 - root) - 1.0
         alpha = roughness * roughness
         alpha_u, alpha_v = alpha, None
         if self.anisotropic:
             amount = values["anisotropic"] if "anisotropic" in values else torch.zeros_like(roughness)
-            aspect = (1.0 - 0.9 * amount).sqrt()
+            aspect = (1.0 - 0.9 * amount).sqrt()  # ratio of v's alpha to u's is its square (2012, section 5.4)
             alpha_u, alpha_v = alpha / aspect, (alpha * aspect).clamp_min(ALPHA_MIN)
         features = ("metallic", "spec_tint", "sheen", "sheen_tint", "clearcoat", "clearcoat_gloss", "flatness")
-        through = {}
+        transmission = {}
         if self.transmissive:
-            through["spec_trans"] = values["spec_trans"] if "spec_trans" in values else torch.zeros_like(roughness)
+            transmission["spec_trans"] = values["spec_trans"] if "spec_trans" in values else torch.zeros_like(roughness)
         return {
             "base_color": values["base_color"],
             "roughness": roughness,
@@ -149,13 +161,13 @@ class Principled(Bsdf):
             "alpha_v": alpha_v,
             "eta": eta,
             **{name: values.get(name) for name in features},
-            **through,
+            **transmission,
         }
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Bsdf.eval_pdf`."""
         eta = parameters["eta"]
-        front = None
+        front = None  # (N,) 1 for a wo in front, 0 behind; None: an opaque model
         if self.transmissive:
             wo, wi, eta, front = flip_to_upper(wo, wi, eta)
         main = self._main(parameters, wo, wi, eta)
@@ -167,19 +179,22 @@ class Principled(Bsdf):
             value = torch.addcmul(value, facet.refracted, main.refraction)
             pdf = torch.addcmul(pdf, probability.refract, main.refraction_pdf)
         cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].clamp_min(0.0)
+        # 1 where both directions are in front: the diffuse lobe and the clearcoat reflect there only.
         seen = ((cos_o > 0) & (cos_i > 0)).to(cos_i.dtype)
         if front is not None:
             seen = seen * front
-        shown = cos_i * seen
-        value = torch.addcmul(value, self._diffuse(parameters, cos_o, cos_i, main.cos), shown)
+        seen_cos = cos_i * seen
+        value = torch.addcmul(value, self._diffuse(parameters, cos_o, cos_i, main.cos), seen_cos)
         pdf = pdf + probability.diffuse * (cos_i * seen * (1.0 / math.pi))
         if probability.clearcoat is not None:
+            # Microfacet theory's D, F and G; lanes that are not seen get finite numbers, which `seen` makes 0.
             m = torch.where(seen > 0, main.m, up(main.m))
             d = gtr1(m, clearcoat_alpha(or_zero(parameters["clearcoat_gloss"], cos_o)))
-            f = lerp(0.04, 1.0, facet.schlick)
+            f = lerp(_COAT_F0, 1.0, facet.schlick)
             cos_o, cos_i = torch.where(seen > 0, cos_o, 1.0), torch.where(seen > 0, cos_i, 1.0)
             g = clearcoat_masking(wo, wi, cos_o, cos_i)
-            value = value + (0.25 * parameters["clearcoat"]) * (f * d * g * shown)
+            # A clearcoat of 1 is a quarter of a full lobe (2012).
+            value = value + (0.25 * parameters["clearcoat"]) * (f * d * g * seen_cos)
             cos = torch.where(main.cos > 0, main.cos, 1.0)
             pdf = pdf + probability.clearcoat * seen * (d * m[2] / (4.0 * cos))
         return value, pdf
@@ -188,7 +203,7 @@ class Principled(Bsdf):
         """Choose a lobe by :meth:`probabilities` and sample it."""
         assert lobe is not None
         eta, above, front, side = parameters["eta"], wo, None, None
-        if self.transmissive:
+        if self.transmissive:  # samples are drawn for a wo in front, and z is multiplied by the sign `side` at the end
             side = torch.copysign(torch.ones_like(wo[2]), wo[2])
             above, _, eta, front = flip_to_upper(wo, wo, eta)
         alpha_u, alpha_v = alphas(parameters)
@@ -197,7 +212,9 @@ class Principled(Bsdf):
         facet = self._facet(parameters, above, m, cos.clamp_min(0.0), eta, front)
         probability = self.probabilities(parameters, above, facet, front)
         wi = microfacet.reflect(above, m, cos)
-        threshold = probability.diffuse
+        threshold = (
+            probability.diffuse
+        )  # lobes take intervals of `lobe` in the order diffuse, coat, refraction, reflection
         wi = torch.where(lobe < threshold, cosine_hemisphere(u), wi)
         if probability.clearcoat is not None:
             coat = sample_gtr1(clearcoat_alpha(or_zero(parameters["clearcoat_gloss"], lobe)), u)
@@ -206,12 +223,12 @@ class Principled(Bsdf):
             threshold = threshold + probability.clearcoat
         if probability.refract is None or side is None:
             return mixture_sample(self, parameters, wo, wi)
-        bent = (lobe >= threshold) & (lobe < threshold + probability.refract)
-        wi = torch.where(bent, refract(above, m, cos, facet.interface), wi)
+        refracts = (lobe >= threshold) & (lobe < threshold + probability.refract)
+        wi = torch.where(refracts, refract(above, m, cos, facet.interface), wi)
         # A reflection that ends up below the surface must not count as a refraction, nor the other way round.
-        valid = ((wi[2] < 0) == bent).to(wi.dtype)
+        valid = ((wi[2] < 0) == refracts).to(wi.dtype)
         drawn = mixture_sample(self, parameters, wo, torch.stack((wi[0], wi[1], wi[2] * side)), valid)
-        return BsdfSample(drawn.wi, drawn.pdf, drawn.weight, torch.where(bent, eta, 1.0).detach())
+        return BsdfSample(drawn.wi, drawn.pdf, drawn.weight, torch.where(refracts, eta, 1.0).detach())
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Return the base colour."""
@@ -223,26 +240,35 @@ class Principled(Bsdf):
         f0 = reflectance_at_normal(eta).expand_as(base)
         if parameters["spec_tint"] is not None:
             f0 = f0 + (f0 * tint(base) - f0) * parameters["spec_tint"]
-        over = f0
-        rest: Tensor = torch.ones_like(eta)
+        dielectric_f0 = f0
+        diffuse: Tensor = torch.ones_like(eta)  # fraction of the diffuse lobe
         if parameters["metallic"] is not None:
             f0 = f0 + (base - f0) * parameters["metallic"]
-            rest = rest - parameters["metallic"]
-        u, v = alphas(parameters)
-        through, passing = parameters.get("spec_trans"), None
-        if through is not None:
+            diffuse = diffuse - parameters["metallic"]
+        alpha_u, alpha_v = alphas(parameters)
+        spec_trans, transmitted = parameters.get("spec_trans"), None
+        if spec_trans is not None:
             # Light takes the root of the base colour on entering and again on leaving.
-            passing, rest = base.clamp_min(1e-12).sqrt() * (rest * through), rest * (1.0 - through)
-        roughness, below = (u * v).sqrt().sqrt(), None if through is None else eta
-        return SplitSumMaterial(base * rest, f0, torch.ones_like(eta), roughness, over, passing, below)
+            transmitted = base.clamp_min(1e-12).sqrt() * (diffuse * spec_trans)
+            diffuse = diffuse * (1.0 - spec_trans)
+        return SplitSumMaterial(
+            diffuse=base * diffuse,
+            f0=f0,
+            f90=torch.ones_like(eta),
+            roughness=(alpha_u * alpha_v).sqrt().sqrt(),
+            over=dielectric_f0,
+            through=transmitted,
+            eta=None if spec_trans is None else eta,
+        )
 
     def probabilities(
         self, parameters: Parameters, wo: Tensor, facet: Facet, front: Tensor | None = None
     ) -> Probabilities:
         """Return the probabilities of the lobes, in proportion to the expected luminance of each.
 
-        The directional albedos are fits. Visible facets of rough surfaces face ``wo``, so their Fresnel reflectance rises
-        less toward grazing, by about ``(1 - roughness)^2``, and masking loses about ``0.7 roughness^3``.
+        The directional albedos, and all their numbers, are fits: they change the noise, not the mean. Visible facets of rough
+        surfaces face ``wo``, so their Fresnel reflectance rises less toward grazing, by about ``(1 - roughness)^2``, and
+        masking loses about ``0.7 roughness^3``.
 
         Args:
             parameters: values per lane.
@@ -252,82 +278,105 @@ class Principled(Bsdf):
         """
         with torch.no_grad():
             cos, roughness = wo[2].clamp_min(0.0), parameters["roughness"]
-            metallic, through = parameters["metallic"], parameters.get("spec_trans")
+            metallic, spec_trans = parameters["metallic"], parameters.get("spec_trans")
             base = luminance(parameters["base_color"])
             weight = schlick_weight(cos)
             smoothness = (1.0 - roughness).clamp_min(0.0)
-            raised = weight * smoothness * smoothness
-            rest = 1.0 if metallic is None else 1.0 - metallic
+            grazing = weight * smoothness * smoothness  # Schlick's weight of the facets that are seen
+            nonmetallic = 1.0 if metallic is None else 1.0 - metallic
             # Above 0 also for black, whose derivative may not be 0.
-            diffuse = rest * (0.01 + 0.99 * base)
-            single = lerp(reflectance_at_normal(parameters["eta"]), 1.0, raised)
-            main = rest * single
+            diffuse = nonmetallic * (0.01 + 0.99 * base)
+            dielectric = lerp(reflectance_at_normal(parameters["eta"]), 1.0, grazing)
+            main = nonmetallic * dielectric
             if metallic is not None:
-                main = main + metallic * lerp(base, 1.0, raised)
-            if through is not None:
-                diffuse = diffuse * (1.0 - through)
-                main = main + rest * through * (1.0 - single) * base.clamp_min(0.0).sqrt()
+                main = main + metallic * lerp(base, 1.0, grazing)
+            if spec_trans is not None:
+                diffuse = diffuse * (1.0 - spec_trans)
+                main = main + nonmetallic * spec_trans * (1.0 - dielectric) * base.clamp_min(0.0).sqrt()
             main = main * (1.0 - 0.7 * roughness * roughness * roughness)
             if parameters["sheen"] is not None:
                 x2 = (1.0 - cos) * (1.0 - cos)
-                diffuse = diffuse + parameters["sheen"] * rest * x2 * (0.06 + 0.03 * x2)
+                diffuse = diffuse + parameters["sheen"] * nonmetallic * x2 * (0.06 + 0.03 * x2)
             coat = None
             if parameters["clearcoat"] is not None:
+                # Smith's masking for alpha 0.25: 0.0625 is its square.
                 g = 2.0 * cos / (cos + (cos * cos * 0.9375 + 0.0625).sqrt())
-                coat = parameters["clearcoat"] * (0.75 * lerp(0.04, 1.0, weight) * cos * cos * g * g + 0.003)
+                coat = parameters["clearcoat"] * (0.75 * lerp(_COAT_F0, 1.0, weight) * cos * cos * g * g + 0.003)
             if front is not None:
                 diffuse = diffuse * front
                 coat = None if coat is None else coat * front
             total = diffuse + main if coat is None else diffuse + main + coat
-            some = total > 0
-            scale = torch.where(some, 1.0 / torch.where(some, total, 1.0), 0.0)
+            positive = total > 0
+            scale = torch.where(positive, 1.0 / torch.where(positive, total, 1.0), 0.0)
             diffuse, main, coat = diffuse * scale, main * scale, None if coat is None else coat * scale
             if facet.refracted is None:
                 return Probabilities(diffuse, coat, main, None)
-            a, b = luminance(facet.reflected), luminance(facet.refracted)
-            some = a + b > 0
-            main = main / torch.where(some, a + b, 1.0) * some
-            return Probabilities(diffuse, coat, main * a, main * b)
+            reflected, refracted = luminance(facet.reflected), luminance(facet.refracted)
+            positive = reflected + refracted > 0
+            main = main / torch.where(positive, reflected + refracted, 1.0) * positive
+            return Probabilities(diffuse, coat, main * reflected, main * refracted)
 
     @property
     def _bounded(self) -> bool:
+        """True if visible normals that would reflect ``wo`` below the surface are avoided; a refraction may use them."""
         return microfacet.BOUNDED and not (self.transmissive or self.anisotropic)
 
     def _main(self, parameters: Parameters, wo: Tensor, wi: Tensor, eta: Tensor) -> MainLobes:
-        """Return both main lobes. With ``s = wo + wi`` or ``wo + eta wi``, ``s . m = |s|`` avoids cancellation."""
+        """Return both main lobes, GGX reflection and refraction, for a ``wo`` in front.
+
+        The half vector ``m`` is ``s = wo + wi`` normalized, or ``s = wo + eta wi`` for a ``wi`` behind. The Jacobian divides
+        by ``|s|`` in place of ``s . m``, which would cancel.
+        """
         alpha_u, alpha_v = alphas(parameters)
         if not (self.transmissive or self.anisotropic):
-            r = microfacet.reflection(wo, wi, alpha_u, alpha_v, self._bounded)
-            return MainLobes(r.m, r.cos_m.clamp_min(0.0), r.value, r.pdf, r.value, r.pdf)
+            facets = microfacet.reflection(wo, wi, alpha_u, alpha_v, bounded=self._bounded)
+            return MainLobes(
+                m=facets.m,
+                cos=facets.cos_m.clamp_min(0.0),
+                reflection=facets.value,
+                reflection_pdf=facets.pdf,
+                refraction=facets.value,
+                refraction_pdf=facets.pdf,
+            )
         below = wi[2] < 0
         s = torch.where(below, wo + wi * eta, wo + wi) if self.transmissive else wo + wi
         square = dot(s, s)
         usable = square > 0
         square = torch.where(usable, square, 1.0)
         m = torch.where(usable, s * torch.copysign(square.rsqrt(), s[2]), up(s))
-        cos, far = dot(wo, m), dot(wi, m)
-        meets = usable & (wo[2] > 0) & (wi[2] != 0) & (cos > 0)
-        reflects, refracts = meets & ~below & (far > 0), meets & below & (far < 0)
+        cos, cos_far = dot(wo, m), dot(wi, m)
+        # wo sees the front of the facet, and wi leaves on the side where its cosine at the facet says so.
+        valid = usable & (wo[2] > 0) & (wi[2] != 0) & (cos > 0)
+        reflects, refracts = valid & ~below & (cos_far > 0), valid & below & (cos_far < 0)
         cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].abs()
         s_o, s_i = (microfacet.stretched_length(w, alpha_u, alpha_v) for w in (wo, wi))
         # Density of visible normals over dot(wo, m), and Smith's masking of wi.
         d = microfacet.ggx(m, alpha_u, alpha_v) if not self.anisotropic else wide_ggx(m, alpha_u, alpha_v)
         d = 2.0 * d / (cos_o + s_o)
         g = 2.0 * cos_i / (cos_i + s_i)
-        jacobian = cos * far.abs() / square
+        jacobian = cos * cos_far.abs() / square  # of refraction, without eta^2: f of radiance lacks it, the pdf has it
         return MainLobes(
-            m,
-            torch.where(meets, cos, 0.0),
-            torch.where(reflects, 0.25 * d * g, 0.0),
-            torch.where(reflects, 0.25 * d, 0.0),
-            torch.where(refracts, d * g * jacobian, 0.0),
-            torch.where(refracts, d * jacobian * (eta * eta), 0.0),
+            m=m,
+            cos=torch.where(valid, cos, 0.0),
+            reflection=torch.where(reflects, 0.25 * d * g, 0.0),
+            reflection_pdf=torch.where(reflects, 0.25 * d, 0.0),
+            refraction=torch.where(refracts, d * g * jacobian, 0.0),
+            refraction_pdf=torch.where(refracts, d * jacobian * (eta * eta), 0.0),
         )
 
     def _facet(
         self, parameters: Parameters, wo: Tensor, m: Tensor, cos: Tensor, eta: Tensor, front: Tensor | None
     ) -> Facet:
-        """Return the Fresnel factors at a facet: exact for dielectrics, Schlick's from the thinner side for tint and metal."""
+        """Return the Fresnel factors at a facet: exact for dielectrics, Schlick's from the thinner side for tint and metal.
+
+        Args:
+            parameters: values per lane.
+            wo: ``(3, N)`` in front.
+            m: normal of the facet ``(3, N)``.
+            cos: ``(N,)`` cosine of the two, at least 0.
+            eta: ``(N,)`` index of the far side over that of ``wo``'s side.
+            front: ``(N,)`` 1 where ``wo`` was in front before it was flipped, else 0; None: 1 everywhere.
+        """
         base, metallic = parameters["base_color"], parameters["metallic"]
         sin2 = None
         if self.transmissive:  # the refracted direction is as accurate as this sine
@@ -336,46 +385,47 @@ class Principled(Bsdf):
         interface = fresnel_dielectric(cos, eta, sin2)
         f = interface.reflectance
         schlick = schlick_weight(torch.where(eta > 1.0, cos, -interface.cos_t))
-        rest = 1.0 if metallic is None else 1.0 - metallic
-        reflected = (rest * f).expand_as(base)
+        nonmetallic = 1.0 if metallic is None else 1.0 - metallic
+        reflected = (nonmetallic * f).expand_as(base)
         if parameters["spec_tint"] is not None:
             tinted = lerp(tint(base) * reflectance_at_normal(eta), 1.0, schlick)
-            reflected = lerp(reflected, rest * tinted, parameters["spec_tint"])
+            reflected = lerp(reflected, nonmetallic * tinted, parameters["spec_tint"])
         if metallic is not None:
             reflected = torch.addcmul(reflected, metallic, lerp(base, 1.0, schlick))
         # As in Mitsuba, an index of 1 has no main reflection, not even for metals.
         reflected = torch.where(eta == 1.0, 0.0, reflected)
-        through = parameters.get("spec_trans")
-        if through is None:
-            return Facet(interface, cos, schlick, reflected, None)
-        through = rest * through
-        if front is not None:
-            reflected = torch.where(front > 0, reflected, through * f)
-        some = base > 0
-        root = torch.where(some, torch.where(some, base, 1.0).sqrt(), 0.0)
-        return Facet(interface, cos, schlick, reflected, root * (through * (1.0 - f)))
+        spec_trans = parameters.get("spec_trans")
+        if spec_trans is None:
+            return Facet(interface, cos, schlick, reflected, refracted=None)
+        glass = nonmetallic * spec_trans
+        if front is not None:  # inside there is glass alone
+            reflected = torch.where(front > 0, reflected, glass * f)
+        # The root of the base colour; the inner `where` keeps its infinite derivative at 0 from becoming 0 * inf.
+        positive = base > 0
+        root = torch.where(positive, torch.where(positive, base, 1.0).sqrt(), 0.0)
+        return Facet(interface, cos, schlick, reflected, refracted=root * (glass * (1.0 - f)))
 
     def _diffuse(self, parameters: Parameters, cos_o: Tensor, cos_i: Tensor, cos_d: Tensor) -> Tensor:
-        """Return the diffuse and sheen lobes ``(3, N)`` without the cosine."""
+        """Return the diffuse and sheen lobes ``(3, N)`` without the cosine; ``cos_d`` is between ``wo`` and the half vector."""
         base, roughness = parameters["base_color"], parameters["roughness"]
         fresnel_o, fresnel_i = schlick_weight(cos_o), schlick_weight(cos_i)
         f = retro_diffuse(roughness, fresnel_o, fresnel_i, cos_d)
         if parameters["flatness"] is not None:
             flat = fake_subsurface(roughness, fresnel_o, fresnel_i, cos_d, cos_o, cos_i)
             f = lerp(f, flat, parameters["flatness"])
-        metallic, through = parameters["metallic"], parameters.get("spec_trans")
-        rest = None if metallic is None else 1.0 - metallic
+        metallic, spec_trans = parameters["metallic"], parameters.get("spec_trans")
+        nonmetallic = None if metallic is None else 1.0 - metallic
         f = f * (1.0 / math.pi)
-        if rest is not None:
-            f = f * rest
-        if through is not None:
-            f = f * (1.0 - through)
+        if nonmetallic is not None:
+            f = f * nonmetallic
+        if spec_trans is not None:
+            f = f * (1.0 - spec_trans)
         value = base * f
         if parameters["sheen"] is None:
             return value
         sheen = parameters["sheen"] * schlick_weight(cos_d)
-        if rest is not None:
-            sheen = sheen * rest
+        if nonmetallic is not None:
+            sheen = sheen * nonmetallic
         if parameters["sheen_tint"] is None:
             return value + sheen
         return torch.addcmul(value, sheen, lerp(1.0, tint(base), parameters["sheen_tint"]))

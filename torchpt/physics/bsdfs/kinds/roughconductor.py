@@ -12,9 +12,16 @@ from torchpt.math import microfacet
 from torchpt.math.vectors import dot
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
 from torchpt.physics.bsdfs.lobes import mixture_sample, with_delta
-from torchpt.physics.bsdfs.metal import Metal, by_reflectance, metal, metal_colour, metal_split_sum
+from torchpt.physics.bsdfs.metal import Metal, by_reflectance, metal_colour, metal_parameters, metal_split_sum
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
-from torchpt.physics.bsdfs.rough import Anisotropic, alphas, energy_at, energy_table, mean_roughness, rough
+from torchpt.physics.bsdfs.rough import (
+    Anisotropic,
+    alphas,
+    energy_at,
+    energy_table,
+    mean_roughness,
+    roughness_parameters,
+)
 
 __all__ = ["RoughConductor"]
 
@@ -32,7 +39,7 @@ class RoughConductor(Anisotropic, Metal):
     Attributes:
         schlick: the colour is ``reflectance`` at normal incidence, not ``eta`` and ``k``.
         anisotropic: ``alpha_u`` and ``alpha_v`` may differ.
-        energy_compensation: scale the lobe so, with height-correlated masking. Not reciprocal.
+        energy_compensation: scale the lobe by that factor, with height-correlated masking. Not reciprocal.
     """
 
     name = "roughconductor"
@@ -46,39 +53,51 @@ class RoughConductor(Anisotropic, Metal):
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
         """See :meth:`Bsdf.of`."""
         return (
-            cls(by_reflectance(values), values["alpha_u"] is not None, values["energy_compensation"]),
+            cls(
+                schlick=by_reflectance(values),
+                anisotropic=values["alpha_u"] is not None,
+                energy_compensation=values["energy_compensation"],
+            ),
             cls.given(values),
         )
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
         """Return all pairs of ``schlick`` and ``anisotropic``, and two variants with energy compensation."""
-        plain = [cls(schlick, anisotropic) for anisotropic in (False, True) for schlick in (False, True)]
+        plain = [
+            cls(schlick=schlick, anisotropic=anisotropic) for anisotropic in (False, True) for schlick in (False, True)
+        ]
         return *plain, cls(energy_compensation=True), cls(anisotropic=True, energy_compensation=True)
 
     def tabulate(self, values: Parameters) -> Parameters:
         """Return the table of directional albedo for energy compensation."""
-        return {"energy": energy_table(rough(values, self.anisotropic), [None])} if self.energy_compensation else {}
+        if not self.energy_compensation:
+            return {}
+        return {"energy": energy_table(roughness_parameters(values, anisotropic=self.anisotropic), etas=[None])}
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :meth:`Bsdf.prepare`."""
+        """Return the parameters of one material, or of all lanes, from its values; see :meth:`Bsdf.prepare`."""
         tables = values if "energy" in values else self.tabulate(values)
         energy = {"energy": tables["energy"]} if self.energy_compensation else {}
-        return {**metal(values), **rough(values, self.anisotropic), **energy}
+        return {**metal_parameters(values), **roughness_parameters(values, anisotropic=self.anisotropic), **energy}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Bsdf.eval_pdf`."""
-        at = microfacet.reflection(wo, wi, *alphas(parameters), microfacet.BOUNDED, self.energy_compensation)
-        on = (~parameters["smooth"]).to(wo.dtype)
-        value = self._colour(parameters, at.cos_m) * (at.value * on)
+        facets = microfacet.reflection(
+            wo, wi, *alphas(parameters), bounded=microfacet.BOUNDED, by_height=self.energy_compensation
+        )
+        is_rough = (~parameters["smooth"]).to(
+            wo.dtype
+        )  # 1, or 0 where the surface is a mirror: `eval` leaves deltas out
+        value = self._colour(parameters, facets.cos_m) * (facets.value * is_rough)
         if self.energy_compensation:
-            f0 = metal_colour(parameters, torch.ones_like(wo[2]))
+            f0 = metal_colour(parameters, cos=torch.ones_like(wo[2]))
             value = torch.addcmul(value, value * f0, 1.0 / energy_at(parameters["energy"], parameters, wo) - 1.0)
-        return value, at.pdf * on
+        return value, facets.pdf * is_rough
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """Reflect at a visible normal, or at the surface normal where the surface is smooth."""
-        m = microfacet.sample_normal(wo, *alphas(parameters), u, microfacet.BOUNDED)
+        m = microfacet.sample_normal(wo, *alphas(parameters), u, bounded=microfacet.BOUNDED)
         drawn = mixture_sample(self, parameters, wo, microfacet.reflect(wo, m, dot(wo, m)))
         mirror = torch.stack((-wo[0], -wo[1], wo[2]))
         return with_delta(drawn, parameters["smooth"] & (wo[2] > 0), mirror, self._colour(parameters, wo[2]))
@@ -92,5 +111,6 @@ class RoughConductor(Anisotropic, Metal):
         return metal_split_sum(parameters, mean_roughness(parameters))
 
     def _colour(self, parameters: Parameters, cos: Tensor) -> Tensor:
+        """Return the reflectance ``(3, N)`` at a cosine ``(N,)``, with the factor ``specular_reflectance``."""
         colour = metal_colour(parameters, cos)
         return colour if parameters["specular_reflectance"] is None else colour * parameters["specular_reflectance"]

@@ -20,14 +20,23 @@ from torchpt.physics.bsdfs.lobes import (
     dielectric_parameters,
     dielectric_split_sum,
     mixture_sample,
-    polished,
     reflectance_at_normal,
+    sample_smooth_interface,
     tinted,
 )
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
-from torchpt.physics.bsdfs.rough import Anisotropic, alphas, energy_at, energy_table, mean_roughness, rough
+from torchpt.physics.bsdfs.rough import (
+    Anisotropic,
+    alphas,
+    energy_at,
+    energy_table,
+    mean_roughness,
+    roughness_parameters,
+)
 
 __all__ = ["RoughDielectric"]
+
+_TINY = 1e-30  # keeps 0 / 0 out of lanes that count for nothing
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,7 @@ class RoughDielectric(Anisotropic, Glass):
     """
 
     name = "roughdielectric"
-    lobed = True
+    lobed = True  # `sample` reads a number `lobe`, which chooses between reflection and refraction
     delta = True
     transmits = True
     refracts = True
@@ -54,87 +63,99 @@ class RoughDielectric(Anisotropic, Glass):
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
         """See :meth:`Bsdf.of`."""
-        return cls(values["alpha_u"] is not None, values["energy_compensation"]), cls.given(values)
+        variant = cls(anisotropic=values["alpha_u"] is not None, energy_compensation=values["energy_compensation"])
+        return variant, cls.given(values)
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
         """See :meth:`Bsdf.variants`."""
-        return tuple(cls(anisotropic, compensated) for compensated in (False, True) for anisotropic in (False, True))
+        return tuple(
+            cls(anisotropic=anisotropic, energy_compensation=compensated)
+            for compensated in (False, True)
+            for anisotropic in (False, True)
+        )
 
     def tabulate(self, values: Parameters) -> Parameters:
         """Return the table of directional albedo for energy compensation, one block for each side."""
         if not self.energy_compensation:
             return {}
         surface = self._surface(values)
-        # Rows with equal indices are smooth and do not read the table: any other index will do.
+        # A smooth material does not read the table: any index but 1, for which the integral would fail, will do.
         eta = torch.where(surface["smooth"], 1.5, surface["eta"])
-        return {"energy": energy_table(surface, [eta, 1.0 / eta])}
+        return {"energy": energy_table(surface, etas=[eta, 1.0 / eta])}
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :meth:`Bsdf.prepare`."""
+        """Return the parameters of one material, or of all lanes, from its values; see :meth:`Bsdf.prepare`."""
         tables = values if "energy" in values else self.tabulate(values)
         return {**self._surface(values), **({"energy": tables["energy"]} if self.energy_compensation else {})}
 
     def _surface(self, values: Parameters) -> Parameters:
-        out = {**dielectric_parameters(values), **rough(values, self.anisotropic)}
+        """Return the parameters of the interface and of its facets, without the table."""
+        out = {**dielectric_parameters(values), **roughness_parameters(values, anisotropic=self.anisotropic)}
         # Facets between equal indices do not bend light.
         out["smooth"] = out["smooth"] | ((out["eta"] - 1.0).abs() < INDEX_MATCHED)
         return out
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """Return equations 20 and 21 of Walter et al., and the densities of equations 14 and 17 with visible normals."""
-        au, av = alphas(parameters)
+        alpha_u, alpha_v = alphas(parameters)
         eta = parameters["eta"]
         reflects = wo[2] * wi[2] > 0
-        eta_it = torch.where(wo[2] > 0, eta, 1.0 / eta)
+        eta_it = torch.where(wo[2] > 0, eta, 1.0 / eta)  # the far side's index over that of wo's side
+        # h is along the facet's normal m, which points to the upper side.
         h = torch.addcmul(wo, wi, torch.where(reflects, 1.0, eta_it))
         m = normalize(h)
         m = m * torch.copysign(torch.ones_like(m[2]), m[2])
-        o, i = dot(wo, m), dot(wi, m)
+        o, i = dot(wo, m), dot(wi, m)  # cosines at the facet
         cos_o, cos_i = wo[2].abs(), wi[2].abs()
         # A facet is visible only from the side of the surface on which the direction lies.
-        seen = torch.minimum(o * wo[2], i * wi[2]) > 0
-        on = seen & ~parameters["smooth"]
+        is_visible = torch.minimum(o * wo[2], i * wi[2]) > 0
+        counts = is_visible & ~parameters["smooth"]  # deltas are left out
         side = fresnel_dielectric(o, eta)
-        s_o, s_i = microfacet.stretched_length(wo, au, av), microfacet.stretched_length(wi, au, av)
+        s_o, s_i = microfacet.stretched_length(wo, alpha_u, alpha_v), microfacet.stretched_length(wi, alpha_u, alpha_v)
         h2 = dot(h, h)
-        # Jacobian dm / dwi: 1 / (4 i), and eta^2 i / |wo + eta wi|^2.
-        through = (o * i).abs() / torch.where(on, h2, 1.0)
-        spread = torch.where(reflects, 0.25, through)
-        visible = torch.where(on, microfacet.ggx(m, au, av) * 2.0 / (cos_o + s_o).clamp_min(_TINY) * spread, 0.0)
+        # Jacobian dm / dwi, times the cosine o of the density of visible normals, which the next line leaves out:
+        # 1 / (4 o) and eta^2 i / |wo + eta wi|^2, the latter without eta^2, which the last line has.
+        refraction_jacobian = (o * i).abs() / torch.where(counts, h2, 1.0)
+        jacobian = torch.where(reflects, 0.25, refraction_jacobian)
+        # Density of wi by reflection or refraction at visible normals.
+        density = torch.where(
+            counts, microfacet.ggx(m, alpha_u, alpha_v) * 2.0 / (cos_o + s_o).clamp_min(_TINY) * jacobian, 0.0
+        )
         r = side.reflectance
         if self.energy_compensation:
-            energy = energy_at(parameters["energy"], parameters, wo, (wo[2] < 0).to(wo.dtype))
-            value = visible * microfacet.height_correlated_masking(cos_o, s_o, cos_i, s_i) / energy
+            energy = energy_at(parameters["energy"], parameters, wo, block=(wo[2] < 0).to(wo.dtype))
+            value = density * microfacet.height_correlated_masking(cos_o, s_o, cos_i, s_i) / energy
         else:
-            value = visible * microfacet.masking(cos_i, s_i)
+            value = density * microfacet.masking(cos_i, s_i)
         colour = torch.where(
             reflects,
             tinted(r * value, parameters["specular_reflectance"]),
             tinted((1.0 - r) * value, parameters["specular_transmittance"]),
         )
-        return colour, visible * torch.where(reflects, r, (1.0 - r) * (eta_it * eta_it))
+        return colour, density * torch.where(reflects, r, (1.0 - r) * (eta_it * eta_it))
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """Sample a visible normal, then reflect or refract by its Fresnel reflectance."""
         assert lobe is not None
         smooth = parameters["smooth"]
-        up = torch.copysign(torch.ones_like(wo[2]), wo[2])
-        m = microfacet.sample_normal(wo * up, *alphas(parameters), u)
-        o = dot(wo, m)
+        sign = torch.copysign(torch.ones_like(wo[2]), wo[2])
+        # Normals point to the upper side; -wo sees from above the facets that wo sees from below.
+        m = microfacet.sample_normal(wo * sign, *alphas(parameters), u)
+        o = dot(wo, m)  # cosine at the facet, negative from below
         side = fresnel_dielectric(o, parameters["eta"])
         reflects = lobe < side.reflectance
         wi = torch.where(reflects, microfacet.reflect(wo, m, o), normalize(refract(wo, m, o, side)))
         # A reflected ray may end up below the surface, a refracted one above it: such samples fail.
-        kept = ((wi[2] * wo[2] > 0) == reflects).to(wo.dtype)
-        drawn = mixture_sample(self, parameters, wo, wi, kept)
-        clean = polished(parameters, wo, lobe)
-        assert clean.eta is not None
+        valid = ((wi[2] * wo[2] > 0) == reflects).to(wo.dtype)
+        drawn = mixture_sample(self, parameters, wo, wi, valid)
+        delta = sample_smooth_interface(parameters, wo, lobe)
+        assert delta.eta is not None
         return BsdfSample(
-            torch.where(smooth, clean.wi, drawn.wi),
-            torch.where(smooth, clean.pdf, drawn.pdf),
-            torch.where(smooth, clean.weight, drawn.weight),
-            torch.where(smooth, clean.eta, torch.where(reflects, 1.0, side.eta_it)).detach(),
+            torch.where(smooth, delta.wi, drawn.wi),
+            torch.where(smooth, delta.pdf, drawn.pdf),
+            torch.where(smooth, delta.weight, drawn.weight),
+            torch.where(smooth, delta.eta, torch.where(reflects, 1.0, side.eta_it)).detach(),
         )
 
     def albedo(self, parameters: Parameters) -> Tensor:
@@ -144,7 +165,6 @@ class RoughDielectric(Anisotropic, Glass):
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Return a rough interface."""
         eta = parameters["eta"]
-        return dielectric_split_sum(parameters, mean_roughness(parameters), reflectance_at_normal(eta), eta)
-
-
-_TINY = 1e-30
+        return dielectric_split_sum(
+            parameters, roughness=mean_roughness(parameters), f0=reflectance_at_normal(eta), eta=eta
+        )

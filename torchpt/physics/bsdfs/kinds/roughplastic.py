@@ -24,11 +24,11 @@ from torchpt.physics.bsdfs.lobes import (
     with_delta,
 )
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
-from torchpt.physics.bsdfs.rough import Rough, mean_roughness, rough
+from torchpt.physics.bsdfs.rough import Rough, mean_roughness, roughness_parameters
 
 __all__ = ["RoughPlastic"]
 
-_ENTRIES = 64  # cosines of the tables, as in Mitsuba
+_COSINES = 64  # entries of the tables, as in Mitsuba
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class RoughPlastic(Rough, Coat):
 
     name = "roughplastic"
     tabulated = ("alpha", "roughness", "int_ior", "ext_ior")
-    lobed = True
+    lobed = True  # `sample` reads a number `lobe`, which chooses between coat and base
     delta = True
 
     nonlinear: bool = False
@@ -52,7 +52,7 @@ class RoughPlastic(Rough, Coat):
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
         """See :meth:`Bsdf.of`."""
-        return cls(values["nonlinear"]), cls.given(values)
+        return cls(nonlinear=values["nonlinear"]), cls.given(values)
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
@@ -60,52 +60,59 @@ class RoughPlastic(Rough, Coat):
         return cls(), cls(nonlinear=True)
 
     def tabulate(self, values: Parameters) -> Parameters:
-        """Return the coat's transmittance by cosine, and its mean reflectance for diffuse light from the base."""
+        """Return the coat's ``transmittance`` by cosine, and ``inner``, its mean reflectance for diffuse light from below."""
         eta = values["int_ior"] / values["ext_ior"]
-        surface = rough(values, False)
-        cosines = torch.linspace(0, 1, _ENTRIES, dtype=torch.float64, device=eta.device).clamp_min(1e-6)
+        surface = roughness_parameters(values, anisotropic=False)
+        cosines = torch.linspace(0, 1, _COSINES, dtype=torch.float64, device=eta.device).clamp_min(1e-6)
         alpha, index = surface["alpha_u"].double(), eta.double()
-        through = microfacet.coat_transmittance(cosines, alpha, index)
-        inner = microfacet.coat_reflectance(cosines, alpha, 1.0 / index)
-        diffuse = 2.0 * (inner * cosines).mean()[None].to(eta.dtype)
-        return {"transmittance": Table(through.to(eta.dtype), _ENTRIES), "inner": diffuse}
+        transmittance = microfacet.coat_transmittance(cosines, alpha, index)
+        from_below = microfacet.coat_reflectance(cosines, alpha, 1.0 / index)
+        inner = 2.0 * (from_below * cosines).mean()[None].to(eta.dtype)  # the integral over cosines of 2 R cos
+        return {"transmittance": Table(transmittance.to(eta.dtype), _COSINES), "inner": inner}
 
     def prepare(self, values: Parameters) -> Parameters:
-        """See :meth:`Bsdf.prepare`."""
+        """Return the parameters of one material, or of all lanes, from its values; see :meth:`Bsdf.prepare`."""
         tables = values if "transmittance" in values else self.tabulate(values)
         return {
-            **coat_parameters(values, values["int_ior"] / values["ext_ior"], 1.0 - tables["inner"], self.nonlinear),
-            **rough(values, False),
+            **coat_parameters(
+                values, values["int_ior"] / values["ext_ior"], 1.0 - tables["inner"], nonlinear=self.nonlinear
+            ),
+            **roughness_parameters(values, anisotropic=False),
             "transmittance": tables["transmittance"],
         }
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coat, and the base attenuated by the coat on the way in and out."""
         alpha = parameters["alpha_u"]
-        at = microfacet.reflection(wo, wi, alpha, alpha, bounded=microfacet.BOUNDED)
-        f = fresnel_dielectric(at.cos_m, parameters["eta"]).reflectance
+        facets = microfacet.reflection(wo, wi, alpha, alpha, bounded=microfacet.BOUNDED)
+        f = fresnel_dielectric(facets.cos_m, parameters["eta"]).reflectance
         t_o, t_i = parameters["transmittance"].at(wo[2]), parameters["transmittance"].at(wi[2])
-        rough_coat = (~parameters["smooth"]).to(wo.dtype)
+        rough_coat = (~parameters["smooth"]).to(
+            wo.dtype
+        )  # 1, or 0 where the coat is a mirror: `eval` leaves deltas out
+        # Over pi; 0 where wo is not above the surface.
         cosine = wi[2].clamp_min(0.0) * (1.0 / math.pi) * wo[2].sign().clamp_min(0.0)
-        coat = tinted(f * at.value * rough_coat, parameters["specular_reflectance"])
-        specular = self._specular(parameters, t_o)
-        pdf = specular * (at.pdf * rough_coat) + (1.0 - specular) * cosine
+        coat = tinted(f * facets.value * rough_coat, parameters["specular_reflectance"])
+        coat_probability = self._coat_probability(parameters, t_o)
+        pdf = coat_probability * (facets.pdf * rough_coat) + (1.0 - coat_probability) * cosine
         return torch.addcmul(coat, parameters["base"], t_o * t_i * cosine), pdf
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """Reflect at a visible normal of the coat, or sample the base by the cosine."""
         assert lobe is not None
         alpha, smooth = parameters["alpha_u"], parameters["smooth"]
-        through = parameters["transmittance"].at(wo[2])
-        specular = self._specular(parameters, through)
-        chosen = lobe < specular
-        m = microfacet.sample_normal(wo, alpha, alpha, u, microfacet.BOUNDED)
+        t_o = parameters["transmittance"].at(wo[2])
+        coat_probability = self._coat_probability(parameters, t_o)
+        chosen = lobe < coat_probability
+        m = microfacet.sample_normal(wo, alpha, alpha, u, bounded=microfacet.BOUNDED)
         wi = torch.where(chosen, microfacet.reflect(wo, m, dot(wo, m)), cosine_hemisphere(u))
         drawn = mixture_sample(self, parameters, wo, wi)
         # Keeps reflectance and tabulated transmittance of a smooth coat from adding up to more than 1.
-        f_o = torch.minimum(fresnel_dielectric(wo[2], parameters["eta"]).reflectance, 1.0 - through)
+        f_o = torch.minimum(fresnel_dielectric(wo[2], parameters["eta"]).reflectance, 1.0 - t_o)
         mirror = torch.stack((-wo[0], -wo[1], wo[2]))
-        weight = tinted(f_o / torch.where(specular > 0, specular, 1.0), parameters["specular_reflectance"])
+        weight = tinted(
+            f_o / torch.where(coat_probability > 0, coat_probability, 1.0), parameters["specular_reflectance"]
+        )
         return with_delta(drawn, chosen & smooth & (wo[2] > 0), mirror, weight)
 
     def albedo(self, parameters: Parameters) -> Tensor:
@@ -116,7 +123,7 @@ class RoughPlastic(Rough, Coat):
         """Return a rough mirror over the base."""
         return coated_split_sum(parameters, mean_roughness(parameters))
 
-    def _specular(self, parameters: Parameters, t_o: Tensor) -> Tensor:
-        """Return the probability of choosing the coat."""
-        weight = parameters["specular_share"]
+    def _coat_probability(self, parameters: Parameters, t_o: Tensor) -> Tensor:
+        """Return the probability of choosing the coat ``(N,)``, for its transmittance ``t_o (N,)`` at ``wo``."""
+        weight = parameters["coat_weight"]
         return lobe_probability((1.0 - t_o) * weight, t_o * (1.0 - weight))
