@@ -198,8 +198,8 @@ FAULTS = (
         "physics/textures/atlas.py",
         "textures integrators",
         "_corners",
-        "u * wide - 0.5 * blend",
-        "u * wide",
+        "u * columns - 0.5 * blend",
+        "u * columns",
         "bilinear images lie half a texel beside where they belong, across but not along",
     ),
     Fault(
@@ -207,8 +207,8 @@ FAULTS = (
         "physics/textures/atlas.py",
         "textures",
         "_slope",
-        "across * c.maps[1] + along * c.maps[4]",
-        "across * c.maps[3] + along * c.maps[4]",
+        "along_u * c.transforms[1] + along_v * c.transforms[4]",
+        "along_u * c.transforms[3] + along_v * c.transforms[4]",
         "bump maps whose uv_transform turns them are lit from the wrong side",
     ),
     Fault(
@@ -338,8 +338,8 @@ FAULTS = (
         "physics/ibl/convolve.py",
         "ibl",
         "prefiltered",
-        "_facets(roughness * roughness, samples)",
-        "_facets(roughness, samples)",
+        "_ggx_lobe(roughness * roughness, samples)",
+        "_ggx_lobe(roughness, samples)",
         "the preview's mirrors are blurred too much: roughness is taken for alpha",
     ),
     # -- shapes

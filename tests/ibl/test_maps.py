@@ -265,9 +265,9 @@ def test_settings_that_are_none() -> None:
 
 def test_a_map_is_convolved_on_its_own_device():
     """Tensors on `meta` are refused beside those of another device, as on CUDA."""
-    convolution = convolve._Convolution(torch.rand(2, 1, 3).to("meta").requires_grad_())
-    _, suns, _ = convolution._ready(1.0)  # none, as the map is that coarse
+    prepared = convolve._PreparedMap(torch.rand(2, 1, 3).to("meta").requires_grad_())
+    _, suns, _ = prepared._prepared(1.0)  # none, as the map is that coarse
     assert suns.device.type == "cpu"  # where they meet directions, though `meta` would take them
-    found = convolution(3, 4, convolve._cosine(16))
-    (gradient,) = torch.autograd.grad(found.sum(), convolution.map)
+    found = prepared.convolved(3, 4, convolve._cosine_lobe(16))
+    (gradient,) = torch.autograd.grad(found.sum(), prepared.map)
     assert found.shape == (3, 4, 3) and found.device.type == gradient.device.type == "meta"

@@ -87,7 +87,7 @@ def baked(texture: dict[str, Any], folder: Path) -> dict[str, Any]:
     (table,) = plain.world(torch.float64)[0].textures.tables
     side = (torch.arange(SIZE, dtype=torch.float64) + 0.5) / SIZE
     uv = torch.stack(torch.meshgrid(side, side, indexing="xy")).reshape(2, -1)
-    values = table.look_up(torch.zeros(SIZE**2, dtype=torch.int64), TexturePoint(uv), True)
+    values = table.look_up(torch.zeros(SIZE**2, dtype=torch.int64), TexturePoint(uv), coloured=True)
     torchpt.write_image(folder / "baked.exr", values.T.reshape(SIZE, SIZE, 3).float())
     return {"type": "image", "path": str(folder / "baked.exr"), "wrap": "clamp"}
 
@@ -149,7 +149,7 @@ def test_materials_of_one_model_are_grouped_by_what_reads_them():
     world, _ = torchpt.load(described, "cpu").world(torch.float32)
     assert [type(table).__name__ for table in world.textures.tables] == ["Atlas", "ComputedTable", "ComputedTable"]
     assert [table.count for table in world.textures.tables] == [3, 2, 1]
-    textured = [binding.readings["reflectance"] for binding in world.materials.textures if binding is not None]
+    textured = [binding.bindings["reflectance"] for binding in world.materials.textures if binding is not None]
     assert sorted(len(binding.nodes) for binding in textured) == [1, 2, 3]
     assert all(model.name == "diffuse" for model in world.materials.models)
 

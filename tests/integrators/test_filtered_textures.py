@@ -144,7 +144,7 @@ def test_what_is_read_at_points_says_so(slot: str, image: str):
 def test_nothing_is_built_without_it(image: str):
     world, _ = torchpt.load(floor(picture(image, "bilinear"))).world(torch.float32)
     (atlas,) = world.textures.tables
-    assert isinstance(atlas, Atlas) and atlas.pyramids is None and world.geometry.tangents is None
+    assert isinstance(atlas, Atlas) and atlas.mipmaps is None and world.geometry.tangents is None
     assert atlas.texels.numel() == 3 * 33 * 64
     world, _ = torchpt.load(floor(picture(image, "trilinear"))).world(torch.float32)
     (atlas,) = world.textures.tables

@@ -318,7 +318,15 @@ def test_every_number_and_word_of_a_world_counts(everything: torchpt.Scene) -> N
         places.append(place)
         assert counts and len(known) == len(places) + 1, place
     assert len(places) > 150
-    for part in ("Atlas.wraps", "Atlas.maps", "Atlas.places", "OpacityMaps", "Instances.x", "Quadrics.e3", "two_sided"):
+    for part in (
+        "Atlas.wraps",
+        "Atlas.transforms",
+        "Atlas.layouts",
+        "OpacityMaps",
+        "Instances.x",
+        "Quadrics.e3",
+        "two_sided",
+    ):
         assert any(part in place for place in places), part
 
 

@@ -144,7 +144,7 @@ def points(n: int = 300, dtype: torch.dtype = torch.float64, footprint: Tensor |
 
 def read(table: Table, point: TexturePoint, coloured: bool = True) -> Tensor:
     assert point.uv is not None
-    return table.look_up(torch.zeros(point.uv.shape[1], dtype=torch.int64), point, coloured)
+    return table.look_up(torch.zeros(point.uv.shape[1], dtype=torch.int64), point, coloured=coloured)
 
 
 def inclines(table: Table, point: TexturePoint) -> Tensor:
@@ -328,7 +328,7 @@ def test_several_nodes_are_each_alone(name: str, opened: Callable[..., Opened]):
     assert len({node.variant for node in nodes}) == 1
     point = points(200, footprint=torch.full((200,), 0.3, dtype=torch.float64))
     for k, node in enumerate(nodes):
-        whole = table.look_up(torch.full((200,), k), point, True)
+        whole = table.look_up(torch.full((200,), k), point, coloured=True)
         assert torch.allclose(whole, read(table_of((node, given, {})), point), atol=1e-12)
 
 

@@ -33,7 +33,7 @@ def _read(uv: Tensor, area: Tensor | None, dtype: torch.dtype, slope: bool, **ke
     }
     table = node.table([node], {**COLORS, **numbers}, dtype, CPU)
     lanes, point = torch.zeros(uv.shape[1], dtype=torch.int64), TexturePoint(uv.to(dtype), area)
-    return torch.stack(table.slope(lanes, point)) if slope else table.look_up(lanes, point, False)
+    return torch.stack(table.slope(lanes, point)) if slope else table.look_up(lanes, point, coloured=False)
 
 
 def plain(x: float, y: float, key: int) -> float:

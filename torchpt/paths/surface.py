@@ -129,7 +129,7 @@ def parameters_at(
     if textures is None:
         return values
     assert point is not None
-    return world.materials.models[number].prepare(_filled(world, values, textures.readings, row, point))
+    return world.materials.models[number].prepare(_filled(world, values, textures.bindings, row, point))
 
 
 def _filled(
@@ -155,7 +155,7 @@ def _filled(
 def _read(world: World, binding: TextureBinding, row: Tensor, point: TexturePoint) -> Tensor:
     """Return the texture values of a parameter, a colour ``(3, n)`` or a number ``(n,)``, for materials ``row (n,)``."""
     table = world.textures.tables[binding.table]
-    point = point if binding.filtered else point.bare  # without footprints
+    point = point if binding.filtered else point.unfiltered
     return table.look_up(take(binding.nodes, row), point, coloured=binding.channel is None)
 
 
@@ -167,13 +167,13 @@ def _value_by_slot(world: World, maps: NodeMap, at: Interaction, *, coloured: bo
     node, point = take(maps.nodes, at.slot).clamp_min(0), TexturePoint(surface_uv(world, at))
     first, *others = (world.textures.tables[number] for number in maps.tables)
     if maps.table is None:  # all nodes are rows of the first table
-        return first.look_up(node, point, coloured)
+        return first.look_up(node, point, coloured=coloured)
     table_of_lane = take(maps.table, at.slot)
     # Each table looks up all lanes; those of other tables read its row 0, and the result is dropped.
-    value = first.look_up(torch.where(table_of_lane == 0, node, 0), point, coloured)
+    value = first.look_up(torch.where(table_of_lane == 0, node, 0), point, coloured=coloured)
     for k, table in enumerate(others, 1):
         in_table = table_of_lane == k
-        value = torch.where(in_table, table.look_up(torch.where(in_table, node, 0), point, coloured), value)
+        value = torch.where(in_table, table.look_up(torch.where(in_table, node, 0), point, coloured=coloured), value)
     return value
 
 
@@ -232,6 +232,6 @@ def _perturbed_frame(
     if local is None:
         assert textures.bump is not None
         table = world.textures.tables[textures.bump.table]
-        point = point if textures.bump.filtered else point.bare
+        point = point if textures.bump.filtered else point.unfiltered
         slope = table.slope(take(textures.bump.nodes, row), point)
     return perturb_normal(textures, row, local, slope, d, at, side)

@@ -187,7 +187,7 @@ def _groups(world: World) -> dict[str, int]:
         if textures is not None:
             maps = ["normal_map"] if textures.normal is not None else []
             maps += ["bump_map"] if textures.bump is not None else []
-            name = f"{name}, textured: {', '.join([*_keys(textures.readings), *maps])}"
+            name = f"{name}, textured: {', '.join([*_keys(textures.bindings), *maps])}"
             bindings = leaves(textures)
             rows = max([rows, *(len(binding) for binding in bindings)])
         while name in found:  # groups of different kinds of textures may have one name

@@ -50,7 +50,7 @@ def resolved(
         if resolve is None or not isinstance(value, TextureInput):
             return value
         node = resolve(value, f"{name}.{key}")
-        return node.at_points() if key in POINTS else node
+        return node.unfiltered() if key in POINTS else node
 
     def common(key: str) -> Any:
         """Return the value of a parameter that all materials have."""

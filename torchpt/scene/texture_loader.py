@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from torchpt.physics.parts import Parameters
-from torchpt.physics.textures import Named, Node, Opening, TextureInput, TexturePoint
+from torchpt.physics.textures import Node, Opening, TextureInput, TexturePoint, TextureReference
 from torchpt.scene.formats.description import Description
 from torchpt.spec.schema import ParsedParams
 
@@ -60,7 +60,7 @@ class TextureLoader:
             parameters: gets the texture's parameters.
         """
         texture, channel = slot.texture, None
-        if isinstance(texture, Named):
+        if isinstance(texture, TextureReference):
             name, channel, texture = f"textures.{texture.texture}", texture.channel, self._textures[texture.texture]
         with self._description.reading_files() as resolve:
             opening = Opening(slot, key, name, channel, parameters, resolve, self.file, self._pictures)
@@ -75,7 +75,7 @@ class TextureLoader:
 
         def open_shared(slot: TextureInput, key: str) -> Node:
             texture, name = slot.texture, key
-            label = None if isinstance(texture, Named) else texture.kind.label(texture.values)
+            label = None if isinstance(texture, TextureReference) else texture.kind.label(texture.values)
             if label is not None:
                 names = self._image_names.setdefault(prefix, {})
                 stem = re.sub(r"\W+", "_", Path(label).stem) or "image"  # letters, digits and underscores
@@ -89,7 +89,7 @@ class TextureLoader:
     def values(self, slot: TextureInput, key: str) -> Callable[[np.ndarray], np.ndarray]:
         """Return a number texture as a function from texture coordinates ``(V, 2)`` to values ``(V,)``, float64."""
         own = Parameters()  # used once to displace the mesh: no parameters of the scene
-        node = self._open(slot, key, key, own).at_points()
+        node = self._open(slot, key, key, own).unfiltered()
         tensors = {name: torch.from_numpy(value) for name, value in own.items()}
         table = node.table([node], tensors, torch.float64, torch.device("cpu"))  # the node is row 0
 

@@ -1,7 +1,8 @@
 """Equirectangular environment maps: latitude by rows, longitude by columns, as in the light ``envmap``.
 
 ``u = atan2(x, -z) / 2 pi`` (wrapped), ``v = acos(y) / pi``. Texel centres lie at ``u = (j + 1/2) / W`` and ``v = i / (H - 1)``:
-the first row is the pole +y, the last one -y. Between them a map is interpolated bilinearly.
+the first row is the pole +y, the last one -y. Between them a map is interpolated bilinearly: a texel counts by its hat
+function, 1 at its centre and 0 at those of its neighbours. Convolutions, cube maps and the light ``envmap`` use this module.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from torch import Tensor
 from torchpt.core.errors import SceneError
 from torchpt.math.vectors import azimuth
 
-__all__ = ["Cell", "angles", "checked", "coordinates", "corners", "directions", "look_up", "solid_angles"]
+__all__ = ["Cell", "angles", "check_map", "coordinates", "corners", "directions", "look_up", "solid_angles"]
 
 
-def checked(map: Tensor, key: str = "map") -> Tensor:
+def check_map(map: Tensor, key: str = "map") -> Tensor:
     """Return the map after checking it: ``(H, W, 3)`` floats, finite, not negative, at least two rows.
 
     Raises:
@@ -49,8 +50,8 @@ def directions(height: int, width: int) -> Tensor:
 def solid_angles(height: int, width: int) -> Tensor:
     """Return the solid angle ``(H,)`` float64 of one texel of each row: the integral of its hat function over the sphere.
 
-    A hat of half-width h about ``theta`` has ``2 sin(theta) (1 - cos h) / h``, a half hat at a pole ``1 - sin(h) / h``, both
-    times the width of a column. All texels sum to 4 pi exactly.
+    A hat from ``theta - h`` to ``theta + h`` has the integral ``2 sin(theta) (1 - cos h) / h``, a half hat at a pole has
+    ``1 - sin(h) / h``, both times the width of a column. All texels sum to 4 pi exactly.
     """
     h = math.pi / (height - 1)
     theta = torch.linspace(0.0, math.pi, height, dtype=torch.float64)
@@ -59,20 +60,20 @@ def solid_angles(height: int, width: int) -> Tensor:
     return rows * (2.0 * math.pi / width)
 
 
-def angles(d: Tensor | Sequence[Tensor], least: float) -> tuple[Tensor, Tensor]:
+def angles(d: Tensor | Sequence[Tensor], min_sin2: float) -> tuple[Tensor, Tensor]:
     """Return longitude in ``[0, 2 pi]`` and angle from +y, each ``(N,)``, of unit directions ``(3, N)`` or three ``(N,)``.
 
-    Not by acos, which near the poles is accurate only to the square root of rounding. ``least``: lower bound of the squared
+    Not by acos, which near the poles is accurate only to the square root of rounding. ``min_sin2``: lower bound of the squared
     sine of the angle from +y; above 0, derivatives are finite at the poles too.
     """
-    across = torch.addcmul(d[0] * d[0], d[2], d[2]).clamp_min(least).sqrt()
-    return azimuth(-d[2], d[0]), azimuth(d[1], across)
+    sine = torch.addcmul(d[0] * d[0], d[2], d[2]).clamp_min(min_sin2).sqrt()
+    return azimuth(-d[2], d[0]), azimuth(d[1], sine)
 
 
 def coordinates(d: Tensor) -> tuple[Tensor, Tensor]:
     """Return ``u, v``, each ``(N,)`` in ``[0, 1]``, of unit directions ``(3, N)``; derivatives are finite at the poles too."""
-    around, down = angles(d, 1e-14)
-    return around * (0.5 / math.pi), down * (1.0 / math.pi)
+    longitude, polar = angles(d, min_sin2=1e-14)  # the square of float32's rounding of a unit direction
+    return longitude * (0.5 / math.pi), polar * (1.0 / math.pi)
 
 
 class Cell(NamedTuple):
@@ -85,7 +86,7 @@ class Cell(NamedTuple):
 
     @staticmethod
     def of(x: Tensor, y: Tensor, height: int | Tensor, width: int | Tensor) -> Cell:
-        """Return the cells of points ``x, y (N,)``, in texels from the centre of the first one; sizes may differ by lane.
+        """Return the cells of points ``x, y (N,)``, in texels from the centre of the first one; maps may differ by lane.
 
         Columns wrap around. A point in the last row has ``y`` 1 in the cells above it.
         """
@@ -104,21 +105,21 @@ class Cell(NamedTuple):
 def corners(
     u: Tensor, v: Tensor, height: int | Tensor, width: int | Tensor
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Return the four texels around points ``(N,)`` with bilinear weights; sizes may differ by lane.
+    """Return the four texels around points ``u, v (N,)`` with bilinear weights; sizes may differ by lane.
 
     Returns:
         Four indices ``(N,)`` int64 into the flat map, and four weights ``(N,)`` that sum to 1.
     """
-    at = Cell.of(u * width - 0.5, (v * (height - 1)).clamp_min(0.0), height, width)
-    x, y = 1.0 - at.x, 1.0 - at.y
-    return at.texels(width), (y * x, y * at.x, at.y * x, at.y * at.x)
+    cell = Cell.of(u * width - 0.5, (v * (height - 1)).clamp_min(0.0), height, width)
+    x, y = 1.0 - cell.x, 1.0 - cell.y
+    return cell.texels(width), (y * x, y * cell.x, cell.y * x, cell.y * cell.x)
 
 
 def look_up(map: Tensor, d: Tensor) -> Tensor:
     """Return radiance ``(..., 3)`` of a map ``(H, W, 3)`` in unit directions ``(..., 3)``; differentiable in both."""
     height, width, _ = map.shape
     flat = map.reshape(-1, 3)
-    index, weight = corners(*coordinates(d.reshape(-1, 3).T), height, width)
-    value = sum(w[:, None] * flat.index_select(0, k) for k, w in zip(index, weight, strict=True))
+    texels, weights = corners(*coordinates(d.reshape(-1, 3).T), height, width)
+    value = sum(weight[:, None] * flat.index_select(0, texel) for texel, weight in zip(texels, weights, strict=True))
     assert isinstance(value, Tensor)
     return value.reshape(d.shape)

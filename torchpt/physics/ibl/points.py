@@ -1,4 +1,4 @@
-"""Hammersley's points: a two-dimensional low-discrepancy set of fixed size."""
+"""Hammersley's points: a two-dimensional low-discrepancy set of fixed size, from which maps and the BRDF table are sampled."""
 
 from __future__ import annotations
 

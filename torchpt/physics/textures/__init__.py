@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from torchpt.physics.textures.base import (
     CHANNELS,
-    Named,
     Node,
     Opening,
     Table,
     Texture,
     TextureInput,
     TexturePoint,
+    TextureReference,
 )
 from torchpt.physics.textures.bindings import (
     MaterialTextures,
@@ -22,7 +22,7 @@ from torchpt.physics.textures.bindings import (
     NodePosition,
     OpacityMaps,
     TextureBinding,
-    tables_of,
+    build_tables,
 )
 from torchpt.spec import Kinds
 
@@ -30,7 +30,6 @@ __all__ = [
     "CHANNELS",
     "KINDS",
     "MaterialTextures",
-    "Named",
     "Node",
     "NodeMap",
     "NodePosition",
@@ -41,8 +40,9 @@ __all__ = [
     "TextureBinding",
     "TextureInput",
     "TexturePoint",
-    "tables_of",
+    "TextureReference",
+    "build_tables",
 ]
 
-#: The kinds of textures.
+#: The kinds of textures by name; a module of ``kinds/`` is imported when its type is first looked up.
 KINDS: Kinds[Texture] = Kinds("torchpt.physics.textures.kinds", ("image", "checkerboard", "vertex_color"))

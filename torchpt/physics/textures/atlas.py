@@ -1,7 +1,8 @@
 """One atlas for all images of a scene, and look-ups into it that are differentiable in texels and coordinates.
 
 An image is stored in the atlas as planes of floats, one a channel. A node defines how it is read: channel, wrap mode, filter,
-transform of texture coordinates. Texel centres are at ``(i + 1/2) / size``; row 0 is ``v = 0`` (Mitsuba).
+transform of texture coordinates. Texel centres are at ``(i + 1/2) / size``; row 0 is ``v = 0`` (Mitsuba). All nodes that read
+images are rows of one table, the :class:`Atlas`, which stages look up on lanes: N points at once, each with its own node.
 
 A filtered node has a mipmap (Williams, *Pyramidal Parametrics*, 1983). Each level is another node with the same settings, and
 a look-up interpolates between the two levels whose texels are about as large as the footprint.
@@ -19,14 +20,14 @@ from torch import Tensor
 
 from torchpt.core.threads import mean_all
 from torchpt.math.vectors import luminance, take
-from torchpt.physics.textures.base import SAME, Matrix, Node, Table, TexturePoint, transform_uv
+from torchpt.physics.textures.base import IDENTITY, Matrix, Node, Table, TexturePoint, transform_uv
 
 __all__ = ["WRAPS", "Atlas", "ImageNode", "Mipmaps", "atlas_of", "look_up", "slope"]
 
 #: Wrap modes beyond the edges of an image, in the order of their codes in :class:`Atlas`.
 WRAPS = ("repeat", "clamp", "mirror")
 #: Coordinates are clamped to this distance from the origin in texels, where float32 has no fraction anyway.
-_FAR = 2.0**30
+_FARTHEST = 2.0**30
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,14 @@ class ImageNode(Node):
     """One use of an image.
 
     Attributes:
-        texels: name of the parameter with the texels, or the argument of ``made``.
+        texels: name of the parameter with the texels, or the argument of ``compute``.
         channel: see :class:`Node`.
         wrap: one of :data:`WRAPS`.
         nearest: whether to read the nearest texel; else bilinear.
         transform: rows of the affine map ``(2, 3)`` of texture coordinates.
         scale: factors of the three channels (the first for a number).
         filtered: whether footprints larger than a texel read levels of a mipmap.
-        made: computes the image ``(H, W, C)`` from the parameters and ``texels``; None: it is a parameter.
+        compute: function that makes the image ``(H, W, C)`` from the parameters and ``texels``; None: it is a parameter.
     """
 
     texels: str
@@ -51,7 +52,7 @@ class ImageNode(Node):
     transform: Matrix
     scale: tuple[float, float, float]
     filtered: bool = False
-    made: Callable[[Mapping[str, Tensor], str], Tensor] | None = None
+    compute: Callable[[Mapping[str, Tensor], str], Tensor] | None = None
 
     @property
     def variant(self) -> Hashable:
@@ -65,14 +66,14 @@ class ImageNode(Node):
 
     def image(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Return the image ``(H, W, C)``, linear."""
-        return parameters[self.texels] if self.made is None else self.made(parameters, self.texels)
+        return parameters[self.texels] if self.compute is None else self.compute(parameters, self.texels)
 
     def table(
         self, nodes: Sequence[Any], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
     ) -> Table:
         """See :meth:`Node.table`."""
-        first = {node.texels: node for node in reversed(nodes)}
-        return atlas_of(nodes, {name: node.image(parameters) for name, node in first.items()}, dtype, device)
+        by_image = {node.texels: node for node in reversed(nodes)}  # of equal names the first node counts
+        return atlas_of(nodes, {name: node.image(parameters) for name, node in by_image.items()}, dtype, device)
 
     def mean(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """See :meth:`Node.mean`; the mean of the whole image, for any transform."""
@@ -83,11 +84,13 @@ class ImageNode(Node):
 
 @dataclass(frozen=True)
 class Mipmaps:
-    """The mipmaps of filtered nodes; their levels above 0 are nodes after the given ones, from large to small.
+    """The mipmaps of the M nodes that :func:`atlas_of` was given.
+
+    Level 0 is the node itself; the levels above are further nodes, after the M given ones, from large to small.
 
     Attributes:
-        first: ``(M,)`` int64 node of level 1, minus one; arbitrary without a mipmap.
-        top: ``(M,)`` the coarsest level.
+        first: ``(M,)`` int64 node of level 1, minus one: level ``k > 0`` is node ``first + k``; arbitrary without a mipmap.
+        top: ``(M,)`` the coarsest level; 0 without a mipmap.
         density: ``(M,)`` number of texels in a unit square of texture coordinates.
     """
 
@@ -98,45 +101,46 @@ class Mipmaps:
 
 @dataclass(frozen=True)
 class Atlas(Table):
-    """All planes of images, and the nodes that read them.
+    """All planes of images, and the M nodes that read them, levels of mipmaps included.
 
     Attributes:
         texels: ``(T,)`` all planes.
-        places: ``(6, M)`` int64: first texel, stride between channels, width, height, code of the wrap mode, 1 if bilinear.
-        maps: ``(9, M)``: rows of the transform of texture coordinates, then ``scale``.
+        layouts: ``(6, M)`` int64: first texel, stride between channels (0: one plane serves all), width, height, code of the
+            wrap mode, 1 if bilinear.
+        transforms: ``(9, M)``: rows of the transform of texture coordinates, then ``scale``.
         wraps: wrap modes in use; static.
         scaled: whether any node scales; static.
         transformed: whether any node transforms texture coordinates; static.
-        pyramids: mipmaps; None if no node is filtered.
+        mipmaps: None if no node is filtered.
     """
 
     texels: Tensor
-    places: Tensor
-    maps: Tensor
+    layouts: Tensor
+    transforms: Tensor
     wraps: tuple[str, ...]
     scaled: bool
     transformed: bool
-    pyramids: Mipmaps | None = None
+    mipmaps: Mipmaps | None = None
 
     @property
     def count(self) -> int:
         """Number of nodes, levels of mipmaps included."""
-        return self.places.shape[1]
+        return self.layouts.shape[1]
 
     @property
     def filtered(self) -> bool:
         """See :attr:`Table.filtered`."""
-        return self.pyramids is not None
+        return self.mipmaps is not None
 
-    def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
+    def look_up(self, nodes: Tensor, point: TexturePoint, *, coloured: bool) -> Tensor:
         """See :meth:`Table.look_up`."""
         assert point.uv is not None
-        return look_up(self, nodes, point.uv, coloured, point.footprint)
+        return look_up(self, nodes, point.uv, coloured=coloured, footprint=point.footprint)
 
     def slope(self, nodes: Tensor, point: TexturePoint) -> tuple[Tensor, Tensor]:
         """See :meth:`Table.slope`."""
         assert point.uv is not None
-        return slope(self, nodes, point.uv, point.footprint)
+        return slope(self, nodes, point.uv, footprint=point.footprint)
 
 
 def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch.dtype, device: torch.device) -> Atlas:
@@ -148,57 +152,62 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
         dtype: dtype of the world.
         device: device of the atlas.
     """
-    planes: list[Tensor] = []
-    blocks: dict[tuple[str, int | None], list[list[int]]] = {}  # first texel, stride, width, height of each size
-    places, maps, smaller, end = [], [], [], 0
+    planes: list[Tensor] = []  # flat, one for each level
+    # Nodes that read the same channels of an image share its planes. By image and channel: for each level first texel, stride
+    # between channels, width, height.
+    levels_of: dict[tuple[str, int | None], list[list[int]]] = {}
+    layouts, transforms, coarser, end = [], [], [], 0  # coarser: layouts of the levels above 0 of each node
     filtered = {(node.texels, node.channel) for node in nodes if node.filtered}
     for node in nodes:
-        block = (node.texels, node.channel)
-        if block not in blocks:
-            sizes = [_planes(images[node.texels], node.channel)]
-            while block in filtered and max(sizes[-1].shape[1:]) > 1:
-                sizes.append(_halved(_halved(sizes[-1], 1), 2))
-            blocks[block] = []
-            for size in sizes:
-                count, height, width = size.shape
-                blocks[block].append([end, width * height if count == 3 else 0, width, height])
-                planes.append(size.reshape(-1).to(device=device, dtype=dtype))
-                end += size.numel()
-        ways = [WRAPS.index(node.wrap), 0 if node.nearest else 1]
-        places.append([*blocks[block][0], *ways])
-        maps.append([*node.transform[0], *node.transform[1], *node.scale])
-        smaller.append([[*size, *ways] for size in blocks[block][1:]] if node.filtered else [])
-    pyramids = None
+        source = (node.texels, node.channel)
+        if source not in levels_of:
+            levels = [_planes(images[node.texels], node.channel)]
+            while source in filtered and max(levels[-1].shape[1:]) > 1:
+                levels.append(_halved(_halved(levels[-1], dim=1), dim=2))
+            levels_of[source] = []
+            for level in levels:
+                channels, height, width = level.shape
+                levels_of[source].append([end, width * height if channels == 3 else 0, width, height])
+                planes.append(level.reshape(-1).to(device=device, dtype=dtype))
+                end += level.numel()
+        modes = [WRAPS.index(node.wrap), 0 if node.nearest else 1]
+        finest, *others = levels_of[source]
+        layouts.append([*finest, *modes])
+        transforms.append([*node.transform[0], *node.transform[1], *node.scale])
+        coarser.append([[*level, *modes] for level in others] if node.filtered else [])
+    mipmaps = None
     if filtered:
-        counts = torch.tensor([len(sizes) for sizes in smaller], dtype=torch.int64)
-        pyramids = Mipmaps(
-            (len(nodes) - 1 + torch.cumsum(counts, 0) - counts).to(device),
-            counts.to(device=device, dtype=dtype),
-            torch.tensor(
-                [_density(p, node) for p, node in zip(places, nodes, strict=True)], dtype=dtype, device=device
+        counts = torch.tensor([len(levels) for levels in coarser], dtype=torch.int64)
+        mipmaps = Mipmaps(
+            first=(len(nodes) - 1 + torch.cumsum(counts, 0) - counts).to(device),
+            top=counts.to(device=device, dtype=dtype),
+            density=torch.tensor(
+                [_density(node, *layout[2:4]) for layout, node in zip(layouts, nodes, strict=True)],
+                dtype=dtype,
+                device=device,
             ),
         )
-        places += [place for sizes in smaller for place in sizes]
-        maps += [row for row, sizes in zip(list(maps), smaller, strict=True) for _ in sizes]
+        layouts += [layout for levels in coarser for layout in levels]
+        transforms += [row for row, levels in zip(list(transforms), coarser, strict=True) for _ in levels]
     return Atlas(
-        torch.cat(planes),
-        torch.tensor(places, dtype=torch.int64, device=device).T.contiguous(),
-        torch.tensor(maps, dtype=dtype, device=device).T.contiguous(),
-        tuple(wrap for wrap in WRAPS if any(node.wrap == wrap for node in nodes)),
-        any(node.scale != (1.0, 1.0, 1.0) for node in nodes),
-        any(node.transform != SAME for node in nodes),
-        pyramids,
+        texels=torch.cat(planes),
+        layouts=torch.tensor(layouts, dtype=torch.int64, device=device).T.contiguous(),
+        transforms=torch.tensor(transforms, dtype=dtype, device=device).T.contiguous(),
+        wraps=tuple(wrap for wrap in WRAPS if any(node.wrap == wrap for node in nodes)),
+        scaled=any(node.scale != (1.0, 1.0, 1.0) for node in nodes),
+        transformed=any(node.transform != IDENTITY for node in nodes),
+        mipmaps=mipmaps,
     )
 
 
-def _density(place: Sequence[int], node: ImageNode) -> float:
-    """Return the number of texels in a unit square of texture coordinates."""
+def _density(node: ImageNode, width: int, height: int) -> float:
+    """Return the number of texels in a unit square of texture coordinates, for an image of this size."""
     (a, b, _), (c, d, _) = node.transform
-    return abs(a * d - b * c) * place[2] * place[3]
+    return abs(a * d - b * c) * width * height
 
 
 def _halved(planes: Tensor, dim: int) -> Tensor:
-    """Downsample planes by 2 along ``dim`` (rounded down) with a box filter, exact for odd sizes too.
+    """Downsample planes ``(C, H, W)`` by 2 along ``dim`` (rounded down) with a box filter, exact for odd sizes too.
 
     For ``2 m + 1`` texels, output ``i`` covers ``i (2 + 1/m) .. (i + 1) (2 + 1/m)``: fractions of three texels.
     """
@@ -206,17 +215,15 @@ def _halved(planes: Tensor, dim: int) -> Tensor:
     m = n // 2
     if m == 0:
         return planes
-    left, right = (planes.narrow(dim, k, 2 * m - 1).index_select(dim, _evens(planes, m)) for k in range(2))
+    # Texels 2 i, 2 i + 1 and, for odd sizes, 2 i + 2.
+    even = torch.arange(0, 2 * m, 2, device=planes.device)
+    left, right = (planes.narrow(dim, k, 2 * m - 1).index_select(dim, even) for k in range(2))
     if n % 2 == 0:
         return 0.5 * (left + right)
-    last = planes.narrow(dim, 2, 2 * m - 1).index_select(dim, _evens(planes, m))
-    share = torch.arange(m, dtype=planes.dtype, device=planes.device)
-    share = share.view([m if k == dim else 1 for k in range(planes.dim())])
-    return (left * (m - share) + right * m + last * (share + 1)) / n
-
-
-def _evens(planes: Tensor, m: int) -> Tensor:
-    return torch.arange(0, 2 * m, 2, device=planes.device)
+    last = planes.narrow(dim, 2, 2 * m - 1).index_select(dim, even)
+    i = torch.arange(m, dtype=planes.dtype, device=planes.device)
+    i = i.view([m if k == dim else 1 for k in range(planes.dim())])
+    return (left * (m - i) + right * m + last * (i + 1)) / n
 
 
 def _planes(image: Tensor, channel: int | None) -> Tensor:
@@ -233,16 +240,16 @@ def _planes(image: Tensor, channel: int | None) -> Tensor:
 
 @dataclass(frozen=True)
 class _Corners:
-    """The four texels around each point, ``(C, N)`` each, and the position between them."""
+    """The four texels around each point, the position between them, and what of the node a look-up needs."""
 
-    low: tuple[Tensor, Tensor]
-    high: tuple[Tensor, Tensor]
-    x: Tensor
+    low: tuple[Tensor, Tensor]  # left and right texel of the row with the smaller v, (3, N) or (N,) each
+    high: tuple[Tensor, Tensor]  # those of the next row
+    x: Tensor  # (N,) 0 at the left texel to 1 at the right one; 0 for nearest
     y: Tensor
-    width: Tensor
+    width: Tensor  # (N,) of the image, in texels
     height: Tensor
-    blend: Tensor  # 1 for bilinear, 0 for nearest
-    maps: Tensor
+    blend: Tensor  # (N,) 1 for bilinear, 0 for nearest
+    transforms: Tensor  # (9, N), see Atlas
 
 
 def look_up(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool, footprint: Tensor | None = None) -> Tensor:
@@ -250,66 +257,75 @@ def look_up(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool, footprint: T
 
     ``footprint``: areas ``(N,)`` in texture coordinates over which filtered nodes average; None: no filtering.
     """
-    if footprint is None or atlas.pyramids is None:
-        return _point(atlas, node, uv, coloured)
-    low, high, share = _sizes(atlas.pyramids, node, footprint)
-    a, b = _point(atlas, low, uv, coloured), _point(atlas, high, uv, coloured)
-    return a + (b - a) * share
+    if footprint is None or atlas.mipmaps is None:
+        return _look_up_level(atlas, node, uv, coloured=coloured)
+    fine, coarse, fraction = _levels(atlas.mipmaps, node, footprint)
+    value_fine = _look_up_level(atlas, fine, uv, coloured=coloured)
+    value_coarse = _look_up_level(atlas, coarse, uv, coloured=coloured)
+    return value_fine + (value_coarse - value_fine) * fraction
 
 
-def _point(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool) -> Tensor:
-    c = _corners(atlas, node, uv, coloured)
+def _look_up_level(atlas: Atlas, node: Tensor, uv: Tensor, *, coloured: bool) -> Tensor:
+    """Return the values of nodes without filtering: interpolated between four texels, or the nearest one."""
+    c = _corners(atlas, node, uv, coloured=coloured)
     low = c.low[0] + (c.low[1] - c.low[0]) * c.x
     high = c.high[0] + (c.high[1] - c.high[0]) * c.x
     value = low + (high - low) * c.y
     if atlas.scaled:
-        value = value * (c.maps[6:9] if coloured else c.maps[6])
+        value = value * (c.transforms[6:9] if coloured else c.transforms[6])
     return value
 
 
 def slope(atlas: Atlas, node: Tensor, uv: Tensor, footprint: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return derivatives ``(N,)`` of number-valued nodes by ``u`` and ``v``; ``footprint`` as for :func:`look_up`."""
-    if footprint is None or atlas.pyramids is None:
+    if footprint is None or atlas.mipmaps is None:
         return _slope(atlas, node, uv)
-    low, high, share = _sizes(atlas.pyramids, node, footprint)
-    a, b = _slope(atlas, low, uv), _slope(atlas, high, uv)
-    return a[0] + (b[0] - a[0]) * share, a[1] + (b[1] - a[1]) * share
+    fine, coarse, fraction = _levels(atlas.mipmaps, node, footprint)
+    (fine_u, fine_v), (coarse_u, coarse_v) = _slope(atlas, fine, uv), _slope(atlas, coarse, uv)
+    return fine_u + (coarse_u - fine_u) * fraction, fine_v + (coarse_v - fine_v) * fraction
 
 
 def _slope(atlas: Atlas, node: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    c = _corners(atlas, node, uv, False)
+    """Return derivatives ``(N,)`` of number-valued nodes by ``u`` and ``v``, without filtering; 0 for nearest."""
+    c = _corners(atlas, node, uv, coloured=False)
     low, high = c.low[1] - c.low[0], c.high[1] - c.high[0]
-    across = (low + (high - low) * c.y) * (c.width * c.blend)
+    along_u = (low + (high - low) * c.y) * (c.width * c.blend)
     left, right = c.high[0] - c.low[0], c.high[1] - c.low[1]
-    along = (left + (right - left) * c.x) * (c.height * c.blend)
+    along_v = (left + (right - left) * c.x) * (c.height * c.blend)
     if atlas.scaled:
-        across, along = across * c.maps[6], along * c.maps[6]
+        along_u, along_v = along_u * c.transforms[6], along_v * c.transforms[6]
     if not atlas.transformed:
-        return across, along
-    return across * c.maps[0] + along * c.maps[3], across * c.maps[1] + along * c.maps[4]
+        return along_u, along_v
+    # Chain rule: these were by transformed coordinates; rows of the transform are m0 m1 m2 and m3 m4 m5.
+    return (
+        along_u * c.transforms[0] + along_v * c.transforms[3],
+        along_u * c.transforms[1] + along_v * c.transforms[4],
+    )
 
 
-def _sizes(pyramids: Mipmaps, node: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _levels(mipmaps: Mipmaps, node: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the two mipmap levels for footprints, as nodes, and the fraction between them: 0 up to one texel."""
-    texels = take(pyramids.density, node) * footprint
-    top = take(pyramids.top, node)
+    texels = take(mipmaps.density, node) * footprint
+    top = take(mipmaps.top, node)
     # Half the logarithm of an area is that of its side. No mipmap has levels beyond 2^60 texels.
-    level = torch.minimum(texels.clamp(1.0, _FAR * _FAR).log() * (0.5 / math.log(2.0)), top)
-    under = level.detach().floor()
-    over = torch.minimum(under + 1.0, top)
-    first = take(pyramids.first, node)
-    low, high = (torch.where(k > 0, first + k.to(torch.int64), node) for k in (under, over))
-    return low, high, level - under
+    level = torch.minimum(texels.clamp(1.0, _FARTHEST * _FARTHEST).log() * (0.5 / math.log(2.0)), top)
+    below = level.detach().floor()
+    above = torch.minimum(below + 1.0, top)
+    first = take(mipmaps.first, node)
+    fine, coarse = (torch.where(k > 0, first + k.to(torch.int64), node) for k in (below, above))
+    return fine, coarse, level - below
 
 
-def _corners(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool) -> _Corners:
-    place, maps = take(atlas.places, node), take(atlas.maps, node)
-    first, stride, width, height, wrap, linear = (place[k] for k in range(6))
-    u, v = transform_uv(maps, uv) if atlas.transformed else (uv[0], uv[1])
+def _corners(atlas: Atlas, node: Tensor, uv: Tensor, *, coloured: bool) -> _Corners:
+    """Read the four texels around points ``uv (2, N)``, three channels of each if ``coloured``."""
+    layout, transforms = take(atlas.layouts, node), take(atlas.transforms, node)
+    first, stride, width, height, wrap, linear = (layout[k] for k in range(6))
+    u, v = transform_uv(transforms, uv) if atlas.transformed else (uv[0], uv[1])
     blend = linear.to(uv.dtype)
-    wide, tall = width.to(uv.dtype), height.to(uv.dtype)
-    x = (u * wide - 0.5 * blend).clamp(-_FAR, _FAR)
-    y = (v * tall - 0.5 * blend).clamp(-_FAR, _FAR)
+    columns, rows = width.to(uv.dtype), height.to(uv.dtype)
+    # In texels: from the first texel's centre for bilinear, from its edge for nearest.
+    x = (u * columns - 0.5 * blend).clamp(-_FARTHEST, _FARTHEST)
+    y = (v * rows - 0.5 * blend).clamp(-_FARTHEST, _FARTHEST)
     i, j = x.detach().floor(), y.detach().floor()
     x, y = (x - i) * blend, (y - j) * blend
     i, j = i.to(torch.int64), j.to(torch.int64)
@@ -318,26 +334,30 @@ def _corners(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool) -> _Corners
     if not coloured:
         a, b, c, d = (take(atlas.texels, row + column) for row in (top, bottom) for column in (left, right))
     else:
+        # All channels of all lanes by one look-up, (3 N,).
         steps = torch.arange(3, device=stride.device)[:, None] * stride
         a, b, c, d = (
             take(atlas.texels, (steps + (row + column)).reshape(-1)).view(3, -1)
             for row in (top, bottom)
             for column in (left, right)
         )
-    return _Corners((a, b), (c, d), x, y, wide, tall, blend, maps)
+    return _Corners(low=(a, b), high=(c, d), x=x, y=y, width=columns, height=rows, blend=blend, transforms=transforms)
 
 
 def _wrapped(wraps: tuple[str, ...], index: Tensor, size: Tensor, code: Tensor) -> Tensor:
-    """Map indices into ``0..size - 1`` by the wrap mode."""
-    folded: Tensor | None = None
+    """Map indices ``(N,)`` of rows or columns into ``0..size - 1`` by the wrap mode, whose ``code (N,)`` indexes :data:`WRAPS`.
+
+    ``wraps``: the modes that occur; others are not computed.
+    """
+    wrapped: Tensor | None = None
     for wrap in wraps:
         if wrap == "repeat":
-            here = torch.remainder(index, size)
+            by_mode = torch.remainder(index, size)
         elif wrap == "clamp":
-            here = torch.minimum(index.clamp_min(0), size - 1)
+            by_mode = torch.minimum(index.clamp_min(0), size - 1)
         else:
-            turned = torch.remainder(index, 2 * size)
-            here = torch.minimum(turned, 2 * size - 1 - turned)
-        folded = here if folded is None else torch.where(code == WRAPS.index(wrap), here, folded)
-    assert folded is not None
-    return folded
+            position = torch.remainder(index, 2 * size)  # in the image and its mirror image after it
+            by_mode = torch.minimum(position, 2 * size - 1 - position)
+        wrapped = by_mode if wrapped is None else torch.where(code == WRAPS.index(wrap), by_mode, wrapped)
+    assert wrapped is not None
+    return wrapped

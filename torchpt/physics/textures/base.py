@@ -1,7 +1,9 @@
 """Base classes of textures: kinds, nodes and tables.
 
-A *kind* of texture is a file in ``kinds/``. A *slot* is a parameter that a texture gives. Opened for a slot
-(:class:`Opening`) a texture becomes a *node*, one use of it; nodes that are looked up by the same code are rows of one *table*.
+A *kind* of texture is a class in a file of ``kinds/``. A *slot* is a parameter whose values a texture gives, such as the
+roughness of a material. Opened for a slot (:class:`Opening`) a texture becomes a *node*, one use of it; nodes that are looked
+up by the same code are rows of one *table*. Scenes open textures when they are loaded; stages look tables up on lanes, the N
+points that are shaded together.
 """
 
 from __future__ import annotations
@@ -25,8 +27,8 @@ if TYPE_CHECKING:
     from torchpt.physics.parts import Parameters
 
 __all__ = [
-    "CHANNELS", "SAME", "Mapped", "Matrix", "Named", "Node", "Opening", "Table", "Texture", "TextureInput", "TexturePoint",
-    "UvTransform", "transform_uv",
+    "CHANNELS", "IDENTITY", "Mapped", "Matrix", "Node", "Opening", "Table", "Texture", "TextureInput", "TexturePoint",
+    "TextureReference", "UvTransform", "transform_uv",
 ]  # fmt: skip
 
 #: Channels from which a number may be read. A node holds the index minus 1: -1 for luminance, else the component of a texel.
@@ -35,13 +37,13 @@ CHANNELS = ("luminance", "r", "g", "b", "a")
 #: Rows of an affine transform of texture coordinates; the third column is the translation.
 Matrix = tuple[tuple[float, float, float], tuple[float, float, float]]
 #: The identity transform of texture coordinates.
-SAME: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _ONE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
-class Named:
-    """A reference to a texture of the block ``textures``; ``channel``: the channel for a slot of a number."""
+class TextureReference:
+    """A reference to the texture ``texture`` of the block ``textures``; ``channel``: the channel for a slot of a number."""
 
     texture: str
     channel: str | None = None
@@ -60,7 +62,7 @@ class TextureInput:
         moves: the geometry that moves with the values, for gradients.
     """
 
-    texture: ParsedParams | Named
+    texture: ParsedParams | TextureReference
     coloured: bool
     linear: bool
     low: float
@@ -77,7 +79,7 @@ class TexturePoint:
     colors: Tensor | None = None  # (3, N) interpolated vertex colours; None if not needed
 
     @property
-    def bare(self) -> TexturePoint:
+    def unfiltered(self) -> TexturePoint:
         """The points without footprints."""
         return self if self.footprint is None else replace(self, footprint=None)
 
@@ -85,7 +87,8 @@ class TexturePoint:
 class Table:
     """Nodes that are looked up by the same code, one a row; a dataclass of tensors and static values.
 
-    Static values are part of the code that is compiled for a look-up; tensors are its data.
+    Static values (numbers, words, flags: whatever is no tensor) are part of the code that is compiled for a look-up; tensors
+    are its data.
     """
 
     @property
@@ -98,7 +101,7 @@ class Table:
         """True if any node averages over footprints; static."""
         return False
 
-    def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
+    def look_up(self, nodes: Tensor, point: TexturePoint, *, coloured: bool) -> Tensor:
         """Return values at points, ``nodes (N,)`` being rows of the table: ``(3, N)`` if ``coloured``, else ``(N,)``.
 
         All nodes of a call are colours, or all are numbers.
@@ -106,17 +109,17 @@ class Table:
         raise NotImplementedError
 
     def slope(self, nodes: Tensor, point: TexturePoint) -> tuple[Tensor, Tensor]:
-        """Return derivatives ``(N,)`` of number-valued nodes by ``u`` and ``v``."""
+        """Return derivatives ``(N,)`` of number-valued nodes by ``u`` and ``v``, for bump maps."""
         raise NotImplementedError
 
 
 class Node:
-    """One use of a texture: a frozen, static dataclass; equal nodes give equal values.
+    """One use of a texture: a frozen dataclass without tensors; equal nodes give equal values.
 
     Attributes:
         channel: None for a colour; for a number the index of the channel, or -1 for luminance.
         filtered: whether look-ups average over footprints.
-        reads: input from the surface: ``uv`` or ``colors``.
+        reads: what a look-up needs from the surface: texture coordinates, ``uv``, or vertex colours, ``colors``.
     """
 
     channel: int | None
@@ -130,10 +133,10 @@ class Node:
 
     @property
     def form(self) -> Hashable:
-        """Key of slots that can be looked up together: the variant, and whether the value is a colour."""
+        """Key of nodes that one call can look up: the variant, and whether the value is a colour."""
         return self.variant, self.channel is None
 
-    def at_points(self) -> Any:
+    def unfiltered(self) -> Any:
         """Return the node without filtering, for slots without a footprint."""
         return replace(self, filtered=False) if self.filtered else self  # type: ignore[type-var]
 
@@ -156,10 +159,10 @@ class Node:
 
     def mean(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Return the mean colour ``(3,)`` over a unit square of texture coordinates, float64, detached; for colours only."""
-        side = (torch.arange(64, dtype=torch.float64) + 0.5) / 64
+        side = (torch.arange(64, dtype=torch.float64) + 0.5) / 64  # centres of a grid of 64 x 64 points
         uv = torch.stack(torch.meshgrid(side, side, indexing="xy")).reshape(2, -1)
-        given = {name: value.detach().cpu() for name, value in parameters.items()}
-        table = self.table([self], given, torch.float64, uv.device)
+        detached = {name: value.detach().cpu() for name, value in parameters.items()}
+        table = self.table([self], detached, torch.float64, uv.device)
         rows = torch.zeros(uv.shape[1], dtype=torch.int64)  # this node is the only one of the table
         return table.look_up(rows, TexturePoint(uv), coloured=True).mean(1)
 
@@ -176,7 +179,7 @@ class Opening:
         parameters: parameters of the scene, to which the texture adds its own.
         resolve: maps a path as written and its dotted key to a file.
         file: the scene file, for errors.
-        pictures: images read for other slots, a cache for kinds.
+        image_cache: images read for other slots, shared by all openings of a scene; keys are those of the kind.
     """
 
     slot: TextureInput
@@ -186,23 +189,23 @@ class Opening:
     parameters: Parameters
     resolve: Callable[[tuple[str, ...], str], Path]
     file: str | None = None
-    pictures: dict[Any, Any] = field(default_factory=dict)
+    image_cache: dict[Any, Any] = field(default_factory=dict)
 
-    def number(self, channels: Sequence[str], without: str) -> int | None:
-        """Return the channel of the node for a texture without alpha; None for a slot of a colour.
+    def channel_index(self, channels: Sequence[str], reason: str) -> int | None:
+        """Return the channel of the node (:attr:`Node.channel`) for a slot of a number, None for a slot of a colour.
 
         Raises:
-            SceneError: the slot's channel is not in ``channels``; ``without`` is the reason.
+            SceneError: the slot's channel is not one of ``channels``, those of the texture; ``reason`` says why.
         """
         channel = self.channel or "luminance"
         if channel not in channels:
-            raise SceneError(f"{self.key}.channel", channel, f"one of {', '.join(channels)} ({without})", self.file)
+            raise SceneError(f"{self.key}.channel", channel, f"one of {', '.join(channels)} ({reason})", self.file)
         return None if self.slot.coloured else CHANNELS.index(channel) - 1
 
     def declare(self, name: str, value: Any, spec: Spec) -> None:
         """Add a parameter; if another slot added it before, its spec becomes the intersection of both."""
-        known = self.parameters.specs.get(name)
-        self.parameters.declare(name, value, spec if known is None else _both(known, spec))
+        declared = self.parameters.specs.get(name)
+        self.parameters.declare(name, value, spec if declared is None else _intersection(declared, spec))
 
     def declare_all(self, kind: Any, values: Mapping[str, Any]) -> None:
         """Add the differentiable parameters of a kind; colours are restricted to the range of the slot.
@@ -216,7 +219,7 @@ class Opening:
             name = f"{self.name}.{key}"
             if isinstance(spec, Color):
                 self.check(np.asarray(values[key]), name)
-                spec = self.ranged(spec)
+                spec = self.restricted(spec)
             self.declare(name, values[key], replace(spec, moves=self.slot.moves))
 
     def check(self, values: np.ndarray, key: str, label: str = "", scale: tuple[float, float, float] = _ONE) -> None:
@@ -228,35 +231,36 @@ class Opening:
         slot = self.slot
         extremes = [float(extreme) * factor for extreme in (values.min(), values.max()) for factor in scale]
         low, high = min(extremes), max(extremes)
-        if low < slot.low - _CLOSE or high > slot.high * (1 + _CLOSE):
+        if low < slot.low - _TOLERANCE or high > slot.high * (1 + _TOLERANCE):
             where = f" in the texels of {label}" if label else ""
-            raise SceneError(key, [low, high], f"numbers{_words(slot.low, slot.high)}{where}", self.file)
+            raise SceneError(key, [low, high], f"numbers{_range_words(slot.low, slot.high)}{where}", self.file)
 
-    def ranged(self, spec: Any, scale: tuple[float, float, float] = _ONE) -> Any:
+    def restricted(self, spec: Any, scale: tuple[float, float, float] = _ONE) -> Any:
         """Return a spec restricted to values that the slot accepts after multiplication by ``scale``."""
         low, high = -LARGEST, LARGEST
-        for factor in {factor for factor in scale if factor != 0.0}:
-            a, b = sorted((self.slot.low / factor, self.slot.high / factor))
-            low, high = max(low, a), min(high, b)
+        for factor in {factor for factor in scale if factor != 0.0}:  # a factor of 0 gives 0, whatever the value
+            least, greatest = sorted((self.slot.low / factor, self.slot.high / factor))
+            low, high = max(low, least), min(high, greatest)
         of_slot = replace(spec, low=low if low > -LARGEST else None, high=high if high < LARGEST else None)
-        return _both(spec, of_slot)
+        return _intersection(spec, of_slot)
 
 
 #: Tolerance for rounding in the range check of a slot.
-_CLOSE = 1e-6
+_TOLERANCE = 1e-6
 
 
-def _words(low: float, high: float) -> str:
+def _range_words(low: float, high: float) -> str:
     """Return a range in words; from 1e30 on ``high`` is no bound."""
     return f" in {low:g}..{high:g}" if high < 1e30 else f" >= {low:g}"
 
 
-def _both(a: Any, b: Any) -> Any:
+def _intersection(a: Any, b: Any) -> Any:
     """Return the spec of a parameter that two slots share: the intersection of the ranges, the larger `moves`."""
     if not hasattr(a, "bounds") or not hasattr(b, "bounds"):  # specs without ranges
         return b
-    lows, highs = ([low for low in (a.low, b.low) if low is not None], [h for h in (a.high, b.high) if h is not None])
-    moves = max(a.moves, b.moves, key=lambda moves: moves.value)
+    lows = [low for low in (a.low, b.low) if low is not None]
+    highs = [high for high in (a.high, b.high) if high is not None]
+    moves = max(a.moves, b.moves, key=lambda moves: moves.value)  # ordered by how much geometry a parameter moves
     return replace(b, low=max(lows, default=None), high=min(highs, default=None), moves=moves)
 
 
@@ -267,7 +271,7 @@ class Texture:
         name: the ``type`` in a scene file.
         parameters: specs of the parameters. Differentiable ones become parameters of the scene; their colours are values
             of the slot.
-        reads: input from the surface: ``uv`` or ``colors``.
+        reads: as of :class:`Node`.
         filters: values of the parameter ``filter`` for which look-ups average over footprints.
     """
 
@@ -328,6 +332,7 @@ class UvTransform:
 
 
 def _uv_transform(value: Any) -> UvTransform:
+    """Return the transform of a mapping of a scene file, or refuse it."""
     if not isinstance(value, Mapping):
         raise Refused("a mapping with scale, rotate, translate")
     try:

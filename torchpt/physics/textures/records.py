@@ -1,4 +1,4 @@
-"""The record of a world's textures."""
+"""The record of a world's textures, which stages look values up in; ``torchpt.scene.world`` builds it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ __all__ = ["LaneTextures"]
 
 @dataclass(frozen=True)
 class LaneTextures:
-    """Tables of all textures, and the textures that surfaces read for any model."""
+    """Tables of all textures, and those that surfaces read whatever their BSDF; BSDFs keep their own bindings."""
 
-    tables: tuple[Table, ...] = ()
+    tables: tuple[Table, ...] = ()  # textures that are looked up by the same code lie in one table
     opacity: OpacityMaps | None = None  # None without textured opacity
     emission: NodeMap | None = None  # None without textured emission
 

@@ -10,15 +10,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from torchpt.core.errors import SceneError, did_you_mean
-from torchpt.physics.textures import CHANNELS, KINDS, Named, TextureInput
+from torchpt.physics.textures import CHANNELS, KINDS, TextureInput, TextureReference
 from torchpt.spec import Refused, Spec, parameters_of
 from torchpt.spec.reading import as_refused
 from torchpt.spec.schema import ParsedParams, check_keys, dotted, read_typed
 
-__all__ = ["Named", "TextureInput", "check_texture", "read_texture", "texture_of"]
+__all__ = ["TextureInput", "TextureReference", "check_texture", "read_texture", "texture_of"]
 
 
-def read_texture(raw: Any, key: str, file: str | None) -> ParsedParams | Named:
+def read_texture(raw: Any, key: str, file: str | None) -> ParsedParams | TextureReference:
     """Read a reference ``{texture: NAME}``, or a texture written in place.
 
     Raises:
@@ -31,7 +31,7 @@ def read_texture(raw: Any, key: str, file: str | None) -> ParsedParams | Named:
             raise SceneError(dotted(key, "texture"), name, "the name of a texture", file)
         if channel is not None and channel not in CHANNELS:
             raise SceneError(dotted(key, "channel"), channel, f"one of {', '.join(CHANNELS)}", file)
-        return Named(name, channel)
+        return TextureReference(name, channel)
     return read_typed("texture", KINDS, raw, key, file)
 
 
@@ -51,7 +51,7 @@ def texture_of(raw: Mapping[str, Any], spec: Spec) -> TextureInput:
         texture = read_texture(raw, "", None)
     except SceneError as error:
         raise as_refused(error) from None
-    channel = texture.channel if isinstance(texture, Named) else texture.values.get("channel")
+    channel = texture.channel if isinstance(texture, TextureReference) else texture.values.get("channel")
     if coloured and channel is not None:
         raise Refused("no channel where a colour is wanted", channel, ("channel",))
     if isinstance(texture, ParsedParams):
@@ -84,7 +84,7 @@ def check_texture(
         SceneError: an unknown texture, or one that the slot cannot read.
     """
     texture = slot.texture
-    if isinstance(texture, Named):
+    if isinstance(texture, TextureReference):
         if texture.texture not in textures:
             known = ", ".join(textures) or "none is defined"
             where = key if key.endswith(".texture") else f"{key}.texture"

@@ -21,7 +21,7 @@ from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Copy, Part, Source
 from torchpt.physics.shapes.geometry import KINDS, Geometry, LaneGeometry
 from torchpt.physics.shapes.primitive import Corners
-from torchpt.physics.textures import tables_of
+from torchpt.physics.textures import build_tables
 from torchpt.physics.textures.records import LaneTextures
 from torchpt.physics.world import World
 from torchpt.scene.space import MAX_COORDINATE, Space
@@ -74,7 +74,7 @@ def assemble(
     materials = {owner.material.name: _with_scaled_bump(owner.material, space.unit) for owner in owners}
     lane_materials = {name: lane_material(material, parameters, dtype) for name, material in materials.items()}
     nodes = [node for material in materials.values() for node in material.textures()]  # uses of textures
-    tables, node_positions = tables_of(nodes, parameters, dtype, device)
+    tables, node_positions = build_tables(nodes, parameters, dtype, device)
     groups = groups_of(materials, lane_materials, node_positions, parameters, dtype, device)
     opacity = opacity_of(owners, lane_materials, slot_counts, dtype, device)
     # (P + I,) 0 where a surface emits, else 1; instances cannot emit.

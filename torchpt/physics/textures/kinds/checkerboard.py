@@ -34,23 +34,23 @@ class Checkerboard(Mapped):
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
         """See :meth:`Texture.open`."""
-        channel = opening.number(CHANNELS[:4], "squares have no alpha")
+        channel = opening.channel_index(CHANNELS[:4], "squares have no alpha")
         opening.declare_all(cls, values)
-        matrix = cls.matrix(values, values["scale"])
+        matrix = cls.matrix(values, repeats=values["scale"])
         filtered = values["filter"] in cls.filters
         return ImageNode(
-            opening.name,
-            channel,
+            texels=opening.name,  # the name that `_squares` finds the colours by
+            channel=channel,
             wrap="repeat",
             nearest=True,
             transform=matrix,
             scale=(1.0, 1.0, 1.0),
             filtered=filtered,
-            made=_squares,
+            compute=_squares,
         )
 
 
 def _squares(parameters: Mapping[str, Tensor], name: str) -> Tensor:
-    """Return the image ``(2, 2, 3)``; ``name``: the texture's dotted name."""
+    """Return the image ``(2, 2, 3)`` of one repeat; ``name``: the texture's dotted name."""
     a, b = parameters[f"{name}.color0"], parameters[f"{name}.color1"]
     return torch.stack((torch.stack((a, b)), torch.stack((b, a))))

@@ -1,4 +1,8 @@
-"""Image textures from files or arrays. The texels become one parameter ``(H, W, C)``; a file is read once a scene."""
+"""Image textures from files or arrays. The texels become one parameter ``(H, W, C)``; a file is read once a scene.
+
+A slot is the parameter of a material whose values the texture gives; opened for it, the texture becomes an ``ImageNode``, which
+``atlas.py`` looks up.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,8 @@ __all__ = ["MOST_PIXELS", "Image"]
 MOST_PIXELS = 2**30
 
 
-def _source(value: Any) -> tuple[str, ...] | EncodedImage:
+def _read_source(value: Any) -> tuple[str, ...] | EncodedImage:
+    """Return the value of ``path``: the parts of a path, or an image within a mesh file, still encoded."""
     return value if isinstance(value, EncodedImage) else Path().read(value)
 
 
@@ -35,7 +40,7 @@ class Image(Mapped):
     parameters: ClassVar = {
         "path": Custom(
             None,
-            reader=_source,
+            reader=_read_source,
             words=Path().accepted,
             doc="PNG, JPEG, TGA, BMP, PPM, EXR or HDR; 8 or 16 bits, half or float",
         ),
@@ -66,7 +71,7 @@ class Image(Mapped):
 
     @classmethod
     def label(cls, values: Mapping[str, Any]) -> str | None:
-        """See :meth:`Texture.label`."""
+        """Return the image's file, or its label within a mesh file."""
         path = values["path"]
         return path.label if isinstance(path, EncodedImage) else path[0] if path else None
 
@@ -79,7 +84,7 @@ class Image(Mapped):
 
     @classmethod
     def check_slot(cls, values: Mapping[str, Any], coloured: bool) -> None:
-        """See :meth:`Texture.check_slot`."""
+        """Refuse three different factors where a number is wanted."""
         if not coloured and len(set(values["scale"])) > 1:
             raise Refused("one number as scale where a number is wanted", list(values["scale"]), ("scale",))
 
@@ -87,10 +92,11 @@ class Image(Mapped):
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
         """See :meth:`Texture.open`."""
         slot, scale = opening.slot, values["scale"]
-        label, picture = _picture(values, opening)
+        label, picture = _read_image(values, opening)
         channel = opening.channel or values["channel"] or "luminance"
         alpha = not slot.coloured and channel == "a"  # alpha is always linear
         space = values["colorspace"]
+        # Files of 8 bits a value hold sRGB, unless the file or the slot says otherwise.
         decode = picture.eight_bit and (space == "srgb" or (space == "auto" and (alpha or not slot.linear)))
         channels = picture.values.shape[2]
         if alpha and channels in (1, 3):
@@ -98,9 +104,9 @@ class Image(Mapped):
         if not slot.coloured and len(set(scale)) > 1:
             expected = f"one number, as {opening.key} is one"
             raise SceneError(f"{opening.name}.scale", list(scale), expected, opening.file)
-        name = _declared(opening, label, picture, decode, alpha, scale)
+        name = _declare_texels(opening, label, picture, scale, decode=decode, alpha=alpha)
         index = None
-        if not slot.coloured:
+        if not slot.coloured:  # the channel's index among the texels; -1: luminance
             grey = channels < 3
             index = {
                 "luminance": 0 if grey else -1,
@@ -109,11 +115,18 @@ class Image(Mapped):
                 "b": 0 if grey else 2,
                 "a": channels - 1,
             }[channel]
-        matrix, filter = cls.matrix(values), values["filter"]
-        return ImageNode(name, index, values["wrap"], filter == "nearest", matrix, scale, filter in cls.filters)
+        return ImageNode(
+            texels=name,
+            channel=index,
+            wrap=values["wrap"],
+            nearest=values["filter"] == "nearest",
+            transform=cls.matrix(values),
+            scale=scale,
+            filtered=values["filter"] in cls.filters,
+        )
 
 
-def _picture(values: Mapping[str, Any], opening: Opening) -> tuple[str, Texels]:
+def _read_image(values: Mapping[str, Any], opening: Opening) -> tuple[str, Texels]:
     """Return the name of an image for errors, and its values as stored."""
     if values["data"] is not None:
         return f"{opening.name}.data", values["data"]
@@ -122,26 +135,38 @@ def _picture(values: Mapping[str, Any], opening: Opening) -> tuple[str, Texels]:
     else:
         source = opening.resolve(values["path"], f"{opening.name}.path")
         label = str(source)
-    most = MAX_PIXELS if values["max_pixels"] is None else values["max_pixels"]
-    picture = opening.pictures.get(label)
-    if picture is None or picture.values.shape[0] * picture.values.shape[1] > most:
-        picture = opening.pictures[label] = read_texels(source, most)
+    max_pixels = MAX_PIXELS if values["max_pixels"] is None else values["max_pixels"]
+    picture = opening.image_cache.get(label)
+    # An image that another slot allowed to be larger is read again, which refuses it by name.
+    if picture is None or picture.values.shape[0] * picture.values.shape[1] > max_pixels:
+        picture = opening.image_cache[label] = read_texels(source, max_pixels)
     return label, picture
 
 
-def _declared(
-    opening: Opening, label: str, picture: Texels, decode: bool, alpha: bool, scale: tuple[float, float, float]
+def _declare_texels(
+    opening: Opening, label: str, picture: Texels, scale: tuple[float, float, float], *, decode: bool, alpha: bool
 ) -> str:
-    """Declare an image's texels as a parameter, decoded or as stored, and return its name; alpha is the same in both."""
+    """Declare an image's texels as a parameter, and return its name.
+
+    Args:
+        opening: the slot.
+        label: name of the image for errors.
+        picture: the image as stored.
+        scale: factors of the values, which count for the range that the slot accepts.
+        decode: whether colours are decoded from sRGB.
+        alpha: whether the slot reads the alpha channel: then either form will do, as alpha is the same in both.
+    """
     texels = _decoded(opening, label, picture) if decode else picture.values
-    name, others = opening.name, opening.parameters
-    if name in others and others[name] is not texels and not alpha:
+    name, parameters = opening.name, opening.parameters
+    if name in parameters and parameters[name] is not texels and not alpha:
         name += ".decoded" if decode else ".stored"  # an image for both colours and numbers has two sets of texels
-    if name in others:
-        texels = others[name]
+    if name in parameters:
+        texels = parameters[name]
     opening.check(texels, opening.key, label, scale)
+    # The slack admits rounding at the bounds.
     spec = TexelsSpec(low=None, slack=1e-6, moves=opening.slot.moves, doc="texels `(H, W, C)`, linear")
-    opening.declare(name, texels, opening.ranged(spec, scale))
+    opening.declare(name, texels, opening.restricted(spec, scale))
+    # Texels of `data` were stated in the scene, not read from a file.
     if label == f"{opening.name}.data":
         opening.parameters.stated.add(name)
     return name
@@ -149,10 +174,11 @@ def _declared(
 
 def _decoded(opening: Opening, label: str, picture: Texels) -> np.ndarray:
     """Return the texels with colours decoded from sRGB."""
-    key = (label, "decoded")
-    if key not in opening.pictures:
+    key = (label, "decoded")  # cached, as other slots recognize the array by its identity
+    if key not in opening.image_cache:
         values = picture.values.copy()
+        # The last of 2 or 4 channels is alpha.
         colours = values.shape[2] - (1 if values.shape[2] in (2, 4) else 0)
         values[..., :colours] = srgb_to_linear(torch.from_numpy(values[..., :colours])).numpy()
-        opening.pictures[key] = values
-    return opening.pictures[key]
+        opening.image_cache[key] = values
+    return opening.image_cache[key]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,15 +23,17 @@ from torchpt.spec import Choice, Color, Integer, Scalar
 __all__ = ["Noise"]
 
 #: Coordinates are clamped to this distance from the origin in cells, where float32 has no fraction anyway.
-_FAR = 2.0**30
+_FARTHEST = 2.0**30
 #: Components of a gradient: cosine and sine of 22.5 degrees.
 _LONG, _SHORT = math.cos(math.pi / 8.0), math.sin(math.pi / 8.0)
-#: With these gradients an octave lies within -0.661..0.661.
+#: With these gradients an octave lies within -0.661..0.661: times this, plus 0.5, it stays within 0..1.
 _GAIN = 0.75
+#: 2^32 over the golden ratio: multiples of it have bits that look unrelated, which makes them good seeds of a hash.
 _GOLDEN = 0x9E3779B9
-_COVERED = 64.0
+#: Footprints of this area in cells leave nothing of an octave: 2^-64.
+_MAX_AREA = 64.0
 
-Values = Mapping[str, Tensor]
+Values = Mapping[str, Tensor]  # parameters by name, per lane
 
 
 @dataclass(frozen=True)
@@ -65,90 +67,141 @@ class Noise(Computed):
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Noise:
-        """See :meth:`Computed.of`."""
-        return cls(values["octaves"])
+        """Return the variant with this number of octaves: its code is compiled with the loop unrolled."""
+        return cls(octaves=values["octaves"])
 
     def constants(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a hash key for the gradients of each octave and a shift of its grid, as unshifted octaves share zeros."""
+        """Return a hash key for the gradients of each octave and a shift of its grid.
+
+        Noise is 0 at the points of its grid; shifts, in cells, keep octaves from being 0 at the same points.
+        """
         keys = [as_int32(mix_int(mix_int(values["seed"] + _GOLDEN) + k * _GOLDEN)) for k in range(self.octaves)]
+        # 16 bits of a hash as a fraction in [0, 1), for both axes of each octave after the first.
         shifts = [(mix_int(key + axis) >> 8 & 0xFFFF) / 2**16 for key in keys[1:] for axis in (1, 2)]
         return {"keys": tuple(keys), "shifts": (0.0, 0.0, *shifts)}
 
     def value(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> Tensor:
         """See :meth:`Computed.value`."""
-        height, whole = torch.zeros_like(x), torch.zeros_like(x)
-        for weight, _, kept, at, key in self._octaves(p, x, y, area):
-            whole = whole + weight
-            height = torch.addcmul(height, weight if kept is None else weight * kept, _noise(at, key, False)[0])
-        return p["color0"] + (p["color1"] - p["color0"]) * (0.5 + _GAIN * (height / whole))
+        height, total_weight = torch.zeros_like(x), torch.zeros_like(x)
+        for octave in self._octaves(p, x, y, area):
+            weight, attenuation = octave.weight, octave.attenuation
+            total_weight = total_weight + weight
+            if attenuation is not None:
+                weight = weight * attenuation
+            height = torch.addcmul(height, weight, _noise(octave.x, octave.y, octave.key))
+        return p["color0"] + (p["color1"] - p["color0"]) * (0.5 + _GAIN * (height / total_weight))
 
     def slope(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> tuple[Tensor, Tensor]:
         """See :meth:`Computed.slope`."""
-        across, along, whole = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x)
-        for weight, cells, kept, at, key in self._octaves(p, x, y, area):
-            whole = whole + weight
-            weight = weight * cells if kept is None else weight * cells * kept
-            dx, dy = _noise(at, key, True)
-            across, along = torch.addcmul(across, weight, dx), torch.addcmul(along, weight, dy)
-        factor = (p["color1"] - p["color0"]) * (_GAIN / whole)
-        return across * factor, along * factor
+        along_x, along_y, total_weight = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x)
+        for octave in self._octaves(p, x, y, area):
+            total_weight = total_weight + octave.weight
+            weight = octave.weight * octave.frequency
+            if octave.attenuation is not None:
+                weight = weight * octave.attenuation
+            dx, dy = _noise_slope(octave.x, octave.y, octave.key)
+            along_x, along_y = torch.addcmul(along_x, weight, dx), torch.addcmul(along_y, weight, dy)
+        factor = (p["color1"] - p["color0"]) * (_GAIN / total_weight)
+        return along_x * factor, along_y * factor
 
-    def _octaves(
-        self, p: Values, x: Tensor, y: Tensor, area: Tensor | None
-    ) -> Iterator[tuple[Tensor, Tensor, Tensor | None, tuple[Tensor, Tensor], Tensor]]:
-        """Yield for each octave weight, frequency, attenuation by the footprint, coordinates in cells, and hash key."""
-        weight, cells, shifts = torch.ones_like(x), p["scale"], p["shifts"]
-        if area is not None:  # in cells; footprints above this size attenuate every octave to nothing
-            area = (area * cells * cells).clamp_max(_COVERED)
+    def _octaves(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> Iterator[_Octave]:
+        """Yield the octaves at points; arguments as for :meth:`Computed.value`."""
+        weight, frequency, shifts = torch.ones_like(x), p["scale"], p["shifts"]
+        if area is not None:  # from here on in cells of the octave
+            area = (area * frequency * frequency).clamp_max(_MAX_AREA)
         for k in range(self.octaves):
             if k:
-                weight, cells = weight * p["persistence"], cells * p["lacunarity"]
+                weight, frequency = weight * p["persistence"], frequency * p["lacunarity"]
                 area = None if area is None else area * p["lacunarity"] * p["lacunarity"]
             # The mean over a square of area a is about 2^-a times the noise at its centre (a least-squares fit).
-            kept = None if area is None else (area * -math.log(2.0)).exp()
-            yield weight, cells, kept, (x * cells + shifts[2 * k], y * cells + shifts[2 * k + 1]), p["keys"][k]
+            attenuation = None if area is None else (area * -math.log(2.0)).exp()
+            shifted_x, shifted_y = x * frequency + shifts[2 * k], y * frequency + shifts[2 * k + 1]
+            yield _Octave(weight, frequency, attenuation, shifted_x, shifted_y, p["keys"][k])
 
 
-def _noise(at: tuple[Tensor, Tensor], key: Tensor, slope: bool) -> tuple[Tensor, ...]:
-    """Return gradient noise ``(N,)`` at coordinates ``at``, or with ``slope`` its derivatives; ``key``: int32 hash key."""
-    x, y = (w.clamp(-_FAR, _FAR) for w in at)
+class _Octave(NamedTuple):
+    """One octave at N points, each ``(N,)``."""
+
+    weight: Tensor  # amplitude over that of the first octave
+    frequency: Tensor  # cells per unit of the coordinates
+    attenuation: Tensor | None  # by the footprint; None: unfiltered
+    x: Tensor  # coordinates in cells
+    y: Tensor
+    key: Tensor  # int32 hash key
+
+
+class _Cell(NamedTuple):
+    """The cell of N points: gradients at its four corners, and their products with the offsets from there.
+
+    Corners are a, b (left and right) at the smaller y, and c, d at the larger one; each tensor is ``(N,)``.
+    """
+
+    gradients_x: tuple[Tensor, Tensor, Tensor, Tensor]
+    gradients_y: tuple[Tensor, Tensor, Tensor, Tensor]
+    products: tuple[Tensor, Tensor, Tensor, Tensor]
+    x: Tensor  # coordinates within the cell, 0 to 1
+    y: Tensor
+
+
+def _cell(x: Tensor, y: Tensor, key: Tensor) -> _Cell:
+    """Return the cells of coordinates ``x, y (N,)``; ``key``: int32 hash key ``(N,)``."""
+    x, y = (coordinate.clamp(-_FARTHEST, _FARTHEST) for coordinate in (x, y))
     i, j = x.detach().floor(), y.detach().floor()
     x, y = x - i, y - j
     i, j = i.to(torch.int32), j.to(torch.int32)
     left, right = mix(i ^ key), mix((i + 1) ^ key)
     (ax, ay), (bx, by), (cx, cy), (dx, dy) = (
-        _direction(mix(column + row), x) for row in (j, j + 1) for column in (left, right)
+        _gradient(mix(column + row), x) for row in (j, j + 1) for column in (left, right)
     )
     x1, y1 = x - 1.0, y - 1.0
     a, b = torch.addcmul(ax * x, ay, y), torch.addcmul(bx * x1, by, y)
     c, d = torch.addcmul(cx * x, cy, y1), torch.addcmul(dx * x1, dy, y1)
-    u, v = _fade(x), _fade(y)
-    low, high = _between(a, b, u), _between(c, d, u)
-    if not slope:
-        return (_between(low, high, v),)
+    return _Cell((ax, bx, cx, dx), (ay, by, cy, dy), (a, b, c, d), x, y)
+
+
+def _noise(x: Tensor, y: Tensor, key: Tensor) -> Tensor:
+    """Return gradient noise ``(N,)``; arguments as for :func:`_cell`."""
+    cell = _cell(x, y, key)
+    a, b, c, d = cell.products
+    u, v = _fade(cell.x), _fade(cell.y)
+    return _lerp(_lerp(a, b, u), _lerp(c, d, u), v)
+
+
+def _noise_slope(x: Tensor, y: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the derivatives ``(N,)`` of gradient noise by both coordinates; arguments as for :func:`_cell`."""
+    cell = _cell(x, y, key)
+    (ax, bx, cx, dx), (ay, by, cy, dy), (a, b, c, d) = cell.gradients_x, cell.gradients_y, cell.products
+    u, v = _fade(cell.x), _fade(cell.y)
+    low, high = _lerp(a, b, u), _lerp(c, d, u)
     return (
-        torch.addcmul(_between(_between(ax, bx, u), _between(cx, dx, u), v), _between(b - a, d - c, v), _fade_slope(x)),
-        torch.addcmul(_between(_between(ay, by, u), _between(cy, dy, u), v), high - low, _fade_slope(y)),
+        torch.addcmul(_lerp(_lerp(ax, bx, u), _lerp(cx, dx, u), v), _lerp(b - a, d - c, v), _fade_slope(cell.x)),
+        torch.addcmul(_lerp(_lerp(ay, by, u), _lerp(cy, dy, u), v), high - low, _fade_slope(cell.y)),
     )
 
 
-def _between(a: Tensor, b: Tensor, t: Tensor) -> Tensor:
+def _lerp(a: Tensor, b: Tensor, t: Tensor) -> Tensor:
+    """Interpolate linearly from ``a`` at ``t`` 0 to ``b`` at ``t`` 1."""
     return torch.addcmul(a, b - a, t)
 
 
-def _direction(bits: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return one of eight gradients by three bits of a hash: which component is longer, and the two signs."""
-    swap, x, y = (logical_shift(bits, 31 - k) & 1 for k in range(3))
-    swap, x, y = (bit.to(like.dtype) for bit in (swap, x, y))
+def _gradient(bits: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return one of eight gradients by the top three bits of a hash: which component is longer, and the two signs.
+
+    ``like``: a tensor of the dtype of the result.
+    """
+    swap, negative_x, negative_y = (logical_shift(bits, 31 - k) & 1 for k in range(3))
+    swap, negative_x, negative_y = (bit.to(like.dtype) for bit in (swap, negative_x, negative_y))
     return (
-        (_LONG + (_SHORT - _LONG) * swap) * (1.0 - 2.0 * x),
-        (_SHORT + (_LONG - _SHORT) * swap) * (1.0 - 2.0 * y),
+        (_LONG + (_SHORT - _LONG) * swap) * (1.0 - 2.0 * negative_x),
+        (_SHORT + (_LONG - _SHORT) * swap) * (1.0 - 2.0 * negative_y),
     )
 
 
 def _fade(t: Tensor) -> Tensor:
+    """Return ``6 t^5 - 15 t^4 + 10 t^3``."""
     return t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
 
 
 def _fade_slope(t: Tensor) -> Tensor:
+    """Return the derivative of :func:`_fade`: ``30 t^2 (t - 1)^2``."""
     return 30.0 * t * t * (t * (t - 2.0) + 1.0)

@@ -1,4 +1,7 @@
-"""Vertex colours, interpolated over triangles."""
+"""Vertex colours, interpolated over triangles.
+
+The surface gives the colours with each point (``TexturePoint.colors``), so the node and the table have no values of their own.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,8 @@ __all__ = ["VertexColor"]
 
 @dataclass(frozen=True)
 class _Node(Node):
+    """One use of vertex colours."""
+
     channel: int | None
     filtered: bool = False
     reads: ClassVar[str] = "colors"
@@ -28,18 +33,20 @@ class _Node(Node):
     def table(
         self, nodes: Sequence[Any], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
     ) -> Table:
-        return _Table(self.channel)
+        return _Table(channel=self.channel)
 
 
 @dataclass(frozen=True)
 class _Table(Table):
+    """All uses of one channel, or of the colours, whatever the mesh."""
+
     channel: int | None
 
     @property
     def count(self) -> int:
         return 0  # no values of its own
 
-    def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
+    def look_up(self, nodes: Tensor, point: TexturePoint, *, coloured: bool) -> Tensor:
         assert point.colors is not None
         if self.channel is None:
             return point.colors
@@ -55,4 +62,4 @@ class VertexColor(Texture):
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
         """See :meth:`Texture.open`."""
-        return _Node(opening.number(CHANNELS[:4], "vertices have no alpha"))
+        return _Node(channel=opening.channel_index(CHANNELS[:4], "vertices have no alpha"))
