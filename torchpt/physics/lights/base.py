@@ -1,4 +1,9 @@
-"""Base classes of lights: all emitters, lights without a surface, environments."""
+"""Base classes of lights: all emitters, lights without a surface, environments.
+
+All lights of a scene lie in one table (:class:`Lights`), a row for each. Lights with a surface have a row for each primitive
+that emits; :class:`Light`, here, is the base of the others (point, spot, ...). While a world is built, :meth:`Light.row`
+makes the row from the parameters in the scene file; while paths are traced, :meth:`Light.sample` reads it.
+"""
 
 from __future__ import annotations
 
@@ -35,30 +40,30 @@ __all__ = [
     "taken",
 ]  # fmt: skip
 
-#: Columns of the table that every row has.
+#: Columns of the table that every row has, fields of :class:`Lights` by name.
 COLUMNS = ("p0", "e1", "e2", "normal", "flip", "area", "bound", "radiance")
 
 
 def taken(lights: Lights, row: Tensor | None) -> Lights:
     """Return the rows ``row (N,)`` of the table, one a lane; for None the table itself, whose single row broadcasts."""
-    bent = lights.quadrics
-    if bent is not None:
+    quadrics = lights.quadrics
+    if quadrics is not None:
         assert lights.quadric is not None
-        bent = rows_of(bent, lights.quadric if row is None else take(lights.quadric, row))
+        quadrics = rows_of(quadrics, lights.quadric if row is None else take(lights.quadric, row))
     if row is None:
-        return lights if bent is None else replace(lights, quadrics=bent)
-    covered = None if lights.opacity is None else take(lights.opacity, row)
+        return lights if quadrics is None else replace(lights, quadrics=quadrics)
+    opacity = None if lights.opacity is None else take(lights.opacity, row)
     columns = {name: take(getattr(lights, name), row) for name in COLUMNS}
-    return replace(lights, opacity=covered, quadrics=bent, **columns)
+    return replace(lights, opacity=opacity, quadrics=quadrics, **columns)
 
 
 @dataclass(frozen=True)
 class Cone:
-    """Cones of emission of K lights about ``Lights.normal``, and intensities: see :func:`torchpt.physics.lights.tree.build`."""
+    """Cones that bound the emission of K lights, for the light tree; their axes are ``Lights.normal``."""
 
-    cos_o: Tensor | float  # (K,)
-    cos_e: Tensor | float  # (K,)
-    intensity: Tensor  # (K,)
+    cos_o: Tensor | float  # (K,) cosine of the half angle of the cone that holds all normals; -1: all directions
+    cos_e: Tensor | float  # (K,) cosine of the largest angle between a normal and emitted light; 0: its hemisphere
+    intensity: Tensor  # (K,) largest radiant intensity in any direction, up to a factor common to all lights
 
 
 class Emitter:
@@ -85,7 +90,7 @@ class Emitter:
             intensity: power over pi ``(K,)``: the intensity of a flat emitter along its normal.
         """
         # All directions; the mean projected area of a convex surface is a quarter of its area.
-        return Cone(-1.0, 0.0, intensity * 0.25)
+        return Cone(cos_o=-1.0, cos_e=0.0, intensity=intensity * 0.25)
 
 
 @dataclass(frozen=True)
@@ -93,11 +98,11 @@ class Setting:
     """Parameters of a light and properties of its scene, from which :meth:`Light.row` makes a row.
 
     Attributes:
-        given: returns a parameter of the light by its key, in the scene's coordinates.
+        given: function that returns a parameter of the light by its key, in the scene's coordinates.
         values: parameters as loaded, for those that are no tensors: flags, choices, integers.
-        place: maps a point ``(3,)`` of the scene to world coordinates, float64.
+        place: function that maps a point ``(3,)`` of the scene to world coordinates, float64.
         unit: length of the world unit in scene units.
-        reach: ``()`` float64 radius of the scene in world units.
+        reach: ``()`` float64 radius of the scene in world units; the power of a distant light grows with its square.
         dtype: dtype of the world.
     """
 
@@ -124,8 +129,8 @@ class Setting:
         """
         scaled = self[key] / self.unit**2
         if not bool(torch.isfinite(scaled.float()).all()):
-            most = torch.finfo(torch.float32).max * self.unit**2
-            expected = f"at most {most:.3g} in a scene this small: what arrives is beyond float32"
+            largest = torch.finfo(torch.float32).max * self.unit**2
+            expected = f"at most {largest:.3g} in a scene this small: what arrives is beyond float32"
             raise Refused(expected, self[key].tolist(), (key,))
         return scaled
 
@@ -162,7 +167,7 @@ class Light(Emitter):
     Attributes:
         name: the ``type`` in a scene file.
         parameters: specs of the parameters.
-        places: names of parameters that are points within the world; its unit covers their distances too.
+        places: names of parameters that are points; the world unit is chosen so that they too stay within float32.
     """
 
     parameters: ClassVar[Mapping[str, Spec]] = {}
@@ -170,7 +175,7 @@ class Light(Emitter):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """Refuse values that contradict each other.
+        """Refuse values that contradict each other; ``given`` are the names of the parameters that the scene file sets.
 
         Raises:
             Refused: with the parameter and the accepted values.
@@ -206,8 +211,8 @@ class Light(Emitter):
         """Sample a point on the light or a direction toward it.
 
         Args:
-            at: rows of the table, one a lane.
-            x: reference points ``(3, N)``.
+            at: rows of the table, one a lane, as from :func:`taken`.
+            x: points to be lit ``(3, N)``.
             u: ``(2, N)`` in [0, 1).
             mis: whether the sample is combined with BSDF sampling by MIS.
 
@@ -225,7 +230,7 @@ class EnvironmentImage:
     Attributes:
         texels: ``(H, W, 3)`` radiance.
         turn: ``(3, 3)`` from the world to the image's own space; None for the identity.
-        even: whether all texels are equal.
+        even: whether all texels are equal, so that the radiance is constant.
     """
 
     texels: Tensor
@@ -234,7 +239,7 @@ class EnvironmentImage:
 
 
 class Environment(Light):
-    """A light that surrounds the scene. Its methods take the :attr:`Row.environment` that its :meth:`row` returned."""
+    """A light that surrounds the scene. Methods take as ``around`` the :attr:`Row.environment` that :meth:`row` returned."""
 
     distant = True
     environment = True
@@ -251,7 +256,7 @@ class Environment(Light):
 
     @classmethod
     def info(cls, around: Any) -> dict[str, Any]:
-        """Return entries for ``torchpt info``."""
+        """Return what ``torchpt info`` prints about the environment, by name."""
         return {}
 
 

@@ -1,4 +1,9 @@
-"""Light samplers: the choice of a light uniformly, by power, or by the light tree, and the bounds for the tree."""
+"""Light samplers: choose a light uniformly, by power, or by the light tree, and bound lights for the tree.
+
+A light sampler chooses a row of the light table (:class:`Lights`). Rows of *local* lights, those at a finite distance, come
+first; rows of *distant* ones (directional lights, environments) follow. A light tree holds the local lights only.
+:func:`light_sampler` is called while a world is built; :func:`draw` and :func:`probability` are called on lanes.
+"""
 
 from __future__ import annotations
 
@@ -37,12 +42,12 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of K lights, arguments of :func:`torchpt.physics.lights.tree.build`; float64, detached."""
+    """Bounds of K lights, in the order of arguments of :func:`torchpt.physics.lights.tree.build`; float64, detached."""
 
-    low: Tensor  # (3, K)
-    high: Tensor  # (3, K)
-    axis: Tensor  # (3, K)
-    cos_o: Tensor  # (K,)
+    low: Tensor  # (3, K) lower corner of the bounding box
+    high: Tensor  # (3, K) upper corner
+    axis: Tensor  # (3, K) unit axis of the cone of emission
+    cos_o: Tensor  # (K,) as in torchpt.physics.lights.base.Cone
     cos_e: Tensor  # (K,)
     intensity: Tensor  # (K,)
 
@@ -55,17 +60,18 @@ def bounds_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor]) -> Bo
         power: power of all rows ``(K,)``.
         boxes: lower and upper corners ``(3, E)`` of the boxes of the E emissive primitives, which are the first rows.
     """
-    near = [kind for kind in map(emitter, lights.kinds) if not kind.distant]
-    number = torch.zeros_like(lights.area, dtype=torch.int64) if lights.kind is None else lights.kind
-    count = int((number < len(near)).sum())
-    number = number[:count]
+    local_kinds = [kind for kind in map(emitter, lights.kinds) if not kind.distant]
+    kind_of_row = torch.zeros_like(lights.area, dtype=torch.int64) if lights.kind is None else lights.kind
+    count = int((kind_of_row < len(local_kinds)).sum())
+    kind_of_row = kind_of_row[:count]
     columns = {name: getattr(lights, name)[..., :count].detach().double() for name in COLUMNS}
-    place, surfaces = columns["p0"], boxes[0].shape[1]
-    low, high = (torch.cat((box.double(), place[:, surfaces:]), 1) for box in boxes)
-    cos_o, cos_e = torch.empty_like(place[0]), torch.empty_like(place[0])
+    position, num_surfaces = columns["p0"], boxes[0].shape[1]
+    # The box of a light without a surface is its position.
+    low, high = (torch.cat((corner.double(), position[:, num_surfaces:]), 1) for corner in boxes)
+    cos_o, cos_e = torch.empty_like(position[0]), torch.empty_like(position[0])
     intensity = power[:count].detach().double() / math.pi
-    for k, kind in enumerate(near):
-        rows = (number == k).nonzero().squeeze(1)
+    for k, kind in enumerate(local_kinds):
+        rows = (kind_of_row == k).nonzero().squeeze(1)
         at = replace(lights, **{name: column.index_select(-1, rows) for name, column in columns.items()})
         cone = kind.bounds(at, intensity[rows])
         cos_o[rows], cos_e[rows], intensity[rows] = cone.cos_o, cone.cos_e, cone.intensity
@@ -77,13 +83,17 @@ def bounds_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor]) -> Bo
 # :func:`draw` returns rows and their probabilities, :func:`probability` the probability of a row whose light a ray hit.
 
 
-#: Values of `light_choice`; auto is `power` below MANY local lights, else `tree`.
+#: Values of the integrators' key `light_choice`; auto is `power` below :data:`MANY` local lights, else `tree`.
 LIGHT_SAMPLERS = ("auto", "uniform", "power", "tree")
+#: Number of local lights from which on `auto` takes the light tree.
 MANY = 3
-#: Probability of a uniform choice instead of the tree: at most EVEN, EACH / K among K lights, 0 beyond FEW lights. The tree
-#: ignores the BSDF and may nearly always choose the wrong light for a glossy surface. At 64 samples a pixel the uniform share
-#: halves the error of four plates under five lights; among many lights it would not help, and cost where one outshines all.
-EVEN, EACH, FEW = 0.25, 2.0, 64
+#: A tree of K lights is mixed with a uniform choice, of probability ``min(UNIFORM_MOST, UNIFORM_LIGHTS / K)``, and 0 beyond
+#: UNIFORM_MAX_COUNT lights. The tree ignores the BSDF and may nearly always choose the wrong light for a glossy surface. At 64
+#: samples a pixel the mixture halves the error of four plates under five lights; among many lights it would not help, and
+#: cost where one outshines all.
+UNIFORM_MOST, UNIFORM_LIGHTS, UNIFORM_MAX_COUNT = 0.25, 2.0, 64
+#: The largest float64 below 1.
+_BELOW_ONE = 1.0 - 2.0**-53
 
 
 @dataclass(frozen=True)
@@ -91,13 +101,13 @@ class TreeSampler:
     """Light sampler of a light tree over local lights, and a choice by power between it and each distant light."""
 
     tree: LightTree
-    beside: Distribution1D | None  # over the tree (0) and the distant rows; None without distant lights
-    even: Distribution1D | None  # uniform over the rows of the tree; None if it is never used
-    share: Tensor  # () float64 probability of `even` among choices of local lights
+    tree_or_distant: Distribution1D | None  # outcome 0: the tree; 1 + k: distant light k; None without distant lights
+    uniform: Distribution1D | None  # over the rows of the tree; None if it is never used
+    uniform_probability: Tensor  # () float64 probability of `uniform` in place of the tree
 
 
 def light_sampler(
-    lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: str
+    lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], light_choice: str
 ) -> Distribution1D | TreeSampler | None:
     """Return the light sampler of a table, None for a single light.
 
@@ -105,25 +115,30 @@ def light_sampler(
         lights: the table; its field ``choice`` is not read.
         power: power of the rows ``(K,)``, float64.
         boxes: lower and upper corners ``(3, E)`` of the boxes of the E emissive primitives, which are the first rows.
-        way: one of :data:`LIGHT_SAMPLERS`.
+        light_choice: one of :data:`LIGHT_SAMPLERS`.
     """
     dtype = lights.area.dtype
     if len(power) == 1:
         return None
-    if way in ("uniform", "power") or (way == "auto" and len(power) < MANY):
-        return Distribution1D.of((power > 0).double() if way == "uniform" else power, dtype)
+    if light_choice in ("uniform", "power") or (light_choice == "auto" and len(power) < MANY):
+        return Distribution1D.of((power > 0).double() if light_choice == "uniform" else power, dtype)
     bounds = bounds_of(lights, power, boxes)
     count = len(bounds.intensity)
-    if not count or (way == "auto" and count < MANY):
+    if not count or (light_choice == "auto" and count < MANY):
         return Distribution1D.of(power, dtype)
-    beside = None
+    tree_or_distant = None
     if count < len(power):
-        beside = Distribution1D.of(torch.cat((sum_all(power[:count]).reshape(1), power[count:])), dtype)
-    shining = (power[:count] > 0).double()
-    few = count <= FEW
-    share = min(EVEN, EACH / max(float(shining.sum()), 1.0)) if few else 0.0
-    part = torch.tensor(share, dtype=torch.float64, device=power.device)
-    return TreeSampler(tree.build(*astuple(bounds)), beside, Distribution1D.of(shining, dtype) if few else None, part)
+        weights = torch.cat((sum_all(power[:count]).reshape(1), power[count:]))
+        tree_or_distant = Distribution1D.of(weights, dtype)
+    shining = (power[:count] > 0).double()  # 1 for lights of positive power, else 0
+    mixed = count <= UNIFORM_MAX_COUNT
+    share = min(UNIFORM_MOST, UNIFORM_LIGHTS / max(float(shining.sum()), 1.0)) if mixed else 0.0
+    return TreeSampler(
+        tree=tree.build(*astuple(bounds)),
+        tree_or_distant=tree_or_distant,
+        uniform=Distribution1D.of(shining, dtype) if mixed else None,
+        uniform_probability=torch.tensor(share, dtype=torch.float64, device=power.device),
+    )
 
 
 def depends_on_point(lights: Lights | None) -> bool:
@@ -143,68 +158,71 @@ def draw(choice: Distribution1D | TreeSampler, u: Tensor, x: Tensor, n: Tensor |
         n: normals ``(3, N)``, or None, as for :func:`torchpt.physics.lights.tree.sample`.
     """
     if isinstance(choice, Distribution1D):
-        row, rest = choice.draw(u)
-        return row, take(choice.pmf, row), rest
-    if choice.beside is None:
-        return _near(choice, u, x, n)
-    beside, first = choice.beside, choice.tree.count
-    outcome, left = beside.draw(u)
-    row, p, rest = _near(choice, left, x, n)
-    near = outcome == 0
-    rest = torch.where(near, rest, left)
-    p = torch.where(near, p, 1.0) * take(beside.pmf, outcome)
-    return torch.where(near, row, outcome + (first - 1)), p, rest
+        row, remapped = choice.draw(u)
+        return row, take(choice.pmf, row), remapped
+    if choice.tree_or_distant is None:
+        return _draw_local(choice, u, x, n)
+    tree_or_distant, first_distant = choice.tree_or_distant, choice.tree.count
+    outcome, u = tree_or_distant.draw(u)
+    row, p, remapped = _draw_local(choice, u, x, n)
+    is_local = outcome == 0
+    remapped = torch.where(is_local, remapped, u)
+    p = torch.where(is_local, p, 1.0) * take(tree_or_distant.pmf, outcome)
+    return torch.where(is_local, row, outcome + (first_distant - 1)), p, remapped
 
 
-def _near(choice: TreeSampler, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Choose among local lights; see :func:`draw`."""
-    if choice.even is None:
+def _draw_local(choice: TreeSampler, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Choose among local lights; arguments and results as for :func:`draw`."""
+    if choice.uniform is None:
         return tree.sample(choice.tree, x, n, u)
-    share = choice.share
-    apart = u < share
-    row, _, rest = tree.sample(choice.tree, x, n, ((u - share) / (1.0 - share)).clamp_min(0.0))
-    other, left = choice.even.draw((u / share).clamp_max(1.0 - 2.0**-53))
-    row, rest = torch.where(apart, other, row), torch.where(apart, left, rest)
-    return row, _chance(choice, row, x, n), rest
+    share = choice.uniform_probability
+    is_uniform = u < share
+    row, _, remapped = tree.sample(choice.tree, x, n, ((u - share) / (1.0 - share)).clamp_min(0.0))
+    uniform_row, uniform_remapped = choice.uniform.draw((u / share).clamp_max(_BELOW_ONE))
+    row, remapped = torch.where(is_uniform, uniform_row, row), torch.where(is_uniform, uniform_remapped, remapped)
+    # Either way may have chosen the row, so the probability is that of the mixture.
+    return row, _local_probability(choice, row, x, n), remapped
 
 
-def _chance(choice: TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
-    """Return the probability among local lights; see :func:`probability`."""
+def _local_probability(choice: TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
+    """Return the probability ``(N,)`` of ``row (N,)``, given that a local light is chosen."""
     p = tree.probability(choice.tree, row, x, n)
-    if choice.even is None:
+    if choice.uniform is None:
         return p
-    share = choice.share.to(p.dtype)
-    return p * (1.0 - share) + take(choice.even.pmf, row) * share
+    share = choice.uniform_probability.to(p.dtype)
+    return p * (1.0 - share) + take(choice.uniform.pmf, row) * share
 
 
 def probability(choice: Distribution1D | TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """Return the probability ``(N,)`` with which :func:`draw` chooses ``row (N,)`` at ``x`` and ``n``."""
     if isinstance(choice, Distribution1D):
         return take(choice.pmf, row)
-    if choice.beside is None:
-        return _chance(choice, row, x, n)
-    first = choice.tree.count
-    p = _chance(choice, torch.minimum(row, first - 1), x, n)
-    return torch.where(row < first, p, 1.0) * take(choice.beside.pmf, (row - (first - 1)).clamp_min(0))
+    if choice.tree_or_distant is None:
+        return _local_probability(choice, row, x, n)
+    first_distant = choice.tree.count
+    p = _local_probability(choice, torch.minimum(row, first_distant - 1), x, n)
+    outcome = (row - (first_distant - 1)).clamp_min(0)
+    return torch.where(row < first_distant, p, 1.0) * take(choice.tree_or_distant.pmf, outcome)
 
 
 def environment(choice: Distribution1D | TreeSampler | None) -> Tensor | float:
     """Return the probability of the last row, the environment's if the scene has one."""
     if choice is None:
         return 1.0
-    chosen = choice if isinstance(choice, Distribution1D) else choice.beside
-    assert chosen is not None
-    return chosen.pmf[-1]
+    distribution = choice if isinstance(choice, Distribution1D) else choice.tree_or_distant
+    assert distribution is not None
+    return distribution.pmf[-1]
 
 
 def without_last(choice: Distribution1D | TreeSampler) -> Distribution1D | TreeSampler:
     """Return the light sampler without the last row, a distant light; at least one row has to be left."""
     if isinstance(choice, TreeSampler):
-        beside = choice.beside
-        assert beside is not None  # distant lights are not in the tree
-        return replace(choice, beside=None if len(beside.pmf) == 2 else _fewer(beside))
-    return _fewer(choice)
+        outcomes = choice.tree_or_distant
+        assert outcomes is not None  # distant lights are not in the tree
+        only_tree_left = len(outcomes.pmf) == 2
+        return replace(choice, tree_or_distant=None if only_tree_left else _without_last_outcome(outcomes))
+    return _without_last_outcome(choice)
 
 
-def _fewer(choice: Distribution1D) -> Distribution1D:
-    return Distribution1D.of(choice.pmf[:-1], choice.pmf.dtype)
+def _without_last_outcome(distribution: Distribution1D) -> Distribution1D:
+    return Distribution1D.of(distribution.pmf[:-1], distribution.pmf.dtype)

@@ -1,4 +1,9 @@
-"""Records of lights: the light table and light samples."""
+"""Records of lights: the light table and light samples.
+
+The table has K rows, one for each of E emissive primitives (triangle, sphere, ...) and one for each light without a surface.
+A row is a column of the tensors below, whose last axis is K. P and I are the numbers of primitives and of instances of the
+scene.
+"""
 
 from __future__ import annotations
 
@@ -25,25 +30,24 @@ class Lights:
     choice: Distribution1D | TreeSampler | None  # the light sampler; None for a single row
     kinds: tuple[str, ...]  # kinds of the rows, in their order: of SURFACES, then of KINDS
     kind: Tensor | None  # (K,) index into `kinds`; None for a single kind
-    p0: Tensor  # (3, K)
-    e1: Tensor  # (3, K)
-    e2: Tensor  # (3, K)
+    p0: Tensor  # (3, K) corner or centre of the primitive, as in LaneGeometry; position of a point or spot light
+    e1: Tensor  # (3, K) first edge of the primitive, p0 + u e1 + v e2
+    e2: Tensor  # (3, K) second edge
     normal: Tensor  # (3, K) unit, the side that emits
     flip: Tensor  # (K,) -1 where a sphere emits inward
-    area: (
-        Tensor  # (K,); for a quadric the area in object space times |det|, see torchpt.physics.lights.surfaces.quadric
-    )
+    #: (K,) area in the world; for a quadric the area in object space times |det|, see torchpt.physics.lights.surfaces.quadric
+    area: Tensor
     bound: Tensor  # (K,) rounding bound, see LaneGeometry.bound
     radiance: Tensor  # (3, K); intensity of a point or spot light, irradiance of a directional light
     opacity: Tensor | None  # (K,) opacity of the emissive surface; None if all are opaque
     environment: Any  # Row.environment of the last row; None without an environment
-    row_of_prim: Tensor | None  # (P + I,) int64, -1 for a primitive that does not emit; None if none emits
+    row_of_prim: Tensor | None  # (P + I,) int64 row by Interaction.slot; -1 if it does not emit; None if none emits
     quadric: Tensor | None  # (K,) int64 column of LaneGeometry.quadrics, 0 for other kinds; None if no quadric emits
     quadrics: Quadrics | None  # LaneGeometry.quadrics if a quadric emits
-    prim: Tensor | None  # (K,) int64 primitive; None without textured emission
-    solid: (
-        Tensor | None
-    )  # (K, 14) float64, see torchpt.physics.lights.solid_angle.table_of; None without triangles and rectangles
+    prim: Tensor | None  # (K,) int64 primitive of each row, an index below P; None without textured emission
+    #: (K, 14) float64, for sampling by solid angle, see torchpt.physics.lights.solid_angle.table_of; None without triangles and
+    #: rectangles
+    solid: Tensor | None
     shapes: tuple[int, ...]  # codes of the shapes in `solid`; static
 
 

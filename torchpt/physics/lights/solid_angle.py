@@ -60,9 +60,9 @@ def table_of(codes: Sequence[int], p0: Tensor, e1: Tensor, e2: Tensor, near: flo
 
     Args:
         codes: shape codes of the rows: :data:`TRIANGLE`, :data:`RECTANGLE` (which may be sheared) or :data:`OTHER`.
-        p0: ``(3, K)``.
-        e1: ``(3, K)``.
-        e2: ``(3, K)``.
+        p0: first corners ``(3, K)``.
+        e1: edges from ``p0`` ``(3, K)``.
+        e2: the other edges from ``p0`` ``(3, K)``.
         near: replaces :data:`NEAR`.
 
     Returns:
@@ -75,12 +75,11 @@ def table_of(codes: Sequence[int], p0: Tensor, e1: Tensor, e2: Tensor, near: flo
     code = torch.tensor(codes, device=p.device)
     skew = dot(a, b).abs() > SQUARE * (dot(a, a) * dot(b, b)).sqrt()
     code = torch.where(skew & (code == RECTANGLE), SKEW, code)
-    share = torch.where(code == TRIANGLE, 1.0 / 3.0, 0.5).double()
-    centre = (a + b) * share
+    centre = (a + b) * torch.where(code == TRIANGLE, 1.0 / 3.0, 0.5).double()  # relative to p0
     corners = [torch.zeros_like(a), a, b, torch.where(code == TRIANGLE, b, a + b)]
     square = torch.stack([dot(corner - centre, corner - centre) for corner in corners]).amax(0)
-    reach = torch.where(code == OTHER, 0.0, square * near**2)
-    return torch.cat((code.double()[None], reach[None], p + centre, p, a, b)).T.contiguous()
+    square_limit = torch.where(code == OTHER, 0.0, square * near**2)
+    return torch.cat((code.double()[None], square_limit[None], p + centre, p, a, b)).T.contiguous()
 
 
 def shapes_of(table: Tensor | None) -> tuple[int, ...]:
@@ -108,9 +107,9 @@ def sample(
         ``(u, v)`` of the points on their primitives ``(2, N)``, ``u`` itself for other shapes, and solid angles ``(N,)`` as
         from :func:`angles`: 0 where the point was sampled by area.
     """
-    shape, near, a, e, f = _seen(table, row, x)
+    shape, near, a, e, f = _lane_lights(table, row, x)
     w = u.double()
-    uv, angle = _of_shapes(shapes, shape, a, e, f, w)
+    uv, angle = _sample_shapes(shapes, shape, a, e, f, w)
     angle = torch.where(near, angle, 0.0)
     by_area = torch.where(shape == TRIANGLE, uniform_triangle(w), w) if TRIANGLE in shapes else w
     return torch.where(angle > 0, uv, by_area).to(u.dtype), angle.to(x.dtype)
@@ -123,8 +122,8 @@ def angles(table: Tensor, row: Tensor | None, x: Tensor, shapes: Sequence[int] =
 
     The angle is the same from behind: the caller has to check which side emits.
     """
-    shape, near, a, e, f = _seen(table, row, x)
-    angle = _of_shapes(shapes, shape, a, e, f, torch.zeros_like(a[:2]))[1]
+    shape, near, a, e, f = _lane_lights(table, row, x)
+    _, angle = _sample_shapes(shapes, shape, a, e, f, torch.zeros_like(a[:2]))
     return torch.where(near, angle, 0.0).to(x.dtype)
 
 
@@ -144,33 +143,39 @@ def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
     return torch.where(angle > 0, solid, by_area)
 
 
-def _seen(table: Tensor, row: Tensor | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return for each lane, in float64: shape code, mask of near lights, first corner relative to ``x``, both edges."""
+def _lane_lights(table: Tensor, row: Tensor | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return for each lane, in float64: shape code, mask of near lights, first corner relative to ``x``, both edges.
+
+    The callers name the last three ``a e f``, ``(3, N)`` each.
+    """
+    # Columns of the table: 0 shape code, 1 squared distance limit, 2:5 centre, 5:8 p0, 8:11 e1, 11:14 e2.
     lanes = (table if row is None else table[row]).T.expand(14, x.shape[1])
     away = lanes[2:5] - x.double()
     near = (lanes[0] != OTHER) & (dot(away, away) < lanes[1])
     return lanes[0], near, lanes[5:8] - x.double(), lanes[8:11], lanes[11:14]
 
 
-def _of_shapes(
+def _sample_shapes(
     shapes: Sequence[int], shape: Tensor, a: Tensor, e: Tensor, f: Tensor, u: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return points ``(2, N)`` and solid angles ``(N,)``, each lane by the formulas of its shape."""
-    forms = {TRIANGLE: _triangle, RECTANGLE: _rectangle, SKEW: _skew}
+    samplers = {TRIANGLE: _triangle, RECTANGLE: _rectangle, SKEW: _skew}
     if not shapes:
         return torch.zeros_like(a[:2]), torch.zeros_like(a[0])
-    uv, angle = forms[shapes[-1]](a, e, f, u)
+    uv, angle = samplers[shapes[-1]](a, e, f, u)
     for code in shapes[-2::-1]:
-        other, of_other = forms[code](a, e, f, u)
-        uv, angle = torch.where(shape == code, other, uv), torch.where(shape == code, of_other, angle)
+        other_uv, other_angle = samplers[code](a, e, f, u)
+        uv, angle = torch.where(shape == code, other_uv, uv), torch.where(shape == code, other_angle, angle)
     return uv, angle
 
 
 def _reciprocal(a: Tensor) -> Tensor:
+    """Return ``1 / a`` of ``a >= 0``, finite at 0."""
     return a.clamp_min(1e-300).reciprocal()
 
 
-def _within(angle: Tensor) -> Tensor:
+def _zero_out_of_range(angle: Tensor) -> Tensor:
+    """Return solid angles, 0 outside of :data:`LEAST` to :data:`MOST`: those lights are sampled by area."""
     return torch.where((angle >= LEAST) & (angle <= MOST), angle, 0.0)
 
 
@@ -181,16 +186,22 @@ def _unit(a: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _excess(volume: Tensor, ab: Tensor, bc: Tensor, ca: Tensor) -> Tensor:
-    """Return half the solid angle of three unit vectors; NaN where it is lost to rounding."""
+    """Return half the solid angle of the triangle of unit vectors A, B, C; NaN where it is lost to rounding.
+
+    ``volume`` is ``|A . (B x C)|``; ``ab bc ca`` are the dot products ``A . B``, ``B . C``, ``C . A``. ``(N,)`` each.
+    """
     half = azimuth(1.0 + ab + bc + ca, volume)
-    told = 1.0 + torch.minimum(torch.minimum(ab, bc), ca) >= OPPOSITE
-    return torch.where(told, torch.where(half <= math.pi, half, 0.0), math.nan)
+    reliable = 1.0 + torch.minimum(torch.minimum(ab, bc), ca) >= OPPOSITE
+    return torch.where(reliable, torch.where(half <= math.pi, half, 0.0), math.nan)
 
 
 def _arc(
     half: Tensor, volume: Tensor, ab: Tensor, bc: Tensor, ca: Tensor, u: Tensor, v: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a sampled direction of the spherical triangle A, B, C as weights of these unit vectors."""
+    """Return a sampled direction of the spherical triangle A, B, C as weights of these unit vectors, ``(N,)`` each.
+
+    ``half`` is :func:`_excess`, the next four are its arguments, and ``u``, ``v`` are in [0, 1).
+    """
     c, s = torch.cos(half * u), torch.sin(half * u)
     # C' on the arc from A to C cuts off the share u: along x A + y C, reflected.
     x, y = volume * c - (bc + ca) * s, (1.0 + ab) * s
@@ -203,7 +214,7 @@ def _arc(
     return t * p, near - t * far, t * q
 
 
-def _share(weights: tuple[Tensor, Tensor, Tensor], ia: Tensor, ib: Tensor, ic: Tensor) -> tuple[Tensor, Tensor]:
+def _barycentric(weights: tuple[Tensor, Tensor, Tensor], ia: Tensor, ib: Tensor, ic: Tensor) -> tuple[Tensor, Tensor]:
     """Return the barycentric coordinates of A and C in the plane, from weights of unit vectors and inverse lengths."""
     a, b, c = (w.clamp_min(0.0) * i for w, i in zip(weights, (ia, ib, ic), strict=True))
     scale = _reciprocal(a + b + c)
@@ -211,35 +222,44 @@ def _share(weights: tuple[Tensor, Tensor, Tensor], ia: Tensor, ib: Tensor, ic: T
 
 
 def _triangle(hub: Tensor, e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Sample the triangle with a corner at ``hub`` and edges ``e``, ``f`` from it, as seen from the origin.
+
+    In names, ``a b c`` are unit vectors to the corners, ``ia ib ic`` one over the distances.
+    """
     (a, ia), (b, ib), (c, ic) = _unit(hub + e), _unit(hub), _unit(hub + f)
     volume = dot(hub, cross(e, f)).abs() * (ia * ib) * ic
     ab, bc, ca = dot(a, b), dot(b, c), dot(c, a)
     half = _excess(volume, ab, bc, ca)
-    p, q = _share(_arc(half, volume, ab, bc, ca, u[0], u[1]), ia, ib, ic)
-    return torch.stack((p, q)), _within(2.0 * half)
+    p, q = _barycentric(_arc(half, volume, ab, bc, ca, u[0], u[1]), ia, ib, ic)
+    return torch.stack((p, q)), _zero_out_of_range(2.0 * half)
 
 
 def _skew(hub: Tensor, e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Sample a parallelogram as two triangles that share the corner ``hub``: names as in :func:`_triangle`."""
     (o, io), (a, ia), (b, ib), (c, ic) = _unit(hub), _unit(hub + e), _unit(hub + e + f), _unit(hub + f)
     volume = dot(hub, cross(e, f)).abs() * io
     oa, ob, oc, ab, bc = dot(o, a), dot(o, b), dot(o, c), dot(a, b), dot(b, c)
     first, second = volume * ia * ib, volume * ib * ic
     one, two = _excess(first, oa, ob, ab), _excess(second, ob, oc, bc)
     at = u[0] * (one + two)
-    left = at < one
+    in_first = at < one
 
     def pick(x: Tensor, y: Tensor) -> Tensor:
-        return torch.where(left, x, y)
+        return torch.where(in_first, x, y)
 
     half = pick(one, two)
     inner = (pick(at, at - one) * _reciprocal(half)).clamp_max(1.0)
     weights = _arc(half, pick(first, second), pick(oa, ob), pick(ob, oc), pick(ab, bc), inner, u[1])
-    p, q = _share(weights, pick(ia, ib), io, pick(ib, ic))
+    p, q = _barycentric(weights, pick(ia, ib), io, pick(ib, ic))
     # A and C end at e and e + f in the first triangle, at e + f and f in the second.
-    return torch.stack((pick(p + q, p), pick(q, p + q))), _within(2.0 * (one + two))
+    return torch.stack((pick(p + q, p), pick(q, p + q))), _zero_out_of_range(2.0 * (one + two))
 
 
 def _rectangle(a: Tensor, e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Sample the rectangle with corner ``a`` and edges ``e``, ``f``, as seen from the origin; notation of Urena et al.
+
+    Coordinates along the edges run from ``x0, y0`` to ``x1, y1``, and ``z`` is the distance of the plane.
+    """
     wide, high = dot(e, e).sqrt(), dot(f, f).sqrt()
     ie, jf = _reciprocal(wide), _reciprocal(high)
     x0, y0, z = dot(a, e) * ie, dot(a, f) * jf, dot(a, cross(e, f)).abs() * ie * jf
@@ -255,6 +275,7 @@ def _rectangle(a: Tensor, e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, Tens
         return z * (x * x + y * y + zz).sqrt(), x * y
 
     def less(p: tuple[Tensor, Tensor], q: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return a complex number whose argument is that of ``p`` less that of ``q``: ``p`` times the conjugate of ``q``."""
         return p[0] * q[0] + p[1] * q[1], p[1] * q[0] - p[0] * q[1]
 
     begin, end = less(corner(x0, y1), corner(x0, y0)), less(corner(x1, y1), corner(x1, y0))
@@ -272,4 +293,4 @@ def _rectangle(a: Tensor, e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, Tens
     g = h0 + u[1] * (h1 - h0)
     y = g * dd.sqrt() * _reciprocal(((1.0 - g) * (1.0 + g)).clamp_min(0.0).sqrt())
     y = torch.minimum(torch.maximum(y, y0), y1)
-    return torch.stack(((x - x0) * _reciprocal(x1 - x0), (y - y0) * _reciprocal(y1 - y0))), _within(angle)
+    return torch.stack(((x - x0) * _reciprocal(x1 - x0), (y - y0) * _reciprocal(y1 - y0))), _zero_out_of_range(angle)

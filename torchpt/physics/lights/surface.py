@@ -1,4 +1,8 @@
-"""The base class of emissive surfaces, one kind for each kind of primitive. They emit on the side of the normal."""
+"""The base class of emissive surfaces, one kind for each kind of primitive. They emit on the side of the normal.
+
+The functions of ``table.py`` call a kind with rows of the light table, gathered so that there is one for each of N lanes:
+parameters named ``at``.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +29,16 @@ class SurfaceSample:
     p: Tensor  # (3, N)
     normal: Tensor  # (3, N) unit, on the side that emits
     uv: Tensor | None = None  # (2, N) the primitive's u, v; None for primitives without
-    own: Tensor | None = None  # (3, N) in the quadric's object space
+    own: Tensor | None = None  # (3, N) the point in the quadric's object space; None for other kinds
 
 
 @dataclass(frozen=True)
 class Faces:
     """E emissive primitives of one kind."""
 
-    e1: Tensor  # (3, E)
+    e1: Tensor  # (3, E) first edge, as in LaneGeometry
     face: Tensor  # (3, E) cross product of the edges
-    column: Tensor  # (E,) int64 among the scene's primitives of the kind
+    column: Tensor  # (E,) int64 index among the scene's primitives of the kind
     quadrics: Quadrics | None  # all quadrics of the scene
     frame: Tensor | None  # (12, Q) float64: p0 e1 e2 e3 of all quadrics
 
@@ -63,7 +67,7 @@ class Surface(Emitter):
     Attributes:
         name: kind of primitive, from :data:`torchpt.physics.shapes.geometry.KINDS`.
         convex: whether it emits to all sides.
-        share: area over the length of the cross product of the edges.
+        share: area over the length of the cross product of the edges: 1/2 for a triangle.
         needs_quadrics: whether sampling reads :class:`~torchpt.physics.shapes.geometry.Quadrics`.
     """
 
@@ -75,14 +79,16 @@ class Surface(Emitter):
     def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
         """Return the column ``Lights.area``, differentiable, and the areas in the world, detached; each ``(E,)`` float64."""
         # In float64: the fourth power of a length leaves float32 long before the length is extreme.
-        wide = faces.face.double()
-        area = dot(wide, wide).clamp_min(torch.finfo(torch.float64).tiny).sqrt() * faces.face.new_tensor(cls.share)
+        cross_product = faces.face.double()
+        area = dot(cross_product, cross_product).clamp_min(
+            torch.finfo(torch.float64).tiny
+        ).sqrt() * faces.face.new_tensor(cls.share)
         return area, area.detach()
 
     @classmethod
     def bounds(cls, at: Lights, intensity: Tensor) -> Cone:
-        """See :meth:`Emitter.bounds`. A flat light has its whole ``intensity`` along the normal."""
-        return super().bounds(at, intensity) if cls.convex else Cone(1.0, 0.0, intensity)
+        """Bound the emission, as :meth:`Emitter.bounds`. A flat light has its whole ``intensity`` along the normal."""
+        return super().bounds(at, intensity) if cls.convex else Cone(cos_o=1.0, cos_e=0.0, intensity=intensity)
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:

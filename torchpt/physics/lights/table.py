@@ -22,13 +22,16 @@ from torchpt.physics.shapes.geometry import Interaction
 
 __all__ = ["emitted", "environment", "environment_image", "sample", "without_environment"]
 
+#: The largest float32 below 1.
+_BELOW_ONE = 1.0 - 2.0**-24
+
 
 def _surfaces(lights: Lights) -> list[tuple[int, type[Surface]]]:
     """Return the kinds of emissive surfaces in the table, each with its index in ``Lights.kinds``."""
     return [(number, SURFACES[name]) for number, name in enumerate(lights.kinds) if name in SURFACES]
 
 
-def _numbers(lights: Lights, row: Tensor | None) -> Tensor | None:
+def _kind_indices(lights: Lights, row: Tensor | None) -> Tensor | None:
     """Return the index of each lane's kind ``(N,)``; None for a single kind."""
     if len(lights.kinds) == 1:
         return None
@@ -37,7 +40,7 @@ def _numbers(lights: Lights, row: Tensor | None) -> Tensor | None:
 
 
 def _pick(number: Tensor | None, k: int, a: Tensor, b: Tensor | None) -> Tensor:
-    """Return ``a`` in the lanes of kind ``k``, else ``b``; ``a`` everywhere without ``b``."""
+    """Return ``a`` in the lanes whose kind is ``k``, else ``b``; ``a`` everywhere without ``b`` or with a single kind."""
     return a if number is None or b is None else torch.where(number == k, a, b)
 
 
@@ -65,9 +68,9 @@ def sample(
     row: Tensor | None = None
     probability: Tensor | float = 1.0
     if lights.choice is not None and which is not None:
-        row, probability, rest = choice.draw(lights.choice, which, x, n)
-        u = torch.stack((rest.to(u.dtype).clamp_max(1.0 - 2.0**-24), u[1]))
-    at, number = taken(lights, row), _numbers(lights, row)
+        row, probability, remapped = choice.draw(lights.choice, which, x, n)
+        u = torch.stack((remapped.to(u.dtype).clamp_max(_BELOW_ONE), u[1]))
+    at, number = taken(lights, row), _kind_indices(lights, row)
     surfaces = _surfaces(lights)
     drawn = _on_surfaces(lights, at, row, number, x, u, offset, probability) if surfaces else None
     bare: Tensor | None = None
@@ -75,12 +78,12 @@ def sample(
     for k, name in enumerate(lights.kinds[len(surfaces) :], len(surfaces)):
         kind = KINDS[name]
         # Rows are sorted by kind: this kind and all later ones; those overwrite it below.
-        here = torch.ones_like(at.area, dtype=torch.bool) if number is None else number >= k
-        bare = here if bare is None else bare
-        distant = here if distant is None and kind.distant else distant
-        own = kind.sample(at, x, u, mis)
-        own = replace(own, pdf=own.pdf * probability, weight=own.weight / probability)
-        drawn = own if drawn is None else _merged(here, own, drawn)
+        in_kinds = torch.ones_like(at.area, dtype=torch.bool) if number is None else number >= k
+        bare = in_kinds if bare is None else bare
+        distant = in_kinds if distant is None and kind.distant else distant
+        found = kind.sample(at, x, u, mis)
+        found = replace(found, pdf=found.pdf * probability, weight=found.weight / probability)
+        drawn = found if drawn is None else _merged(in_kinds, found, drawn)
     assert drawn is not None
     return replace(drawn, distant=distant, bare=bare, row=row)
 
@@ -101,20 +104,32 @@ def _on_surfaces(
     offset: float,
     probability: Tensor | float,
 ) -> LightSample:
+    """Return samples of emissive surfaces; values in lanes of other lights are arbitrary.
+
+    Args:
+        lights: the table.
+        at: rows of the table, one a lane.
+        row: their numbers ``(N,)``; None for a single row.
+        number: index of each lane's kind ``(N,)``; None for a single kind.
+        x: reference points ``(3, N)``.
+        u: ``(2, N)`` in [0, 1).
+        offset: as for :func:`sample`.
+        probability: of the choice of the light ``(N,)``.
+    """
     target: Tensor | None = None
     normal: Tensor | None = None
-    inside: Tensor | None = None
+    in_object: Tensor | None = None  # SurfaceSample.own, of quadrics
     uv, angle, kinds = torch.zeros_like(u), None, _surfaces(lights)
     if lights.solid is not None:
         uv, angle = solid_angle.sample(lights.solid, row, x, u, lights.shapes)
         target, normal = flat_point(at.p0, at.e1, at.e2, uv), at.normal.expand_as(x)
     for k, kind in kinds:
-        if kind.code != solid_angle.OTHER:
+        if kind.code != solid_angle.OTHER:  # sampled above, by solid angle
             continue
-        own = kind.sample(at, x, u)
-        target, normal = _pick(number, k, own.p, target), _pick(number, k, own.normal, normal)
-        uv = uv if own.uv is None else _pick(number, k, own.uv, uv)
-        inside = inside if own.own is None else own.own
+        found = kind.sample(at, x, u)
+        target, normal = _pick(number, k, found.p, target), _pick(number, k, found.normal, normal)
+        uv = uv if found.uv is None else _pick(number, k, found.uv, uv)
+        in_object = in_object if found.own is None else found.own
     assert target is not None and normal is not None
     to = target - x
     square = dot(to, to)
@@ -128,10 +143,11 @@ def _on_surfaces(
         inverse = inverse / probability
     # Where the light is not visible the weight is 0, and the pdf does not matter.
     pdf = safe_reciprocal(inverse.detach())
-    point = None if lights.prim is None else _textured(lights, row, target, normal, uv, inside)
+    point = None if lights.prim is None else _textured(lights, row, target, normal, uv, in_object)
+    # Shadow rays end off the surface of the light, so that they do not hit it.
     target = torch.addcmul(target, normal, bound * offset)
     radiance = at.radiance if at.opacity is None else at.radiance * at.opacity
-    return LightSample(wi, target, None, radiance.expand_as(wi), pdf, inverse, point)
+    return LightSample(wi, target, distant=None, radiance=radiance.expand_as(wi), pdf=pdf, weight=inverse, at=point)
 
 
 def _inverse_pdf(
@@ -144,12 +160,15 @@ def _inverse_pdf(
     square: Tensor,
     angle: Tensor | None,
 ) -> Tensor:
-    """Return ``1 / pdf`` in steradians ``(N,)`` of sampled or hit points, without the choice of the light; 0 from behind."""
-    size = at.area
+    """Return ``1 / pdf`` in steradians ``(N,)`` of sampled or hit points, without the choice of the light; 0 from behind.
+
+    ``square (N,)`` is the squared distance, ``angle (N,)`` the solid angle of the light, 0 where it is sampled by area.
+    """
+    area = at.area
     for k, kind in kinds:
         other = kind.size(at, normal)
-        size = size if other is None else _pick(number, k, other, size)
-    inverse = flat_inverse_pdf(normal, size, wi, square)
+        area = area if other is None else _pick(number, k, other, area)
+    inverse = flat_inverse_pdf(normal, area, wi, square)
     if angle is not None:
         inverse = solid_angle.inverse_pdf(angle, inverse)
     for k, kind in kinds:
@@ -159,12 +178,24 @@ def _inverse_pdf(
 
 
 def _textured(
-    lights: Lights, row: Tensor | None, p: Tensor, normal: Tensor, uv: Tensor, own: Tensor | None
+    lights: Lights, row: Tensor | None, p: Tensor, normal: Tensor, uv: Tensor, in_object: Tensor | None
 ) -> Interaction:
     """Return the point on the light as an interaction, for textured emission."""
     assert lights.prim is not None
     prim = lights.prim.expand(p.shape[1]) if row is None else take(lights.prim, row)
-    return Interaction(p, normal, normal, None, None, prim, prim, None, uv[0], uv[1], own)
+    return Interaction(
+        p,
+        ng=normal,
+        ns=normal,
+        tangent=None,
+        bitangent=None,
+        prim=prim,
+        slot=prim,
+        bound=None,
+        u=uv[0],
+        v=uv[1],
+        own=in_object,
+    )
 
 
 def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -186,7 +217,7 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | 
     with torch.no_grad():
         to = at.p - x
         angle = None if lights.solid is None else solid_angle.angles(lights.solid, row, x, lights.shapes)
-        number = _numbers(lights, row)
+        number = _kind_indices(lights, row)
         inverse = _inverse_pdf(table, _surfaces(lights), number, x, at.ng, wi, dot(to, to), angle)
         facing = dot(wi, at.ng) < 0
         pdf = safe_reciprocal(inverse)
@@ -220,14 +251,14 @@ def without_environment(lights: Lights | None) -> Lights | None:
     """Return the table without the environment; None if no row is left."""
     if lights is None or lights.environment is None:
         return lights
-    left = len(lights.area) - 1
-    if not left:
+    num_left = len(lights.area) - 1
+    if not num_left:
         return None
     columns = (*COLUMNS, "opacity", "quadric", "prim", "kind")
-    cut = {name: getattr(lights, name) for name in columns}
-    cut = {name: None if value is None else value[..., :left] for name, value in cut.items()}
-    cut["solid"] = None if lights.solid is None else lights.solid[:left]
-    if left == 1 or lights.choice is None:
-        return replace(lights, **{**cut, "kind": None}, kinds=lights.kinds[:1], choice=None, environment=None)
-    fewer = choice.without_last(lights.choice)
-    return replace(lights, **cut, kinds=lights.kinds[:-1], choice=fewer, environment=None)
+    kept = {name: getattr(lights, name) for name in columns}
+    kept = {name: None if value is None else value[..., :num_left] for name, value in kept.items()}
+    kept["solid"] = None if lights.solid is None else lights.solid[:num_left]
+    if num_left == 1 or lights.choice is None:
+        return replace(lights, **{**kept, "kind": None}, kinds=lights.kinds[:1], choice=None, environment=None)
+    light_sampler = choice.without_last(lights.choice)
+    return replace(lights, **kept, kinds=lights.kinds[:-1], choice=light_sampler, environment=None)

@@ -23,7 +23,7 @@ from torchpt.core.dispatch import dispatched
 
 __all__ = ["FIELDS", "WIDTH", "LightTree", "build", "from_digits", "probability", "sample"]
 
-#: Children of a node.
+#: Children of a node: as many as a vector of AVX2 holds float32.
 WIDTH = 8
 #: Fields of each child of a node: bounding sphere, cone of the axes, angle of emission beyond the cone (angles as cosines), and
 #: intensity relative to the brightest child.
@@ -43,8 +43,8 @@ _DIMMEST = 1e-30
 class LightTree:
     """A tree over K lights."""
 
-    nodes: Tensor  # (M, F, 8) float32, see FIELDS
-    child: Tensor  # (M, 8) int32: a node, or ~row
+    nodes: Tensor  # (M, F, 8) float32: a field of FIELDS, for each of eight children
+    child: Tensor  # (M, 8) int32: index of a node, or ~row (negative) for the light of that row of the light table
     full: Tensor  # (M,) int32 number of children
     trail: Tensor  # (W, K) int32 path from the root: three bits a level, ten levels a word, the first level lowest
     depth: Tensor  # (K,) int32 number of levels; 0 for lights without intensity, which are not in the tree
@@ -56,9 +56,9 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
     """Build the tree over lights, given by bounding boxes and cones of emission.
 
     Args:
-        low: ``(3, K)``.
-        high: ``(3, K)``.
-        axis: unit ``(3, K)``.
+        low: lower corners ``(3, K)``.
+        high: upper corners ``(3, K)``.
+        axis: axes of the cones, unit ``(3, K)``.
         cos_o: ``(K,)`` cosine of the half angle of the cone about ``axis`` that holds all normals; -1: all directions.
         cos_e: ``(K,)`` cosine of the largest angle between a normal and emitted light: 0 for the whole hemisphere.
         intensity: ``(K,)`` maximum radiant intensity, up to a common factor. Lights of intensity 0 are never chosen, unless
@@ -78,32 +78,34 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
     power = power / power.max()
     shining = power > 0
     power = np.where(shining, np.maximum(power / power.sum(), _DIMMEST), 0.0)
-    cone, edge = array(cos_o), array(cos_e)
+    cone = array(cos_o)
+    # Columns, which the builder adds and bounds over groups: low, high, axis weighted by power and by how narrow the cone is,
+    # cos_e, power, number of lights.
     lights = np.empty((count, 12))
     lights[:, 0:3], lights[:, 3:6] = array(low).T, array(high).T
     lights[:, 6:9] = array(axis).T * (power * (0.5 + 0.5 * cone))[:, None]
-    lights[:, 9], lights[:, 10], lights[:, 11] = edge, power, 1.0
+    lights[:, 9], lights[:, 10], lights[:, 11] = array(cos_e), power, 1.0
     lights = np.nan_to_num(lights)
     ids = np.nonzero(shining)[0].astype(np.int32)
-    most = max(len(ids) - 1, 1)
-    nodes = np.zeros((most, len(FIELDS), WIDTH), np.float32)
-    child = np.zeros((most, WIDTH), np.int32)
-    full, trail, depth = np.zeros(most, np.int32), np.zeros(count, np.int64), np.zeros(count, np.int32)
-    used = tree_build.build(lights, cone, ids, nodes, child, full, trail, depth)
+    max_nodes = max(len(ids) - 1, 1)  # every node has at least two children
+    nodes = np.zeros((max_nodes, len(FIELDS), WIDTH), np.float32)
+    child = np.zeros((max_nodes, WIDTH), np.int32)
+    full, trail, depth = np.zeros(max_nodes, np.int32), np.zeros(count, np.int64), np.zeros(count, np.int32)
+    num_nodes = tree_build.build(lights, cone, ids, nodes, child, full, trail, depth)
     levels = int(depth.max())
+    # Three bits a level; a word of int32 holds those of STEPS levels.
     words = [trail >> 3 * first & (1 << 3 * STEPS) - 1 for first in range(0, max(levels, 1), STEPS)]
-    parts = (
+    tensors = (
         torch.from_numpy(a).to(device)
         for a in (
-            nodes[:used].copy(),
-            child[:used].copy(),
-            full[:used].copy(),
+            nodes[:num_nodes].copy(),
+            child[:num_nodes].copy(),
+            full[:num_nodes].copy(),
             np.stack(words).astype(np.int32),
             depth,
         )
     )
-    number = torch.tensor(count, dtype=torch.int64, device=device)
-    return LightTree(*parts, count=number, levels=levels)
+    return LightTree(*tensors, count=torch.tensor(count, dtype=torch.int64, device=device), levels=levels)
 
 
 def from_digits(u: Tensor) -> Tensor:
@@ -121,7 +123,7 @@ def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Ten
 
     Args:
         tree: the lights.
-        x: ``(3, N)``.
+        x: points to be lit ``(3, N)``.
         n: unit normals ``(3, N)`` of surfaces lit on their front only; zero where light counts from both sides. None: zero
             everywhere.
         u: ``(N,)`` in [0, 1), float64, see :func:`from_digits`.
@@ -130,16 +132,17 @@ def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Ten
         Rows ``(N,)`` int64, their probabilities ``(N,)``, always positive, and the remapped ``u``: ``(N,)`` float64 in [0, 1],
         uniform given the choice.
     """
-    row, p, rest = _walk(tree, x, n, u, None)
-    assert rest is not None
-    return row, p, rest
+    row, p, remapped = _walk(tree, x, n, u=u, row=None)
+    assert remapped is not None
+    return row, p, remapped
 
 
 @dispatched
 @torch.no_grad()
 def probability(tree: LightTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """Return the probability ``(N,)`` with which :func:`sample` chooses ``row (N,)`` at ``x`` and ``n``."""
-    return _walk(tree, x, n, None, row)[1]
+    _, p, _ = _walk(tree, x, n, u=None, row=row)
+    return p
 
 
 def _weigh(nodes: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
@@ -149,6 +152,9 @@ def _weigh(nodes: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     theta_b the angle that the child subtends, its lights emit toward p at least theta_w - theta_o - theta_b off their normals;
     likewise for p's own normal. Bounds alone would favour wide groups: each cosine is the mean of its bound and its value at
     the centre.
+
+    In the names below, suffix ``w`` is theta_w, ``b`` theta_b, ``o`` theta_o, ``x`` theta_w - theta_o, and ``i`` the angle at
+    p's normal; ``best`` is the bound of a cosine.
     """
     p, tiny = x.float(), torch.finfo(torch.float32).tiny
     cx, cy, cz, radius, ax, ay, az, cos_o, sin_o, cos_e, intensity = nodes.unbind(1)
@@ -186,30 +192,31 @@ def _walk(
     """Descend the tree, by ``u`` or to ``row``; return the rows reached, their probabilities, and the remapped ``u``."""
     node = torch.zeros(x.shape[1], dtype=torch.int64, device=x.device)
     p = torch.ones(x.shape[1], dtype=torch.float64, device=x.device)
-    places = torch.arange(tree.child.shape[1], device=x.device)
-    way: Tensor | None = None
-    left = None if u is None else u.double()
+    child_index = torch.arange(tree.child.shape[1], device=x.device)
+    trail: Tensor | None = None  # (N,) children on the way down to `row`, three bits each
+    remapped = None if u is None else u.double()
     for level in range(tree.levels):
         if row is not None and level % STEPS == 0:
-            way = tree.trail[level // STEPS][row]
-        inner = node.clamp_min(0)
+            trail = tree.trail[level // STEPS][row]
+        inner = node.clamp_min(0)  # lanes that have arrived at a light read the root; what they compute is dropped
         weight = _weigh(tree.nodes[inner], x, n).double()
         total = weight.sum(1, keepdim=True)
-        weight = torch.where(total > 0, weight, (places < tree.full[inner, None]).double())
+        weight = torch.where(total > 0, weight, (child_index < tree.full[inner, None]).double())
         ends = weight.cumsum(1)
-        aim = None if left is None else left * ends[:, -1]
+        aim = None if remapped is None else remapped * ends[:, -1]
         if aim is None:
-            assert way is not None
-            chosen, way = (way & 7).long(), way >> 3
+            assert trail is not None
+            chosen, trail = (trail & 7).long(), trail >> 3
         else:
             # The last child of positive weight whose interval starts at or before `aim`.
-            chosen = torch.where((weight > 0) & (ends - weight <= aim[:, None]), places, 0).amax(1)
-        share, end = (a.gather(1, chosen[:, None])[:, 0] for a in (weight, ends))
+            chosen = torch.where((weight > 0) & (ends - weight <= aim[:, None]), child_index, 0).amax(1)
+        chosen_weight, end = (a.gather(1, chosen[:, None])[:, 0] for a in (weight, ends))
         deeper = node >= 0
-        if aim is not None and left is not None:
-            left = torch.where(deeper, ((aim - (end - share)) / share).clamp(0.0, 1.0), left)
-        p = torch.where(deeper, p * share / ends[:, -1], p)
+        if aim is not None and remapped is not None:
+            inside = ((aim - (end - chosen_weight)) / chosen_weight).clamp(0.0, 1.0)
+            remapped = torch.where(deeper, inside, remapped)
+        p = torch.where(deeper, p * chosen_weight / ends[:, -1], p)
         node = torch.where(deeper, tree.child[inner, chosen].long(), node)
     if row is not None:
         p = torch.where(tree.depth[row] > 0, p, 0.0)
-    return ~node, p.to(x.dtype), left
+    return ~node, p.to(x.dtype), remapped
