@@ -138,7 +138,7 @@ def run(words: list[str], interrupt: Interrupt) -> int:
             for case in cases:
                 if number and not case.backend:
                     continue  # does not depend on the backend
-                outcome = outcome_of(case, harness, quick)
+                outcome = outcome_of(case, harness, quick=quick)
                 found.setdefault(label, {}).setdefault(topic, []).append(outcome)
                 _print_unless_json(options, line(outcome))
     every = [one for by_topic in found.values() for row in by_topic.values() for one in row]

@@ -1,4 +1,7 @@
-"""Records of a scene before they become tensors: parameters, parts of shapes, instances, lights without a surface."""
+"""Records of a scene before they become tensors: parameters, parts of shapes, instances, lights without a surface.
+
+The scene reader makes them of a scene file. From them :class:`~torchpt.physics.world.World` is built, on one device.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ class Parameters(dict[str, np.ndarray]):
 
     Attributes:
         specs: the spec of each parameter by name.
-        stated: names of texels that are given in the scene, not in an image file.
+        stated: names of parameters whose texels are given in the scene, not in an image file.
     """
 
     def __init__(self) -> None:
@@ -35,8 +38,8 @@ class Parameters(dict[str, np.ndarray]):
 
     def declare(self, name: str, value: Any, spec: Spec) -> None:
         """Add a parameter, in float64 unless it is a float32 array (texels)."""
-        keeps = isinstance(value, np.ndarray) and value.dtype == np.float32
-        self[name] = value if keeps else np.asarray(value, np.float64)
+        is_texels = isinstance(value, np.ndarray) and value.dtype == np.float32
+        self[name] = value if is_texels else np.asarray(value, np.float64)
         self.specs[name] = spec
 
     def declare_all(self, prefix: str, kind: Any, values: Mapping[str, Any]) -> None:
@@ -108,13 +111,13 @@ class Part:
 
 @dataclass(frozen=True)
 class Copy:
-    """An instance of one part of a mesh; it shares the triangles.
+    """An instance of one part of a mesh; it shares the triangles of that part.
 
     Attributes:
         name: dotted prefix of the parameters, e.g. ``shapes.third_bunny``.
         shape: name of the instance in the scene.
         object_id: index of the instance in the scene, from 1.
-        of: name of the part.
+        of: :attr:`Part.name` of the part that is instanced.
         material: material of the instance.
         flip: whether to flip the normals relative to the part.
         to_world: ``(4, 4)`` float64, replaces the transform of the part.

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError
 from torchpt.math.transforms import tensor_of
-from torchpt.physics.cameras.opencv import USUAL, angles, numbers_of
+from torchpt.physics.cameras.opencv import DEFAULTS, angles, numbers_of
 from torchpt.physics.cameras.poses import POSES, posed
 from torchpt.physics.shapes.base import Place, Size
 from torchpt.scene.build import SceneBuild
@@ -47,7 +47,9 @@ def with_all_intrinsics(description: Description, tensors: DictTensors) -> Descr
     if not any(key[0] == "K" for key in tensors.under("camera")):
         return description
     values = {**camera.values, **angles(camera["K"], camera["size"])}
-    values |= {key: usual for key, usual in USUAL.items() if values[key] is None}  # so that they become parameters
+    values |= {
+        key: default for key, default in DEFAULTS.items() if values[key] is None
+    }  # so that they become parameters
     return replace(description, camera=ParsedParams(camera.kind, values, camera.given))
 
 

@@ -1,10 +1,14 @@
-"""A stress test, and its result."""
+"""Records of a stress test (a case), of its figures along a sweep, and of its result.
+
+A case measures one figure, an error, at each point of a sweep of one quantity (a scale, a distance, ...). All figures must stay
+below the bound of the case.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -72,12 +76,12 @@ class Outcome:
     """
 
     case: Case
-    readings: tuple[Measurement, ...] = field(default=())
+    readings: tuple[Measurement, ...] = ()
     seconds: float = 0.0
 
     @property
     def worst(self) -> Measurement:
-        """Reading that decides: a failure, else the largest figure; a refusal if there is nothing else."""
+        """Measurement that decides: a failure (NaN), else the largest figure; a refusal if there is nothing else."""
         measured = [one for one in self.readings if not one.refused] or self.readings
         return max(measured, key=lambda one: math.inf if math.isnan(one.figure) else one.figure)
 
@@ -93,5 +97,5 @@ class Outcome:
 
 
 def powers(low: int, high: int, step: int = 1) -> tuple[float, ...]:
-    """Return ``10^low .. 10^high``."""
+    """Return the powers of ten from ``10^low`` to ``10^high``, each ``10^step`` times the one before."""
     return tuple(10.0**k for k in range(low, high + 1, step))

@@ -47,7 +47,7 @@ class Harness:
         Raises:
             RenderError: a sample was not finite.
         """
-        found = render(
+        result = render(
             load(described, device=self.device),
             spp=spp,
             seed=seed,
@@ -58,9 +58,11 @@ class Harness:
             dtype=self.dtype,
             full=True,
         )
-        if found.nonfinite_samples:
-            raise RenderError(f"{found.nonfinite_samples} samples are not finite; the first is {found.nonfinite_first}")
-        return found.image.double().cpu()
+        if result.nonfinite_samples:
+            raise RenderError(
+                f"{result.nonfinite_samples} samples are not finite; the first is {result.nonfinite_first}"
+            )
+        return result.image.double().cpu()
 
     def exact(self) -> Harness:
         """Return a copy that renders in float64."""

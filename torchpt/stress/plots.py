@@ -13,9 +13,12 @@ from torchpt.stress.case import Outcome
 
 __all__ = ["draw"]
 
+#: Plots side by side.
 COLUMNS = 3
-#: Value at which a figure of 0 is drawn.
-NOTHING = 1e-9
+#: Value at which a figure of 0 is drawn, as the axis is logarithmic.
+DRAWN_ZERO = 1e-9
+#: Sweeps whose largest positive point is more than this many times the least one get a logarithmic axis.
+LOG_RATIO = 50
 
 
 def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
@@ -24,7 +27,7 @@ def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
     Raises:
         OutputError: the file cannot be written.
     """
-    swept = [outcome for outcome in outcomes if len(outcome.readings) > 2]
+    swept = [outcome for outcome in outcomes if len(outcome.readings) > 2]  # two points make no curve
     if not swept:
         return False
     os.environ.setdefault("MPLBACKEND", "agg")
@@ -39,14 +42,14 @@ def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
         for number, outcome in enumerate(swept):
             axes = figure.add_subplot(rows, COLUMNS, number + 1)
             readings = sorted(outcome.readings, key=lambda one: one.at)
-            at, wide = _places([one.at for one in readings])
-            values = [max(one.figure, NOTHING) if math.isfinite(one.figure) else math.nan for one in readings]
+            at, is_log = _axis_positions([one.at for one in readings])
+            values = [max(one.figure, DRAWN_ZERO) if math.isfinite(one.figure) else math.nan for one in readings]
             axes.spines[["top", "right"]].set_visible(False)
             axes.plot(at, values, "o-", color="#0072B2", markersize=3, linewidth=1)
-            axes.axhline(max(outcome.case.bound, NOTHING), color="#D55E00", linestyle="--", linewidth=1)
-            axes.set_ylim(NOTHING / 3, max(*(v for v in values if not math.isnan(v)), outcome.case.bound, 1e-3) * 3)
+            axes.axhline(max(outcome.case.bound, DRAWN_ZERO), color="#D55E00", linestyle="--", linewidth=1)
+            axes.set_ylim(DRAWN_ZERO / 3, max(*(v for v in values if not math.isnan(v)), outcome.case.bound, 1e-3) * 3)
             axes.set_yscale("log")
-            if wide:
+            if is_log:
                 axes.set_xscale("log")
             axes.set_title(outcome.case.name, loc="left")
             axes.set_xlabel(outcome.case.axis)
@@ -61,9 +64,9 @@ def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
     return True
 
 
-def _places(at: list[float]) -> tuple[list[float], bool]:
+def _axis_positions(at: list[float]) -> tuple[list[float], bool]:
     """Return positions of readings, and True for a logarithmic axis, on which 0 lies at half of the least other point."""
-    positive = [place for place in at if place > 0]
-    if not positive or min(at) < 0 or max(positive) <= 50 * min(positive):
+    positive = [x for x in at if x > 0]
+    if not positive or min(at) < 0 or max(positive) <= LOG_RATIO * min(positive):
         return at, False
-    return [place or min(positive) / 2 for place in at], True
+    return [x or min(positive) / 2 for x in at], True

@@ -1,4 +1,8 @@
-"""Make cases of any scene: moved, scaled, turned, by every search and in float64 its picture must not change."""
+"""Make cases of any scene: moved, scaled, turned, by every search and in float64 its picture must not change.
+
+The figure of each case is the difference between the picture rendered in another way and the plain one, divided by the
+difference that another seed makes (the noise). With the same random numbers it should be far below 1, else about 1.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +31,11 @@ __all__ = ["cases_of", "moved"]
 
 #: Pixels of the longer side, and samples a pixel.
 SIZE, SPP = 48, 4
-#: Largest difference of two pictures, in that of two seeds: with the same random numbers, and with others (as after a turn).
-NEAR, ANOTHER = 0.2, 1.2
+#: Bounds of the figure: with the same random numbers, and with others (as after a turn).
+SAME_NUMBERS, OTHER_NUMBERS = 0.2, 1.2
 _NOISE = "difference over that of another seed"
-#: Primitives up to which brute force is tested too.
-FEW = 2_000
+#: Largest number of primitives for which brute force is tested too: its time grows with their number.
+BRUTE_MAX_PRIMITIVES = 2_000
 
 Array = NDArray[np.float64]
 
@@ -50,54 +54,59 @@ def cases_of(
         TorchptError: the scene or a setting cannot be used.
     """
     description, settings = overridden(read_description(source, overrides=changes), overrides)
-    wishes = _small(settings)
-    own = Scene(description, torch.device("cpu"))
+    small = _small(settings)
+    scene = Scene(description, torch.device("cpu"))
     extent, pose = (
-        bounds_extent(own.built.parts, own.built.copies),
-        np.asarray(own.built.parameters["camera.to_world"], np.float64),
+        bounds_extent(scene.built.parts, scene.built.copies),
+        np.asarray(scene.built.parameters["camera.to_world"], np.float64),
     )
-    known: dict[Harness, tuple[Tensor, Tensor]] = {}
+    references: dict[Harness, tuple[Tensor, Tensor]] = {}  # plain picture, and that of another seed
 
-    def picture(harness: Harness, description: Description = description, seed: int = wishes.render.seed) -> Tensor:
+    def picture(harness: Harness, description: Description = description, seed: int = small.render.seed) -> Tensor:
         compiled = "off" if harness.dtype == torch.float64 else harness.compile
-        given = replace(wishes, render=wishes.render.but(accel=harness.accel, compile=compiled, seed=seed))
-        found = render_scene(Scene(description, device_of(harness.device)), given, dtype=harness.dtype)
-        if found.nonfinite_samples:
-            raise RenderError(f"{found.nonfinite_samples} samples are not finite; the first is {found.nonfinite_first}")
-        return found.image.double().cpu()
+        settings = replace(small, render=small.render.but(accel=harness.accel, compile=compiled, seed=seed))
+        result = render_scene(Scene(description, device_of(harness.device)), settings, dtype=harness.dtype)
+        if result.nonfinite_samples:
+            raise RenderError(
+                f"{result.nonfinite_samples} samples are not finite; the first is {result.nonfinite_first}"
+            )
+        return result.image.double().cpu()
 
-    def beside(harness: Harness, found: Callable[[], Tensor]) -> float:
-        if harness not in known:
-            known[harness] = picture(harness), picture(harness, seed=wishes.render.seed + 1)
-        plain, other = known[harness]
-        noise = relative_difference(other, plain)
-        return relative_difference(found(), plain) / (noise or 1.0)
+    def over_noise(harness: Harness, changed: Callable[[], Tensor]) -> float:
+        """Return the difference of a picture from the plain one, over that of another seed."""
+        if harness not in references:
+            references[harness] = picture(harness), picture(harness, seed=small.render.seed + 1)
+        plain, reseeded = references[harness]
+        noise = relative_difference(reseeded, plain)
+        return relative_difference(changed(), plain) / (noise or 1.0)
 
-    def by(harness: Harness, **other: Any) -> float:
-        return beside(harness, lambda: picture(replace(harness, **other)))
+    def with_harness(harness: Harness, **changes: Any) -> float:
+        """Return the figure of a picture rendered by a harness with other fields."""
+        return over_noise(harness, lambda: picture(replace(harness, **changes)))
 
-    def elsewhere(harness: Harness, way: Array) -> float:
-        changed = read_description(source, change=lambda raw: moved(raw, way, pose), overrides=changes)
-        return beside(harness, lambda: picture(harness, changed))
+    def transformed(harness: Harness, matrix: Array) -> float:
+        """Return the figure of the scene moved by a similarity ``(4, 4)``."""
+        changed = read_description(source, change=lambda raw: moved(raw, matrix, pose), overrides=changes)
+        return over_noise(harness, lambda: picture(harness, changed))
 
-    few = sum(len(part.faces) if part.faces is not None else 1 for part in own.built.parts) <= FEW
-    searches = ("numba", "torch", *(("brute",) if few else ()))
+    num_primitives = sum(len(part.faces) if part.faces is not None else 1 for part in scene.built.parts)
+    searches = ("numba", "torch", *(("brute",) if num_primitives <= BRUTE_MAX_PRIMITIVES else ()))
     return (
-        Case("no sample is lost", _NOISE, 0.0, lambda b, _: by(b)),
-        Case("in float64", _NOISE, NEAR, lambda b, _: beside(b, lambda: picture(b.exact()))),
-        Case("by tensor operations", _NOISE, NEAR, lambda b, _: by(b, compile="off")),
-        *(Case(f"searched by {accel}", _NOISE, NEAR, lambda b, _, a=accel: by(b, accel=a)) for accel in searches),
-        Case("scaled", _NOISE, NEAR, lambda b, s: elsewhere(b, np.diag([s, s, s, 1.0])), "scale", powers(-12, 12, 4)),
-        Case("moved", _NOISE, NEAR, lambda b, d: elsewhere(b, _step(d * extent)), "times its size", powers(0, 6)),
-        Case("turned", _NOISE, ANOTHER, lambda b, a: elsewhere(b, rotate({"axis": [1.0, 2.0, 3.0], "angle": a})), "degrees",
-             (1.0, 90.0, 180.0)),
+        Case("no sample is lost", _NOISE, 0.0, lambda b, _: with_harness(b)),
+        Case("in float64", _NOISE, SAME_NUMBERS, lambda b, _: over_noise(b, lambda: picture(b.exact()))),
+        Case("by tensor operations", _NOISE, SAME_NUMBERS, lambda b, _: with_harness(b, compile="off")),
+        *(Case(f"searched by {x}", _NOISE, SAME_NUMBERS, lambda b, _, a=x: with_harness(b, accel=a)) for x in searches),
+        Case("scaled", _NOISE, SAME_NUMBERS, lambda b, s: transformed(b, np.diag([s, s, s, 1.0])), "scale", powers(-12, 12, 4)),
+        Case("moved", _NOISE, SAME_NUMBERS, lambda b, d: transformed(b, _step(d * extent)), "times its size", powers(0, 6)),
+        Case("turned", _NOISE, OTHER_NUMBERS, lambda b, a: transformed(b, rotate({"axis": [1.0, 2.0, 3.0], "angle": a})),
+             "degrees", (1.0, 90.0, 180.0)),
     )  # fmt: skip
 
 
 def _small(settings: Settings) -> Settings:
     """Return settings of a quick render that writes no files."""
-    film, most = settings.film, max(settings.film.width, settings.film.height)
-    width, height = (max(round(side * SIZE / most), 1) for side in (film.width, film.height))
+    film, longer_side = settings.film, max(settings.film.width, settings.film.height)
+    width, height = (max(round(side * SIZE / longer_side), 1) for side in (film.width, film.height))
     render = settings.render.without(Role.FILES | Role.ENDS).but(spp=SPP, pilots=False)
     sampler = settings.sampler
     if settings.adaptive:
@@ -107,6 +116,7 @@ def _small(settings: Settings) -> Settings:
 
 
 def _step(distance: float) -> Array:
+    """Return a translation ``(4, 4)`` in a skew direction, by 1.15 times ``distance``."""
     matrix = np.eye(4)
     matrix[:3, 3] = np.array([1.0, 0.5, -0.25]) * distance
     return matrix
@@ -127,20 +137,20 @@ def moved(raw: dict[str, Any], by: Array, camera: Array) -> dict[str, Any]:
     def point(p: Any) -> list[float]:
         return (by[:3, :3] @ np.broadcast_to(np.asarray(p, np.float64), 3) + by[:3, 3]).tolist()
 
-    def way(d: Any) -> list[float]:
+    def direction(d: Any) -> list[float]:
         return (turn[:3, :3] @ np.asarray(d, np.float64)).tolist()
 
     pose = by @ camera
     pose[:3, :3] /= scale
-    seen = {
+    new_camera = {
         key: value
         for key, value in (raw.get("camera") or {}).items()
         if key not in ("origin", "target", "up", "R", "t")
     }
-    seen |= {"to_world": pose.tolist()}
-    seen |= {key: seen[key] * scale for key in ("aperture_radius", "focus_distance") if key in seen}
-    if seen.get("type") == "orthographic":
-        seen["width"] = seen.get("width", 2.0) * scale
+    new_camera |= {"to_world": pose.tolist()}
+    new_camera |= {key: new_camera[key] * scale for key in ("aperture_radius", "focus_distance") if key in new_camera}
+    if new_camera.get("type") == "orthographic":
+        new_camera["width"] = new_camera.get("width", 2.0) * scale
     shapes = {
         name: {**shape, "transform": [*(shape.get("transform") or []), {"matrix": by.tolist()}]}
         for name, shape in (raw.get("shapes") or {}).items()
@@ -150,10 +160,10 @@ def moved(raw: dict[str, Any], by: Array, camera: Array) -> dict[str, Any]:
         changed = dict(light)
         changed |= {key: point(light[key]) for key in ("position", "target") if key in light}
         if "direction" in light:
-            changed["direction"] = way(light["direction"])
-        if light.get("type") in ("point", "spot"):
+            changed["direction"] = direction(light["direction"])
+        if light.get("type") in ("point", "spot"):  # the same irradiance at scaled distances
             changed["intensity"] = (np.asarray(light.get("intensity", 1.0), np.float64) * scale**2).tolist()
         if light.get("type") == "envmap":
             changed["transform"] = [*(light.get("transform") or []), {"matrix": turn.tolist()}]
         lights[name] = changed
-    return {**raw, "camera": seen, "shapes": shapes, **({"lights": lights} if lights else {})}
+    return {**raw, "camera": new_camera, "shapes": shapes, **({"lights": lights} if lights else {})}

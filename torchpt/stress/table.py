@@ -1,4 +1,4 @@
-"""Show outcomes as lines of text, as Markdown and as JSON."""
+"""Format outcomes as lines of text, as Markdown and as plain values for JSON."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ def line(outcome: Outcome) -> str:
     at = f"{case.axis} {worst.at:g}" if case.axis else ""
     verdict = _verdict(outcome)
     figure = "-" if math.isnan(worst.figure) else f"{worst.figure:.2g}"
-    said = _COLUMNS.format(case.name, figure, f"{case.bound:g}", at if len(at) < 15 else f"{worst.at:g}", verdict)
-    return f"{said}: {worst.problem[:300]}" if worst.problem else said
+    text = _COLUMNS.format(case.name, figure, f"{case.bound:g}", at if len(at) < 15 else f"{worst.at:g}", verdict)
+    return f"{text}: {worst.problem[:300]}" if worst.problem else text
 
 
 def _verdict(outcome: Outcome) -> str:
     """Return the verdict in words."""
-    said = "passed" if outcome.passed else "FAILED"
+    verdict = "passed" if outcome.passed else "FAILED"
     if outcome.refused == len(outcome.readings):
         return "refused"
-    return f"{said}, refused at {outcome.refused} of {len(outcome.readings)} places" if outcome.refused else said
+    return f"{verdict}, refused at {outcome.refused} of {len(outcome.readings)} places" if outcome.refused else verdict
 
 
 def facts(outcomes: Mapping[str, Sequence[Outcome]]) -> list[dict[str, Any]]:
@@ -72,6 +72,6 @@ def markdown(outcomes: Mapping[str, Sequence[Outcome]]) -> str:
             figure = "-" if math.isnan(worst.figure) else f"{worst.figure:.1e}"
             at = f"{worst.at:g}" if case.axis else ""
             verdict = _verdict(outcome)
-            said = "" if verdict == "passed" else f" ({verdict})" if outcome.passed else f" **{verdict}**"
-            rows.append(f"| {case.name} | {swept} | {case.measures} | {figure}{said} | {at} | {case.bound:g} |")
+            remark = "" if verdict == "passed" else f" ({verdict})" if outcome.passed else f" **{verdict}**"
+            rows.append(f"| {case.name} | {swept} | {case.measures} | {figure}{remark} | {at} | {case.bound:g} |")
     return "\n".join(rows)

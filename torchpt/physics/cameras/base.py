@@ -1,4 +1,8 @@
-"""The base class of cameras."""
+"""The base class of cameras.
+
+Camera space has the viewing direction along +z, up along +y, and +x to the *left* in the picture (Mitsuba's convention). Film
+positions are in pixels from the upper left corner of the whole film, y downward.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,7 @@ class Camera(ABC):
 
     Attributes:
         name: the ``type`` in a scene file.
-        parameters: specs of the parameters; traced ones are differentiable.
+        parameters: specs of the parameters; those whose spec is ``differentiable`` are tensors.
         lens: whether rays also depend on a point on a lens.
         reaches: parameters that bound the distance of ray origins from the camera's origin.
         projects: whether :meth:`project` is implemented.
@@ -48,6 +52,10 @@ class Camera(ABC):
     def check(cls, values: dict[str, Any], given: frozenset[str]) -> None:
         """Set ``to_world`` from the parameters of the pose, and refuse values that contradict each other.
 
+        Args:
+            values: values of the parameters by name; ``to_world`` is written.
+            given: names of the parameters that the scene file sets.
+
         Raises:
             Refused: with the parameter and the accepted values.
         """
@@ -56,9 +64,9 @@ class Camera(ABC):
     @classmethod
     def on(cls, to_world: Tensor, resolution: tuple[int, int], values: Mapping[str, Any]) -> Self:
         """Return a camera of this kind for a film of ``resolution`` pixels, from the values of its parameters."""
-        own = {field.name: values[field.name] for field in fields(cls) if field.name in values}
+        parameters = {field.name: values[field.name] for field in fields(cls) if field.name in values}
         film = to_world.new_tensor(resolution)
-        return cls(**{**own, "to_world": to_world, "resolution": resolution, "film": film})
+        return cls(**{**parameters, "to_world": to_world, "resolution": resolution, "film": film})
 
     @abstractmethod
     def rays(self, x: Tensor, y: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -112,8 +120,8 @@ class Camera(ABC):
 
     def kind(self) -> tuple[object, ...]:
         """Return all fields that are no tensors, as part of the cache key of compiled stages."""
-        own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "resolution"}
-        return (self.name, *((key, value) for key, value in own.items() if not isinstance(value, Tensor)))
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "resolution"}
+        return (self.name, *((key, value) for key, value in values.items() if not isinstance(value, Tensor)))
 
     def place(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return film positions as distances right of and above the film's centre, in half widths of the film."""

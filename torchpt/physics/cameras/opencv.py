@@ -22,8 +22,8 @@ from torchpt.math.vectors import normalize
 from torchpt.spec import Refused, reading
 
 __all__ = [
+    "DEFAULTS",
     "K_WORDS",
-    "USUAL",
     "PinholeMatrices",
     "angles",
     "calibration",
@@ -35,10 +35,12 @@ __all__ = [
     "translation",
 ]
 
+#: Largest error of an entry of ``R R^T`` of a rotation, as in :func:`torchpt.math.transforms.is_rigid`.
+_TOLERANCE = 1e-3
 #: From OpenCV's axes (right, down, ahead) to those of cameras here (left, up, ahead).
 _TURN = np.diag([-1.0, -1.0, 1.0])
 #: Default values of parameters that ``K`` determines; :func:`angles` leaves them out.
-USUAL = {"principal_point_offset_x": 0.0, "principal_point_offset_y": 0.0, "pixel_aspect": 1.0}
+DEFAULTS = {"principal_point_offset_x": 0.0, "principal_point_offset_y": 0.0, "pixel_aspect": 1.0}
 #: Accepted form of ``K``, for errors.
 K_WORDS = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy > 0"
 
@@ -56,7 +58,7 @@ def _listed(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | Tensor) else value
 
 
-def _square(value: Any, expected: str) -> NDArray[np.float64]:
+def _matrix3(value: Any, expected: str) -> NDArray[np.float64]:
     """Read three rows of three finite numbers."""
     value = _listed(value)
     if not isinstance(value, list | tuple) or len(value) != 3:
@@ -67,8 +69,8 @@ def _square(value: Any, expected: str) -> NDArray[np.float64]:
 def rotation(value: Any) -> NDArray[np.float64]:
     """Read a rotation matrix ``(3, 3)`` from a scene file."""
     expected = "three rows of a rotation: orthogonal, and of determinant 1"
-    found = _square(value, expected)
-    if np.abs(found @ found.T - np.eye(3)).max() > 1e-3 or np.linalg.det(found) < 0.0:
+    found = _matrix3(value, expected)
+    if np.abs(found @ found.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(found) < 0.0:
         raise Refused(expected)
     return found
 
@@ -88,7 +90,7 @@ def size(value: Any) -> tuple[int, int]:
 
 def calibration(value: Any) -> NDArray[np.float64]:
     """Read ``K (3, 3)`` from a scene file; refuse skew and negative focal lengths."""
-    found = _square(value, K_WORDS)
+    found = _matrix3(value, K_WORDS)
     if found[0, 1] != 0.0:
         raise Refused(f"{K_WORDS} (there is no skew)", float(found[0, 1]), (0, 1))
     if found[1, 0] != 0.0 or found[2].tolist() != [0.0, 0.0, 1.0]:
@@ -114,8 +116,8 @@ def extrinsics(to_world: Tensor) -> tuple[Tensor, Tensor]:
 def numbers_of(matrix: Any, picture: tuple[int, int]) -> dict[str, Any]:
     """Return a pinhole's numeric parameters for ``K (3, 3)``, an array or a tensor, of a ``picture (width, height)``."""
     (width, height), fx, fy = picture, matrix[0, 0], matrix[1, 1]
-    taped = isinstance(fx, Tensor)
-    half = torch.atan2(fx.new_tensor(0.5 * width), fx) if taped else math.atan2(0.5 * width, fx)
+    is_tensor = isinstance(fx, Tensor)
+    half = torch.atan2(fx.new_tensor(0.5 * width), fx) if is_tensor else math.atan2(0.5 * width, fx)
     return {
         "fov": half * (2.0 * 180.0 / math.pi),
         "principal_point_offset_x": 0.5 - matrix[0, 2] / width,
@@ -127,5 +129,5 @@ def numbers_of(matrix: Any, picture: tuple[int, int]) -> dict[str, Any]:
 def angles(matrix: NDArray[np.float64], picture: tuple[int, int]) -> dict[str, float | str]:
     """Return a pinhole's parameters for ``K`` of a ``picture (width, height)``, without those at their defaults."""
     found = {key: float(value) for key, value in numbers_of(matrix, picture).items()}
-    rest = {key: found[key] for key, usual in USUAL.items() if found[key] != usual}
-    return {"fov": found["fov"], "fov_axis": "x", **rest}
+    others = {key: found[key] for key, default in DEFAULTS.items() if found[key] != default}
+    return {"fov": found["fov"], "fov_axis": "x", **others}

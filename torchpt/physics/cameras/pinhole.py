@@ -17,6 +17,7 @@ __all__ = ["FOV_AXES", "Pinhole"]
 
 #: Values of ``fov_axis``: ``fov`` spans the film's width, height, smaller or larger side, or diagonal.
 FOV_AXES = ("x", "y", "smaller", "larger", "diagonal")
+#: Parameters that ``K`` determines, and which must not be given beside it.
 _FROM_K = ("fov", "fov_axis", "principal_point_offset_x", "principal_point_offset_y", "pixel_aspect")
 
 
@@ -79,7 +80,7 @@ class Pinhole(Camera):
 
     @classmethod
     def check(cls, values: dict[str, Any], given: frozenset[str]) -> None:
-        """See :meth:`Camera.check`; ``K`` is converted to the other parameters."""
+        """Check the parameters as :meth:`Camera.check` does, and convert ``K`` to the other ones."""
         super().check(values, given)
         if values["K"] is None:
             if "size" in given:
@@ -116,8 +117,8 @@ class Pinhole(Camera):
             return half * (w / (w * w + h * h).sqrt())
         if self.fov_axis == "y":
             return half * (w / h)
-        other = h < w if self.fov_axis == "smaller" else h > w
-        return torch.where(other, half * (w / h), half)
+        spans_height = h < w if self.fov_axis == "smaller" else h > w
+        return torch.where(spans_height, half * (w / h), half)
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return the slopes of rays through film positions: right and up per unit of depth, each ``(N,)``."""
@@ -132,7 +133,7 @@ class Pinhole(Camera):
         return right * half, up * half
 
     def film_of(self, p: Tensor) -> Tensor | None:
-        """See :meth:`Camera.film_of`."""
+        """Return homogeneous film coordinates, as :meth:`Camera.film_of`; None with a lens."""
         return None if self.lens else self.project_homogeneous(p - self.origin())
 
     def project_homogeneous(self, away: Tensor) -> Tensor:
@@ -150,14 +151,14 @@ class Pinhole(Camera):
         return torch.stack((x, y, depth, depth))
 
     def pixel(self) -> Tensor:
-        """See :meth:`Camera.pixel`."""
+        """Return the footprint of a pixel ``(5,)``, as :meth:`Camera.pixel`."""
         spread = self.half_width() * (2.0 / self.film[0])
         if self.pixel_aspect is not None:
             spread = spread / self.pixel_aspect.sqrt()
         return torch.cat((self.origin()[:, 0], torch.stack((torch.ones_like(spread), spread))))
 
     def intrinsics(self) -> Tensor:
-        """See :meth:`Camera.intrinsics`."""
+        """Return OpenCV's ``K (3, 3)`` in pixels, as :meth:`Camera.intrinsics`."""
         width, height = self.film[0], self.film[1]
         fx = width / (2.0 * self.half_width())
         fy = fx if self.pixel_aspect is None else fx * self.pixel_aspect

@@ -1,4 +1,9 @@
-"""The base class of shapes: parameters, and the primitives that they become."""
+"""The base class of shapes: parameters, and the primitives that they become.
+
+The scene reader calls these methods while it builds a scene: sizes and positions of a shape become a matrix
+(:meth:`Shape.own`), which together with the parameter ``transform`` maps standard primitives (unit sphere, unit disk, ...) to
+the world.
+"""
 
 from __future__ import annotations
 
@@ -59,11 +64,11 @@ class Triangles:
     """The triangles of a shape, or the file that contains them.
 
     Attributes:
-        path: candidates, of which the first that exists is read; None: the arrays are used.
-        vertices: ``(V, 3)`` float64.
-        faces: ``(F, 3)`` int64.
-        normals: ``(V, 3)``, or None.
-        uvs: ``(V, 2)``, or None.
+        path: paths of files, of which the first that exists is read; None: the arrays below are used.
+        vertices: ``(V, 3)`` float64 in object space.
+        faces: ``(F, 3)`` int64 indices of vertices.
+        normals: ``(V, 3)`` at the vertices, or None.
+        uvs: ``(V, 2)`` texture coordinates at the vertices, or None.
         flat: use face normals even if vertex normals are given.
         displacement: ``texture``, ``scale`` and ``subdivisions`` of :class:`~torchpt.physics.shapes.kinds.mesh.Displacement`,
             or None.
@@ -122,7 +127,7 @@ class Shape:
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """Refuse values that contradict each other.
+        """Refuse values that contradict each other; ``given`` are the names of the parameters that the scene file sets.
 
         Raises:
             Refused: with the parameter and the accepted values.
@@ -169,6 +174,6 @@ def placed(origin: Sequence[Any], size: Sequence[Any], turn: Matrix) -> Any:
 
 #: Rotates z to y about x: in scene files axes of rotation lie along y, those of quadrics along z.
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-#: From the unit disk to the caps of a quadric at z = 1 and z = 0, facing outward.
+#: Maps ``(4, 4)`` from the unit disk at z = 0, facing +z, to the caps of a quadric at z = 1 and z = 0, facing outward.
 TOP = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]])
 BOTTOM = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -1,4 +1,11 @@
-"""Records of geometry for the search and for stages, of hits, and of surface points."""
+"""Records of geometry for the search and for stages, of hits, and of surface points.
+
+A *shape* of a scene file consists of *primitives* (a mesh of triangles, a cube of six rectangles). The scene has P primitives,
+of which Q are quadrics, and I instances of meshes. ``prim`` is an index of a primitive. N is the number of *lanes*, the rays or
+points that are computed together.
+
+:class:`Geometry` is what the search reads, without gradients; :class:`LaneGeometry` is what shading reads, with gradients.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +35,7 @@ class Geometry:
     ``p = p0 + x e1 + y e2 + z e3``; ``quadrics`` has it in float64.
 
     Attributes:
-        p0: ``(3, P)``.
+        p0: ``(3, P)`` corner or centre.
         p1: ``(3, P)``; ``e1`` for a quadric.
         p2: ``(3, P)``; ``e2`` for a quadric.
         counts: number of primitives of each of :data:`KINDS`, in the order of storage.
@@ -57,8 +64,8 @@ class QuadricTable:
 
     frame: Tensor  # (12, Q) p0 e1 e2 e3
     form: Tensor  # (7, Q) the surface in object space, see torchpt.physics.shapes.quadrics.Form
-    low: Tensor  # (3, Q) bounding box in the world
-    high: Tensor  # (3, Q)
+    low: Tensor  # (3, Q) lower corner of the bounding box in the world
+    high: Tensor  # (3, Q) upper corner
 
 
 @dataclass(frozen=True)
@@ -67,7 +74,7 @@ class Quadrics:
 
     kinds: tuple[type[Quadric], ...]  # the kinds of surfaces; static
     code: Tensor | None  # (Q,) int64 index into `kinds`; None for a single kind
-    e3: Tensor  # (3, Q)
+    e3: Tensor  # (3, Q) image of the z axis of object space; p0, e1 and e2 are in LaneGeometry
     n1: Tensor  # (3, Q) columns of the cofactor matrix of (e1, e2, e3), toward the front, up to a common scale
     n2: Tensor  # (3, Q)
     n3: Tensor  # (3, Q)
@@ -84,10 +91,10 @@ class Instances:
 
     start: Tensor  # (I + 1,) int64 id of the instance's first primitive
     first: Tensor  # (I + 1,) int64 first triangle of the mesh
-    x: Tensor  # (3, I + 1) columns of the linear map
-    y: Tensor  # (3, I + 1)
-    z: Tensor  # (3, I + 1)
-    move: Tensor  # (3, I + 1)
+    x: Tensor  # (3, I + 1) first column of the linear map from the mesh to the instance
+    y: Tensor  # (3, I + 1) second column
+    z: Tensor  # (3, I + 1) third column
+    move: Tensor  # (3, I + 1) translation
     nx: Tensor  # (3, I + 1) columns of the cofactor matrix, toward the front, up to a common scale
     ny: Tensor  # (3, I + 1)
     nz: Tensor  # (3, I + 1)
@@ -100,12 +107,12 @@ class LaneGeometry:
     kinds: tuple[type[Primitive], ...]  # the kinds present, in the order of KINDS; static
     counts: tuple[int, int, int, int, int]  # as in Geometry; static: stages read `ends`
     ends: Tensor  # (5,) int64 the id after the last primitive of each kind
-    p0: Tensor  # (3, P)
-    e1: Tensor  # (3, P)
-    e2: Tensor  # (3, P)
+    p0: Tensor  # (3, P) as in Geometry
+    e1: Tensor  # (3, P) p1 - p0 of flat primitives; the radius in e1[0] of spheres
+    e2: Tensor  # (3, P) p2 - p0
     normal: Tensor  # (3, P) unit geometric normal; zero for spheres, without meaning for quadrics
     bound: Tensor  # (P,) rounding bound: sum |n_i| max |p_i| over the primitive, the scale of rounding of its plane
-    flip: Tensor | None  # (P,) orientation of spheres
+    flip: Tensor | None  # (P,) -1 for spheres whose normals point inward, else 1; None without spheres
     normals: tuple[Tensor, Tensor, Tensor] | None  # (3, P) shading normals at the corners; None if all are flat
     #: (3, P) derivative of p by texture coordinate u; zero: any tangent will do. For a sphere the vector whose cross product
     #: with the normal is this derivative. None if no shading frame needs it.
@@ -125,17 +132,19 @@ class LaneGeometry:
             return prim
         import torch
 
-        copy = self.copy(prim)
-        return torch.where(copy > 0, copy + (self.ends[4] - 1), prim)
+        column = self.instance_column(prim)
+        # Column k is instance k - 1, whose row follows those of the P = ends[4] primitives.
+        return torch.where(column > 0, column + (self.ends[4] - 1), prim)
 
-    def of(self, kind: type[Primitive], prim: Tensor) -> Tensor:
-        """Return a mask ``(N,)`` of the primitives ``prim (N,)`` of a kind that the scene has."""
+    def mask_of_kind(self, kind: type[Primitive], prim: Tensor) -> Tensor:
+        """Return a mask ``(N,)`` of the primitives ``prim (N,)`` that are of a kind, one that the scene has."""
         number = KINDS.index(kind.name)
-        after = prim >= self.ends[number - 1] if number else prim >= 0
-        return after & (prim < self.ends[number]) if any(self.counts[number + 1 :]) else after
+        not_before = prim >= self.ends[number - 1] if number else prim >= 0
+        # Ids are sorted by kind, so the upper end needs no test if no later kind is there.
+        return not_before & (prim < self.ends[number]) if any(self.counts[number + 1 :]) else not_before
 
-    def copy(self, prim: Tensor) -> Tensor:
-        """Return columns ``(N,)`` of ``copies`` for primitive ids of the search."""
+    def instance_column(self, prim: Tensor) -> Tensor:
+        """Return columns ``(N,)`` of :class:`Instances` for primitive ids of the search; 0 for what is not instanced."""
         import torch
 
         assert self.copies is not None
@@ -146,13 +155,12 @@ class LaneGeometry:
 class Hit:
     """Hits of rays, as returned by the search."""
 
-    t: Tensor  # (N,) in units of |d|
-    prim: Tensor  # (N,) int64, -1 for a miss; P and more for instances, see Copies
-    u: Tensor  # (N,)
+    t: Tensor  # (N,) distance in units of |d|
+    prim: Tensor  # (N,) int64, -1 for a miss; P and more for triangles of instances, see Geometry.copies
+    u: Tensor  # (N,) position on the primitive, by its own parametrization
     v: Tensor  # (N,)
-    chance: Tensor | None = (
-        None  # (N,) 1, with the derivative of the probability to get here past opacity; None without derivative
-    )
+    #: (N,) 1, with the derivative of the probability to get here past opacity; None without derivative
+    chance: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -165,7 +173,7 @@ class Interaction:
     tangent: Tensor | None  # (3, N) along u, neither unit nor orthogonal; None if no shading frame needs it
     bitangent: Tensor | None  # (3, N) along v; None without bump maps
     prim: Tensor  # (N,) below P: for an instance the triangle of its mesh
-    slot: Tensor  # (N,) row of the instance, see Copies; else prim
+    slot: Tensor  # (N,) row of the instance, see Instances; else prim
     bound: Tensor | None  # (N,) rounding bounds; None: LaneGeometry.bound at prim
     u: Tensor  # (N,) in the primitive's own parametrization
     v: Tensor  # (N,)

@@ -25,7 +25,8 @@ __all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
 #: Rays leave a surface ``OFFSET * world.geometry.bound`` off its plane. Re-deriving a point and evaluating its plane in the
 #: search each round by less than ``4 * 2^-24 * 2 bound``; this is twice their sum, and scales with the scene.
 OFFSET = 2.0**-19
-#: Distances below this fraction of the coordinates count as 0 and have no derivative, in :func:`reattach`.
+#: Distances below this fraction of the coordinates count as 0 and have no derivative, in :func:`reattach`: 2^9 units in the
+#: last digit of float32.
 NEAR = 2.0**-15
 
 
@@ -40,7 +41,7 @@ def _plane_uv(o: Tensor, d: Tensor, p0: Tensor, e1: Tensor, e2: Tensor) -> tuple
 
 def _not_flat(world: World, prim: Tensor) -> list[tuple[type[Primitive], Tensor]]:
     """Return the kinds in the scene that are not flat (spheres, quadrics), each with the mask of its lanes ``(N,)``."""
-    return [(kind, world.geometry.of(kind, prim)) for kind in world.geometry.kinds if not kind.flat]
+    return [(kind, world.geometry.mask_of_kind(kind, prim)) for kind in world.geometry.kinds if not kind.flat]
 
 
 def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_ray: bool = False) -> Interaction:
@@ -59,24 +60,30 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_ray: bool = Fa
     if follow_ray:
         u, v = _plane_uv(o, d, p0, e1, e2)
     # In lanes of other kinds u and v are no affine coordinates; at 0 the sum below stays finite. ``hit_points`` replaces it.
-    for _, mine in not_flat:
-        u, v = torch.where(mine, 0.0, u), torch.where(mine, 0.0, v)
+    for _, is_kind in not_flat:
+        u, v = torch.where(is_kind, 0.0, u), torch.where(is_kind, 0.0, v)
     p = affine(p0, e1, u, e2, v)
-    ng = take(geometry.normal, prim) if primitives.copies is None else primitives.turned(take(geometry.normal, prim))
-    bound, own = None, None  # see Interaction
-    if primitives.copied is not None and primitives.reach is not None:
-        bound = torch.where(primitives.copied, dot(ng.detach().abs(), primitives.reach), take(geometry.bound, prim))
-    for kind, mine in not_flat:
-        points = kind.hit_points(world, primitives, Rays(o, d, hit, follow_ray), mine)
-        p, ng = torch.where(mine, points.p, p), torch.where(mine, points.ng, ng)
+    ng = (
+        take(geometry.normal, prim)
+        if primitives.copies is None
+        else primitives.normals_to_instance(take(geometry.normal, prim))
+    )
+    bound, own = None, None  # fields of Interaction: rounding bound, point in object space
+    if primitives.is_instanced is not None and primitives.reach is not None:
+        bound = torch.where(
+            primitives.is_instanced, dot(ng.detach().abs(), primitives.reach), take(geometry.bound, prim)
+        )
+    for kind, is_kind in not_flat:
+        points = kind.hit_points(world, primitives, Rays(o, d, hit, follow_ray), is_kind)
+        p, ng = torch.where(is_kind, points.p, p), torch.where(is_kind, points.ng, ng)
         if points.bound is not None:
-            bound = torch.where(mine, points.bound, take(geometry.bound, prim) if bound is None else bound)
+            bound = torch.where(is_kind, points.bound, take(geometry.bound, prim) if bound is None else bound)
         own = own if points.own is None else points.own
     ns = ng
     if geometry.normals is not None:
         corners = [take(n, prim) for n in geometry.normals]
         if primitives.copies is not None:
-            corners = [primitives.turned(n) for n in corners]
+            corners = [primitives.normals_to_instance(n) for n in corners]
         ns = normalize(affine(corners[0] * (1.0 - u - v), corners[1], u, corners[2], v))
         if any(geometry.counts[1:]):  # only triangles, which come first, have normals at their corners
             ns = torch.where(prim < geometry.ends[0], ns, ng)
@@ -86,7 +93,7 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_ray: bool = Fa
 
 
 def _framed(world: World, primitives: LanePrimitives, at: Interaction) -> Interaction:
-    """Add tangents and bitangents, if the world has them."""
+    """Return surface points with tangents and bitangents added, if the world has them."""
     geometry = world.geometry
     if geometry.tangents is None:
         return at
@@ -94,14 +101,16 @@ def _framed(world: World, primitives: LanePrimitives, at: Interaction) -> Intera
     bitangent = None if geometry.bitangents is None else take(geometry.bitangents, at.prim)
     at = replace(at, tangent=tangent, bitangent=bitangent)
     for kind in (kind for kind in geometry.kinds if kind.has_own_uv):
-        mine = geometry.of(kind, at.prim)
-        along_u, along_v = kind.tangents(world, primitives, at, mine)
-        tangent = torch.where(mine, along_u, tangent)
-        bitangent = None if bitangent is None or along_v is None else torch.where(mine, along_v, bitangent)
-    if primitives.copied is not None:
-        tangent = torch.where(primitives.copied, primitives.moved(tangent), tangent)
+        is_kind = geometry.mask_of_kind(kind, at.prim)
+        along_u, along_v = kind.tangents(world, primitives, at, is_kind)
+        tangent = torch.where(is_kind, along_u, tangent)
+        bitangent = None if bitangent is None or along_v is None else torch.where(is_kind, along_v, bitangent)
+    if primitives.is_instanced is not None:
+        tangent = torch.where(primitives.is_instanced, primitives.vectors_to_instance(tangent), tangent)
         bitangent = (
-            None if bitangent is None else torch.where(primitives.copied, primitives.moved(bitangent), bitangent)
+            None
+            if bitangent is None
+            else torch.where(primitives.is_instanced, primitives.vectors_to_instance(bitangent), bitangent)
         )
     return replace(at, tangent=tangent, bitangent=bitangent)
 
@@ -128,9 +137,9 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
     not_flat = _not_flat(world, primitives.prim)
     if not_flat:
         rays = Rays(x, wi, replace(hit, t=torch.where(missed, 0.0, hit.t)))
-        for kind, mine in not_flat:
-            fixed = kind.fixed_points(world, primitives, rays, mine)
-            y, area = torch.where(mine, fixed.p, y), torch.where(mine, fixed.area, area)
+        for kind, is_kind in not_flat:
+            fixed = kind.fixed_points(world, primitives, rays, is_kind)
+            y, area = torch.where(is_kind, fixed.p, y), torch.where(is_kind, fixed.area, area)
     offset = torch.where(missed, wi, y - x)
     square = dot(offset, offset)
     # Where two surfaces touch, the derivative grows as one over the distance. Points within rounding of each other count as

@@ -16,6 +16,8 @@ __all__ = ["smooth_normals"]
 
 
 def _length(a: Tensor) -> Tensor:
+    """Return lengths ``(N,)`` of vectors ``(3, N)``, with derivative 0 at 0."""
+    # The inner ``where`` keeps the infinite derivative of the root at 0 out of the backward pass.
     square = dot(a, a)
     return torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
 

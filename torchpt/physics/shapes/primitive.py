@@ -1,4 +1,9 @@
-"""The base class of primitives: their geometry when a world is built, and surface points of hits on them."""
+"""The base class of primitives: their geometry when a world is built, and surface points of hits on them.
+
+A *part* is a set of primitives of one kind that share a shape and a material. Flat kinds (triangle, rectangle, disk) share one
+affine form, which this class has; spheres and quadrics override the methods on lanes. These methods are called with the lanes
+of all kinds together and a mask ``is_kind (N,)`` of those that count.
+"""
 
 from __future__ import annotations
 
@@ -57,27 +62,28 @@ class Corners:
 class LanePrimitives:
     """Geometry of the primitives of N lanes, with their instances."""
 
-    prim: Tensor  # (N,) below P
-    p0: Tensor  # (3, N)
+    prim: Tensor  # (N,) index below P: of an instance the triangle of its mesh
+    p0: Tensor  # (3, N) in the world: of an instance already transformed, as e1 and e2
     e1: Tensor  # (3, N)
     e2: Tensor  # (3, N)
     copies: Instances | None = None  # columns (., N); None without instances
-    copied: Tensor | None = None  # (N,) bool: primitives of instances
+    is_instanced: Tensor | None = None  # (N,) bool: primitives of instances
     reach: Tensor | None = None  # (3, N) sums of coordinate magnitudes, for rounding bounds; None without instances
 
-    def moved(self, w: Tensor) -> Tensor:
+    def vectors_to_instance(self, w: Tensor) -> Tensor:
         """Transform vectors ``(3, N)`` from the mesh to its instance."""
         assert self.copies is not None
         return _linear(self.copies, w)
 
-    def turned(self, n: Tensor) -> Tensor:
+    def normals_to_instance(self, n: Tensor) -> Tensor:
         """Transform unit normals ``(3, N)`` from the mesh to its instance."""
-        assert self.copies is not None and self.copied is not None
-        turned = affine(self.copies.nx * n[0], self.copies.ny, n[1], self.copies.nz, n[2])
-        return torch.where(self.copied, normalize(turned), n)
+        assert self.copies is not None and self.is_instanced is not None
+        transformed = affine(self.copies.nx * n[0], self.copies.ny, n[1], self.copies.nz, n[2])
+        return torch.where(self.is_instanced, normalize(transformed), n)
 
 
 def _linear(copies: Instances, w: Tensor) -> Tensor:
+    """Apply the linear maps of instances to vectors ``w (3, N)``."""
     return affine(copies.x * w[0], copies.y, w[1], copies.z, w[2])
 
 
@@ -86,14 +92,14 @@ def lane_primitives(world: World, prim: Tensor) -> LanePrimitives:
     geometry = world.geometry
     if geometry.copies is None:
         return LanePrimitives(prim, take(geometry.p0, prim), take(geometry.e1, prim), take(geometry.e2, prim))
-    column = geometry.copy(prim)
+    column = geometry.instance_column(prim)
     table = rows(geometry.copies, column)
-    prim = prim - table.start + table.first
+    prim = prim - table.start + table.first  # from the instance's ids to those of the mesh
     p0, e1, e2 = take(geometry.p0, prim), take(geometry.e1, prim), take(geometry.e2, prim)
     size = (p0.abs() + e1.abs() + e2.abs()).detach()
     reach = affine(table.x.abs() * size[0], table.y.abs(), size[1], table.z.abs(), size[2]) + table.move.abs()
     p0, e1, e2 = _linear(table, p0) + table.move, _linear(table, e1), _linear(table, e2)
-    return LanePrimitives(prim, p0, e1, e2, table, column > 0, reach.detach())
+    return LanePrimitives(prim, p0, e1, e2, copies=table, is_instanced=column > 0, reach=reach.detach())
 
 
 @dataclass(frozen=True)
@@ -146,8 +152,8 @@ class Primitive:
     Attributes:
         name: one of :data:`torchpt.physics.shapes.geometry.KINDS`.
         flat: whether points lie in the plane ``p0 + u e1 + v e2``. Flat kinds come first in the order of kinds.
-        has_own_uv: whether texture coordinates are not affine: then :meth:`tangents` and :meth:`uv` compute them.
-        angles: whether only similarity transforms keep the kind, as for spheres.
+        has_own_uv: whether texture coordinates are not affine in ``u, v``: then :meth:`tangents` and :meth:`uv` compute them.
+        angles: whether only similarity transforms keep the kind: a sheared sphere is none.
     """
 
     name: ClassVar[str] = ""
@@ -177,7 +183,7 @@ class Primitive:
 
     @classmethod
     def uvs(cls, part: Part, corners: Corners) -> Triple:
-        """Return texture coordinates ``(2, P)`` at the corners; zero for charted kinds."""
+        """Return texture coordinates ``(2, P)`` at the corners; zero for kinds with :attr:`has_own_uv`."""
         nothing = torch.zeros_like(corners.p0[:2])
         return nothing, nothing, nothing
 
@@ -196,34 +202,34 @@ class Primitive:
     # -- on lanes; results in lanes of other kinds are arbitrary
 
     @classmethod
-    def hit_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> HitPoints:
-        """Return the hit points, for kinds that are not flat; ``mine (N,)`` masks lanes of this kind."""
+    def hit_points(cls, world: World, primitives: LanePrimitives, rays: Rays, is_kind: Tensor) -> HitPoints:
+        """Return the hit points, for kinds that are not flat; ``is_kind (N,)`` masks lanes of this kind."""
         raise NotImplementedError
 
     @classmethod
-    def fixed_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> FixedPoints:
+    def fixed_points(cls, world: World, primitives: LanePrimitives, rays: Rays, is_kind: Tensor) -> FixedPoints:
         """Return the hit points fixed on their surfaces under differentiation, for kinds that are not flat."""
         raise NotImplementedError
 
     @classmethod
     def tangents(
-        cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
+        cls, world: World, primitives: LanePrimitives, at: Interaction, is_kind: Tensor
     ) -> tuple[Tensor, Tensor | None]:
         """Return derivatives of points by texture coordinates, ``(3, N)`` each, the second if ``at`` has a bitangent.
 
-        Called for charted kinds.
+        Called for kinds with :attr:`has_own_uv`.
 
         Args:
             world: the scene's tensors.
-            place: geometry of the primitives.
+            primitives: geometry of the primitives.
             at: the points, with columns of ``LaneGeometry.tangents`` and ``bitangents``.
-            mine: mask ``(N,)`` of lanes of this kind.
+            is_kind: mask ``(N,)`` of lanes of this kind.
         """
         raise NotImplementedError
 
     @classmethod
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
-        """Return texture coordinates ``(2, N)``, for charted kinds; None if no point is of this kind."""
+        """Return texture coordinates ``(2, N)``, for kinds with :attr:`has_own_uv`; None if no point is of this kind."""
         raise NotImplementedError
 
 

@@ -44,6 +44,9 @@ __all__ = [
     "tangent",
 ]  # fmt: skip
 
+#: Samples along each axis for the mean area of mapped quadrics; it decides how often a light is chosen, not what it emits.
+_GRID = 16
+
 
 @dataclass(frozen=True)
 class Form:
@@ -153,11 +156,11 @@ def quadrics_of(kinds: Sequence[type[Quadric]], turned: Sequence[bool], frames: 
         dtype: dtype of the world.
     """
     p0, e1, e2, e3 = frames[0:3], frames[3:6], frames[6:9], frames[9:12]
-    faces = [cross(e2, e3), cross(e3, e1), cross(e1, e2)]  # columns of the cofactor matrix
+    cofactors = [cross(e2, e3), cross(e3, e1), cross(e1, e2)]  # columns of the cofactor matrix
     front = torch.tensor([-1.0 if turn else 1.0 for turn in turned], dtype=p0.dtype, device=p0.device)
-    front = front * torch.sign(dot(e1, faces[0]).detach())  # the sign of the determinant: mirroring maps
-    scale = torch.stack(faces).detach().abs().amax((0, 1))
-    n1, n2, n3 = ((n * (front / scale)).to(dtype) for n in faces)
+    front = front * torch.sign(dot(e1, cofactors[0]).detach())  # the sign of the determinant: mirroring maps
+    scale = torch.stack(cofactors).detach().abs().amax((0, 1))
+    n1, n2, n3 = ((n * (front / scale)).to(dtype) for n in cofactors)
     reach = (p0.abs() + e1.abs() + e2.abs() + e3.abs()).detach().to(dtype)
     present = tuple(sorted(set(kinds), key=lambda kind: kind.name))
     code = None
@@ -173,7 +176,7 @@ def table_of(table: Quadrics, frames: Tensor) -> QuadricTable:
     p0, e1, e2, e3 = frames[0:3], frames[3:6], frames[6:9], frames[9:12]
     low, high = zip(*(kind.box(e1, e2, e3) for kind in table.kinds), strict=True)
     form = forms.expand(-1, frames.shape[1]) if table.code is None else forms[:, table.code]
-    return QuadricTable(frames, form, _each(table, low) + p0, _each(table, high) + p0)
+    return QuadricTable(frames, form, _select_by_kind(table, low) + p0, _select_by_kind(table, high) + p0)
 
 
 def areas(table: Quadrics, frames: Tensor) -> tuple[Tensor, Tensor]:
@@ -185,18 +188,18 @@ def areas(table: Quadrics, frames: Tensor) -> tuple[Tensor, Tensor]:
     in object space times a numerical mean, over a 16 x 16 grid of samples, of the factor by which the map scales area.
     """
     e1, e2, e3 = frames[3:6], frames[6:9], frames[9:12]
-    own = torch.tensor([kind.area for kind in table.kinds], dtype=torch.float64, device=e1.device)
-    own = own.expand(e1.shape[1]) if table.code is None else own[table.code]
+    object_area = torch.tensor([kind.area for kind in table.kinds], dtype=torch.float64, device=e1.device)
+    object_area = object_area.expand(e1.shape[1]) if table.code is None else object_area[table.code]
     det = dot(e1, cross(e2, e3)).abs()
-    faces = [n.detach() for n in (cross(e2, e3), cross(e3, e1), cross(e1, e2))]
-    grid = (torch.arange(16, dtype=torch.float64, device=e1.device) + 0.5) / 16
+    cofactors = [n.detach() for n in (cross(e2, e3), cross(e3, e1), cross(e1, e2))]
+    grid = (torch.arange(_GRID, dtype=torch.float64, device=e1.device) + 0.5) / _GRID
     samples = torch.cartesian_prod(grid, grid)
-    total = torch.zeros_like(own)
+    total = torch.zeros_like(object_area)
     for u in samples:
-        n = normal(table, sample(table, u[:, None].expand(2, len(own))))
-        mapped = affine(faces[0] * n[0], faces[1], n[1], faces[2], n[2])  # cofactor matrix times n
+        n = normal(table, sample(table, u[:, None].expand(2, len(object_area))))
+        mapped = affine(cofactors[0] * n[0], cofactors[1], n[1], cofactors[2], n[2])
         total += (dot(mapped, mapped) / dot(n, n)).sqrt()
-    return own * det, own * total / len(samples)
+    return object_area * det, object_area * total / len(samples)
 
 
 # -- on lanes
@@ -209,23 +212,23 @@ def rows(world: World, prim: Tensor) -> Quadrics:
     return columns(world.geometry.quadrics, index)
 
 
-def _each(table: Quadrics, values: Iterable[Tensor]) -> Tensor:
+def _select_by_kind(table: Quadrics, values: Iterable[Tensor]) -> Tensor:
     """Select in each lane the value of its surface; ``values`` are in the order of ``table.kinds``."""
-    first, *others = values
+    selected, *others = values
     for number, value in enumerate(others, 1):
         assert table.code is not None
-        first = torch.where(table.code == number, value, first)
-    return first
+        selected = torch.where(table.code == number, value, selected)
+    return selected
 
 
 def place(table: Quadrics, u: Tensor, v: Tensor) -> Tensor:
     """Return points ``(3, N)`` in object space by ``u, v (N,)`` of hits."""
-    return _each(table, (kind.place(u, v) for kind in table.kinds))
+    return _select_by_kind(table, (kind.place(u, v) for kind in table.kinds))
 
 
 def normal(table: Quadrics, q: Tensor) -> Tensor:
     """Return outward normals ``(3, N)`` in object space, with the lengths of :meth:`Quadric.normal`."""
-    return _each(table, (kind.normal(q) for kind in table.kinds))
+    return _select_by_kind(table, (kind.normal(q) for kind in table.kinds))
 
 
 def direction(table: Quadrics, n: Tensor) -> Tensor:
@@ -251,14 +254,16 @@ def bitangent(table: Quadrics, e1: Tensor, e2: Tensor, q: Tensor) -> Tensor:
     square = (q[0] * q[0] + q[1] * q[1]).detach()
     radius = torch.where(square > 0, square, 1.0).sqrt()
     x, y = q[0] / radius, q[1] / radius
-    dr_dv, dz_dv = (_each(table, part) for part in zip(*(kind.climb(q, radius) for kind in table.kinds), strict=True))
+    dr_dv, dz_dv = (
+        _select_by_kind(table, part) for part in zip(*(kind.climb(q, radius) for kind in table.kinds), strict=True)
+    )
     return affine(e1 * (dr_dv * x), e2, dr_dv * y, table.e3, dz_dv)
 
 
 def surface_uv(table: Quadrics, q: Tensor) -> Tensor:
     """Return texture coordinates ``(2, N)``: the azimuth about z over 2 pi, and :meth:`Quadric.v`."""
     radius, azimuth_u = polar(q[0], q[1])
-    return torch.stack((azimuth_u, _each(table, (kind.v(q, radius) for kind in table.kinds))))
+    return torch.stack((azimuth_u, _select_by_kind(table, (kind.v(q, radius) for kind in table.kinds))))
 
 
 def follow_ray(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, t: Tensor, q: Tensor) -> Tensor:
@@ -273,10 +278,10 @@ def follow_ray(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, t:
     def to_object(x: Tensor) -> Tensor:
         return torch.stack((dot(table.n1, x), dot(table.n2, x), dot(table.n3, x))) * inverse
 
-    f, e = to_object(o - p0), to_object(d)
-    at = f + e * t.detach()
-    value = _each(table, (_residual(kind.form, at) for kind in table.kinds))
-    slope = _each(table, (_slope(kind.form, at, e) for kind in table.kinds)).detach()
+    origin, e = to_object(o - p0), to_object(d)  # the ray in object space
+    at = origin + e * t.detach()
+    value = _select_by_kind(table, (_residual(kind.form, at) for kind in table.kinds))
+    slope = _select_by_kind(table, (_slope(kind.form, at, e) for kind in table.kinds)).detach()
     moved = at - e.detach() * (value / torch.where(slope == 0, 1.0, slope))
     return moved if q.dtype == torch.float64 else q + (moved - moved.detach())
 
@@ -303,4 +308,4 @@ def _slope(form: Form, q: Tensor, e: Tensor) -> Tensor:
 
 def sample(table: Quadrics, u: Tensor) -> Tensor:
     """Sample points ``(3, N)`` uniformly by area in object space, from ``u (2, N)`` in [0, 1)."""
-    return _each(table, (kind.sample(u) for kind in table.kinds))
+    return _select_by_kind(table, (kind.sample(u) for kind in table.kinds))

@@ -17,15 +17,15 @@ __all__ = ["surface_uv", "vertex_colors"]
 
 
 def surface_uv(world: World, at: Interaction) -> Tensor:
-    """Return texture coordinates ``(2, N)``."""
+    """Return texture coordinates ``(2, N)`` of surface points; the world must have textures."""
     geometry = world.geometry
     assert geometry.uvs is not None
     a, b, c = (take(x, at.prim) for x in geometry.uvs)
     uv = torch.addcmul(torch.addcmul(a * (1.0 - at.u - at.v), b, at.u), c, at.v)
     for kind in geometry.kinds:
-        own = kind.uv(world, at) if kind.has_own_uv else None
-        if own is not None:
-            uv = torch.where(geometry.of(kind, at.prim), own, uv)
+        kind_uv = kind.uv(world, at) if kind.has_own_uv else None
+        if kind_uv is not None:
+            uv = torch.where(geometry.mask_of_kind(kind, at.prim), kind_uv, uv)
     return uv
 
 

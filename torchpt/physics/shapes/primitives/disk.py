@@ -37,12 +37,12 @@ class Disk(Primitive):
 
     @classmethod
     def tangents(
-        cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
+        cls, world: World, primitives: LanePrimitives, at: Interaction, is_kind: Tensor
     ) -> tuple[Tensor, Tensor | None]:
         """See :meth:`Primitive.tangents`; ``u`` grows outward, ``v`` around the centre."""
-        u, v, e1, e2 = at.u, at.v, place.e1, place.e2
+        u, v, e1, e2 = at.u, at.v, primitives.e1, primitives.e2
         away = torch.addcmul(e1 * u, e2, v)
-        square = torch.where(mine, u * u + v * v, 1.0)
+        square = torch.where(is_kind, u * u + v * v, 1.0)
         some = square > 0
         tangent = torch.where(some, away / torch.where(some, square, 1.0).sqrt(), e1)
         if at.bitangent is None:

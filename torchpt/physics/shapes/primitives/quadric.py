@@ -36,34 +36,34 @@ class Quadric(Primitive):
         return Corners(move.to(dtype), x.to(dtype), y.to(dtype), frame=frame)
 
     @classmethod
-    def hit_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> HitPoints:
+    def hit_points(cls, world: World, primitives: LanePrimitives, rays: Rays, is_kind: Tensor) -> HitPoints:
         """See :meth:`Primitive.hit_points`."""
-        table = quadrics.rows(world, place.prim)
-        own = _object_point(table, rays, mine)
+        table = quadrics.rows(world, primitives.prim)
+        own = _object_point(table, rays, is_kind)
         if rays.follow_ray:
-            moved = quadrics.follow_ray(table, place.p0, place.e1, rays.o, rays.d, rays.hit.t, own)
-            own = torch.where(mine, moved, own)
+            moved = quadrics.follow_ray(table, primitives.p0, primitives.e1, rays.o, rays.d, rays.hit.t, own)
+            own = torch.where(is_kind, moved, own)
         ng = quadrics.outward(table, own)
         # The bound at the point, not of the whole primitive: a needle is far thinner than it is long.
-        return HitPoints(_point(table, place, own), ng, dot(ng.detach().abs(), table.reach), own)
+        return HitPoints(_point(table, primitives, own), ng, dot(ng.detach().abs(), table.reach), own)
 
     @classmethod
-    def fixed_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> FixedPoints:
+    def fixed_points(cls, world: World, primitives: LanePrimitives, rays: Rays, is_kind: Tensor) -> FixedPoints:
         """See :meth:`Primitive.fixed_points`; points stay fixed in object space."""
-        table = quadrics.rows(world, place.prim)
-        own = _object_point(table, rays, mine)
-        return FixedPoints(_point(table, place, own), quadrics.direction(table, quadrics.normal(table, own)))
+        table = quadrics.rows(world, primitives.prim)
+        own = _object_point(table, rays, is_kind)
+        return FixedPoints(_point(table, primitives, own), quadrics.direction(table, quadrics.normal(table, own)))
 
     @classmethod
     def tangents(
-        cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
+        cls, world: World, primitives: LanePrimitives, at: Interaction, is_kind: Tensor
     ) -> tuple[Tensor, Tensor | None]:
         """See :meth:`Primitive.tangents`."""
         assert at.own is not None
-        tangent = quadrics.tangent(place.e1, place.e2, at.own)
+        tangent = quadrics.tangent(primitives.e1, primitives.e2, at.own)
         if at.bitangent is None:
             return tangent, None
-        return tangent, quadrics.bitangent(quadrics.rows(world, at.prim), place.e1, place.e2, at.own)
+        return tangent, quadrics.bitangent(quadrics.rows(world, at.prim), primitives.e1, primitives.e2, at.own)
 
     @classmethod
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
@@ -73,10 +73,10 @@ class Quadric(Primitive):
         return quadrics.surface_uv(quadrics.rows(world, at.prim), at.own)
 
 
-def _object_point(table: Quadrics, rays: Rays, mine: Tensor) -> Tensor:
+def _object_point(table: Quadrics, rays: Rays, is_kind: Tensor) -> Tensor:
     """Return hit points ``(3, N)`` in object space."""
-    return quadrics.place(table, torch.where(mine, rays.hit.u, 0.0), torch.where(mine, rays.hit.v, 0.0))
+    return quadrics.place(table, torch.where(is_kind, rays.hit.u, 0.0), torch.where(is_kind, rays.hit.v, 0.0))
 
 
-def _point(table: Quadrics, place: LanePrimitives, own: Tensor) -> Tensor:
-    return affine(place.p0 + place.e1 * own[0], place.e2, own[1], table.e3, own[2])
+def _point(table: Quadrics, primitives: LanePrimitives, own: Tensor) -> Tensor:
+    return affine(primitives.p0 + primitives.e1 * own[0], primitives.e2, own[1], table.e3, own[2])

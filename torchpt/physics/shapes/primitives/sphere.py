@@ -24,7 +24,7 @@ _NUMBER = KINDS.index("sphere")
 
 
 class Sphere(Primitive):
-    """A sphere. Masks ``mine (N,)`` tell the lanes whose primitive is a sphere; results in other lanes are arbitrary."""
+    """A sphere. Masks ``is_kind (N,)`` are True in lanes whose primitive is a sphere; results in other lanes are arbitrary."""
 
     name = "sphere"
     has_own_uv = True
@@ -52,27 +52,27 @@ class Sphere(Primitive):
         return around, torch.stack((math.pi * radius * handed, zero, zero))
 
     @classmethod
-    def hit_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> HitPoints:
+    def hit_points(cls, world: World, primitives: LanePrimitives, rays: Rays, is_kind: Tensor) -> HitPoints:
         """See :meth:`Primitive.hit_points`."""
         assert world.geometry.flip is not None
-        o, d, p0 = rays.o, rays.d, place.p0
-        radius = torch.where(mine, place.e1[0], 1.0)  # 1 and 0: finite values, and so gradients, in other lanes
+        o, d, p0 = rays.o, rays.d, primitives.p0
+        radius = torch.where(is_kind, primitives.e1[0], 1.0)  # 1 and 0: finite values, and so gradients, in other lanes
         t = _distance(o, d, p0, radius, rays.hit.t) if rays.follow_ray else rays.hit.t
-        t = torch.where(mine, t, 0.0)
+        t = torch.where(is_kind, t, 0.0)
         away = o + d * t - p0
-        outward = normalize(torch.where(mine, away, torch.ones_like(away)))
-        return HitPoints(p0 + outward * radius, outward * take(world.geometry.flip, place.prim))
+        outward = normalize(torch.where(is_kind, away, torch.ones_like(away)))
+        return HitPoints(p0 + outward * radius, outward * take(world.geometry.flip, primitives.prim))
 
     @classmethod
-    def fixed_points(cls, world: World, place: LanePrimitives, rays: Rays, mine: Tensor) -> FixedPoints:
+    def fixed_points(cls, world: World, primitives: LanePrimitives, rays: Rays, is_kind: Tensor) -> FixedPoints:
         """See :meth:`Primitive.fixed_points`; points keep their normal."""
-        radius = torch.where(mine, place.e1[0], 1.0)
-        outward = normalize((rays.o + rays.d * rays.hit.t - place.p0).detach())
-        return FixedPoints(place.p0 + outward * radius, outward * (radius * radius))
+        radius = torch.where(is_kind, primitives.e1[0], 1.0)
+        outward = normalize((rays.o + rays.d * rays.hit.t - primitives.p0).detach())
+        return FixedPoints(primitives.p0 + outward * radius, outward * (radius * radius))
 
     @classmethod
     def tangents(
-        cls, world: World, place: LanePrimitives, at: Interaction, mine: Tensor
+        cls, world: World, primitives: LanePrimitives, at: Interaction, is_kind: Tensor
     ) -> tuple[Tensor, Tensor | None]:
         """See :meth:`Primitive.tangents`; ``u`` grows around the axis, ``v`` downward."""
         assert at.tangent is not None
