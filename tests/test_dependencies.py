@@ -124,7 +124,7 @@ def test_install_states_the_ranges_and_the_versions_that_are_tested() -> None:
     text = (ROOT / "docs" / "getting-started" / "install.md").read_text()
     asked = {Requirement(text).name: Requirement(text).specifier for text in PROJECT["dependencies"]}
     pins = dict(re.findall(r"^([\w.-]+)==(.+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE))
-    for name in ("torch", "numba", "llvmlite", "numpy"):
+    for name in ("torch", "llvmlite", "numpy"):
         low = next(bound.version for bound in asked[name] if bound.operator == ">=")
         assert f"{low} up to {next(bound.version for bound in asked[name] if bound.operator == '<')}" in text, name
         assert pins[name].rpartition(".")[0] in text, name

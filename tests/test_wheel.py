@@ -37,5 +37,7 @@ def test_the_wheel_carries_configs_and_scenes(tmp_path: Path) -> None:
         for path in (ROOT / folder).rglob("*"):
             if path.is_file():
                 assert f"torchpt/share/{path.relative_to(ROOT)}" in names
+    kernels = {path.name for path in (ROOT / "torchpt" / "native" / "ir").iterdir()}
+    assert kernels and {f"torchpt/native/ir/{name}" for name in kernels} <= names
     assert any(name.endswith("entry_points.txt") for name in names)
     assert not any(name.startswith(("configs", "tests")) for name in names)

@@ -30,7 +30,7 @@ from torchpt.engines.kernels.engine import KernelsEngine
 FAILURES: dict[str, Callable[[], Exception]] = {
     "torch on a CPU": lambda: RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to"),
     "torch on CUDA": lambda: torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
-    "python, numba": lambda: MemoryError(),
+    "python": lambda: MemoryError(),
     "numpy": lambda: np._core._exceptions._ArrayMemoryError((1 << 40,), np.dtype(np.float32)),  # pyright: ignore
     "C++": lambda: RuntimeError("std::bad_alloc"),
 }

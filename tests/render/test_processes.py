@@ -1,5 +1,5 @@
-"""Renders from threads, forked and spawned workers, under numba's workqueue layer, and without a writable cache: each runs
-in an interpreter of its own, and must give the picture that a plain render gives."""
+"""Renders from threads, forked and spawned workers, and without a writable cache: each runs in an interpreter of its own, and
+must give the picture that a plain render gives."""
 
 from __future__ import annotations
 
@@ -104,13 +104,6 @@ def test_threads_then_a_fork_give_the_same_picture():
 @pytest.mark.parametrize("way", SCRIPTS)
 def test_threads_and_workers_give_the_same_picture(tmp_path, way, name):
     assert set(run(tmp_path, SCRIPTS[way], name, {})) == {expected(name)}
-
-
-@pytest.mark.parametrize("way", SCRIPTS)
-@pytest.mark.slow
-def test_under_the_workqueue_layer(tmp_path, way):
-    found = run(tmp_path, SCRIPTS[way], "cornell_box", {"NUMBA_THREADING_LAYER": "workqueue"})
-    assert set(found) == {expected("cornell_box")}
 
 
 @pytest.mark.slow

@@ -9,17 +9,16 @@ import pytest
 import torch
 from few import few
 from few_lanes import few_lanes
-from numba.core.compiler_lock import global_compiler_lock
 from trials import film_of
 
 import torchpt
 from torchpt.core.errors import SceneError
+from torchpt.native import kernels
 from torchpt.physics.film import ErrorEstimate, pilots_of
 from torchpt.rendering.api import Rendering, render_scene
 from torchpt.rendering.stopping import StopRules
 from torchpt.scene.formats.description import settings
 from torchpt.scene.settings import Render
-from torchpt.search import tree
 from torchpt.spec.schema import read_params
 
 
@@ -142,16 +141,15 @@ def test_kernels_take_none_of_the_time(monkeypatch):
     """Those of the search are made at their first call, when sampling has begun."""
     scene = torchpt.load("cornell_box", device="cpu")
     shot(scene, spp=2, accel="numba")
-    kept_back, made = tree.ensure_compiled, []
+    original, made = kernels._load, []
 
-    def slow(kernel: Any, *args: Any) -> Any:
-        if not made:
-            made.append(kernel)
-            with global_compiler_lock:  # as numba has it while it compiles
-                time.sleep(0.25)
-        return kept_back(kernel, *args)
+    def slow(module: str) -> Any:
+        made.append(module)
+        time.sleep(0.25)
+        return original(module)
 
-    monkeypatch.setattr(tree, "ensure_compiled", slow)
+    monkeypatch.setattr(kernels, "_load", slow)
+    monkeypatch.delitem(kernels._modules, "tree_nearest")
     start = time.perf_counter()
     found = shot(scene, spp=10**6, accel="numba", time_limit=0.15, threads=1)
     wall = time.perf_counter() - start

@@ -2,17 +2,17 @@
 
 import math
 
+import numba
 import numpy as np
 import torch
 
-from torchpt.native.jit import jit
 from torchpt.search.tree_build import mesh_tree
 from torchpt.search.tree_layout import FLOOR, SLACK
 
 ZERO, INF = np.float32(0), np.float32(np.inf)
 
 
-@jit()
+@numba.njit(error_model="numpy")
 def _enter(box, base, k, o, inverse, far):
     """Entry into a child's box, or NaN where it is not met before ``far``."""
     a, b = ZERO, far
@@ -24,7 +24,7 @@ def _enter(box, base, k, o, inverse, far):
     return a if a <= b * SLACK else np.float32(np.nan)
 
 
-@jit()
+@numba.njit(error_model="numpy")
 def _triangle(p, row, o, d, axes):
     """``t, u, v`` by Woop's edge functions and the plane's distance; ``t`` is NaN for a miss."""
     x, y, z = axes
@@ -47,7 +47,7 @@ def _triangle(p, row, o, d, axes):
     return min(max(plane, min(min(a, b), c)), max(max(a, b), c)), f / det, g / det
 
 
-@jit()
+@numba.njit(error_model="numpy")
 def _trace(o, d, t_max, box, child, ids, p, rows, t, prim, u, v):
     stack, entries = np.empty(4096, np.int64), np.empty(4096, np.float32)
     for i in range(len(t_max)):

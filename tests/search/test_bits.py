@@ -96,14 +96,17 @@ def test_bits_do_not_depend_on_the_rays_beside():
 
 
 SCRIPT = """
+import sys
+from torchpt.native import kernels, machine
+machine.host = lambda: tuple(sys.argv[1:])
 from test_bits import KINDS, WideBvh, check, sphere_mesh, triangles
 g = triangles(*sphere_mesh(12))
 accel = WideBvh(g, 1)
 for kind in KINDS:
     for sort in (False, True):
         check(g, accel, kind, 20_000, 5, sort)
-from torchpt.search import tree_packet
-code = next(iter(tree_packet.nearest.inspect_asm().values()))
+made = machine.new_machine()
+code = made.emit_assembly(machine.parse(kernels.read_module("tree_nearest"), made))
 print(*(name in code for name in ("zmm", "ymm", "xmm")))
 """
 
@@ -115,12 +118,11 @@ print(*(name in code for name in ("zmm", "ymm", "xmm")))
     [("haswell", "+avx2", ["False", "True", "True"]), ("nehalem", "", ["False", "False", "True"])],
 )
 def test_shorter_vectors_give_the_same_bits(cpu, features, registers, tmp_path):
-    settings = {"NUMBA_CPU_NAME": cpu, "NUMBA_CPU_FEATURES": features, "TORCHPT_CACHE": str(tmp_path)}
     root = Path(__file__).resolve().parents[2]
     path = os.pathsep.join([str(root), *sys.path])  # with the helpers beside tests
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT],
-        env={**os.environ, "PYTHONPATH": path, **settings}, capture_output=True, text=True, timeout=600,
+        [sys.executable, "-c", SCRIPT, cpu, features],
+        env={**os.environ, "PYTHONPATH": path, "TORCHPT_CACHE": str(tmp_path)}, capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.split() == registers

@@ -3,6 +3,7 @@
 import math
 from itertools import product
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -13,7 +14,6 @@ from test_arrays import with_copies, with_quadrics
 from test_bits import KINDS, equal_bits, found, make_rays
 
 import torchpt
-from torchpt.native.jit import jit
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.physics.shapes.kinds.cylinder import Cylinder
 from torchpt.physics.shapes.kinds.sphere import Ellipsoid
@@ -57,7 +57,8 @@ def moved(g, seed, size):
 
 def nodes_of(accel):
     """The nodes of a tree as ``(box, code)`` of their children, by code; children's ids where the code is a leaf's."""
-    tree, codes = accel.arrays[:2]
+    tree = accel.tables[0]
+    codes = tree.view(np.int32)
     nodes, leaves, todo = {}, {}, [0]
     while todo:
         line = todo.pop() >> 2
@@ -81,7 +82,7 @@ def union(boxes):
 
 def check_blocks(accel, g):
     """Every box is the one about what it holds, every triangle is where the geometry has it."""
-    (nodes, leaves), tree = nodes_of(accel), accel.arrays[0]
+    (nodes, leaves), tree = nodes_of(accel), accel.tables[0]
     area = affine_rows(g).area.numpy()
     bounds = torch.cat(primitive_bounds(g)).T.numpy()
     corners = torch.cat([g.p0, g.p1, g.p2]).T.numpy()
@@ -102,7 +103,7 @@ def check_blocks(accel, g):
     assert sorted(held) == np.flatnonzero(area).tolist()
 
 
-@jit()
+@numba.njit(error_model="numpy")
 def _nearest_of_all(o, d, p, rows, t, prim):
     for i in range(o.shape[1]):
         t[i], prim[i] = np.inf, -1
@@ -190,7 +191,7 @@ def test_the_same_places_give_the_same_blocks():
     g = soup(5, (300, 8, 6, 6))
     tree = WideBvh(g, 1)
     again = refitted(tree, g)
-    for a, b in zip(tree.arrays[:-1], again.arrays[:-1], strict=True):
+    for a, b in zip(tree.tables, again.tables, strict=True):
         assert a is not b and np.array_equal(a, b, equal_nan=a.dtype != np.int32)
     assert again.refit_state.sah_ratio == 1.0 and tree.describe() == again.describe() | {
         "build_seconds": tree.describe()["build_seconds"]
@@ -200,12 +201,12 @@ def test_the_same_places_give_the_same_blocks():
 def test_a_tree_in_use_stays_as_it_is(whatever_it_costs):
     g = soup(6, (300, 8, 6, 6))
     tree = WideBvh(g, 1)
-    before, rays = [x.copy() for x in tree.arrays], make_rays("random", g, 5000)
+    before, rays = [x.copy() for x in tree.tables], make_rays("random", g, 5000)
     hits, facts = found(tree, *rays), tree.describe()
     other = refitted(tree, moved(g, 2, 0.5))
     assert not equal_bits(found(other, *rays), hits)
     assert equal_bits(found(tree, *rays), hits) and tree.describe() == facts
-    for a, b in zip(before, tree.arrays, strict=True):
+    for a, b in zip(before, tree.tables, strict=True):
         assert np.array_equal(a, b, equal_nan=a.dtype != np.int32)
 
 
@@ -353,7 +354,7 @@ def test_copies_move_with_their_meshes(size, whatever_it_costs):
     tree = build(g, "numba", 1)
     old, new = tree.refit(there), build(there, "numba", 1)
     assert isinstance(old, InstancedWideBvh) and isinstance(tree, InstancedWideBvh)
-    assert len(old.arrays[2]) == len(tree.arrays[2])  # the meshes' blocks; those of the upper level are new
+    assert len(old.tables[1]) == len(tree.tables[1])  # the meshes' blocks; those of the upper level are new
     rays = make_rays("random", there, 30_000, 2)
     hits = found(old, *rays)
     assert equal_bits(hits, found(new, *rays)) and (hits[1] >= g.size).sum() > 500

@@ -110,8 +110,8 @@ def test_no_other_tree_over_the_same_binary_one_costs_less(seed: int) -> None:
     root = half_area(around(ids))
     assert written(0)[1] / root == pytest.approx(tree.cost, rel=1e-5)
 
-    nodes, spans, order = np.empty((2 * n, 6), np.float32), np.empty((2 * n, 3), np.int32), ids.copy()
-    build_binary(given.copy(), order, nodes, spans, triangles)
+    order = ids.copy()
+    nodes, spans = build_binary(given.copy(), order, triangles)
 
     @functools.cache
     def least(node: int, places: int) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 from torchpt.compiler.ptx import emit_ptx
 from torchpt.compiler.target import Target
 from torchpt.core.memory import check_address_space
-from torchpt.native import cache
+from torchpt.native import cache, machine
 
 __all__ = [
     "Function",
@@ -28,7 +28,7 @@ __all__ = [
 #: Part of every key: raised when compilation changes, so that older entries are not read.
 _VERSION = "5"
 _lock = threading.Lock()
-_state: dict[str, Any] = {"ready": False, "compiled": 0, "loaded": 0}
+_state: dict[str, Any] = {"compiled": 0, "loaded": 0}
 _functions: dict[str, Function] = {}
 _machines: dict[Target, Any] = {}
 
@@ -50,23 +50,10 @@ class Function:
     key: str = ""
 
 
-def _llvm() -> Any:
-    """Return llvmlite's binding, initialized for this machine."""
-    import llvmlite.binding as llvm
-
-    if not _state["ready"]:
-        llvm.initialize_native_target()
-        llvm.initialize_native_asmprinter()
-        _state["ready"] = True
-    return llvm
-
-
 def host() -> Target:
     """Return the target of this machine."""
     if "host" not in _state:
-        check_address_space()
-        llvm = _llvm()
-        _state["host"] = Target(llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
+        _state["host"] = Target(*machine.host())
     return _state["host"]
 
 
@@ -85,7 +72,7 @@ def compile_ir(ir: str, target: Target | None = None) -> Function:
             code = cache.read(_entry(key, target))
             check_address_space()  # LLVM ends the process where it finds no memory
             if code is None:
-                code = emit_ptx(_llvm(), ir, target) if target.form.threads else _object(ir, target)
+                code = emit_ptx(machine.llvm(), ir, target) if target.form.threads else _object(ir, target)
                 _state["compiled"] += 1
                 cache.write(_entry(key, target), code)
             else:
@@ -134,7 +121,7 @@ def _machine(target: Target) -> Any:
 
 
 def _new_machine(target: Target) -> Any:
-    llvm = _llvm()
+    llvm = machine.llvm()
     if target.triple is not None:
         llvm.initialize_all_targets()
         llvm.initialize_all_asmprinters()
@@ -145,10 +132,10 @@ def _new_machine(target: Target) -> Any:
 
 def _object(ir: str, target: Target) -> bytes:
     """Compile IR to an object file."""
-    llvm, machine = _llvm(), _machine(target)
+    llvm, target_machine = machine.llvm(), _machine(target)
     module = llvm.parse_assembly(ir)
     module.triple = target.triple or llvm.get_default_triple()
-    module.data_layout = str(machine.target_data)
+    module.data_layout = str(target_machine.target_data)
     module.verify()
     # The IR is already vectorized and its constants are folded: LLVM's standard pipelines take three times as long as these
     # passes, and the code is no faster.
@@ -157,17 +144,13 @@ def _object(ir: str, target: Target) -> bytes:
     passes.add_instruction_combine_pass()
     passes.add_new_gvn_pass()
     passes.add_aggressive_dce_pass()
-    passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
-    return machine.emit_object(module)
+    passes.run(module, llvm.create_pass_builder(target_machine, llvm.create_pipeline_tuning_options()))
+    return target_machine.emit_object(module)
 
 
 def _loaded(code: bytes, target: Target, key: str) -> Function:
     if target.triple is not None:
         return Function(None, code, None, key)  # for another machine: cannot be called here
-    llvm = _llvm()
-    machine = _new_machine(target)  # owned and freed by the engine
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
-    engine.finalize_object()
-    call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)(engine.get_function_address("kernel"))
+    engine, address_of = machine.load_object(code)
+    call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)(address_of("kernel"))
     return Function(call, code, engine, key)

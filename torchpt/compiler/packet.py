@@ -292,7 +292,7 @@ class _Search(Block):
         self.lines += [f"  br i1 {some}, label %{kind}_exact, label %{kind}_last", f"{kind}_exact:"]
 
     def _sphere(self, kind: str) -> tuple[str, str | None]:
-        """See :func:`torchpt.search.tree_leaf.sphere_distance`."""
+        """See ``sphere_distance`` of ``scripts/kernel_sources/tree_leaf.py``."""
         own = self.op(f"sub i64 %{kind}_id, %end_disk")
         base = self.op(f"getelementptr [4 x double], ptr %balls, i64 {own}")
         ball = [self.splat("d", self.load("double", self.at(base, "double", k))) for k in range(4)]

@@ -295,18 +295,20 @@ def map_in_order(
             raise result
 
 
-def parallel_for(work: Callable[[int, int], object], items: int, threads: int) -> None:
-    """Call ``work(first, last)`` for parts ``range(first, last)`` of ``range(items)``, one a thread, the first in this one.
+def parallel_for(work: Callable[[int, int], object], items: int, threads: int, parts_per_thread: int = 1) -> None:
+    """Call ``work(first, last)`` for equal parts ``range(first, last)`` of ``range(items)``, the first in this thread.
 
     Args:
         work: machine code that releases the GIL.
         items: length of the range.
-        threads: 1 runs strictly in the calling thread.
+        threads: number of threads; 1 runs strictly in the calling thread.
+        parts_per_thread: number of parts a thread: threads that are done with theirs take others, if the cost of items varies.
     """
     if threads == 1:
         work(0, items)
         return
-    parts = deque(pairwise(items * k // threads for k in range(threads + 1)))  # (first, last), last excluded
+    count = threads * parts_per_thread
+    parts = deque(pairwise(items * k // count for k in range(count + 1)))  # (first, last), last excluded
     errors: list[BaseException] = []
 
     def work_on_parts() -> None:

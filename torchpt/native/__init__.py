@@ -1,9 +1,8 @@
-"""Numba kernels: their compilation, cache on disk and compile time, and SIMD vectors as a numba type.
+"""Machine code: the kernels that the package carries, and what all compiled code needs: LLVM, cache, clock.
 
-``jit.py`` has the decorators: start there. ``content.py`` computes digests of code, by which ``cache.py`` caches kernels;
-``compile_time.py`` measures the time of compilation; ``simd/`` has the vector type. ``device_checks.py`` knows
-the GPU's driver, and whether a card has passed the check of kernels. ``jit.py`` and ``simd/`` import numba, so
-other packages import them only when a kernel is needed.
+``kernels.py`` compiles and runs the kernels that lie in ``ir/`` as LLVM IR: start there. ``machine.py`` is LLVM for this
+machine; ``cache.py`` keeps machine code on disk; ``content.py`` computes digests of Python code; ``compile_time.py`` measures
+the time of compilation. ``device_checks.py`` knows the GPU's driver, and whether a card has passed the check of kernels.
 
 May import: ``core``.
 """

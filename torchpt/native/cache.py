@@ -26,7 +26,7 @@ MOST = 1 << 29
 DAY = 86_400.0
 #: Prefix of the names of entries that are being written.
 _UNFINISHED = "unfinished-"
-#: Files that may be removed: the folder may hold other files.
+#: Files that may be removed: the folder may hold other files. Entries ``.nbc`` are of earlier versions.
 _OURS = re.compile(rf"[0-9a-f]{{40}}\.(o|json|nbc|ptx)|{_UNFINISHED}.*")
 
 

@@ -3,12 +3,12 @@
 One interface (:class:`~torchpt.search.base.Accel`: start there), three backends:
 
 - ``brute`` (CPU): brute force in packets of rays, by kernels of the lane compiler; for a few dozen primitives.
-- ``numba`` (CPU): an eight-wide BVH built by the surface area heuristic (``tree_build.py``, ``tree_layout.py``,
-  ``tree_leaf.py``), traversed by packets and single rays (``tree_packet.py``, ``tree_single.py``, ``tree.py``).
+- ``numba`` (CPU): an eight-wide BVH built by the surface area heuristic (``tree_build.py``, ``tree_layout.py``), traversed by
+  packets and single rays (``tree.py``). Its kernels were lowered by numba (``scripts/kernel_sources``), hence the name; the
+  package carries them as LLVM IR (:mod:`torchpt.native.kernels`).
 - ``torch`` (any device, the reference): a linear BVH built and traversed by tensor operations (``lbvh.py``).
 
-Instances of meshes are a second level above the last two (``instances.py``, ``tree_instances.py``). numba is imported only when
-a numba backend is built.
+Instances of meshes are a second level above the last two (``instances.py``, ``tree_instances.py``).
 
 May import: ``compiler`` and the packages below it; of ``physics`` only ``shapes.geometry``.
 """

@@ -45,7 +45,7 @@ class Accel(ABC):
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """Find the nearest hits of the first ``count`` rays of numpy arrays, for loops outside of torch.
 
-        Runs in the calling thread; the numba backends release the GIL, so several Python threads may search at once. Only
+        Runs in the calling thread; backends of machine code release the GIL, so several Python threads may search at once. Only
         lanes below ``count`` are read and written. Misses are as in :meth:`intersect`.
 
         Args:

@@ -28,7 +28,7 @@ MARGIN = 2.0**-20
 
 
 class CopyTables:
-    """Tables of the instances, for the searches of torch and of numba.
+    """Tables of the instances, for both searches, by tensor operations and by trees of kernels.
 
     Attributes:
         meshes: the geometry of each distinct mesh.

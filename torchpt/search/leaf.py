@@ -5,7 +5,7 @@ Triangles and parallelograms are watertight after Woop, Benthin, Wald, "Watertig
 primitive. Products round monotonically, so a computed edge function has the right sign or is zero; zero counts as
 inside. This holds only without fused operations. The distance comes from the plane, clamped to the depths of the corners:
 rounding may move the plane of a primitive seen edge-on anywhere, even behind the ray, which would open a hole.
-The numba kernels (tree_leaf.py) do the same operations in the same order.
+The tree's kernels (``scripts/kernel_sources/tree_leaf.py``) do the same operations in the same order.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _polygon(rays: Rays, corner: Tensor, plane: Tensor, four: Tensor | None) -> 
 
 
 def _sphere(o: Tensor, d: Tensor, corner: Tensor) -> Tensor:
-    """Intersect spheres as :func:`torchpt.search.tree_leaf.sphere_distance`: Haines et al., Ray Tracing Gems ch. 7, float64."""
+    """Intersect spheres as ``sphere_distance`` of the tree's kernels: Haines et al., Ray Tracing Gems ch. 7, float64."""
     f, e, radius = o.double() - corner[0:3], d.double(), corner[3].double()
     a = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
     b = -(f[0] * e[0] + f[1] * e[1] + f[2] * e[2])

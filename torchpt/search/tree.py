@@ -1,9 +1,10 @@
-"""The search by an eight-wide BVH (numba), and its refit when primitives move."""
+"""The search by an eight-wide BVH, and its refit when primitives move."""
 
 from __future__ import annotations
 
 import copy
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,24 +12,8 @@ import torch
 from torch import Tensor
 
 from torchpt.core.threads import thread_count
-from torchpt.native.jit import ensure_compiled, jit, jit_internal, launch
-from torchpt.native.simd import (
-    bits,
-    gather,
-    highest,
-    item,
-    load,
-    lowest,
-    popcount,
-    put,
-    select,
-    splat,
-    store,
-    trailing_zeros,
-    widen,
-)
+from torchpt.native.kernels import kernel, run_parallel
 from torchpt.physics.shapes.geometry import Geometry
-from torchpt.search import tree_packet as kernels
 from torchpt.search.base import Accel, Array, Hits
 from torchpt.search.bounds import select_primitives
 from torchpt.search.tree_build import (
@@ -36,163 +21,15 @@ from torchpt.search.tree_build import (
     NonTriangles,
     WideTree,
     aligned_buffer,
-    boxes_of,
     corners,
     line_count,
     mesh_tree,
-    planes_of,
     primitive_tables,
-    stack_size,
     write_tree,
 )
-from torchpt.search.tree_layout import CHILDREN, IDS, LEAF, LINE, MORE, NODE, PLANES, block_offset
-from torchpt.search.tree_leaf import RECTANGLES, RULED
+from torchpt.search.tree_layout import LINE, packet_memory, stack_size
 
-__all__ = ["REBUILD_THRESHOLD", "RefitState", "WideBvh", "refit"]
-
-
-# ---- Refit (numba): the same nodes, leaves and ids, with new boxes and triangles
-
-
-_INF, _NAN = np.float32(np.inf), np.float32(np.nan)
-
-
-@jit_internal(forceinline=True)
-def _moved(tree, at, p, ids, here):
-    """Copy a corner of a leaf's triangles to the tree, NaN where the mask is not set; return it in float64."""
-    n, none = np.int32(p.shape[1]), splat(_NAN, 8)
-    x = gather(p, ids, here, none)
-    y = gather(p, ids + splat(n, 8), here, none)
-    z = gather(p, ids + splat(np.int32(2 * n), 8), here, none)
-    store(tree, at, x)
-    store(tree, at + 8, y)
-    store(tree, at + 16, z)
-    return widen(x), widen(y), widen(z)
-
-
-@jit_internal(forceinline=True)
-def _half_area(tree, at):
-    """Return half the area of the box whose six numbers begin at ``at``, eight apart; 0 for an empty box."""
-    x = np.float64(item(tree, at + 24)) - np.float64(item(tree, at))
-    y = np.float64(item(tree, at + 32)) - np.float64(item(tree, at + 8))
-    z = np.float64(item(tree, at + 40)) - np.float64(item(tree, at + 16))
-    return x * y + y * z + z * x if x >= 0.0 and y >= 0.0 and z >= 0.0 else 0.0
-
-
-@jit_internal(forceinline=True)
-def _union(boxes, first, out, at):
-    """Write the bounding box of eight boxes to ``at``, in the layout of a node."""
-    for j in range(0, 24, 8):
-        put(out, at + j, lowest(load(boxes, first + j, 8)))
-        put(out, at + 24 + j, highest(load(boxes, first + 24 + j, 8)))
-
-
-@jit_internal()
-def _leaf(at, old, tree, codes, p0, p1, p2, triangles, non_triangles, boxes):
-    """Write the block of a leaf; ``boxes`` ``(48,)`` gets low x, y, z, high x, y, z of its primitives."""
-    ids, none = load(old, at + IDS, 8), splat(_NAN, 8)
-    store(codes, at + IDS, ids)
-    here = ids >= splat(np.int32(0), 8)
-    a, b, c = (
-        _moved(tree, at, p0, ids, here),
-        _moved(tree, at + 24, p1, ids, here),
-        _moved(tree, at + 48, p2, ids, here),
-    )
-    n0, n1, n2, d, good = planes_of(a, b, c)
-    # A triangle without area gets NaN, which no ray hits; its id stays for the next refit.
-    store(tree, at + PLANES, select(good, n0, none))
-    store(tree, at + PLANES + 8, select(good, n1, none))
-    store(tree, at + PLANES + 16, select(good, n2, none))
-    store(tree, at + PLANES + 24, select(good, d, none))
-    if bits(good) != bits(here):
-        for j in range(0, 72, 8):
-            store(tree, at + j, select(good, load(tree, at + j, 8), none))
-    x0, y0, z0, x1, y1, z1 = boxes_of(a, b, c)
-    low, high = splat(_INF, 8), splat(-_INF, 8)
-    store(boxes, 0, select(good, x0, low))
-    store(boxes, 8, select(good, y0, low))
-    store(boxes, 16, select(good, z0, low))
-    store(boxes, 24, select(good, x1, high))
-    store(boxes, 32, select(good, y1, high))
-    store(boxes, 40, select(good, z1, high))
-    mixed = bits(ids < splat(np.int32(-1), 8))
-    while mixed != 0:
-        k = trailing_zeros(mixed)
-        mixed &= mixed - 1
-        for j in range(6):
-            boxes[j * 8 + k] = non_triangles[-2 - item(old, at + IDS + k) - triangles, j]
-
-
-@jit_internal()
-def _rectangles(at, before, old, tree, corner, rows, triangles, disk):
-    """Write the rectangles of a leaf; unused entries stay NaN."""
-    for j in range(RECTANGLES, RECTANGLES + MORE * LINE):
-        put(tree, at + j, item(before, at + j))
-    for k in range(8):
-        q = -2 - item(old, at + IDS + k)
-        if triangles <= q < disk:
-            for c in range(12):
-                put(tree, at + RECTANGLES + c * 8 + k, corner[q - triangles, c])
-            for c in range(4):
-                put(tree, at + RECTANGLES + RULED + c * 8 + k, rows[q - triangles, c])
-
-
-@jit()
-def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, non_triangles, tree, codes):
-    """Fill the blocks of a tree with the topology of another tree, which is not changed.
-
-    In the buffer children must follow their parents, and the leaves of a node must follow it at once.
-
-    Args:
-        before: the other tree's buffer, float32.
-        old: the same memory as int32.
-        line: line of both buffers at which the root begins.
-        nodes: number of nodes.
-        p0: ``(3, P)`` float32 corners.
-        p1: ``(3, P)``.
-        p2: ``(3, P)``.
-        triangles: number of triangles among the P primitives; they come first.
-        disk: id of the first primitive that is neither triangle nor rectangle.
-        corner: ``(P - triangles, 12)`` corners of the other primitives.
-        rows: ``(P - triangles, 12)`` affine rows of the other primitives.
-        non_triangles: ``(P - triangles, 6)`` float32 boxes of the other primitives: low x, y, z, high x, y, z.
-        tree: float32, as long as ``before``, filled.
-        codes: the same memory as int32.
-
-    Returns:
-        Expected cost of a random ray through the root's box, 1 a node and 1 a leaf: of the other tree, and of this one.
-    """
-    lines, boxes = np.empty(nodes, np.int64), np.empty(48, np.float32)
-    first, root = np.int64(0), np.int64(line) * LINE
-    for node in range(nodes):
-        lines[node] = line
-        children, none = load(old, line * LINE + CHILDREN, 8), splat(np.int32(0), 8)
-        leaves = bits(children < none)
-        ruled = leaves & bits((children & splat(np.int32(2), 8)) == none)
-        line += NODE + LEAF * popcount(leaves) + MORE * popcount(ruled)
-    work, work_before = 0.0, 0.0
-    for node in range(nodes - 1, -1, -1):
-        base = lines[node] * LINE
-        store(codes, base + CHILDREN, load(old, base + CHILDREN, 16))
-        for k in range(8):
-            code, at = np.int64(item(old, base + CHILDREN + k)), base + k
-            if code > 0:
-                _union(tree, block_offset(code), tree, at)
-            elif code < 0:
-                _leaf(block_offset(code), old, tree, codes, p0, p1, p2, triangles, non_triangles, boxes)
-                if code & 2 == 0:
-                    _rectangles(block_offset(code), before, old, tree, corner, rows, triangles, disk)
-                _union(boxes, first, tree, at)
-            else:  # an empty box, which no ray hits
-                for j in range(0, 24, 8):
-                    put(tree, at + j, _INF)
-                    put(tree, at + 24 + j, -_INF)
-            work += _half_area(tree, at)
-            work_before += _half_area(before, at)
-    _union(tree, root, boxes, first)
-    work /= _half_area(boxes, first)
-    _union(before, root, boxes, first)
-    return 1.0 + work_before / _half_area(boxes, first), 1.0 + work
+__all__ = ["REBUILD_THRESHOLD", "RefitState", "WideBvh", "scene_words"]
 
 
 # ---- When to refit
@@ -238,7 +75,9 @@ class RefitState:
         corner, rows, _ = (x.numpy() for x in non_triangles.tensors)
         tables = (triangles, triangles + self.counts[1], corner, rows, non_triangles.boxes)
         args = (before, codes, self.line, self.nodes, *corners(geometry), *tables)
-        work, moved = refit(*args, memory, memory.view(np.int32))
+        lines, costs = np.empty(self.nodes, np.int64), np.empty(2)
+        kernel("tree_refit", "refit")(*args, memory, memory.view(np.int32), lines, costs)
+        work, moved = costs.tolist()
         found = copy.copy(self)
         found.built_cost = work if self.built_cost is None else self.built_cost
         found.sah_ratio = moved / found.built_cost
@@ -255,12 +94,13 @@ class RefitState:
 # ---- The search
 
 
-_GRAIN = 512  # rays that are worth another thread
+#: Rays that are worth another thread.
+_GRAIN = 512
 _ALL_OPAQUE = np.empty(0, np.uint8)
 
 
 class WideBvh(Accel):
-    """A search by a BVH with eight children a node, built by the surface area heuristic (numba, CPU).
+    """A search by a BVH with eight children a node, built by the surface area heuristic, on a CPU.
 
     Args:
         geometry: the primitives, on the CPU.
@@ -281,9 +121,9 @@ class WideBvh(Accel):
         self._take(memory, non_triangles, start)
 
     def _take(self, memory: np.ndarray, non_triangles: NonTriangles, start: float) -> None:
-        kinds = torch.tensor([*(sum(self.counts[:k]) for k in range(1, 5)), stack_size(self.depth)], dtype=torch.int64)
-        self.tensors = [torch.from_numpy(memory), *non_triangles.tensors, kinds]
-        self.arrays = _arrays(self.tensors)
+        self.tables = [memory, *(x.numpy() for x in non_triangles.tensors)]
+        self.stack_length = stack_size(self.depth)
+        self.words = scene_words(self.tables, self.counts, self.stack_length)
         self.build_seconds = time.perf_counter() - start
 
     def refit(self, geometry: Geometry, threads: int | None = None) -> WideBvh | None:
@@ -291,8 +131,8 @@ class WideBvh(Accel):
         start = time.perf_counter()
         if (geometry.copies is not None) != self.copied:
             return None
-        non_triangles, memory = NonTriangles(geometry), aligned_buffer(len(self.arrays[0]))
-        refit_state = self.refit_state.refit(geometry, non_triangles, self.arrays[0], memory)
+        non_triangles, memory = NonTriangles(geometry), aligned_buffer(len(self.tables[0]))
+        refit_state = self.refit_state.refit(geometry, non_triangles, self.tables[0], memory)
         if refit_state is None:
             return None
         tree = copy.copy(self)
@@ -301,31 +141,40 @@ class WideBvh(Accel):
         return tree
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        t, u, v = (torch.empty_like(t_max) for _ in range(3))
+        t, u, v = torch.empty_like(t_max), torch.empty_like(t_max), torch.empty_like(t_max)
         prim = torch.empty_like(t_max, dtype=torch.int32)
         rays = (x.contiguous().numpy() for x in (o, d, t_max))
-        args = (*rays, *self.arrays, *(x.numpy() for x in (t, prim, u, v)))
-        launch(kernels.nearest, kernels.nearest_parallel, t_max.shape[0], thread_count(self.threads), _GRAIN, args)
+        self._nearest(t_max.shape[0], thread_count(self.threads), *rays, *(x.numpy() for x in (t, prim, u, v)))
         return t, prim, u, v
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
         out = torch.empty_like(t_max, dtype=torch.int32)
-        rays = (x.contiguous().numpy() for x in (o, d, t_max))
-        args = (*rays, *self.arrays, _ALL_OPAQUE, out.numpy())
-        launch(kernels.blocked, kernels.blocked_parallel, t_max.shape[0], thread_count(self.threads), _GRAIN, args)
+        origins, directions, ends = (x.contiguous().numpy() for x in (o, d, t_max))
+        threads = thread_count(self.threads)
+        self._blocked(t_max.shape[0], threads, origins, directions, ends, _ALL_OPAQUE, out.numpy())
         return out != 0
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
-        args = (o, d, t_max, *self.arrays, t, prim, u, v)
-        ensure_compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
+        self._nearest(count, 1, o, d, t_max, t, prim, u, v)
 
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
     ) -> None:
         """See :meth:`Accel.blocked`."""
-        args = (o, d, t_max, *self.arrays, _ALL_OPAQUE if non_opaque is None else non_opaque, out)
-        ensure_compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
+        self._blocked(count, 1, o, d, t_max, _ALL_OPAQUE if non_opaque is None else non_opaque, out)
+
+    def _nearest(self, count: int, threads: int, o: Array, d: Array, t_max: Array, *hits: Array) -> None:
+        args = (o, d, t_max, d.shape[1], self.words, *hits)
+        run_parallel(kernel("tree_nearest", "nearest"), count, threads, _GRAIN, packet_memory(self.stack_length), args)
+
+    def _blocked(
+        self, count: int, threads: int, o: Array, d: Array, t_max: Array, non_opaque: Array, out: Array
+    ) -> None:
+        args = (o, d, t_max, d.shape[1], self.words, non_opaque, len(non_opaque), out)
+        run_parallel(
+            kernel("tree_occluded", "occluded"), count, threads, _GRAIN, packet_memory(self.stack_length), args
+        )
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`.
@@ -339,12 +188,22 @@ class WideBvh(Accel):
             "leaves": self.leaves,
             "sah_cost": self.sah_cost * self.refit_state.sah_ratio,
             "depth": self.depth,
-            "bytes": sum(x.nbytes for x in self.tensors),
+            "bytes": sum(x.nbytes for x in (*self.tables, self.words)),
             "build_seconds": self.build_seconds,
         }
 
 
-def _arrays(tensors: list[Tensor]) -> tuple[np.ndarray, ...]:
-    """Return the kernels' arguments: the tree as float32 and as int32, then the other tables."""
-    tree, *rest = (x.numpy() for x in tensors)
-    return tree, tree.view(np.int32), *rest
+def scene_words(tables: Sequence[np.ndarray], counts: Sequence[int], stack_length: int) -> np.ndarray:
+    """Return the int64 words by which kernels find a tree.
+
+    Args:
+        tables: the tree, and of the primitives that are not triangles corners, affine rows and quadrics.
+        counts: numbers of primitives of each kind.
+        stack_length: stack size of a ray.
+
+    Returns:
+        ``(9,)``: addresses of the tables, which have to be kept alive; ids of the first rectangle, disk, sphere and quadric;
+        the stack size.
+    """
+    first_ids = np.cumsum(counts)[:4]
+    return np.array([*(x.ctypes.data for x in tables), *first_ids, stack_length], np.int64)

@@ -1,4 +1,8 @@
-"""Build an eight-wide BVH: a binary tree by the surface area heuristic, collapsed, then laid out in memory (numba)."""
+"""Build an eight-wide BVH: a binary tree by the surface area heuristic, collapsed, then laid out in memory.
+
+The work is done by kernels (``scripts/kernel_sources/tree_build.py``), on one thread; :func:`mesh_tree` and :func:`write_tree`
+are what the searches call.
+"""
 
 from __future__ import annotations
 
@@ -6,612 +10,25 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchpt.native.jit import jit, jit_internal
-from torchpt.native.simd import (
-    absolute,
-    as_float,
-    as_int,
-    bits,
-    lane_numbers,
-    load_masked,
-    maximum,
-    minimum,
-    narrow,
-    select,
-    splat,
-    square_root,
-    store,
-    trailing_zeros,
-    widen,
-)
+from torchpt.native.kernels import kernel
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.bounds import primitive_bounds
 from torchpt.search.tables import QUADRIC, affine_rows, quadric_rows
-from torchpt.search.tree_layout import CHILDREN, IDS, LEAF, LINE, MORE, NODE, PLANES
-from torchpt.search.tree_leaf import RECTANGLES, RULED
+from torchpt.search.tree_layout import LEAF, LINE, MORE, NODE, WIDTH
 
 __all__ = [
-    "WIDTH",
+    "Floats",
     "NonTriangles",
     "WideTree",
     "aligned_buffer",
-    "boxes_of",
     "build_binary",
-    "choose_collapse",
-    "collapse",
     "corners",
-    "half_area",
-    "lay_out",
-    "leaf_ids",
     "line_count",
     "mesh_tree",
-    "planes_of",
     "primitive_tables",
-    "stack_size",
-    "triangle_tables",
     "wide_tree",
     "write_tree",
 ]
-
-
-# ---- Binary trees by the surface area heuristic (numba): binned (Wald 2007); the last few primitives by a full sweep
-
-
-#: Children a node, and primitives a leaf: one vector of boxes or triangles.
-WIDTH = 8
-_BINS = 16
-_INF = np.float32(np.inf)
-_ZERO = np.float32(0.0)
-
-
-@jit(forceinline=True)
-def half_area(b, k):
-    """Compute half the surface area of a box."""
-    x, y, z = b[k, 3] - b[k, 0], b[k, 4] - b[k, 1], b[k, 5] - b[k, 2]
-    return x * y + y * z + z * x
-
-
-@jit(forceinline=True)
-def _clear(b, k):
-    for c in range(3):
-        b[k, c] = _INF
-        b[k, 3 + c] = -_INF
-
-
-@jit(forceinline=True)
-def _grow(b, k, x, i):
-    for c in range(3):
-        b[k, c] = min(b[k, c], x[i, c])
-        b[k, 3 + c] = max(b[k, 3 + c], x[i, 3 + c])
-
-
-@jit(forceinline=True)
-def _bin(box, i, axis, low, scale):
-    k = int((box[i, axis] + box[i, 3 + axis] - low) * scale)
-    return min(max(k, 0), _BINS - 1)
-
-
-@jit()
-def _best_split(box, start, stop, low, scale, bins, counts, suffix):
-    """Find the split of least SAH cost (Wald 2007): axis (-1: none), first bin of the upper side."""
-    counts[:] = 0
-    for k in range(3 * _BINS):
-        _clear(bins, k)
-    for i in range(start, stop):
-        for axis in range(3):
-            k = axis * _BINS + _bin(box, i, axis, low[axis], scale[axis])
-            counts[k] += 1
-            _grow(bins, k, box, i)
-    best, best_axis, best_cut = np.float64(np.inf), -1, 0
-    for axis in range(3):
-        if scale[axis] == _ZERO:
-            continue
-        base = axis * _BINS
-        _clear(bins, 3 * _BINS)
-        n = 0
-        for k in range(_BINS - 1, 0, -1):
-            n += counts[base + k]
-            _grow(bins, 3 * _BINS, bins, base + k)
-            suffix[k] = np.float64(half_area(bins, 3 * _BINS)) * n if n > 0 else 0.0
-        _clear(bins, 3 * _BINS)
-        n = 0
-        for k in range(1, _BINS):
-            n += counts[base + k - 1]
-            _grow(bins, 3 * _BINS, bins, base + k - 1)
-            if 0 < n < stop - start:
-                cost = np.float64(half_area(bins, 3 * _BINS)) * n + suffix[k]
-                if cost < best:
-                    best, best_axis, best_cut = cost, axis, k
-    return best_axis, best_cut
-
-
-@jit()
-def _partition(box, ids, start, stop, axis, cut, low, scale):
-    """Move the primitives of the lower bins to the front; return the start of the upper side."""
-    i, j = start, stop - 1
-    while i <= j:
-        if _bin(box, i, axis, low, scale) < cut:
-            i += 1
-        else:
-            for c in range(6):
-                box[i, c], box[j, c] = box[j, c], box[i, c]
-            ids[i], ids[j] = ids[j], ids[i]
-            j -= 1
-    return i
-
-
-@jit()
-def _sorted(box, ids, start, stop, axis):
-    """Sort a few primitives by their centres along an axis, equal ones by id."""
-    for i in range(start + 1, stop):
-        j = i
-        while j > start:
-            own, other = box[j, axis] + box[j, 3 + axis], box[j - 1, axis] + box[j - 1, 3 + axis]
-            if not (own < other or (own == other and ids[j] < ids[j - 1])):
-                break
-            for c in range(6):
-                box[j, c], box[j - 1, c] = box[j - 1, c], box[j, c]
-            ids[j], ids[j - 1] = ids[j - 1], ids[j]
-            j -= 1
-
-
-@jit()
-def _exact_split(box, ids, start, stop, bins, suffix):
-    """Sort a few primitives along the axis of the split of least SAH cost; return the start of the upper side."""
-    best, best_axis, best_cut = np.float64(np.inf), 2, (start + stop) // 2
-    for axis in range(3):
-        _sorted(box, ids, start, stop, axis)
-        _clear(bins, 0)
-        for i in range(stop - 1, start, -1):
-            _grow(bins, 0, box, i)
-            suffix[i - start] = np.float64(half_area(bins, 0))
-        _clear(bins, 0)
-        for i in range(start + 1, stop):
-            _grow(bins, 0, box, i - 1)
-            cost = np.float64(half_area(bins, 0)) * (i - start) + suffix[i - start] * (stop - i)
-            if cost < best:
-                best, best_axis, best_cut = cost, axis, i
-    _sorted(box, ids, start, stop, best_axis)
-    return best_cut
-
-
-@jit()
-def build_binary(box, ids, nodes, spans, common):
-    """Build a binary tree over primitives.
-
-    A leaf holds at most :data:`WIDTH` primitives. Primitives are split down to one a leaf if they are not of the common kind
-    (only those are tested together), or if their areas sum to less than the area of their bounding box.
-
-    Args:
-        box: ``(L, 6)`` float32 boxes; permuted in place.
-        ids: ``(L,)`` int32; permuted alike.
-        nodes: ``(2 L, 6)`` float32, filled with boxes.
-        spans: ``(2 L, 3)`` int32, filled: first primitive, one past the last, first child (0 for a leaf; the second
-            child follows it).
-        common: primitives with smaller ids are of the common kind.
-
-    Returns:
-        The number of nodes; node 0 is the root.
-    """
-    bins = np.empty((3 * _BINS + 1, 6), np.float32)
-    counts = np.empty(3 * _BINS, np.int64)
-    suffix = np.empty(_BINS, np.float64)
-    low, high, scale = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
-    spans[0, 0], spans[0, 1], spans[0, 2] = 0, len(ids), 0
-    used = 1
-    node = 0
-    while node < used:  # breadth first: the queue is the tree itself
-        start, stop = spans[node, 0], spans[node, 1]
-        _clear(nodes, node)
-        low[:] = _INF
-        high[:] = -_INF
-        areas, rare = np.float64(0.0), False
-        for i in range(start, stop):
-            _grow(nodes, node, box, i)
-            areas += np.float64(half_area(box, i))
-            rare = rare or ids[i] >= common
-            for c in range(3):
-                centre = box[i, c] + box[i, 3 + c]
-                low[c] = min(low[c], centre)
-                high[c] = max(high[c], centre)
-        few = stop - start <= WIDTH
-        if stop - start > 1 and (not few or rare or areas < half_area(nodes, node)):
-            if few:
-                middle = _exact_split(box, ids, start, stop, bins, suffix)
-            else:
-                for c in range(3):
-                    size = high[c] - low[c]
-                    scale[c] = np.float32(_BINS) / size if size > _ZERO else _ZERO
-                    if not scale[c] < _INF:
-                        scale[c] = _ZERO
-                axis, cut = _best_split(box, start, stop, low, scale, bins, counts, suffix)
-                middle = (start + stop) // 2
-                if axis >= 0:
-                    middle = _partition(box, ids, start, stop, axis, cut, low[axis], scale[axis])
-            spans[node, 2] = used
-            for child in range(2):
-                spans[used + child, 0] = start if child == 0 else middle
-                spans[used + child, 1] = middle if child == 0 else stop
-                spans[used + child, 2] = 0
-            used += 2
-        node += 1
-    return used
-
-
-# ---- Collapse of a binary tree to the wide tree of least SAH cost (numba)
-#
-# By dynamic programming over the binary tree, as in section 3.1 of Ylitie, Karras and Laine, "Efficient Incoherent Ray
-# Traversal on GPUs Through Compressed Wide BVHs" (2017): each subtree becomes a leaf, a wide node, or up to seven of its
-# parent's children, whichever costs least by the surface area heuristic.
-
-
-_INF, _ZERO = np.float32(np.inf), np.float32(0.0)
-#: Cost of testing a leaf's eight triangles, its rectangles, and each other primitive; a wide node costs 1.
-_TRIANGLES, _RECTANGLES, _OTHER = np.float32(1.0), np.float32(1.3), np.float32(2.0)
-
-
-@jit()
-def _leaf_cost(ids, start, stop, rectangle, other):
-    ruled, more = False, _ZERO
-    for i in range(start, stop):
-        ruled = ruled or rectangle <= ids[i] < other
-        more += _OTHER if ids[i] >= other else _ZERO
-    return _TRIANGLES + more + (_RECTANGLES if ruled else _ZERO)
-
-
-@jit()
-def choose_collapse(nodes, spans, ids, rectangle, other, cost, share):
-    """Find the cheapest use of each node of a binary tree.
-
-    Args:
-        nodes: boxes ``(M, 6)`` float32.
-        spans: ``(M, 3)`` int32: first primitive, one past the last, first child (0 for none).
-        ids: ``(L,)`` primitives in the tree's order.
-        rectangle: id of the first primitive that is no triangle.
-        other: id of the first primitive that is neither triangle nor rectangle.
-        cost: ``(M, WIDTH)`` float32, filled: cost of the subtree as at most 1, 2, ... children of a wide node.
-        share: ``(M, WIDTH)`` int8, filled: how many of these children come from the node's first child; 0 if fewer children
-            cost no more. In column 0: 0 for a leaf, else a wide node with so many of its eight children from the first child.
-    """
-    for node in range(len(nodes) - 1, -1, -1):  # children come after their parents
-        start, stop, left = spans[node, 0], spans[node, 1], spans[node, 2]
-        area = half_area(nodes, node)
-        leaf = area * _leaf_cost(ids, start, stop, rectangle, other) if stop - start <= WIDTH else _INF
-        cost[node, :] = leaf
-        share[node, :] = 0
-        if left == 0:
-            continue
-        for k in range(1, WIDTH):
-            best, pick = _INF, 1
-            for i in range(k):
-                both = cost[left, i] + cost[left + 1, k - 1 - i]
-                if both < best:
-                    best, pick = both, i + 1
-            cost[node, k], share[node, k] = best, pick
-        wide = cost[node, WIDTH - 1] + area
-        if wide < leaf or stop - start > WIDTH:
-            cost[node, 0], share[node, 0] = wide, share[node, WIDTH - 1]
-        for k in range(1, WIDTH):
-            if cost[node, k - 1] <= cost[node, k]:
-                cost[node, k], share[node, k] = cost[node, k - 1], 0
-
-
-@jit()
-def _children(root, spans, share, slots, nodes, room):
-    """Fill ``slots`` with the binary nodes that are the children of a wide node; return their number."""
-    count, top, first = 0, 2, share[root, 0]
-    left = spans[root, 2]
-    nodes[0], room[0], nodes[1], room[1] = left + 1, WIDTH - first, left, first
-    while top > 0:
-        top -= 1
-        node, k = nodes[top], room[top] - 1
-        while k > 0 and share[node, k] == 0:
-            k -= 1
-        if k == 0:
-            slots[count] = node
-            count += 1
-        else:
-            left, first = spans[node, 2], share[node, k]
-            nodes[top], room[top], nodes[top + 1], room[top + 1] = left + 1, k + 1 - first, left, first
-            top += 2
-    return count
-
-
-@jit()
-def collapse(nodes, spans, share, boxes, child, first):
-    """Build the wide tree that :func:`choose_collapse` found.
-
-    Args:
-        nodes: boxes of the binary tree.
-        spans: topology of the binary tree.
-        share: result of :func:`choose_collapse`.
-        boxes: ``(M * 48,)`` float32, filled: per node low x, y, z, high x, y, z of 8 children; empty ones at infinity.
-        child: ``(M * 8,)`` int32, filled: a node, or ``~leaf``.
-        first: ``(K, 2)`` int32, filled: the primitives of each leaf.
-
-    Returns:
-        Numbers of nodes and leaves, and the depth.
-    """
-    pending = np.empty((len(child) // WIDTH + 1, 2), np.int32)  # binary node and depth of each wide node
-    pending[0, 0], pending[0, 1] = 0, 1
-    slots, stack, room = np.empty(WIDTH, np.int32), np.empty(2 * WIDTH, np.int32), np.empty(2 * WIDTH, np.int32)
-    used, leaves, depth, wide = 1, 0, 1, 0
-    while wide < used:
-        root, level = pending[wide, 0], pending[wide, 1]
-        depth = max(depth, level)
-        if share[root, 0] == 0:  # the whole tree is one leaf
-            slots[0], n = root, 1
-        else:
-            n = _children(root, spans, share, slots, stack, room)
-        for k in range(WIDTH):
-            for c in range(6):
-                boxes[wide * 6 * WIDTH + c * WIDTH + k] = nodes[slots[k], c] if k < n else _INF
-            code = np.int32(0)
-            if k < n and share[slots[k], 0] > 0:
-                code = np.int32(used)
-                pending[used, 0], pending[used, 1] = slots[k], level + 1
-                used += 1
-            elif k < n:
-                code = np.int32(~leaves)
-                first[leaves, 0], first[leaves, 1] = spans[slots[k], 0], spans[slots[k], 1]
-                leaves += 1
-            child[wide * WIDTH + k] = code
-        wide += 1
-    return used, leaves, depth
-
-
-# ---- Memory layout: blocks of cache lines (numba)
-
-
-_INF, _NAN = np.float32(np.inf), np.float32(np.nan)
-
-
-@jit_internal()
-def _kinds(ids, first, triangles, disk):
-    """Return 2 if a leaf holds rectangles, plus 1 if it holds primitives that are neither triangles nor rectangles."""
-    found = 0
-    for k in range(8):
-        q = ids[first + k]
-        if q >= disk:
-            found |= 1
-        elif q >= triangles:
-            found |= 2
-    return found
-
-
-@jit_internal()
-def _leaf(base, tree, codes, ids, first, p0, p1, p2, planes, triangles):
-    """Write the triangles and ids of a leaf."""
-    for k in range(8):
-        q = ids[first + k]
-        codes[base + IDS + k] = -2 - q if q >= triangles else q
-        here = 0 <= q < triangles
-        for c in range(3):
-            tree[base + c * 8 + k] = p0[c, q] if here else _NAN
-            tree[base + (3 + c) * 8 + k] = p1[c, q] if here else _NAN
-            tree[base + (6 + c) * 8 + k] = p2[c, q] if here else _NAN
-        for c in range(4):
-            tree[base + PLANES + c * 8 + k] = planes[q, c] if here else _NAN
-
-
-@jit_internal()
-def _rectangles(base, tree, ids, first, corner, rows, triangles, disk):
-    """Write the rectangles of a leaf."""
-    for k in range(8):
-        q = ids[first + k]
-        here = triangles <= q < disk
-        for c in range(12):
-            tree[base + RECTANGLES + c * 8 + k] = corner[q - triangles, c] if here else _NAN
-        for c in range(4):
-            tree[base + RECTANGLES + RULED + c * 8 + k] = rows[q - triangles, c] if here else _NAN
-
-
-@jit()
-def lay_out(boxes, child, ids, p0, p1, p2, planes, corner, rows, triangles, disk, line, tree, codes):
-    """Fill the blocks of a tree: parents before children, each node followed by its leaves.
-
-    Args:
-        boxes: ``(M * 48,)`` float32: low x, y, z, high x, y, z of eight children a node; infinite for none.
-        child: ``(M * 8,)`` int32: a node, or ``~leaf``, or 0 for none.
-        ids: ``(L * 8,)`` int32 primitives of the leaves in rising order, -1 for none.
-        p0: ``(3, P)`` corners.
-        p1: ``(3, P)``.
-        p2: ``(3, P)``.
-        planes: ``(T, 4)`` planes of the triangles.
-        corner: ``(K, 12)`` corners of the other primitives.
-        rows: ``(K, 12)`` affine rows of the other primitives.
-        triangles: number of triangles among the P primitives; they come first.
-        disk: id of the first primitive that is neither triangle nor rectangle.
-        line: line of ``tree`` at which the root begins.
-        tree: float32, filled: ``4 M + 7 L`` lines, and 8 for each leaf that holds rectangles.
-        codes: the same memory as int32.
-    """
-    lines = np.empty(len(child) // 8, np.int64)
-    stack = np.empty(len(child) + 8, np.int32)
-    stack[0], top, next_line = 0, 1, np.int64(line)
-    while top > 0:
-        top -= 1
-        node = stack[top]
-        lines[node] = next_line
-        next_line += NODE
-        for k in range(7, -1, -1):
-            code = child[node * 8 + k]
-            if code > 0:
-                stack[top] = code
-                top += 1
-            elif code < 0:
-                next_line += LEAF + (MORE if _kinds(ids, (~code) * 8, triangles, disk) & 2 else 0)
-    for node in range(len(lines)):
-        base, leaf = lines[node] * LINE, lines[node] + NODE
-        for k in range(8):
-            code = child[node * 8 + k]
-            for c in range(6):
-                x = boxes[node * 48 + c * 8 + k]
-                # an empty box, which no ray hits
-                tree[base + c * 8 + k] = -_INF if code == 0 and c >= 3 else x
-            codes[base + CHILDREN + k] = 4 * lines[code] if code > 0 else 0
-            if code < 0:
-                first = (~code) * 8
-                kinds = _kinds(ids, first, triangles, disk)
-                _leaf(leaf * LINE, tree, codes, ids, first, p0, p1, p2, planes, triangles)
-                codes[base + CHILDREN + k] = ~(4 * leaf + kinds)
-                leaf += LEAF
-                if kinds & 2:
-                    _rectangles((leaf - LEAF) * LINE, tree, ids, first, corner, rows, triangles, disk)
-                    leaf += MORE
-            codes[base + CHILDREN + 8 + k] = 0
-
-
-# ---- Planes and boxes of triangles (numba): the float64 operations of ``tables.affine_rows`` and ``bounds`` in one pass
-#
-# Eight triangles are processed together, as vectors of float64.
-
-
-_MARGIN = 2.0**-22
-
-
-@jit_internal(forceinline=True)
-def _cross(a, b):
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@jit_internal(forceinline=True)
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@jit_internal(forceinline=True)
-def _finite(row, p):
-    """Return a mask: affine rows through points are finite in float32."""
-    total, zero = narrow(row[0]) + narrow(row[1]) + narrow(row[2]) + narrow(-_dot(row, p)), splat(_ZERO, 8)
-    return total * zero == zero
-
-
-@jit_internal(forceinline=True)
-def planes_of(a, b, c):
-    """Compute the planes (unit normal, distance) of eight triangles from float64 corners, and the mask of those with an area.
-
-    See :func:`torchpt.search.tables.affine_rows`. The planes of triangles outside of the mask are undefined.
-    """
-    e1 = (b[0] - a[0], b[1] - a[1], b[2] - a[2])
-    e2 = (c[0] - a[0], c[1] - a[1], c[2] - a[2])
-    cross = _cross(e1, e2)
-    length = square_root(_dot(cross, cross))
-    n = (cross[0] / length, cross[1] / length, cross[2] / length)
-    u, v = _cross(e2, n), _cross(n, e1)
-    u, v = (u[0] / length, u[1] / length, u[2] / length), (v[0] / length, v[1] / length, v[2] / length)
-    good = (length > splat(0.0, 8)) & _finite(n, a) & _finite(u, a) & _finite(v, a)
-    return narrow(n[0]), narrow(n[1]), narrow(n[2]), narrow(-_dot(n, a)), good
-
-
-@jit_internal(forceinline=True)
-def _down(x):
-    """Round float64 lanes down to float32."""
-    near, one = narrow(x), splat(np.int32(1), 8)
-    whole, zero = as_int(near), splat(np.int32(0), 8)
-    # The next float32 below: its bits less 1, plus 1 for a negative number.
-    below = select(whole < zero, whole + one, whole - one)
-    below = select(near == splat(_ZERO, 8), splat(np.int32(-(2**31) + 1), 8), below)
-    return select(widen(near) > x, as_float(below), near)
-
-
-@jit_internal(forceinline=True)
-def _span(a, b, c):
-    return minimum(minimum(a, b), c), maximum(maximum(a, b), c)
-
-
-@jit_internal(forceinline=True)
-def boxes_of(a, b, c):
-    """Compute the boxes of eight triangles with a margin: low x, y, z, high x, y, z.
-
-    See :func:`torchpt.search.bounds.primitive_bounds`.
-    """
-    x0, x1 = _span(a[0], b[0], c[0])
-    y0, y1 = _span(a[1], b[1], c[1])
-    z0, z1 = _span(a[2], b[2], c[2])
-    size, share = maximum(maximum(x1 - x0, y1 - y0), z1 - z0), splat(_MARGIN, 8)
-    x = share * (maximum(absolute(x0), absolute(x1)) + size)
-    y = share * (maximum(absolute(y0), absolute(y1)) + size)
-    z = share * (maximum(absolute(z0), absolute(z1)) + size)
-    return _down(x0 - x), _down(y0 - y), _down(z0 - z), -_down(-(x1 + x)), -_down(-(y1 + y)), -_down(-(z1 + z))
-
-
-@jit_internal(forceinline=True)
-def _corner(p, i, some):
-    """Load a corner of the eight triangles from ``i`` on where the mask is set, as float64."""
-    n, none = p.shape[1], splat(_ZERO, 8)
-    x, y, z = (
-        load_masked(p, i, some, none),
-        load_masked(p, n + i, some, none),
-        load_masked(p, 2 * n + i, some, none),
-    )
-    return widen(x), widen(y), widen(z)
-
-
-@jit()
-def triangle_tables(p0, p1, p2, count, planes, boxes, ids):
-    """Compute the planes of the first ``count`` primitives, and the boxes of those that can be hit.
-
-    Args:
-        p0: ``(3, P)`` float32 corners.
-        p1: ``(3, P)``.
-        p2: ``(3, P)``.
-        count: number of triangles among the primitives.
-        planes: ``(count, 4)`` float32, filled: unit normal and distance; zeros where a triangle has no area.
-        boxes: ``(count, 6)`` float32, filled from the front.
-        ids: ``(count,)`` int32, filled alike.
-
-    Returns:
-        The number of triangles that can be hit.
-    """
-    kept = 0
-    row, box, none = np.empty(32, np.float32), np.empty(48, np.float32), splat(_ZERO, 8)
-    for i in range(0, count, 8):
-        some = lane_numbers(8) < splat(np.int32(min(count - i, 8)), 8)
-        a, b, c = _corner(p0, i, some), _corner(p1, i, some), _corner(p2, i, some)
-        n0, n1, n2, d, good = planes_of(a, b, c)
-        store(row, 0, select(good, n0, none))
-        store(row, 8, select(good, n1, none))
-        store(row, 16, select(good, n2, none))
-        store(row, 24, select(good, d, none))
-        x0, y0, z0, x1, y1, z1 = boxes_of(a, b, c)
-        store(box, 0, x0)
-        store(box, 8, y0)
-        store(box, 16, z0)
-        store(box, 24, x1)
-        store(box, 32, y1)
-        store(box, 40, z1)
-        for k in range(min(count - i, 8)):
-            for j in range(4):
-                planes[i + k, j] = row[j * 8 + k]
-        left = bits(good)
-        while left != 0:
-            k = trailing_zeros(left)
-            left &= left - 1
-            for j in range(6):
-                boxes[kept, j] = box[j * 8 + k]
-            ids[kept] = i + k
-            kept += 1
-    return kept
-
-
-@jit()
-def leaf_ids(first, ids, slots):
-    """Fill ``slots (L, 8)`` with the sorted primitives of leaves, which span ``first (L, 2)`` of ``ids``; -1 behind them."""
-    for leaf in range(len(first)):
-        start, count = first[leaf, 0], first[leaf, 1] - first[leaf, 0]
-        for k in range(8):
-            slots[leaf, k] = -1
-        for k in range(count):
-            q, j = ids[start + k], k
-            while j > 0 and slots[leaf, j - 1] > q:
-                slots[leaf, j] = slots[leaf, j - 1]
-                j -= 1
-            slots[leaf, j] = q
-
-
-# ---- The whole build
-
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -625,7 +42,7 @@ class WideTree:
         child: ``(M * 8,)``: a node, or ``~leaf``, or 0 for none.
         ids: ``(L * 8,)``: primitives of the leaves in rising order, -1 for none.
         depth: nodes on the longest path from the root.
-        cost: expected cost of a random ray through the root's box, 1 a node; see :func:`choose_collapse`.
+        cost: expected cost of a random ray through the root's box, 1 a node.
     """
 
     def __init__(self, boxes: Floats, child: Ints, ids: Ints, depth: int, cost: float) -> None:
@@ -669,6 +86,22 @@ class NonTriangles:
         self.tensors = [corner.T.contiguous(), tables.rows, quadrics.T.contiguous()]
 
 
+def build_binary(boxes: Floats, ids: Ints, common: int) -> tuple[Floats, Ints]:
+    """Build a binary tree over boxes ``(L, 6)`` of primitives ``ids (L,)``; both arrays are permuted.
+
+    A leaf holds at most :data:`~torchpt.search.tree_layout.WIDTH` primitives. Primitives are split down to one a leaf if their
+    ids are not below ``common`` (only primitives of one kind are tested together), or if their areas sum to less than the area
+    of their bounding box.
+
+    Returns:
+        Boxes ``(M, 6)`` of the nodes, the root first; and ``(M, 3)``: first primitive, one past the last, first child (0 for a
+        leaf; the second child follows it).
+    """
+    nodes, spans = np.empty((2 * len(ids), 6), np.float32), np.empty((2 * len(ids), 3), np.int32)
+    used = kernel("tree_build", "build_binary")(boxes, ids, nodes, spans, common)
+    return nodes[:used], spans[:used]
+
+
 def wide_tree(boxes: Floats, ids: Ints, counts: tuple[int, ...] = (0, 0)) -> WideTree:
     """Build a wide tree over boxes ``(L, 6)`` of primitives ``ids (L,)``; both arrays are permuted.
 
@@ -679,17 +112,17 @@ def wide_tree(boxes: Floats, ids: Ints, counts: tuple[int, ...] = (0, 0)) -> Wid
         return WideTree(
             np.full(6 * WIDTH, np.inf, np.float32), np.zeros(WIDTH, np.int32), np.zeros(0, np.int32), 1, 0.0
         )
-    nodes, spans = np.empty((2 * n, 6), np.float32), np.empty((2 * n, 3), np.int32)
-    used = build_binary(boxes, ids, nodes, spans, counts[0])
-    nodes, spans = nodes[:used], spans[:used]
+    nodes, spans = build_binary(boxes, ids, counts[0])
+    used = len(nodes)
     cost, share = np.empty((used, WIDTH), np.float32), np.empty((used, WIDTH), np.int8)
-    choose_collapse(nodes, spans, ids, counts[0], counts[0] + counts[1], cost, share)
+    kernel("tree_build", "choose_collapse")(nodes, spans, ids, counts[0], counts[0] + counts[1], cost, share)
     wide, ends = max(1, int((share[:, 0] > 0).sum())), int((share[:, 0] == 0).sum())
     flat, child = np.empty(wide * 6 * WIDTH, np.float32), np.empty(wide * WIDTH, np.int32)
-    first = np.empty((ends, 2), np.int32)
-    count, leaves, depth = collapse(nodes, spans, share, flat, child, first)
+    first, pending, found = np.empty((ends, 2), np.int32), np.empty((wide + 1, 2), np.int32), np.empty(3, np.int32)
+    kernel("tree_build", "collapse")(nodes, spans, share, flat, child, first, pending, found)
+    count, leaves, depth = found.tolist()
     slots = np.empty((leaves, WIDTH), np.int32)
-    leaf_ids(first[:leaves], ids, slots)
+    kernel("tree_build", "leaf_ids")(first[:leaves], ids, slots)
     x, y, z = (nodes[0, 3:] - nodes[0, :3]).astype(np.float64)
     area = x * y + y * z + z * x
     # Expected cost of a random ray through the root's box (MacDonald & Booth 1990).
@@ -704,11 +137,6 @@ def line_count(tree: WideTree, counts: tuple[int, ...]) -> int:
     return NODE * tree.nodes + LEAF * tree.leaves + MORE * int(ruled)
 
 
-def stack_size(depth: int) -> int:
-    """Return the stack size for a tree of a depth: each level leaves up to seven entries, and eight are written at once."""
-    return depth * (WIDTH - 1) + 2 * WIDTH
-
-
 def aligned_buffer(count: int) -> Floats:
     """Allocate ``count`` float32, aligned to a cache line."""
     raw = np.zeros(count * 4 + LINE * 4, np.uint8)
@@ -720,7 +148,7 @@ def primitive_tables(geometry: Geometry) -> tuple[Floats, Floats, Ints, NonTrian
     """Return planes ``(T, 4)`` of the triangles, boxes ``(K, 6)`` and ids ``(K,)`` of those with an area, and the others."""
     count = geometry.counts[0]
     planes, boxes, ids = np.empty((count, 4), np.float32), np.empty((count, 6), np.float32), np.empty(count, np.int32)
-    kept = triangle_tables(*corners(geometry), count, planes, boxes, ids)
+    kept = kernel("tree_build", "triangle_tables")(*corners(geometry), count, planes, boxes, ids)
     return planes, boxes[:kept], ids[:kept], NonTriangles(geometry)
 
 
@@ -741,7 +169,11 @@ def write_tree(
     codes, triangles = memory.view(np.int32), geometry.counts[0]
     disk = triangles + geometry.counts[1]
     tables = (planes, non_triangles.tensors[0].numpy(), non_triangles.tensors[1].numpy())
-    lay_out(tree.boxes, tree.child, tree.ids, *corners(geometry), *tables, triangles, disk, line, memory, codes)
+    topology, scratch = (tree.boxes, tree.child, tree.ids), np.empty(tree.nodes, np.int64)
+    stack = np.empty(len(tree.child) + WIDTH, np.int32)
+    kernel("tree_build", "lay_out")(
+        *topology, *corners(geometry), *tables, triangles, disk, line, memory, codes, scratch, stack
+    )
 
 
 def corners(geometry: Geometry) -> tuple[Floats, Floats, Floats]:

@@ -1,4 +1,4 @@
-"""Instances of meshes as a second level of search (numba): a tree over their boxes above the trees of their meshes."""
+"""Instances of meshes as a second level of search: a tree over their boxes above the trees of their meshes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import prange
 from torch import Tensor
 
 from torchpt.core.threads import thread_count
-from torchpt.native.jit import ensure_compiled, jit, jit_internal, launch
-from torchpt.native.simd import item, pointer, put, splat
+from torchpt.native.kernels import kernel, run_parallel
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.base import Accel, Array, Hits, mark_non_opaque
 from torchpt.search.instances import CopyTables
@@ -24,241 +22,20 @@ from torchpt.search.tree_build import (
     aligned_buffer,
     line_count,
     mesh_tree,
-    stack_size,
     wide_tree,
     write_tree,
 )
-from torchpt.search.tree_layout import IDS, LINE, SLACK, block_offset, boxes, is_valid_ray, push
-from torchpt.search.tree_leaf import setup_ray
-from torchpt.search.tree_packet import PIECES
-from torchpt.search.tree_single import SCRATCH, pop, trace_single
+from torchpt.search.tree_layout import LINE, instance_memory, stack_size
 
-__all__ = ["InstancedWideBvh", "blocked", "blocked_parallel", "nearest", "nearest_parallel"]
+__all__ = ["InstancedWideBvh", "instance_words"]
 
 
-# ---- Kernels: traversal of the tree of instances, and for each instance that a ray hits of the tree of its mesh
-
-
-_ZERO, _INF = np.float32(0.0), np.float32(np.inf)
-
-
-@jit_internal(forceinline=True)
-def _row(table, k, x, y, z):
-    """Multiply the linear part of a row of an affine map with a point, in float64."""
-    return item(table, k) * x + item(table, k + 1) * y + item(table, k + 2) * z
-
-
-@jit_internal()
-def _moved(table, copy, o, d):
-    """Transform a ray to the space of an instance's mesh, in float64, rounded to float32."""
-    k = 12 * copy
-    px, py, pz = np.float64(o[0]), np.float64(o[1]), np.float64(o[2])
-    rx, ry, rz = np.float64(d[0]), np.float64(d[1]), np.float64(d[2])
-    at = (
-        np.float32(_row(table, k, px, py, pz) + item(table, k + 3)),
-        np.float32(_row(table, k + 4, px, py, pz) + item(table, k + 7)),
-        np.float32(_row(table, k + 8, px, py, pz) + item(table, k + 11)),
-    )
-    along = (
-        np.float32(_row(table, k, rx, ry, rz)),
-        np.float32(_row(table, k + 4, rx, ry, rz)),
-        np.float32(_row(table, k + 8, rx, ry, rz)),
-    )
-    return at, along
-
-
-@jit_internal()
-def _ray(o, d, best, prim, upper, lower, copies, work, any_hit):
-    """Find the nearest hit of one ray with instances nearer than ``best``, or any such hit: ``t, prim, u, v``."""
-    tree, codes = upper
-    table, shift, roots = copies
-    keys, parents, scratch = work
-    _, _, _, _, _, _, ix, iy, iz = setup_ray(d[0], d[1], d[2])
-    nx, ny, nz = 0 if ix > _ZERO else 24, 8 if iy > _ZERO else 32, 16 if iz > _ZERO else 40
-    u, v = _ZERO, _ZERO
-    top, code, first = np.int64(0), np.int64(0), prim
-    while top >= 0:
-        base = block_offset(code)
-        if code >= 0:
-            a, met = boxes(
-                tree, base, nx, ny, nz, splat(o[0], 8), splat(o[1], 8), splat(o[2], 8),
-                splat(ix, 8), splat(iy, 8), splat(iz, 8), splat(best, 8),
-            )  # fmt: skip
-            top = push(keys, parents, top, base, a, met)
-        else:
-            for k in range(8):
-                copy = np.int64(-2) - item(codes, base + IDS + k)
-                if copy < 0:
-                    continue
-                at, along = _moved(table, copy, o, d)
-                previous = prim
-                best, prim, a, b = trace_single(
-                    lower, item(roots, copy), at, along, best, prim, item(shift, copy),
-                    keys, parents, top, scratch, any_hit,
-                )  # fmt: skip
-                if prim != previous:
-                    u, v = a, b
-            if any_hit and prim != first:
-                break
-        top, code, _ = pop(codes, keys, parents, top, 0, best * SLACK)
-    return best, prim, u, v
-
-
-@jit_internal(inline="always")
-def _search(
-    first,
-    last,
-    o,
-    d,
-    t_max,
-    upper,
-    upper_codes,
-    lower,
-    lower_codes,
-    table,
-    shift,
-    roots,
-    stack_length,
-    t,
-    prim,
-    u,
-    v,
-    any_hit,
-):
-    keys, parents, scratch = (
-        np.empty(stack_length, np.int32),
-        np.empty(stack_length, np.int32),
-        np.empty(SCRATCH, np.float32),
-    )
-    none = np.empty(1, np.uint8)
-    work = (pointer(keys), pointer(parents), pointer(scratch))
-    above, below = (
-        (pointer(upper), pointer(upper_codes)),
-        (pointer(lower), pointer(lower_codes), 0, 0, pointer(none), 0),
-    )
-    copies = (pointer(table), pointer(shift), pointer(roots))
-    for i in range(first, last):
-        p, r = (o[0, i], o[1, i], o[2, i]), (d[0, i], d[1, i], d[2, i])
-        if not is_valid_ray(p[0], p[1], p[2], r[0], r[1], r[2], t_max[i]):
-            continue
-        if any_hit:
-            if prim[i] == 0:
-                _, found, _, _ = _ray(p, r, t_max[i], np.int32(-1), above, below, copies, work, True)
-                prim[i] = 1 if found >= 0 else 0
-        else:
-            best, found, a, b = _ray(p, r, min(t[i], t_max[i]), prim[i], above, below, copies, work, False)
-            if found != prim[i]:
-                put(prim, i, found)
-                t[i], u[i], v[i] = best, a, b
-    keys[0], parents[0], scratch[0], none[0] = 0, 0, 0, 0  # keeps the arrays alive: pointers hold no references
-
-
-@jit()
-def nearest(
-    first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, t, prim, u, v
-):
-    """Update the hits of rays ``first <= i < last`` by nearer hits with instances.
-
-    Args:
-        first: first ray.
-        last: ray after the last one.
-        o: origins ``(3, N)``.
-        d: directions ``(3, N)``.
-        t_max: ``(N,)``.
-        upper: blocks of the tree over the instances' boxes.
-        upper_codes: the same memory as int32.
-        lower: blocks of the trees of all meshes, concatenated.
-        lower_codes: the same memory as int32.
-        table: ``(I, 12)`` float64 transforms from the world to the meshes.
-        shift: ``(I,)`` int32, added to a triangle's number in its mesh to get its id in the instance.
-        roots: ``(I,)`` int64 codes of the meshes' roots.
-        stack_length: size of the stack.
-        t: nearest hits so far, inf for none; updated.
-        prim: their primitives, -1 for none; updated.
-        u: updated likewise.
-        v: updated likewise.
-    """
-    _search(
-        first,
-        last,
-        o,
-        d,
-        t_max,
-        upper,
-        upper_codes,
-        lower,
-        lower_codes,
-        table,
-        shift,
-        roots,
-        stack_length,
-        t,
-        prim,
-        u,
-        v,
-        False,
-    )
-
-
-@jit(parallel=True)
-def nearest_parallel(
-    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, t, prim, u, v
-):
-    """Run :func:`nearest` on several threads, over equal pieces of the rays."""
-    pieces = chunks * PIECES
-    for c in prange(chunks):
-        for k in range(c, pieces, chunks):
-            a, b = k * items // pieces, (k + 1) * items // pieces
-            nearest(
-                a,
-                b,
-                o,
-                d,
-                t_max,
-                upper,
-                upper_codes,
-                lower,
-                lower_codes,
-                table,
-                shift,
-                roots,
-                stack_length,
-                t,
-                prim,
-                u,
-                v,
-            )
-
-
-@jit()
-def blocked(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out):
-    """Write 1 to ``out (N,)`` for rays that hit an instance; rays that have 1 already are skipped."""
-    _search(
-        first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length,
-        t_max, out, t_max, t_max, True,
-    )  # fmt: skip
-
-
-@jit(parallel=True)
-def blocked_parallel(
-    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out
-):
-    """Run :func:`blocked` on several threads, over equal pieces of the rays."""
-    pieces = chunks * PIECES
-    for c in prange(chunks):
-        for k in range(c, pieces, chunks):
-            a, b = k * items // pieces, (k + 1) * items // pieces
-            blocked(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out)
-
-
-# ---- The search
-
-
-_GRAIN = 256  # rays that are worth another thread
+#: Rays that are worth another thread.
+_GRAIN = 256
 
 
 class InstancedWideBvh(Accel):
-    """A search by wide trees with instances: one tree for the primitives, two levels of trees for the instances (numba, CPU).
+    """A search by wide trees with instances: one tree for the primitives, two levels of trees for the instances, on a CPU.
 
     Args:
         geometry: the primitives, with instances, on the CPU.
@@ -287,10 +64,11 @@ class InstancedWideBvh(Accel):
         nodes, leaves, depth = self._below
         depth += top.depth
         roots = np.array([4 * x.line for x in self.refit_states], np.int64)
-        self.arrays = (
-            upper, upper.view(np.int32), lower, lower.view(np.int32), tables.inverse.numpy(),
-            tables.shift.numpy().astype(np.int32), roots[tables.mesh.numpy()], stack_size(depth),
+        self.tables = (
+            upper, lower, tables.inverse.numpy(), tables.shift.numpy().astype(np.int32), roots[tables.mesh.numpy()]
         )  # fmt: skip
+        self.stack_length = stack_size(depth)
+        self.words = instance_words(self.tables, self.stack_length)
         self.depth, self.copies, self.nodes, self.leaves = depth, len(some), top.nodes + nodes, top.leaves + leaves
         self.ids = int(geometry.size + geometry.copies[13].sum())
         self.build_seconds = time.perf_counter() - start
@@ -303,7 +81,7 @@ class InstancedWideBvh(Accel):
         base = self.base.refit(geometry, threads)
         if base is None:
             return None
-        tables, before, found = CopyTables(geometry), self.arrays[2], []
+        tables, before, found = CopyTables(geometry), self.tables[1], []
         lower = aligned_buffer(len(before))
         for refit_state, mesh in zip(self.refit_states, tables.meshes, strict=True):
             # instances of empty meshes are not in the upper level
@@ -319,42 +97,44 @@ class InstancedWideBvh(Accel):
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
         hits = self.base._intersect(o, d, t_max)
         rays = (x.contiguous().numpy() for x in (o, d, t_max))
-        args = (*rays, *self.arrays, *(x.numpy() for x in hits))
-        launch(nearest, nearest_parallel, t_max.shape[0], thread_count(self.threads), _GRAIN, args)
+        self._run("nearest", t_max.shape[0], thread_count(self.threads), *rays, *(x.numpy() for x in hits))
         return hits
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
         out = self.base._occluded(o, d, t_max).int()
         rays = (x.contiguous().numpy() for x in (o, d, t_max))
-        args = (*rays, *self.arrays, out.numpy())
-        launch(blocked, blocked_parallel, t_max.shape[0], thread_count(self.threads), _GRAIN, args)
+        self._run("occluded", t_max.shape[0], thread_count(self.threads), *rays, out.numpy())
         return out != 0
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
         self.base.nearest(o, d, t_max, count, t, prim, u, v)
-        args = (o, d, t_max, *self.arrays, t, prim, u, v)
-        ensure_compiled(nearest, 0, 0, *args)(0, count, *args)
+        self._run("nearest", count, 1, o, d, t_max, t, prim, u, v)
 
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
     ) -> None:
         """See :meth:`Accel.blocked`; with ``non_opaque`` every ray that hits anything gets 2."""
         self.base.blocked(o, d, t_max, count, out)
-        args = (o, d, t_max, *self.arrays, out)
-        ensure_compiled(blocked, 0, 0, *args)(0, count, *args)
+        self._run("occluded", count, 1, o, d, t_max, out)
         mark_non_opaque(out[:count], non_opaque)
+
+    def _run(self, name: str, count: int, threads: int, o: Array, d: Array, t_max: Array, *results: Array) -> None:
+        """Search the instances, and update the results of the search among the primitives."""
+        args = (o, d, t_max, d.shape[1], self.words, *results)
+        run_parallel(
+            kernel(f"instances_{name}", name), count, threads, _GRAIN, instance_memory(self.stack_length), args
+        )
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost leaves instances out."""
         base = self.base.describe()
-        upper, _, lower, _, *tables = self.arrays[:-1]
         return base | {
             "primitives": self.ids,
             "instances": self.copies,
             "nodes": base["nodes"] + self.nodes,
             "leaves": base["leaves"] + self.leaves,
-            "bytes": base["bytes"] + sum(x.nbytes for x in (upper, lower, *tables)),
+            "bytes": base["bytes"] + sum(x.nbytes for x in self.tables),
             "depth": max(base["depth"], self.depth),
             "build_seconds": self.build_seconds,
         }
@@ -376,3 +156,18 @@ def _meshes(meshes: list[Geometry]) -> tuple[list[WideTree], list[RefitState], n
         write_tree(tree, mesh, planes, non_triangles, line, memory)
     trees = [tree for tree, _, _ in built]
     return trees, [RefitState(*args) for args in zip(trees, meshes, lines[:-1], strict=True)], memory
+
+
+def instance_words(tables: tuple[np.ndarray, ...], stack_length: int) -> np.ndarray:
+    """Return the int64 words by which kernels find instances.
+
+    Args:
+        tables: tree over the instances' boxes; trees of all meshes, one after the other; transforms ``(I, 12)`` float64 from
+            the world to the meshes; ``(I,)`` int32, added to a triangle's number in its mesh to get its id in the instance;
+            ``(I,)`` int64 codes of the meshes' roots.
+        stack_length: stack size of a ray.
+
+    Returns:
+        ``(6,)``: addresses of the tables, which have to be kept alive, and the stack size.
+    """
+    return np.array([*(x.ctypes.data for x in tables), stack_length], np.int64)

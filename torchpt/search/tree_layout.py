@@ -1,4 +1,4 @@
-"""The memory layout of a wide tree (numba), and tests of one ray with a node's eight boxes or a leaf's eight triangles.
+"""The memory layout of a wide tree: what its kernels (``scripts/kernel_sources``) and the code that calls them agree on.
 
 A tree is one buffer of 64-byte cache lines of 16 float32. A *node* has 4 lines: lower x, y, z and upper x, y, z of eight
 children, eight codes, eight unused numbers. A *leaf* has 7 lines: nine components of eight triangles' corners, four numbers of
@@ -19,156 +19,64 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchpt.native.jit import jit_internal
-from torchpt.native.simd import (
-    as_int,
-    bits,
-    item,
-    lane_numbers,
-    load,
-    maximum,
-    minimum,
-    popcount,
-    prefetch,
-    select,
-    sort_descending,
-    splat,
-    store,
-)
-
 __all__ = [
     "CHILDREN",
     "FLOOR",
+    "FOURTH",
     "IDS",
+    "INSTANCE_MEMORY",
     "LEAF",
     "LINE",
     "MAY_PASS",
     "MORE",
     "NODE",
+    "PACKET_MEMORY",
     "PLANES",
+    "RAYS_IN_FLIGHT",
+    "RECTANGLES",
+    "RULED",
     "SLACK",
-    "block_offset",
-    "blocking",
-    "boxes",
-    "crossed_triangles",
-    "is_valid_ray",
-    "planes",
-    "prefetch_block",
-    "push",
-    "triangles_alone",
+    "WIDTH",
+    "instance_memory",
+    "packet_memory",
+    "stack_size",
 ]
 
-LINE = 16  # float32 in a cache line
-NODE, LEAF, MORE = 4, 7, 8  # lines of a node, of a leaf, and of a leaf's rectangles
-CHILDREN = 48  # offset of the codes in a node
-PLANES, IDS = 72, 104  # offsets of planes and ids in a leaf
+#: Children a node, and primitives a leaf: one vector of boxes or triangles.
+WIDTH = 8
+#: Float32 in a cache line.
+LINE = 16
+#: Lines of a node, of a leaf, and of a leaf's rectangles.
+NODE, LEAF, MORE = 4, 7, 8
+#: Offset of the codes in a node.
+CHILDREN = 48
+#: Offsets of planes and ids in a leaf.
+PLANES, IDS = 72, 104
+#: Offset of the rectangles in a leaf: three corners as for triangles, then from :data:`FOURTH` on the fourth corners, and from
+#: :data:`RULED` on the planes.
+RECTANGLES = LEAF * LINE
+FOURTH, RULED = 72, 96
 SLACK = np.float32(1.0 + 2.0**-16)
 FLOOR = np.float32(1.0 - 2.0**-17)
 #: Instead of an id: an any-hit ray has so far hit only surfaces that may let light pass.
 MAY_PASS = np.int32(-2)
-_ZERO = np.float32(0.0)
+
+#: Single rays that a kernel traces in turn, each with a stack of its own.
+RAYS_IN_FLIGHT = 16
+#: Bytes of scratch memory of a search, without the stacks.
+PACKET_MEMORY, INSTANCE_MEMORY = 24_672, 96
 
 
-@jit_internal(forceinline=True)
-def block_offset(code):
-    """Return the offset of a code's block in the buffer."""
-    return ((code ^ (code >> 63)) & ~3) * (LINE // 4)
+def stack_size(depth: int) -> int:
+    """Return the stack size for a tree of a depth: each level leaves up to seven entries, and eight are written at once."""
+    return depth * (WIDTH - 1) + 2 * WIDTH
 
 
-@jit_internal(forceinline=True)
-def triangles_alone(code):
-    """Return True if a leaf holds only triangles, by its code."""
-    return code & 3 == 3
+def packet_memory(stack_length: int) -> int:
+    """Return the bytes of scratch memory for a search of a tree: two stacks of int32 for each ray in flight, and rays."""
+    return PACKET_MEMORY + 2 * 4 * RAYS_IN_FLIGHT * stack_length
 
 
-@jit_internal(forceinline=True)
-def blocking(scene, prim):
-    """Return the id of a primitive if it is opaque, else :data:`MAY_PASS`.
-
-    ``scene`` ends with one uint8 a primitive, nonzero if light may pass, and their number: 0 if all primitives are opaque.
-    """
-    return MAY_PASS if scene[5] > 0 and item(scene[4], prim) != 0 else prim
-
-
-@jit_internal(forceinline=True)
-def is_valid_ray(ox, oy, oz, dx, dy, dz, t_max):
-    """Return True if a ray can hit anything: it is finite and ``t_max > 0``."""
-    zero = ox * _ZERO + oy * _ZERO + oz * _ZERO + dx * _ZERO + dy * _ZERO + dz * _ZERO
-    return t_max > _ZERO and zero == _ZERO
-
-
-@jit_internal(forceinline=True)
-def boxes(tree, base, nx, ny, nz, ox, oy, oz, ix, iy, iz, far):
-    """Return the entries of a node's eight boxes, and the mask of those hit before ``far``.
-
-    ``nx, ny, nz`` are the offsets of the near planes; origin, reciprocal direction and ``far`` are splats.
-    """
-    ax, bx = (load(tree, base + nx, 8) - ox) * ix, (load(tree, base + (24 - nx), 8) - ox) * ix
-    ay, by = (load(tree, base + ny, 8) - oy) * iy, (load(tree, base + (40 - ny), 8) - oy) * iy
-    az, bz = (load(tree, base + nz, 8) - oz) * iz, (load(tree, base + (56 - nz), 8) - oz) * iz
-    a = maximum(maximum(ax, ay), maximum(az, splat(_ZERO, 8)))
-    b = minimum(minimum(bx, by), minimum(bz, far)) * splat(SLACK, 8)
-    return a, a <= b
-
-
-@jit_internal(forceinline=True)
-def push(keys, parents, top, base, a, met):
-    """Push the boxes that were hit on the stack, the nearest on top; return the new top.
-
-    A key is an entry whose last three bits are the child's number. Eight keys are always written, which avoids a branch on the
-    number of hits.
-    """
-    key = select(met, (as_int(a) & splat(np.int32(-8), 8)) | lane_numbers(8), splat(np.int32(-1), 8))
-    store(keys, top, sort_descending(key))
-    store(parents, top, splat(np.int32(base), 8))
-    return top + popcount(bits(met))
-
-
-@jit_internal(forceinline=True)
-def crossed_triangles(tree, base, kx, ky, kz, px, py, pz, sx, sy):
-    """Return the mask of a leaf's triangles that the ray's line crosses, corners' depths, two edge functions, determinant.
-
-    Edge functions of Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection" (2013), without any tolerance. Origin
-    and shear are splats, their axes in the order of :func:`torchpt.search.tree_leaf.setup_ray`.
-    """
-    x, y, z = base + kx * 8, base + ky * 8, base + kz * 8
-    za, zb, zc = load(tree, z, 8) - pz, load(tree, z + 24, 8) - pz, load(tree, z + 48, 8) - pz
-    ax, ay = (load(tree, x, 8) - px) - sx * za, (load(tree, y, 8) - py) - sy * za
-    bx, by = (load(tree, x + 24, 8) - px) - sx * zb, (load(tree, y + 24, 8) - py) - sy * zb
-    cx, cy = (load(tree, x + 48, 8) - px) - sx * zc, (load(tree, y + 48, 8) - py) - sy * zc
-    e, f, g = cx * by - cy * bx, ax * cy - ay * cx, bx * ay - by * ax
-    low, high = minimum(minimum(e, f), g), maximum(maximum(e, f), g)
-    det, zero = e + f + g, splat(_ZERO, 8)
-    return ((low >= zero) | (high <= zero)) & (det != zero), za, zb, zc, f, g, det
-
-
-@jit_internal(forceinline=True)
-def planes(tree, base, o, d, za, zb, zc, sz, floor):
-    """Return ``t`` of a leaf's planes, clamped to the corners' depths and to at least ``floor``, and the mask of valid ones."""
-    zero = splat(_ZERO, 8)
-    n0, n1, n2 = load(tree, base + PLANES, 8), load(tree, base + PLANES + 8, 8), load(tree, base + PLANES + 16, 8)
-    away = n0 * splat(o[0], 8) + n1 * splat(o[1], 8) + n2 * splat(o[2], 8) + load(tree, base + PLANES + 24, 8)
-    along = n0 * splat(d[0], 8) + n1 * splat(d[1], 8) + n2 * splat(d[2], 8)
-    plane = -away / along
-    za, zb, zc = za * sz, zb * sz, zc * sz
-    t = minimum(maximum(plane, minimum(minimum(za, zb), zc)), maximum(maximum(za, zb), zc))
-    return maximum(t, splat(floor, 8)), (plane == plane) & (t > zero)
-
-
-@jit_internal(forceinline=True)
-def prefetch_block(tree, code):
-    """Prefetch the cache lines of a block.
-
-    Nodes and leaves share one path with computed addresses: a branch would be mispredicted as often as the one that follows.
-    The ids of a leaf are left out, as few rays read them.
-    """
-    leaf = code >> 63
-    base = ((code ^ leaf) & ~3) * (LINE // 4)
-    rest = base + (leaf & (NODE * LINE))
-    prefetch(tree, base)
-    prefetch(tree, base + LINE)
-    prefetch(tree, base + 2 * LINE)
-    prefetch(tree, base + 3 * LINE)
-    prefetch(tree, rest)
-    prefetch(tree, rest + LINE)
-    prefetch(tree, rest + 2 * LINE)
+def instance_memory(stack_length: int) -> int:
+    """Return the bytes of scratch memory for a search of instances: two stacks of int32, and eight hits."""
+    return INSTANCE_MEMORY + 2 * 4 * stack_length

@@ -66,7 +66,7 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
     """
     import numpy as np
 
-    from torchpt.physics.lights import tree_build
+    from torchpt.native.kernels import kernel
 
     def array(tensor: Tensor) -> np.ndarray:
         return tensor.detach().double().cpu().numpy()
@@ -91,7 +91,8 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
     nodes = np.zeros((max_nodes, len(FIELDS), WIDTH), np.float32)
     child = np.zeros((max_nodes, WIDTH), np.int32)
     full, trail, depth = np.zeros(max_nodes, np.int32), np.zeros(count, np.int64), np.zeros(count, np.int32)
-    num_nodes = tree_build.build(lights, cone, ids, nodes, child, full, trail, depth)
+    scratch = np.zeros((max_nodes, 2), np.int64), np.zeros(max_nodes, np.int64), np.zeros(max_nodes, np.int64)
+    num_nodes = kernel("light_tree", "build")(lights, cone, ids, nodes, child, full, trail, depth, *scratch)
     levels = int(depth.max())
     # Three bits a level; a word of int32 holds those of STEPS levels.
     words = [trail >> 3 * first & (1 << 3 * STEPS) - 1 for first in range(0, max(levels, 1), STEPS)]

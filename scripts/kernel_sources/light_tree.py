@@ -1,4 +1,4 @@
-"""Builder of the light tree (numba, float64): top down, nodes of eight children, splitting the child of highest cost.
+"""Build the light tree in float64: top down, nodes of eight children, splitting the child of highest cost.
 
 Conty Estevez and Kulla, "Importance Sampling of Many Lights with Adaptive Tree Splitting", Proc. ACM Comput. Graph. Interact.
 Tech. 1(2), 2018: the cost of a group of lights is intensity times spread of positions times spread of directions.
@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba.np.numpy_support import carray
 
-from torchpt.native.jit import jit
+from kernel_sources.jit import array, inner, kernel
+from kernel_sources.simd import stack_memory
 from torchpt.physics.lights.tree import WIDTH
 
 __all__ = ["build"]
@@ -21,6 +23,8 @@ _EVEN = 11
 #: Bins of a split along each axis; two more rows are the sums from the upper and from the lower end.
 _BINS = 12
 _UPPER, _LOWER = _BINS, _BINS + 1
+#: Numbers of the bins, of the groups of a node's children, and of the ends of these groups.
+_BIN_NUMBERS, _GROUP_NUMBERS, _CUTS = 12 * (_BINS + 2), 12 * WIDTH, WIDTH + 1
 _INF = np.inf
 _PI = math.pi
 
@@ -28,14 +32,14 @@ _PI = math.pi
 # cosine of the angle theta_e of the paper, intensity, count.
 
 
-@jit()
+@inner()
 def _clear(groups, k):
     for c in range(3):
         groups[k, c], groups[k, 3 + c], groups[k, 6 + c] = _INF, -_INF, 0.0
     groups[k, 9], groups[k, 10], groups[k, 11] = 1.0, 0.0, 0.0
 
 
-@jit()
+@inner()
 def _add(groups, k, others, i):
     for c in range(3):
         groups[k, c] = min(groups[k, c], others[i, c])
@@ -46,17 +50,17 @@ def _add(groups, k, others, i):
     groups[k, 11] += others[i, 11]
 
 
-@jit()
+@inner()
 def _length(x, y, z):
     return math.sqrt(x * x + y * y + z * z)
 
 
-@jit()
+@inner()
 def _angle(cosine):
     return math.acos(min(max(cosine, -1.0), 1.0))
 
 
-@jit()
+@inner()
 def _cost(groups, k):
     """Return the cost of a group: intensity times measure of directions times squared diagonal.
 
@@ -75,19 +79,19 @@ def _cost(groups, k):
     return groups[k, 10] * directions * diagonal * diagonal
 
 
-@jit()
+@inner()
 def _gather(groups, k, lights, ids, start, stop):
     _clear(groups, k)
     for i in range(start, stop):
         _add(groups, k, lights, ids[i])
 
 
-@jit()
+@inner()
 def _bin(lights, i, axis, low, scale):
     return min(max(int((lights[i, axis] + lights[i, 3 + axis] - low) * scale), 0), _BINS - 1)
 
 
-@jit()
+@inner()
 def _split(lights, ids, start, stop, bins, suffix):
     """Partition a range of lights into two groups of least cost; return the start of the second."""
     best, best_axis, best_cut, best_low, best_scale = _INF, -1, 0, 0.0, 0.0
@@ -124,7 +128,7 @@ def _split(lights, ids, start, stop, bins, suffix):
     return i
 
 
-@jit()
+@inner()
 def _cone(lights, cos_o, ids, start, stop):
     """Return axis and half angle of a cone that contains the cones of a range of lights."""
     x, y, z = 0.0, 0.0, 0.0
@@ -147,8 +151,17 @@ def _cone(lights, cos_o, ids, start, stop):
     return x, y, z, min(theta, _PI)
 
 
-@jit()
-def build(lights, cos_o, ids, nodes, child, full, trail, depth):
+@kernel(
+    "light_tree",
+    array("f8", 2),
+    array("f8"),
+    array("i4"),
+    array("f4", 3),
+    array("i4", 2),
+    *(array("i4"), array("i8"), array("i4")),
+    *(array("i8", 2), array("i8"), array("i8")),
+)
+def build(lights, cos_o, ids, nodes, child, full, trail, depth, spans, level, way):
     """Build the tree.
 
     Args:
@@ -160,15 +173,21 @@ def build(lights, cos_o, ids, nodes, child, full, trail, depth):
         full: ``(nodes,)`` int32, filled: number of children.
         trail: ``(K,)`` int64, filled: path from the root, three bits a level, the first lowest.
         depth: ``(K,)`` int32 zeros, filled: number of levels.
+        spans: ``(nodes, 2)`` int64 zeros, scratch memory.
+        level: ``(nodes,)`` likewise.
+        way: ``(nodes,)`` likewise.
 
     Returns:
         The number of nodes; node 0 is the root.
     """
-    spans = np.zeros((len(nodes), 2), np.int64)
-    level = np.zeros(len(nodes), np.int64)
-    way = np.zeros(len(nodes), np.int64)
-    bins, suffix = np.empty((_BINS + 2, 12), np.float64), np.empty(_BINS, np.float64)
-    groups, cuts, costs = np.zeros((WIDTH, 12)), np.zeros(WIDTH + 1, np.int64), np.zeros(WIDTH)
+    bins = carray(stack_memory(_BIN_NUMBERS, np.float64), (_BINS + 2, 12))
+    suffix = carray(stack_memory(_BINS, np.float64), (_BINS,))
+    groups = carray(stack_memory(_GROUP_NUMBERS, np.float64), (WIDTH, 12))
+    cuts = carray(stack_memory(_CUTS, np.int64), (_CUTS,))
+    costs = carray(stack_memory(WIDTH, np.float64), (WIDTH,))
+    groups[:, :] = 0.0
+    cuts[:] = 0
+    costs[:] = 0.0
     spans[0, 1] = len(ids)
     used, at = 1, 0
     while at < used:  # breadth first: the queue is the tree itself

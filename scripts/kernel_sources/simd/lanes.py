@@ -7,7 +7,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import types
 
-from torchpt.native.simd.types import I32, Vector, intrinsic, lanes_of, numbers
+from kernel_sources.simd.types import I32, Vector, intrinsic, lanes_of, numbers
 
 __all__ = ["bits", "highest", "lane_numbers", "lowest", "mask", "popcount", "sort_descending", "trailing_zeros"]
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from torchpt.native.jit import jit, jit_internal
-from torchpt.native.simd import (
+from kernel_sources.jit import BYTES, FLOATS, INT, INTS, LONGS, inner, kernel
+from kernel_sources.simd import (
     absolute,
     as_float,
     as_int,
@@ -14,11 +13,12 @@ from torchpt.native.simd import (
     highest,
     item,
     load,
+    load_pointer,
     lowest,
     mask,
     maximum,
     minimum,
-    pointer,
+    part,
     popcount,
     put,
     select,
@@ -26,13 +26,8 @@ from torchpt.native.simd import (
     store,
     trailing_zeros,
 )
-from torchpt.search.tree_layout import (
-    CHILDREN,
-    FLOOR,
-    IDS,
-    MAY_PASS,
-    PLANES,
-    SLACK,
+from kernel_sources.tree_leaf import intersect_others
+from kernel_sources.tree_nodes import (
     block_offset,
     blocking,
     boxes,
@@ -41,39 +36,22 @@ from torchpt.search.tree_layout import (
     push,
     triangles_alone,
 )
-from torchpt.search.tree_leaf import FOURTH, RECTANGLES, RULED, intersect_others
-from torchpt.search.tree_single import SCRATCH, nearest_triangle, occluding_triangle, pop
+from kernel_sources.tree_single import SCRATCH, nearest_triangle, occluding_triangle, pop
+from torchpt.search.tree_layout import (
+    CHILDREN,
+    FLOOR,
+    FOURTH,
+    IDS,
+    MAY_PASS,
+    PACKET_MEMORY,
+    PLANES,
+    RAYS_IN_FLIGHT,
+    RECTANGLES,
+    RULED,
+    SLACK,
+)
 
-__all__ = [
-    "AXIS",
-    "BEST",
-    "COLUMNS",
-    "DIRECTION",
-    "FLOATS",
-    "INVERSE",
-    "NEAR",
-    "NUMBERS",
-    "ORIGIN",
-    "PIECES",
-    "RAYS",
-    "RAYS_IN_FLIGHT",
-    "RAY_IDS",
-    "SCRATCH",
-    "SHEAR",
-    "SPARE",
-    "STATE",
-    "U",
-    "V",
-    "blocked",
-    "blocked_parallel",
-    "is_coherent",
-    "load_rays",
-    "nearest",
-    "nearest_parallel",
-    "store_hits",
-    "trace_interleaved",
-    "trace_packet",
-]
+__all__ = ["nearest", "occluded"]
 
 
 # ---- Rays in rows of memory, sixteen of them loaded at a time
@@ -83,27 +61,27 @@ __all__ = [
 COLUMNS = 256
 #: Rows of float32: origin, direction, reciprocal direction, shear, best distance (-1: the ray is finished), u, v.
 ORIGIN, DIRECTION, INVERSE, SHEAR, BEST, U, V = (k * COLUMNS for k in (0, 3, 6, 9, 12, 13, 14))
-FLOATS = 15 * COLUMNS
+FLOATS_OF_RAYS = 15 * COLUMNS
 #: Rows of int32: axes (the longest of the direction last), offsets of the near planes, primitive hit.
 AXIS, NEAR, RAY_IDS = 0, 3 * COLUMNS, 6 * COLUMNS
-NUMBERS = 7 * COLUMNS
+INTS_OF_RAYS = 7 * COLUMNS
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _LEAST, _TINY = np.float32(1e-20), np.float32(1e-37)  # as in tree_leaf.setup
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _inverse(d, least):
     """Compute reciprocals that are never infinite."""
     sign = as_int(d) & splat(np.int32(-(2**31)), 16)
     return splat(_ONE, 16) / select(absolute(d) >= least, d, as_float(as_int(least) | sign))
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _facing(inverse, at):
     return select(inverse > splat(_ZERO, 16), splat(np.int32(at), 16), splat(np.int32(at + 24), 16))
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def load_rays(i, rays, c, rows, ids):
     """Fill columns ``c`` to ``c + 15`` with rays ``i`` to ``i + 15``; return the mask of those that can hit anything."""
     o, d, t_max, n = rays
@@ -148,7 +126,6 @@ def load_rays(i, rays, c, rows, ids):
 # ---- Interleaved single rays: each advances by one block in turn, while the next blocks of the others are prefetched
 
 
-RAYS_IN_FLIGHT = 16  # rays in flight
 _ROW = 4
 STATE = RAYS_IN_FLIGHT * _ROW
 _ZERO = np.float32(0.0)
@@ -156,17 +133,17 @@ _ZERO = np.float32(0.0)
 _RAY, _CODE, _KEY, _TOP = 0, 1, 2, 3
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _splats(rows, at):
     return splat(item(rows, at), 8), splat(item(rows, at + COLUMNS), 8), splat(item(rows, at + 2 * COLUMNS), 8)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _scalars(rows, at):
     return item(rows, at), item(rows, at + COLUMNS), item(rows, at + 2 * COLUMNS)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
     """Test a leaf and store nearer hits; return True if an any-hit ray is finished."""
     tree, codes = scene[0], scene[1]
@@ -212,7 +189,7 @@ def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
     return False
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def trace_interleaved(count, scene, stack_length, rows, ids, work, any_hit):
     """Find the nearest hits of the rays in the first ``count`` columns, or any hits.
 
@@ -293,7 +270,7 @@ FEWEST = 4
 _ZERO, _INF = np.float32(0.0), np.float32(np.inf)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def is_coherent(c, good, rows):
     """Return True if the rays in columns ``c`` to ``c + 15`` form a packet: enough are in the mask ``good``, all of one octant.
 
@@ -307,7 +284,7 @@ def is_coherent(c, good, rows):
     return alike and popcount(good) >= FEWEST, ux != 0, uy != 0, uz != 0
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _filled(rows, c, first, whole):
     """Load three rows of columns ``c`` to ``c + 15``, with column ``first`` in place of inactive rays."""
     return (
@@ -317,7 +294,7 @@ def _filled(rows, c, first, whole):
     )
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _interval(o, inverse, up):
     """Return the intervals of 16 rays on one axis: origins for near and far planes, least and greatest reciprocal."""
     low, high = lowest(o), highest(o)
@@ -325,7 +302,7 @@ def _interval(o, inverse, up):
     return splat(near, 8), splat(far, 8), splat(lowest(inverse), 8), splat(highest(inverse), 8)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _met(tree, base, nx, ny, nz, x, y, z, limit):
     """Return lower bounds of all rays' entries into eight boxes, and the mask of boxes that a ray may hit before ``limit``."""
     ax, bx = load(tree, base + nx, 8) - x[0], load(tree, base + (24 - nx), 8) - x[1]
@@ -342,7 +319,7 @@ def _met(tree, base, nx, ny, nz, x, y, z, limit):
     return a, a <= b * splat(SLACK, 8)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _box(tree, at, nx, ny, nz, o, inverse, best):
     """Return every ray's entry into one box, whose first number is at ``at``, and the mask of rays that hit it."""
     ax = (splat(item(tree, at + nx), 16) - o[0]) * inverse[0]
@@ -355,7 +332,7 @@ def _box(tree, at, nx, ny, nz, o, inverse, best):
     return a, a <= minimum(minimum(bx, by), minimum(bz, best)) * splat(SLACK, 16)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _corner(tree, at, m, p, s):
     """Return a corner in the sheared space of every ray; ``m`` has the masks of rays whose longest axis is x, and y."""
     x = splat(item(tree, at), 16) - p[0]
@@ -369,7 +346,7 @@ def _corner(tree, at, m, p, s):
     )
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _triangle(tree, at, axes, s, o, d, floor):
     """Intersect 16 rays with the triangle whose first number is at ``at``: mask, ``t``, two edge functions, determinant."""
     zero = splat(_ZERO, 16)
@@ -392,9 +369,9 @@ def _triangle(tree, at, axes, s, o, d, floor):
     return m, t, f, g, det
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _rectangle(tree, at, axes, s, o, d):
-    """Intersect 16 rays with one rectangle: mask, ``t``, u, v; see :func:`torchpt.search.tree_leaf.intersect_others`."""
+    """Intersect 16 rays with one rectangle: mask, ``t``, u, v; see :func:`kernel_sources.tree_leaf.intersect_others`."""
     zero = splat(_ZERO, 16)
     n0, n1 = splat(item(tree, at + RULED), 16), splat(item(tree, at + RULED + 8), 16)
     n2, n3 = splat(item(tree, at + RULED + 16), 16), splat(item(tree, at + RULED + 24), 16)
@@ -414,7 +391,7 @@ def _rectangle(tree, at, axes, s, o, d):
     return m & (t > zero), t, f / (f + h), g / (g + k)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _rest(scene, code, base, memory, o, d, floor, lanes, best, prim, u, v, any_hit):
     """Intersect the rays of a mask, one by one, with a leaf's primitives that are neither triangles nor rectangles.
 
@@ -452,7 +429,7 @@ def _rest(scene, code, base, memory, o, d, floor, lanes, best, prim, u, v, any_h
     return load(spare, 112, 16), load(ids, 0, 16), load(spare, 128, 16), load(spare, 144, 16)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _packet_leaf(scene, code, memory, axes, s, o, d, floor, lanes, best, prim, u, v, any_hit):
     """Update the hits of a packet's rays in the mask by a leaf; any-hit rays with an opaque hit get ``best`` -1."""
     tree, codes = scene[0], scene[1]
@@ -484,7 +461,7 @@ def _packet_leaf(scene, code, memory, axes, s, o, d, floor, lanes, best, prim, u
     return best, prim, u, v
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def store_hits(i, out, best, prim, u, v, any_hit):
     """Write the hits of 16 rays; of any-hit rays 1 if blocked, 2 if light may pass all that they hit, else 0."""
     missed = prim < splat(np.int32(0), 16)
@@ -498,7 +475,7 @@ def store_hits(i, out, best, prim, u, v, any_hit):
         store(out[3], i, v)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def trace_packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, any_hit):
     """Trace rays ``i`` to ``i + 15``, in columns ``c`` to ``c + 15``, as a packet; :func:`is_coherent` must hold for them."""
     tree, codes = scene[0], scene[1]
@@ -545,11 +522,7 @@ def trace_packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, 
 # ---- Kernels: nearest and any hits of a range of rays, coherent ones as packets, the others as interleaved single rays
 
 
-#: Pieces of work a thread, as the cost of rays varies over the picture.
-PIECES = 8
-
-
-@jit_internal(inline="always")
+@inner(inline="always")
 def _trace(first, last, rays, scene, stack_length, groups, columns, work, spare, out, any_hit):
     """Trace rays ``first`` to ``last``; their number is a multiple of 16."""
     rows, ids = columns
@@ -571,99 +544,94 @@ def _trace(first, last, rays, scene, stack_length, groups, columns, work, spare,
             count = np.int64(0)
 
 
-@jit_internal()
-def _none():
-    return np.empty(0, np.uint8)
+#: Offsets in the scratch memory, in bytes: int64 first, then numbers of 32 bits, then the stacks.
+_SLOTS = 0
+_GROUPS = _SLOTS + 8 * STATE
+_ROWS = _GROUPS + 8 * (COLUMNS >> 4)
+_IDS = _ROWS + 4 * FLOATS_OF_RAYS
+_SCRATCH = _IDS + 4 * INTS_OF_RAYS
+_LANES = _SCRATCH + 4 * SCRATCH
+_KEPT = _LANES + 4 * SPARE
+_EDGE = _KEPT + 4 * RAYS
+_EDGE_IDS = _EDGE + 4 * 10 * RAYS
+_STACKS = _EDGE_IDS + 4 * RAYS
+assert _STACKS == PACKET_MEMORY
 
 
-@jit_internal(inline="always")
-def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, t, prim, u, v, any_hit):
-    """Allocate memory and run :func:`_trace`; a remainder of fewer than 16 rays is padded in separate memory."""
-    stack_length = kinds[4]
-    keys, parents = np.empty(RAYS_IN_FLIGHT * stack_length, np.int32), np.empty(RAYS_IN_FLIGHT * stack_length, np.int32)
-    slots, scratch, groups = np.empty(STATE, np.int64), np.empty(SCRATCH, np.float32), np.empty(COLUMNS >> 4, np.int64)
-    columns, numbers = np.empty(FLOATS, np.float32), np.empty(NUMBERS, np.int32)
-    lanes, kept = np.empty(SPARE, np.float32), np.empty(RAYS, np.int32)
-    tables = (pointer(corner), pointer(rows), pointer(quadrics))
-    scene = (pointer(tree), pointer(codes), tables, pointer(kinds), pointer(non_opaque), len(non_opaque))
-    work = (pointer(keys), pointer(parents), pointer(slots), pointer(scratch))
-    ray_rows = (pointer(columns), pointer(numbers))
-    spare = (pointer(lanes), pointer(kept), pointer(scratch))
-    given = (pointer(o), pointer(d), pointer(t_max), d.shape[1])
-    found = (pointer(t), pointer(prim), pointer(u), pointer(v))
+@inner(inline="always")
+def _search(first, last, memory, o, d, t_max, stride, words, non_opaque, surfaces, t, prim, u, v, any_hit):
+    """Run :func:`_trace`; a remainder of fewer than 16 rays is padded in separate memory."""
+    tree, kinds = load_pointer(words, 0, np.float32), part(words, 4, np.int64)
+    tables = (
+        load_pointer(words, 1, np.float32),
+        load_pointer(words, 2, np.float32),
+        load_pointer(words, 3, np.float64),
+    )
+    stack_length = item(kinds, 4)
+    scene = (tree, part(tree, 0, np.int32), tables, kinds, non_opaque, surfaces)
+    keys = part(memory, _STACKS, np.int32)
+    parents, slots = part(keys, RAYS_IN_FLIGHT * stack_length, np.int32), part(memory, _SLOTS, np.int64)
+    groups, scratch = part(memory, _GROUPS, np.int64), part(memory, _SCRATCH, np.float32)
+    work = (keys, parents, slots, scratch)
+    ray_rows = (part(memory, _ROWS, np.float32), part(memory, _IDS, np.int32))
+    spare = (part(memory, _LANES, np.float32), part(memory, _KEPT, np.int32), scratch)
+    given, found = (o, d, t_max, stride), (t, prim, u, v)
     # the remainder of fewer than 16 rays, padded with rays that hit nothing
     end = last - (last - first) % RAYS
-    edge, number = np.zeros(10 * RAYS, np.float32), np.zeros(RAYS, np.int32)
+    edge, number = part(memory, _EDGE, np.float32), part(memory, _EDGE_IDS, np.int32)
+    for j in range(10 * RAYS):
+        put(edge, j, _ZERO)
     for j in range(last - end):
-        edge[6 * RAYS + j] = t_max[end + j]
+        put(edge, 6 * RAYS + j, item(t_max, end + j))
         for k in range(3):
-            edge[k * RAYS + j], edge[(3 + k) * RAYS + j] = o[k, end + j], d[k, end + j]
-    given_edge = (pointer(edge), pointer(edge[3 * RAYS :]), pointer(edge[6 * RAYS :]), RAYS)
-    found_edge = (pointer(edge[7 * RAYS :]), pointer(number), pointer(edge[8 * RAYS :]), pointer(edge[9 * RAYS :]))
+            put(edge, k * RAYS + j, item(o, k * stride + end + j))
+            put(edge, (3 + k) * RAYS + j, item(d, k * stride + end + j))
+    given_edge = (edge, part(edge, 3 * RAYS, np.float32), part(edge, 6 * RAYS, np.float32), np.int64(RAYS))
+    edge_t, edge_u, edge_v = 7 * RAYS, 8 * RAYS, 9 * RAYS
+    found_edge = (
+        part(edge, edge_t, np.float32), number, part(edge, edge_u, np.float32), part(edge, edge_v, np.float32),
+    )  # fmt: skip
     for k in range(2):  # a single call, which is inlined and compiled once
         rays, out = (given, found) if k == 0 else (given_edge, found_edge)
         start, stop = (first, end) if k == 0 else (0, RAYS if end < last else 0)
-        _trace(start, stop, rays, scene, stack_length, pointer(groups), ray_rows, work, spare, out, any_hit)
+        _trace(start, stop, rays, scene, stack_length, groups, ray_rows, work, spare, out, any_hit)
     for j in range(last - end):
-        prim[end + j] = number[j]
+        put(prim, end + j, item(number, j))
         if not any_hit:
-            t[end + j], u[end + j], v[end + j] = edge[7 * RAYS + j], edge[8 * RAYS + j], edge[9 * RAYS + j]
-    # keeps the arrays alive: pointers hold no references
-    keys[0], parents[0], slots[0], scratch[0], groups[0] = 0, 0, 0, 0, 0
-    columns[0], numbers[0], lanes[0], kept[0], edge[0], number[0] = 0, 0, 0, 0, 0, 0
+            put(t, end + j, item(edge, edge_t + j))
+            put(u, end + j, item(edge, edge_u + j))
+            put(v, end + j, item(edge, edge_v + j))
 
 
-@jit()
-def nearest(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, t, prim, u, v):
+@kernel("tree_nearest", INT, INT, BYTES, FLOATS, FLOATS, FLOATS, INT, LONGS, FLOATS, INTS, FLOATS, FLOATS)
+def nearest(first, last, memory, o, d, t_max, stride, words, t, prim, u, v):
     """Find the nearest hits of rays ``first <= i < last``.
 
     Args:
         first: first ray.
         last: ray after the last one.
-        o: origins ``(3, N)`` float32.
-        d: directions ``(3, N)``.
-        t_max: ends of the rays ``(N,)``.
-        tree: blocks of nodes and leaves, see :mod:`torchpt.search.tree_layout`.
-        codes: the same memory as int32.
-        corner: ``(K, 12)`` corners of the primitives that are not triangles.
-        rows: ``(K, 12)`` affine rows of these primitives.
-        quadrics: ``(Q, 19)`` float64.
-        kinds: ``(5,)`` int64: ids of the first rectangle, disk, sphere and quadric; stack size of a ray.
-        t: ``(N,)`` float32, filled; inf for a miss.
-        prim: ``(N,)`` int32, filled; -1 for a miss.
-        u: ``(N,)`` float32, filled.
-        v: ``(N,)`` float32, filled.
+        memory: scratch memory of :func:`torchpt.search.tree_layout.packet_memory`.
+        o: origins ``(3, stride)``.
+        d: directions ``(3, stride)``.
+        t_max: ends of the rays.
+        stride: length of a row of ``o`` and ``d``.
+        words: the scene, see :func:`torchpt.search.tree.scene_words`.
+        t: filled; inf for a miss.
+        prim: filled; -1 for a miss.
+        u: filled.
+        v: filled.
     """
-    _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, _none(), t, prim, u, v, False)
+    none = part(words, 0, np.uint8)
+    _search(first, last, memory, o, d, t_max, stride, words, none, np.int64(0), t, prim, u, v, False)
 
 
-@jit(parallel=True)
-def nearest_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, t, prim, u, v):
-    """Run :func:`nearest` on several threads, over equal pieces of the rays."""
-    pieces = chunks * PIECES
-    for c in prange(chunks):
-        for k in range(c, pieces, chunks):
-            a, b = k * items // pieces, (k + 1) * items // pieces
-            nearest(a, b, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, t, prim, u, v)
+@kernel("tree_occluded", INT, INT, BYTES, FLOATS, FLOATS, FLOATS, INT, LONGS, BYTES, INT, INTS)
+def occluded(first, last, memory, o, d, t_max, stride, words, non_opaque, surfaces, out):
+    """Write 1 to ``out`` for rays ``first <= i < last`` that hit an opaque primitive, else 0.
 
-
-@jit()
-def blocked(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, out):
-    """Write 1 to ``out`` ``(N,)`` int32 for rays ``first <= i < last`` that hit an opaque primitive, else 0.
-
-    ``non_opaque`` is empty, or holds a uint8 for each primitive, nonzero if light may pass: rays that hit only such primitives
-    get 2.
+    ``non_opaque`` holds a uint8 for each of so many ``surfaces``, nonzero if light may pass: rays that hit only such primitives
+    get 2. With 0 surfaces all primitives are opaque. The other arguments are those of :func:`nearest`.
     """
     _search(
-        first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, t_max, out, t_max, t_max, True
-    )
-
-
-@jit(parallel=True)
-def blocked_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, out):
-    """Run :func:`blocked` on several threads, over equal pieces of the rays."""
-    pieces = chunks * PIECES
-    for c in prange(chunks):
-        for k in range(c, pieces, chunks):
-            a, b = k * items // pieces, (k + 1) * items // pieces
-            blocked(a, b, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, out)
+        first, last, memory, o, d, t_max, stride, words, non_opaque, surfaces, t_max, out, t_max, t_max, True
+    )  # fmt: skip

@@ -4,21 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchpt.native.jit import jit_internal
-from torchpt.native.simd import as_float, bits, item, splat, store, trailing_zeros
-from torchpt.search.tree_layout import (
-    CHILDREN,
-    FLOOR,
-    IDS,
-    SLACK,
-    block_offset,
-    blocking,
-    boxes,
-    crossed_triangles,
-    planes,
-    push,
-)
-from torchpt.search.tree_leaf import setup_ray
+from kernel_sources.jit import inner
+from kernel_sources.simd import as_float, bits, item, splat, store, trailing_zeros
+from kernel_sources.tree_leaf import setup_ray
+from kernel_sources.tree_nodes import block_offset, blocking, boxes, crossed_triangles, planes, push
+from torchpt.search.tree_layout import CHILDREN, FLOOR, IDS, SLACK
 
 __all__ = ["SCRATCH", "nearest_triangle", "occluding_triangle", "pop", "trace_single"]
 
@@ -27,7 +17,7 @@ _ZERO = np.float32(0.0)
 SCRATCH = 24
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def pop(codes, keys, parents, top, bottom, limit):
     """Pop the next box with an entry below ``limit``; return top of the stack (below ``bottom`` if none is left), code, key."""
     code, key = np.int64(0), np.int32(0)
@@ -42,7 +32,7 @@ def pop(codes, keys, parents, top, bottom, limit):
     return top, code, key
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def nearest_triangle(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch):
     """Update the nearest hit by a leaf's triangles that :func:`crossed_triangles` has found.
 
@@ -65,7 +55,7 @@ def nearest_triangle(tree, codes, base, met, sz, o, d, floor, best, prim, shift,
     return best, prim, lane
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def occluding_triangle(scene, base, met, sz, o, d, floor, best, prim, shift):
     """Return the id of an opaque triangle of those that the ray hits, else :data:`MAY_PASS` for a hit, or ``prim``."""
     tree, codes = scene[0], scene[1]
@@ -77,12 +67,12 @@ def occluding_triangle(scene, base, met, sz, o, d, floor, best, prim, shift):
     return prim
 
 
-@jit_internal()
+@inner()
 def trace_single(scene, root, o, d, best, prim, shift, keys, parents, bottom, scratch, any_hit):
     """Find the nearest hit of a ray in a subtree of triangles, nearer than ``best``, or any such hit.
 
     Args:
-        scene: the tree as float32 and as int32, and the tables of :func:`torchpt.search.tree_layout.blocking`.
+        scene: the tree as float32 and as int32, and the tables of :func:`kernel_sources.tree_nodes.blocking`.
         root: code of the node.
         o: origin, a tuple.
         d: direction.

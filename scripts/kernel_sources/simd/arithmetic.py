@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import lower_builtin, type_callable
 
-from torchpt.native.simd.types import I32, Vector, intrinsic
+from kernel_sources.simd.types import I32, Vector, intrinsic
 
 __all__ = ["absolute", "as_float", "as_int", "maximum", "minimum", "narrow", "select", "square_root", "widen"]
 

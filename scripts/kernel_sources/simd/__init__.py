@@ -5,7 +5,7 @@ AVX-512, AVX2, SSE or NEON, with several instructions a vector if the machine's 
 each lane has the bits of the scalar operation. Indices are not checked: neither bounds nor negative ones.
 """
 
-from torchpt.native.simd.arithmetic import (
+from kernel_sources.simd.arithmetic import (
     absolute,
     as_float,
     as_int,
@@ -16,7 +16,7 @@ from torchpt.native.simd.arithmetic import (
     square_root,
     widen,
 )
-from torchpt.native.simd.lanes import (
+from kernel_sources.simd.lanes import (
     bits,
     highest,
     lane_numbers,
@@ -26,8 +26,9 @@ from torchpt.native.simd.lanes import (
     sort_descending,
     trailing_zeros,
 )
-from torchpt.native.simd.memory import gather, item, load, load_masked, pointer, prefetch, put, store, store_masked
-from torchpt.native.simd.types import Vector, splat
+from kernel_sources.simd.memory import gather, item, load, load_masked, prefetch, put, store, store_masked
+from kernel_sources.simd.pointers import load_pointer, part, stack_memory
+from kernel_sources.simd.types import Vector, splat
 
 __all__ = [
     "Vector",
@@ -41,12 +42,13 @@ __all__ = [
     "lane_numbers",
     "load",
     "load_masked",
+    "load_pointer",
     "lowest",
     "mask",
     "maximum",
     "minimum",
     "narrow",
-    "pointer",
+    "part",
     "popcount",
     "prefetch",
     "put",
@@ -54,6 +56,7 @@ __all__ = [
     "sort_descending",
     "splat",
     "square_root",
+    "stack_memory",
     "store",
     "store_masked",
     "trailing_zeros",

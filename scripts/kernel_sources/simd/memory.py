@@ -7,7 +7,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils, types
 
-from torchpt.native.simd.types import ELEMENTS, I32, Vector, intrinsic, lanes_of, splatted
+from kernel_sources.simd.types import ELEMENTS, I32, Vector, intrinsic, lanes_of, splatted
 
 __all__ = ["gather", "item", "load", "load_masked", "pointer", "prefetch", "put", "store", "store_masked"]
 

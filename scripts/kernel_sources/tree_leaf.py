@@ -6,14 +6,12 @@ import math
 
 import numpy as np
 
-from torchpt.native.jit import jit_internal
-from torchpt.native.simd import absolute, bits, item, load, maximum, minimum, splat, store, trailing_zeros
-from torchpt.search.tree_layout import IDS, LEAF, LINE, blocking
+from kernel_sources.jit import inner
+from kernel_sources.simd import absolute, bits, item, load, maximum, minimum, splat, store, trailing_zeros
+from kernel_sources.tree_nodes import blocking
+from torchpt.search.tree_layout import FOURTH, IDS, RECTANGLES, RULED
 
 __all__ = [
-    "FOURTH",
-    "RECTANGLES",
-    "RULED",
     "intersect_others",
     "intersect_primitive",
     "quadric_hit",
@@ -25,7 +23,7 @@ __all__ = [
 # ---- Spheres
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def sphere_distance(ox, oy, oz, dx, dy, dz, cx, cy, cz, radius):
     """Return the nearest positive ``t`` at which ``o + t d`` hits the sphere, as float32; NaN for a miss.
 
@@ -56,12 +54,12 @@ _INFINITE = np.float64(np.inf)
 _NAN32 = np.float32(np.nan)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _sign(x):
     return math.copysign(1.0, x)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _diamond(x, y):
     """Return the distance along the square ``|x| + |y| = 1`` from +x to a direction: in [-2, 2], monotonic in the angle."""
     s = abs(x) + abs(y)
@@ -69,7 +67,7 @@ def _diamond(x, y):
     return (1.0 - c if x >= 0.0 else 1.0 + c) * _sign(y)
 
 
-@jit_internal()
+@inner()
 def quadric_hit(table, k, ox, oy, oz, dx, dy, dz):
     """Return ``t, u, v`` as float32 of the nearest hit on quadric ``k`` of ``table (Q, 19)``; ``t`` is NaN for a miss.
 
@@ -139,7 +137,7 @@ _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def setup_ray(dx, dy, dz):
     """Return the axes, that of the largest component last, the shear, and reciprocals of the direction, which are finite."""
     x, y, z = abs(dx), abs(dy), abs(dz)
@@ -153,7 +151,7 @@ def setup_ray(dx, dy, dz):
     return kx, ky, kz, px / pz, py / pz, _ONE / pz, ix, iy, iz
 
 
-@jit_internal()
+@inner()
 def intersect_primitive(prim, corner, rows, quadrics, n2, n3, n4, o, d):
     """Return ``t, u, v`` of ray ``o, d`` (tuples) at a disk, sphere or quadric; ``t`` is NaN for a miss.
 
@@ -196,20 +194,15 @@ def intersect_primitive(prim, corner, rows, quadrics, n2, n3, n4, o, d):
 # ---- A leaf: eight rectangles at once, other primitives one by one
 
 
-#: Offset of the rectangles in a leaf: three corners as for triangles, then the fourth corners, then planes.
-RECTANGLES = LEAF * LINE
-FOURTH, RULED = 72, 96
-
-
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _corner(tree, at, axes, p, s):
-    """Return a corner of eight rectangles in sheared space; see :func:`torchpt.search.tree_layout.crossed_triangles`."""
+    """Return a corner of eight rectangles in sheared space; see :func:`kernel_sources.tree_nodes.crossed_triangles`."""
     z = load(tree, at + axes[2] * 8, 8) - p[2]
     x = (load(tree, at + axes[0] * 8, 8) - p[0]) - s[0] * z
     return x, (load(tree, at + axes[1] * 8, 8) - p[1]) - s[1] * z, z * s[2]
 
 
-@jit_internal(forceinline=True)
+@inner(forceinline=True)
 def _rectangles(tree, at, axes, o, d, p, s):
     """Intersect eight rectangles: mask of hits, ``t``, u and v, by the operations of :func:`torchpt.search.leaf.distances`."""
     zero = splat(_ZERO, 8)
@@ -232,22 +225,22 @@ def _rectangles(tree, at, axes, o, d, p, s):
     return met & (t > zero), t, f / (f + h), g / (g + k)
 
 
-@jit_internal()
+@inner()
 def intersect_others(scene, code, base, o, d, axes, shear, floor, best, prim, scratch, any_hit):
     """Update the nearest hit of one ray by a leaf's primitives that are not triangles.
 
     Args:
         scene: the tree as float32 and as int32; corners, affine rows and quadrics of all primitives but triangles; ids of the
-            first rectangle, disk, sphere and quadric; the tables of :func:`torchpt.search.tree_layout.blocking`.
+            first rectangle, disk, sphere and quadric; the tables of :func:`kernel_sources.tree_nodes.blocking`.
         code: code of the leaf.
         base: offset of the leaf.
         o: origin.
         d: direction.
         axes: order of the axes.
-        shear: see :func:`torchpt.search.tree_leaf.setup_ray`.
+        shear: see :func:`kernel_sources.tree_leaf.setup_ray`.
         floor: least distance of a hit here.
         best: distance of the nearest hit so far.
-        prim: primitive of that hit, or -1; for any-hit rays see :func:`torchpt.search.tree_layout.blocking`.
+        prim: primitive of that hit, or -1; for any-hit rays see :func:`kernel_sources.tree_nodes.blocking`.
         scratch: 24 float32.
         any_hit: stop at the first opaque hit; of the results only ``prim`` is defined then.
 
