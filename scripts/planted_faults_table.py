@@ -184,13 +184,13 @@ FAULTS = (
         "light sampled from an environment map comes from half a texel beside where it is seen, and MIS adds up wrongly",
     ),
     Fault(
-        "cone_without_own_spread",
-        "physics/lights/tree_build.py",
+        "axes_turned_round",
+        "physics/lights/tree.py",
         "lights",
-        "_cone",
-        "off + _angle(cos_o[k])",
-        "off",
-        "many balls or spots: the light tree believes that they shine nowhere but along their mean axis",
+        "build",
+        "array(axis).T",
+        "-array(axis).T",
+        "many lights: the light tree believes that they shine away from where they do, and passes them over",
     ),
     # -- textures
     Fault(
