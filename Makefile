@@ -87,5 +87,5 @@ $(VENV)/docs.stamp: $(VENV)/run.stamp
 	@touch $@
 
 $(VENV)/bench.stamp: $(VENV)/dev.stamp
-	$(PIP) -e ".[dev,formats,video,compare,denoise,sweep,bench,docs]"
+	$(PIP) -e ".[dev,formats,video,compare,denoise,sweep,bench,cuda-dev,docs]"
 	@touch $@

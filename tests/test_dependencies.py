@@ -85,7 +85,7 @@ def test_every_extra_is_imported_by_a_feature_when_it_is_asked_for(extra: str) -
 
 
 def test_what_developers_install_is_used() -> None:
-    assert set(EXTRAS) == {*FEATURES, "sweep", "bench", "docs", "dev"}
+    assert set(EXTRAS) == {*FEATURES, "sweep", "bench", "cuda-dev", "docs", "dev"}
     dev = {Requirement(text).name for text in EXTRAS["dev"]}
     wanted = modules(EXTRAS["bench"]) | modules([name for name in dev if name not in TOOLS])
     found = {name for folder in ("scripts", "tests") for name, _ in imports(folder, wanted)}
@@ -100,6 +100,11 @@ def test_the_launcher_of_sweeps_is_tested() -> None:
     assert (
         name == "hydra-joblib-launcher" and "hydra/launcher=joblib" in (ROOT / "tests/cli/test_sweeps.py").read_text()
     )
+
+
+def test_the_assembler_of_gpu_kernels_is_run() -> None:
+    assert [Requirement(text).name for text in EXTRAS["cuda-dev"]] == ["nvidia-cuda-nvcc"]
+    assert "bin/ptxas" in (ROOT / "tests/references/ptx_assembler.py").read_text()
 
 
 def test_the_makers_of_the_site_are_named_by_its_settings() -> None:

@@ -53,7 +53,8 @@ ROOM = {
 }
 
 
-@pytest.mark.parametrize("adjoint", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["picture", "gradient"])
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", [False, True], ids=["picture", "gradient"])
 def test_a_users_model(adjoint):
     def run(scene: torchpt.Scene) -> None:
         if not adjoint:

@@ -272,6 +272,22 @@ def probed(scene: Any, run: Callable[[Any], Any], **loading: Any) -> dict[str, P
     return probes.found
 
 
+def named_stages(scene: Any, run: Callable[[Any], Any]) -> dict[str, TracedStage]:
+    """Return the stages of all kernels that ``run(scene)`` asks for, by the names that :func:`probed` gives them."""
+    codes: dict[str, str] = {}
+    with traced_stages() as stages, pytest.MonkeyPatch.context() as patch:
+        program_of = programs.program_of
+
+        def noted(key: tuple[Any, ...], *given: Any) -> Any:
+            program = program_of(key, *given)
+            codes["_".join(map(str, key))] = program.code
+            return program
+
+        patch.setattr(programs, "program_of", noted)
+        run(torchpt.load(scene, "cpu"))
+        return {name: stages[code] for name, code in codes.items()}
+
+
 # ---- Functions of tensors
 
 
