@@ -69,7 +69,7 @@ def again() -> None:
     """Forget what this process has loaded, as a new one would."""
     cpu._functions.clear()
     cache._folder.cache_clear()
-    cache._tidied.cache_clear()
+    cache._remove_old_entries.cache_clear()
 
 
 @pytest.mark.slow

@@ -37,7 +37,7 @@ def test_files_that_did_not_change_are_not_read(tmp_path, monkeypatch):
     (tmp_path / "package" / "a.py").write_text("x = 1\n")
     code_of_folder.cache_clear()
     first = code_of_folder(tmp_path / "package")
-    monkeypatch.setattr(content, "_code_of_file", lambda path: pytest.fail("read"))
+    monkeypatch.setattr(content, "_digest_of_file", lambda path: pytest.fail("read"))
     code_of_folder.cache_clear()
     assert code_of_folder(tmp_path / "package") == first
     code_of_folder.cache_clear()

@@ -9,11 +9,12 @@ import time
 __all__ = ["begin", "end", "seconds"]
 
 _lock = threading.Lock()
+# total: seconds of finished compilations; depth: compilations in progress; since: time at which the first of these began
 _state = {"total": 0.0, "since": 0.0, "depth": 0}
 
 
 def seconds() -> float:
-    """Return the seconds so far, including a compilation in progress; nested or simultaneous ones count once."""
+    """Return the seconds so far, including a compilation in progress. Time in which several are in progress counts once."""
     with _lock:
         under_way = time.perf_counter() - _state["since"] if _state["depth"] else 0.0
         return _state["total"] + under_way
@@ -28,7 +29,7 @@ def begin() -> None:
 
 
 def end() -> None:
-    """Mark the end of what :func:`begin` has marked."""
+    """Mark the end of a compilation, or of a wait, that :func:`begin` has marked."""
     with _lock:
         _state["depth"] -= 1
         if not _state["depth"]:

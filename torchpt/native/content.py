@@ -1,6 +1,7 @@
-"""Digests of code, which ignore docstrings, comments, and path and time of the file.
+"""Digests of Python code, which ignore docstrings, comments, assertions, and path and time of the file.
 
-They are the keys of the kernel cache, see :mod:`torchpt.native.cache`.
+The digest of the whole package enters the cache keys of compiled stages (``compiler/cache.py``): an edit of any code in the
+package makes them stale, an edit of text does not.
 """
 
 from __future__ import annotations
@@ -29,21 +30,23 @@ def _digest(text: str) -> str:
 def code_of_folder(folder: Path = _PACKAGE) -> str:
     """Return a digest of the code of all modules below a folder, by default of the whole package.
 
-    A file is read again only if its size or time has changed: digests are cached. ``assert`` statements are ignored.
+    The digest of each file is kept on disk. A file is read again only if its size or time has changed.
     """
-    name = _digest(str(folder))[:40] + ".json"
-    kept: dict[str, list[Any]] = json.loads(cache.read(name) or b"{}")
-    found: dict[str, list[Any]] = {}
+    name = _digest(str(folder))[: cache.KEY_DIGITS] + ".json"
+    # by path relative to the folder: [size in bytes, time of change in nanoseconds, digest]
+    on_disk: dict[str, list[Any]] = json.loads(cache.read(name) or b"{}")
+    present: dict[str, list[Any]] = {}
     for path, facts in _modules(str(folder)):
-        place, state = os.path.relpath(path, folder), [facts.st_size, facts.st_mtime_ns]
-        known = kept.get(place)
-        found[place] = known if known is not None and known[:2] == state else [*state, _code_of_file(path)]
-    if found != kept:
-        cache.write(name, json.dumps(found).encode())
-    return _digest(repr(sorted((place, known[2]) for place, known in found.items())))
+        key, state = os.path.relpath(path, folder), [facts.st_size, facts.st_mtime_ns]
+        entry = on_disk.get(key)
+        present[key] = entry if entry is not None and entry[:2] == state else [*state, _digest_of_file(path)]
+    if present != on_disk:
+        cache.write(name, json.dumps(present).encode())
+    return _digest(repr(sorted((key, digest) for key, (_, _, digest) in present.items())))
 
 
 def _modules(folder: str) -> Iterator[tuple[str, os.stat_result]]:
+    """Yield path and status of each Python file below a folder."""
     with os.scandir(folder) as entries:
         for entry in entries:
             if entry.name.endswith(".py"):
@@ -52,22 +55,23 @@ def _modules(folder: str) -> Iterator[tuple[str, os.stat_result]]:
                 yield from _modules(entry.path)
 
 
-def _code_of_file(path: str) -> str:
+def _digest_of_file(path: str) -> str:
     # optimize=2 removes docstrings and asserts
-    return _digest(repr(_code(compile(Path(path).read_bytes(), "", "exec", dont_inherit=True, optimize=2))))
+    return _digest(repr(_content(compile(Path(path).read_bytes(), "", "exec", dont_inherit=True, optimize=2))))
 
 
-def _code(code: CodeType) -> tuple[Any, ...]:
+def _content(code: CodeType) -> tuple[Any, ...]:
     """Return the content of a code object without line numbers and file name."""
     consts = tuple(_constant(x) for x in code.co_consts)
-    places = (code.co_argcount, code.co_kwonlyargcount, code.co_posonlyargcount, code.co_flags)
+    signature = (code.co_argcount, code.co_kwonlyargcount, code.co_posonlyargcount, code.co_flags)
     names = (code.co_name, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
-    return code.co_code, consts, places, names, getattr(code, "co_exceptiontable", b"")
+    return code.co_code, consts, signature, names, getattr(code, "co_exceptiontable", b"")
 
 
 def _constant(value: Any) -> Any:
-    if isinstance(value, CodeType):
-        return _code(value)
-    if isinstance(value, frozenset):  # its order depends on the process
+    """Return the content of a constant; its type as well, since ``repr`` alone may be equal."""
+    if isinstance(value, CodeType):  # a function or class within the code
+        return _content(value)
+    if isinstance(value, frozenset):  # the order of its elements depends on the process
         return "frozenset", sorted(map(repr, value))
     return type(value).__name__, repr(value)

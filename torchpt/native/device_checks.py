@@ -1,8 +1,8 @@
-"""What is known of this machine's GPUs: the driver, and whether a card has passed the first check of kernels.
+"""The NVIDIA driver of this machine, and whether a card has passed the check of kernels.
 
-``scripts/first_gpu.py`` runs the check and calls :func:`record`; ``device=auto`` takes a card only where its
-:func:`last_check` passed. A result is kept in the cache folder, by card and driver: a new driver compiles kernels anew, so it
-is checked anew.
+The check renders on the card and compares the bits with those of the CPU. ``scripts/first_gpu.py`` runs it and calls
+:func:`record`; ``device=auto`` takes a card only if its :func:`last_check` passed. A result is kept in the cache folder, by
+card and driver: a new driver compiles kernels anew, so the card is checked anew.
 """
 
 from __future__ import annotations
@@ -32,6 +32,9 @@ __all__ = [
     "why_unavailable",
 ]
 
+#: Bytes of NVML's version text; NVML writes at most 80 (NVML_SYSTEM_DRIVER_VERSION_BUFFER_SIZE).
+_VERSION_BYTES = 96
+
 
 class CheckResult(NamedTuple):
     """The result of a check of one card with one driver.
@@ -59,23 +62,23 @@ def card_name(device: torch.device | int | None = None) -> str:
 def driver_version() -> str:
     """Return the version of the NVIDIA driver, such as ``550.54.15``; ``""`` if there is none.
 
-    NVML has it. Where that library is missing, it is the version of CUDA that the driver has, such as ``CUDA 12.4``.
+    It is read from NVML. Without that library it is the version of CUDA that the driver supports, such as ``CUDA 12.4``.
     """
-    text = ctypes.create_string_buffer(96)
+    text = ctypes.create_string_buffer(_VERSION_BYTES)
     with suppress(OSError, AttributeError):
         nvml = ctypes.CDLL("nvml.dll" if sys.platform == "win32" else "libnvidia-ml.so.1")
-        if nvml.nvmlInit_v2() == 0:
-            found = nvml.nvmlSystemGetDriverVersion(text, ctypes.c_uint(len(text)))
+        if nvml.nvmlInit_v2() == 0:  # 0: success
+            status = nvml.nvmlSystemGetDriverVersion(text, ctypes.c_uint(len(text)))
             nvml.nvmlShutdown()
-            if found == 0:
+            if status == 0:
                 return text.value.decode(errors="replace")
     version = cuda_of_driver()
     return f"CUDA {version[0]}.{version[1]}" if version else ""
 
 
 def cuda_of_driver() -> tuple[int, int] | None:
-    """Return the newest version of CUDA that the driver has, such as ``(12, 4)``; None if there is no driver."""
-    number = ctypes.c_int(0)
+    """Return the newest version of CUDA that the driver supports, such as ``(12, 4)``; None if there is no driver."""
+    number = ctypes.c_int(0)  # 1000 major + 10 minor
     with suppress(OSError, AttributeError):
         driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
         if driver.cuDriverGetVersion(ctypes.byref(number)) == 0 and number.value:
@@ -84,8 +87,8 @@ def cuda_of_driver() -> tuple[int, int] | None:
 
 
 def why_unavailable() -> str | None:
-    """Return why torch finds no CUDA device, in words that go on after "as "; None where it finds one."""
-    with warnings.catch_warnings():  # torch warns in a paragraph of a driver that is too old
+    """Return why torch finds no CUDA device, as a clause for the end of a sentence; None if it finds one."""
+    with warnings.catch_warnings():  # torch warns, in a whole paragraph, about a driver that is too old
         warnings.simplefilter("ignore")
         if torch.cuda.is_available():
             return None
@@ -101,12 +104,13 @@ def why_unavailable() -> str | None:
 
 
 def driver_too_old() -> bool:
-    """Return True if there is a driver, and torch was built for a later major version of CUDA than the driver's."""
+    """Return True if there is a driver, and torch was built for a later major version of CUDA than the driver supports."""
     wanted, found = torch.version.cuda, cuda_of_driver()
     return wanted is not None and found is not None and found[0] < int(wanted.partition(".")[0])
 
 
 def _entry(card: str, driver: str) -> str:
+    """Return the name of the cache entry that holds the result for a card and a driver."""
     return f"cuda-check-{hashlib.sha256(json.dumps([card, driver]).encode()).hexdigest()[:32]}.json"
 
 
@@ -130,5 +134,5 @@ def recorded(card: str, driver: str) -> CheckResult | None:
 
 
 def last_check(device: torch.device | int | None = None) -> CheckResult | None:
-    """Return the last result for a CUDA device, by its name and the driver of this machine; None: it was never checked."""
+    """Return the last result for a CUDA device with the driver of this machine; None if it was never checked."""
     return recorded(card_name(device), driver_version())

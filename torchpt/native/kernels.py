@@ -28,10 +28,10 @@ from torchpt.native import cache, compile_time, machine
 __all__ = ["FOLDER", "Kernel", "kernel", "read_module", "run_parallel"]
 
 FOLDER = Path(__file__).with_name("ir")
-#: Parts of work a thread, as the cost of items varies.
-_PARTS = 8
-#: A kernel's line in the head of a module: name, and types of arguments.
-_HEAD = re.compile(r"^; (\w+)\((.*)\)$", re.MULTILINE)
+#: Parts into which the work is cut for each thread. Items differ in cost, so a thread that finishes early takes another part.
+_PARTS_PER_THREAD = 8
+#: A kernel's line in the head of a module, such as ``; nearest(int, f4*, f4[2])``: the name, and the types of the arguments.
+_SIGNATURE = re.compile(r"^; (\w+)\((.*)\)$", re.MULTILINE)
 
 
 def _plain_address(array: np.ndarray) -> int:
@@ -41,19 +41,25 @@ def _plain_address(array: np.ndarray) -> int:
 def _fast_address(array: np.ndarray) -> int:
     """Return the address of an array's numbers, in a fifth of the time of :func:`_plain_address`.
 
-    By numpy's binary interface it follows the head of the array's Python object.
+    In numpy's binary interface the pointer to the numbers is the first member of an array (``PyArrayObject.data``). It lies
+    right behind the members that every Python object has, and CPython's ``id`` is the address of the object.
     """
-    return _word_at(id(array) + _HEAD_BYTES).value
+    return _word_at(id(array) + _OBJECT_BYTES).value
 
 
-_word_at, _HEAD_BYTES = ctypes.c_int64.from_address, object.__basicsize__
+_word_at, _OBJECT_BYTES = ctypes.c_int64.from_address, object.__basicsize__
 _sample = np.zeros(3)
-_fast = sys.implementation.name == "cpython" and _fast_address(_sample) == _plain_address(_sample)
-address_of = _fast_address if _fast else _plain_address
+_fast_is_right = sys.implementation.name == "cpython" and _fast_address(_sample) == _plain_address(_sample)
+address_of = _fast_address if _fast_is_right else _plain_address
 
 
 class _Argument(NamedTuple):
-    """The type of an argument: None for an integer, else of the numbers that it points to; dimensions of an array, else 0."""
+    """The type of an argument of a kernel.
+
+    Attributes:
+        dtype: the type of the numbers that the argument points to; None for an integer.
+        dimensions: dimensions of an array, whose shape is passed as well; 0 for an integer or a pointer.
+    """
 
     dtype: np.dtype[Any] | None
     dimensions: int
@@ -62,7 +68,7 @@ class _Argument(NamedTuple):
     def parse(text: str) -> _Argument:
         """Return the type that is written as ``int``, ``f4*`` or ``f4[2]``."""
         if text == "int":
-            return _Argument(None, 0)
+            return _Argument(dtype=None, dimensions=0)
         dtype, dimensions = (text[:-1], 0) if text.endswith("*") else (text[:-3], int(text[-2]))
         return _Argument(np.dtype(dtype), dimensions)
 
@@ -71,7 +77,7 @@ class Kernel:
     """A compiled kernel.
 
     Attributes:
-        call: machine code that takes 64-bit words and returns one (undefined if the kernel returns nothing).
+        call: machine code that takes 64-bit integers (:meth:`words`) and returns one, undefined if the kernel returns nothing.
     """
 
     def __init__(self, name: str, arguments: list[_Argument], address: int, engine: Any) -> None:
@@ -84,7 +90,9 @@ class Kernel:
         return self.call(*self.words(*args))
 
     def words(self, *args: Any) -> list[int]:
-        """Return the words of a call. The caller keeps the arrays alive.
+        """Return the 64-bit integers of a call: an array becomes its address, followed by its shape if the type has dimensions.
+
+        The caller keeps the arrays alive.
 
         Args:
             args: for each argument an integer, or a contiguous array of its type; for a pointer also an address.
@@ -138,21 +146,22 @@ def kernel(module: str, name: str) -> Kernel:
 
 
 def read_module(module: str) -> str:
-    """Return the IR of a module, with its head."""
+    """Return the IR of a module as text, with the comments that list its kernels."""
     return lzma.decompress((FOLDER / f"{module}.ll.xz").read_bytes()).decode()
 
 
 def _load(module: str) -> dict[str, Kernel]:
     ir = read_module(module)
-    key = hashlib.sha256(f"{machine.identity()}\n{ir}".encode()).hexdigest()[:40]
+    key = hashlib.sha256(f"{machine.identity()}\n{ir}".encode()).hexdigest()[: cache.KEY_DIGITS]
     code = cache.read(f"{key}.o")
     if code is None:
         code = machine.object_code(ir)
         cache.write(f"{key}.o", code)
-    engine, address_of = machine.load_object(code)
+    engine, address_of_function = machine.load_object(code)
+    head = ir.partition("\ndefine ")[0]  # all before the first function
     return {
-        name: Kernel(name, [_Argument.parse(text) for text in arguments.split(", ")], address_of(name), engine)
-        for name, arguments in _HEAD.findall(ir.partition("\ndefine ")[0])
+        name: Kernel(name, [_Argument.parse(text) for text in arguments.split(", ")], address_of_function(name), engine)
+        for name, arguments in _SIGNATURE.findall(head)
     }
 
 
@@ -160,22 +169,23 @@ def run_parallel(kernel: Kernel, items: int, threads: int, grain: int, memory: i
     """Run a kernel over ``range(items)`` on several threads.
 
     Args:
-        kernel: its first arguments are the first item, one past the last, and scratch memory; each item writes its own results,
-            so that these do not depend on the split.
+        kernel: its first three arguments are the first item, one past the last, and scratch memory. Each item writes results
+            of its own, so that they do not depend on how the items are shared out.
         items: number of items.
         threads: most threads; 1 runs in the calling thread.
         grain: fewest items that are worth another thread.
         memory: bytes of scratch memory of a call.
-        args: the other arguments.
+        args: the arguments after the first three.
     """
+    # the first three words differ from part to part
     words, call = kernel.words(0, items, 0, *args)[3:], kernel.call
 
-    def part(first: int, last: int) -> None:
+    def run_part(first: int, last: int) -> None:
         scratch = np.empty(memory, np.uint8)
         call(first, last, address_of(scratch), *words)
 
     threads = min(threads, max(1, items // grain))
     if threads == 1:
-        part(0, items)
+        run_part(0, items)
         return
-    parallel_for(part, items, threads, _PARTS)
+    parallel_for(run_part, items, threads, parts_per_thread=_PARTS_PER_THREAD)

@@ -1,4 +1,8 @@
-"""LLVM for this machine: compile IR to object code, and load object code."""
+"""LLVM for this machine, through llvmlite: compile IR to object code, and load object code.
+
+The kernels of ``ir/`` and those of the lane compiler come here. :func:`torchpt.core.memory.check_address_space` stands before
+each use of LLVM that takes much memory, since LLVM ends the process when it gets none.
+"""
 
 from __future__ import annotations
 
@@ -36,24 +40,27 @@ def identity() -> str:
 
 
 def new_machine() -> Any:
-    """Return a target machine of LLVM for this CPU."""
+    """Return a target machine of LLVM for this CPU, for code that is loaded into this process (``jit``).
+
+    ``opt=2`` is LLVM's default level of code generation: it selects instructions and registers, and runs no passes on the IR.
+    """
     cpu, features = host()
     return llvm().Target.from_default_triple().create_target_machine(cpu=cpu, features=features, opt=2, jit=True)
 
 
 def object_code(ir: str) -> bytes:
-    """Compile IR to object code without further passes.
+    """Compile IR to object code. No passes run on it: whoever wrote the IR has optimized it.
 
     Args:
         ir: a module in LLVM's text form, without triple and data layout.
     """
-    check_address_space()  # LLVM ends the process where it finds no memory
+    check_address_space()
     machine = new_machine()
     return machine.emit_object(parse(ir, machine))
 
 
 def parse(ir: str, machine: Any) -> Any:
-    """Return a module of LLVM for a target machine, of IR as :func:`object_code` takes it."""
+    """Parse IR as :func:`object_code` takes it; return the verified module, with triple and data layout of a target machine."""
     module = llvm().parse_assembly(ir)
     module.triple = llvm().get_default_triple()
     module.data_layout = str(machine.target_data)
@@ -62,9 +69,15 @@ def parse(ir: str, machine: Any) -> Any:
 
 
 def load_object(code: bytes) -> tuple[Any, Callable[[str], int]]:
-    """Link object code into this process; return what keeps it in memory, and a function from names to addresses."""
+    """Link object code into this process.
+
+    Returns:
+        LLVM's execution engine, which keeps the code in memory as long as it is referenced; and a function that returns the
+        address of a function of the code by its name.
+    """
     check_address_space()
-    engine = llvm().create_mcjit_compiler(llvm().parse_assembly(""), new_machine())  # which owns and frees the machine
+    # An engine needs a module, here an empty one. It takes the target machine over and frees it.
+    engine = llvm().create_mcjit_compiler(llvm().parse_assembly(""), new_machine())
     engine.add_object_file(llvm().ObjectFileRef.from_data(code))
     engine.finalize_object()
     return engine, engine.get_function_address

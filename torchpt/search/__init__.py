@@ -1,6 +1,7 @@
 """Ray intersection: acceleration structures that find the nearest hit of a ray, or whether it hits anything.
 
-One interface (:class:`~torchpt.search.base.Accel`: start there), three backends:
+There is one interface (:class:`~torchpt.search.base.Accel`: start there) with three backends, named as in the key
+``render.accel``:
 
 - ``brute`` (CPU): brute force in packets of rays, by kernels of the lane compiler; for a few dozen primitives.
 - ``numba`` (CPU): an eight-wide BVH built by the surface area heuristic (``tree_build.py``, ``tree_layout.py``), traversed by
@@ -21,7 +22,7 @@ from torchpt.search.base import Accel, Hits
 
 __all__ = ["BRUTE_LIMIT", "KINDS", "Accel", "Hits", "build"]
 
-#: Values of ``kind`` in :func:`build`.
+#: Values of ``kind`` in :func:`build`: the backends, and ``auto``, which chooses one.
 KINDS = ("auto", "torch", "numba", "brute")
 #: Most primitives for which ``auto`` chooses ``brute`` on a CPU (measured crossover, scripts/bench_accel.py).
 BRUTE_LIMIT = 128
@@ -34,7 +35,7 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
         geometry: the primitives, on the device of the rays.
         kind: ``auto``, ``torch``, ``numba`` or ``brute``.
         threads: CPU threads of ``numba`` and ``brute``; None: torch's number. Results do not depend on it.
-        before: a structure to refit if it is of the chosen kind; it is not changed.
+        before: an earlier structure of these primitives, which is refitted if it is of the chosen kind. It is not changed.
 
     Returns:
         The structure. ``auto`` chooses ``torch`` on an accelerator; on a CPU ``brute`` for few primitives of similar scale
@@ -49,9 +50,9 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
     if geometry.copies is not None and kind == "brute":
         raise SceneError("render.accel", kind, "numba or torch (this scene has instances)")
     if kind == "auto":
-        packets = _packets(geometry, threads) if on_cpu else None
-        if packets is not None:
-            return packets
+        brute = _brute_if_fastest(geometry, threads) if on_cpu else None
+        if brute is not None:
+            return brute
         kind = "numba" if on_cpu else "torch"
     if before is not None and before.name == kind:
         refitted = before.refit(geometry, threads)
@@ -77,12 +78,13 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
     return WideBvh(geometry, threads)
 
 
-def _packets(geometry: Geometry, threads: int | None) -> Accel | None:
+def _brute_if_fastest(geometry: Geometry, threads: int | None) -> Accel | None:
     """Return the brute-force search; None if a tree is faster, or if float32 rows are too coarse for these primitives."""
-    # Quadrics are tested outside of packets: from three on the tree is as fast or faster.
-    if geometry.size > BRUTE_LIMIT or geometry.copies is not None or geometry.counts[4]:
+    *_, quadrics = geometry.counts
+    # Brute force tests quadrics outside of its packets: with three of them the tree is as fast already.
+    if geometry.size > BRUTE_LIMIT or geometry.copies is not None or quadrics:
         return None
     from torchpt.search.brute import Brute, rows_of
 
     rows = rows_of(geometry)
-    return Brute(geometry, threads, rows) if rows.fine else None
+    return Brute(geometry, threads, rows) if rows.is_precise else None

@@ -1,4 +1,9 @@
-"""The interface of acceleration structures."""
+"""The interface of acceleration structures.
+
+It comes twice: on tensors, whole waves of rays at once on all threads (:meth:`Accel.intersect`, :meth:`Accel.occluded`), for
+the engine of tensors; and on numpy arrays, some rays in the calling thread (:meth:`Accel.nearest`, :meth:`Accel.blocked`), for
+the workers of the engine of kernels.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +21,8 @@ __all__ = ["Accel", "Array", "Hits", "mark_non_opaque"]
 #: A numpy array, float32 or int32.
 Array = np.ndarray[Any, Any]
 
-#: ``t`` (N,) float32, ``prim`` (N,) int32, ``u`` (N,) and ``v`` (N,) float32, see :class:`Accel`.
+#: ``t`` (N,) float32, ``prim`` (N,) int32, ``u`` (N,) and ``v`` (N,) float32: distance, primitive id, and parameters of the
+#: point on the primitive (:class:`torchpt.physics.shapes.geometry.Geometry`). See :class:`Accel`.
 Hits = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
@@ -49,7 +55,7 @@ class Accel(ABC):
         lanes below ``count`` are read and written. Misses are as in :meth:`intersect`.
 
         Args:
-            o: origins ``(3, C)`` float32, C-contiguous, ``C >= count``.
+            o: origins ``(3, C)`` float32, C-contiguous; C is the capacity of the arrays, at least ``count``.
             d: directions, likewise.
             t_max: ``(C,)`` float32.
             count: number of rays.
@@ -59,8 +65,8 @@ class Accel(ABC):
             v: ``(C,)`` float32, filled.
         """
         rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
-        for out, found in zip((t, prim, u, v), self.intersect(*rays), strict=True):
-            out[:count] = found.numpy()
+        for out, result in zip((t, prim, u, v), self.intersect(*rays), strict=True):
+            out[:count] = result.numpy()
 
     def refit(self, geometry: Geometry, threads: int | None = None) -> Accel | None:
         """Return a structure for primitives that have moved, refitted from this one, which is not changed and may be in use.
@@ -86,8 +92,9 @@ class Accel(ABC):
             t_max: likewise.
             count: number of rays.
             out: ``(C,)`` int32, filled.
-            non_opaque: uint8 a primitive, nonzero if light may pass it. A ray gets 2 if all that it hits may be such
-                primitives: the caller has to compute its transmittance.
+            non_opaque: ``(P,)`` uint8, nonzero for a primitive that may let light pass; None: all are opaque. A ray gets 2
+                instead of 1 if possibly all primitives that it hits are of this sort: the caller then computes its
+                transmittance. A backend that does not look at the primitives it hits writes 2 for every ray that hits.
         """
         rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
         out[:count] = self.occluded(*rays).numpy()
@@ -101,16 +108,19 @@ class Accel(ABC):
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """Return statistics: name, primitives, nodes, leaves, sah_cost, depth, bytes, build_seconds."""
+        """Return statistics: name, primitives, nodes, leaves, sah_cost, depth, bytes, build_seconds.
+
+        ``sah_cost`` is the expected cost of a random ray that meets the root's box, by the surface area heuristic.
+        """
 
 
 def mark_non_opaque(out: Array, non_opaque: Array | None) -> None:
-    """Replace 1 by 2 in ``out`` if there are non-opaque primitives, for a search that does not test for them.
+    """Replace 1 by 2 in ``out`` if there are non-opaque primitives, for a search that does not look which ones a ray hits.
 
     2 means that the caller has to compute the transmittance, see :meth:`Accel.blocked`.
     """
     if non_opaque is not None:
-        np.left_shift(out, 1, out=out)
+        np.left_shift(out, 1, out=out)  # 1 becomes 2, 0 stays
 
 
 def _rays(o: Tensor, d: Tensor, t_max: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -37,10 +37,11 @@ __all__ = ["MAX_TOLERANCE", "Brute", "Rows", "merge_quadric_hits", "rows_of"]
 
 #: Largest enlargement of a primitive, relative to its size (for rays at right angles to it, from within the scene).
 MAX_TOLERANCE = 1e-3
-#: Rays of a block, a multiple of a packet; threads share the work by blocks.
+#: Rays of a block, by which threads share the work: a multiple of the 16 rays of a packet.
 _BLOCK = 64
 #: Rays times primitives that are worth another thread: about 50 microseconds.
 _GRAIN = 100_000
+#: Index of the address of the scene data in the head of a kernel's arguments.
 _SEARCH = HEAD.index("search")
 
 
@@ -58,13 +59,13 @@ class Rows(NamedTuple):
     tolerance: Tensor
 
     @property
-    def fine(self) -> bool:
+    def is_precise(self) -> bool:
         """Return True if float32 is precise enough for these primitives: no mixed scales, no slivers."""
         return bool((self.tolerance * self.size <= MAX_TOLERANCE).all())
 
 
 def rows_of(geometry: Geometry) -> Rows:
-    """Return the rows of primitives; the caller checks :attr:`Rows.fine`."""
+    """Return the rows of primitives; the caller checks :attr:`Rows.is_precise`."""
     size, tables = extent(geometry), affine_rows(geometry)
     return Rows(tables, size, tolerances(tables.rows64, size))
 
@@ -91,17 +92,22 @@ class Brute(Accel):
         if geometry.p0.device.type != "cpu":
             raise SceneError("render.accel", "brute", "torch (brute runs on the CPU only)")
         tables, size, tolerance = rows = rows_of(geometry) if rows is None else rows
-        if not rows.fine:
+        if not rows.is_precise:
             raise SceneError("render.accel", "brute", "numba or torch (this scene's scales are too mixed for brute)")
-        planar, round_ = sum(geometry.counts[:3]), sum(geometry.counts[:4])
-        table = torch.cat([tables.rows64, tolerance[:, None]], 1)[:planar]
+        first_sphere, first_quadric = sum(geometry.counts[:3]), sum(geometry.counts[:4])
+        spheres = slice(first_sphere, first_quadric)
+        table = torch.cat([tables.rows64, tolerance[:, None]], 1)[:first_sphere]
         self.table = table.float().contiguous()
-        balls = torch.cat([geometry.p0, geometry.p1[:1]])[:, planar:round_].T.double()
-        self.spheres = torch.where(tables.area[planar:round_, None], balls, torch.nan).contiguous()
-        columns = quadric_rows(geometry).T.contiguous()
-        self.quadrics = [(row, torch.tensor(round_ + k, dtype=torch.int32)) for k, row in enumerate(columns)]
+        centre_and_radius = torch.cat([geometry.p0, geometry.p1[:1]])[:, spheres].T.double()
+        self.spheres = torch.where(tables.area[spheres, None], centre_and_radius, torch.nan).contiguous()
+        rows_of_quadrics = quadric_rows(geometry).T.contiguous()
+        # for each quadric its numbers and its primitive id
+        self.quadrics = [
+            (row, torch.tensor(prim, dtype=torch.int32)) for prim, row in enumerate(rows_of_quadrics, first_quadric)
+        ]
         self.counts = list(geometry.counts)
-        self.kinds = tuple(kind for kind, some in zip(KINDS, self.counts, strict=False) if some)
+        # the kinds in this scene; KINDS are those that kernels know, without quadrics
+        self.kinds = tuple(kind for kind, count in zip(KINDS, self.counts, strict=False) if count)
         self.threads = threads
         self.words = scene_words(self.table, self.spheres, self.counts, size)
         self.build_seconds = time.perf_counter() - start
@@ -109,36 +115,39 @@ class Brute(Accel):
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
         t, u, v = (torch.empty_like(t_max) for _ in range(3))
         prim = torch.empty_like(t_max, dtype=torch.int32)
-        self._search(False, (o, d, t_max), (t, prim, u, v))
-        for row, number in self.quadrics:
-            t, prim, u, v = merge_quadric_hits(o, d, t_max, t, prim, u, v, row, number)
+        self._search(rays=(o, d, t_max), results=(t, prim, u, v), any_hit=False)
+        for row, quadric_prim in self.quadrics:
+            t, prim, u, v = merge_quadric_hits(o, d, t_max, t, prim, u, v, row, quadric_prim)
         return t, prim, u, v
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
         if self.quadrics:
-            return self._intersect(o, d, t_max)[1] >= 0
+            _, prim, _, _ = self._intersect(o, d, t_max)
+            return prim >= 0
         blocked = torch.empty_like(t_max, dtype=torch.bool)
-        self._search(True, (o, d, t_max), (blocked,))
+        self._search(rays=(o, d, t_max), results=(blocked,), any_hit=True)
         return blocked
 
-    def _search(self, any_hit: bool, rays: Sequence[Tensor], results: Sequence[Tensor]) -> None:
-        """Intersect rays with planar primitives and spheres; the number of threads depends on the work."""
+    def _search(self, *, rays: Sequence[Tensor], results: Sequence[Tensor], any_hit: bool) -> None:
+        """Intersect rays with planar primitives and spheres, on more threads the more work there is, and write ``results``."""
         call, count = _kernel(self.kinds, any_hit), results[0].shape[0]
-        rows = [(x.data_ptr(), x.element_size()) for x in (*rays, *results)]
+        tensors = [(x.data_ptr(), x.element_size()) for x in (*rays, *results)]
 
-        def part(first: int, last: int) -> None:
+        def search_blocks(first: int, last: int) -> None:
             start, end = first * _BLOCK, min(last * _BLOCK, count)
-            head = [0] * len(HEAD)
-            head[_SEARCH] = ctypes.addressof(self.words)
-            for address, size in rows:
-                head += (address + start * size, count)
-            block = (ctypes.c_int64 * len(head))(*head)
-            call(ctypes.addressof(block), end - start)
+            # The kernel's arguments: the head (compiler/kernel.py), and for each tensor the address of the first ray's number,
+            # and the numbers from one component to the next.
+            arguments = [0] * len(HEAD)
+            arguments[_SEARCH] = ctypes.addressof(self.words)
+            for address, size in tensors:
+                arguments += (address + start * size, count)
+            in_memory = (ctypes.c_int64 * len(arguments))(*arguments)
+            call(ctypes.addressof(in_memory), end - start)
 
-        most = max(count * sum(self.counts) // _GRAIN, 1)
+        worthwhile = max(count * sum(self.counts) // _GRAIN, 1)
         # torch has one thread inside a worker thread, where callers share the work already.
-        threads = min(thread_count(self.threads), torch.get_num_threads(), most)
-        parallel_for(part, -(-count // _BLOCK), threads)
+        threads = min(thread_count(self.threads), torch.get_num_threads(), worthwhile)
+        parallel_for(search_blocks, -(-count // _BLOCK), threads)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; there are no nodes, and the cost is 1 a primitive."""
@@ -157,13 +166,19 @@ class Brute(Accel):
 
 @functools.cache
 def _kernel(kinds: tuple[str, ...], any_hit: bool) -> Any:
-    """Compile the search among kinds of primitives; the kernel's tensors are rays ``o, d, t_max`` and the results."""
+    """Compile the search among kinds of primitives; the kernel's tensors are rays ``o, d, t_max`` and the results.
+
+    The graph is written by hand, as no tensor function has to be traced. Types are those of :mod:`torchpt.compiler.graph`:
+    ``f`` float32, ``i`` int32, ``b`` bool, ``S`` several values of which ``part`` takes one.
+    """
     graph = Graph()
-    ray = [graph.node("tensor", "f", extra=(slot, k)) for slot, rows in enumerate((3, 3, 1)) for k in range(rows)]
+    components = (3, 3, 1)  # of o, d, t_max
+    ray = [graph.node("tensor", "f", extra=(tensor, k)) for tensor, n in enumerate(components) for k in range(n)]
     if any_hit:
         stores = [Store((graph.node("occluded", "b", *ray),), "b")]
     else:
         hits = graph.node("nearest", "S", *ray)
+        # the results t, prim, u, v
         stores = [Store((graph.node("part", ty, hits, extra=k),), ty) for k, ty in enumerate("fiff")]
     compile_time.begin()
     try:
@@ -177,12 +192,14 @@ def merge_quadric_hits(
     o: Tensor, d: Tensor, t_max: Tensor, t: Tensor, prim: Tensor, u: Tensor, v: Tensor, row: Tensor, number: Tensor
 ) -> Hits:
     """Return the hits, replaced by those on a quadric where it is nearer; ``row (19,)`` is the quadric, ``number`` its id."""
-    sound = torch.isfinite(o).all(0) & torch.isfinite(d).all(0)
-    at, a, b = quadric(o, d, row[:, None])
-    hit = sound & (at > 0) & (at < torch.minimum(t, t_max))
-    return torch.where(hit, at, t), torch.where(hit, number, prim), torch.where(hit, a, u), torch.where(hit, b, v)
+    valid = torch.isfinite(o).all(0) & torch.isfinite(d).all(0)
+    new_t, new_u, new_v = quadric(o, d, row[:, None])
+    nearer = valid & (new_t > 0) & (new_t < torch.minimum(t, t_max))
+    new = (new_t, number, new_u, new_v)
+    return tuple(torch.where(nearer, x, old) for x, old in zip(new, (t, prim, u, v), strict=True))  # type: ignore[return-value]
 
 
+# on CPU tensors the function runs as one compiled kernel; the last two arguments are the same for all rays
 merge_quadric_hits.register(
     Lanewise(merge_quadric_hits.function, ("o", "d", "t_max", "t", "prim", "u", "v"), ("row", "number"))
 )

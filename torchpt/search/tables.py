@@ -4,6 +4,8 @@ A planar primitive becomes three affine rows ``(n, c)``, ``(a, ca)``, ``(b, cb)`
 to its plane (``n`` unit), ``u(x) = a . x + ca`` and ``v(x) = b . x + cb`` its parameters. Every backend computes the
 distance of a planar hit from the first row, which is as exact as the plane: a ray that leaves a surface is within a few
 ulps of the surface's plane, however large the primitive.
+
+P is the number of primitives, Q that of the quadrics among them.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ __all__ = ["QUADRIC", "ROUNDING", "Tables", "affine_rows", "extent", "quadric_ro
 #: 32 units of float32 rounding. The affine test of a primitive errs by at most 16 of them times the magnitudes of the terms
 #: (see :func:`tolerances`); the other half covers grazing rays, where ``n . d`` itself is uncertain.
 ROUNDING = 2.0**-19
-#: Length of a quadric's row: transform to its own space, and coefficients (:class:`torchpt.physics.shapes.quadrics.Form`).
+#: Numbers of a quadric: 12 of the transform to its own space, 7 coefficients (:class:`torchpt.physics.shapes.quadrics.Form`).
 QUADRIC = 19
 
 
@@ -28,9 +30,10 @@ class Tables(NamedTuple):
     """Affine rows of primitives.
 
     Attributes:
-        rows: ``(P, 12)`` float32: ``n c a ca b cb``; zeros for spheres, quadrics and primitives without area.
+        rows: ``(P, 12)`` float32: ``n c a ca b cb``, where ``n``, ``a`` and ``b`` are three numbers each; zeros for spheres,
+            quadrics and primitives without area.
         rows64: the same in float64, not rounded.
-        area: ``(P,)`` bool: True if the primitive can be hit.
+        area: ``(P,)`` bool: True if the primitive has an area and finite numbers, so that it can be hit.
     """
 
     rows: Tensor
@@ -52,19 +55,22 @@ def affine_rows(geometry: Geometry) -> Tables:
     e1, e2 = p1 - p0, p2 - p0
     cross = torch.linalg.cross(e1, e2, dim=0)
     length = cross.square().sum(0).sqrt()
-    first, balls = sum(geometry.counts[:3]), sum(geometry.counts[:4])
-    number = torch.arange(geometry.size, device=p0.device)
-    planar = number < first
+    first_sphere, first_quadric = sum(geometry.counts[:3]), sum(geometry.counts[:4])
+    prim = torch.arange(geometry.size, device=p0.device)
+    planar = prim < first_sphere
     n = cross / length
     a = torch.linalg.cross(e2, n, dim=0) / length
     b = torch.linalg.cross(n, e1, dim=0) / length
+    # each of the three functions is 0 at p0, which gives its constant
     rows = torch.cat([r for x in (n, a, b) for r in (x, -(x * p0).sum(0, keepdim=True))])
-    good = planar & (length > 0) & torch.isfinite(rows.float()).all(0)
-    rows = torch.where(good, rows, 0.0)
-    round_ = ~planar & (number < balls) & torch.isfinite(p0).all(0) & (p1[0].abs() > 0) & torch.isfinite(p1[0])
+    good_plane = planar & (length > 0) & torch.isfinite(rows.float()).all(0)
+    rows = torch.where(good_plane, rows, 0.0)
+    radius = p1[0]
+    good_curved = ~planar & (prim < first_quadric)
+    good_curved &= torch.isfinite(p0).all(0) & (radius.abs() > 0) & torch.isfinite(radius)
     if geometry.quadrics is not None:
-        round_[balls:] = torch.isfinite(quadric_rows(geometry)[:12]).all(0)
-    return Tables(rows.float().T.contiguous(), rows.T, good | round_)
+        good_curved[first_quadric:] = torch.isfinite(quadric_rows(geometry)[:12]).all(0)
+    return Tables(rows.float().T.contiguous(), rows.T, good_plane | good_curved)
 
 
 def quadric_rows(geometry: Geometry) -> Tensor:
@@ -77,9 +83,10 @@ def quadric_rows(geometry: Geometry) -> Tensor:
     if table is None:
         return torch.zeros(QUADRIC, 0, dtype=torch.float64, device=geometry.p0.device)
     p0, e1, e2, e3 = table.frame.split(3)
-    faces = (torch.linalg.cross(a, b, dim=0) for a, b in ((e2, e3), (e3, e1), (e1, e2)))
+    # the inverse of the matrix with columns e1, e2, e3: its cofactors over its determinant
+    cofactors = (torch.linalg.cross(a, b, dim=0) for a, b in ((e2, e3), (e3, e1), (e1, e2)))
     det = (e1 * torch.linalg.cross(e2, e3, dim=0)).sum(0)
-    rows = [row for n in faces for row in (n / det, -(n * p0).sum(0, keepdim=True) / det)]
+    rows = [row for n in cofactors for row in (n / det, -(n * p0).sum(0, keepdim=True) / det)]
     return torch.cat([*rows, table.form])
 
 
@@ -87,15 +94,16 @@ def extent(geometry: Geometry) -> float:
     """Return the largest absolute coordinate of the scene, at least the smallest normal float32."""
     if geometry.size == 0:
         return 1.0
-    planar, round_ = sum(geometry.counts[:3]), sum(geometry.counts[:4])
-    points = torch.stack([p[:, :planar] for p in (geometry.p0, geometry.p1, geometry.p2)]).abs()
-    balls = geometry.p0[:, planar:round_].abs() + geometry.p1[0, planar:round_].abs()
-    both = torch.cat([points.reshape(-1), balls.reshape(-1)])
+    first_sphere, first_quadric = sum(geometry.counts[:3]), sum(geometry.counts[:4])
+    spheres = slice(first_sphere, first_quadric)
+    points = torch.stack([p[:, :first_sphere] for p in (geometry.p0, geometry.p1, geometry.p2)]).abs()
+    sphere_bounds = geometry.p0[:, spheres].abs() + geometry.p1[0, spheres].abs()  # |centre| + radius
+    magnitudes = torch.cat([points.reshape(-1), sphere_bounds.reshape(-1)])
     if geometry.quadrics is not None:
-        reach = geometry.quadrics.frame.abs().reshape(4, 3, -1).sum(0)
-        both = torch.cat([both, reach.reshape(-1).float()])
-    both = both[torch.isfinite(both)]
-    return max(float(both.max()) if both.numel() else 1.0, 2.0**-126)
+        quadric_bounds = geometry.quadrics.frame.abs().reshape(4, 3, -1).sum(0)  # |p0| + |e1| + |e2| + |e3|
+        magnitudes = torch.cat([magnitudes, quadric_bounds.reshape(-1).float()])
+    magnitudes = magnitudes[torch.isfinite(magnitudes)]
+    return max(float(magnitudes.max()) if magnitudes.numel() else 1.0, torch.finfo(torch.float32).tiny)
 
 
 def tolerances(rows: Tensor, scene_extent: float) -> Tensor:
@@ -116,7 +124,7 @@ def tolerances(rows: Tensor, scene_extent: float) -> Tensor:
     rows = rows.abs()
     w, cw = rows[:, 0:3].sum(1), rows[:, 3]
     worst = torch.zeros_like(w)
-    for k in (4, 8):
-        u, cu = rows[:, k : k + 3].sum(1), rows[:, k + 3]
+    for first in (4, 8):  # first columns of u and of v
+        u, cu = rows[:, first : first + 3].sum(1), rows[:, first + 3]
         worst = torch.maximum(worst, 2 * u * w + (cu * w + cw * u + w) / scene_extent)
     return ROUNDING * worst

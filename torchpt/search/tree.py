@@ -1,4 +1,8 @@
-"""The search by an eight-wide BVH, and its refit when primitives move."""
+"""The search by a *wide tree*, a BVH with eight children a node, and its refit when primitives move.
+
+The tree lies in one buffer (:mod:`torchpt.search.tree_layout`), which machine code traverses
+(:mod:`torchpt.native.kernels`, module ``tree_nearest`` and ``tree_occluded``).
+"""
 
 from __future__ import annotations
 
@@ -47,7 +51,7 @@ class RefitState:
     Args:
         tree: the tree as built.
         geometry: the primitives of the tree.
-        line: line of the buffer at which the root begins.
+        line: cache line of the buffer at which the root begins.
 
     Attributes:
         sah_ratio: expected cost of a random ray, relative to the tree as built.
@@ -55,7 +59,9 @@ class RefitState:
 
     def __init__(self, tree: WideTree, geometry: Geometry, line: int = 0) -> None:
         self.nodes, self.line, self.counts = tree.nodes, line, geometry.counts
-        self.without_area = np.zeros(0, np.int32)  # rising ids of the primitives without area
+        self.without_area = np.zeros(
+            0, np.int32
+        )  # ascending ids of the primitives without area, which are not in the tree
         if (tree.ids >= 0).sum() < geometry.size:
             self.without_area = np.setdiff1d(np.arange(geometry.size, dtype=np.int32), tree.ids)
         self.built_cost: float | None = None  # expected cost as built, computed by the first refit
@@ -64,38 +70,51 @@ class RefitState:
     def refit(
         self, geometry: Geometry, non_triangles: NonTriangles, before: Floats, memory: Floats
     ) -> RefitState | None:
-        """Write this tree for primitives that have moved to ``memory``; ``before`` is the buffer of the present tree.
+        """Write this tree, with boxes and leaves of primitives that have moved, and return its state.
 
-        Returns None, with undefined content of ``memory``, if the numbers of primitives differ, if a primitive without area in
-        the build has one now, if no primitive has an area, or if the cost has grown by more than :data:`REBUILD_THRESHOLD`.
+        Args:
+            geometry: the primitives at their new positions.
+            non_triangles: those of them that are not triangles.
+            before: the buffer of the present tree, which is not changed.
+            memory: the buffer of the new tree, of the same length.
+
+        Returns:
+            The new state. None, with undefined content of ``memory``, if the numbers of primitives differ, if a primitive
+            without area in the build has one now, if no primitive has an area, or if the cost has grown by more than
+            :data:`REBUILD_THRESHOLD`.
         """
         if geometry.counts != self.counts or self._gains_area(geometry):
             return None
-        codes, triangles = before.view(np.int32), self.counts[0]
+        triangles, rectangles, *_ = self.counts
         corner, rows, _ = (x.numpy() for x in non_triangles.tensors)
-        tables = (triangles, triangles + self.counts[1], corner, rows, non_triangles.boxes)
+        first_rectangle, first_disk = triangles, triangles + rectangles
+        tables = (first_rectangle, first_disk, corner, rows, non_triangles.boxes)
+        codes = before.view(np.int32)
         args = (before, codes, self.line, self.nodes, *corners(geometry), *tables)
-        lines, costs = np.empty(self.nodes, np.int64), np.empty(2)
+        lines, costs = np.empty(self.nodes, np.int64), np.empty(2)  # scratch memory; costs of both trees
         kernel("tree_refit", "refit")(*args, memory, memory.view(np.int32), lines, costs)
-        work, moved = costs.tolist()
-        found = copy.copy(self)
-        found.built_cost = work if self.built_cost is None else self.built_cost
-        found.sah_ratio = moved / found.built_cost
-        return found if found.sah_ratio <= REBUILD_THRESHOLD else None  # NaN if no primitive has an area
+        cost_before, cost_moved = costs.tolist()
+        state = copy.copy(self)
+        state.built_cost = cost_before if self.built_cost is None else self.built_cost
+        state.sah_ratio = cost_moved / state.built_cost
+        # written so that NaN, the ratio if no primitive has an area, gives None
+        return state if state.sah_ratio <= REBUILD_THRESHOLD else None
 
     def _gains_area(self, geometry: Geometry) -> bool:
+        """Return True if a primitive that had no area in the build has one now."""
         if not len(self.without_area):
             return False
-        some = select_primitives(geometry, torch.from_numpy(self.without_area).long())
-        _, _, ids, non_triangles = primitive_tables(some)
+        were_without_area = select_primitives(geometry, torch.from_numpy(self.without_area).long())
+        _, _, ids, non_triangles = primitive_tables(were_without_area)
         return len(ids) > 0 or bool(non_triangles.area.any())
 
 
 # ---- The search
 
 
-#: Rays that are worth another thread.
+#: Fewest rays that are worth another thread.
 _GRAIN = 512
+#: The argument ``non_opaque`` of kernels if all primitives are opaque.
 _ALL_OPAQUE = np.empty(0, np.uint8)
 
 
@@ -115,12 +134,13 @@ class WideBvh(Accel):
         tree, planes, non_triangles = mesh_tree(geometry)
         self.counts, self.depth, self.sah_cost = geometry.counts, tree.depth, tree.cost
         self.nodes, self.leaves = tree.nodes, tree.leaves
-        self.refit_state, self.copied = RefitState(tree, geometry), geometry.copies is not None
+        self.refit_state, self.has_instances = RefitState(tree, geometry), geometry.copies is not None
         memory = aligned_buffer(line_count(tree, geometry.counts) * LINE)
-        write_tree(tree, geometry, planes, non_triangles, 0, memory)
-        self._take(memory, non_triangles, start)
+        write_tree(tree, geometry, planes, non_triangles, line=0, memory=memory)
+        self._set_tables(memory, non_triangles, start)
 
-    def _take(self, memory: np.ndarray, non_triangles: NonTriangles, start: float) -> None:
+    def _set_tables(self, memory: np.ndarray, non_triangles: NonTriangles, start: float) -> None:
+        """Set what kernels read: the buffer of the tree, and the other primitives. The build began at the time ``start``."""
         self.tables = [memory, *(x.numpy() for x in non_triangles.tensors)]
         self.stack_length = stack_size(self.depth)
         self.words = scene_words(self.tables, self.counts, self.stack_length)
@@ -129,7 +149,7 @@ class WideBvh(Accel):
     def refit(self, geometry: Geometry, threads: int | None = None) -> WideBvh | None:
         """See :meth:`Accel.refit` and :meth:`RefitState.refit`; the new tree has its own memory."""
         start = time.perf_counter()
-        if (geometry.copies is not None) != self.copied:
+        if (geometry.copies is not None) != self.has_instances:
             return None
         non_triangles, memory = NonTriangles(geometry), aligned_buffer(len(self.tables[0]))
         refit_state = self.refit_state.refit(geometry, non_triangles, self.tables[0], memory)
@@ -137,14 +157,15 @@ class WideBvh(Accel):
             return None
         tree = copy.copy(self)
         tree.threads, tree.refit_state = threads, refit_state
-        tree._take(memory, non_triangles, start)
+        tree._set_tables(memory, non_triangles, start)
         return tree
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
         t, u, v = torch.empty_like(t_max), torch.empty_like(t_max), torch.empty_like(t_max)
         prim = torch.empty_like(t_max, dtype=torch.int32)
         rays = (x.contiguous().numpy() for x in (o, d, t_max))
-        self._nearest(t_max.shape[0], thread_count(self.threads), *rays, *(x.numpy() for x in (t, prim, u, v)))
+        threads = thread_count(self.threads)
+        self._nearest(t_max.shape[0], threads, *rays, *(x.numpy() for x in (t, prim, u, v)))
         return t, prim, u, v
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
@@ -165,13 +186,15 @@ class WideBvh(Accel):
         self._blocked(count, 1, o, d, t_max, _ALL_OPAQUE if non_opaque is None else non_opaque, out)
 
     def _nearest(self, count: int, threads: int, o: Array, d: Array, t_max: Array, *hits: Array) -> None:
-        args = (o, d, t_max, d.shape[1], self.words, *hits)
+        capacity = d.shape[1]  # the arrays may be longer than the number of rays
+        args = (o, d, t_max, capacity, self.words, *hits)
         run_parallel(kernel("tree_nearest", "nearest"), count, threads, _GRAIN, packet_memory(self.stack_length), args)
 
     def _blocked(
         self, count: int, threads: int, o: Array, d: Array, t_max: Array, non_opaque: Array, out: Array
     ) -> None:
-        args = (o, d, t_max, d.shape[1], self.words, non_opaque, len(non_opaque), out)
+        capacity = d.shape[1]
+        args = (o, d, t_max, capacity, self.words, non_opaque, len(non_opaque), out)
         run_parallel(
             kernel("tree_occluded", "occluded"), count, threads, _GRAIN, packet_memory(self.stack_length), args
         )
@@ -197,9 +220,9 @@ def scene_words(tables: Sequence[np.ndarray], counts: Sequence[int], stack_lengt
     """Return the int64 words by which kernels find a tree.
 
     Args:
-        tables: the tree, and of the primitives that are not triangles corners, affine rows and quadrics.
-        counts: numbers of primitives of each kind.
-        stack_length: stack size of a ray.
+        tables: the buffer of the tree; then the tables :attr:`NonTriangles.tensors`: corners, affine rows and quadrics.
+        counts: numbers of triangles, rectangles, disks, spheres and quadrics.
+        stack_length: stack size of a ray, see :func:`torchpt.search.tree_layout.stack_size`.
 
     Returns:
         ``(9,)``: addresses of the tables, which have to be kept alive; ids of the first rectangle, disk, sphere and quadric;

@@ -1,7 +1,10 @@
-"""Build an eight-wide BVH: a binary tree by the surface area heuristic, collapsed, then laid out in memory.
+"""Build a wide tree, a BVH with eight children a node: a binary tree by the surface area heuristic, collapsed, then laid out.
 
-The work is done by kernels (``scripts/kernel_sources/tree_build.py``), on one thread; :func:`mesh_tree` and :func:`write_tree`
-are what the searches call.
+Kernels do the work (``scripts/kernel_sources/tree_build.py``), on one thread. The searches call :func:`mesh_tree`, which
+builds, and :func:`write_tree`, which writes the tree to memory (:mod:`torchpt.search.tree_layout`).
+
+In shapes P is the number of all primitives, T of triangles, K of the other primitives, L of the primitives with an area (or of
+leaves of a wide tree), M of nodes.
 """
 
 from __future__ import annotations
@@ -38,11 +41,11 @@ class WideTree:
     """A wide tree before its memory layout.
 
     Attributes:
-        boxes: ``(M * 48,)``: low x, y, z, high x, y, z of eight children a node; infinite for none.
-        child: ``(M * 8,)``: a node, or ``~leaf``, or 0 for none.
-        ids: ``(L * 8,)``: primitives of the leaves in rising order, -1 for none.
+        boxes: ``(M * 48,)``: for each node low x of its eight children, then low y, z, high x, y, z; infinite for no child.
+        child: ``(M * 8,)``: the index of a child that is a node, ``~k`` for leaf k, 0 for no child (0 is the root).
+        ids: ``(L * 8,)``: primitive ids of each leaf in ascending order, then -1.
         depth: nodes on the longest path from the root.
-        cost: expected cost of a random ray through the root's box, 1 a node.
+        cost: expected cost of a random ray through the root's box, in units of a visit of a node.
     """
 
     def __init__(self, boxes: Floats, child: Ints, ids: Ints, depth: int, cost: float) -> None:
@@ -71,34 +74,41 @@ class NonTriangles:
 
     def __init__(self, geometry: Geometry) -> None:
         rest = _without_triangles(geometry)
-        if not rest.size:  # the operations below take longer than the build for a small mesh
+        if not rest.size:  # to save time: the operations below take longer than the build of a small mesh
             self.area, self.boxes = np.zeros(0, bool), np.zeros((0, 6), np.float32)
             self.tensors = [torch.zeros(0, 12), torch.zeros(0, 12), torch.zeros(0, QUADRIC, dtype=torch.float64)]
             return
         tables = affine_rows(rest)
-        good = tables.area
+        area = tables.area
         low, high = primitive_bounds(rest)
-        boxes = torch.cat((torch.where(good, low, torch.inf), torch.where(good, high, -torch.inf)))
-        self.area, self.boxes = good.numpy(), boxes.T.contiguous().numpy()
+        boxes = torch.cat((torch.where(area, low, torch.inf), torch.where(area, high, -torch.inf)))
+        self.area, self.boxes = area.numpy(), boxes.T.contiguous().numpy()
         corner = torch.cat([rest.p0, rest.p1, rest.p2, (rest.p1 + rest.p2) - rest.p0]).float()
-        corner, quadrics = torch.where(good, corner, torch.nan), quadric_rows(rest)
-        quadrics = torch.where(good[rest.size - rest.counts[4] :], quadrics, torch.nan)
+        corner, quadrics = torch.where(area, corner, torch.nan), quadric_rows(rest)
+        quadrics = torch.where(
+            area[rest.size - quadrics.shape[1] :], quadrics, torch.nan
+        )  # they are the last primitives
         self.tensors = [corner.T.contiguous(), tables.rows, quadrics.T.contiguous()]
 
 
-def build_binary(boxes: Floats, ids: Ints, common: int) -> tuple[Floats, Ints]:
+def build_binary(boxes: Floats, ids: Ints, triangles: int) -> tuple[Floats, Ints]:
     """Build a binary tree over boxes ``(L, 6)`` of primitives ``ids (L,)``; both arrays are permuted.
 
-    A leaf holds at most :data:`~torchpt.search.tree_layout.WIDTH` primitives. Primitives are split down to one a leaf if their
-    ids are not below ``common`` (only primitives of one kind are tested together), or if their areas sum to less than the area
-    of their bounding box.
+    A leaf holds at most :data:`~torchpt.search.tree_layout.WIDTH` primitives. Primitives are split down to one a leaf if one of
+    them is no triangle (only primitives of one kind are tested together), or if their areas sum to less than the area of their
+    bounding box.
+
+    Args:
+        boxes: low x, y, z, high x, y, z of each primitive.
+        ids: primitive ids; those below ``triangles`` are triangles.
+        triangles: number of triangles.
 
     Returns:
         Boxes ``(M, 6)`` of the nodes, the root first; and ``(M, 3)``: first primitive, one past the last, first child (0 for a
         leaf; the second child follows it).
     """
     nodes, spans = np.empty((2 * len(ids), 6), np.float32), np.empty((2 * len(ids), 3), np.int32)
-    used = kernel("tree_build", "build_binary")(boxes, ids, nodes, spans, common)
+    used = kernel("tree_build", "build_binary")(boxes, ids, nodes, spans, triangles)
     return nodes[:used], spans[:used]
 
 
@@ -109,79 +119,102 @@ def wide_tree(boxes: Floats, ids: Ints, counts: tuple[int, ...] = (0, 0)) -> Wid
     """
     n = len(ids)
     if n == 0:
-        return WideTree(
-            np.full(6 * WIDTH, np.inf, np.float32), np.zeros(WIDTH, np.int32), np.zeros(0, np.int32), 1, 0.0
-        )
-    nodes, spans = build_binary(boxes, ids, counts[0])
-    used = len(nodes)
-    cost, share = np.empty((used, WIDTH), np.float32), np.empty((used, WIDTH), np.int8)
-    kernel("tree_build", "choose_collapse")(nodes, spans, ids, counts[0], counts[0] + counts[1], cost, share)
-    wide, ends = max(1, int((share[:, 0] > 0).sum())), int((share[:, 0] == 0).sum())
-    flat, child = np.empty(wide * 6 * WIDTH, np.float32), np.empty(wide * WIDTH, np.int32)
-    first, pending, found = np.empty((ends, 2), np.int32), np.empty((wide + 1, 2), np.int32), np.empty(3, np.int32)
-    kernel("tree_build", "collapse")(nodes, spans, share, flat, child, first, pending, found)
-    count, leaves, depth = found.tolist()
-    slots = np.empty((leaves, WIDTH), np.int32)
-    kernel("tree_build", "leaf_ids")(first[:leaves], ids, slots)
+        no_boxes, no_children = np.full(6 * WIDTH, np.inf, np.float32), np.zeros(WIDTH, np.int32)
+        return WideTree(no_boxes, no_children, np.zeros(0, np.int32), depth=1, cost=0.0)
+    triangles, rectangles, *_ = counts
+    nodes, spans = build_binary(boxes, ids, triangles)
+    binary_count = len(nodes)
+    # Column k: the least cost of the binary node's subtree as at most k + 1 children of a wide node, and how many of these
+    # come from the node's first child. Column 0 says the same of the node as a wide node of its own, and has 0 for a leaf.
+    cost = np.empty((binary_count, WIDTH), np.float32)
+    decision = np.empty((binary_count, WIDTH), np.int8)
+    kernel("tree_build", "choose_collapse")(nodes, spans, ids, triangles, triangles + rectangles, cost, decision)
+    # upper bounds, which also count binary nodes that the collapse never reaches
+    most_nodes, most_leaves = max(1, int((decision[:, 0] > 0).sum())), int((decision[:, 0] == 0).sum())
+    wide_boxes, child = np.empty(most_nodes * 6 * WIDTH, np.float32), np.empty(most_nodes * WIDTH, np.int32)
+    leaf_spans = np.empty((most_leaves, 2), np.int32)
+    pending, sizes = np.empty((most_nodes + 1, 2), np.int32), np.empty(3, np.int32)
+    kernel("tree_build", "collapse")(nodes, spans, decision, wide_boxes, child, leaf_spans, pending, sizes)
+    node_count, leaves, depth = sizes.tolist()
+    leaf_ids = np.empty((leaves, WIDTH), np.int32)
+    kernel("tree_build", "leaf_ids")(leaf_spans[:leaves], ids, leaf_ids)
     x, y, z = (nodes[0, 3:] - nodes[0, :3]).astype(np.float64)
-    area = x * y + y * z + z * x
+    area = x * y + y * z + z * x  # half the surface of the root's box, as in the costs
     # Expected cost of a random ray through the root's box (MacDonald & Booth 1990).
     expected = float(cost[0, 0] / area) if area > 0 else float(n)
-    return WideTree(flat[: count * 6 * WIDTH], child[: count * WIDTH], slots.reshape(-1), depth, expected)
+    wide_boxes, child = wide_boxes[: node_count * 6 * WIDTH], child[: node_count * WIDTH]
+    return WideTree(wide_boxes, child, leaf_ids.reshape(-1), depth, expected)
 
 
 def line_count(tree: WideTree, counts: tuple[int, ...]) -> int:
     """Return the size of a tree in cache lines; ``counts`` are the numbers of primitives of each kind."""
     ids = tree.ids.reshape(-1, WIDTH)
-    ruled = ((ids >= counts[0]) & (ids < counts[0] + counts[1])).any(1).sum() if counts[1] else 0
-    return NODE * tree.nodes + LEAF * tree.leaves + MORE * int(ruled)
+    triangles, rectangles, *_ = counts
+    with_rectangles = ((ids >= triangles) & (ids < triangles + rectangles)).any(1).sum() if rectangles else 0
+    return NODE * tree.nodes + LEAF * tree.leaves + MORE * int(with_rectangles)
 
 
 def aligned_buffer(count: int) -> Floats:
     """Allocate ``count`` float32, aligned to a cache line."""
-    raw = np.zeros(count * 4 + LINE * 4, np.uint8)
+    raw = np.zeros(count * 4 + LINE * 4, np.uint8)  # 4 bytes each
     skip = -raw.ctypes.data % (LINE * 4)
     return raw[skip : skip + count * 4].view(np.float32)
 
 
 def primitive_tables(geometry: Geometry) -> tuple[Floats, Floats, Ints, NonTriangles]:
-    """Return planes ``(T, 4)`` of the triangles, boxes ``(K, 6)`` and ids ``(K,)`` of those with an area, and the others."""
+    """Return what a build reads of each primitive.
+
+    Returns:
+        Planes ``(T, 4)`` of the triangles; boxes ``(R, 6)`` and ids ``(R,)`` of the R triangles with an area; and the other
+        primitives.
+    """
     count = geometry.counts[0]
     planes, boxes, ids = np.empty((count, 4), np.float32), np.empty((count, 6), np.float32), np.empty(count, np.int32)
-    kept = kernel("tree_build", "triangle_tables")(*corners(geometry), count, planes, boxes, ids)
-    return planes, boxes[:kept], ids[:kept], NonTriangles(geometry)
+    with_area = kernel("tree_build", "triangle_tables")(*corners(geometry), count, planes, boxes, ids)
+    return planes, boxes[:with_area], ids[:with_area], NonTriangles(geometry)
 
 
 def mesh_tree(geometry: Geometry) -> tuple[WideTree, Floats, NonTriangles]:
     """Build the tree of a geometry; return it with the planes ``(T, 4)`` of its triangles and its other primitives."""
     planes, boxes, ids, non_triangles = primitive_tables(geometry)
     if non_triangles.area.size:
-        keep = np.flatnonzero(non_triangles.area)
-        boxes = np.concatenate([boxes, non_triangles.boxes[keep]])
-        ids = np.concatenate([ids, (keep + geometry.counts[0]).astype(np.int32)])
+        with_area = np.flatnonzero(non_triangles.area)
+        boxes = np.concatenate([boxes, non_triangles.boxes[with_area]])
+        ids = np.concatenate([ids, (with_area + geometry.counts[0]).astype(np.int32)])
     return wide_tree(boxes, ids, geometry.counts), planes, non_triangles
 
 
 def write_tree(
     tree: WideTree, geometry: Geometry, planes: Floats, non_triangles: NonTriangles, line: int, memory: Floats
 ) -> None:
-    """Write a tree to ``memory`` from a line on."""
-    codes, triangles = memory.view(np.int32), geometry.counts[0]
-    disk = triangles + geometry.counts[1]
-    tables = (planes, non_triangles.tensors[0].numpy(), non_triangles.tensors[1].numpy())
+    """Write a tree to ``memory``.
+
+    Args:
+        tree: the tree.
+        geometry: the primitives that it was built of.
+        planes: ``(T, 4)`` planes of the triangles.
+        non_triangles: the other primitives.
+        line: cache line of ``memory`` at which the root is to begin.
+        memory: an aligned buffer with at least :func:`line_count` lines from there on.
+    """
+    codes = memory.view(np.int32)
+    triangles, rectangles, *_ = geometry.counts
+    first_disk = triangles + rectangles
+    corner, rows, _ = non_triangles.tensors
+    tables = (planes, corner.numpy(), rows.numpy())
     topology, scratch = (tree.boxes, tree.child, tree.ids), np.empty(tree.nodes, np.int64)
     stack = np.empty(len(tree.child) + WIDTH, np.int32)
     kernel("tree_build", "lay_out")(
-        *topology, *corners(geometry), *tables, triangles, disk, line, memory, codes, scratch, stack
+        *topology, *corners(geometry), *tables, triangles, first_disk, line, memory, codes, scratch, stack
     )
 
 
 def corners(geometry: Geometry) -> tuple[Floats, Floats, Floats]:
-    """Return the three corners ``(3, P)`` as arrays."""
+    """Return the points p0, p1 and p2 of all primitives, ``(3, P)`` each, as arrays."""
     return tuple(p.contiguous().numpy() for p in (geometry.p0, geometry.p1, geometry.p2))  # type: ignore[return-value]
 
 
 def _without_triangles(geometry: Geometry) -> Geometry:
-    _, *counts = geometry.counts
-    p0, p1, p2 = (p[:, geometry.counts[0] :] for p in (geometry.p0, geometry.p1, geometry.p2))
-    return Geometry(p0, p1, p2, (0, counts[0], counts[1], counts[2], counts[3]), geometry.quadrics)
+    triangles, rectangles, disks, spheres, quadrics = geometry.counts
+    p0, p1, p2 = (p[:, triangles:] for p in (geometry.p0, geometry.p1, geometry.p2))
+    return Geometry(p0, p1, p2, (0, rectangles, disks, spheres, quadrics), geometry.quadrics)

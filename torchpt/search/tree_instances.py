@@ -1,4 +1,8 @@
-"""Instances of meshes as a second level of search: a tree over their boxes above the trees of their meshes."""
+"""Instances of meshes as a second level of search: a tree over their boxes above the trees of their meshes.
+
+The upper level is a wide tree whose primitives are the boxes of the instances; the lower level has the wide trees of all
+distinct meshes in one buffer. Primitives that belong to no instance have a wide tree of their own, which is searched first.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,7 @@ from torchpt.search.tree_layout import LINE, instance_memory, stack_size
 __all__ = ["InstancedWideBvh", "instance_words"]
 
 
-#: Rays that are worth another thread.
+#: Fewest rays that are worth another thread.
 _GRAIN = 256
 
 
@@ -47,51 +51,65 @@ class InstancedWideBvh(Accel):
     def __init__(self, geometry: Geometry, threads: int | None = None) -> None:
         start = time.perf_counter()
         tables = CopyTables(geometry)
-        trees, self.refit_states, lower = _meshes(tables.meshes)
-        self._below = [sum(x.nodes for x in trees), sum(x.leaves for x in trees), max(x.depth for x in trees)]
-        self._take(geometry, WideBvh(geometry, threads), tables, lower, start)
+        trees, self.refit_states, lower = _build_lower_level(tables.meshes)
+        self._lower_nodes, self._lower_leaves = sum(x.nodes for x in trees), sum(x.leaves for x in trees)
+        self._lower_depth = max(x.depth for x in trees)
+        self._build_upper_level(geometry, WideBvh(geometry, threads), tables, lower, start)
 
-    def _take(self, geometry: Geometry, base: WideBvh, tables: CopyTables, lower: np.ndarray, start: float) -> None:
-        """Set all attributes; builds the upper level."""
+    def _build_upper_level(
+        self, geometry: Geometry, base: WideBvh, tables: CopyTables, lower: np.ndarray, start: float
+    ) -> None:
+        """Build the upper level, and set all attributes.
+
+        Args:
+            geometry: the primitives, with instances.
+            base: the search over the primitives that belong to no instance.
+            tables: the instances.
+            lower: the buffer with the trees of the meshes.
+            start: time at which the build or refit began.
+        """
         assert geometry.copies is not None
-        self.base, self.threads, self.places = base, base.threads, geometry.copies[12:]
-        some = np.flatnonzero([tables.meshes[k].size > 0 for k in tables.mesh.tolist()]).astype(np.int32)
-        boxes = torch.cat((tables.low, tables.high)).T.contiguous().numpy()[some]
-        top = wide_tree(boxes, some.copy())
-        none = _nothing()
+        self.base, self.threads, self.spans = base, base.threads, geometry.copies[12:]
+        not_empty = np.flatnonzero([tables.meshes[k].size > 0 for k in tables.mesh.tolist()]).astype(np.int32)
+        boxes = torch.cat((tables.low, tables.high)).T.contiguous().numpy()[not_empty]
+        top = wide_tree(boxes, not_empty.copy())  # the build permutes the ids
+        # the leaves of the upper level have ids of instances, and no triangles
+        none = _no_primitives()
         upper = aligned_buffer(line_count(top, none.counts) * LINE)
-        write_tree(top, none, np.zeros((0, 4), np.float32), NonTriangles(none), 0, upper)
-        nodes, leaves, depth = self._below
-        depth += top.depth
-        roots = np.array([4 * x.line for x in self.refit_states], np.int64)
+        write_tree(top, none, np.zeros((0, 4), np.float32), NonTriangles(none), line=0, memory=upper)
+        self.depth = top.depth + self._lower_depth
+        roots = np.array([4 * state.line for state in self.refit_states], np.int64)  # codes, see tree_layout.py
         self.tables = (
             upper, lower, tables.inverse.numpy(), tables.shift.numpy().astype(np.int32), roots[tables.mesh.numpy()]
         )  # fmt: skip
-        self.stack_length = stack_size(depth)
+        self.stack_length = stack_size(self.depth)
         self.words = instance_words(self.tables, self.stack_length)
-        self.depth, self.copies, self.nodes, self.leaves = depth, len(some), top.nodes + nodes, top.leaves + leaves
-        self.ids = int(geometry.size + geometry.copies[13].sum())
+        self.copies = len(not_empty)
+        self.nodes, self.leaves = top.nodes + self._lower_nodes, top.leaves + self._lower_leaves
+        self.primitives = int(geometry.size + geometry.copies[13].sum())  # row 13: triangles of each instance
         self.build_seconds = time.perf_counter() - start
 
     def refit(self, geometry: Geometry, threads: int | None = None) -> InstancedWideBvh | None:
         """See :meth:`Accel.refit`; the upper level, which is small, is always rebuilt."""
         start = time.perf_counter()
-        if geometry.copies is None or not torch.equal(geometry.copies[12:], self.places):
+        # the meshes of the instances have to be the same triangles
+        if geometry.copies is None or not torch.equal(geometry.copies[12:], self.spans):
             return None
         base = self.base.refit(geometry, threads)
         if base is None:
             return None
-        tables, before, found = CopyTables(geometry), self.tables[1], []
-        lower = aligned_buffer(len(before))
+        tables, states = CopyTables(geometry), []
+        _, lower_before, *_ = self.tables
+        lower = aligned_buffer(len(lower_before))
         for refit_state, mesh in zip(self.refit_states, tables.meshes, strict=True):
             # instances of empty meshes are not in the upper level
-            moved = refit_state if not mesh.size else refit_state.refit(mesh, NonTriangles(mesh), before, lower)
+            moved = refit_state if not mesh.size else refit_state.refit(mesh, NonTriangles(mesh), lower_before, lower)
             if moved is None:
                 return None
-            found.append(moved)
+            states.append(moved)
         tree = shallow(self)
-        tree.refit_states = found
-        tree._take(geometry, base, tables, lower, start)
+        tree.refit_states = states
+        tree._build_upper_level(geometry, base, tables, lower, start)
         return tree
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
@@ -120,7 +138,7 @@ class InstancedWideBvh(Accel):
         mark_non_opaque(out[:count], non_opaque)
 
     def _run(self, name: str, count: int, threads: int, o: Array, d: Array, t_max: Array, *results: Array) -> None:
-        """Search the instances, and update the results of the search among the primitives."""
+        """Search the instances with the kernel ``name``, and update the results of the search among the other primitives."""
         args = (o, d, t_max, d.shape[1], self.words, *results)
         run_parallel(
             kernel(f"instances_{name}", name), count, threads, _GRAIN, instance_memory(self.stack_length), args
@@ -130,7 +148,7 @@ class InstancedWideBvh(Accel):
         """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost leaves instances out."""
         base = self.base.describe()
         return base | {
-            "primitives": self.ids,
+            "primitives": self.primitives,
             "instances": self.copies,
             "nodes": base["nodes"] + self.nodes,
             "leaves": base["leaves"] + self.leaves,
@@ -140,22 +158,22 @@ class InstancedWideBvh(Accel):
         }
 
 
-def _nothing() -> Geometry:
-    """Return a geometry without primitives, for the leaves of the upper level."""
+def _no_primitives() -> Geometry:
+    """Return a geometry without primitives."""
     none = torch.zeros(3, 0)
     return Geometry(none, none, none, (0, 0, 0, 0, 0))
 
 
-def _meshes(meshes: list[Geometry]) -> tuple[list[WideTree], list[RefitState], np.ndarray]:
-    """Build the trees of all meshes in one buffer; return the trees, their topologies and the buffer."""
+def _build_lower_level(meshes: list[Geometry]) -> tuple[list[WideTree], list[RefitState], np.ndarray]:
+    """Build the trees of all meshes in one buffer; return the trees, the states for their refits, and the buffer."""
     built = [mesh_tree(mesh) for mesh in meshes]
-    lines = [line_count(tree, mesh.counts) for (tree, _, _), mesh in zip(built, meshes, strict=True)]
-    lines = np.cumsum([0, *lines]).tolist()
-    memory = aligned_buffer(lines[-1] * LINE)
-    for (tree, planes, non_triangles), mesh, line in zip(built, meshes, lines[:-1], strict=True):
+    sizes = [line_count(tree, mesh.counts) for (tree, _, _), mesh in zip(built, meshes, strict=True)]
+    *first_lines, all_lines = np.cumsum([0, *sizes]).tolist()
+    memory = aligned_buffer(all_lines * LINE)
+    for (tree, planes, non_triangles), mesh, line in zip(built, meshes, first_lines, strict=True):
         write_tree(tree, mesh, planes, non_triangles, line, memory)
     trees = [tree for tree, _, _ in built]
-    return trees, [RefitState(*args) for args in zip(trees, meshes, lines[:-1], strict=True)], memory
+    return trees, [RefitState(*args) for args in zip(trees, meshes, first_lines, strict=True)], memory
 
 
 def instance_words(tables: tuple[np.ndarray, ...], stack_length: int) -> np.ndarray:
