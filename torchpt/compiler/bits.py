@@ -1,4 +1,4 @@
-"""Bit reversal as one LLVM intrinsic; in tensor operations it takes twenty-five."""
+"""Bit reversal in kernels, by one LLVM intrinsic. Torch has no operator for it; by shifts and masks it takes twenty-five."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Build LLVM IR text, one instruction a line, for values of one lane or of a vector of lanes."""
+"""Build LLVM IR text, one instruction a line, for values of one lane or of a vector of lanes.
+
+A value is given by the name of its LLVM register, such as ``%v12``, or by a constant in LLVM's syntax. A *node type* ``ty`` is
+one letter (:mod:`torchpt.compiler.graph`), an *element* an LLVM type such as ``float``.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,7 @@ __all__ = ["ELEMENTS", "Block"]
 
 #: LLVM type of a register, by node type.
 ELEMENTS = {"f": "float", "d": "double", "i": "i32", "l": "i32", "u": "i32", "L": "i64", "b": "i1"}
+#: How LLVM writes a type in the names of its intrinsics.
 _SUFFIX = {"float": "f32", "double": "f64", "i32": "i32", "i64": "i64", "i1": "i1", "i8": "i8"}
 
 
@@ -84,7 +89,7 @@ class Block:
         return (f"v{self.width}" if self.width > 1 else "") + _SUFFIX[element]
 
     def numbers(self) -> str:
-        """Return the int32 constant 0, 1, 2, ..., one number a lane."""
+        """Return the int32 constant 0, 1, 2, ..., one number for each lane of a value."""
         return f"<{', '.join(f'i32 {k}' for k in range(self.width))}>" if self.width > 1 else "0"
 
     def places(self, first: str) -> str:
@@ -105,7 +110,7 @@ class Block:
         return self.op(f"shufflevector {vector} {one}, {vector} poison, {self.each('i32')} zeroinitializer")
 
     def some(self, mask: str) -> str:
-        """Return an i1: the mask is set in any lane."""
+        """Return an i1 that is true if the mask is set in any lane."""
         if self.width == 1:
             return mask
         bits = self.op(f"bitcast {self.each('i1')} {mask} to i{self.width}")
@@ -114,12 +119,15 @@ class Block:
     # -- arithmetic
 
     def call(self, function: str, ty: str, *arguments: str, result: str | None = None) -> str:
-        """Call an intrinsic such as ``llvm.fabs`` on values of type ``ty``; the type suffix is appended to its name."""
+        """Call an intrinsic such as ``llvm.fabs`` on values of type ``ty``; the suffix of the type is appended to its name.
+
+        ``result`` is the LLVM type of the result, if it is not that of the arguments.
+        """
         vector = self.vector(ty)
         name = f"{function}.{self.suffix(ELEMENTS[ty])}"
         self.declarations.add(f"declare {result or vector} @{name}({', '.join([vector] * len(arguments))})")
-        given = ", ".join(f"{vector} {a}" for a in arguments)
-        return self.op(f"call {result or vector} @{name}({given})")
+        typed = ", ".join(f"{vector} {a}" for a in arguments)
+        return self.op(f"call {result or vector} @{name}({typed})")
 
     def binary(self, op: str, ty: str, a: str, b: str) -> str:
         """Append an LLVM binary instruction, without fast-math flags: LLVM neither fuses nor reorders floats."""
@@ -167,7 +175,8 @@ class Block:
     def to_integer(self, source: str, target: str, a: str) -> str:
         """Round a float towards zero; NaN and numbers out of range give the least integer, the result of x86."""
         number = self.convert("fptosi", source, target, a)
-        if not self.form.threads:  # by x86 itself: LLVM leaves the result open, and freezes what the instruction gives
+        if not self.form.threads:
+            # For NaN and numbers out of range LLVM leaves the result open. `freeze` makes it the result of the instruction.
             return self.op(f"freeze {self.vector(target)} {number}")
         top = 2.0 ** (63 if target == "L" else 31)
         low, high = (self.compare(op, source, a, self.constant(source, x)) for op, x in (("oge", -top), ("olt", top)))
@@ -244,7 +253,7 @@ class Block:
     def masked_load(self, element: str, pointer: str, mask: str) -> str:
         """Load consecutive elements; 0 where the mask is not set."""
         if self.width == 1:  # a loop over single lanes ends at the last lane, and threads beyond it load that one again
-            return self.load(element, pointer, False)
+            return self.load(element, pointer, invariant=False)
         vector, suffix = self.each(element), self.suffix(element)
         name = f"llvm.masked.load.{suffix}.p0"
         self.declarations.add(f"declare {vector} @{name}(ptr, i32, {self.each('i1')}, {vector})")

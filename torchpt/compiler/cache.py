@@ -1,4 +1,8 @@
-"""Caches of compiled programs: in memory by the structure of a stage's arguments, on disk by content."""
+"""Caches of compiled programs: in memory by the structure of a stage's arguments, on disk by content.
+
+The *structure* of arguments is all that a trace depends on except for the values of tensors: names, dtypes, shapes, and all
+values that are not tensors.
+"""
 
 from __future__ import annotations
 
@@ -31,15 +35,16 @@ __all__ = ["MOST_PROGRAMS", "cache_key", "clear_programs", "compile_stage", "loa
 # JSON without code: operators are looked up by name in torch.ops.aten.
 
 
-#: Elements of the largest constant of a program that is written to disk.
-_MOST = 1 << 16
+#: Elements of the largest constant of a program that is written to disk; programs with larger ones are traced in each process.
+_MOST_ELEMENTS = 1 << 16
 #: Packages whose classes enter a key by name: the key already holds the versions of these packages.
 _LIBRARIES = ("torchpt", "torch", "builtins")
+#: Attributes of a program that JSON takes as they are.
 _PLAIN = ("uniforms", "lists", "counters", "tensors", "results", "shadows", "nodes", "sums")
 
 
-class _NotKept(Exception):
-    """A value that cannot be stored in an entry."""
+class _NotStorable(Exception):
+    """An error: a value cannot be stored in an entry."""
 
 
 def cache_key(structure: Any, target: Target | None = None) -> str | None:
@@ -49,12 +54,13 @@ def cache_key(structure: Any, target: Target | None = None) -> str | None:
     """
     try:
         content = "\n".join((code_of_folder(), torch.__version__, cpu.identity(target), _canonical(structure)))
-    except _NotKept:
+    except _NotStorable:
         return None
     return hashlib.sha256(content.encode()).hexdigest()
 
 
 def _canonical(value: Any) -> str:
+    """Return text that is equal for equal structures, in all processes."""
     if isinstance(value, tuple | list):
         return f"({','.join(map(_canonical, value))})"
     if value is None or isinstance(value, bool | int | float | str | torch.dtype):
@@ -63,101 +69,105 @@ def _canonical(value: Any) -> str:
         return f"{value.__module__}.{value.__qualname__}"  # the code of other packages may change under the same name
     if isinstance(value, bytes):
         return value.hex()
-    raise _NotKept
+    raise _NotStorable
 
 
 def load(key: str, target: Target | None = None) -> Program | None:
     """Load a program for a target (None: this machine) from disk; None if there is no usable entry."""
-    content = cache.read(f"{key[:40]}.json")
+    content = cache.read(f"{key[: cache.KEY_DIGITS]}.json")
     if content is None:
         return None
-    facts = json.loads(content)
-    function = cpu.load_function(facts["code"], target)
+    entry = json.loads(content)
+    function = cpu.load_function(entry["code"], target)
     if function is None:
         return None
     return Program(
         function=function,
-        tables=tuple(Table(_source(x), axis) for x, axis in facts["tables"]),
-        steps=tuple(_step(x) for x in facts["steps"]),
-        constants=tuple(_tensor(x) for x in facts["constants"]),
-        guards=tuple(Guard(_source(x), value) for x, value in facts["guards"]),
-        **{name: _frozen(facts[name]) for name in _PLAIN},
+        tables=tuple(Table(_source_from_json(source), axis) for source, axis in entry["tables"]),
+        steps=tuple(_step_from_json(step) for step in entry["steps"]),
+        constants=tuple(_tensor_from_json(tensor) for tensor in entry["constants"]),
+        guards=tuple(Guard(_source_from_json(source), value) for source, value in entry["guards"]),
+        **{name: _tuple_if_list(entry[name]) for name in _PLAIN},
     )
 
 
 def store(key: str, program: Program) -> None:
     """Write a program to disk, unless it holds values that cannot be stored."""
     try:
-        facts = {
+        entry = {
             "code": program.code,
-            "tables": [[_source_out(t.source), t.axis] for t in program.tables],
-            "steps": [[str(s.function), _out(s.args), _out(s.kwargs)] for s in program.steps],
-            "constants": [_tensor_out(t) for t in program.constants],
-            "guards": [[_source_out(g.source), g.value] for g in program.guards],
+            "tables": [[_source_to_json(table.source), table.axis] for table in program.tables],
+            "steps": [[str(step.function), _to_json(step.args), _to_json(step.kwargs)] for step in program.steps],
+            "constants": [_tensor_to_json(tensor) for tensor in program.constants],
+            "guards": [[_source_to_json(guard.source), guard.value] for guard in program.guards],
             **{name: getattr(program, name) for name in _PLAIN},
         }
-    except _NotKept:
+    except _NotStorable:
         return
-    cache.write(f"{key[:40]}.json", json.dumps(facts).encode())
+    cache.write(f"{key[: cache.KEY_DIGITS]}.json", json.dumps(entry).encode())
 
 
-def _frozen(value: Any) -> Any:
+def _tuple_if_list(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _source_out(source: Source) -> list[Any]:
+def _source_to_json(source: Source) -> list[Any]:
     return [source.kind, source.name, source.item]
 
 
-def _source(value: list[Any]) -> Source:
-    return Source(*value)
+def _source_from_json(value: list[Any]) -> Source:
+    kind, name, item = value
+    return Source(kind, name, item)
 
 
-def _tensor_out(tensor: Tensor) -> list[Any]:
-    if tensor.numel() > _MOST or tensor.requires_grad or tensor.dtype not in DTYPES:
-        raise _NotKept
+def _tensor_to_json(tensor: Tensor) -> list[Any]:
+    if tensor.numel() > _MOST_ELEMENTS or tensor.requires_grad or tensor.dtype not in DTYPES:
+        raise _NotStorable
     data = base64.b64encode(tensor.detach().contiguous().numpy().tobytes()).decode()
     return [str(tensor.dtype).removeprefix("torch."), list(tensor.shape), data]
 
 
-def _tensor(value: list[Any]) -> Tensor:
+def _tensor_from_json(value: list[Any]) -> Tensor:
     name, shape, data = value
     return torch.from_numpy(np.frombuffer(base64.b64decode(data), name).reshape(shape).copy())
 
 
-def _out(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
+    """Return an argument of a step as JSON; what JSON has no type for becomes an object with one key, the kind of value."""
     if isinstance(value, Source):
-        return {"source": _source_out(value)}
+        return {"source": _source_to_json(value)}
     if isinstance(value, torch.dtype | torch.device | torch.layout | torch.memory_format):
         return {type(value).__name__: str(value).removeprefix("torch.")}
     if isinstance(value, dict):
-        return {"dict": {name: _out(item) for name, item in value.items()}}
+        return {"dict": {name: _to_json(item) for name, item in value.items()}}
     if isinstance(value, tuple | list):
-        return [_out(item) for item in value]
+        return [_to_json(item) for item in value]
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    raise _NotKept
+    raise _NotStorable
 
 
-def _in(value: Any) -> Any:
+def _from_json(value: Any) -> Any:
+    """Return the argument that :func:`_to_json` has written."""
     if isinstance(value, list):
-        return [_in(item) for item in value]
+        return [_from_json(item) for item in value]
     if not isinstance(value, dict):
         return value
     ((kind, content),) = value.items()
     if kind == "source":
-        return _source(content)
+        return _source_from_json(content)
     if kind == "dict":
-        return {name: _in(item) for name, item in content.items()}
+        return {name: _from_json(item) for name, item in content.items()}
     return torch.device(content) if kind == "device" else getattr(torch, content)
 
 
-def _step(value: list[Any]) -> Step:
+def _step_from_json(value: list[Any]) -> Step:
     name, args, kwargs = value
-    space, operator, overload = name.split(".")
-    if space != "aten":
+    namespace, operator, overload = name.split(".")
+    if namespace != "aten":
         raise ValueError(f"{name} is none of torch's operators")
-    return Step(getattr(getattr(torch.ops.aten, operator), overload), tuple(_in(args)), _in(kwargs))
+    function = getattr(getattr(torch.ops.aten, operator), overload)
+    return Step(function, tuple(_from_json(args)), _from_json(kwargs))
 
 
 # ---- Programs in memory: each is loaded from disk, or traced and compiled, once for all tensors of one structure
@@ -171,14 +181,14 @@ _tracing = threading.Lock()
 
 
 def program_of(
-    structure: Any, tensors: Mapping[str, Tensor], traced: Callable[[], TracedStage], target: Target | None = None
+    structure: Any, tensors: Mapping[str, Tensor], trace: Callable[[], TracedStage], target: Target | None = None
 ) -> Program:
     """Return the program of a structure: from memory, from disk, or traced and compiled now.
 
     Args:
         structure: all that a trace depends on, except for the values of tensors; hashable.
         tensors: the leaves by path; a trace may depend on their values, and then has guards.
-        traced: traces the stage.
+        trace: traces the stage.
         target: machine to compile for; None: this one.
 
     Raises:
@@ -187,14 +197,14 @@ def program_of(
     with _tracing:  # one at a time in a process: see torchpt.compiler.tracing.tracing
         key = structure, target
         program = _programs.get(key)
-        name = cache_key(structure, target) if program is None else None
-        if program is None and name is not None:
-            program = load(name, target)
+        disk_key = cache_key(structure, target) if program is None else None
+        if program is None and disk_key is not None:
+            program = load(disk_key, target)
         if program is None or not guards_hold(program, tensors):
-            program = compile_stage(traced(), target)
-            if name is not None:
-                store(name, program)
-        if _programs.get(key) is not program:
+            program = compile_stage(trace(), target)
+            if disk_key is not None:
+                store(disk_key, program)
+        if _programs.get(key) is not program:  # put last, as the newest
             _programs.pop(key, None)
             _programs[key] = program
             if len(_programs) > MOST_PROGRAMS:

@@ -1,4 +1,11 @@
-"""Generate LLVM instructions for the nodes of a graph."""
+"""Generate LLVM instructions for the nodes of a graph.
+
+:func:`generate_node` calls the handler of the node's operation: ``handler(block, ty, *values, extra)``. ``ty`` is the node's
+type (:mod:`torchpt.compiler.graph`), ``values`` are the LLVM registers of its arguments, ``extra`` are its constants, if it has
+any; a handler returns the register of the result. ``block.op(text)`` appends an instruction and returns its register,
+``block.each("i32")`` is the LLVM type of one i32 a lane, ``block.vector(ty)`` that of a value of type ``ty``. Names of
+registers such as ``%table0`` are those that :mod:`torchpt.compiler.kernel` loads.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +21,7 @@ __all__ = ["MEMORY", "LoopBody", "generate_node"]
 #: LLVM type of an element in tables and in the arena, by node type; see :func:`torchpt.compiler.program.bind_tables`.
 MEMORY = {"f": "float", "d": "double", "i": "i32", "l": "i32", "L": "i32", "u": "i32", "b": "i32"}
 
+#: LLVM's predicates of a comparison: of floats, and of signed integers. NaN compares as in torch.
 _COMPARISONS = {
     "gt": ("ogt", "sgt"),
     "lt": ("olt", "slt"),
@@ -28,7 +36,7 @@ class LoopBody(Block):
     """A builder for the body of a kernel's loop.
 
     Attributes:
-        listed: lanes are read at the indices of a list; False: all lanes in order.
+        listed: True: lanes are read at the indices of a list; False: all lanes in order.
         products: the product that is fused into each sum, both as nodes; see :func:`torchpt.compiler.fusing.fused_products`.
     """
 
@@ -82,6 +90,7 @@ _CARRIES = ("add", "sub", "mul", "shl", "neg", "xor", "floordiv", "truncdiv", "r
 
 
 def _byte(block: Block, a: str) -> str:
+    """Keep the lowest eight bits of a uint8 held in 32 bits."""
     return block.binary("and", "u", a, block.constant("u", 255))
 
 
@@ -111,6 +120,8 @@ def _cast(block: Block, source: str, target: str, a: str) -> str:
 
 
 def _arithmetic(op: str) -> Callable[..., str]:
+    """Return the handler of a sum, difference or product; of booleans, as in torch, ``or`` and for products ``and``."""
+
     def handler(block: Block, ty: str, a: str, b: str) -> str:
         if ty == "b":
             return block.op(f"{'and' if op == 'mul' else 'or'} {block.each('i1')} {a}, {b}")
@@ -163,7 +174,10 @@ def _sign(block: Block, ty: str, a: str) -> str:
 
 
 def _quotient(block: Block, ty: str, a: str, b: str, rounding: str) -> str:
-    """Divide 32-bit integers in float64, which is exact: CPUs have no integer division of vectors."""
+    """Divide 32-bit integers, with LLVM's ``rounding`` (floor, trunc).
+
+    The division is done in float64, where it is exact after rounding, as CPUs have no integer division of vectors.
+    """
     x, y = (block.convert("sitofp", ty, "d", v) for v in (a, b))
     q = block.call(f"llvm.{rounding}", "d", block.div("d", x, y))
     return block.to_integer("d", ty, q)
@@ -268,7 +282,7 @@ def _from_memory(block: Block, ty: str, stored: str) -> str:
 
 
 def _scalar(block: Block, ty: str, pointer: str, place: int) -> str:
-    """Load one element and broadcast it to all lanes."""
+    """Load element ``place`` of a table or uniform and broadcast it to all lanes."""
     value = block.load(MEMORY[ty], block.at(pointer, MEMORY[ty], place))
     if ty == "b":
         value = block.op(f"trunc i32 {value} to i1")
@@ -278,32 +292,40 @@ def _scalar(block: Block, ty: str, pointer: str, place: int) -> str:
 
 
 def _search(block: Block, ty: str, value: str, extra: tuple[int, str, bool]) -> str:
-    """Count the entries of a sorted table that are below a value (``right``: not above it), by a call of a binary search."""
-    table, element, right = extra
-    name = f"@sorted_{element}_{'right' if right else 'left'}"
-    vector = block.vector(element)
+    """Count the entries of a sorted table that are below a value (``right``: not above it), by a call of a binary search.
+
+    ``extra`` is the number of the table, its node type, and ``right``.
+    """
+    table, table_ty, right = extra
+    name = f"@sorted_{table_ty}_{'right' if right else 'left'}"
+    vector = block.vector(table_ty)
     return block.op(f"call {block.each('i32')} {name}(ptr %table{table}, i64 %count{table}, {vector} {value})")
 
 
-def _occluded(block: Block, ty: str, *a: str) -> str:
-    given = ", ".join(f"{block.each('float')} {x}" for x in a)
-    return block.op(f"call {block.each('i1')} @occluded({given}, ptr %search)")
+def _occluded(block: Block, ty: str, *ray: str) -> str:
+    """Test a ray, the values o, d (three components each) and t_max, for any hit (:mod:`torchpt.compiler.packet`)."""
+    typed = ", ".join(f"{block.each('float')} {x}" for x in ray)
+    return block.op(f"call {block.each('i1')} @occluded({typed}, ptr %search)")
 
 
-def _nearest(block: Block, ty: str, *a: str) -> str:
-    given = ", ".join(f"{block.each('float')} {x}" for x in a)
-    return block.op(f"call {{{_hit(block)}}} @nearest({given}, ptr %search)")
+def _nearest(block: Block, ty: str, *ray: str) -> str:
+    """Find the nearest hit of a ray, as a struct of t, prim, u, v; arguments as for :func:`_occluded`."""
+    typed = ", ".join(f"{block.each('float')} {x}" for x in ray)
+    return block.op(f"call {{{_hit(block)}}} @nearest({typed}, ptr %search)")
 
 
 def _hit(block: Block) -> str:
+    """Return the LLVM types of t, prim, u, v."""
     return ", ".join(map(block.each, ("float", "i32", "float", "float")))
 
 
 def _part(block: Block, ty: str, a: str, extra: int) -> str:
+    """Take element ``extra`` of the result of :func:`_nearest`."""
     return block.op(f"extractvalue {{{_hit(block)}}} {a}, {extra}")
 
 
 def _iota(block: Block, ty: str) -> str:
+    """Return the number of the lane in this call of the kernel."""
     places = block.places("%i")
     return block.convert("sext", "i", "L", places) if ty == "L" else _cast(block, "i", ty, places)
 
@@ -314,7 +336,7 @@ def _place(block: LoopBody, ty: str) -> str:
 
 
 def _arena(block: LoopBody, ty: str, extra: int) -> str:
-    """Load a row of the arena at the lane's index."""
+    """Load row ``extra`` of the source arena at the lane's index."""
     element = MEMORY[ty]
     if block.listed:
         stored = block.gather(element, f"%row{extra}", "%place")
@@ -324,7 +346,7 @@ def _arena(block: LoopBody, ty: str, extra: int) -> str:
 
 
 def _slot(block: Block, ty: str, place: str, extra: int) -> str:
-    """Load a row of the slots at an index."""
+    """Load row ``extra`` of the slots at index ``place``."""
     element = MEMORY[ty]
     start = block.at("%slots", element, block.op(f"mul i64 %stride, {extra}")) if extra else "%slots"
     # The index comes from the arena, whose rows hold any number behind the last lane.
@@ -332,7 +354,7 @@ def _slot(block: Block, ty: str, place: str, extra: int) -> str:
 
 
 def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
-    """Load row ``k`` of an input tensor at the lane's number."""
+    """Load row ``k`` of input tensor ``slot`` at the lane's number; ``%in0s`` is the length of the rows of ``%in0``."""
     slot, k = extra
     element = {"l": "i64", "L": "i64", "b": "i8", "u": "i8"}.get(ty, ELEMENTS[ty])
     size = {"i64": 8, "double": 8, "i8": 1}.get(element, 4)
@@ -345,6 +367,8 @@ def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
     return block.op(f"zext {block.each('i8')} {stored} to {block.each('i32')}") if ty == "u" else stored
 
 
+#: The handler of each operation. `extra` of those that have it: gather (table, numbers an entry, component), element (table,
+#: index), uniform (uniform, index), search (table, its type, right), part (index), arena and slot (row), tensor (tensor, row).
 _HANDLERS: dict[str, Callable[..., str]] = {
     "bitreverse": lambda block, ty, a: block.call("llvm.bitreverse", ty, a),
     "add": _arithmetic("add"),

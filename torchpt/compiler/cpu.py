@@ -1,6 +1,6 @@
 """Compile LLVM IR by llvmlite: to machine code of this CPU that can be called, or to code for another machine.
 
-Code is cached in memory and on disk, by the IR, the target and the version of llvmlite.
+Code is cached in memory and on disk; its key is a hash of the IR, the target and the version of llvmlite.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ __all__ = [
 #: Part of every key: raised when compilation changes, so that older entries are not read.
 _VERSION = "5"
 _lock = threading.Lock()
-_state: dict[str, Any] = {"compiled": 0, "loaded": 0}
-_functions: dict[str, Function] = {}
-_machines: dict[Target, Any] = {}
+_state: dict[str, Any] = {"compiled": 0, "loaded": 0}  # counters for `counts`, and the target of this machine
+_functions: dict[str, Function] = {}  # by key
+_machines: dict[Target, Any] = {}  # LLVM's target machines
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def compile_ir(ir: str, target: Target | None = None) -> Function:
         function = _functions.get(key)
         if function is None:
             code = cache.read(_entry(key, target))
-            check_address_space()  # LLVM ends the process where it finds no memory
+            check_address_space()  # LLVM ends the process if it gets no memory
             if code is None:
                 code = emit_ptx(machine.llvm(), ir, target) if target.form.threads else _object(ir, target)
                 _state["compiled"] += 1
@@ -96,22 +96,22 @@ def load_function(key: str, target: Target | None = None) -> Function | None:
 
 def identity(target: Target | None = None) -> str:
     """Return text that identifies compiler and target (None: this machine), as part of cache keys."""
-    return _named(target or host())
+    return _identity(target or host())
 
 
 def _entry(key: str, target: Target) -> str:
-    """Return the name of the cache's entry."""
-    return f"{key[:40]}.{'ptx' if target.form.threads else 'o'}"
+    """Return the name of the entry on disk."""
+    return f"{key[: cache.KEY_DIGITS]}.{'ptx' if target.form.threads else 'o'}"
 
 
-def _named(target: Target) -> str:
+def _identity(target: Target) -> str:
     import llvmlite
 
     return "\n".join((_VERSION, llvmlite.__version__, repr(target)))
 
 
 def _key(ir: str, target: Target) -> str:
-    return hashlib.sha256(f"{_named(target)}\n{ir}".encode()).hexdigest()
+    return hashlib.sha256(f"{_identity(target)}\n{ir}".encode()).hexdigest()
 
 
 def _machine(target: Target) -> Any:
@@ -121,6 +121,7 @@ def _machine(target: Target) -> Any:
 
 
 def _new_machine(target: Target) -> Any:
+    """Return LLVM's target machine; ``jit`` suits code that is loaded into this process, so it is for this machine only."""
     llvm = machine.llvm()
     if target.triple is not None:
         llvm.initialize_all_targets()
@@ -149,8 +150,8 @@ def _object(ir: str, target: Target) -> bytes:
 
 
 def _loaded(code: bytes, target: Target, key: str) -> Function:
-    if target.triple is not None:
-        return Function(None, code, None, key)  # for another machine: cannot be called here
-    engine, address_of = machine.load_object(code)
-    call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)(address_of("kernel"))
+    if target.triple is not None:  # code for another machine cannot be called here
+        return Function(call=None, code=code, engine=None, key=key)
+    engine, address_of_function = machine.load_object(code)
+    call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)(address_of_function("kernel"))
     return Function(call, code, engine, key)

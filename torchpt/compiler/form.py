@@ -1,4 +1,8 @@
-"""The form of a kernel: lanes in a register, elements in a row of the arena, and how lanes are divided among threads."""
+"""The form of a kernel: lanes in a register, elements in a row of an arena, and how lanes are divided among threads.
+
+An *arena* is the memory of one worker in which path states lie between kernels, component by component: a *row* holds one
+component of all lanes, as 32-bit elements. Stages do not depend on the form, only the generation of LLVM IR does.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +11,8 @@ from dataclasses import dataclass
 __all__ = ["CAPACITY", "SCALAR", "THREADS", "VECTORS", "WARP", "Form"]
 
 
-# ---- Path states between kernels: an *arena* has a row of 32-bit elements for each component of the path state
-
-
-#: Elements of a row: lanes (a multiple of 16) and one vector of padding, as kernels write whole vectors.
+#: Elements of a row of a CPU's arenas: at most 2^14 lanes, and one vector of padding, as kernels write whole vectors.
 CAPACITY = 16384 + 16
-
-
-# ---- The form of a kernel. Stages do not depend on it, only the generation of LLVM IR does
-
-
 #: Threads of a warp on NVIDIA GPUs.
 WARP = 32
 
@@ -25,13 +21,13 @@ WARP = 32
 class Form:
     """The layout of lanes in a kernel.
 
-    Results have the same bits in any form: the graph decides which products and sums are fused
-    (:mod:`torchpt.compiler.fusing`), and each lane is computed by the same operations.
+    Results have the same bits in any form: each lane is computed by the same operations, and which products and sums become
+    fused multiply-adds is decided in the graph (:mod:`torchpt.compiler.fusing`).
 
     A CPU kernel is ``kernel(ptr arguments, i64 lanes)`` and computes lanes 0 to ``lanes - 1`` in order. ``arguments`` is the
-    address of a block of 64-bit words: the words of :data:`torchpt.compiler.kernel.HEAD`, the address of each uniform, the
-    address of each list, and address and row length of each input tensor and then of each result tensor
-    (:func:`torchpt.compiler.kernel.argument_words`).
+    address of a block of 64-bit words: the words of :data:`torchpt.compiler.kernel.HEAD`, the address of each *uniform* (an
+    input that all lanes share), the address of each *list* of lane indices, and address and row length of each input tensor
+    and then of each result tensor (:func:`torchpt.compiler.kernel.argument_words`).
 
     A GPU kernel (``threads``) is ``kernel(block arguments, ptr lanes)``, in PTX an entry with two parameters:
 
@@ -48,7 +44,7 @@ class Form:
     Attributes:
         width: lanes of a value; a value is an LLVM vector if there is more than one, else a scalar.
         row: elements from one row of an arena to the next.
-        threads: True: each lane is computed by a GPU thread; False: a loop of one CPU thread takes ``width`` lanes at a time.
+        threads: True: GPU threads compute one lane each; False: a loop of one CPU thread takes ``width`` lanes at a time.
     """
 
     width: int
@@ -56,9 +52,9 @@ class Form:
     threads: bool = False
 
 
-#: The form of CPU kernels. LLVM splits the vectors on machines with narrower registers.
-VECTORS = Form(16)
+#: The form of CPU kernels: 16 float32 fill a register of AVX-512. LLVM splits the vectors for narrower registers.
+VECTORS = Form(width=16)
 #: One lane at a time on a CPU.
-SCALAR = Form(1)
-#: One lane a GPU thread, here with the rows of CPU arenas; see :class:`Form` for the calling convention.
-THREADS = Form(1, threads=True)
+SCALAR = Form(width=1)
+#: One lane a GPU thread, here with the row length of CPU arenas; see :class:`Form` for the calling convention.
+THREADS = Form(width=1, threads=True)

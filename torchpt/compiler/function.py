@@ -1,7 +1,7 @@
 """Compile functions of tensors that work lane by lane, for calls outside of traced stages.
 
-:class:`Lanewise` compiles a function for the arguments of each call and caches the kernels; :func:`compile_lanewise` compiles a
-function at once.
+The lanes are the last axis of tensors. :class:`Lanewise` compiles a function when it is first called with arguments of a
+structure, and caches the kernels; :func:`compile_lanewise` compiles a function at once.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ __all__ = ["Lanewise", "compile_lanewise"]
 BLOCK = 64
 #: Operations times lanes that are worth another thread: about 50 microseconds.
 GRAIN = 3_000_000
-#: Most structures of arguments that are kept for one function.
-_MOST = 32
-#: Number of the word of a kernel's arguments that holds the address of the tables.
+#: Most structures of arguments for which kernels of one function are kept.
+_MOST_STRUCTURES = 32
+#: Index of the address of the tables among the words of a kernel's arguments.
 _TABLES = HEAD.index("tables")
 
 
@@ -43,7 +43,7 @@ class Lanewise:
     """A compiled function of tensors ``(..., N)``, each lane of whose results depends on the same lane of the arguments.
 
     The function is traced and compiled once for each structure of arguments: dtypes, shapes except for N, and all values that
-    are not in tensors. A call returns NotImplemented where the function itself has to be called: for tensors on other devices
+    are not in tensors. A call returns NotImplemented if the caller has to run the function itself: for tensors on other devices
     or with gradients, for N = 0, while a stage is traced, and for code that the lane compiler cannot compile.
 
     Args:
@@ -51,7 +51,7 @@ class Lanewise:
         lanes: names of the parameters that are tensors ``(..., N)`` or None.
         uniforms: names of the parameters that are small tensors whose values change from call to call. Tensors in all other
             parameters are tables: they are copied to the layout of kernels again when they change.
-        detached: results have no derivatives, so tensors that require gradients are accepted.
+        detached: True: results have no derivatives, so tensors that require gradients are accepted.
 
     Attributes:
         refused: the message of :class:`Unsupported`, by the structure of arguments that could not be compiled.
@@ -90,7 +90,7 @@ class Lanewise:
                 records.append(value)
                 structure.append(signature(value))
                 continue
-            if self._unfit(value):
+            if self._is_unreadable(value):
                 return NotImplemented
             if kind == "uniform":
                 uniforms.append(value)
@@ -105,59 +105,61 @@ class Lanewise:
         if count < 1 or key in self.refused:
             return NotImplemented
         tables = leaves(records)
-        made = self._made.get(key)
-        if made is None or not made.is_current(tables):
-            if any(map(self._unfit, tables)):
+        compiled = self._made.get(key)
+        if compiled is None or not compiled.is_current(tables):
+            if any(map(self._is_unreadable, tables)):
                 return NotImplemented
             compile_time.begin()
             try:
-                made = self._make(key, args, tables)
+                compiled = self._make(key, args, tables)
             except Unsupported as error:
                 self.refused[key] = str(error)
                 return NotImplemented
             finally:
                 compile_time.end()
-        return made.run(inputs, uniforms, count, thread_count(None))
+        return compiled.run(inputs, uniforms, count, thread_count(None))
 
-    def _unfit(self, tensor: Tensor) -> bool:
+    def _is_unreadable(self, tensor: Tensor) -> bool:
         """Return True for a tensor that kernels cannot read."""
         return tensor.device.type != "cpu" or (tensor.requires_grad and not self._detached)
 
     def _make(self, key: tuple[Any, ...], args: Sequence[Any], tables: list[Tensor]) -> _CompiledFunction:
         """Return the compiled function for arguments of this structure, with these tables, and cache it."""
-        paths = {str(k): table for k, table in enumerate(tables)}  # tables have no names here: their numbers
+        paths = {
+            str(k): table for k, table in enumerate(tables)
+        }  # tables have no paths here, so their numbers are used
         program_key = self._name, tuple(self._kinds), key
-        program = cache.program_of(program_key, paths, lambda: self._traced(args, paths))
+        program = cache.program_of(program_key, paths, trace=lambda: self._trace(args, paths))
         states = [(table, _version(table)) for table in tables]
-        before = self._made.get(key)  # with tables that have changed since
-        results = self._results(args) if before is None else before.results
-        made = _CompiledFunction(
+        before = self._made.get(key)  # compiled for the same structure, with tables that have changed since
+        results = self._results_of_no_lanes(args) if before is None else before.results
+        compiled = _CompiledFunction(
             program, bind_tables(program.tables, program.steps, program.constants, paths), states, results
         )
-        if before is None and len(self._made) >= _MOST:
+        if before is None and len(self._made) >= _MOST_STRUCTURES:
             self._made.pop(next(iter(self._made)), None)
-        self._made[key] = made
-        return made
+        self._made[key] = compiled
+        return compiled
 
-    def _changed(
+    def _with_tensors_replaced(
         self, args: Sequence[Any], lane: Callable[[Tensor], Tensor], uniform: Callable[[Tensor], Tensor]
     ) -> Any:
-        """Return the arguments with ``lane`` and ``uniform`` applied to their tensors."""
-        change = {"lane": lane, "uniform": uniform}
+        """Return the arguments, with ``lane`` applied to the tensors of lanes and ``uniform`` to the small tensors."""
+        replace = {"lane": lane, "uniform": uniform}
         return [
-            change[kind](value) if kind != "table" and isinstance(value, Tensor) else value
+            replace[kind](value) if kind != "table" and isinstance(value, Tensor) else value
             for kind, value in zip(self._kinds, args, strict=True)
         ]
 
-    def _results(self, args: Sequence[Any]) -> Tensor | tuple[Tensor, ...]:
+    def _results_of_no_lanes(self, args: Sequence[Any]) -> Tensor | tuple[Tensor, ...]:
         """Return the results for no lanes, which have the number, dtypes and shapes of the real ones."""
         with torch.no_grad():
-            return self._function(*self._changed(args, lambda x: x[..., :0], lambda x: x))
+            return self._function(*self._with_tensors_replaced(args, lambda x: x[..., :0], lambda x: x))
 
-    def _traced(self, args: Sequence[Any], paths: dict[str, Tensor]) -> TracedStage:
-        """Trace the function on example lanes of these arguments."""
+    def _trace(self, args: Sequence[Any], paths: dict[str, Tensor]) -> TracedStage:
+        """Trace the function on example lanes of these arguments; ``paths`` has the tables by their path."""
         # The tracer knows the axis of the lanes by its length, so no other axis of an argument may have that length.
-        without_lanes = self._changed(args, lambda x: x[..., 0], lambda x: x)
+        without_lanes = self._with_tensors_replaced(args, lambda x: x[..., 0], lambda x: x)
         lanes = choose_lane_count(leaves(without_lanes))
         tracer = Tracer(lanes, {id(table): (path, table) for path, table in paths.items()})
         slots = 0  # inputs so far
@@ -165,13 +167,13 @@ class Lanewise:
         def lane(x: Tensor) -> Tensor:
             nonlocal slots
             slots += 1
-            return _input(tracer, slots - 1, _sample(x, lanes))
+            return _input(tracer, slots - 1, _example_lanes(x, lanes))
 
-        given = self._changed(args, lane, lambda x: tracer.uniform(x.clone()))
+        inputs = self._with_tensors_replaced(args, lane, lambda x: tracer.uniform(x.clone()))
         with torch.no_grad(), tracer:
-            results = self._function(*given)
+            results = self._function(*inputs)
         stores = _stores(tracer, [results] if isinstance(results, Tensor) else results)
-        # Threads call kernels for a range of lanes, which kernels number from 0.
+        # Each thread calls the kernel for some of the lanes, which it numbers from 0: the number within all is not known.
         if any(op == "iota" for op, *_ in tracer.graph.nodes):
             raise Unsupported("a use of the lane's own number")
         tables, steps, guards = without_unused_steps(tracer.tables, tracer.steps, tracer.guards)
@@ -194,7 +196,7 @@ class _CompiledFunction:
         outputs: shape without lanes, and dtype, of each result.
         arguments: C type of the kernel's arguments: the words of :data:`HEAD`, an address for each uniform, address and row
             length for each input and output.
-        grain: least number of blocks that are worth another thread.
+        grain: fewest blocks that are worth another thread.
     """
 
     program: Program
@@ -203,19 +205,19 @@ class _CompiledFunction:
     results: Tensor | tuple[Tensor, ...]
 
     def __post_init__(self) -> None:
-        each = [self.results] if isinstance(self.results, Tensor) else self.results
-        self.outputs = [(x.shape[:-1], x.dtype) for x in each]
+        results = [self.results] if isinstance(self.results, Tensor) else self.results
+        self.outputs = [(x.shape[:-1], x.dtype) for x in results]
         self.arguments = ctypes.c_int64 * (
             len(HEAD) + len(self.program.uniforms) + 2 * (self.program.tensors + len(self.outputs))
         )
-        operations = max(self.program.nodes.values(), default=1)  # a lane
+        operations = max(self.program.nodes.values(), default=1)  # for each lane
         self.grain = max(GRAIN // operations // BLOCK, 1)
 
     def is_current(self, tables: list[Tensor]) -> bool:
         """Return True if the tables were made from these tensors in their present versions."""
         return all(
-            table is known and _version(table) == version
-            for table, (known, version) in zip(tables, self.states, strict=True)
+            table is used and _version(table) == version
+            for table, (used, version) in zip(tables, self.states, strict=True)
         )
 
     def run(self, inputs: Sequence[Tensor], uniforms: Sequence[Tensor], count: int, threads: int) -> Any:
@@ -225,18 +227,18 @@ class _CompiledFunction:
         head = [0] * len(HEAD)
         head[_TABLES] = self.tables.address
         head += [x.data_ptr() for x in uniforms]
-        rows = [(x.data_ptr(), x.element_size()) for x in (*inputs, *outputs)]
+        tensors = [(x.data_ptr(), x.element_size()) for x in (*inputs, *outputs)]
 
-        def part(first: int, last: int) -> None:  # blocks first .. last - 1
+        def run_blocks(first: int, last: int) -> None:  # blocks first .. last - 1
             start, end = first * BLOCK, min(last * BLOCK, count)
             words = head.copy()
-            for address, size in rows:
+            for address, size in tensors:
                 words += (address + start * size, count)
             arguments = self.arguments(*words)
             self.program.call(ctypes.addressof(arguments), end - start)
 
         blocks = -(-count // BLOCK)
-        parallel_for(part, blocks, min(threads, max(blocks // self.grain, 1)))
+        parallel_for(run_blocks, blocks, min(threads, max(blocks // self.grain, 1)))
         return outputs[0] if isinstance(self.results, Tensor) else tuple(outputs)
 
 
@@ -253,19 +255,19 @@ def compile_lanewise(
     Raises:
         Unsupported: the function does something that the lane compiler cannot compile.
     """
-    lanes = choose_lane_count([x[..., 0] for x in like if x.numel()])  # see Lanewise._traced
-    tracer = Tracer(lanes, {})
-    given = [_input(tracer, slot, _sample(x, lanes)) for slot, x in enumerate(like)]
+    lanes = choose_lane_count([x[..., 0] for x in like if x.numel()])  # see Lanewise._trace
+    tracer = Tracer(lanes, leaves={})
+    inputs = [_input(tracer, slot, _example_lanes(x, lanes)) for slot, x in enumerate(like)]
     with torch.no_grad(), tracer:
-        results = list(function(*given))
+        results = list(function(*inputs))
     sinks = Sinks(store=_stores(tracer, results))
-    stage = TracedStage(tracer.graph, sinks, tracer.tables, tracer.steps, tracer.constants, tensors=len(given))
-    tables = bind_tables(stage.tables, stage.steps, stage.constants, {})
+    stage = TracedStage(tracer.graph, sinks, tracer.tables, tracer.steps, tracer.constants, tensors=len(inputs))
+    tables = bind_tables(stage.tables, stage.steps, stage.constants, leaves={})
     program = cache.compile_stage(stage, target)
-    made = _CompiledFunction(program, tables, states=[], results=tuple(x[..., :0] for x in results))
+    compiled = _CompiledFunction(program, tables, states=[], results=tuple(x[..., :0] for x in results))
 
     def run(*arguments: Tensor) -> list[Tensor]:
-        return list(made.run(arguments, uniforms=(), count=arguments[0].shape[-1], threads=1))
+        return list(compiled.run(arguments, uniforms=(), count=arguments[0].shape[-1], threads=1))
 
     return run
 
@@ -282,11 +284,11 @@ def _stores(tracer: Tracer, results: Sequence[Tensor]) -> list[Store]:
 
 
 def _version(tensor: Tensor) -> object:
-    """Return the version of a tensor's content; inference tensors have none, so theirs is never equal to another."""
+    """Return the version of a tensor's content. Inference tensors have none: they get one that equals no other."""
     return object() if tensor.is_inference() else tensor._version
 
 
-def _sample(x: Tensor, lanes: int) -> Tensor:
+def _example_lanes(x: Tensor, lanes: int) -> Tensor:
     """Return the first ``lanes`` lanes of an argument, repeated if it has fewer."""
     columns = torch.arange(lanes) % max(x.shape[-1], 1)
     if not x.numel():

@@ -1,6 +1,6 @@
 """Choose the products and sums that become fused multiply-adds, in the graph instead of in LLVM.
 
-LLVM's own choice would depend on its version, on the vector width and on the machine.
+LLVM's own choice would depend on its version, on the vector width and on the machine, and results with it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ __all__ = ["fused_products"]
 
 
 def fused_products(graph: Graph, needed: list[int], roots: list[int]) -> dict[int, int]:
-    """Find for each sum or difference the product to fuse with it: the first term that is a product without other uses.
+    """Find for each sum or difference the product to fuse with it: its first term that is a product which nothing else uses.
 
     Args:
         graph: the graph of a stage.
@@ -27,11 +27,11 @@ def fused_products(graph: Graph, needed: list[int], roots: list[int]) -> dict[in
     for node in needed:
         _, _, terms, _ = graph.nodes[node]
         uses.update(terms)
-    found: dict[int, int] = {}
+    products: dict[int, int] = {}
     for node in needed:
         op, ty, terms, _ = graph.nodes[node]
         if op in ("add", "sub") and ty in FLOATS:
             product = next((x for x in terms if graph.nodes[x][0] == "mul" and uses[x] == 1), None)
             if product is not None:
-                found[node] = product
-    return found
+                products[node] = product
+    return products

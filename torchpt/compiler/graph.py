@@ -1,8 +1,10 @@
 """The graph of a stage: its nodes are scalar operations, each with one value a lane.
 
 Types are one letter: ``f`` float32, ``d`` float64, ``i`` int32, ``b`` bool, ``u`` uint8 held in 32 bits. Nodes of int64 tensors
-have one of two types: ``l`` for indices, which fit in 32 bits, and ``L`` for products, powers, shifts and conversions from
-int32 lanes, which may need all 64 bits. (LLVM narrows a product to 32 bits where it is used as an index.)
+have one of two types: ``l`` for indices, which fit in 32 bits and are held in 32, and ``L`` for products, powers, shifts and
+conversions from int32 lanes, which may need all 64 bits. (LLVM narrows a product to 32 bits where it is used as an index.)
+
+``codegen.py`` lists the operations in ``_HANDLERS``, with the meaning of ``extra`` for those that have it.
 """
 
 from __future__ import annotations
@@ -37,19 +39,21 @@ DTYPES = _Types(
         torch.uint8: "u",
     }
 )
+#: Types that are floats, and those that are integers.
 FLOATS, INTEGERS = "fd", "ilLu"
 #: Bytes of an element in tensors.
 BYTES = {"f": 4, "d": 8, "i": 4, "l": 8, "L": 8, "b": 1, "u": 1}
 
 
 class Graph:
-    """A list of unique nodes ``(op, type, arguments, extra)``.
+    """A list of unique nodes ``(op, type, arguments, extra)``; a node is referred to by its index in the list.
 
     Attributes:
-        nodes: all nodes; arguments come before their users.
-        origins: for each node the files of the package that created it first, innermost first.
+        nodes: all nodes; ``arguments`` are indices of nodes, which come before their users; ``extra`` holds the constants of
+            the operation, such as the row that it loads.
+        origins: for each node the package's files on the stack when it was created, innermost first.
         origin: the same for nodes that are added next.
-        derivatives: a backward pass is traced: sums over lanes become ``total`` nodes, and the sign of 0 is ignored.
+        derivatives: True if a backward pass is traced: sums over lanes become ``total`` nodes, and the sign of 0 is ignored.
     """
 
     def __init__(self) -> None:
@@ -78,11 +82,11 @@ class Graph:
         if ty in FLOATS:
             with np.errstate(over="ignore"):
                 value = float(np.float32(value) if ty == "f" else value)
-            return self.node("const", ty, extra=struct.pack("<d", value))  # by its bits: -0.0, NaN
+            return self.node("const", ty, extra=struct.pack("<d", value))  # as bits: 0.0 == -0.0, but NaN != NaN
         if ty == "b":
             return self.node("const", ty, extra=bool(value))
         value = int(value)
-        if ty == "i":
+        if ty == "i":  # wraps around, as int32 does
             value = (value + (1 << 31)) % (1 << 32) - (1 << 31)
         return self.node("const", ty, extra=value % 256 if ty == "u" else value)
 
@@ -101,7 +105,7 @@ class Graph:
         value = self.value(node)
         if value is not None and not (own in FLOATS and ty in INTEGERS and not math.isfinite(value)):
             return self.constant(ty, value != 0 if ty == "b" else value)
-        if own in "ilu" and ty in "il":
+        if own in "ilu" and ty in "il":  # the same 32 bits
             return self.node("retype", ty, node)
         return self.node("cast", ty, node)
 
@@ -109,9 +113,9 @@ class Graph:
         """Select ``yes`` in lanes where the condition holds, else ``no``; both have the same type."""
         if yes == no:
             return yes
-        known = self.value(condition)
-        if known is not None:
-            return yes if known else no
+        constant = self.value(condition)
+        if constant is not None:
+            return yes if constant else no
         return self.node("select", self.type(yes), condition, yes, no)
 
     def binary(self, op: str, ty: str, x: int, y: int) -> int:
@@ -132,13 +136,16 @@ class Graph:
                 for constant in (a, b):
                     if constant is not None and math.isnan(constant):
                         return self.constant(ty, constant)
-            top = 2.0**127 if ty == "f" else 2.0**1023
-            if op == "div" and b and abs(math.frexp(b)[0]) == 0.5 and 1.0 / top <= abs(b) and abs(1.0 / b) <= top:
-                return self.node("mul", ty, x, self.constant(ty, 1.0 / b))  # a power of two: exact
+            # A division by a power of two is a multiplication by its reciprocal, exactly, if both are normal numbers.
+            largest = 2.0**127 if ty == "f" else 2.0**1023  # the largest power of two
+            if op == "div" and b:
+                mantissa, _ = math.frexp(b)
+                if abs(mantissa) == 0.5 and 1.0 / largest <= abs(b) and abs(1.0 / b) <= largest:
+                    return self.node("mul", ty, x, self.constant(ty, 1.0 / b))
             if a is not None and b is not None and op in ("add", "sub", "mul"):
-                real = np.float32 if ty == "f" else np.float64
+                float_type = np.float32 if ty == "f" else np.float64
                 with np.errstate(all="ignore"):
-                    p, q = real(a), real(b)
+                    p, q = float_type(a), float_type(b)
                     return self.constant(ty, float(p + q if op == "add" else p - q if op == "sub" else p * q))
         return self.node(op, ty, x, y)
 

@@ -2,6 +2,10 @@
 
 A kernel reads lanes of one arena (:mod:`~torchpt.compiler.form`): all of them in order, or those at the indices of a list. Its
 sinks (:mod:`~torchpt.compiler.sinks`) say where results go, its form how it is called and which lanes an iteration takes.
+
+The IR is written as text. Values are the names of LLVM registers, such as ``%mask``; ``names`` maps nodes of the graph to them.
+:class:`~torchpt.compiler.block.Block` appends instructions: ``block.op(text)`` returns the register of the result,
+``block.do(text)`` has none, ``block.each("i32")`` is the type of one i32 a lane (``<16 x i32>`` or ``i32``).
 """
 
 from __future__ import annotations
@@ -31,11 +35,11 @@ __all__ = ["HEAD", "SinkWriter", "argument_words", "kernel_ir", "sink_writer"]
 class SinkWriter(ABC):
     """A writer of the stores to a kernel's sinks.
 
-    In the loop ``%i`` is the number of the (first) lane and ``%mask`` marks the lanes that exist. ``%first0``, ``%first1``, ...
-    are the counters at the kernel's start.
+    In the loop ``%i`` is the number of the lane, of a vector its first; ``%mask`` marks the lanes that exist, as a vector may
+    reach beyond the last one. ``%first0``, ``%first1``, ... are the values of the counters at the kernel's start.
 
     Attributes:
-        before: lines at the head of the loop.
+        before: lines of IR at the head of the loop.
         after: lines behind the loop.
         functions: definitions of functions that the loop calls.
     """
@@ -66,14 +70,16 @@ class SinkWriter(ABC):
     def _compact(self, compact: Compact) -> None: ...
 
     @abstractmethod
-    def _append_index(self, append: AppendIndex, mask: str, places: str) -> None: ...
+    def _append_index(self, append: AppendIndex, mask: str, places: str) -> None:
+        """Append the indices ``places`` (one i32 a lane) to a list where the mask is set."""
 
     @abstractmethod
     def _write(self, place: str) -> None:
         """Write rows of the target arena from index ``place`` (an i64) on."""
 
     @abstractmethod
-    def _count(self, counter: int, mask: str) -> None: ...
+    def _count(self, counter: int, mask: str) -> None:
+        """Add the number of lanes where the mask is set to a counter."""
 
     @abstractmethod
     def _put_scattered(self, stores: Sequence[tuple[str, str, str]], place: str, mask: str) -> None:
@@ -84,6 +90,7 @@ class SinkWriter(ABC):
         """Store at the lanes' numbers, for lanes that exist; stores as for :meth:`_put_scattered`."""
 
     def _masked(self, mask: int) -> str:
+        """Return the mask of a node, without the lanes that do not exist."""
         return self.block.op(f"and {self.block.each('i1')} {self.names[mask]}, %mask")
 
     def _stored_value(self, node: int) -> tuple[str, str]:
@@ -100,6 +107,7 @@ class SinkWriter(ABC):
         return self.block.at("%dst", "i8", 4 * self.block.form.row * row) if row else "%dst"
 
     def _row(self, row: int, element: str, place: str) -> str:
+        """Return the address of index ``place`` in a row of the target arena."""
         return self.block.at(self._start(row), element, place)
 
     def _scatter(self, scatter: Scatter) -> None:
@@ -130,7 +138,7 @@ class SinkWriter(ABC):
             elif store.ty == "u":
                 value = block.op(f"trunc {block.each('i32')} {value} to {block.each('i8')}")
             row = f"%out{number}"
-            if k:
+            if k:  # %out0s, %out1s, ... are the elements from one row of a result to the next
                 row = block.at(row, "i8", block.op(f"mul i64 %out{number}s, {k * size}"))
             stores.append((element, value, row))
         self._put_lanes(stores)
@@ -141,7 +149,9 @@ class _VectorSinks(SinkWriter):
 
     def __init__(self, block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
         super().__init__(block, graph, names, sinks)
-        self._counters = {k: f"%c{k}" for k in range(sinks.counters())}
+        self._counters = {
+            k: f"%c{k}" for k in range(sinks.counters())
+        }  # the register of each, as of the last instruction
 
     def write(self) -> None:
         """See :meth:`SinkWriter.write`; adds the phi nodes of the counters."""
@@ -185,7 +195,7 @@ class _VectorSinks(SinkWriter):
         if compact.appends:
             places = self.block.places(start)
             for append in compact.appends:
-                # The note's mask, compressed as the lanes are; 0 behind them.
+                # The mask of the list, compressed as the lanes are, and not set behind them.
                 both = block.op(f"and {block.each('i1')} {self.names[append.mask]}, {mask}")
                 wide = block.op(f"sext {block.each('i1')} {both} to {block.each('i32')}")
                 chosen = block.op(f"icmp ne {block.each('i32')} {self._compressed(wide, mask)}, zeroinitializer")
@@ -261,6 +271,7 @@ class _LaneSinks(SinkWriter):
         self._take(counter, mask)
 
     def _take(self, counter: int, mask: str) -> str:
+        """Return the value of a counter, an i64, and increment it where the mask is set."""
         return self.block.op(f"call i64 @take(ptr {self.block.at('%counters', 'i64', counter)}, i1 {mask})")
 
     def _write(self, place: str) -> None:
@@ -305,6 +316,9 @@ def sink_writer(block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sin
 
 
 #: First words of a kernel's arguments; uniforms, lists, and input and output tensors with their row lengths follow.
+#: ``src``, ``dst``: source and target arena; ``list``: indices of the lanes to read, if the stage is listed; ``slots``,
+#: ``stride``: address of the slots, and elements from one row of them to the next; ``counters``: the counters; ``tables``: for
+#: each table address and number of entries; ``search``: data for ray searches (:func:`torchpt.compiler.packet.scene_words`).
 HEAD = ("src", "dst", "list", "slots", "stride", "counters", "tables", "search")
 
 
@@ -330,25 +344,25 @@ def kernel_ir(stage: TracedStage, form: Form) -> str:
         raise Unsupported("a counter that shifts the results while other threads increment it")
     products = fused_products(graph, needed, sinks.roots())
     body = LoopBody(form, stage.listed, products)
-    _enter(body, stage, needed)
-    entry, body.lines, body.label = body.lines, [], "loop"
-    _begin(body)
+    _load_arguments(body, stage, needed)
+    entry, body.lines, body.label = body.lines, [], "loop"  # what was written so far comes before the loop
+    _begin_body(body)
     names: dict[int, str] = {}
-    within = set(products.values())
+    fused = set(products.values())  # computed with their sums
     for node in needed:
-        if node not in within:
+        if node not in fused:
             names[node] = generate_node(body, graph, node, names)
-    ends = sink_writer(body, graph, names, sinks)
-    ends.write()
-    inner = [binary_searches(graph, needed, form), float_remainders(graph, needed, form)]
+    writer = sink_writer(body, graph, names, sinks)
+    writer.write()
+    functions = [binary_searches(graph, needed, form), float_remainders(graph, needed, form)]
     if stage.searched is not None:
-        inner.append(packet_search(stage.searched, form))
-    declarations = set().union(*(block.declarations for block in (body, *inner)))
-    frame = _grid_stride_loop if form.threads else _loop
+        functions.append(packet_search(stage.searched, form))
+    declarations = set().union(*(block.declarations for block in (body, *functions)))
+    loop = _grid_stride_loop if form.threads else _cpu_loop
     lines = [
-        *(line for block in inner for line in block.lines),
-        *ends.functions,
-        *frame(entry, body, ends, len(argument_words(stage))),
+        *(line for block in functions for line in block.lines),
+        *writer.functions,
+        *loop(entry, body, writer, len(argument_words(stage))),
         *sorted(declarations),
         f"attributes #0 = {{ nounwind{_PREFERRED if form.width > 1 else ''} }}",
         "!0 = !{}",
@@ -357,11 +371,19 @@ def kernel_ir(stage: TracedStage, form: Form) -> str:
     return "\n".join(lines)
 
 
+#: Attributes by which LLVM uses the 512-bit registers of AVX-512 where it would choose 256 bits.
 _PREFERRED = ' "prefer-vector-width"="512" "min-legal-vector-width"="512"'
 
 
-def _loop(entry: list[str], body: LoopBody, ends: SinkWriter, words: int) -> list[str]:
-    """Return the kernel of a CPU: a loop over all lanes."""
+def _cpu_loop(entry: list[str], body: LoopBody, writer: SinkWriter, words: int) -> list[str]:
+    """Return the function of a CPU's kernel: a loop over all lanes.
+
+    Args:
+        entry: lines before the loop.
+        body: the loop's body.
+        writer: the writer of the stores in the body.
+        words: number of words of the arguments, which a GPU's kernel takes by value.
+    """
     return [
         "define void @kernel(ptr noalias %arguments, i64 %n) #0 {",
         "entry:",
@@ -370,22 +392,23 @@ def _loop(entry: list[str], body: LoopBody, ends: SinkWriter, words: int) -> lis
         "  br i1 %any, label %loop, label %exit",
         "loop:",
         f"  %i = phi i64 [ 0, %entry ], [ %next, %{body.label} ]",
-        *ends.before,
+        *writer.before,
         *body.lines,
         f"  %next = add i64 %i, {body.width}",
         "  %more = icmp slt i64 %next, %n",
         "  br i1 %more, label %loop, label %exit",
         "exit:",
-        *ends.after,
+        *writer.after,
         "  ret void",
         "}",
     ]
 
 
-def _grid_stride_loop(entry: list[str], body: LoopBody, ends: SinkWriter, words: int) -> list[str]:
-    """Return the kernel of a GPU: each thread takes the lanes of its number plus multiples of the number of threads.
+def _grid_stride_loop(entry: list[str], body: LoopBody, writer: SinkWriter, words: int) -> list[str]:
+    """Return the function of a GPU's kernel: each thread takes the lanes of its number plus multiples of the number of threads.
 
     The loop's condition is that of the warp's first thread, so that all threads of a warp meet in the calls of ``take``.
+    Arguments as for :func:`_cpu_loop`.
     """
     registers = ("tid", "ntid", "ctaid", "nctaid")
     body.declarations.update(f"declare i32 @llvm.nvvm.read.ptx.sreg.{name}.x()" for name in registers)
@@ -418,26 +441,30 @@ def _grid_stride_loop(entry: list[str], body: LoopBody, ends: SinkWriter, words:
     ]
 
 
-def _begin(body: LoopBody) -> None:
-    """Write the head of the loop's body: the mask of the lanes (``%mask``) and their indices in the arena (``%place``)."""
+def _begin_body(body: LoopBody) -> None:
+    """Write the head of the loop's body: the mask of the lanes (``%mask``), and for a list their indices (``%place``)."""
     if not body.form.threads:
         body.declarations.add("declare i64 @llvm.smin.i64(i64, i64)")
         left = body.op("sub i64 %n, %i")
-        few = body.op(f"call i64 @llvm.smin.i64(i64 {left}, i64 {body.width})")
-        few = body.splat("i", body.op(f"trunc i64 {few} to i32"))
-        body.do(f"%mask = icmp sgt {body.each('i32')} {few}, {body.numbers()}")
+        existing = body.op(f"call i64 @llvm.smin.i64(i64 {left}, i64 {body.width})")  # lanes of this iteration
+        existing = body.splat("i", body.op(f"trunc i64 {existing} to i32"))
+        body.do(f"%mask = icmp sgt {body.each('i32')} {existing}, {body.numbers()}")
     if body.listed:
         listed = body.at("%list", "i32", "%i")
         body.do(f"%place = load {body.each('i32')}, ptr {listed}, align 4")
 
 
-def _enter(body: LoopBody, stage: TracedStage, needed: list[int]) -> None:
-    """Load the kernel's arguments, before the loop."""
+def _load_arguments(body: LoopBody, stage: TracedStage, needed: list[int]) -> None:
+    """Load the kernel's arguments before the loop, to registers of their names.
+
+    For a table k that the graph reads these are ``%table0``, its address, ``%count0``, its number of entries, and ``%last0``,
+    the last of its entries in each lane; for a row of the source arena its address, ``%row0``.
+    """
     graph, sinks = stage.graph, stage.sinks
     for place, (name, ty) in enumerate(argument_words(stage)):
         _load_word(body, name, ty, body.at("%arguments", "i64", place))
-    found = [graph.nodes[node] for node in needed]
-    for k in sorted({extra[0] for op, _, _, extra in found if op in ("gather", "element", "search")}):
+    nodes = [graph.nodes[node] for node in needed]
+    for k in sorted({extra[0] for op, _, _, extra in nodes if op in ("gather", "element", "search")}):
         if k >= len(stage.tables):
             raise Unsupported("a table that does not exist")
         invariant = body.form.threads
@@ -445,7 +472,7 @@ def _enter(body: LoopBody, stage: TracedStage, needed: list[int]) -> None:
         _load_word(body, f"count{k}", "i64", body.at("%tables", "i64", 2 * k + 1), invariant)
         last = body.op(f"sub i32 {body.op(f'trunc i64 %count{k} to i32')}, 1")
         body.let(f"last{k}", body.each("i32"), body.splat("i", last))
-    for k in sorted({extra for op, _, _, extra in found if op == "arena"}):
+    for k in sorted({extra for op, _, _, extra in nodes if op == "arena"}):
         body.do(f"%row{k} = getelementptr i8, ptr %src, i64 {4 * body.form.row * k}")
     # Vectors keep counters in registers. Single lanes read only the one that shifts what they write, and which none of them
     # increments: other threads may have begun already.

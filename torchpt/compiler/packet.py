@@ -1,4 +1,8 @@
-"""Searches inside a kernel: binary search in sorted tables, and brute-force ray intersection with few primitives."""
+"""Searches inside a kernel: binary search in sorted tables, and brute-force ray intersection with few primitives.
+
+Both are written as LLVM IR text, by :class:`~torchpt.compiler.block.Block`, whose methods append an instruction and return the
+register of its result. A *packet* is the rays of one value: 16 in a vector, else one.
+"""
 
 from __future__ import annotations
 
@@ -45,11 +49,12 @@ def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
             "  %half = lshr i32 %more, 1",
             "  %step = sub i32 %half, 1",
         ]
+        # the entry in the middle of the `length` entries from `base` on; if it is below the value, the search goes on behind it
         middle = block.call("llvm.umin", "i", block.add("i", "%base", block.splat("i", "%step")), last)
         entry = block.gather(element, "%table", middle, invariant=True)
-        below = block.compare(
-            ("ule" if right else "ult") if ty in "fd" else ("sle" if right else "slt"), ty, entry, "%value"
-        )
+        # an unordered comparison of floats: for NaN all entries are below, as in torch
+        predicate = ("ule" if right else "ult") if ty in "fd" else ("sle" if right else "slt")
+        below = block.compare(predicate, ty, entry, "%value")
         further = block.add("i", "%base", block.splat("i", "%half"))
         block.lines += [
             f"  %better = select {block.each('i1')} {below}, {places} {further}, {places} %base",
@@ -67,8 +72,11 @@ def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
 
 
 def _attributes(form: Form) -> str:
-    """Return the attributes of a function that kernels call: a call costs a GPU thread registers and local memory."""
-    return "alwaysinline #0" if form.threads else "noinline #0"  # the CPU's passes inline nothing
+    """Return the attributes of a function that kernels call.
+
+    It is inlined on GPUs, where a call costs a thread registers and local memory; the passes of CPU kernels inline nothing.
+    """
+    return "alwaysinline #0" if form.threads else "noinline #0"
 
 
 # ---- Brute-force intersection of a packet of rays with every primitive, as functions inside a kernel, for small scenes
@@ -79,8 +87,9 @@ def _attributes(form: Form) -> str:
 
 #: Primitives that these functions know, in the order of their ids.
 KINDS = ("triangle", "rectangle", "disk", "sphere")
-#: Length of a planar primitive's row.
+#: Length of a planar primitive's row: three affine rows of four numbers, and the tolerance.
 _ROW = 13
+#: Parameters of the functions: components of the ray's origin and direction.
 _RAY = ("ox", "oy", "oz", "dx", "dy", "dz")
 
 
@@ -93,7 +102,7 @@ def packet_search(kinds: Sequence[str], form: Form) -> Block:
     """
     whole = Block(form)
     for any_hit in (False, True):
-        block = _Search(kinds, any_hit, form)
+        block = _SearchFunction(kinds, any_hit, form)
         block.write()
         whole.lines += block.lines
         whole.declarations |= block.declarations
@@ -114,11 +123,18 @@ def scene_words(rows: Tensor, balls: Tensor, counts: Sequence[int], extent: floa
     """
     ends = [sum(counts[: k + 1]) for k in range(len(KINDS))]
     words = (ctypes.c_int64 * (3 + len(ends)))(rows.data_ptr(), balls.data_ptr(), *ends)
-    ctypes.c_double.from_buffer(words, 8 * (2 + len(ends))).value = extent
+    ctypes.c_double.from_buffer(words, 8 * (2 + len(ends))).value = extent  # in the last word
     return words
 
 
-class _Search(Block):
+class _SearchFunction(Block):
+    """The function ``occluded`` (``any_hit``) or ``nearest``: a loop over the primitives of each kind, one after the other.
+
+    ``f``, ``i``, ``d`` and ``b`` are the LLVM types of a value of float32, int32, float64 and bool; ``hit`` is that of the
+    result t, prim, u, v. Registers of the loop over a kind begin with its name: ``%disk_t`` and ``%disk_p`` are the nearest
+    distance so far and its primitive, ``%disk_id`` the primitive that is tested.
+    """
+
     def __init__(self, kinds: Sequence[str], any_hit: bool, form: Form) -> None:
         super().__init__(form)
         self.f, self.i, self.d, self.b = (self.vector(ty) for ty in "fidb")
@@ -127,9 +143,10 @@ class _Search(Block):
 
     def write(self) -> None:
         """Write the function."""
-        given = ", ".join(f"{self.f} %{name}" for name in (*_RAY, "t_max"))
+        parameters = ", ".join(f"{self.f} %{name}" for name in (*_RAY, "t_max"))
         name, result = ("occluded", self.b) if self.any_hit else ("nearest", self.hit)
-        self.lines.append(f"define internal {result} @{name}({given}, ptr %search) {_attributes(self.form)} {{\nentry:")
+        attributes = _attributes(self.form)
+        self.lines.append(f"define internal {result} @{name}({parameters}, ptr %search) {attributes} {{\nentry:")
         self._start()
         t, prim, before = "%t0", self.constant("i", -1), "entry"
         for kind in self.kinds:
@@ -141,6 +158,12 @@ class _Search(Block):
         self.lines.append("}")
 
     def _start(self) -> None:
+        """Load the scene data, and compute what the tests need of the rays.
+
+        ``%t0`` is ``t_max``, or -1 for a ray that cannot hit anything; ``%live`` says whether any ray can. ``%reach`` is the
+        scale of the tolerances, see :func:`torchpt.search.tables.tolerances`. For spheres ``%square`` is ``|d|^2`` in float64,
+        ``%shrink`` and ``%shrink32`` its reciprocal in both precisions.
+        """
         words = ("rows", "balls", *(f"end_{kind}" for kind in KINDS))
         for k, word in enumerate(words):
             place = self.at("%search", "i64", k)
@@ -152,18 +175,18 @@ class _Search(Block):
         extent = self.splat("f", self.op(f"fptrunc double {extent} to float"))
         zero = self.constant("f", 0.0)
         # 0 if all components are finite, else NaN.
-        nothing = None
+        sum_of_zeros = None
         for name in _RAY:
             product = self.mul("f", f"%{name}", zero)
-            nothing = product if nothing is None else self.add("f", nothing, product)
-        assert nothing is not None
-        good = self.op(
-            f"and {self.b} {self.compare('oeq', 'f', nothing, zero)}, {self.compare('ogt', 'f', '%t_max', zero)}"
+            sum_of_zeros = product if sum_of_zeros is None else self.add("f", sum_of_zeros, product)
+        assert sum_of_zeros is not None
+        valid = self.op(
+            f"and {self.b} {self.compare('oeq', 'f', sum_of_zeros, zero)}, {self.compare('ogt', 'f', '%t_max', zero)}"
         )
-        self.lines.append(f"  %t0 = select {self.b} {good}, {self.f} %t_max, {self.f} {self.constant('f', -1.0)}")
-        far_o, far_d = self._size(_RAY[:3]), self._size(_RAY[3:])
-        self.lines.append(f"  %reach = fmul {self.f} {far_d}, {self._larger(far_o, extent)}")
-        self.let("live", "i1", self.some(good))
+        self.lines.append(f"  %t0 = select {self.b} {valid}, {self.f} %t_max, {self.f} {self.constant('f', -1.0)}")
+        size_o, size_d = self._maximum_norm(_RAY[:3]), self._maximum_norm(_RAY[3:])
+        self.lines.append(f"  %reach = fmul {self.f} {size_d}, {self._larger(size_o, extent)}")
+        self.let("live", "i1", self.some(valid))
         if "sphere" in self.kinds:
             d = [self.convert("fpext", "f", "d", f"%{name}") for name in _RAY[3:]]
             self.lines.append(f"  %square = fadd {self.d} {self._dot(d, d)}, {self.constant('d', 0.0)}")
@@ -173,15 +196,25 @@ class _Search(Block):
     def _larger(self, a: str, b: str) -> str:
         return self.select("f", self.compare("ogt", "f", a, b), a, b)
 
-    def _size(self, names: tuple[str, ...]) -> str:
+    def _maximum_norm(self, names: tuple[str, ...]) -> str:
         a, b, c = (self.call("llvm.fabs", "f", f"%{name}") for name in names)
         return self._larger(self._larger(a, b), c)
 
     def _loop(self, kind: str, t: str, prim: str, before: str) -> tuple[str, str, str]:
-        """Write a loop over all primitives of a kind; return distance, primitive and the name of the basic block after it."""
-        number = KINDS.index(kind)
-        first = "0" if number == 0 else f"%end_{KINDS[number - 1]}"
-        last = f"{kind}_last" if kind == "sphere" else kind
+        """Write a loop over all primitives of a kind.
+
+        Args:
+            kind: the kind.
+            t: nearest distances before the loop.
+            prim: their primitives.
+            before: name of the basic block before the loop.
+
+        Returns:
+            Distances and primitives after the loop, and the name of the basic block behind it.
+        """
+        index = KINDS.index(kind)
+        first = "0" if index == 0 else f"%end_{KINDS[index - 1]}"
+        last = f"{kind}_last" if kind == "sphere" else kind  # the last basic block of the loop's body
         self.lines += [
             f"  %{kind}_some = icmp slt i64 {first}, %end_{kind}",
             f"  %{kind}_go = and i1 %{kind}_some, %live",
@@ -192,7 +225,7 @@ class _Search(Block):
             f"  %{kind}_p = phi {self.i} [ {prim}, %{before} ], [ %{kind}_p1, %{last} ]",
         ]
         if kind == "sphere":
-            self._near_sphere(kind)
+            self._skip_far_sphere(kind)
         distance, hit = self._sphere(kind) if kind == "sphere" else self._planar(kind)
         tests = [
             self.compare("ogt", "f", distance, self.constant("f", 0.0)),
@@ -201,12 +234,14 @@ class _Search(Block):
         for test in tests:
             hit = test if hit is None else self.op(f"and {self.b} {hit}, {test}")
         # Any hit ends the ray: no later distance is below -1.
-        better = self.constant("f", -1.0) if self.any_hit else distance
-        number_ = self.splat("i", self.op(f"trunc i64 %{kind}_id to i32"))
-        tail = "e" if kind == "sphere" else "1"
+        new_t = self.constant("f", -1.0) if self.any_hit else distance
+        new_prim = self.splat("i", self.op(f"trunc i64 %{kind}_id to i32"))
+        tail = (
+            "e" if kind == "sphere" else "1"
+        )  # of spheres as the exact test gives it, before the loop's last basic block
         self.lines += [
-            f"  %{kind}_t{tail} = select {self.b} {hit}, {self.f} {better}, {self.f} %{kind}_t",
-            f"  %{kind}_p{tail} = select {self.b} {hit}, {self.i} {number_}, {self.i} %{kind}_p",
+            f"  %{kind}_t{tail} = select {self.b} {hit}, {self.f} {new_t}, {self.f} %{kind}_t",
+            f"  %{kind}_p{tail} = select {self.b} {hit}, {self.i} {new_prim}, {self.i} %{kind}_p",
         ]
         if kind == "sphere":
             self.lines += [
@@ -226,12 +261,14 @@ class _Search(Block):
         return f"%{kind}_t2", f"%{kind}_p2", f"{kind}_done"
 
     def _affine(self, row: list[str], x: tuple[str, ...]) -> str:
+        """Evaluate ``row[0:3] . x + row[3]``."""
         value = row[3]
         for a, b in zip(row, x, strict=False):
             value = self.fma("f", a, b, value)
         return value
 
     def _planar(self, kind: str) -> tuple[str, str]:
+        """Intersect a planar primitive; return t, and the mask of the rays whose hit is inside or within its tolerance."""
         base = self.op(f"getelementptr [{_ROW} x float], ptr %rows, i64 %{kind}_id")
         row = [self.splat("f", self.load("float", self.at(base, "float", k))) for k in range(_ROW)]
         o, d = tuple(f"%{name}" for name in _RAY[:3]), tuple(f"%{name}" for name in _RAY[3:])
@@ -261,8 +298,8 @@ class _Search(Block):
             value = self.fma("d", x, y, value)
         return value
 
-    def _near_sphere(self, kind: str) -> None:
-        """Branch to the exact test if any ray comes near the sphere, by float32 and a bound of its rounding error.
+    def _skip_far_sphere(self, kind: str) -> None:
+        """Branch to the exact test if any ray comes near the sphere, else to the next sphere; in float32 with a bound of error.
 
         The perpendicular from the centre ``c`` to the ray has an error below ``2^-20 (|f| + |c|)``, with ``f = o - c``: a
         few roundings of terms of that size, including the centre's conversion to float32.
@@ -292,7 +329,7 @@ class _Search(Block):
         self.lines += [f"  br i1 {some}, label %{kind}_exact, label %{kind}_last", f"{kind}_exact:"]
 
     def _sphere(self, kind: str) -> tuple[str, str | None]:
-        """See ``sphere_distance`` of ``scripts/kernel_sources/tree_leaf.py``."""
+        """Intersect a sphere as ``sphere_distance`` of ``scripts/kernel_sources/tree_leaf.py``; return t, NaN for a miss."""
         own = self.op(f"sub i64 %{kind}_id, %end_disk")
         base = self.op(f"getelementptr [4 x double], ptr %balls, i64 {own}")
         ball = [self.splat("d", self.load("double", self.at(base, "double", k))) for k in range(4)]
@@ -302,8 +339,8 @@ class _Search(Block):
         s = self.mul("d", b, "%shrink")
         off = [self.fma("d", s, y, x) for x, y in zip(f, d, strict=True)]
         square = self.mul("d", ball[3], ball[3])
-        rest = self.sub("d", square, self._dot(off, off))
-        root = self.call("llvm.sqrt", "d", self.mul("d", a, rest))
+        discriminant = self.sub("d", square, self._dot(off, off))
+        root = self.call("llvm.sqrt", "d", self.mul("d", a, discriminant))
         q = self.add("d", b, self.call("llvm.copysign", "d", root, b))
         near, far = self.div("d", self.sub("d", self._dot(f, f), square), q), self.mul("d", q, "%shrink")
         first = self.compare("olt", "d", near, far)
@@ -315,6 +352,7 @@ class _Search(Block):
         """Compute ``u, v`` of planar hits, clamped to the primitive, and return the hits."""
         hit = self.op(f"icmp sge {self.i} {prim}, zeroinitializer")
         zero, one = self.constant("f", 0.0), self.constant("f", 1.0)
+        # the ids after the last triangle, rectangle and disk
         ends = {kind: self.splat("i", self.op(f"trunc i64 %end_{kind} to i32")) for kind in KINDS[:3]}
         planar = self.op(f"and {self.b} {hit}, {self.op(f'icmp slt {self.i} {prim}, ' + ends['disk'])}")
         u = v = zero
@@ -323,11 +361,12 @@ class _Search(Block):
             p = tuple(self.fma("f", t, f"%{d}", f"%{o}") for o, d in zip(_RAY[:3], _RAY[3:], strict=True))
             row = [self.gather("float", self.at("%rows", "float", k), place, invariant=True) for k in range(4, 12)]
             u, v = self._affine(row[:4], p), self._affine(row[4:], p)
-            flat = self.op(f"icmp slt {self.i} {prim}, {ends['rectangle']}")
-            three = self.op(f"icmp slt {self.i} {prim}, {ends['triangle']}")
-            inner = self._between(u, zero, one)
-            top = self.select("f", three, self.sub("f", one, inner), one)
-            u, v = self.select("f", flat, inner, u), self.select("f", flat, self._between(v, zero, top), v)
+            polygon = self.op(f"icmp slt {self.i} {prim}, {ends['rectangle']}")
+            triangle = self.op(f"icmp slt {self.i} {prim}, {ends['triangle']}")
+            clamped_u = self._between(u, zero, one)
+            largest_v = self.select("f", triangle, self.sub("f", one, clamped_u), one)
+            u = self.select("f", polygon, clamped_u, u)
+            v = self.select("f", polygon, self._between(v, zero, largest_v), v)
             u, v = (self.select("f", planar, x, zero) for x in (u, v))
         t = self.select("f", hit, t, self.constant("f", math.inf))
         value = "poison"

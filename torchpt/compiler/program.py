@@ -1,4 +1,8 @@
-"""Traced stages, compiled programs, and the tables of a scene in the layout that kernels read."""
+"""Traced stages, compiled programs, and the tables of a scene in the layout that kernels read.
+
+A stage is traced once (:class:`TracedStage`), compiled (:class:`Program`), and bound to the tables of each scene
+(:func:`bind_tables`). For leaves, tables, steps and guards see :mod:`torchpt.compiler.prologue`.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
 """The prologue of a kernel: torch operators on tables alone, recorded in the trace and run again for each scene.
 
-Thus a kernel serves all tables of the same shapes.
+A *table* is a tensor that does not depend on lanes. Some tables of a kernel are *leaves*, tensors of the scene that a stage
+gets as arguments, named by their path in these (``geometry.p0``); others are computed from leaves by the steps of the
+prologue. A kernel reads all of them from memory, so it serves every scene whose tables have the same shapes.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from torch import Tensor
 
 __all__ = ["Guard", "Source", "Step", "StepKey", "Table", "run_prologue", "step_keys", "without_unused_steps"]
 
-#: Largest tensor, in bytes, that is kept for other prologues.
+#: Largest result of a step, in bytes, that is kept for other prologues. Larger ones would hold much memory.
 SMALL = 1 << 16
 
 
@@ -27,7 +29,7 @@ class Source:
         kind: ``leaf`` (of the stage's arguments), ``step`` (result of a prologue step) or ``constants`` (a constant of the
             program, such as the weights of a network).
         name: path of a leaf, else the number of the step or constant.
-        item: index into the results of a step that returns several; -1 if it returns one.
+        item: index into the results of a step that returns several tensors; -1 if it returns one.
     """
 
     kind: str
@@ -68,7 +70,7 @@ class Guard:
 def without_unused_steps(
     tables: Sequence[Table], steps: Sequence[Step], guards: Sequence[Guard]
 ) -> tuple[tuple[Table, ...], tuple[Step, ...], tuple[Guard, ...]]:
-    """Return tables, steps and guards without the unused steps."""
+    """Return tables, steps and guards, with the steps dropped that neither a table nor a guard depends on."""
     needed: set[int] = set()  # numbers of steps
 
     def mark_needed(value: Any) -> None:
@@ -86,6 +88,7 @@ def without_unused_steps(
     numbers = {old: new for new, old in enumerate(sorted(needed))}
 
     def renumbered(value: Any) -> Any:
+        """Return a source, or nested arguments with sources, with the new numbers of steps."""
         if isinstance(value, Source):
             return replace(value, name=numbers[int(value.name)]) if value.kind == "step" else value
         return type(value)(renumbered(x) for x in value) if isinstance(value, list | tuple) else value
@@ -103,7 +106,9 @@ def without_unused_steps(
 
 @dataclass(frozen=True)
 class StepKey:
-    """An identity of a step: equal in all prologues of the process for the same operators on leaves of the same paths.
+    """An identity of a step, by which prologues share its result.
+
+    Two steps have equal keys, in all prologues of the process, if they are the same operators on leaves of the same paths.
 
     Attributes:
         number: a unique number.
@@ -115,14 +120,15 @@ class StepKey:
 
 
 def step_keys(steps: Sequence[Step]) -> tuple[StepKey | None, ...]:
-    """Return the keys of steps.
+    """Return the key of each step.
 
-    None for a step that depends on a constant tensor, has unhashable arguments or writes into them.
+    None for a step that depends on a constant tensor, has arguments without a hash, or writes into its arguments.
     """
     keys: list[StepKey | None] = []
     leaves: set[str] = set()  # of the current step
 
     def content_of(value: Any) -> Any:
+        """Return hashable content by which an argument is compared; adds to ``leaves``."""
         if isinstance(value, Source):
             if value.kind == "constants":
                 raise TypeError("a tensor of the program's own")
@@ -173,7 +179,7 @@ def run_prologue(
     names: Sequence[StepKey | None] = (),
     known: dict[StepKey, Tensor] | None = None,
 ) -> Any:
-    """Run a prologue and return the function ``tensor(source)``.
+    """Run a prologue and return a function that returns the tensor of a :class:`Source`.
 
     Args:
         steps: the prologue.
@@ -193,6 +199,7 @@ def run_prologue(
         return result if source.item < 0 else result[source.item]
 
     def filled(value: Any) -> Any:
+        """Return an argument with tensors in place of sources."""
         if isinstance(value, Source):
             return tensor(value)
         return type(value)(filled(x) for x in value) if isinstance(value, list | tuple) else value

@@ -1,4 +1,4 @@
-"""Compile LLVM IR to PTX, the text that the driver of an NVIDIA GPU compiles to its machine code.
+"""Compile LLVM IR to PTX, the assembly text that the driver of an NVIDIA GPU compiles to machine code.
 
 llvmlite has LLVM's NVPTX target, so neither the CUDA toolkit nor a GPU is needed here. The text is of PTX 7.0 for compute
 capability 7.5 and uses nothing newer: drivers since CUDA 11.0 compile it for any later GPU.
@@ -22,7 +22,7 @@ def ptx_target(row: int = CAPACITY) -> Target:
     Args:
         row: elements from one row of the GPU's arenas to the next, a constant in the code.
     """
-    return Target("sm_75", "+ptx70", _TRIPLE, Form(1, row=row, threads=True))
+    return Target(cpu="sm_75", features="+ptx70", triple=_TRIPLE, form=Form(width=1, row=row, threads=True))
 
 
 def emit_ptx(llvm: Any, ir: str, target: Target) -> bytes:
@@ -40,7 +40,8 @@ def emit_ptx(llvm: Any, ir: str, target: Target) -> bytes:
     head = f'target datalayout = "{machine.target_data}"\ntarget triple = "{_TRIPLE}"\n'
     module = llvm.parse_assembly(head + ir)
     module.verify()
-    # Passes of CPU kernels, and what inlines functions and removes them. LLVM's standard pipelines need more registers.
+    # The passes of CPU kernels; before them functions are inlined, behind them their definitions are removed. Kernels that
+    # LLVM's standard pipelines compile need more registers.
     passes = llvm.create_new_module_pass_manager()
     passes.add_always_inliner_pass()
     passes.add_sroa_pass()

@@ -1,6 +1,7 @@
 """The remainder of floats, C's ``fmod``, as LLVM IR: a function that kernels for GPUs call.
 
-CPUs call the C library. NVPTX would compute ``x - trunc(x / y) y``, whose quotient is rounded.
+On CPUs LLVM's instruction ``frem`` calls the C library. On GPUs it would become ``x - trunc(x / y) y``, which is wrong where
+the quotient is rounded.
 """
 
 from __future__ import annotations
@@ -11,17 +12,22 @@ from torchpt.compiler.graph import FLOATS, Graph
 
 __all__ = ["float_remainders"]
 
-#: Operations that take a remainder of floats.
+#: Operations of a graph that take a remainder of floats.
 _OPERATIONS = ("fmod", "remainder", "floordiv")
-#: Bits of the fraction, and bits by which a remainder is shifted at once: it stays below 2^64.
+#: By node type: bits of the fraction, and bits by which a remainder is shifted at once, so that it stays below 2^64.
 _FRACTION, _SHIFT = {"f": 23, "d": 52}, {"f": 40, "d": 11}
 
 
 def float_remainders(graph: Graph, needed: list[int], form: Form) -> Block:
     """Write the functions ``fmod_f`` and ``fmod_d`` that a graph needs for GPU threads; nothing for other forms.
 
-    Both numbers are whole multiples of a power of two, so the remainder is that of a long division of integers, and exact:
+    Both numbers are integers times a power of two, so the remainder is that of a long division of integers, and exact:
     ``m 2^n mod k``, a few bits of ``n`` at a time.
+
+    Args:
+        graph: the graph of a stage.
+        needed: nodes that are computed.
+        form: layout of lanes.
     """
     block = Block(form)
     if form.threads:
@@ -33,6 +39,13 @@ def float_remainders(graph: Graph, needed: list[int], form: Form) -> Block:
 
 
 def _text(ty: str) -> str:
+    """Return the definition of ``fmod_f`` or ``fmod_d``.
+
+    ``%a`` and ``%b`` are the bits of ``|x|`` and ``|y|``, which order as the numbers do. The result is NaN where ``%none`` is
+    set: ``x`` infinite or NaN, ``y`` NaN or 0. It is ``x`` if ``|x| < |y|``. Else ``|x| = m 2^p`` and ``|y| = k 2^q`` up to a
+    common factor, and ``n = p - q``; ``%r`` becomes ``m 2^n mod k`` in the loop, where ``%left`` bits of ``n`` are left.
+    ``normalize`` shifts ``%r`` up until its leading bit is the hidden one, as far as the exponent ``q`` allows.
+    """
     real, fraction = ELEMENTS[ty], _FRACTION[ty]
     bits = 32 if ty == "f" else 64
     exponents = (1 << (bits - 1 - fraction)) - 1

@@ -17,7 +17,7 @@ class Target:
         cpu: LLVM's name of the processor.
         features: LLVM's list of processor features.
         triple: LLVM's target triple; None: this machine.
-        form: layout of lanes; with ``threads`` the code is PTX, else machine code.
+        form: layout of lanes; with ``form.threads`` the code is PTX, else machine code.
     """
 
     cpu: str

@@ -1,8 +1,9 @@
 """Trace a stage: run it once on a few lanes and record its operations on one lane as a graph.
 
-Under :class:`Tracer` every tensor that depends on lanes has a graph node for each of its elements in one lane. Operators on
-tables alone are run and recorded as a list of steps (the *prologue*), which are run again for other tables of the same
-shapes: a kernel reads tables from memory and does not depend on their values.
+A stage computes tensors whose last axis is the *lanes* (one lane a path) from lanes and from *tables*, the tensors of the
+scene. Under :class:`Tracer` every tensor that depends on lanes has a graph node for each of its elements in one lane: a ``(3,
+N)`` tensor has three. Operators on tables alone are run and recorded as a list of steps (the *prologue*), which are run again
+for other tables of the same shapes: a kernel reads tables from memory and does not depend on their values.
 """
 
 from __future__ import annotations
@@ -33,15 +34,17 @@ __all__ = [
 ]
 
 #: Candidates for the number of lanes that a stage is traced on. An axis whose length is a multiple of it is taken for the
-#: lanes' axis, so it must divide no axis of a table.
+#: lanes' axis, so it must divide no axis of a table. Primes, as few tables have such lengths.
 LANES = (97, 89, 101, 83, 103, 79, 107, 109, 113, 127)
+#: Most elements of a table that become a node each, where a stage computes with a whole table in every lane.
+_MOST_ELEMENTS = 4096
 
 Handler = Callable[..., None]
 #: Lowering of each torch operator, by its name without overload.
 LOWERINGS: dict[str, Handler] = {}
 
-_PACKAGE = __file__.rpartition("compiler")[0]
-_active: list[Tracer] = []
+_PACKAGE = __file__.rpartition("compiler")[0]  # the folder of torchpt
+_active: list[Tracer] = []  # tracers that are entered, the innermost last
 
 
 def register_lowering(*names: str) -> Callable[[Handler], Handler]:
@@ -83,8 +86,8 @@ class Value:
     """The nodes of a traced tensor.
 
     Attributes:
-        nodes: numpy array of node numbers (of objects, as numpy's types cannot express int), of the tensor's shape with the
-            lanes' axis divided by the number of lanes.
+        nodes: numpy array of node indices (Python integers in an array of objects), of the tensor's shape with the length of
+            the lanes' axis divided by the number of lanes: 1 for an ordinary axis of lanes.
         lane: the lanes' axis; None: the tensor is the same for all lanes.
     """
 
@@ -104,8 +107,8 @@ class Tracer(TorchDispatchMode):
         uniforms: inputs that are the same for all lanes, in order: type and number of elements.
         tables: tables that the graph reads, in order.
         steps: the prologue.
-        guards: values of tables that Python code read: the trace holds only for these.
-        constants: tensors that are neither leaves nor results of steps.
+        guards: values that Python code read from tables while it ran; for other values the trace is not valid.
+        constants: tensors that are neither leaves nor results of steps, such as the weights of a network.
     """
 
     @classmethod
@@ -124,7 +127,6 @@ class Tracer(TorchDispatchMode):
         self.constants: list[Tensor] = []
         self._values: dict[int, Value] = {}
         self._sources = {key: Source("leaf", path) for key, (path, _) in leaves.items()}
-        self._tensors: dict[Table, Tensor] = {}
         self._numbers: dict[Table, int] = {}
         self._reads = _Reads(self)
         self._keep: list[Any] = [leaves]  # ids stay those of the same tensors as long as these live
@@ -142,7 +144,7 @@ class Tracer(TorchDispatchMode):
     # -- inputs and results
 
     def lane(self, like: Tensor, make: Callable[[int], int]) -> Tensor:
-        """Declare ``like (..., lanes)`` as an input; ``make(k)`` returns the node of its k-th element of a lane."""
+        """Declare ``like (..., lanes)`` as an input and return it; ``make(k)`` returns the node of element k of a lane."""
         lead = like.shape[:-1]
         nodes = np.empty((*lead, 1), object)
         for k, entry in enumerate(np.ndindex(*lead)):
@@ -152,7 +154,7 @@ class Tracer(TorchDispatchMode):
         return like
 
     def uniform(self, like: Tensor) -> Tensor:
-        """Declare a small tensor as an input that all lanes share and that may differ from call to call."""
+        """Declare a small tensor as an input that all lanes share and that may differ from call to call, and return it."""
         ty = DTYPES[like.dtype]
         nodes = np.empty(tuple(like.shape), object)
         slot = len(self.uniforms)
@@ -183,14 +185,14 @@ class Tracer(TorchDispatchMode):
         return id(tensor) in self._values
 
     def lane_axis(self, shape: Iterable[int]) -> int | None:
-        """Return the lanes' axis of a shape; None if it has none."""
+        """Return the lanes' axis of a shape, the one whose length is a multiple of the number of lanes; None without lanes."""
         axes = [axis for axis, size in enumerate(shape) if size and size % self.lanes == 0]
         if len(axes) > 1:
             raise Unsupported(f"a tensor of shape {tuple(shape)} with lanes on two axes")
         return axes[0] if axes else None
 
     def inner(self, shape: Iterable[int], lane: int | None) -> tuple[int, ...]:
-        """Return the shape of the nodes of a tensor: the lanes' axis divided by the number of lanes."""
+        """Return the shape of the nodes of a tensor: its own, with the length of axis ``lane`` divided by the lanes."""
         return tuple(size // self.lanes if axis == lane else size for axis, size in enumerate(shape))
 
     def put(self, out: Tensor, nodes: Any, lane: int | None = None) -> None:
@@ -215,19 +217,20 @@ class Tracer(TorchDispatchMode):
             return value
         lane = self.lane_axis(tensor.shape)
         if lane is not None:
-            return self._spread(tensor, lane)
-        if tensor.numel() > 4096:
+            return self._expanded_table(tensor, lane)
+        if tensor.numel() > _MOST_ELEMENTS:
             raise Unsupported(f"a table of shape {tuple(tensor.shape)} read whole in every lane")
-        table, ty = self.table(tensor, None), DTYPES[tensor.dtype]
+        table, ty = self.table(tensor, axis=None), DTYPES[tensor.dtype]
         nodes = np.empty(tuple(tensor.shape), object)
         for k, entry in enumerate(np.ndindex(*tensor.shape)):
             nodes[entry] = self.graph.node("element", ty, extra=(table, k))
         return Value(nodes, None)
 
-    def _spread(self, tensor: Tensor, lane: int) -> Value:
-        """Return the nodes of a table that was expanded along lanes, with the same value in each."""
+    def _expanded_table(self, tensor: Tensor, lane: int) -> Value:
+        """Return the nodes of a table that was expanded along the axis ``lane``, with the same value in each lane."""
         first = torch.ops.aten.narrow.default(tensor, lane, 0, 1)
-        if not bool(((tensor == first) | ((tensor != tensor) & (first != first))).all()):
+        both_nan = (tensor != tensor) & (first != first)
+        if not bool(((tensor == first) | both_nan).all()):
             raise Unsupported("a table as long as the lanes that the stage is traced on")
         self._record(torch.ops.aten.narrow.default, (tensor, lane, 0, 1), {}, first)
         value = Value(self.get(first).nodes, lane)
@@ -244,9 +247,11 @@ class Tracer(TorchDispatchMode):
         return source
 
     def table(self, tensor: Tensor, axis: int | None) -> int:
-        """Return the number of a table, which is added if it is new.
+        """Return the number of a table in :attr:`tables`, to which it is added if it is new.
 
-        ``axis``: the axis that lanes index, the first one in the kernel's memory; None: the layout stays.
+        Args:
+            tensor: the table.
+            axis: the axis that lanes index; in the kernel's memory it is the first one. None: the layout stays.
         """
         table = Table(self.source(tensor), axis)
         if table not in self._numbers:
@@ -259,16 +264,16 @@ class Tracer(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         name = func.overloadpacket.__name__
-        self.graph.origin = _files()
-        given = [x for x in _flat((args, kwargs)) if isinstance(x, Tensor)]
-        traced = any(id(x) in self._values for x in given)
+        self.graph.origin = _files_on_stack()
+        tensors = [x for x in _flattened((args, kwargs)) if isinstance(x, Tensor)]
+        traced = any(id(x) in self._values for x in tensors)
         if name == "_local_scalar_dense":  # tensor.item(), bool(tensor)
             if traced:
                 raise Unsupported("a lane's value read by Python")
             out = func(*args, **kwargs)
             self.guards.append(Guard(self.source(args[0]), out))
             return out
-        out = func(*_safe(name, args) if traced else args, **kwargs)
+        out = func(*_with_valid_indices(name, args) if traced else args, **kwargs)
         if traced:
             handler = LOWERINGS.get(name) if func.namespace == "aten" else None
             if handler is None:
@@ -279,7 +284,7 @@ class Tracer(TorchDispatchMode):
                 raise Unsupported(
                     f"the operator {func} with {', '.join(map(str, kwargs)) or 'these arguments'}"
                 ) from error
-        elif not given and isinstance(out, Tensor) and self.lane_axis(out.shape) is not None:
+        elif not tensors and isinstance(out, Tensor) and self.lane_axis(out.shape) is not None:
             self._factory(name, out)
         else:
             self._record(func, args, kwargs, out)
@@ -300,13 +305,14 @@ class Tracer(TorchDispatchMode):
     def _record(self, func: Any, args: Any, kwargs: dict[str, Any], out: Any) -> None:
         """Record an operator on tables in the prologue."""
 
-        def replaced(x: Any) -> Any:
+        def with_sources(x: Any) -> Any:
+            """Return an argument with the source of each tensor in place of the tensor."""
             if isinstance(x, Tensor):
                 return self.source(x)
-            return type(x)(replaced(y) for y in x) if isinstance(x, list | tuple) else x
+            return type(x)(with_sources(y) for y in x) if isinstance(x, list | tuple) else x
 
         number = len(self.steps)
-        self.steps.append(Step(func, tuple(map(replaced, args)), {k: replaced(v) for k, v in kwargs.items()}))
+        self.steps.append(Step(func, tuple(map(with_sources, args)), {k: with_sources(v) for k, v in kwargs.items()}))
         self._keep.append(out)
         for item, tensor in enumerate(out if isinstance(out, list | tuple) else [out]):
             source = Source("step", number, item if isinstance(out, list | tuple) else -1)
@@ -329,17 +335,20 @@ class _Reads(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
-def _flat(values: Any) -> Iterable[Any]:
+def _flattened(values: Any) -> Iterable[Any]:
     """Yield the elements of nested lists, tuples and dictionaries."""
     for value in values.values() if isinstance(values, dict) else values:
         if isinstance(value, list | tuple | dict):
-            yield from _flat(value)
+            yield from _flattened(value)
         else:
             yield value
 
 
-def _safe(name: str, args: Any) -> Any:
-    """Return arguments with indices clamped to the table: values are meaningless in a trace."""
+def _with_valid_indices(name: str, args: Any) -> Any:
+    """Return the arguments of an operator with its indices clamped to the table.
+
+    Values of lanes are meaningless in a trace, so an index may be out of range, which torch would refuse.
+    """
     if name == "index_select":
         table, axis, index = args
         return table, axis, index.clamp(0, max(table.shape[axis] - 1, 0))
@@ -356,10 +365,10 @@ def _safe(name: str, args: Any) -> Any:
     return args
 
 
-def _files() -> tuple[str, ...]:
+def _files_on_stack() -> tuple[str, ...]:
     """Return the package's files on the stack, innermost first, without those of the lane compiler."""
     files: list[str] = []
-    frame: Any = sys._getframe(2)
+    frame: Any = sys._getframe(2)  # the caller of __torch_dispatch__
     while frame is not None:
         name = frame.f_code.co_filename
         if name.startswith(_PACKAGE):

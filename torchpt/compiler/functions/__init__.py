@@ -1,7 +1,11 @@
 """Elementary functions as LLVM IR, without branches and calls: argument reduction and a polynomial.
 
-The polynomials are those of Moshier's Cephes library (*Methods and Programs for Mathematical Functions*, 1989) unless
-stated otherwise. ``tests/compiler/test_functions.py`` bounds the error of each in units of the last place (ulp).
+The polynomials and their coefficients are those of Moshier's Cephes library (*Methods and Programs for Mathematical Functions*,
+1989) unless stated otherwise, and so are the parts of ln 2 and pi / 2 by which arguments are reduced.
+``tests/compiler/test_functions.py`` bounds the error of each in units of the last place (ulp).
+
+In all files here ``b`` is the :class:`~torchpt.compiler.block.Block` to which instructions are appended, ``ty`` the type, ``f``
+(float32) or ``d`` (float64), and other arguments and results are registers of LLVM that hold values.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Double-double arithmetic: sums and products of float64 with their rounding errors (Dekker 1971)."""
+"""Double-double arithmetic: sums and products of float64 with their rounding errors (Dekker 1971).
+
+A double-double number is a pair of float64 whose sum it is: the rounded number, and the rest that rounding leaves out.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +24,7 @@ def two_product(b: Block, x: str, y: str) -> tuple[str, str]:
 
 def double_product(b: Block, x: tuple[str, str], y: tuple[str, str]) -> tuple[str, str]:
     """Multiply two double-double numbers."""
-    p, rest = two_product(b, x[0], y[0])
-    rest = b.fma("d", x[0], y[1], b.fma("d", x[1], y[0], rest))
+    (x_high, x_low), (y_high, y_low) = x, y
+    p, rest = two_product(b, x_high, y_high)
+    rest = b.fma("d", x_high, y_low, b.fma("d", x_low, y_high, rest))
     return two_sum(b, p, rest)

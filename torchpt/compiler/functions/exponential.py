@@ -13,7 +13,10 @@ _LN2 = math.log(2.0)
 
 
 def _scaled(b: Block, ty: str, p: str, q: str) -> str:
-    """Compute ``p 2^q`` for an integer ``q`` held as a float, by two factors, which avoids early overflow."""
+    """Compute ``p 2^q`` for an integer ``q`` held as a float.
+
+    It is multiplied by two powers of two, made of their bits, since ``2^q`` alone may overflow where the product does not.
+    """
     n = b.convert("fptosi", ty, "i", q)
     half = b.binary("ashr", "i", n, b.constant("i", 1))
     for k in (half, b.sub("i", n, half)):
@@ -42,11 +45,13 @@ def _power_of_two(b: Block, ty: str, q: str, r: str) -> str:
 
 
 def _finish_exponential(b: Block, ty: str, x: str, value: str) -> str:
+    """Return ``value``, or NaN where ``x`` is NaN."""
     return b.select(ty, b.compare("uno", ty, x, x), x, value)
 
 
 def exp(b: Block, ty: str, x: str, rest: str | None = None) -> str:
     """Compute ``e^x``, or ``e^(x + rest)`` for a rest below one ulp of ``x``."""
+    # beyond these limits the result is 0 or infinite
     q, r = _reduced(b, ty, x, *((-104.0, 89.0) if ty == "f" else (-746.0, 710.0)))
     if rest is not None:
         r = b.add(ty, r, rest)
@@ -65,7 +70,7 @@ def _reduced(b: Block, ty: str, x: str, low: float, high: float) -> tuple[str, s
 
 def exp2(b: Block, ty: str, x: str) -> str:
     """Compute ``2^x``."""
-    low, high = (-151.0, 129.0) if ty == "f" else (-1076.0, 1025.0)
+    low, high = (-151.0, 129.0) if ty == "f" else (-1076.0, 1025.0)  # beyond, the result is 0 or infinite
     y = clamped(b, ty, x, low, high)
     y = b.select(ty, b.compare("uno", ty, x, x), b.constant(ty, 0.0), y)
     q = b.call("llvm.rint", ty, y)
@@ -79,13 +84,13 @@ def expm1(b: Block, ty: str, x: str) -> str:
         value = narrow(b, ty, b.sub("d", exp(b, "d", wide(b, ty, x)), b.constant("d", 1.0)))
         small = b.compare("olt", ty, absolute(b, ty, x), b.constant(ty, 1e-8))
         return b.select(ty, small, x, value)
-    # 2^q (e^r - 1 + (1 - 2^-q)), where the inner sum is exact.
-    q, r = _reduced(b, ty, x, -40.0, 710.0)
+    # 2^q (e^r - 1 + (1 - 2^-q)), where the inner sum is exact. Below -40 the result is -1.
+    q, r = _reduced(b, ty, x, low=-40.0, high=710.0)
     one = b.constant(ty, 1.0)
     p = b.polynomial(ty, r, tuple(1.0 / math.factorial(k) for k in range(13, 1, -1)))
     p = b.fma(ty, b.mul(ty, r, r), p, r)
-    less = b.sub(ty, one, _scaled(b, ty, one, b.negative(ty, q)))
-    value = _scaled(b, ty, b.add(ty, p, less), q)
+    inner = b.sub(ty, one, _scaled(b, ty, one, b.negative(ty, q)))
+    value = _scaled(b, ty, b.add(ty, p, inner), q)
     small = b.compare("olt", ty, absolute(b, ty, x), b.constant(ty, 1e-17))  # keeps the sign of zeros, too
     return _finish_exponential(b, ty, x, b.select(ty, small, x, value))
 
@@ -101,7 +106,7 @@ def sigmoid(b: Block, ty: str, x: str) -> str:
 def tanh(b: Block, ty: str, x: str) -> str:
     """Compute the hyperbolic tangent, by ``expm1(2 |x|)``."""
     twice = b.mul(ty, absolute(b, ty, x), b.constant(ty, 2.0))
-    twice = b.extreme("min", ty, twice, b.constant(ty, 80.0))  # 1 up to rounding
+    twice = b.extreme("min", ty, twice, b.constant(ty, 80.0))  # beyond, the result is 1 up to rounding
     e = expm1(b, ty, twice)
     return b.call("llvm.copysign", ty, b.div(ty, e, b.add(ty, e, b.constant(ty, 2.0))), x)
 
@@ -114,6 +119,7 @@ def sinh(b: Block, ty: str, x: str) -> str:
     value = b.mul(ty, half, b.add(ty, e, b.div(ty, e, b.add(ty, e, one))))
     root = exp(b, ty, b.mul(ty, half, size))
     large = b.mul(ty, b.mul(ty, half, root), root)
+    # from 20 on e^-|x| is below the rounding error of e^|x|
     value = b.select(ty, b.compare("ogt", ty, size, b.constant(ty, 20.0)), large, value)
     return b.call("llvm.copysign", ty, value, x)
 

@@ -18,13 +18,13 @@ _LN2_PARTS = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 def log(b: Block, ty: str, x: str) -> str:
     """Compute the natural logarithm."""
     if ty == "f":
-        return log_ends(b, ty, x, narrow(b, ty, _log_series(b, wide(b, ty, x), 5)))
+        return log_ends(b, ty, x, narrow(b, ty, _log_series(b, wide(b, ty, x), terms=5)))
     return log_ends(b, ty, x, b.add(ty, *log_parts(b, x)))
 
 
 def log_wide(b: Block, x: str) -> str:
     """Compute the logarithm of a float64 to about 50 bits; denormals are not supported."""
-    return log_ends(b, "d", x, _log_series(b, x, 11))
+    return log_ends(b, "d", x, _log_series(b, x, terms=11))
 
 
 def log_ends(b: Block, ty: str, x: str, value: str) -> str:
@@ -38,13 +38,17 @@ def log_ends(b: Block, ty: str, x: str, value: str) -> str:
 def _mantissa(b: Block, y: str) -> tuple[str, str]:
     """Split a positive float64 into ``m 2^e``: ``m`` between the square roots of 1/2 and 2, and ``e`` as a float64."""
     bits = b.convert("bitcast", "d", "L", y)
+    # relative to the bits of the square root of 1/2, the exponent counts from there
     e = b.binary("ashr", "L", b.sub("L", bits, b.constant("L", 0x3FE6A09E00000000)), b.constant("L", 52))
     m = b.convert("bitcast", "L", "d", b.sub("L", bits, b.binary("shl", "L", e, b.constant("L", 52))))
     return m, b.convert("sitofp", "i", "d", b.convert("trunc", "L", "i", e))
 
 
 def _log_series(b: Block, x: str, terms: int) -> str:
-    """Compute a logarithm by the series of ``ln m = 2 atanh(s)``, ``s = (m - 1) / (m + 1)``, ``|s| < 0.172``."""
+    """Compute the logarithm of ``x = m 2^e`` by the series of ``ln m = 2 atanh(s)``.
+
+    Here ``s = (m - 1) / (m + 1)``, so ``|s| < 0.172``; ``terms`` is the number of terms after the first, ``2 s``.
+    """
     m, e = _mantissa(b, x)
     f = b.sub("d", m, b.constant("d", 1.0))
     s = b.div("d", f, b.add("d", m, b.constant("d", 1.0)))
@@ -57,27 +61,29 @@ def _log_series(b: Block, x: str, terms: int) -> str:
 
 def log_parts(b: Block, x: str) -> tuple[str, str]:
     """Compute the logarithm of positive finite float64 as a sum of two, to about 63 bits; the series of :func:`_log_series`."""
+    # denormals are scaled to normal numbers
     tiny = b.compare("olt", "d", x, b.constant("d", 2.0**-1022))
     m, e = _mantissa(b, b.select("d", tiny, b.mul("d", x, b.constant("d", 2.0**54)), x))
     e = b.select("d", tiny, b.sub("d", e, b.constant("d", 54.0)), e)
     one = b.constant("d", 1.0)
     f = b.sub("d", m, one)
-    # s = f / (2 + f), with its rounding error.
-    d = two_sum(b, b.constant("d", 2.0), f)
-    sh = b.div("d", f, d[0])
-    off = b.fma("d", b.negative("d", sh), d[1], b.fma("d", b.negative("d", sh), d[0], f))
-    s = sh, b.div("d", off, d[0])
-    z = double_product(b, s, s)
-    # 2 + z (2/3 + z (2/5 + ...)): the last bracket needs no more than float64 has.
-    p = b.polynomial("d", z[0], tuple(2.0 / k for k in range(23, 4, -2)))
-    w = two_sum(b, b.constant("d", 2.0 / 3.0), b.mul("d", z[0], p))
-    w = w[0], b.add("d", w[1], b.constant("d", 3.700743415417188e-17))  # rounding error of 2/3
-    w = double_product(b, z, w)
-    h = two_sum(b, b.constant("d", 2.0), w[0])
-    r = double_product(b, s, (h[0], b.add("d", h[1], w[1])))
-    t = two_sum(b, b.mul("d", e, b.constant("d", _LN2_PARTS[0])), r[0])
-    rest = b.fma("d", e, b.constant("d", _LN2_PARTS[1]), b.add("d", t[1], r[1]))
-    return two_sum(b, t[0], rest)
+    # From here on the numbers are double-double: high part, low part.
+    # s = f / (2 + f)
+    d_high, d_low = two_sum(b, b.constant("d", 2.0), f)
+    s_high = b.div("d", f, d_high)
+    off = b.fma("d", b.negative("d", s_high), d_low, b.fma("d", b.negative("d", s_high), d_high, f))
+    s = s_high, b.div("d", off, d_high)
+    z_high, z_low = double_product(b, s, s)
+    # s (2 + z (2/3 + z (2/5 + ...))) with z = s^2: the last bracket needs no more than float64 has.
+    p = b.polynomial("d", z_high, tuple(2.0 / k for k in range(23, 4, -2)))
+    w_high, w_low = two_sum(b, b.constant("d", 2.0 / 3.0), b.mul("d", z_high, p))
+    w_low = b.add("d", w_low, b.constant("d", 3.700743415417188e-17))  # rounding error of 2/3
+    w_high, w_low = double_product(b, (z_high, z_low), (w_high, w_low))
+    h_high, h_low = two_sum(b, b.constant("d", 2.0), w_high)
+    r_high, r_low = double_product(b, s, (h_high, b.add("d", h_low, w_low)))
+    t_high, t_low = two_sum(b, b.mul("d", e, b.constant("d", _LN2_PARTS[0])), r_high)
+    rest = b.fma("d", e, b.constant("d", _LN2_PARTS[1]), b.add("d", t_low, r_low))
+    return two_sum(b, t_high, rest)
 
 
 def log_by(factor: float, rest: float) -> Callable[[Block, str, str], str]:
@@ -101,8 +107,8 @@ def log1p(b: Block, ty: str, x: str) -> str:
         return b.select(ty, small, x, value)
     # With u the rounded sum 1 + x and c its rounding error: ln(u + c) = ln u + c / u.
     u = b.add("d", x, one)
-    less = b.sub("d", u, x)
-    c = b.add("d", b.sub("d", x, b.sub("d", u, less)), b.sub("d", one, less))
+    rounded_one = b.sub("d", u, x)  # 1 as it entered the sum
+    c = b.add("d", b.sub("d", x, b.sub("d", u, rounded_one)), b.sub("d", one, rounded_one))
     high, low = log_parts(b, u)
     value = b.add(ty, high, b.add(ty, low, b.div(ty, c, u)))
     return b.select(ty, small, x, log_ends(b, ty, u, value))

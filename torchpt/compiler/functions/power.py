@@ -22,23 +22,24 @@ def power(b: Block, ty: str, x: str, y: str) -> str:
         high, low = log_parts(b, size)
         high = log_ends(b, "d", size, high)
         product = b.mul("d", q, high)
-        rest = b.fma("d", q, low, b.fma("d", q, high, b.negative("d", product)))
-        ends = b.compare(
-            "ult", "d", absolute(b, "d", product), b.constant("d", 800.0)
-        )  # beyond, the result is 0 or infinite
-        value = exp(b, "d", product, b.select("d", ends, rest, zero))
-    whole = b.compare("oeq", "d", b.call("llvm.rint", "d", q), q)
+        product_error = b.fma("d", q, low, b.fma("d", q, high, b.negative("d", product)))
+        # beyond 800 the result is 0 or infinite, and the error may be NaN
+        in_range = b.compare("ult", "d", absolute(b, "d", product), b.constant("d", 800.0))
+        value = exp(b, "d", product, b.select("d", in_range, product_error, zero))
+    # so far of |x|; now of negative x
+    is_integer = b.compare("oeq", "d", b.call("llvm.rint", "d", q), q)
     half = b.mul("d", q, b.constant("d", 0.5))
-    odd = b.op(f"and {b.each('i1')} {whole}, " + b.compare("one", "d", b.call("llvm.rint", "d", half), half))
-    mirrored = b.select("d", odd, b.negative("d", value), value)
+    is_odd = b.op(f"and {b.each('i1')} {is_integer}, " + b.compare("one", "d", b.call("llvm.rint", "d", half), half))
+    of_negative = b.select("d", is_odd, b.negative("d", value), value)
     # A fractional power of a negative number is NaN; that of -0 and of minus infinity is the power of the absolute value.
-    some = b.op(f"and {b.each('i1')} {b.compare('olt', 'd', p, zero)}, {b.compare('olt', 'd', size, inf)}")
-    broken = b.compare("one", "d", b.call("llvm.rint", "d", q), q)
-    missing = b.op(f"and {b.each('i1')} {broken}, {some}")
-    mirrored = b.select("d", missing, b.constant("d", math.nan), mirrored)
-    value = b.select("d", negative(b, "d", p), mirrored, value)
-    endless = b.compare("oeq", "d", absolute(b, "d", q), inf)
-    always = b.op(f"and {b.each('i1')} {endless}, {b.compare('oeq', 'd', size, one)}")  # (-1)^inf, as C has it
-    for condition in (always, b.compare("oeq", "d", p, one), b.compare("oeq", "d", q, zero)):
+    finite_negative = b.op(f"and {b.each('i1')} {b.compare('olt', 'd', p, zero)}, {b.compare('olt', 'd', size, inf)}")
+    is_fractional = b.compare("one", "d", b.call("llvm.rint", "d", q), q)
+    undefined = b.op(f"and {b.each('i1')} {is_fractional}, {finite_negative}")
+    of_negative = b.select("d", undefined, b.constant("d", math.nan), of_negative)
+    value = b.select("d", negative(b, "d", p), of_negative, value)
+    # 1, as in C: (-1)^inf, 1^y for any y, x^0 for any x
+    infinite_exponent = b.compare("oeq", "d", absolute(b, "d", q), inf)
+    unit_to_infinity = b.op(f"and {b.each('i1')} {infinite_exponent}, {b.compare('oeq', 'd', size, one)}")
+    for condition in (unit_to_infinity, b.compare("oeq", "d", p, one), b.compare("oeq", "d", q, zero)):
         value = b.select("d", condition, one, value)
     return narrow(b, ty, value)

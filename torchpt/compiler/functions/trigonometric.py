@@ -15,7 +15,7 @@ _HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879
 
 
 def _quadrant(b: Block, ty: str, x: str) -> tuple[str, str]:
-    """Reduce ``x`` to the number of the nearest multiple of pi / 2, modulo 4 (int32), and the remainder."""
+    """Return the number of the multiple of pi / 2 nearest to ``x``, modulo 4 (int32), and ``x`` minus that multiple."""
     y = wide(b, ty, x)
     q = b.call("llvm.rint", "d", b.mul("d", y, b.constant("d", 2.0 / math.pi)))
     for part in _HALF_PI[: 2 if ty == "f" else 3]:
@@ -25,7 +25,7 @@ def _quadrant(b: Block, ty: str, x: str) -> tuple[str, str]:
     q = b.fma("d", turns, b.constant("d", -4.0), q)
     finite = b.compare("olt", "d", absolute(b, "d", q), b.constant("d", 5.0))
     q = b.select("d", finite, q, b.constant("d", 0.0))
-    # Beyond 2^20 the remainder loses digits; far beyond it is clamped to the range that rounding allows.
+    # Beyond 2^20 the remainder loses digits; far beyond, it may be anything and is clamped, to a bit more than pi / 4.
     y = clamped(b, "d", y, -0.79, 0.79)
     return b.convert("fptosi", "d", "i", q), narrow(b, ty, y)
 
@@ -64,39 +64,41 @@ def _cosine(b: Block, ty: str, x: str) -> str:
     return b.fma(ty, b.mul(ty, z, z), p, b.fma(ty, z, b.constant(ty, -0.5), b.constant(ty, 1.0)))
 
 
-def _turned(b: Block, ty: str, q: str, s: str, c: str) -> str:
+def _sine_in_quadrant(b: Block, ty: str, q: str, sine: str, cosine: str) -> str:
     """Return the sine of an angle from its quadrant ``q`` and sine and cosine of the remainder."""
     one, zero = b.constant("i", 1), b.constant("i", 0)
     odd = b.compare("ne", "i", b.binary("and", "i", q, one), zero)
-    value = b.select(ty, odd, c, s)
-    below = b.compare("ne", "i", b.binary("and", "i", q, b.constant("i", 2)), zero)
-    return b.select(ty, below, b.negative(ty, value), value)
+    value = b.select(ty, odd, cosine, sine)
+    third_or_fourth = b.compare("ne", "i", b.binary("and", "i", q, b.constant("i", 2)), zero)
+    return b.select(ty, third_or_fourth, b.negative(ty, value), value)
 
 
 def trigonometric(shift: int) -> Callable[[Block, str, str], str]:
     """Return the function for the sine; for the cosine if ``shift`` is 1, a quarter of a turn."""
 
     def function(b: Block, ty: str, x: str) -> str:
-        q, rest = _quadrant(b, ty, x)
+        q, remainder = _quadrant(b, ty, x)
         if shift:
             q = b.add("i", q, b.constant("i", shift))
-        value = _turned(b, ty, q, _sine(b, ty, rest), _cosine(b, ty, rest))
+        value = _sine_in_quadrant(b, ty, q, _sine(b, ty, remainder), _cosine(b, ty, remainder))
         if not shift:  # keeps the sign of zeros
             value = b.select(ty, b.compare("oeq", ty, x, b.constant(ty, 0.0)), x, value)
-        # NaN for infinity and NaN.
-        none = b.compare("uge", ty, absolute(b, ty, x), b.constant(ty, math.inf))
-        return b.select(ty, none, b.constant(ty, math.nan), value)
+        not_finite = b.compare("uge", ty, absolute(b, ty, x), b.constant(ty, math.inf))
+        return b.select(ty, not_finite, b.constant(ty, math.nan), value)
 
     return function
 
 
 def tan(b: Block, ty: str, x: str) -> str:
     """Compute the tangent."""
-    return b.div(ty, trigonometric(0)(b, ty, x), trigonometric(1)(b, ty, x))
+    return b.div(ty, trigonometric(shift=0)(b, ty, x), trigonometric(shift=1)(b, ty, x))
 
 
 def _atan_positive(b: Block, ty: str, x: str) -> str:
-    """Compute the inverse tangent on [0, inf]."""
+    """Compute the inverse tangent on [0, inf].
+
+    Around 1 it is ``pi / 4 + atan((x - 1) / (x + 1))``, above ``pi / 2 + atan(-1 / x)``.
+    """
     one = b.constant(ty, 1.0)
     steep = b.compare("ogt", ty, x, b.constant(ty, 1.0 + math.sqrt(2.0)))
     middle = b.compare("ogt", ty, x, b.constant(ty, math.sqrt(2.0) - 1.0 if ty == "f" else 0.66))
@@ -143,10 +145,10 @@ def atan2(b: Block, ty: str, y: str, x: str) -> str:
     u, v = absolute(b, ty, y), absolute(b, ty, x)
     inf = b.constant(ty, math.inf)
     # Both infinite: as if both were 1. Both zero: as if the quotient were 0.
-    both = b.op(f"and {b.each('i1')} {b.compare('oeq', ty, u, inf)}, {b.compare('oeq', ty, v, inf)}")
-    u, v = (b.select(ty, both, b.constant(ty, 1.0), w) for w in (u, v))
-    none = b.compare("oeq", ty, b.extreme("max", ty, u, v), b.constant(ty, 0.0))
-    v = b.select(ty, none, b.constant(ty, 1.0), v)
+    both_infinite = b.op(f"and {b.each('i1')} {b.compare('oeq', ty, u, inf)}, {b.compare('oeq', ty, v, inf)}")
+    u, v = (b.select(ty, both_infinite, b.constant(ty, 1.0), w) for w in (u, v))
+    both_zero = b.compare("oeq", ty, b.extreme("max", ty, u, v), b.constant(ty, 0.0))
+    v = b.select(ty, both_zero, b.constant(ty, 1.0), v)
     r = _atan_positive(b, ty, b.div(ty, u, v))
     r = b.select(ty, negative(b, ty, x), b.sub(ty, b.constant(ty, math.pi), r), r)
     return b.call("llvm.copysign", ty, r, y)

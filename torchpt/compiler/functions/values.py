@@ -1,4 +1,4 @@
-"""Helpers of the elementary functions; a type is "f" or "d"."""
+"""Helpers of the elementary functions; the type ``ty`` is "f" (float32) or "d" (float64)."""
 
 from __future__ import annotations
 
@@ -28,6 +28,6 @@ def clamped(b: Block, ty: str, x: str, low: float, high: float) -> str:
 
 
 def negative(b: Block, ty: str, x: str) -> str:
-    """Return a mask of the sign bit."""
+    """Return the mask of the lanes whose sign bit is set, -0 included."""
     integer_type = "i" if ty == "f" else "L"
     return b.compare("slt", integer_type, b.convert("bitcast", ty, integer_type, x), "zeroinitializer")

@@ -16,6 +16,8 @@ __all__ = ["binary"]
 
 #: Operations whose result may need more than 32 bits where the operands did not.
 _GROWS = ("mul", "shl")
+#: Largest constant exponent of a power that is computed by at most four multiplications instead of logarithm and exponential.
+_MOST_MULTIPLIED = 8
 
 
 def binary(op: str) -> Any:
@@ -63,6 +65,8 @@ def _div(tracer: Tracer, out: Tensor, a: Any, b: Any, rounding_mode: str | None 
 
 
 def _sum(op: str) -> Any:
+    """Return the lowering of ``a + alpha b`` (``add``) or ``a - alpha b`` (``sub``)."""
+
     def handler(tracer: Tracer, out: Tensor, a: Any, b: Any, alpha: float = 1) -> None:
         graph = tracer.graph
 
@@ -122,6 +126,8 @@ def _lerp(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, weight: Any) -> Non
 
 
 def _unary(op: str) -> Any:
+    """Return the lowering of an elementwise operator of one operand to the node ``op``."""
+
     def handler(tracer: Tracer, out: Tensor, a: Tensor) -> None:
         def function(x: int) -> int:
             ty = type_of(tracer, out.dtype, x)
@@ -183,6 +189,7 @@ def _pow(tracer: Tracer, out: Tensor, a: Any, b: Any) -> None:
     graph, ty = tracer.graph, "L" if out.dtype == torch.int64 else DTYPES[out.dtype]
 
     def power(x: int, n: int) -> int:
+        """Multiply ``x`` with itself, by squaring."""
         half = power(x, n // 2) if n > 1 else x
         if n == 1:
             return x
@@ -196,7 +203,7 @@ def _pow(tracer: Tracer, out: Tensor, a: Any, b: Any) -> None:
             return graph.constant(ty, 1)
         if n == 0.5:
             return graph.node("sqrt", ty, x)
-        if n is not None and float(n).is_integer() and 1 <= n <= 8:
+        if n is not None and float(n).is_integer() and 1 <= n <= _MOST_MULTIPLIED:
             return power(x, int(n))
         if n == -1:
             return graph.node("div", ty, graph.constant(ty, 1.0), x)

@@ -66,6 +66,8 @@ def masked_fill(tracer: Tracer, out: Tensor, a: Tensor, mask: Tensor, value: Any
 
 
 def _compare(op: str) -> Any:
+    """Return the lowering of a comparison to the node ``op``, in the type to which torch promotes the operands."""
+
     def handler(tracer: Tracer, out: Tensor, a: Any, b: Any) -> None:
         graph, dtype = tracer.graph, torch.result_type(a, b)
 
@@ -85,12 +87,12 @@ for _name in ("gt", "lt", "ge", "le", "eq", "ne"):
 @register_lowering("clamp", "clip")
 def _clamp(tracer: Tracer, out: Tensor, a: Tensor, low: Any = None, high: Any = None) -> None:
     def function(x: int, *ends: int) -> int:
-        graph, rest = tracer.graph, list(ends)
+        graph = tracer.graph
         ty = type_of(tracer, out.dtype, x)
         x = graph.cast(x, ty)
-        for op, end in (("max", low), ("min", high)):
-            if end is not None:
-                x = graph.binary(op, ty, x, graph.cast(rest.pop(0), ty))
+        operations = [op for op, end in (("max", low), ("min", high)) if end is not None]
+        for op, end_node in zip(operations, ends, strict=True):
+            x = graph.binary(op, ty, x, graph.cast(end_node, ty))
         return x
 
     apply(tracer, out, function, a, *(end for end in (low, high) if end is not None))
@@ -108,6 +110,8 @@ def _to_copy(tracer: Tracer, out: Tensor, a: Tensor, *_: Any, **__: Any) -> None
 
 
 def _like(value: float) -> Any:
+    """Return the lowering of an operator that makes a tensor filled with a value."""
+
     def handler(tracer: Tracer, out: Tensor, *_: Any, **__: Any) -> None:
         tracer.put(out, np.array(tracer.graph.constant(DTYPES[out.dtype], value), object))
 
@@ -119,5 +123,6 @@ register_lowering("zeros_like", "new_zeros")(_like(0))
 
 
 @register_lowering("full_like", "new_full")
-def _full_like(tracer: Tracer, out: Tensor, a: Tensor, *rest: Any, **_: Any) -> None:
-    tracer.put(out, np.array(tracer.graph.constant(DTYPES[out.dtype], rest[-1]), object))
+def _full_like(tracer: Tracer, out: Tensor, a: Tensor, *args: Any, **_: Any) -> None:
+    value = args[-1]  # new_full has the size before it
+    tracer.put(out, np.array(tracer.graph.constant(DTYPES[out.dtype], value), object))

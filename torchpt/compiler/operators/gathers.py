@@ -1,4 +1,9 @@
-"""Lowerings of table look-ups, binary searches and products with small matrices."""
+"""Lowerings of table look-ups, binary searches and products with small matrices.
+
+A *table* is a tensor that does not depend on lanes; a look-up at an index that does is a load from memory (node ``gather``,
+whose ``extra`` is the number of the table, the numbers of an entry, and the one that is loaded). A look-up in a tensor that
+depends on lanes is supported only at the lane's own index, and among a few values of each lane.
+"""
 
 from __future__ import annotations
 
@@ -19,32 +24,31 @@ def _look_up(tracer: Tracer, table: Tensor, axis: int, index: int) -> np.ndarray
     """Return the nodes of entry ``index`` of a table along an axis, in the table's shape without that axis."""
     graph, ty = tracer.graph, DTYPES[table.dtype]
     number = tracer.table(table, axis)
-    lead = (*table.shape[:axis], *table.shape[axis + 1 :])
-    width = math.prod(lead)
-    entries = np.empty(lead, object)
-    for k, entry in enumerate(np.ndindex(*lead)):
-        entries[entry] = graph.node("gather", ty, graph.cast(index, "i"), extra=(number, width, k))
-    return entries
+    shape = (*table.shape[:axis], *table.shape[axis + 1 :])  # of an entry
+    width = math.prod(shape)
+    components = np.empty(shape, object)
+    for k, component in enumerate(np.ndindex(*shape)):
+        components[component] = graph.node("gather", ty, graph.cast(index, "i"), extra=(number, width, k))
+    return components
 
 
 @register_lowering("index_select")
 def _index_select(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Tensor) -> None:
     axis %= table.dim()
-    lanes = tracer.get(index)
-    rows = lanes.nodes.reshape(-1)
+    index_nodes = tracer.get(index).nodes.reshape(-1)
     if tracer.is_traced(table):
-        return _from_lanes(tracer, out, table, axis, rows)
-    if len(rows) == 1:
-        nodes = np.expand_dims(_look_up(tracer, table, axis, rows[0]), axis)
+        return _from_lanes(tracer, out, table, axis, index_nodes)
+    if len(index_nodes) == 1:
+        nodes = np.expand_dims(_look_up(tracer, table, axis, index_nodes[0]), axis)
     else:  # several look-ups a lane
-        nodes = np.stack([_look_up(tracer, table, axis, row) for row in rows], axis)
+        nodes = np.stack([_look_up(tracer, table, axis, node) for node in index_nodes], axis)
     tracer.put(out, nodes)
 
 
-def _from_lanes(tracer: Tracer, out: Tensor, table: Tensor, axis: int, rows: Any) -> None:
-    """Lower a look-up in a tensor of lanes, which must be at the lane's own number."""
+def _from_lanes(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index_nodes: Any) -> None:
+    """Lower a look-up in a tensor of lanes, which must be at the lane's own number (node ``iota``)."""
     value = tracer.get(table)
-    if value.lane == axis and len(rows) == 1 and tracer.graph.nodes[rows[0]][0] == "iota":
+    if value.lane == axis and len(index_nodes) == 1 and tracer.graph.nodes[index_nodes[0]][0] == "iota":
         return tracer.alias(out, table)
     if value.lane is not None and axis != value.lane:  # selects one of a few values of each lane
         raise Unsupported("a look-up in a tensor that depends on lanes")
@@ -59,42 +63,42 @@ def _index(tracer: Tracer, out: Tensor, table: Tensor, indices: Any) -> None:
     if axes != list(range(len(axes))) or tracer.is_traced(table):
         raise Unsupported(f"a look-up by {len(axes)} indices")
     graph, ty = tracer.graph, DTYPES[table.dtype]
-    columns: Any = np.broadcast_arrays(*(tracer.get(index).nodes for index in indices[: len(axes)]))
-    rest = tuple(table.shape[len(axes) :])
-    width, number = math.prod(rest), tracer.table(table, None)
-    nodes = np.empty((*columns[0].shape, *rest), object)
-    for entry in np.ndindex(*columns[0].shape):
-        place = graph.constant("i", 0)
-        for axis, column in enumerate(columns):
-            place = graph.binary("mul", "i", place, graph.constant("i", table.shape[axis])) if axis else place
-            place = graph.binary("add", "i", place, graph.cast(column[entry], "i"))
-        place = graph.binary("mul", "i", place, graph.constant("i", width))
-        for k, inner in enumerate(
-            np.ndindex(*rest)
-        ):  # elements of the flattened table, whose indices are clamped one by one
-            one = graph.binary("add", "i", place, graph.constant("i", k))
-            nodes[(*entry, *inner)] = graph.node("gather", ty, one, extra=(number, 1, 0))
+    index_nodes: Any = np.broadcast_arrays(*(tracer.get(index).nodes for index in indices[: len(axes)]))
+    shape, entry_shape = index_nodes[0].shape, tuple(table.shape[len(axes) :])
+    width, number = math.prod(entry_shape), tracer.table(table, axis=None)
+    nodes = np.empty((*shape, *entry_shape), object)
+    for entry in np.ndindex(*shape):
+        # the index of the entry's first number in the flattened table
+        first = graph.constant("i", 0)
+        for axis, of_axis in enumerate(index_nodes):
+            first = graph.binary("mul", "i", first, graph.constant("i", table.shape[axis])) if axis else first
+            first = graph.binary("add", "i", first, graph.cast(of_axis[entry], "i"))
+        first = graph.binary("mul", "i", first, graph.constant("i", width))
+        for k, component in enumerate(np.ndindex(*entry_shape)):  # each index is clamped by itself
+            flat_index = graph.binary("add", "i", first, graph.constant("i", k))
+            nodes[(*entry, *component)] = graph.node("gather", ty, flat_index, extra=(number, 1, 0))
     tracer.put(out, nodes)
 
 
 def _index_one(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Tensor) -> None:
-    lanes = tracer.get(index).nodes
+    """Lower a look-up by one index, whose shape takes the place of the axis."""
+    index_nodes = tracer.get(index).nodes
     if tracer.is_traced(table):
-        return _from_lanes(tracer, out, table, axis, lanes.reshape(-1))
-    rows = [_look_up(tracer, table, axis, row) for row in lanes.reshape(-1)]
-    nodes = np.stack(rows, axis)
-    tracer.put(out, nodes.reshape((*nodes.shape[:axis], *lanes.shape, *nodes.shape[axis + 1 :])))
+        return _from_lanes(tracer, out, table, axis, index_nodes.reshape(-1))
+    entries = [_look_up(tracer, table, axis, node) for node in index_nodes.reshape(-1)]
+    nodes = np.stack(entries, axis)
+    tracer.put(out, nodes.reshape((*nodes.shape[:axis], *index_nodes.shape, *nodes.shape[axis + 1 :])))
 
 
 @register_lowering("take")
 def _take(tracer: Tracer, out: Tensor, table: Tensor, index: Tensor) -> None:
     if tracer.is_traced(table):
         raise Unsupported("a look-up in a tensor that depends on lanes")
-    graph, ty, lanes = tracer.graph, DTYPES[table.dtype], tracer.get(index).nodes
-    number = tracer.table(table, None)
-    nodes = np.empty(lanes.shape, object)
-    for entry in np.ndindex(*lanes.shape):
-        nodes[entry] = graph.node("gather", ty, graph.cast(lanes[entry], "i"), extra=(number, 1, 0))
+    graph, ty, index_nodes = tracer.graph, DTYPES[table.dtype], tracer.get(index).nodes
+    number = tracer.table(table, axis=None)
+    nodes = np.empty(index_nodes.shape, object)
+    for entry in np.ndindex(*index_nodes.shape):
+        nodes[entry] = graph.node("gather", ty, graph.cast(index_nodes[entry], "i"), extra=(number, 1, 0))
     tracer.put(out, nodes)
 
 
@@ -139,12 +143,13 @@ def _searchsorted(
         raise Unsupported("a search in a table with more than one axis, a sorter, or lanes")
     graph, ty = tracer.graph, DTYPES[table.dtype]
     right = right or side == "right"
-    number, lanes = tracer.table(table, None), tracer.get(values).nodes
-    nodes = np.empty(lanes.shape, object)
-    for entry in np.ndindex(*lanes.shape):
-        if graph.type(lanes[entry]) != ty and not (ty == "l" and graph.type(lanes[entry]) in "il"):
+    number, value_nodes = tracer.table(table, axis=None), tracer.get(values).nodes
+    nodes = np.empty(value_nodes.shape, object)
+    for entry in np.ndindex(*value_nodes.shape):
+        value_type = graph.type(value_nodes[entry])
+        if value_type != ty and not (ty == "l" and value_type in "il"):
             raise Unsupported("a search for values of another type than the table's")
-        nodes[entry] = graph.node("search", "l", lanes[entry], extra=(number, ty, right))
+        nodes[entry] = graph.node("search", "l", value_nodes[entry], extra=(number, ty, right))
     tracer.put(out, nodes)
 
 
@@ -156,6 +161,7 @@ def _matrix(tracer: Tracer, tensor: Tensor) -> np.ndarray:
 
 
 def _product(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, start: Tensor | None) -> None:
+    """Lower the matrix product ``start + a b``; ``start`` None: 0. Sums are in the order of the rows of ``b``."""
     graph, ty = tracer.graph, "L" if out.dtype == torch.int64 else DTYPES[out.dtype]
     if (tracer.is_traced(a) and tracer.get(a).lane == 1) or (tracer.is_traced(b) and tracer.get(b).lane == 0):
         raise Unsupported("a sum over lanes")
@@ -174,7 +180,7 @@ def _product(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, start: Tensor | 
 
 @register_lowering("mm", "matmul")
 def _mm(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor) -> None:
-    _product(tracer, out, a, b, None)
+    _product(tracer, out, a, b, start=None)
 
 
 @register_lowering("addmm")

@@ -1,4 +1,8 @@
-"""Helpers of lowerings: elementwise application with broadcasting, and types."""
+"""Helpers of lowerings: elementwise application with broadcasting, and types.
+
+The nodes of a tensor are a numpy array of node indices, one for each of its elements in one lane
+(:class:`torchpt.compiler.tracing.Value`).
+"""
 
 from __future__ import annotations
 
@@ -15,29 +19,35 @@ from torchpt.compiler.tracing import Tracer
 __all__ = ["apply", "cast_all", "type_of"]
 
 
+#: A function of nodes that adds nodes to the graph and returns the one of the result.
 Nodes = Callable[..., int]
 
 
 def apply(tracer: Tracer, out: Tensor, function: Nodes, *operands: Any) -> None:
-    """Set ``out`` to ``function`` of the operands' broadcast nodes; Python numbers become constants."""
+    """Set the nodes of ``out``, element by element, to ``function`` of the nodes of the operands.
+
+    The operands are broadcast, as in torch; Python numbers become constants.
+    """
     graph = tracer.graph
-    columns = [tracer.get(x).nodes if isinstance(x, Tensor) else np.array(_number(graph, x), object) for x in operands]
-    shape = np.broadcast_shapes(*(c.shape for c in columns))
-    columns = [np.broadcast_to(c, shape) for c in columns]
+    arrays = [
+        tracer.get(x).nodes if isinstance(x, Tensor) else np.array(_constant_node(graph, x), object) for x in operands
+    ]
+    shape = np.broadcast_shapes(*(nodes.shape for nodes in arrays))
+    arrays = [np.broadcast_to(nodes, shape) for nodes in arrays]
     result = np.empty(shape, object)
     for entry in np.ndindex(*shape):
-        result[entry] = function(*(c[entry] for c in columns))
+        result[entry] = function(*(nodes[entry] for nodes in arrays))
     tracer.put(out, result)
 
 
-def _number(graph: Any, x: float | int | bool) -> int:
+def _constant_node(graph: Any, x: float | int | bool) -> int:
     if isinstance(x, bool):
         return graph.constant("b", x)
     return graph.constant("l", x) if isinstance(x, int) else graph.constant("d", x)
 
 
 def type_of(tracer: Tracer, dtype: torch.dtype, *nodes: int) -> str:
-    """Return the node type of a result of ``dtype``: ``L`` for int64 if an operand may need 64 bits."""
+    """Return the node type of a result of ``dtype``: of int64 ``L`` if an operand may need 64 bits, else ``l``."""
     ty = DTYPES[dtype]
     return "L" if ty == "l" and any(tracer.graph.type(node) in "iL" for node in nodes) else ty
 

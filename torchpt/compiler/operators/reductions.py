@@ -40,12 +40,12 @@ def _reduce(op: str, boolean: bool = False) -> Any:
                 summed = sum_over_lanes(tracer, nodes, k, DTYPES[out.dtype])
                 nodes = np.expand_dims(summed, k) if keepdim else summed
                 continue
-            # Slices of the array of nodes along the axis; squeezed, so that one of a vector is an array and no number.
+            # Slices of the array of nodes along the axis; squeezed, so that a slice of a vector is an array of no axes.
             parts: list[Any] = [np.squeeze(np.take(nodes, [j], axis=k), axis=k) for j in range(nodes.shape[k])]
             if not parts:
                 shape = (*nodes.shape[:k], *nodes.shape[k + 1 :])
-                parts = [np.full(shape, _nothing(graph, op, DTYPES[out.dtype]), object)]
-            total = cast_all(tracer, parts[0], "b" if boolean else _sums(op, out))
+                parts = [np.full(shape, _neutral_element(graph, op, DTYPES[out.dtype]), object)]
+            total = cast_all(tracer, parts[0], "b" if boolean else _type_of_sums(op, out))
             for part in parts[1:]:
                 joined: Any = np.empty(total.shape, object)
                 for entry in np.ndindex(*total.shape):
@@ -58,12 +58,12 @@ def _reduce(op: str, boolean: bool = False) -> Any:
     return handler
 
 
-def _sums(op: str, out: Tensor) -> str:
+def _type_of_sums(op: str, out: Tensor) -> str:
     """Return the node type in which a reduction is computed: "L" (64 bits) for int64 sums and products, else that of `out`."""
     return "L" if out.dtype == torch.int64 and op in ("add", "mul") else DTYPES[out.dtype]
 
 
-def _nothing(graph: Any, op: str, ty: str) -> int:
+def _neutral_element(graph: Any, op: str, ty: str) -> int:
     """Return the result of a reduction of no elements."""
     if op not in ("add", "mul", "and", "or"):
         raise Unsupported("the maximum or minimum of no elements")
@@ -87,7 +87,7 @@ def _mean(tracer: Tracer, out: Tensor, a: Tensor, axis: Any = None, keepdim: boo
 
 @register_lowering("cumsum")
 def _cumsum(tracer: Tracer, out: Tensor, a: Tensor, axis: int, dtype: Any = None) -> None:
-    value, graph, ty = tracer.get(a), tracer.graph, _sums("add", out)
+    value, graph, ty = tracer.get(a), tracer.graph, _type_of_sums("add", out)
     axis %= a.dim()
     if axis == value.lane:
         raise Unsupported("a sum over lanes")

@@ -1,4 +1,4 @@
-"""Lowerings of views and other rearrangements, which cost nothing in a kernel."""
+"""Lowerings of views and other rearrangements, which cost nothing in a kernel: they rearrange the nodes of tensors."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from torchpt.compiler.operators.nodes import cast_all
 from torchpt.compiler.tracing import Tracer, register_lowering
 
 __all__: list[str] = []
+
+#: The end of a slice is open if it is beyond this: torch writes an open end as the largest int64.
+OPEN_END = 1 << 40
 
 
 @register_lowering("detach", "alias", "clone", "contiguous", "lift_fresh")
@@ -43,24 +46,23 @@ def _slice(
         if out.shape != a.shape:
             raise Unsupported("a slice of the lanes' axis")
         return tracer.alias(out, a)
-    # torch writes an open end as the largest int64.
-    part: list[Any] = [slice(None)] * a.dim()
-    part[axis] = slice(start, None if end is not None and end > 1 << 40 else end, step)
-    tracer.put(out, value.nodes[tuple(part)])
+    selection: list[Any] = [slice(None)] * a.dim()
+    selection[axis] = slice(start, None if end is not None and end > OPEN_END else end, step)
+    tracer.put(out, value.nodes[tuple(selection)])
 
 
 @register_lowering("unbind")
 def _unbind(tracer: Tracer, out: Any, a: Tensor, axis: int = 0) -> None:
-    for k, one in enumerate(out):
-        _select(tracer, one, a, axis, k)
+    for k, result in enumerate(out):
+        _select(tracer, result, a, axis, k)
 
 
 @register_lowering("split", "split_with_sizes", "chunk")
 def _split(tracer: Tracer, out: Any, a: Tensor, sizes: Any, axis: int = 0) -> None:
     start = 0
-    for one in out:
-        _slice(tracer, one, a, axis, start, start + one.shape[axis])
-        start += one.shape[axis]
+    for result in out:
+        _slice(tracer, result, a, axis, start, start + result.shape[axis])
+        start += result.shape[axis]
 
 
 @register_lowering("unsqueeze")
@@ -71,8 +73,8 @@ def _unsqueeze(tracer: Tracer, out: Tensor, a: Tensor, axis: int) -> None:
 @register_lowering("squeeze")
 def _squeeze(tracer: Tracer, out: Tensor, a: Tensor, axis: Any = None) -> None:
     axes = range(a.dim()) if axis is None else [axis] if isinstance(axis, int) else axis
-    gone = tuple(k % a.dim() for k in axes if a.shape[k] == 1)
-    tracer.put(out, np.squeeze(tracer.get(a).nodes, gone) if gone else tracer.get(a).nodes)
+    removed = tuple(k % a.dim() for k in axes if a.shape[k] == 1)
+    tracer.put(out, np.squeeze(tracer.get(a).nodes, removed) if removed else tracer.get(a).nodes)
 
 
 @register_lowering("permute")
@@ -135,5 +137,6 @@ def _cat(tracer: Tracer, out: Tensor, tensors: Any, axis: int = 0) -> None:
     if tracer.lane_axis(out.shape) == axis % out.dim():
         raise Unsupported("a concatenation along the lanes' axis")
     rank = out.dim()
+    # torch also accepts empty tensors of one axis among others
     parts = [_cast(tracer, tensor, out) for tensor in tensors if tensor.dim() == rank]
     tracer.put(out, np.concatenate(parts, axis))
