@@ -37,7 +37,7 @@ def test_quickly(name: str) -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", CASES)
 def test_whole_sweeps_by_every_backend(name: str, backend: str) -> None:
-    if not CASES[name].backend and backend != "numba on":
+    if not CASES[name].uses_backend and backend != "numba on":
         pytest.skip("the same for all")
     outcome = outcome_of(CASES[name], BACKENDS[backend])
     assert outcome.passed, told(outcome)
@@ -102,7 +102,7 @@ def refusing(harness: Harness, at: float) -> float:
 
 def test_a_search_may_refuse_a_scene() -> None:
     partly = outcome_of(case(figure=refusing, sweep=(0.1, 1.0)), Harness(accel="brute"))
-    assert partly.passed and partly.refused == 1 and partly.worst == Measurement(1.0, 0.5)
+    assert partly.passed and partly.refusals == 1 and partly.worst == Measurement(1.0, 0.5)
     assert line(partly).endswith("passed, refused at 1 of 2 places")
     wholly = outcome_of(case(figure=refusing, sweep=(0.1,)), Harness(accel="brute"))
     assert wholly.passed and "refused: SceneError: render.accel: expected numba" in line(wholly)
@@ -112,8 +112,8 @@ def test_a_search_may_refuse_a_scene() -> None:
 
 def test_places_of_a_quick_run() -> None:
     sweep = case(sweep=tuple(float(k) for k in range(9)))
-    assert sweep.points(True) == (0.0, 4.0, 8.0) and len(sweep.points(False)) == 9
-    assert case(sweep=(1.0, 2.0), quick=(2.0,)).points(True) == (2.0,)
+    assert sweep.points(quick=True) == (0.0, 4.0, 8.0) and len(sweep.points(quick=False)) == 9
+    assert case(sweep=(1.0, 2.0), quick_sweep=(2.0,)).points(quick=True) == (2.0,)
 
 
 # -- the command

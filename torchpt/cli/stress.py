@@ -136,13 +136,13 @@ def run(words: list[str], interrupt: Interrupt) -> int:
         _print_unless_json(options, f"{label}\n{heading()}")
         for topic, cases in topics.items():
             for case in cases:
-                if number and not case.backend:
+                if number and not case.uses_backend:
                     continue  # does not depend on the backend
                 outcome = outcome_of(case, harness, quick=quick)
                 found.setdefault(label, {}).setdefault(topic, []).append(outcome)
                 _print_unless_json(options, line(outcome))
     every = [one for by_topic in found.values() for row in by_topic.values() for one in row]
-    failed, refused = sum(not one.passed for one in every), sum(one.refused > 0 for one in every)
+    failed, refused = sum(not one.passed for one in every), sum(one.refusals > 0 for one in every)
     results = {
         "cases": len(every),
         "failed": failed,

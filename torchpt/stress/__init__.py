@@ -1,7 +1,7 @@
 """Stress tests as a command: extreme scenes that break float32 path tracers, against closed forms and float64.
 
-``case.py`` defines a case, ``cases/`` has the cases by topic, ``harness.py`` renders their scenes, ``own_scene.py`` makes cases
-of any scene, ``outcome.py`` runs cases, ``table.py`` and ``plots.py`` show the results.
+``case.py`` defines a case, ``cases/`` has the cases by topic, ``harness.py`` renders their scenes, ``scene_cases.py`` makes
+cases of any scene, ``outcome.py`` runs cases, ``table.py`` and ``plots.py`` show the results.
 """
 
 from __future__ import annotations

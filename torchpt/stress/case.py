@@ -1,7 +1,7 @@
 """Records of a stress test (a case), of its figures along a sweep, and of its result.
 
-A case measures one figure, an error, at each point of a sweep of one quantity (a scale, a distance, ...). All figures must stay
-below the bound of the case.
+A case measures one figure, an error, at each point of a sweep of one quantity (a scale, a distance, ...). All figures must be
+at most the bound of the case.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torchpt.stress.harness import Harness
 
-__all__ = ["Case", "Measurement", "Outcome", "powers"]
+__all__ = ["Case", "Measurement", "Outcome", "powers_of_ten"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Case:
     """A stress test: a figure that must be small at all points of a sweep.
 
     Attributes:
         name: the name in tables.
-        measures: what the figure is, in a line; 0 is perfect.
+        measures: what the figure is, in a line; 0 is perfect. "relative" is the relative error of the mean of the picture.
         bound: the largest figure that passes.
         figure: returns the figure at a point of the sweep. An exception is a failure, and is reported.
-        axis: name of the swept quantity.
+        axis: name of the swept quantity; "" for a case of a single point, whose number means nothing.
         sweep: the points of the sweep.
-        quick: points of a quick run; by default the first, the middle and the last.
-        backend: True if the figure depends on search and engine; else one run is enough.
+        quick_sweep: points of a quick run; by default the first, the middle and the last of ``sweep``.
+        uses_backend: True if the figure depends on search and engine; else one run is enough.
     """
 
     name: str
@@ -38,14 +38,15 @@ class Case:
     figure: Callable[[Harness, float], float]
     axis: str = ""
     sweep: tuple[float, ...] = (0.0,)
-    quick: tuple[float, ...] = ()
-    backend: bool = True
+    quick_sweep: tuple[float, ...] = ()
+    uses_backend: bool = True
 
-    def points(self, quick: bool) -> tuple[float, ...]:
-        """Return the points of a run."""
+    def points(self, *, quick: bool) -> tuple[float, ...]:
+        """Return the points of the whole sweep, or of a quick run."""
         if not quick:
             return self.sweep
-        return self.quick or tuple(dict.fromkeys((self.sweep[0], self.sweep[len(self.sweep) // 2], self.sweep[-1])))
+        first, middle, last = self.sweep[0], self.sweep[len(self.sweep) // 2], self.sweep[-1]
+        return self.quick_sweep or tuple(dict.fromkeys((first, middle, last)))  # each once
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Outcome:
     Attributes:
         case: the case.
         readings: the figures in the order of the sweep.
-        seconds: run time.
+        seconds: run time of all points.
     """
 
     case: Case
@@ -91,11 +92,11 @@ class Outcome:
         return all(one.refused or one.figure <= self.case.bound for one in self.readings)
 
     @property
-    def refused(self) -> int:
+    def refusals(self) -> int:
         """Number of points at which the search refused the scene."""
         return sum(one.refused for one in self.readings)
 
 
-def powers(low: int, high: int, step: int = 1) -> tuple[float, ...]:
+def powers_of_ten(low: int, high: int, *, step: int = 1) -> tuple[float, ...]:
     """Return the powers of ten from ``10^low`` to ``10^high``, each ``10^step`` times the one before."""
-    return tuple(10.0**k for k in range(low, high + 1, step))
+    return tuple(10.0**exponent for exponent in range(low, high + 1, step))

@@ -24,14 +24,14 @@ from torchpt.scene.scene import Scene
 from torchpt.scene.settings import Settings
 from torchpt.scene.space import bounds_extent
 from torchpt.spec import Role
-from torchpt.stress.case import Case, powers
+from torchpt.stress.case import Case, powers_of_ten
 from torchpt.stress.harness import Harness, relative_difference
 
 __all__ = ["cases_of", "moved"]
 
-#: Pixels of the longer side, and samples a pixel.
+#: Pixels of the longer side, and samples a pixel: every case renders the scene once or more.
 SIZE, SPP = 48, 4
-#: Bounds of the figure: with the same random numbers, and with others (as after a turn).
+#: Bounds of the figure: with the same random numbers, and with others (as after a turn, which changes the shading frames).
 SAME_NUMBERS, OTHER_NUMBERS = 0.2, 1.2
 _NOISE = "difference over that of another seed"
 #: Largest number of primitives for which brute force is tested too: its time grows with their number.
@@ -56,10 +56,8 @@ def cases_of(
     description, settings = overridden(read_description(source, overrides=changes), overrides)
     small = _small(settings)
     scene = Scene(description, torch.device("cpu"))
-    extent, pose = (
-        bounds_extent(scene.built.parts, scene.built.copies),
-        np.asarray(scene.built.parameters["camera.to_world"], np.float64),
-    )
+    extent = bounds_extent(scene.built.parts, scene.built.copies)  # size of the scene, a length
+    camera_pose = np.asarray(scene.built.parameters["camera.to_world"], np.float64)
     references: dict[Harness, tuple[Tensor, Tensor]] = {}  # plain picture, and that of another seed
 
     def picture(harness: Harness, description: Description = description, seed: int = small.render.seed) -> Tensor:
@@ -73,7 +71,7 @@ def cases_of(
         return result.image.double().cpu()
 
     def over_noise(harness: Harness, changed: Callable[[], Tensor]) -> float:
-        """Return the difference of a picture from the plain one, over that of another seed."""
+        """Return the difference of the picture that ``changed`` renders from the plain one, over that of another seed."""
         if harness not in references:
             references[harness] = picture(harness), picture(harness, seed=small.render.seed + 1)
         plain, reseeded = references[harness]
@@ -86,21 +84,45 @@ def cases_of(
 
     def transformed(harness: Harness, matrix: Array) -> float:
         """Return the figure of the scene moved by a similarity ``(4, 4)``."""
-        changed = read_description(source, change=lambda raw: moved(raw, matrix, pose), overrides=changes)
+        changed = read_description(source, change=lambda raw: moved(raw, matrix, camera_pose), overrides=changes)
         return over_noise(harness, lambda: picture(harness, changed))
 
     num_primitives = sum(len(part.faces) if part.faces is not None else 1 for part in scene.built.parts)
     searches = ("numba", "torch", *(("brute",) if num_primitives <= BRUTE_MAX_PRIMITIVES else ()))
+
+    # Figures of cases take a point of the sweep; those of cases without one leave it unused.
+    def by_search(accel: str) -> Callable[[Harness, float], float]:
+        return lambda harness, _: with_harness(harness, accel=accel)
+
+    def by_scale(harness: Harness, scale: float) -> float:
+        return transformed(harness, np.diag([scale, scale, scale, 1.0]))
+
+    def by_distance(harness: Harness, sizes: float) -> float:
+        return transformed(harness, _step(sizes * extent))
+
+    def by_angle(harness: Harness, degrees: float) -> float:
+        return transformed(harness, rotate({"axis": [1.0, 2.0, 3.0], "angle": degrees}))  # in no plane of two axes
+
+    def same_numbers(name: str, figure: Callable[[Harness, float], float], **keys: Any) -> Case:
+        return Case(name=name, measures=_NOISE, bound=SAME_NUMBERS, figure=figure, **keys)
+
     return (
-        Case("no sample is lost", _NOISE, 0.0, lambda b, _: with_harness(b)),
-        Case("in float64", _NOISE, SAME_NUMBERS, lambda b, _: over_noise(b, lambda: picture(b.exact()))),
-        Case("by tensor operations", _NOISE, SAME_NUMBERS, lambda b, _: with_harness(b, compile="off")),
-        *(Case(f"searched by {x}", _NOISE, SAME_NUMBERS, lambda b, _, a=x: with_harness(b, accel=a)) for x in searches),
-        Case("scaled", _NOISE, SAME_NUMBERS, lambda b, s: transformed(b, np.diag([s, s, s, 1.0])), "scale", powers(-12, 12, 4)),
-        Case("moved", _NOISE, SAME_NUMBERS, lambda b, d: transformed(b, _step(d * extent)), "times its size", powers(0, 6)),
-        Case("turned", _NOISE, OTHER_NUMBERS, lambda b, a: transformed(b, rotate({"axis": [1.0, 2.0, 3.0], "angle": a})),
-             "degrees", (1.0, 90.0, 180.0)),
-    )  # fmt: skip
+        # The plain picture again: its difference is 0, and the case fails where a sample is not finite.
+        Case(name="no sample is lost", measures=_NOISE, bound=0.0, figure=lambda harness, _: with_harness(harness)),
+        same_numbers("in float64", lambda harness, _: over_noise(harness, lambda: picture(harness.exact()))),
+        same_numbers("by tensor operations", lambda harness, _: with_harness(harness, compile="off")),
+        *(same_numbers(f"searched by {accel}", by_search(accel)) for accel in searches),
+        same_numbers("scaled", by_scale, axis="scale", sweep=powers_of_ten(-12, 12, step=4)),
+        same_numbers("moved", by_distance, axis="times its size", sweep=powers_of_ten(0, 6)),
+        Case(
+            name="turned",
+            measures=_NOISE,
+            bound=OTHER_NUMBERS,
+            figure=by_angle,
+            axis="degrees",
+            sweep=(1.0, 90.0, 180.0),
+        ),
+    )
 
 
 def _small(settings: Settings) -> Settings:
@@ -116,7 +138,7 @@ def _small(settings: Settings) -> Settings:
 
 
 def _step(distance: float) -> Array:
-    """Return a translation ``(4, 4)`` in a skew direction, by 1.15 times ``distance``."""
+    """Return a translation ``(4, 4)`` by ``distance`` along x, and by less along y and z: 1.15 times ``distance`` in all."""
     matrix = np.eye(4)
     matrix[:3, 3] = np.array([1.0, 0.5, -0.25]) * distance
     return matrix
@@ -128,20 +150,21 @@ def moved(raw: dict[str, Any], by: Array, camera: Array) -> dict[str, Any]:
     Args:
         raw: the scene as read from its file.
         by: ``(4, 4)``: rotation, uniform scale and translation.
-        camera: pose of its camera ``(4, 4)``.
+        camera: pose of its camera ``(4, 4)``, camera to world.
     """
     scale = float(np.cbrt(np.linalg.det(by[:3, :3])))
-    turn = np.eye(4)
-    turn[:3, :3] = by[:3, :3] / scale
+    rotation = np.eye(4)
+    rotation[:3, :3] = by[:3, :3] / scale
 
-    def point(p: Any) -> list[float]:
+    def moved_point(p: Any) -> list[float]:
         return (by[:3, :3] @ np.broadcast_to(np.asarray(p, np.float64), 3) + by[:3, 3]).tolist()
 
-    def direction(d: Any) -> list[float]:
-        return (turn[:3, :3] @ np.asarray(d, np.float64)).tolist()
+    def moved_direction(d: Any) -> list[float]:
+        return (rotation[:3, :3] @ np.asarray(d, np.float64)).tolist()
 
     pose = by @ camera
     pose[:3, :3] /= scale
+    # ``to_world`` replaces the keys that give the pose in other ways.
     new_camera = {
         key: value
         for key, value in (raw.get("camera") or {}).items()
@@ -150,7 +173,7 @@ def moved(raw: dict[str, Any], by: Array, camera: Array) -> dict[str, Any]:
     new_camera |= {"to_world": pose.tolist()}
     new_camera |= {key: new_camera[key] * scale for key in ("aperture_radius", "focus_distance") if key in new_camera}
     if new_camera.get("type") == "orthographic":
-        new_camera["width"] = new_camera.get("width", 2.0) * scale
+        new_camera["width"] = new_camera.get("width", 2.0) * scale  # 2: the default
     shapes = {
         name: {**shape, "transform": [*(shape.get("transform") or []), {"matrix": by.tolist()}]}
         for name, shape in (raw.get("shapes") or {}).items()
@@ -158,12 +181,12 @@ def moved(raw: dict[str, Any], by: Array, camera: Array) -> dict[str, Any]:
     lights = {}
     for name, light in (raw.get("lights") or {}).items():
         changed = dict(light)
-        changed |= {key: point(light[key]) for key in ("position", "target") if key in light}
+        changed |= {key: moved_point(light[key]) for key in ("position", "target") if key in light}
         if "direction" in light:
-            changed["direction"] = direction(light["direction"])
+            changed["direction"] = moved_direction(light["direction"])
         if light.get("type") in ("point", "spot"):  # the same irradiance at scaled distances
             changed["intensity"] = (np.asarray(light.get("intensity", 1.0), np.float64) * scale**2).tolist()
         if light.get("type") == "envmap":
-            changed["transform"] = [*(light.get("transform") or []), {"matrix": turn.tolist()}]
+            changed["transform"] = [*(light.get("transform") or []), {"matrix": rotation.tolist()}]
         lights[name] = changed
     return {**raw, "camera": new_camera, "shapes": shapes, **({"lights": lights} if lights else {})}

@@ -10,7 +10,12 @@ from torchpt.stress.case import Outcome
 
 __all__ = ["facts", "heading", "line", "markdown"]
 
+#: Columns of the printed table, as in :func:`heading`.
 _COLUMNS = "{:38s} {:>10s} {:>10s} {:>14s}  {}"
+#: Width of the column "at" above: where the name of the swept quantity does not fit, the number stands alone.
+_AT_WIDTH = 14
+#: Characters of an error message that are printed.
+_LONGEST_PROBLEM = 300
 
 
 def heading() -> str:
@@ -24,16 +29,19 @@ def line(outcome: Outcome) -> str:
     at = f"{case.axis} {worst.at:g}" if case.axis else ""
     verdict = _verdict(outcome)
     figure = "-" if math.isnan(worst.figure) else f"{worst.figure:.2g}"
-    text = _COLUMNS.format(case.name, figure, f"{case.bound:g}", at if len(at) < 15 else f"{worst.at:g}", verdict)
-    return f"{text}: {worst.problem[:300]}" if worst.problem else text
+    text = _COLUMNS.format(
+        case.name, figure, f"{case.bound:g}", at if len(at) <= _AT_WIDTH else f"{worst.at:g}", verdict
+    )
+    return f"{text}: {worst.problem[:_LONGEST_PROBLEM]}" if worst.problem else text
 
 
 def _verdict(outcome: Outcome) -> str:
     """Return the verdict in words."""
     verdict = "passed" if outcome.passed else "FAILED"
-    if outcome.refused == len(outcome.readings):
+    if outcome.refusals == len(outcome.readings):
         return "refused"
-    return f"{verdict}, refused at {outcome.refused} of {len(outcome.readings)} places" if outcome.refused else verdict
+    of_all = f"{outcome.refusals} of {len(outcome.readings)}"
+    return f"{verdict}, refused at {of_all} places" if outcome.refusals else verdict
 
 
 def facts(outcomes: Mapping[str, Sequence[Outcome]]) -> list[dict[str, Any]]:

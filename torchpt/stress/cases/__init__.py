@@ -1,4 +1,4 @@
-"""The cases by topic: each module has a tuple ``CASES``."""
+"""The cases by topic: each module is a topic and has a tuple ``CASES``; names that begin with ``_`` are no topics."""
 
 from __future__ import annotations
 

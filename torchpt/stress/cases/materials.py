@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
-from torchpt.stress.case import Case, powers
-from torchpt.stress.cases._scenes import facing, furnace
+from torchpt.stress.case import Case, powers_of_ten
+from torchpt.stress.cases._scenes import front_camera, furnace
 from torchpt.stress.harness import Harness, relative
 
 __all__ = ["CASES"]
 
+#: Swept roughness, 1e-5 to 1, and swept index of refraction, 1e-3 to 1e3: four points a decade.
 ALPHA = tuple(10.0 ** (-5 + k / 4) for k in range(21))
 INDEX = tuple(10.0 ** (k / 4) for k in range(-12, 13))
 
@@ -27,9 +29,9 @@ def beside_float64(harness: Harness, material: dict[str, Any], spp: int = 16) ->
     return relative(harness.render(scene, spp=spp, max_depth=8), harness.exact().render(scene, spp=spp, max_depth=8))
 
 
-def rough(kind: str, **more: Any):
-    """Return a function from roughness to material."""
-    return lambda alpha: {"type": kind, "alpha": alpha, **more}
+def rough(kind: str, **keys: Any) -> Callable[[float], dict[str, Any]]:
+    """Return a function from roughness to a material of type ``kind`` with further keys."""
+    return lambda alpha: {"type": kind, "alpha": alpha, **keys}
 
 
 METAL = rough("roughconductor", reflectance=1.0)
@@ -39,7 +41,7 @@ PLASTIC = rough("roughplastic", diffuse_reflectance=1.0)
 
 
 def one_direction(harness: Harness, alpha: float) -> float:
-    """Render metals whose roughness is 0 along one direction: no energy is gained."""
+    """Return the gain of metals whose roughness is 0 along u or along v, and ``alpha`` along the other; the larger one."""
     pairs = ({"alpha_u": 0.0, "alpha_v": alpha}, {"alpha_u": alpha, "alpha_v": 0.0})
     return max(gain(harness, {"type": "roughconductor", "reflectance": 1.0, **pair}) for pair in pairs)
 
@@ -61,14 +63,14 @@ def thin_glass(harness: Harness, index: float) -> float:
 
 
 def grazing(harness: Harness, height: float) -> float:
-    """Return the excess over 1 of a square in a furnace, seen at a grazing angle."""
+    """Return the excess over 1 of a square in a furnace, the largest of four materials; ``height``: sine of its angle."""
     angle = math.asin(height)
     camera = {
         "type": "orthographic",
         "origin": [4 * math.cos(angle), 0, 4 * math.sin(angle)],
         "target": [0, 0, 0],
         "up": [0, 1, 0],
-        "width": 0.1 * height,
+        "width": 0.1 * height,  # the square looks that much lower: it fills the picture
     }
     worst = 0.0
     for material in (
@@ -93,7 +95,7 @@ def albedo(harness: Harness, value: float) -> float:
 
 
 def backs(harness: Harness, alpha: float) -> float:
-    """Compare the back of a two-sided metal with its front."""
+    """Compare the back of a two-sided metal square with its front."""
     scenes = []
     for turn in (0, 180):
         shape = {
@@ -101,27 +103,110 @@ def backs(harness: Harness, alpha: float) -> float:
             "material": METAL(alpha),
             "transform": [{"rotate": {"axis": [0, 1, 0], "angle": turn}}],
         }
-        scenes.append({"camera": facing(), "shapes": {"it": shape}, "lights": furnace({})["lights"]})
+        scenes.append({"camera": front_camera(), "shapes": {"it": shape}, "lights": furnace({})["lights"]})
     front, back = (harness.render(scene, spp=256) for scene in scenes)
     return relative(front, back)
 
 
 CASES = (
-    Case("rough metal gains nothing", "reflectance above 1", 2e-3, lambda b, a: gain(b, METAL(a)), "alpha", ALPHA),
-    Case("compensated metal gains nothing", "reflectance above 1", 5e-3, lambda b, a: gain(b, COMPENSATED(a)), "alpha", ALPHA),
-    Case("rough glass gains nothing", "radiance above 1", 2e-3, lambda b, a: gain(b, GLASS(a)), "alpha", ALPHA),
-    Case("rough plastic gains nothing", "radiance above 1", 2e-3, lambda b, a: gain(b, PLASTIC(a)), "alpha", ALPHA),
-    Case("rough metal as in float64", "relative", 2e-3, lambda b, a: beside_float64(b, METAL(a)), "alpha", ALPHA),
-    Case("rough glass as in float64", "relative", 5e-3, lambda b, a: beside_float64(b, GLASS(a)), "alpha", ALPHA),
-    Case("one roughness of two is 0", "reflectance above 1", 2e-3, one_direction, "alpha", ALPHA),
-    Case("glass of any index", "relative to 1", 1e-4, glass_in_a_furnace, "index", INDEX),
-    Case("white plastic of any index", "relative to 1", 2e-3, plastic, "index", tuple(n for n in INDEX if n > 1.0)),
-    Case("panes of any index", "relative to 1", 1e-3, thin_glass, "index", INDEX),
     Case(
-        "rough glass of any index as in float64", "relative", 5e-3,
-        lambda b, n: beside_float64(b, {"type": "roughdielectric", "alpha": 0.2, "int_ior": n}), "index", INDEX,
+        name="rough metal gains nothing",
+        measures="reflectance above 1",
+        bound=2e-3,
+        figure=lambda harness, alpha: gain(harness, METAL(alpha)),
+        axis="alpha",
+        sweep=ALPHA,
     ),
-    Case("grazing light", "radiance above 1", 5e-3, grazing, "sine of the angle", powers(-5, 0)),
-    Case("albedo", "relative to a white one", 1e-5, albedo, "albedo", (*powers(-30, -2, 4), 0.5, 0.9, 0.999, 1.0)),
-    Case("backs are fronts", "relative", 5e-3, backs, "alpha", ALPHA[::4]),
-)  # fmt: skip
+    Case(
+        name="compensated metal gains nothing",
+        measures="reflectance above 1",
+        bound=5e-3,
+        figure=lambda harness, alpha: gain(harness, COMPENSATED(alpha)),
+        axis="alpha",
+        sweep=ALPHA,
+    ),
+    Case(
+        name="rough glass gains nothing",
+        measures="radiance above 1",
+        bound=2e-3,
+        figure=lambda harness, alpha: gain(harness, GLASS(alpha)),
+        axis="alpha",
+        sweep=ALPHA,
+    ),
+    Case(
+        name="rough plastic gains nothing",
+        measures="radiance above 1",
+        bound=2e-3,
+        figure=lambda harness, alpha: gain(harness, PLASTIC(alpha)),
+        axis="alpha",
+        sweep=ALPHA,
+    ),
+    Case(
+        name="rough metal as in float64",
+        measures="relative",
+        bound=2e-3,
+        figure=lambda harness, alpha: beside_float64(harness, METAL(alpha)),
+        axis="alpha",
+        sweep=ALPHA,
+    ),
+    Case(
+        name="rough glass as in float64",
+        measures="relative",
+        bound=5e-3,
+        figure=lambda harness, alpha: beside_float64(harness, GLASS(alpha)),
+        axis="alpha",
+        sweep=ALPHA,
+    ),
+    Case(
+        name="one roughness of two is 0",
+        measures="reflectance above 1",
+        bound=2e-3,
+        figure=one_direction,
+        axis="alpha",
+        sweep=ALPHA,
+    ),
+    Case(
+        name="glass of any index",
+        measures="relative to 1",
+        bound=1e-4,
+        figure=glass_in_a_furnace,
+        axis="index",
+        sweep=INDEX,
+    ),
+    Case(
+        name="white plastic of any index",
+        measures="relative to 1",
+        bound=2e-3,
+        figure=plastic,
+        axis="index",
+        sweep=tuple(n for n in INDEX if n > 1.0),
+    ),
+    Case(name="panes of any index", measures="relative to 1", bound=1e-3, figure=thin_glass, axis="index", sweep=INDEX),
+    Case(
+        name="rough glass of any index as in float64",
+        measures="relative",
+        bound=5e-3,
+        figure=lambda harness, index: beside_float64(
+            harness, {"type": "roughdielectric", "alpha": 0.2, "int_ior": index}
+        ),
+        axis="index",
+        sweep=INDEX,
+    ),
+    Case(
+        name="grazing light",
+        measures="radiance above 1",
+        bound=5e-3,
+        figure=grazing,
+        axis="sine of the angle",
+        sweep=powers_of_ten(-5, 0),
+    ),
+    Case(
+        name="albedo",
+        measures="relative to a white one",
+        bound=1e-5,
+        figure=albedo,
+        axis="albedo",
+        sweep=(*powers_of_ten(-30, -2, step=4), 0.5, 0.9, 0.999, 1.0),
+    ),
+    Case(name="backs are fronts", measures="relative", bound=5e-3, figure=backs, axis="alpha", sweep=ALPHA[::4]),
+)
