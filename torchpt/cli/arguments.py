@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -59,6 +60,7 @@ _OPTIONS = {
 }
 # What may follow the name of a config group: file names between commas, a list of them, or a mapping.
 _FILE_CHOICE = re.compile(r"[A-Za-z_][\w,-]*\Z|\[[\w,-]+\]\Z|\{")
+#: What ``--cfg`` shows: settings, those of Hydra, or both.
 _CFG_VALUES = ("job", "hydra", "all")
 
 
@@ -126,16 +128,20 @@ def parse(command: str, words: list[str]) -> Arguments:
     arguments = Arguments(command)
     value_of_key: dict[str, str] = {}
     swept_words: list[str] = []
-    rest = iter(words)
-    for word in rest:
+    remaining_words = iter(words)
+    for word in remaining_words:
         if word.startswith("-"):
-            _add_option(arguments, word, rest)
+            _add_option(arguments, word, remaining_words)
             continue
         if is_scene_word(word):
             swept_words += _add_scene_key(arguments, word)
             continue
         match = _KEY_VALUE.match(word)
-        if match is None or match[1] not in ("scene", "out", *path_keys()):
+        if match is None or match[1] not in (
+            "scene",
+            "out",
+            *path_keys(),
+        ):  # else a word of this command alone, or Hydra's
             match = _TURN_WORD.match(word) if arguments.command == "orbit" else _DEBUG_WORD.match(word)
         if match is None:
             _add_override(arguments, word)
@@ -161,7 +167,7 @@ def parse(command: str, words: list[str]) -> Arguments:
         )
     if arguments.command == "info" and "out" in value_of_key:
         raise UsageError("out: `torchpt info` writes no picture")
-    arguments.scenes = _split_scenes(value_of_key.get("scene"), arguments.multirun)
+    arguments.scenes = _split_scenes(value_of_key.get("scene"), multirun=arguments.multirun)
     arguments.outs = _split_names("out", value_of_key.get("out"))
     arguments.paths = {
         key: None if value_of_key[key] == "null" else value_of_key[key] for key in path_keys() if key in value_of_key
@@ -238,15 +244,15 @@ def parse_study(words: list[str]) -> tuple[dict[str, str], list[str]]:
     return study, changes
 
 
-def _add_option(arguments: Arguments, word: str, rest: object) -> None:
-    """Add an option to ``arguments``; its value may be the next of the words in iterator ``rest``."""
+def _add_option(arguments: Arguments, word: str, remaining_words: Iterator[str]) -> None:
+    """Add an option to ``arguments``; its value may be the next of ``remaining_words``."""
     name, _, value = word.partition("=")
     option = next((option for option, (short, _) in _OPTIONS.items() if name in (option, short)), None)
     if option is None:
         raise UsageError(f"{word}: unknown option; known: {', '.join(_OPTIONS)}")
     _, takes_value = _OPTIONS[option]
     if takes_value:
-        value = value or next(rest, "")  # type: ignore[call-overload]
+        value = value or next(remaining_words, "")
         if option == "--cfg" and value not in _CFG_VALUES:
             raise UsageError(f"--cfg: expected one of {', '.join(_CFG_VALUES)}, got {value!r}")
         if option == "--config-dir":
@@ -283,7 +289,7 @@ def _add_override(arguments: Arguments, word: str) -> None:
     arguments.overrides.append(word)
 
 
-def _split_scenes(value: str | None, multirun: bool) -> list[str]:
+def _split_scenes(value: str | None, *, multirun: bool) -> list[str]:
     """Return the names of scenes in the value of ``scene=``; commas separate them in a sweep only."""
     if value is None:
         return []

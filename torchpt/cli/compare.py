@@ -45,6 +45,8 @@ _KEYS = ("map", "metric", "range", "layer", "exposure", "tonemap", "gamma")
 _KEY = re.compile(rf"({'|'.join(_KEYS)})=(.*)\Z", re.DOTALL)
 _MAP_ENDINGS = (".exr", ".png")
 _DISPLAY_KEYS = ("exposure", "tonemap", "gamma")
+#: Columns of text that does not go to a terminal.
+_FILE_WIDTH = 120
 #: Metrics whose values are at most 1.
 _UP_TO_ONE = ("smape", "ssim", "flip")
 
@@ -55,12 +57,12 @@ class CompareOptions:
 
     Attributes:
         pictures: paths of the picture and of its reference, as written.
-        given: values by key, as written.
+        text_of_key: values by key, as written.
         json: print JSON.
     """
 
     pictures: list[str] = field(default_factory=list)
-    given: dict[str, str] = field(default_factory=dict)
+    text_of_key: dict[str, str] = field(default_factory=dict)
     json: bool = False
 
     @classmethod
@@ -80,11 +82,11 @@ class CompareOptions:
                 raise UsageError(f"{word}: unknown option; known: --json, --help, -- (before names of files)")
             elif match := _KEY.match(word):
                 key, value = match.groups()
-                if key in options.given:
-                    raise UsageError(f"{key}: given twice, as {options.given[key]!r} and {value!r}")
+                if key in options.text_of_key:
+                    raise UsageError(f"{key}: given twice, as {options.text_of_key[key]!r} and {value!r}")
                 if not value:
                     raise UsageError(f"{key}: expected a value, got nothing")
-                options.given[key] = value
+                options.text_of_key[key] = value
             elif re.match(r"[\w.]+=", word) and not os.path.exists(word):
                 raise UsageError(f"{word}: unknown key, and no file of this name; known: {', '.join(_KEYS)}")
             else:
@@ -98,13 +100,13 @@ class CompareOptions:
             names = f": {', '.join(self.pictures)}" if self.pictures else ""
             raise UsageError(f"expected two pictures, torchpt compare TEST REFERENCE, got {len(self.pictures)}{names}")
         for key in ("metric", "range"):
-            if key in self.given and "map" not in self.given:
+            if key in self.text_of_key and "map" not in self.text_of_key:
                 raise UsageError(f"{key}: says what the error map shows, and there is none; add map=FILE.png")
 
 
 @dataclass(frozen=True)
 class _MapRequest:
-    """The error map to write: file, metric, and the error that gets the brightest colour (None: automatic)."""
+    """The error map to write: file, metric, and the error that gets the brightest colour (None: see ``_top_of_range``)."""
 
     file: str
     metric: str
@@ -120,28 +122,30 @@ def run(words: list[str], interrupt: Interrupt) -> int:
     options = CompareOptions.read(words)
     from torchpt.images.comparison import compare as measure
 
-    gc_pause.resume()
-    shown, map_request = _display_transform(options.given), _map_request(options)
-    layer = options.given.get("layer")
+    gc_pause.resume()  # the imports are done: collect garbage again
+    screen, map_request = _display_transform(options.text_of_key), _map_request(options)
+    layer = options.text_of_key.get("layer")
     (name, first), (_, second) = (_read_layer(path, layer) for path in options.pictures)
     _check_same_size(options.pictures, first, second)
     height, width, channels = first.shape
     colours = _is_colour(name, channels)
     if not colours:
         _refuse_colour_keys(options, name)
-    (image, alpha), (reference, other) = (_split_alpha(picture, colours) for picture in (first, second))
-    found = measure(image, reference, shown, colours)
+    (image, alpha), (reference, reference_alpha) = (
+        _split_alpha(picture, colours=colours) for picture in (first, second)
+    )
+    found = measure(image, reference, screen, colours=colours)
     facts: dict[str, Any] = {"test": options.pictures[0], "reference": options.pictures[1], "layer": name}
     facts |= {"width": width, "height": height, "channels": channels, "metrics": found.metrics}
     facts |= {"reasons": found.reasons, "mean": dict(zip(("test", "reference"), found.means, strict=True))}
     facts["mean_ratio"] = found.ratio
     facts["nonfinite_pixels"] = dict(zip(("test", "reference"), found.nonfinite, strict=True))
     if colours:
-        facts["display"] = vars(shown)
-    if alpha is not None and other is not None:
-        facts["largest_alpha_difference"] = float((alpha.double() - other.double()).abs().max())
+        facts["display"] = vars(screen)
+    if alpha is not None and reference_alpha is not None:
+        facts["largest_alpha_difference"] = float((alpha.double() - reference_alpha.double()).abs().max())
     if map_request is not None:
-        facts["map"] = _write_map(map_request, image, reference, shown)
+        facts["map"] = _write_map(map_request, image, reference, screen)
     with flushed_stdout():
         if options.json:
             print(json.dumps(plain(facts), allow_nan=False))
@@ -150,7 +154,7 @@ def run(words: list[str], interrupt: Interrupt) -> int:
     return 0
 
 
-def _display_transform(given: dict[str, str]) -> DisplayTransform:
+def _display_transform(text_of_key: dict[str, str]) -> DisplayTransform:
     """Parse ``exposure=``, ``tonemap=`` and ``gamma=``, which take the same values as ``film.*``.
 
     Raises:
@@ -162,12 +166,13 @@ def _display_transform(given: dict[str, str]) -> DisplayTransform:
 
     values: dict[str, Any] = {}
     for key in _DISPLAY_KEYS:
-        if key in given:
-            number = _float_or_nan(given[key])
+        if key in text_of_key:
+            text = text_of_key[key]
+            number = _float_or_nan(text)
             try:
-                values[key] = Film.parameters[key].read(given[key] if math.isnan(number) else number)
+                values[key] = Film.parameters[key].read(text if math.isnan(number) else number)
             except Refused as refused:
-                raise SceneError(key, given[key], refused.expected) from None
+                raise SceneError(key, text, refused.expected) from None
     return DisplayTransform(**values)
 
 
@@ -188,23 +193,23 @@ def _map_request(options: CompareOptions) -> _MapRequest | None:
     from torchpt.images import check_writable
     from torchpt.images.metrics import MAPS
 
-    given = options.given
-    if "map" not in given:
+    text_of_key = options.text_of_key
+    if "map" not in text_of_key:
         return None
-    metric = given.get("metric", "relmse")
+    metric = text_of_key.get("metric", "relmse")
     if metric not in MAPS:
         raise SceneError("metric", metric, f"one of {', '.join(MAPS)}")
-    map_path = check_writable(given["map"], _MAP_ENDINGS)
+    map_path = check_writable(text_of_key["map"], _MAP_ENDINGS)
     if str(map_path) in map(os.path.realpath, options.pictures):
-        raise OutputError(given["map"], "is one of the pictures that are compared; give map= another name")
-    if "range" not in given:
-        return _MapRequest(given["map"], metric, None)
+        raise OutputError(text_of_key["map"], "is one of the pictures that are compared; give map= another name")
+    if "range" not in text_of_key:
+        return _MapRequest(text_of_key["map"], metric, top=None)
     if map_path.suffix.lower() == ".exr":
         raise UsageError("range: an .exr map holds the numbers themselves; only .png has a range")
-    top = _float_or_nan(given["range"])
+    top = _float_or_nan(text_of_key["range"])
     if not 0.0 < top < math.inf:
-        raise SceneError("range", given["range"], "a number above 0")
-    return _MapRequest(given["map"], metric, top)
+        raise SceneError("range", text_of_key["range"], "a number above 0")
+    return _MapRequest(text_of_key["map"], metric, top=top)
 
 
 def _read_layer(path: str, layer: str | None) -> tuple[str, Tensor]:
@@ -252,20 +257,20 @@ def _refuse_colour_keys(options: CompareOptions, layer: str) -> None:
     from torchpt.images.comparison import COLOUR_METRICS
 
     for key in _DISPLAY_KEYS:
-        if key in options.given:
+        if key in options.text_of_key:
             raise UsageError(f"{key}: the layer {layer} holds no colours, so it is not shown on a screen")
-    if options.given.get("metric") in COLOUR_METRICS:
+    if options.text_of_key.get("metric") in COLOUR_METRICS:
         raise UsageError(f"metric: the layer {layer} holds no colours; expected relmse, mse or smape")
 
 
-def _split_alpha(picture: Tensor, colours: bool) -> tuple[Tensor, Tensor | None]:
-    """Split a picture into its colours and its alpha channel (None if it has none)."""
+def _split_alpha(picture: Tensor, *, colours: bool) -> tuple[Tensor, Tensor | None]:
+    """Split a picture into its colours and its alpha channel; None without, and for layers that hold no ``colours``."""
     if colours and picture.shape[2] in (2, 4):
         return picture[..., :-1], picture[..., -1]
     return picture, None
 
 
-def _write_map(map_request: _MapRequest, image: Tensor, reference: Tensor, shown: DisplayTransform) -> dict[str, Any]:
+def _write_map(map_request: _MapRequest, image: Tensor, reference: Tensor, screen: DisplayTransform) -> dict[str, Any]:
     """Write the error map and return its facts: file, metric, largest error, range of the colours.
 
     Raises:
@@ -278,7 +283,7 @@ def _write_map(map_request: _MapRequest, image: Tensor, reference: Tensor, shown
     from torchpt.images.false_colour import false_colour
 
     try:
-        errors = comparison_map(map_request.metric, image, reference, shown)
+        errors = comparison_map(map_request.metric, image, reference, screen)
     except (ImportError, ValueError) as problem:
         raise OutputError(map_request.file, f"there is no such map: {problem}") from None
     finite = errors[torch.isfinite(errors)]
@@ -311,7 +316,7 @@ def _print_tables(facts: dict[str, Any], found: Comparison) -> None:
         def on_broken_pipe(self) -> None:  # rich's own version exits the process
             raise BrokenPipeError
 
-    console = PipeConsole(highlight=False, width=None if sys.stdout.isatty() else 120)
+    console = PipeConsole(highlight=False, width=None if sys.stdout.isatty() else _FILE_WIDTH)
 
     def print_line(text: str) -> None:
         code = console.encoding  # a file name may contain characters that the encoding lacks
@@ -320,7 +325,7 @@ def _print_tables(facts: dict[str, Any], found: Comparison) -> None:
     def print_table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
         rich_table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False)
         for index, title in enumerate(head):
-            rich_table.add_column(title, justify="right" if 0 < index < 4 else "left")
+            rich_table.add_column(title, justify="right" if index > 0 else "left")  # names, then numbers
         for row in rows:
             rich_table.add_row(*map(Text, row))
         console.print()
@@ -344,14 +349,14 @@ def _print_tables(facts: dict[str, Any], found: Comparison) -> None:
         print_line(
             f"alpha is in no measure; its largest difference is {_format_value(facts['largest_alpha_difference'])}"
         )
-    if map_request := facts.get("map"):
+    if map_facts := facts.get("map"):
         shows = (
-            f"; black 0, brightest {_format_value(map_request['range'][1])} and more, green not finite"
-            if "range" in map_request
+            f"; black 0, brightest {_format_value(map_facts['range'][1])} and more, green not finite"
+            if "range" in map_facts
             else ""
         )
         print_line(
-            f"map: {map_request['metric']}, largest {_format_value(map_request['largest'])}{shows}, in {map_request['file']}"
+            f"map: {map_facts['metric']}, largest {_format_value(map_facts['largest'])}{shows}, in {map_facts['file']}"
         )
 
 

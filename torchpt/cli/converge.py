@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -135,6 +136,7 @@ def _parse_value(key: str, text: str) -> Any:
 
 
 def _scene_names(text: str) -> list[str]:
+    """Return the scenes of ``scene=``: one name or file, or a list in brackets."""
     if Path(text).exists() or not (text.startswith("[") and text.endswith("]")):
         return [text]
     return [name.strip().strip("'\"") for name in text[1:-1].split(",")]
@@ -157,7 +159,7 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
     from torchpt.reports.runs import Stopped, Store, measure, prepare, write_whole
     from torchpt.reports.study import study_of
 
-    gc_pause.resume()
+    gc_pause.resume()  # the imports are done: collect garbage again
     start = time.perf_counter()
     raw, file = raw_study({key: text for key, text in words.items() if key != "out"}, changes)
     with printed_scene_warnings():
@@ -171,7 +173,7 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
     if note:
         print(f"torchpt: {note}", file=sys.stderr)
     interrupt.check()
-    interrupt.deferred = True
+    interrupt.deferred = True  # from here on a signal ends the study after a run, and raises nothing
     with Bar(folder.name, lines=True) as bar:
 
         def on_progress(done: int, total: int, rays: int, seconds: float) -> bool:
@@ -186,7 +188,7 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
                 "command takes up there",
                 file=sys.stderr,
             )
-            return Interrupted(interrupt.signum or 2).exit_code
+            return Interrupted(interrupt.signum or signal.SIGINT).exit_code
     scene_reports = write_report(study, prepared, folder)
     facts = {
         "out": str(folder / "report.html"),
@@ -197,7 +199,7 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
                 "curves": [
                     {
                         "label": line.label,
-                        "denoised": line.of is not None,
+                        "denoised": line.of is not None,  # it has the denoised pictures of that line
                         "slope": line.by_spp.slope.mean if line.by_spp else None,
                         "times": line.times,
                         "biased": line.bias["biased"] if line.bias else None,
@@ -238,16 +240,18 @@ def _output_folder(out: str | None, name: str, identity: dict[str, Any]) -> tupl
 
 
 def _holds_another(folder: Path, identity: dict[str, Any]) -> bool:
-    """Return True if a folder holds another study. A study with fewer steps or seeds, else equal, is the same one."""
+    """Return True if a folder holds another study. One with fewer steps or seeds, else equal, is the same: it is continued."""
     study_file = folder / _STUDY_FILE
     if not study_file.exists():
         return (folder / "report.html").exists() or (folder.exists() and not folder.is_dir())
     try:
-        known = json.loads(study_file.read_text(encoding="utf-8"))
-        has_same_or_more_steps = set(known["spp"]) <= set(identity["spp"]) and known["seeds"] <= identity["seeds"]
+        known_identity = json.loads(study_file.read_text(encoding="utf-8"))
+        has_same_or_more_steps = (
+            set(known_identity["spp"]) <= set(identity["spp"]) and known_identity["seeds"] <= identity["seeds"]
+        )
     except (OSError, ValueError, KeyError, TypeError):  # not written by torchpt
         return True
-    return {**known, "spp": 0, "seeds": 0} != {**identity, "spp": 0, "seeds": 0} or not has_same_or_more_steps
+    return {**known_identity, "spp": 0, "seeds": 0} != {**identity, "spp": 0, "seeds": 0} or not has_same_or_more_steps
 
 
 def _study_identity(raw: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
@@ -264,6 +268,7 @@ def _study_identity(raw: Mapping[str, Any], options: Mapping[str, Any]) -> dict[
 
 
 def _default_stem(scenes: tuple[str, ...], file: str | None) -> str:
+    """Return the start of the output folder's name: that of the study file, else those of the scenes."""
     if file is not None:
         return Path(file).stem
     return "_".join(Path(name).stem if name.endswith((".yaml", ".yml")) else name for name in scenes)

@@ -23,7 +23,10 @@ __all__ = ["PathRequest", "debug", "lines"]
 
 # [x,y] or x,y: two whole numbers of at most nine digits.
 _PIXEL = re.compile(r"\[?\s*(\d{1,9})\s*,\s*(\d{1,9})\s*\]?\Z")
+# A whole number that int64 holds.
 _SAMPLE = re.compile(r"\d{1,18}\Z")
+#: Digits by which any two numbers of float32 differ.
+_EXACT_DIGITS = 9
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ def debug(job: Job, request: PathRequest, interrupt: Interrupt, *, as_json: bool
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
 
-    gc_pause.resume()
+    gc_pause.resume()  # the imports are done: collect garbage again
     with printed_scene_warnings():
         description, settings = scene_and_settings(job)
         scene = Scene(description, device_of(settings.render.device))
@@ -94,9 +97,9 @@ def lines(path: Path) -> Iterator[str]:
     for vertex in path.vertices:
         yield from _vertex_lines(vertex)
     yield f"ended: {path.ended}"
-    yield f"radiance {_triple_text(path.radiance, 9)}"
+    yield f"radiance {_triple_text(path.radiance, digits=_EXACT_DIGITS)}"
     if path.value != path.radiance:
-        yield f"in the picture {_triple_text(path.value, 9)}"
+        yield f"in the picture {_triple_text(path.value, digits=_EXACT_DIGITS)}"
 
 
 def _vertex_lines(vertex: Vertex) -> Iterator[str]:
@@ -160,4 +163,4 @@ def _number_text(value: float, digits: int = 6) -> str:
 
 
 def _triple_text(values: Sequence[float], digits: int = 6) -> str:
-    return f"({', '.join(_number_text(value, digits) for value in values)})"
+    return f"({', '.join(_number_text(value, digits=digits) for value in values)})"

@@ -69,7 +69,7 @@ def read_value(key: str, text: str) -> tuple[list[Any], bool]:
     if len(values) > MAX_VALUES:
         raise UsageError(f"{key}: expected at most {MAX_VALUES} values, got {text!r}")
     for item in values:
-        _check(key, item, text)
+        _check_value(key, item, text)
     return values, sweeps
 
 
@@ -79,7 +79,7 @@ def parse_failure(error: Exception) -> str:
     return found.partition(": ")[2] or "quote what holds blanks, brackets or commas, as in key='a b'"
 
 
-def _check(key: str, value: Any, text: str) -> None:
+def _check_value(key: str, value: Any, text: str) -> None:
     """Refuse values that a scene file cannot hold: interpolations, and mappings whose keys are not text."""
     if isinstance(value, str) and "${" in value:
         raise UsageError(f"{key}: expected a value, got {text!r} (scenes know no interpolation)")
@@ -88,4 +88,4 @@ def _check(key: str, value: Any, text: str) -> None:
             if not isinstance(name, str):
                 raise UsageError(f"{key}: expected text as keys, got {name!r} in {text!r}")
     for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-        _check(key, item, text)
+        _check_value(key, item, text)

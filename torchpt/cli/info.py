@@ -45,7 +45,7 @@ def info(job: Job, interrupt: Interrupt, *, as_json: bool = False) -> int:
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
 
-    gc_pause.resume()
+    gc_pause.resume()  # the imports are done: collect garbage again
     with printed_scene_warnings():
         description, settings = scene_and_settings(job)
         scene = Scene(description, device_of(settings.render.device))
@@ -84,7 +84,7 @@ def _memory_facts(scene: Any, settings: Any) -> dict[str, Any]:
     settings = replace(settings, render=settings.render.but(checkpoint=None, resume=False))
     try:
         with torch.no_grad():
-            Run(scene, settings, None, torch.float32)
+            Run(scene, settings, params=None, dtype=torch.float32)  # is not started: this checks the memory limit
     except TorchptError as error:
         return {"enough": False, "refused": str(error)}
     return {"enough": True}

@@ -208,7 +208,7 @@ class _Task:
         try:
             composed = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
         except OmegaConfBaseException as error:
-            raise UsageError(f"{error.full_key or 'settings'}: {_first_line(error)}") from error
+            raise UsageError(f"{error.full_key or 'settings'}: {_shortened(error)}") from error
         assert isinstance(composed, dict)
         number = hydra.job.num if hydra.mode == RunMode.MULTIRUN else None
         scene = self.arguments.scenes[composed.pop("scene_number", 0)]
@@ -302,7 +302,9 @@ def _compose_and_run(
         ):
             try:
                 hydra.main(version_base="1.3", config_path=str(_configs()), config_name="config")(task)()
-            except SystemExit as end:
+            except (
+                SystemExit
+            ) as end:  # by a job that failed, with its code; Hydra exits with 1 for what it cannot parse
                 return end.code if isinstance(end.code, int) and end.code != 1 else 2 if end.code else 0
             except JobFailedError as end:
                 return end.code
@@ -316,7 +318,7 @@ def _compose_and_run(
             finally:
                 GlobalHydra.instance().clear()
                 if folder is not None:
-                    print_jobs(folder)
+                    print_jobs(folder)  # the results that jobs have recorded there
     interrupt.check()
     return 0
 
@@ -413,11 +415,11 @@ def _one_line(error: Exception, words: list[str]) -> str:
     cause = error.__cause__
     if cause is not None and str(cause) not in text:
         text = f"{(text.splitlines() or [type(error).__name__])[0]}: {cause}"
-    return _first_line(text) if text.strip() else type(error).__name__
+    return _shortened(text) if text.strip() else type(error).__name__
 
 
-def _first_line(error: object) -> str:
-    """Return the first three lines of an error that say something, joined to one."""
+def _shortened(error: object) -> str:
+    """Return the first three lines of an error of Hydra or OmegaConf that say something, joined to one line."""
     lines = [" ".join(line.split()) for line in str(error).splitlines()]
     kept = [line for line in lines if line and not line.startswith(("See http", "full_key", "object_type", "^"))]
     return "; ".join(kept[:3])
@@ -463,39 +465,41 @@ def _command_with_settings(
 #: All commands, in the order of the help. To add one, add a file to this folder and a row here.
 COMMANDS = (
     Command(
-        "render",
-        "scene=cornell_box render.spp=64 out=cornell.exr",
-        "render a picture",
-        render.HELP,
-        _command_with_settings("render", render.run),
+        name="render",
+        example="scene=cornell_box render.spp=64 out=cornell.exr",
+        line="render a picture",
+        help=render.HELP,
+        run=_command_with_settings("render", render.run),
     ),
     Command(
-        "orbit",
-        "scene=cornell_box frames=48 out=turn.gif",
-        "turn the camera about it: .gif, .mp4",
-        orbit.HELP,
-        _command_with_settings("orbit", orbit.run),
+        name="orbit",
+        example="scene=cornell_box frames=48 out=turn.gif",
+        line="turn the camera about it: .gif, .mp4",
+        help=orbit.HELP,
+        run=_command_with_settings("orbit", orbit.run),
     ),
     Command(
-        "info",
-        "scene=cornell_box",
-        "what the scene holds, what was built, what left out",
-        info.HELP,
-        _command_with_settings("info", info.run),
+        name="info",
+        example="scene=cornell_box",
+        line="what the scene holds, what was built, what left out",
+        help=info.HELP,
+        run=_command_with_settings("info", info.run),
     ),
     Command(
-        "compare",
-        "test.exr reference.exr",
-        "how far a picture is from its reference",
-        compare.HELP,
-        compare.run,
+        name="compare",
+        example="test.exr reference.exr",
+        line="how far a picture is from its reference",
+        help=compare.HELP,
+        run=compare.run,
     ),
     Command(
-        "converge",
-        "scene=cornell_box sampler=[independent,sobol]",
-        "error against run time, as a report",
-        converge.HELP,
-        converge.run,
+        name="converge",
+        example="scene=cornell_box sampler=[independent,sobol]",
+        line="error against run time, as a report",
+        help=converge.HELP,
+        run=converge.run,
     ),
-    Command("stress", "quick=true", "stiff and extreme cases, measured", stress.HELP, stress.run),
+    Command(
+        name="stress", example="quick=true", line="stiff and extreme cases, measured", help=stress.HELP, run=stress.run
+    ),
 )

@@ -57,6 +57,7 @@ stopped, the same command takes up where it was. The last line on stdout is a su
 Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the finished frames kept.
 """
 _MOST_FRAMES = 100_000
+#: The file in the folder of frames with all that they depend on.
 _MANIFEST = "orbit.json"
 
 
@@ -84,6 +85,7 @@ class Turn:
             SceneError: an invalid value.
         """
         numbers: dict[str, Any] = {}
+        # Of each key: type, what is accepted in words, and the test, which NaN fails.
         for key, kind, expected, accept in (
             ("frames", int, f"a whole number 1..{_MOST_FRAMES}", lambda x: 1 <= x <= _MOST_FRAMES),
             ("degrees", float, "an angle in degrees", lambda x: abs(x) <= 1e6),
@@ -114,16 +116,16 @@ def poses(scene: Scene, turn: Turn) -> Iterator[NDArray[np.float64]]:
         axis = np.asarray(camera["up"] or (0.0, 1.0, 0.0), np.float64)
         centre = np.asarray(camera["target"], np.float64)
     else:
-        nearest = int(np.abs(start[:3, 1]).argmax())
+        nearest = int(np.abs(start[:3, 1]).argmax())  # the axis of the scene that is nearest to the camera's up
         axis, centre = np.sign(start[nearest, 1]) * np.eye(3)[nearest], scene.center()
     for frame in range(turn.frames):
-        if frame * turn.degrees % (360.0 * turn.frames) == 0.0:
+        if frame * turn.degrees % (360.0 * turn.frames) == 0.0:  # whole turns: the scene's own pose, to the bit
             yield start
             continue
         rotation = rotate({"axis": axis.tolist(), "angle": turn.degrees * frame / turn.frames})[:3, :3]
         position = centre + rotation @ ((np.asarray(camera["origin"]) if has_target else start[:3, 3]) - centre)
         if has_target:
-            yield look_at(position.tolist(), centre.tolist(), axis.tolist(), key="")
+            yield look_at(position.tolist(), centre.tolist(), axis.tolist(), key="")  # errors name `target` or `up`
             continue
         pose = start.copy()
         pose[:3, :3], pose[:3, 3] = rotation @ start[:3, :3], position
@@ -147,7 +149,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     from torchpt.scene.scene import Scene
     from torchpt.scene.settings import MAX_SEED
 
-    gc_pause.resume()
+    gc_pause.resume()  # the imports are done: collect garbage again
     start = time.perf_counter()
     with printed_scene_warnings():
         description, run_settings = scene_and_settings(job)
@@ -175,7 +177,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     load_seconds = time.perf_counter() - start
     print_job(job, outs)
     interrupt.check()
-    interrupt.deferred = True
+    interrupt.deferred = True  # from here on a signal ends the run after a chunk, and raises nothing
     totals = _render_missing_frames(job, scene, turn, frames, interrupt)
     ready = frames.count(turn.frames)
     facts: dict[str, Any] = {
@@ -195,7 +197,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     facts["seconds"] = round(time.perf_counter() - start, 4)
     with flushed_stdout():
         print(json.dumps(plain(facts), allow_nan=False))
-    record_job(job, facts)
+    record_job(job, facts)  # for the table of a sweep; nothing outside one
     if interrupt.signum is None:
         return 0
     kept = (
@@ -206,6 +208,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
 
 
 def _outputs(job: Job) -> list[str]:
+    """Return the movies to write; in a sweep their names have the job's number."""
     path = Path(job.scene)
     name = path.stem if path.suffix in (".yaml", ".yml") else path.name
     return [numbered(str(Path(out).expanduser()), job.number) for out in job.outs or (f"{name}.gif",)]
@@ -218,7 +221,7 @@ def _render_missing_frames(job: Job, scene: Scene, turn: Turn, frames: Frames, i
     from torchpt.rendering.api import render_scene
     from torchpt.scene.formats.description import settings
 
-    place, seed = scene.params["camera.to_world"], settings(scene.description, job.overrides).render.seed
+    own_pose, seed = scene.params["camera.to_world"], settings(scene.description, job.overrides).render.seed
     totals: dict[str, int] = {"rays": 0, "nonfinite_samples": 0}
     causes: Counter[str] = Counter()
     begun = time.perf_counter()
@@ -239,7 +242,7 @@ def _render_missing_frames(job: Job, scene: Scene, turn: Turn, frames: Frames, i
             # In a scene file these settings are meant for `torchpt render`.
             film, render = run_settings.film.but(denoise=False), run_settings.render.but(checkpoint=None, resume=False)
             run_settings = replace(run_settings, film=film, render=render)
-            scene.params["camera.to_world"] = torch.from_numpy(pose.copy()).to(place)
+            scene.params["camera.to_world"] = torch.from_numpy(pose.copy()).to(own_pose)
             rendering = render_scene(scene, run_settings, on_progress=partial(on_progress, number, totals["rays"]))
             if not rendering.complete:
                 break
@@ -328,8 +331,8 @@ def _frame_dependencies(scene: Scene, run_settings: Settings, turn: Turn) -> dic
     from torchpt.spec import Role
 
     facts = {"torchpt": __version__, "frames": turn.frames, "degrees": turn.degrees}
-    free = {"render": settings_with(Role.FREE, but=Role.ENDS)["render"]}  # settings that do not change a frame
-    return {**facts, **dict(_dotted(run_settings.plain(free))), "scene": fingerprint(scene)}
+    without = {"render": settings_with(Role.FREE, but=Role.ENDS)["render"]}  # settings that do not change a frame
+    return {**facts, **dict(_dotted(run_settings.plain(without=without))), "scene": fingerprint(scene)}
 
 
 def _dotted(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -126,7 +126,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
 
-    gc_pause.resume()  # it was paused at the start of the program, for faster imports
+    gc_pause.resume()  # the imports are done: collect garbage again
     start = time.perf_counter()
     group = distributed.group()
     writes_files = group is None or group.rank == 0
@@ -153,11 +153,11 @@ def render(job: Job, interrupt: Interrupt) -> int:
         if checkpoint is not None:
             settings = replace(settings, render=settings.render.but(checkpoint=checkpoint))
             if writes_files:
-                CheckpointFile(checkpoint).check(settings.render.resume)
+                CheckpointFile(checkpoint).check(resume=settings.render.resume)
         scene = Scene(description, device_of(settings.render.device))
     scene.load_seconds = time.perf_counter() - start
     if writes_files:
-        print_job(job, outs)  # prints
+        print_job(job, outs)
     if preview and writes_files:
         hits = first_hit(scene, settings)
         # The last of the three files is the picture, which is written after each pass.
@@ -191,7 +191,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     height, width = rendering.image.shape[:2]
     with flushed_stdout():  # one print, as the jobs of a sweep may share stdout; the last line is the summary
         print(f"{sentence(summary, width, height)}\n{json.dumps(summary, allow_nan=False)}")
-    record_job(job, summary)
+    record_job(job, summary)  # for the table of a sweep; nothing outside one
     if interrupt.signum is None:
         return 0
     resume_hint = "" if settings.render.checkpoint is None else "; render.resume=true goes on"

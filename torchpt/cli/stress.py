@@ -40,6 +40,7 @@ torchpt stress scene=NAME|FILE.yaml [key=value ...]
 
 Exit codes: 0 all passed; 1 some failed; 2 bad input.
 """
+#: Values that a key accepts, the default first.
 _CHOICES = {
     "accel": ("auto", "numba", "torch", "brute"),
     "compile": ("auto", "on", "off"),
@@ -54,13 +55,13 @@ class StressOptions:
     """The parsed arguments of ``torchpt stress``.
 
     Attributes:
-        given: values by key, as written.
+        text_of_key: values of the keys in ``_KEYS``, as written.
         settings: settings of the scene, by block and key.
         changes: overrides of scene keys.
         json: print JSON.
     """
 
-    given: dict[str, str] = field(default_factory=dict)
+    text_of_key: dict[str, str] = field(default_factory=dict)
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     changes: dict[str, Any] = field(default_factory=dict)
     json: bool = False
@@ -82,11 +83,11 @@ class StressOptions:
             if word == "--json":
                 found.json = True
             elif is_scene_word(word):
-                found.change(word)
+                found.add_change(word)
             elif equals and key in _KEYS:
-                if key in found.given:
+                if key in found.text_of_key:
                     raise UsageError(f"{key}: given twice")
-                found.given[key] = value
+                found.text_of_key[key] = value
             elif equals and dot and group in GROUPS:
                 try:
                     found.settings.setdefault(group, {})[name] = yaml.safe_load(value)
@@ -94,16 +95,17 @@ class StressOptions:
                     raise UsageError(f"{word}: the value cannot be read") from None
             else:
                 raise UsageError(f"{word}: expected one of {', '.join(f'{k}=' for k in _KEYS)}, --json or --help")
-        if (found.settings or found.changes) and "scene" not in found.given:
+        if (found.settings or found.changes) and "scene" not in found.text_of_key:
             first = next(iter([*found.settings, *found.changes]))
             raise UsageError(f"{first}: settings are of a scene: expected scene= beside them")
         for key, accepted in _CHOICES.items():
-            wrong = [value for value in found.list(key, accepted[0]) if value not in accepted]
-            if wrong or (key in ("dtype", "quick") and len(found.list(key, accepted[0])) > 1):
-                raise SceneError(key, found.given[key], f"one of {', '.join(accepted)}")
+            values = found.list(key, accepted[0])
+            takes_one = key in ("dtype", "quick")
+            if not set(values) <= set(accepted) or (takes_one and len(values) > 1):
+                raise SceneError(key, found.text_of_key[key], f"one of {', '.join(accepted)}")
         return found
 
-    def change(self, word: str) -> None:
+    def add_change(self, word: str) -> None:
         """Add an override of a scene key."""
         from torchpt.cli.grammar import read_word
 
@@ -114,7 +116,7 @@ class StressOptions:
 
     def list(self, key: str, default: str) -> list[str]:
         """Return the values of a key: those of a list ``[a,b]``, or the single value."""
-        text = self.given.get(key, default)
+        text = self.text_of_key.get(key, default)
         return [part.strip() for part in text[1:-1].split(",")] if text[:1] == "[" and text[-1:] == "]" else [text]
 
 
@@ -128,32 +130,32 @@ def run(words: list[str], interrupt: Interrupt) -> int:
     from torchpt.stress.outcome import outcome_of
     from torchpt.stress.table import facts, heading, line
 
-    gc_pause.resume()
+    gc_pause.resume()  # the imports are done: collect garbage again
     topics, harnesses, folder = _topics(options), _harnesses(options), _folder(options)
-    quick, start = options.given.get("quick") == "true", time.perf_counter()
-    found: dict[str, dict[str, list[Outcome]]] = {}
+    quick, start = options.text_of_key.get("quick") == "true", time.perf_counter()
+    outcomes: dict[str, dict[str, list[Outcome]]] = {}  # by label of the harness and topic
     for number, (label, harness) in enumerate(harnesses.items()):
         _print_unless_json(options, f"{label}\n{heading()}")
         for topic, cases in topics.items():
             for case in cases:
-                if number and not case.uses_backend:
-                    continue  # does not depend on the backend
+                if number and not case.uses_backend:  # the first run is enough
+                    continue
                 outcome = outcome_of(case, harness, quick=quick)
-                found.setdefault(label, {}).setdefault(topic, []).append(outcome)
+                outcomes.setdefault(label, {}).setdefault(topic, []).append(outcome)
                 _print_unless_json(options, line(outcome))
-    every = [one for by_topic in found.values() for row in by_topic.values() for one in row]
-    failed, refused = sum(not one.passed for one in every), sum(one.refusals > 0 for one in every)
+    flat = [outcome for by_topic in outcomes.values() for row in by_topic.values() for outcome in row]
+    failed, refused = sum(not outcome.passed for outcome in flat), sum(outcome.refusals > 0 for outcome in flat)
     results = {
-        "cases": len(every),
+        "cases": len(flat),
         "failed": failed,
         "refused": refused,
         "seconds": round(time.perf_counter() - start, 1),
-        "runs": {label: facts(by_topic) for label, by_topic in found.items()},
+        "runs": {label: facts(by_topic) for label, by_topic in outcomes.items()},
     }
     if folder is not None:
-        _write_results(folder, results, found)
+        _write_results(folder, results, outcomes)
     refused_text = f", {refused} refused wholly or in part by the search" if refused else ""
-    _print_unless_json(options, f"{len(every)} cases, {failed} failed{refused_text}")
+    _print_unless_json(options, f"{len(flat)} cases, {failed} failed{refused_text}")
     if options.json:
         with flushed_stdout():
             print(json.dumps(results, allow_nan=False))
@@ -167,21 +169,21 @@ def _print_unless_json(options: StressOptions, text: str) -> None:
 
 
 def _harnesses(options: StressOptions) -> dict[str, Harness]:
-    """Return a bench for each combination of ``accel=`` and ``compile=``, by label."""
+    """Return a harness for each combination of ``accel=`` and ``compile=``, by label."""
     import torch
 
     from torchpt.scene.devices import device_of
     from torchpt.stress import Harness
 
-    device, dtype = options.given.get("device", "cpu"), options.given.get("dtype", "float32")
+    device, dtype = options.text_of_key.get("device", "cpu"), options.text_of_key.get("dtype", "float32")
     if not (device in ("cpu", "cuda") or (device.startswith("cuda:") and device[5:].isdigit())):
         raise SceneError("device", device, "cpu, cuda or cuda:N")
-    device_of(device)
+    device_of(device)  # raises where it is not available
     if "on" in options.list("compile", "auto") and (device, dtype) != ("cpu", "float32"):
         raise SceneError("compile", "on", f"auto or off (there are no kernels for {dtype} on {device})")
     return {
         f"accel {accel}, compile {compiled}, {dtype} on {device}": Harness(
-            device, accel, compiled, getattr(torch, dtype)
+            device=device, accel=accel, compile=compiled, dtype=getattr(torch, dtype)
         )
         for accel, compiled in product(options.list("accel", "auto"), options.list("compile", "auto"))
     }
@@ -192,22 +194,23 @@ def _topics(options: StressOptions) -> dict[str, tuple[Case, ...]]:
     from torchpt.stress.cases import all_cases
     from torchpt.stress.scene_cases import cases_of
 
-    scene = options.given.get("scene")
-    every = all_cases() if scene is None else {"scene": cases_of(scene, options.settings, options.changes)}
-    pattern = options.given.get("case", "*")
+    scene = options.text_of_key.get("scene")
+    cases_of_topic = all_cases() if scene is None else {"scene": cases_of(scene, options.settings, options.changes)}
+    pattern = options.text_of_key.get("case", "*")
     found = {
         topic: tuple(one for one in cases if fnmatch.fnmatch(one.name, pattern) or fnmatch.fnmatch(topic, pattern))
-        for topic, cases in every.items()
+        for topic, cases in cases_of_topic.items()
     }
     if not any(found.values()):
-        raise SceneError("case", pattern, f"a topic ({', '.join(every)}) or a case, with * and ?")
+        raise SceneError("case", pattern, f"a topic ({', '.join(cases_of_topic)}) or a case, with * and ?")
     return found
 
 
 def _folder(options: StressOptions) -> Path | None:
-    if "out" not in options.given:
+    """Return the folder of ``out=``, which is made if it is missing; None without."""
+    if "out" not in options.text_of_key:
         return None
-    folder = Path(options.given["out"]).expanduser()
+    folder = Path(options.text_of_key["out"]).expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -215,14 +218,14 @@ def _folder(options: StressOptions) -> Path | None:
     return folder
 
 
-def _write_results(folder: Path, results: dict[str, Any], found: dict[str, dict[str, list[Outcome]]]) -> None:
+def _write_results(folder: Path, results: dict[str, Any], outcomes: dict[str, dict[str, list[Outcome]]]) -> None:
     """Write the figures, the table, and a picture of each topic by the first backend."""
     from torchpt.reports.runs import write_whole
     from torchpt.stress.plots import draw
     from torchpt.stress.table import markdown
 
     write_whole(folder / "stress.json", json.dumps(results, indent=1, allow_nan=False).encode())
-    pages = [f"### {label}\n\n{markdown(by_topic)}\n" for label, by_topic in found.items()]
+    pages = [f"### {label}\n\n{markdown(by_topic)}\n" for label, by_topic in outcomes.items()]
     write_whole(folder / "stress.md", "\n".join(pages).encode())
-    for topic, outcomes in next(iter(found.values())).items():
-        draw(outcomes, folder / f"{topic}.svg")
+    for topic, topic_outcomes in next(iter(outcomes.values())).items():
+        draw(topic_outcomes, folder / f"{topic}.svg")

@@ -21,8 +21,8 @@ from torch import Tensor
 from torchpt.core.errors import SceneError
 
 __all__ = [
+    "FINITE_WORDS",
     "OPERATIONS",
-    "WITHIN",
     "affine",
     "apply_points",
     "compose",
@@ -46,7 +46,7 @@ Array = Any
 Device = torch.device | None
 
 #: Text of errors about a matrix that is not usable.
-WITHIN = "it and its inverse finite in float32 (up to 3.4e38)"
+FINITE_WORDS = "it and its inverse finite in float32 (up to 3.4e38)"
 
 _SINGULAR = 1e-12  # smallest singular value over the largest; float64 products of a few matrices stay near 1e-15
 _LARGEST = float(np.finfo(np.float32).max)
@@ -294,7 +294,7 @@ def compose(operations: Any, device: Device = None) -> Array:
         with np.errstate(over="ignore", invalid="ignore"):
             total = OPERATIONS[name](argument, f"{index}.{name}", device) @ total
     if device is None and not is_usable(total):
-        raise SceneError("", operations, f"operations whose product can be inverted, {WITHIN}")
+        raise SceneError("", operations, f"operations whose product can be inverted, {FINITE_WORDS}")
     return total
 
 

@@ -95,12 +95,12 @@ class Scene:
         self._built: SceneBuild = retry_out_of_memory(
             "the files and shapes of the scene", lambda: build_parts(description, vertex_params)
         )
-        # A centre other than 0 means that the scene lies far from its origin. Then positions (`spec.place`) stay in float64:
-        # float32 would lose detail before they are moved to the origin.
+        # A centre other than 0 means that the scene lies far from its origin. Then positions stay in float64: float32 would
+        # lose detail before they are moved to the origin.
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {
             name: torch.from_numpy(value.copy()).to(
-                device, torch.float64 if far and self.spec(name).place else torch.float32
+                device, torch.float64 if far and self.spec(name).holds_positions else torch.float32
             )
             for name, value in self._built.parameters.items()
         }
@@ -419,7 +419,7 @@ class Scene:
         if not changed and not gone:
             return
         for name in changed:
-            if self.spec(name).place and name in before:  # moved: it may lie out of reach now
+            if self.spec(name).holds_positions and name in before:  # moved: it may lie out of reach now
                 self.check_number(name, self.params[name].detach())
         self._cached_versions.clear()
         self._cached_versions.update(now)

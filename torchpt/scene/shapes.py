@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from torchpt.core.errors import AssetError, SceneError
-from torchpt.math.transforms import WITHIN, is_usable
+from torchpt.math.transforms import FINITE_WORDS, is_usable
 from torchpt.physics.bsdfs import KINDS as BSDFS
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Copy, Parameters, Part, Source
@@ -88,7 +88,7 @@ class ShapeBuilder:
             raise SceneError(f"{key}.of", mesh_name, f"the name of a mesh among the shapes{known}", file)
         self.parameters.declare(f"{key}.to_world", entry.to_world, Pose())
         if not is_usable(entry.to_world @ np.linalg.inv(mesh.kind.to_world(mesh.values))):
-            expected = f"a way from where {mesh_name} lies to where it is copied that can be inverted, {WITHIN}"
+            expected = f"a way from where {mesh_name} lies to where it is copied that can be inverted, {FINITE_WORDS}"
             raise SceneError(f"{key}.transform", entry.to_world.tolist(), expected, file)
         copies = []
         for part in (part for part in parts if part.shape == mesh_name):
@@ -111,7 +111,7 @@ class ShapeBuilder:
             with np.errstate(over="ignore", invalid="ignore"):  # `is_usable` finds what is not finite
                 pose = pose @ own_map
             if not is_usable(pose):
-                expected = f"sizes that differ by less than 1e12, and a place: {WITHIN}"
+                expected = f"sizes that differ by less than 1e12, and a place: {FINITE_WORDS}"
                 raise SceneError(entry.key, pose.tolist(), expected, self.description.file)
         surfaces = shape.kind.surfaces(shape.values, pose)
         self._declare_pose(entry.key, pose, surfaces)

@@ -55,7 +55,9 @@ def view_attributes(
     far = bool(built.centre.any())  # then positions are in float64, as in `Scene`
     camera_params = {
         name: torch.tensor(
-            value, device=device, dtype=torch.float64 if far and parameters.specs[name].place else torch.float32
+            value,
+            device=device,
+            dtype=torch.float64 if far and parameters.specs[name].holds_positions else torch.float32,
         )
         for name, value in parameters.items()
         if name.startswith("camera.")

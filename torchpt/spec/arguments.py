@@ -125,7 +125,7 @@ def check_names(call: str, given: Collection[str], form: Any, own: Collection[st
         call: name of the function, such as ``render_batch``.
         given: names of the arguments of this call.
         form: the ``TypedDict``.
-        own: further arguments of ``call``, as suggestions.
+        own: arguments of ``call`` that the form does not declare, which may be meant too.
 
     Raises:
         TypeError: an unknown argument.
@@ -133,6 +133,6 @@ def check_names(call: str, given: Collection[str], form: Any, own: Collection[st
     known = arguments_of(form)
     for name in given:
         if name not in known:
-            close = closest_names(name, sorted({*known, *own}), 1)
+            close = closest_names(name, sorted({*known, *own}), 1)  # one name at most
             hint = f". Did you mean '{close[0]}'?" if close else ""
             raise TypeError(f"{call}() got an unexpected keyword argument '{name}'{hint}")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from torchpt.core.errors import did_you_mean
-from torchpt.math.transforms import WITHIN, is_rigid, is_usable, similarity_scale
+from torchpt.math.transforms import FINITE_WORDS, is_rigid, is_usable, similarity_scale
 from torchpt.spec import reading
 from torchpt.spec.reading import LARGEST, Refused
 
@@ -64,7 +64,7 @@ class Moves(Enum):
 class Role(enum.Flag):
     """The influence of a setting on the samples of a picture."""
 
-    NONE = 0
+    NONE = 0  #: samples depend on it; it neither ends a render nor writes files
     FREE = enum.auto()  #: no sample depends on it
     ENDS = enum.auto()  #: a stop rule: it may end a render before ``spp`` samples are taken
     FILES = enum.auto()  #: it decides which files are written during the render
@@ -106,8 +106,9 @@ class Spec:
 
     #: True for a tensor of ``scene.params``; else the value is fixed once the scene is loaded.
     differentiable: ClassVar[bool] = False
-    #: True for a position in the scene's own coordinates: kept in float64 where the scene lies far from the origin.
-    place: ClassVar[bool] = False
+    #: True where it holds positions (points, vertices in whatever space, the translation of a pose): kept in float64 where the
+    #: scene lies far from the origin, since float32 would round them to coarse steps.
+    holds_positions: ClassVar[bool] = False
     #: True where it takes three channels of a texture, else one.
     coloured: ClassVar[bool] = False
     #: True where texels are plain numbers, so that 8-bit image files are read without sRGB decoding.
@@ -211,7 +212,7 @@ class _Numbers(Spec):
             raise Refused("numbers finite in float32", "a value that is not finite in float32")
         low, high = self.bounds
         # Rounding on the way here must not get a value refused.
-        slack = getattr(self, "slack", 0.0)
+        slack = getattr(self, "slack", 0.0)  # of texels
         bad = (value < low - TOLERANCE * abs(low) - slack) | (value > high + TOLERANCE * abs(high) + slack)
         rounded = value.float()
         if self.above is not None:
@@ -284,6 +285,7 @@ class Index(Scalar):
         media: indices of refraction by the medium's name in lower case.
     """
 
+    # Bounds far beyond any medium, between which stress cases find that energy is kept.
     low: float | None = field(default=1e-3, kw_only=True)
     high: float | None = field(default=1e3, kw_only=True)
     moves: Moves = field(default=Moves.RAYS, kw_only=True)
@@ -376,7 +378,7 @@ class _Vector(Spec):
 class Point(_Vector):
     """A point in the scene's coordinates."""
 
-    place: ClassVar[bool] = True
+    holds_positions: ClassVar[bool] = True
 
     @property
     def accepted(self) -> str:
@@ -413,7 +415,7 @@ class Vertices(_Vector):
 
     moves: Moves = field(default=Moves.SURFACES, kw_only=True)
 
-    place: ClassVar[bool] = True
+    holds_positions: ClassVar[bool] = True
 
     @property
     def accepted(self) -> str:
@@ -429,7 +431,7 @@ class Vertices(_Vector):
 class VertexAttribute(Vertices):
     """Vertex normals ``(V, 3)`` or texture coordinates ``(V, 2)`` of a mesh."""
 
-    place: ClassVar[bool] = False
+    holds_positions: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
@@ -449,14 +451,14 @@ class Pose(Spec):
     moves: Moves = field(default=Moves.SURFACES, kw_only=True)
 
     differentiable: ClassVar[bool] = True
-    place: ClassVar[bool] = True
+    holds_positions: ClassVar[bool] = True
 
     @property
     def accepted(self) -> str:
         """See :class:`Spec`."""
         if self.angles:
             return "a transform that keeps angles (rotation, reflection, uniform scale)"
-        return f"a matrix that can be inverted, {WITHIN}"
+        return f"a matrix that can be inverted, {FINITE_WORDS}"
 
     def read(self, value: Any) -> Any:
         """See :class:`Spec`."""
@@ -473,7 +475,7 @@ class Pose(Spec):
         if not bool(torch.isfinite(value.float()).all()):
             raise Refused("numbers finite in float32", "a value that is not finite in float32")
         if not is_usable(matrix):
-            raise Refused(f"a matrix that can be inverted, {WITHIN}", matrix.tolist())
+            raise Refused(f"a matrix that can be inverted, {FINITE_WORDS}", matrix.tolist())
         if abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > POSE_TOLERANCE:
             raise Refused("a transform whose last row is 0 0 0 1", matrix[3].tolist())
         if self.angles and similarity_scale(matrix, POSE_TOLERANCE) is None:
@@ -580,7 +582,7 @@ class Pair(Spec):
 
 @dataclass(frozen=True)
 class Path(Spec):
-    """The path of a file, or a list of paths of which the first that exists is used."""
+    """The path of a file, or a list of paths of which the first that exists is used; the value is a tuple of all of them."""
 
     @property
     def accepted(self) -> str:
@@ -612,7 +614,7 @@ class Custom(Spec):
     """A value with a reader of its own.
 
     Attributes:
-        reader: returns the parameter's value for the value as written; raises :class:`Refused`.
+        reader: returns the parameter's value for the value as written, or raises :class:`Refused`; unchanged by default.
     """
 
     reader: Callable[[Any], Any] = field(default=lambda value: value, kw_only=True, hash=False)

@@ -57,8 +57,8 @@ class Refused(ValueError):
 
 
 def as_refused(error: SceneError) -> Refused:
-    """Return a :class:`Refused` for an error about an element, with the element's key relative to the value."""
-    return Refused(error.expected, error.value, tuple(part for part in error.key.split(".") if part))
+    """Return a :class:`Refused` for an error whose key is relative to the value that is read."""
+    return Refused(error.expected, error.value, at=tuple(part for part in error.key.split(".") if part))
 
 
 def number(value: Any, expected: str = "a finite number") -> float:
@@ -118,7 +118,12 @@ def text(value: Any) -> str:
 
 
 def transform(value: Any, device: torch.device | None = None) -> Any:
-    """Return the ``(4, 4)`` of a matrix or of a list of operations as in :func:`torchpt.math.transforms.compose`."""
+    """Return the ``(4, 4)`` of a matrix or of a list of operations as in :func:`torchpt.math.transforms.compose`.
+
+    Args:
+        value: the matrix or the list as written.
+        device: device of a float64 tensor, to which gradients of tensors in ``value`` flow; None: an array.
+    """
     row_types = list | np.ndarray | Tensor
     is_nested = isinstance(value, list) and value and isinstance(value[0], row_types)
     if isinstance(value, np.ndarray | Tensor) or is_nested:
@@ -136,12 +141,18 @@ def matrix(value: Any) -> NDArray[np.float64]:
     except SceneError as error:
         raise as_refused(error) from None
     if not transforms.is_usable(found):
-        raise Refused(f"a matrix that can be inverted, {transforms.WITHIN}")
+        raise Refused(f"a matrix that can be inverted, {transforms.FINITE_WORDS}")
     return found
 
 
 def rows(value: Any, columns: int, what: str) -> NDArray[np.float64]:
-    """Return ``(V, columns)`` float64 from nested lists or an array, checked and converted in bulk."""
+    """Return ``(V, columns)`` float64 from nested lists or an array, checked and converted in bulk.
+
+    Args:
+        value: the rows as written.
+        columns: numbers of a row.
+        what: a row in the words of errors, such as ``[x, y, z]``.
+    """
     expected = f"a list of {what}, finite numbers each"
     if isinstance(value, list | tuple):
         if not value or not set(map(type, value)) <= {list, tuple} or set(map(len, value)) != {columns}:
@@ -153,13 +164,13 @@ def rows(value: Any, columns: int, what: str) -> NDArray[np.float64]:
         found = np.array(value, dtype=np.float64)
     except (OverflowError, TypeError, ValueError, RuntimeError):
         raise Refused(expected) from None
-    if isinstance(value, np.ndarray) and value.dtype.kind not in "iuf":
+    if isinstance(value, np.ndarray) and value.dtype.kind not in "iuf":  # integers and floats
         raise Refused(expected, value.dtype)
     if found.ndim != 2 or found.shape[1] != columns or not len(found):
         raise Refused(expected)
     bad = np.flatnonzero(~(np.abs(found) <= LARGEST).all(axis=1))
     if len(bad):
-        raise Refused(expected, found[bad[0]].tolist(), (int(bad[0]),))
+        raise Refused(expected, found[bad[0]].tolist(), at=(int(bad[0]),))
     return found
 
 
@@ -167,18 +178,18 @@ def _refuse_first_bad_row(value: Any, columns: int, expected: str) -> None:
     """Raise for the first row of a list that is not ``columns`` numbers."""
     for index, row in enumerate(value):
         if not isinstance(row, list | tuple) or len(row) != columns or not all(type(x) in (int, float) for x in row):
-            raise Refused(expected, row, (index,))
+            raise Refused(expected, row, at=(index,))
 
 
 def faces(value: Any) -> NDArray[np.int64]:
     """Return triangles ``(F, 3)`` int64 from lists of three or more indices; polygons are split into fans."""
     expected = "a list of faces, each three or more vertex indices (whole numbers >= 0)"
     if isinstance(value, list | tuple):
-        lists = bool(value) and set(map(type, value)) <= {list, tuple}
-        if not lists or set(map(type, chain.from_iterable(value))) != {int} or min(map(len, value)) < 3:
+        all_lists = bool(value) and set(map(type, value)) <= {list, tuple}
+        if not all_lists or set(map(type, chain.from_iterable(value))) != {int} or min(map(len, value)) < 3:
             for index, row in enumerate(value):
                 if not isinstance(row, list | tuple) or len(row) < 3 or not all(type(x) is int for x in row):
-                    raise Refused(expected, row, (index,))
+                    raise Refused(expected, row, at=(index,))
             raise Refused(expected)
         triangles: Any = value
         if max(map(len, value)) > 3:
@@ -208,8 +219,8 @@ def memory_size(value: Any) -> int | None:
         if not match:
             raise Refused(expected)
         base = 1024 if match[3] else 1000
-        number, prefix, _ = match.groups()
-        value = int(float(number) * base ** " KMGT".index(prefix.upper() or " "))  # the exponent is the prefix's index
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 2**60:
+        digits, prefix, _ = match.groups()
+        value = int(float(digits) * base ** " KMGT".index(prefix.upper() or " "))  # the exponent is the prefix's index
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 2**60:  # an EiB
         raise Refused(expected)
     return value

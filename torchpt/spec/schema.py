@@ -60,32 +60,32 @@ class Kinds(Mapping[str, type[K]], Generic[K]):
     """
 
     def __init__(self, package: str, first: tuple[str, ...] = ()) -> None:
-        self.package, self._first = package, first
-        self._known: dict[str, type[K]] = {}
+        self.package, self._first_names = package, first
+        self._imported: dict[str, type[K]] = {}
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Return the names of all kinds, without importing their files."""
         package_spec = find_spec(self.package)
         assert package_spec is not None and package_spec.submodule_search_locations is not None
-        every = [module.name for module in iter_modules(list(package_spec.submodule_search_locations))]
-        rest = sorted(name for name in every if not name.startswith("_") and name not in self._first)
-        return (*self._first, *rest)
+        files = [module.name for module in iter_modules(list(package_spec.submodule_search_locations))]
+        others = sorted(name for name in files if not name.startswith("_") and name not in self._first_names)
+        return (*self._first_names, *others)
 
     def __getitem__(self, name: str) -> type[K]:
-        if name not in self._known:
+        if name not in self._imported:
             if name not in self.names:
                 raise KeyError(name)
             module = import_module(f"{self.package}.{name}")
-            own = [
+            kinds = [
                 value
                 for value in vars(module).values()
                 if isinstance(value, type) and _defines_kind(value, module, name)
             ]
-            if len(own) != 1:
+            if len(kinds) != 1:
                 raise TypeError(f"{module.__name__} has to define one class with name = {name!r}")
-            self._known[name] = own[0]
-        return self._known[name]
+            self._imported[name] = kinds[0]
+        return self._imported[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)
@@ -211,6 +211,10 @@ class FrozenConfig:
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
         """Check values of several parameters against each other.
 
+        Args:
+            values: values of all parameters by name, defaults filled in.
+            given: names of those that the file or the caller sets.
+
         Raises:
             Refused: values that exclude each other.
         """
@@ -254,7 +258,7 @@ class ResultCache(Generic[T]):
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._known: dict[Hashable, T] = {}
+        self._results: dict[Hashable, T] = {}  # the oldest first
 
     def get(self, names: Hashable, values: Any, make: Callable[[], T]) -> T:
         """Return the cached result for ``values``, or call ``make`` and cache what it returns; errors are not cached.
@@ -266,13 +270,13 @@ class ResultCache(Generic[T]):
         """
         try:
             key = names, frozen(values)
-            found = self._known.get(key)
+            found = self._results.get(key)
         except TypeError:
             return make()
         if found is None:
-            found = self._known[key] = make()
-            if len(self._known) > self._most:
-                self._known.pop(next(iter(self._known)), None)
+            found = self._results[key] = make()
+            if len(self._results) > self._most:
+                self._results.pop(next(iter(self._results)), None)
         return found
 
 
@@ -285,7 +289,15 @@ def dotted(*parts: str | int) -> str:
 
 
 def check_keys(raw: Mapping[str, Any], known: Iterable[str], key: str, what: str, file: str | None) -> None:
-    """Raise a SceneError for the first unknown key, with the known keys and the closest one."""
+    """Raise a SceneError for the first unknown key, with the known keys and the closest one.
+
+    Args:
+        raw: the mapping as written.
+        known: its known keys.
+        key: its dotted key; empty for a whole scene.
+        what: the mapping in the words of errors.
+        file: scene file, for errors.
+    """
     names = list(known)
     for name in raw:
         if name not in names:
@@ -303,15 +315,22 @@ def scene_error(error: Refused, key: str, value: Any, file: str | None) -> Scene
 def refuse_not_built(
     raw: Mapping[str, Any], unsupported_keys: Mapping[str, object], key: str, available: str, file: str | None
 ) -> dict[str, Any]:
-    """Return the mapping without the keys of ``unsupported_keys``, which the format knows and this version does not support.
+    """Return the mapping without the keys that the format knows and this version does not support.
+
+    Args:
+        raw: the mapping as written.
+        unsupported_keys: such keys, each with its neutral value, which changes nothing.
+        key: dotted key of the mapping.
+        available: the supported keys, for errors.
+        file: scene file, for errors.
 
     Raises:
         NotBuiltError: such a key with a value that is neither null nor its neutral value.
     """
     for name, neutral in unsupported_keys.items():
         value = raw.get(name)
-        same = type(value) in (int, float, bool) and isinstance(value, bool) == isinstance(neutral, bool)
-        if value is not None and not (same and value == neutral):
+        is_comparable = type(value) in (int, float, bool) and isinstance(value, bool) == isinstance(neutral, bool)
+        if value is not None and not (is_comparable and value == neutral):
             raise NotBuiltError(dotted(key, name), value, available, file)
     return {name: value for name, value in raw.items() if name not in unsupported_keys}
 
@@ -390,24 +409,24 @@ def read_typed(
 
     if not isinstance(kind, type):  # an instance may change between calls
         return read()
-    found = _known.get((what, kind, texture), raw, read)
+    found = _parsed_blocks.get((what, kind, texture), raw, read)
     return ParsedParams(kind, dict(found.values), found.given)
 
 
 #: Blocks that were read, by the mapping as written.
-_known: ResultCache[ParsedParams] = ResultCache(4096)
+_parsed_blocks: ResultCache[ParsedParams] = ResultCache(most=4096)
 
 
 def _read_kind(
     what: str, kind: Any, name: str, raw: Mapping[str, Any], key: str, file: str | None, texture: ReadTexture | None
 ) -> ParsedParams:
-    """Read a mapping whose kind is known."""
+    """Read a mapping whose kind is known; arguments as of :func:`read_typed`, ``name``: the ``type``."""
     words = f"{what} type {name}"
     names = list(parameters_of(kind))
     unsupported_keys = {**unsupported.KEYS.get(what, {}), **unsupported.KEYS.get(name, {})}
     check_keys({k: v for k, v in raw.items() if k not in unsupported_keys}, ("type", *names), key, words, file)
-    rest = refuse_not_built(raw, unsupported_keys, key, ", ".join(names), file)
-    values = {k: value for k, value in rest.items() if k != "type"}
+    supported = refuse_not_built(raw, unsupported_keys, key, ", ".join(names), file)
+    values = {name: value for name, value in supported.items() if name != "type"}
     return read_params(kind, values, key, file, words, texture)
 
 
@@ -422,6 +441,14 @@ def read_params(
     """Read the values of a kind's parameters from a mapping without ``type``; null means unset.
 
     The kind's ``check(values, given)``, if any, may fill in values that follow from others, as a camera does with its pose.
+
+    Args:
+        kind: the class or instance that declares ``parameters``.
+        raw: the mapping as written.
+        key: its dotted key.
+        file: scene file, for errors.
+        words: the mapping in the words of errors; None: the name of the kind.
+        texture: reads textures in place of numbers and colours; None: none are accepted.
 
     Raises:
         SceneError: an unknown key, a bad value, or values that ``check`` refuses.
@@ -440,6 +467,7 @@ def read_params(
             raise SceneError(dotted(key, name), None, "a value (this key is required)", file)
         else:
             values[name] = None if callable(spec.default) else spec.default
+    # Defaults that are functions follow from the values of the others.
     for name, spec in specs.items():
         if name not in given and callable(spec.default):
             values[name] = spec.default(values)
@@ -495,7 +523,7 @@ def _read_value(spec: Spec, value: Any, texture: ReadTexture | None) -> Any:
 
 
 def _read_block(spec: Block, texture: ReadTexture | None, value: Any) -> ParsedParams | None:
-    """Return a nested mapping; errors have keys relative to it."""
+    """Return a nested mapping, or None for null; errors have keys relative to it."""
     if value is None:
         return None
     if not isinstance(value, Mapping):
