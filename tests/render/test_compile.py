@@ -11,7 +11,7 @@ from trials import film_of
 
 import torchpt
 from torchpt.core.errors import SceneError
-from torchpt.engines.kernels import programs
+from torchpt.engines.kernels import driver, programs
 from torchpt.engines.kernels.threads import KernelsForward
 from torchpt.rendering import scene_cache, uses_kernels
 from torchpt.rendering.api import Rendering, render_scene
@@ -80,10 +80,11 @@ def test_on_is_refused_in_float64():
         run(torchpt.load("cornell_box", device="cpu"), 2, "on", dtype=torch.float64)
 
 
-def test_on_is_refused_away_from_a_cpu():
+def test_on_is_refused_without_a_driver(monkeypatch):
+    monkeypatch.setattr(driver, "library", lambda: None)
     device, box = torch.device("cuda:0"), torchpt.load("cornell_box", device="cpu").description
     on, auto = (settings(box, {"render": {"compile": mode}}) for mode in ("on", "auto"))
-    with pytest.raises(SceneError, match=r"render.compile: .* auto or off \(kernels run on a CPU; .* on cuda:0\)"):
+    with pytest.raises(SceneError, match=r"render.compile: .* auto or off \(there is no CUDA driver .* on cuda:0\)"):
         uses_kernels(on, device, torch.float32)
     assert not uses_kernels(auto, device, torch.float32) and uses_kernels(on, torch.device("cpu"), torch.float32)
 

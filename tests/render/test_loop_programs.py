@@ -39,13 +39,13 @@ def rendered(scene: torchpt.Scene, params: Any = None, **wishes: Any) -> Renderi
 @pytest.fixture
 def work(monkeypatch) -> Iterator[Any]:
     """Counts kernels compiled and stages traced since it was last asked."""
-    traced, kept = [0], programs._traced
+    traced, kept = [0], programs.trace_stage
 
     def counting(*args: Any) -> Any:
         traced[0] += 1
         return kept(*args)
 
-    monkeypatch.setattr(programs, "_traced", counting)
+    monkeypatch.setattr(programs, "trace_stage", counting)
     before = [cpu.counts()[0], 0]
 
     def since() -> tuple[int, int]:
@@ -165,11 +165,11 @@ AGAIN = """
 import sys, torchpt
 from torchpt.engines.kernels import programs
 from torchpt.compiler import cpu
-traced, kept = [0], programs._traced
+traced, kept = [0], programs.trace_stage
 def counting(*args):
     traced[0] += 1
     return kept(*args)
-programs._traced = counting
+programs.trace_stage = counting
 scene = torchpt.load("cornell_box", "cpu")
 wish = dict(film={"width": 16, "height": 16, "aovs": ["albedo"]}, threads=1)
 image = torchpt.render(scene, spp=4, full=True, **wish).image

@@ -27,7 +27,7 @@ from torchpt.core.threads import parallel_for, thread_count
 from torchpt.core.tree import leaves, signature
 from torchpt.native import compile_time
 
-__all__ = ["Lanewise", "compile_lanewise"]
+__all__ = ["Lanewise", "compile_lanewise", "trace_lanewise"]
 
 #: Lanes of a block; threads share the work by blocks.
 BLOCK = 64
@@ -255,13 +255,7 @@ def compile_lanewise(
     Raises:
         Unsupported: the function does something that the lane compiler cannot compile.
     """
-    lanes = choose_lane_count([x[..., 0] for x in like if x.numel()])  # see Lanewise._trace
-    tracer = Tracer(lanes, leaves={})
-    inputs = [_input(tracer, slot, _example_lanes(x, lanes)) for slot, x in enumerate(like)]
-    with torch.no_grad(), tracer:
-        results = list(function(*inputs))
-    sinks = Sinks(store=_stores(tracer, results))
-    stage = TracedStage(tracer.graph, sinks, tracer.tables, tracer.steps, tracer.constants, tensors=len(inputs))
+    stage, results = trace_lanewise(function, like)
     tables = bind_tables(stage.tables, stage.steps, stage.constants, leaves={})
     program = cache.compile_stage(stage, target)
     compiled = _CompiledFunction(program, tables, states=[], results=tuple(x[..., :0] for x in results))
@@ -270,6 +264,20 @@ def compile_lanewise(
         return list(compiled.run(arguments, uniforms=(), count=arguments[0].shape[-1], threads=1))
 
     return run
+
+
+def trace_lanewise(
+    function: Callable[..., Sequence[Tensor]], like: Sequence[Tensor]
+) -> tuple[TracedStage, list[Tensor]]:
+    """Trace a function, see :func:`compile_lanewise`; return the stage, and results for some lanes."""
+    lanes = choose_lane_count([x[..., 0] for x in like if x.numel()])  # see Lanewise._trace
+    tracer = Tracer(lanes, leaves={})
+    inputs = [_input(tracer, slot, _example_lanes(x, lanes)) for slot, x in enumerate(like)]
+    with torch.no_grad(), tracer:
+        results = list(function(*inputs))
+    sinks = Sinks(store=_stores(tracer, results))
+    stage = TracedStage(tracer.graph, sinks, tracer.tables, tracer.steps, tracer.constants, tensors=len(inputs))
+    return stage, results
 
 
 def _input(tracer: Tracer, slot: int, x: Tensor) -> Tensor:

@@ -199,6 +199,7 @@ def bind_tables(
     known: dict[Any, Tensor] | None = None,
     names: Sequence[StepKey | None] = (),
     results: dict[StepKey, Tensor] | None = None,
+    device: torch.device | None = None,
 ) -> Tables:
     """Compute and lay out the tables of a kernel for one scene.
 
@@ -210,9 +211,10 @@ def bind_tables(
         known: leaves laid out before, by path and axis; filled.
         names: names of the steps.
         results: results of steps of other kernels, see :func:`torchpt.compiler.prologue.run_prologue`; filled.
+        device: of the leaves, if kernels read tables on a device; None: on the host.
     """
     known = {} if known is None else known
-    tensor = run_prologue(steps, constants, leaves, names, results)
+    tensor = run_prologue(steps, constants, leaves, names, results, device)
     words: list[int] = []
     keep: list[Tensor] = []
     for table in tables:
@@ -225,15 +227,18 @@ def bind_tables(
                 known[key] = numbers
         keep.append(numbers)
         words += [numbers.data_ptr(), plain.numel() if table.axis is None else plain.shape[table.axis]]
+    if device is not None:
+        pairs = torch.tensor(words or [0], dtype=torch.int64, device=device)
+        return Tables(pairs.data_ptr(), (pairs, keep))
     block = (ctypes.c_int64 * max(len(words), 1))(*words)
     return Tables(ctypes.addressof(block), (block, keep))
 
 
-def guards_hold(program: Program, leaves: Mapping[str, Tensor]) -> bool:
-    """Return True if the guards of a program hold for these leaves."""
+def guards_hold(program: Program, leaves: Mapping[str, Tensor], device: torch.device | None = None) -> bool:
+    """Return True if the guards of a program hold for these leaves, which are on a device (None: the host)."""
     if not program.guards:
         return True
-    tensor = run_prologue(program.steps, program.constants, leaves)
+    tensor = run_prologue(program.steps, program.constants, leaves, device=device)
 
     def number(value: Any) -> Any:
         return value.item() if isinstance(value, Tensor) else value

@@ -30,6 +30,7 @@ __all__ = [
     "BackwardKernels",
     "Block",
     "Forward",
+    "ForwardDevice",
     "Kernels",
     "SampleRange",
     "TaskResult",
@@ -37,6 +38,7 @@ __all__ = [
     "backward_kernels",
     "backward_tensors",
     "describe_kernels",
+    "forward_device",
     "forward_kernels",
     "forward_tensors",
     "hits",
@@ -46,6 +48,7 @@ __all__ = [
     "seen",
     "trace",
     "weighted_radiance",
+    "why_no_kernels",
 ]
 
 P = TypeVar("P", bound=Population)
@@ -108,6 +111,16 @@ class Tasks(Forward, Protocol):
         """Cancel the render: tasks stop at their next kernel."""
 
 
+class ForwardDevice(Forward, Protocol):
+    """A forward engine on a device.
+
+    Attributes:
+        kernels: of the render.
+    """
+
+    kernels: Any
+
+
 def forward_tensors(wave: Wave, budget: Budget) -> Forward:
     """Return a forward engine of tensor operations, in pieces of as many lanes as the budget allows."""
     return TensorsForward(wave, budget)
@@ -141,6 +154,34 @@ def forward_kernels(kernels: Kernels, threads: int | None = None, strict: bool =
         strict: True: a task ends at its first chunk with a sample that is not finite; the caller has to end the render.
     """
     return KernelsForward(kernels, threads or torch.get_num_threads(), kernels.wave.integrator.clamp, strict)
+
+
+def why_no_kernels(device: torch.device) -> str:
+    """Return why kernels cannot run on a device, in a few words; empty if they can."""
+    if device.type == "cpu":
+        return ""
+    if device.type != "cuda":
+        return "kernels run on a CPU or with CUDA"
+    from torchpt.engines.kernels.driver import missing  # imported where there is such a device
+
+    return missing(torch.cuda.current_device() if device.index is None else device.index)
+
+
+def forward_device(wave: Wave, own: Sequence[int], packets: bool, before: Kernels | None = None) -> ForwardDevice:
+    """Return a forward engine of kernels on a CUDA device.
+
+    Args:
+        wave: of the render, on the device.
+        own: see :func:`kernels_of`.
+        packets: True: few primitives are searched inside of kernels; False: by the wave's acceleration structure.
+        before: kernels of another render; its tables are shared where they were made of the same tensors.
+
+    Raises:
+        RenderError: kernels cannot run on the device.
+    """
+    from torchpt.engines.kernels.device import device_forward
+
+    return device_forward(wave, own, packets, before)
 
 
 def describe_kernels(kernels: Kernels) -> dict[str, Any]:

@@ -43,7 +43,7 @@ from torchpt.scene.memory_estimate import (
     mark_loaded,
     memory_estimate,
 )
-from torchpt.scene.prepare import kernel_engine, make_wave, surface_layers, uses_kernels
+from torchpt.scene.prepare import device_engine, kernel_engine, make_wave, surface_layers, uses_kernels
 from torchpt.scene.settings import Settings
 
 __all__ = ["Run", "render_scene"]
@@ -79,7 +79,7 @@ class Run:
         picture: the pixel set of the picture, with its film and those of AOVs.
         surface_layers: the AOVs of first surfaces, by name.
         probes: the error probes; None without an error estimate.
-        engine: traces the paths; ``tasks`` is the same engine if it is compiled, else None.
+        engine: traces the paths; ``tasks`` is the same engine if it is that of kernels on a CPU, else None.
         unsupported: why a stage cannot be compiled; None: all can, as far as is known.
         taken: samples a pixel of the finished passes.
         done: number of paths traced, by all ranks.
@@ -134,8 +134,14 @@ class Run:
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
             self.checkpoint_file = CheckpointFile(settings.render.checkpoint, identity(scene, settings, params, dtype))
             self.checkpoint_file.check(settings.render.resume)
-        self.tasks: Tasks | None = kernel_engine(scene, self.wave, self.eager_reasons, threads) if compiled else None
-        self.engine: Forward = self._tensor_engine() if self.tasks is None else self.tasks
+        self.tasks: Tasks | None = None
+        self.engine: Forward
+        if compiled and self.device.type == "cpu":
+            self.engine = self.tasks = kernel_engine(scene, self.wave, self.eager_reasons, threads)
+        elif compiled:
+            self.engine = device_engine(scene, self.wave, settings, self.eager_reasons)
+        else:
+            self.engine = self._tensor_engine()
         words_per_lane = self.engine.rows(self.surface_layers)  # 32-bit words of a lane in a worker's memory
         models = len(self.wave.context.world.materials.models)
         self.memory_need = memory_estimate(settings, self.device, self._how(), models, words_per_lane)

@@ -19,9 +19,10 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError, warn_once
 from torchpt.engines import engine
-from torchpt.engines.engine import Kernels, Tasks
+from torchpt.engines.engine import ForwardDevice, Kernels, Tasks
 from torchpt.images.denoiser import GUIDES
 from torchpt.math.vectors import dot, normalize
+from torchpt.native import device_checks
 from torchpt.paths.integrators.base import Integrator
 from torchpt.paths.layers import LAYERS, SurfaceLayer
 from torchpt.paths.state import Plan, StageContext
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 __all__ = [
     "SceneCache",
     "describe_engine",
+    "device_engine",
     "kernel_engine",
     "kernels_of",
     "make_wave",
@@ -289,19 +291,29 @@ def _pixel_of(world: World, camera: Camera) -> Tensor | None:
 def uses_kernels(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool:
     """Return True where a render runs as kernels, False where it runs as tensor operations.
 
+    Kernels run on a CPU; on a CUDA device where they have passed their check, or where ``render.compile`` is ``on``.
+
     Raises:
         SceneError: ``render.compile`` is ``on`` where there are no kernels.
     """
     if settings.render.compile == "off":
         return False
     missing = ""
-    if device.type != "cpu":
-        missing = f"kernels run on a CPU; this scene is on {device}"
-    elif dtype != torch.float32:
+    if dtype != torch.float32:
         missing = f"kernels compute in float32; this render is in {str(dtype).removeprefix('torch.')}"
-    if missing and settings.render.compile == "on":
-        raise SceneError("render.compile", "on", f"auto or off ({missing})")
-    return not missing
+    elif reason := engine.why_no_kernels(device):
+        missing = f"{reason}; this scene is on {device}"
+    if settings.render.compile == "on":
+        if missing:
+            raise SceneError("render.compile", "on", f"auto or off ({missing})")
+        return True
+    return not missing and (device.type == "cpu" or _has_passed(device))
+
+
+def _has_passed(device: torch.device) -> bool:
+    """Return True if kernels have passed their check on a CUDA device."""
+    result = device_checks.last_check(device)
+    return result is not None and result.passed
 
 
 def own_models(scene: Scene, wave: Wave) -> list[int]:
@@ -320,7 +332,10 @@ def describe_engine(scene: Scene, settings: Settings) -> dict[str, Any]:
     with torch.no_grad():
         if not uses_kernels(settings, scene.device, torch.float32):
             return {"stages": "eager, by tensor operations"}
-        return engine.describe_kernels(kernels_of(scene, make_wave(scene, settings, None, torch.float32)))
+        wave = make_wave(scene, settings, None, torch.float32)
+        on_cpu = scene.device.type == "cpu"
+        kernels = kernels_of(scene, wave) if on_cpu else device_engine(scene, wave, settings, []).kernels
+        return engine.describe_kernels(kernels)
 
 
 def kernel_engine(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Tasks:
@@ -334,8 +349,30 @@ def kernel_engine(scene: Scene, wave: Wave, eager: list[str], threads: int | Non
     """
     cache = scene_cache(scene)
     kernels = cache.kernels = kernels_of(scene, wave, cache.kernels)
+    _warn_of_eager_models(wave, kernels, eager)
+    return engine.forward_kernels(kernels, threads, wave.integrator.strict)
+
+
+def device_engine(scene: Scene, wave: Wave, settings: Settings, eager: list[str]) -> ForwardDevice:
+    """Return the engine of kernels of a render on a CUDA device; its kernels are cached with the scene.
+
+    Args:
+        scene: the scene.
+        wave: the wave of the render.
+        settings: complete settings.
+        eager: gets the names of models that cannot be compiled, each with the reason.
+    """
+    cache = scene_cache(scene)
+    packets = settings.render.accel == "auto"
+    forward = engine.forward_device(wave, own_models(scene, wave), packets, cache.kernels)
+    cache.kernels = forward.kernels
+    _warn_of_eager_models(wave, forward.kernels, eager)
+    return forward
+
+
+def _warn_of_eager_models(wave: Wave, kernels: Kernels, eager: list[str]) -> None:
+    """Warn of models that cannot be compiled, and append them to ``eager``."""
     for number, reason in kernels.eager.items():
         name = str(wave.context.world.materials.models[number])
         eager.append(f"{name}: {reason}")
         warn_once(f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}")
-    return engine.forward_kernels(kernels, threads, wave.integrator.strict)

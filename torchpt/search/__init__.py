@@ -20,7 +20,7 @@ from torchpt.core.errors import SceneError
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.base import Accel, Hits
 
-__all__ = ["BRUTE_LIMIT", "KINDS", "Accel", "Hits", "build"]
+__all__ = ["BRUTE_LIMIT", "KINDS", "Accel", "Hits", "brute_if_fastest", "build"]
 
 #: Values of ``kind`` in :func:`build`: the backends, and ``auto``, which chooses one.
 KINDS = ("auto", "torch", "numba", "brute")
@@ -50,7 +50,7 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
     if geometry.copies is not None and kind == "brute":
         raise SceneError("render.accel", kind, "numba or torch (this scene has instances)")
     if kind == "auto":
-        brute = _brute_if_fastest(geometry, threads) if on_cpu else None
+        brute = brute_if_fastest(geometry, threads) if on_cpu else None
         if brute is not None:
             return brute
         kind = "numba" if on_cpu else "torch"
@@ -78,7 +78,7 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
     return WideBvh(geometry, threads)
 
 
-def _brute_if_fastest(geometry: Geometry, threads: int | None) -> Accel | None:
+def brute_if_fastest(geometry: Geometry, threads: int | None = None) -> Accel | None:
     """Return the brute-force search; None if a tree is faster, or if float32 rows are too coarse for these primitives."""
     *_, quadrics = geometry.counts
     # Brute force tests quadrics outside of its packets: with three of them the tree is as fast already.

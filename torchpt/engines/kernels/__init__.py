@@ -1,4 +1,4 @@
-"""Compiled wavefront path tracing on a CPU: a thread takes a chunk of lanes from the camera to the ends of all paths.
+"""Compiled wavefront path tracing: a thread takes a chunk of lanes from the camera to the ends of all paths, or a GPU a wave.
 
 The stages are the tensor functions that also run eagerly; :mod:`torchpt.compiler` compiles them to kernels. Between two kernels
 of a chunk there is neither an operator of torch nor a barrier between threads.
@@ -10,5 +10,7 @@ of a chunk there is neither an operator of torch nor a barrier between threads.
 ``stages.py``      the functions that trace kernels: camera rays, search, emission, bounce, layers, film
 ``layout.py``      rows of the path state in memory; loads, stores and lists that kernels share
 ``backward.py``    kernels and engine of path replay
+``device.py``      the same stages on a CUDA device: waves, counts in memory, films
+``driver.py``      the device's driver: loading code and launching kernels
 =================  =======================================================================================
 """

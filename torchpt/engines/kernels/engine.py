@@ -9,7 +9,8 @@ rays, lists lanes and ends paths. A path that ends writes its radiance to the *s
 
 A stage is a list of *steps*: kernel calls that name the kernel, the memory that it reads and writes, and where its lanes are
 counted. :class:`Calls` runs a step at once, in the calling thread: a count is an int, and steps without lanes are left out.
-Another class may run the same steps elsewhere and leave counts in memory, where kernels read them.
+On a device (:mod:`~torchpt.engines.kernels.device`) all steps are launched, and counts stay in memory, where kernels read
+them.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ __all__ = ["LANES", "Calls", "Chunk", "ChunkSearch", "Halted", "KernelsEngine", 
 
 
 _WORD = {name: k for k, name in enumerate(HEAD)}
-#: A number of lanes: an int, or an object that is always true where only kernels know the number.
+#: A number of lanes: an int, or on a device a :class:`torchpt.engines.kernels.device.Count`, which is always true.
 LaneCount = Any
 
 
@@ -418,7 +419,7 @@ class KernelsEngine:
     def __init__(self, kernels: Kernels, halt: threading.Event | None = None, calls: Any = None) -> None:
         self.kernels, self.wave = kernels, kernels.wave
         self.calls: Calls = Calls(kernels, halt or threading.Event()) if calls is None else calls
-        self.search = self._search()
+        self.search = self._make_search()
         self.slots = self.calls.slots
         self.shown: Memory | None = None
         self.tally = RayCounts()
@@ -426,7 +427,7 @@ class KernelsEngine:
         self._lost: list[np.ndarray] = []  # samples with splats that are not finite
         self._rooms = [self._room() for _ in range(2)]
 
-    def _search(self) -> ChunkSearch:
+    def _make_search(self) -> ChunkSearch:
         return ChunkSearch(self.calls)
 
     def _room(self) -> Paths:

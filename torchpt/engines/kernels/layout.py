@@ -227,7 +227,7 @@ class Layout:
     def __init__(self, wave: Wave, packets: bool, fused: bool) -> None:
         self.wave, self.packets, self.fused = wave, packets, fused
         self.plan, self.world = wave.context.plan, wave.context.world
-        self.numbers = wave.sampler.tensors(torch.device("cpu"))
+        self.numbers = wave.sampler.tensors(wave.centre.device)
         table = self.world.lights
         self.models = len(self.world.materials.models)
         self.has_environment = table is not None and table.environment is not None

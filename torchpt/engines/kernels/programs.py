@@ -33,7 +33,16 @@ if TYPE_CHECKING:
     from torchpt.paths.wave import Wave
 
 
-__all__ = ["Kernel", "KernelCache", "Kernels", "NamedTensors", "TensorVersion", "program_of"]
+__all__ = [
+    "Kernel",
+    "KernelCache",
+    "Kernels",
+    "NamedTensors",
+    "TensorVersion",
+    "program_of",
+    "records_of",
+    "trace_stage",
+]
 
 
 # ---- The tensors that kernels read, by name, with their versions
@@ -153,10 +162,11 @@ def program_of(
         build: traces the stage.
         listed: True: the kernel reads lanes by a list.
     """
-    return cache.program_of((key, structure), leaves.tensors, lambda: _traced(leaves, layout, build, listed))
+    return cache.program_of((key, structure), leaves.tensors, lambda: trace_stage(leaves, layout, build, listed))
 
 
-def _traced(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> TracedStage:
+def trace_stage(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> TracedStage:
+    """Trace a stage; arguments as for :func:`program_of`."""
     tracer = Tracer(choose_lane_count(leaves.tensors.values()), leaves.ids)
     trace = Trace(tracer, layout)
     with torch.no_grad():
@@ -179,6 +189,21 @@ def _traced(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], Sinks
 
 
 # ---- The kernels of a render
+
+
+def records_of(layout: Layout, cotangent: Tensor | None) -> dict[str, Any]:
+    """Return the records that kernels of a render may read, by name; ``cotangent``: see :class:`Kernels`."""
+    wave = layout.wave
+    return {
+        "world": layout.world,
+        "camera": wave.camera,
+        "filter": wave.filter.tensors(),
+        "sampler": layout.numbers,
+        "centre": wave.centre,
+        "pixel": wave.context.pixel,
+        "first": wave.first_surface,
+        "cotangent": cotangent,
+    }
 
 
 @dataclass(frozen=True)
@@ -219,19 +244,7 @@ class Kernels(Layout):
         cotangent: Tensor | None = None,
     ) -> None:
         super().__init__(wave, packets, fused)
-        self._leaves = NamedTensors(
-            {
-                "world": self.world,
-                "camera": wave.camera,
-                "filter": wave.filter.tensors(),
-                "sampler": self.numbers,
-                "centre": wave.centre,
-                "pixel": wave.context.pixel,
-                "first": wave.first_surface,
-                "cotangent": cotangent,
-            },
-            None if before is None else before._leaves,
-        )
+        self._leaves = NamedTensors(records_of(self, cotangent), None if before is None else before._leaves)
         same = fixed and before is not None and before.world is self.world
         self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
         own = (fingerprint(wave.integrator), wave.context.crop) if wave.integrator.has_own_stages else None
@@ -243,13 +256,18 @@ class Kernels(Layout):
         self._results = self.kernel_cache.results(self._leaves)
         self._made: dict[tuple[Any, ...], Kernel] = {}
         self._lock = threading.Lock()
-        self.search = stages.search_words(wave) if packets else None
-        self.non_opaque: np.ndarray | None = None
-        if self.has_opacity and not packets:
-            prims = torch.arange(sum(self.world.geometry.counts))
-            self.non_opaque = non_opaque(self.world, prims).to(torch.uint8).numpy()
+        self.search, self.non_opaque = self._search_inputs()
         self.seconds = 0.0
         self.eager: dict[int, str] = {}
+
+    def _search_inputs(self) -> tuple[Any, np.ndarray | None]:
+        """Return :attr:`search` and :attr:`non_opaque`."""
+        if self.packets:
+            return stages.search_words(self.wave), None
+        if not self.has_opacity:
+            return None, None
+        prims = torch.arange(sum(self.world.geometry.counts))
+        return None, non_opaque(self.world, prims).to(torch.uint8).numpy()
 
     def probe(self, numbers: Iterable[int]) -> dict[int, str]:
         """Compile the stages of models; return those that cannot be compiled, with the reasons."""
@@ -352,14 +370,19 @@ class Kernels(Layout):
         def traced(trace: Any) -> Sinks:
             return build(trace, *arguments)
 
-        program = program_of(key, self.structure, self._leaves, self, traced, listed)
+        program = self._program(key, listed, traced)
         old = self.kernel_cache.kernel(key, program, self._leaves)
         if old is not None:
             return old
-        leaves = self._leaves.tensors
-        tables = bind_tables(
-            program.tables, program.steps, program.constants, leaves, self._laid_out, program.names, self._results
-        )
-        made = Kernel(program, tables)
+        made = Kernel(program, self._bind(program))
         self.kernel_cache.keep(key, made, self._laid_out, self._results, self._leaves)
         return made
+
+    def _program(self, key: tuple[Any, ...], listed: bool, build: Callable[[Trace], Sinks]) -> Program:
+        return program_of(key, self.structure, self._leaves, self, build, listed)
+
+    def _bind(self, program: Program) -> Tables:
+        leaves = self._leaves.tensors
+        return bind_tables(
+            program.tables, program.steps, program.constants, leaves, self._laid_out, program.names, self._results
+        )

@@ -38,7 +38,8 @@ class Along:
     def __init__(self, scene: Scene, settings: Settings, wave: Wave) -> None:
         self._scene, self._clamp = scene, wave.integrator.clamp
         # Kernels of a kind with stages of its own are made anew for each depth that is asked for.
-        compiled = uses_kernels(settings, scene.device, wave.context.plan.dtype) and not wave.integrator.has_own_stages
+        own = wave.integrator.has_own_stages or scene.device.type != "cpu"
+        compiled = not own and uses_kernels(settings, scene.device, wave.context.plan.dtype)
         self._compiled = compiled
         self._kernels: Kernels | None = None
         self._keep = settings.render.max_memory is None

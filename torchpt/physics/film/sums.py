@@ -7,6 +7,8 @@ Additions happen in the order of samples, whatever the threads, so sums have the
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -160,14 +162,20 @@ class Film:
 
     def count_samples(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> None:
         """Count ``samples`` consecutive samples of ``pixels`` consecutive pixels, which a kernel has added to :attr:`sums`."""
-        counts = self._counts.numpy()
+        counts: Any = self._counts.numpy() if self._counts.is_cpu else self._counts
         for k in range(self.randomizations):
             # Number of sample indices that are `k` modulo the randomizations.
             number = len(range((k - first_sample) % self.randomizations, samples, self.randomizations))
             counts[k, first_pixel : first_pixel + pixels] += number
 
-    def set_first_samples(self, values: np.ndarray, first_pixel: int) -> None:
-        """Store the first samples ``(C, n)`` of ``n`` consecutive pixels, which a kernel has added to :attr:`sums`."""
+    def set_first_samples(self, values: np.ndarray | Tensor, first_pixel: int) -> None:
+        """Store the first samples ``(C, n)`` of ``n`` consecutive pixels, which a kernel has added to :attr:`sums`.
+
+        ``values``: an array on the host, else a tensor on the film's device.
+        """
+        if isinstance(values, Tensor):
+            self._first[:, first_pixel : first_pixel + values.shape[1]] = values
+            return
         # By numpy: torch would start a team of threads for each thread that renders.
         self._first.numpy()[:, first_pixel : first_pixel + values.shape[1]] = values
 

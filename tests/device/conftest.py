@@ -1,0 +1,41 @@
+"""Renders by the engine of a device, without a device: its kernels run on the CPU, in CPU memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import pytest
+from simulated_driver import PtxDriver, SimulatedCuda, shuffled_lanes, simulated_target
+
+from torchpt.compiler.ptx import ptx_target
+from torchpt.engines.kernels.device import DeviceForward, device_forward
+from torchpt.paths.wave import Wave
+from torchpt.rendering import run
+from torchpt.scene.prepare import own_models
+
+
+@pytest.fixture
+def device(monkeypatch) -> Iterator[Callable[..., SimulatedCuda]]:
+    """A function that lets later renders use a simulated device; it returns the device.
+
+    Its arguments are the most lanes of a wave, the number of the random order that kernels take lanes in (None: in order),
+    and whether the kernels are PTX, which takes warps in a random order.
+    """
+
+    def use(lanes: int = 2048, order: int | None = None, packets: bool = True, ptx: bool = False) -> SimulatedCuda:
+        cuda = SimulatedCuda(PtxDriver() if ptx else None)
+
+        def engine(scene: Any, wave: Wave, eager: list[str], threads: int | None = None) -> DeviceForward:
+            own = own_models(scene, wave)
+            target = ptx_target if ptx else partial(simulated_target, order=order)
+            made = device_forward(wave, own, packets, None, cuda, target, lanes)
+            eager += [f"{number}: {reason}" for number, reason in made.kernels.eager.items()]
+            return made
+
+        monkeypatch.setattr(run, "kernel_engine", engine)
+        return cuda
+
+    with shuffled_lanes():
+        yield use

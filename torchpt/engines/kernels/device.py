@@ -1,0 +1,799 @@
+"""The engine of kernels on a CUDA device: launches all kernels of a wave without waiting for the device.
+
+The stages are those of :mod:`~torchpt.engines.kernels.engine`; steps are run in another way. Each kernel reads the number of
+its lanes from memory, where an earlier kernel has counted them, so steps are launched one after the other on torch's current
+stream, also those that turn out to have no lanes. Counters are rows of a tensor; a new row is begun wherever threads of a CPU
+set theirs to 0. Loops without a fixed end (paths without a depth limit, rays through surfaces) check every
+:data:`CHECK_EVERY` steps whether lanes are left, and do so one check late, when the number is on the host.
+
+Threads count in any order, so the places of lanes in an arena are random. No result depends on them: radiance is written to
+the slot of its sample, and slots are added to the film in the order of samples.
+
+Stages that cannot be compiled, and searches that are not part of kernels, run as tensor operations between kernels; they wait
+for the number of lanes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.compiler import cache
+from torchpt.compiler.kernel import HEAD
+from torchpt.compiler.program import Program, Tables, bind_tables
+from torchpt.compiler.ptx import ptx_target
+from torchpt.compiler.sinks import Sinks
+from torchpt.compiler.target import Target
+from torchpt.core.memory import Budget, Span, explain_out_of_memory, fits_in_memory
+from torchpt.core.tree import map_leaves
+from torchpt.engines.kernels.driver import Cuda, Function, HostCopy, cuda_of
+from torchpt.engines.kernels.engine import Chunk, ChunkSearch, KernelsEngine, LaneCount, Paths
+from torchpt.engines.kernels.layout import HIT, Layout, Rows
+from torchpt.engines.kernels.programs import Kernel, Kernels, NamedTensors, records_of, trace_stage
+from torchpt.engines.kernels.stages import CHUNK_FIELDS
+from torchpt.engines.work import SampleRange, TaskResult
+from torchpt.paths.nonfinite import NonFinite
+from torchpt.paths.walk import Counts, walk
+from torchpt.paths.wave import PixelSet, RayCounts, Wave, clamp_scale
+from torchpt.physics.film import Film
+from torchpt.physics.film.splats import LARGEST, Splats
+from torchpt.physics.samplers import salts
+from torchpt.physics.shapes.geometry import Geometry
+from torchpt.search import Accel, brute_if_fastest
+from torchpt.search.lbvh import Lbvh
+
+__all__ = [
+    "CHECK_EVERY",
+    "MAX_LANES",
+    "Count",
+    "DeviceCalls",
+    "DeviceEngine",
+    "DeviceForward",
+    "DeviceKernels",
+    "DeviceMemory",
+    "device_forward",
+    "device_kernels",
+]
+
+#: Steps between two checks of a loop without a fixed end for lanes that are left.
+CHECK_EVERY = 4
+#: Most lanes of a wave: some hundred launches of a few microseconds each are then short beside the work.
+MAX_LANES = 1 << 20
+#: Fewest lanes of a wave; the number of lanes is a multiple of it.
+MIN_LANES = 1 << 10
+#: Rows of counters that are allocated, and set to 0, at once.
+_COUNTER_ROWS = 64
+_WORD = {name: k for k, name in enumerate(HEAD)}
+
+
+# ---- Kernels and their tables on the device
+
+
+def wave_on_host(wave: Wave) -> Wave:
+    """Return a copy of a wave whose tensors are on the host, to trace stages with; its search is left as it is."""
+    host = torch.device("cpu")
+    if wave.centre.device == host:
+        return wave
+    moved = map_leaves(lambda leaf: leaf.to(host), wave)
+    return replace(moved, filter=type(wave.filter)(wave.filter.values, host))
+
+
+class DeviceKernels(Kernels):
+    """The kernels of one render on a device.
+
+    Args:
+        wave: the render; its tensors are on the device.
+        cuda: the device.
+        target: the target that stages are compiled for; its form has the row length of arenas.
+        search: see :func:`packets_on_device`; None: rays are searched outside of kernels.
+        fused: True: the search is part of the stages.
+        before: see :class:`Kernels`.
+
+    Attributes:
+        row: number of lanes of an arena.
+    """
+
+    def __init__(
+        self,
+        wave: Wave,
+        cuda: Cuda,
+        target: Target,
+        search: SearchWords | None,
+        fused: bool,
+        before: Kernels | None = None,
+    ) -> None:
+        super().__init__(wave, search is not None, fused, before)
+        self.cuda, self.target, self.row = cuda, target, target.form.row
+        self.search = search
+        self._host: tuple[Layout, NamedTensors] | None = None
+
+    def _search_inputs(self) -> tuple[Any, None]:
+        return None, None
+
+    def _program(self, key: tuple[Any, ...], listed: bool, build: Callable[[Any], Sinks]) -> Program:
+        """Return the program of a stage, traced on the host if it is new."""
+
+        def traced() -> Any:
+            layout, leaves = self._host_inputs()
+            return trace_stage(leaves, layout, build, listed)
+
+        return cache.program_of((key, self.structure), self._leaves.tensors, traced, self.target, self.cuda.device)
+
+    def _host_inputs(self) -> tuple[Layout, NamedTensors]:
+        """Return layout and leaves on the host, which stages are traced with."""
+        if self._host is None:
+            wave = wave_on_host(self.wave)
+            layout = Layout(wave, self.packets, self.fused)
+            self._host = layout, NamedTensors(records_of(layout, None))
+        return self._host
+
+    def _bind(self, program: Program) -> Tables:
+        return bind_tables(
+            program.tables,
+            program.steps,
+            program.constants,
+            self._leaves.tensors,
+            self._laid_out,
+            program.names,
+            self._results,
+            self.cuda.device,
+        )
+
+
+@dataclass(frozen=True)
+class SearchWords:
+    """The argument of packet searches, on a device.
+
+    Attributes:
+        words: int64, see :func:`torchpt.compiler.packet.scene_words`.
+        keep: tensors whose addresses are among the words.
+    """
+
+    words: Tensor
+    keep: tuple[Tensor, ...]
+
+
+def host_packet_search(accel: Accel) -> Accel | None:
+    """Return the packet search, on the host, of the primitives that a device searches by a tree of tensors.
+
+    None if there are too many primitives or other ones than packets know.
+    """
+    if not isinstance(accel, Lbvh) or accel.counts[4]:
+        return None
+    p0, p1, p2 = accel.corners.cpu().split(3)
+    triangles, rectangles, disks, spheres, quadrics = accel.counts
+    return brute_if_fastest(Geometry(p0, p1, p2, (triangles, rectangles, disks, spheres, quadrics)))
+
+
+def packets_on_device(brute: Any, device: torch.device) -> SearchWords:
+    """Copy the scene data of packet searches to a device; ``brute``: :class:`torchpt.search.brute.Brute`."""
+    tables = tuple(table.to(device) for table in (brute.table, brute.spheres))
+    words = torch.frombuffer(bytearray(brute.words), dtype=torch.int64).clone()
+    words[0], words[1] = (table.data_ptr() for table in tables)
+    return SearchWords(words.to(device), tables)
+
+
+# ---- Memory, counters and launches
+
+
+class DeviceMemory:
+    """Rows of 32-bit words on a device; as :class:`torchpt.engines.kernels.layout.Memory`."""
+
+    def __init__(self, rows: int, row: int, device: torch.device) -> None:
+        self.words: Any = torch.zeros(rows, row, dtype=torch.int32, device=device)
+        self.floats: Any = self.words.view(torch.float32)
+        self.address: int = self.words.data_ptr()
+
+    def repeat(self, first: int, values: Tensor, times: int) -> None:
+        """See :meth:`torchpt.engines.kernels.layout.Memory.repeat`."""
+        held = self.floats if values.is_floating_point() else self.words
+        held[first : first + len(values), : times * values.shape[1]] = values.repeat(1, times)
+
+    def take(self, first: int, rows: int, lanes: Tensor, dtype: torch.dtype) -> Tensor:
+        """See :meth:`torchpt.engines.kernels.layout.Memory.take`."""
+        held = self.floats if dtype.is_floating_point else self.words
+        return held[first : first + rows].index_select(1, lanes).to(dtype)
+
+    def put(self, first: int, start: int, values: Tensor) -> None:
+        """See :meth:`torchpt.engines.kernels.layout.Memory.put`."""
+        held = self.floats if values.is_floating_point() else self.words
+        held[first : first + len(values), start : start + values.shape[1]] = values
+
+
+class Count:
+    """A number of lanes in the device's memory; always true, as the host does not know it.
+
+    Attributes:
+        value: the number, a tensor of one element.
+        address: of the number.
+        counters: block, row and column of the counters that it is the sum of.
+    """
+
+    __slots__ = ("address", "counters", "value")
+
+    def __init__(self, value: Tensor, counters: tuple[tuple[int, int, int], ...]) -> None:
+        self.value, self.counters = value, counters
+        self.address = value.data_ptr()
+
+
+class LateCheck:
+    """Checks whether a loop has lanes left, :data:`CHECK_EVERY` steps late.
+
+    Args:
+        cuda: the device.
+    """
+
+    def __init__(self, cuda: Cuda) -> None:
+        self._cuda = cuda
+        self._pending: HostCopy | None = None
+
+    def ended(self, step: int, count: Count) -> bool:
+        """Return True once no lanes were left at the check before; ``count``: lanes left at this step, counted from 0."""
+        if step == 0:
+            self._pending = None
+        if step % CHECK_EVERY:
+            return False
+        if self._pending is not None and not int(self._pending.values()):
+            return True
+        self._pending = self._cuda.to_host(count.value)
+        return False
+
+
+class _Arguments(NamedTuple):
+    """The arguments of a kernel.
+
+    Attributes:
+        words: the argument block, a ctypes array of int64.
+        function: the kernel on the device.
+        uniforms: index of the word of each uniform, and its name.
+        lists: indices of the words of the lists.
+    """
+
+    words: Any
+    function: Function
+    uniforms: tuple[tuple[int, str], ...]
+    lists: range
+
+
+class DeviceCalls:
+    """Launches kernels on a device; as :class:`torchpt.engines.kernels.engine.Calls`.
+
+    Args:
+        kernels: of the render.
+
+    Attributes:
+        slots: radiance of the chunk's samples.
+        blocks: tensors of counters of the wave, :data:`_COUNTER_ROWS` rows each.
+    """
+
+    def __init__(self, kernels: DeviceKernels) -> None:
+        self.kernels, self.cuda = kernels, kernels.cuda
+        self.device, self._row_length = kernels.cuda.device, kernels.row
+        self.width = kernels.models + 6
+        self.place = torch.zeros(len(CHUNK_FIELDS), dtype=torch.int32, device=self.device)
+        self.slots = self.memory(3)
+        self.blocks: list[Tensor] = []
+        self._zero = Count(torch.zeros(1, dtype=torch.int64, device=self.device), ())
+        self._row = _COUNTER_ROWS
+        self._counters = 0
+        self._max_lanes = 0  # lanes of the wave
+        self._stream = 0
+        self._look = LateCheck(self.cuda)
+        #: By id of a kernel: the kernel, which keeps the id from being reused, and what :meth:`_arguments` returns.
+        self._prepared: dict[int, tuple[Kernel, _Arguments]] = {}
+        self._salts: dict[tuple[int, int], Tensor] = {}
+        self._uniforms = {"place": self.place.data_ptr()}
+
+    def memory(self, rows: int) -> Any:
+        """Return new memory for kernels."""
+        return DeviceMemory(rows, self._row_length, self.device)
+
+    # -- counters
+
+    def begin(self, lanes: int) -> None:
+        """Begin a wave of ``lanes`` samples, with counters of its own."""
+        self.blocks, self._row, self._max_lanes = [], _COUNTER_ROWS, lanes
+        self.cuda.enter()
+        self._stream = self.cuda.stream()
+
+    def clear(self) -> None:
+        """Go to the next row of counters, which are 0."""
+        self._row += 1
+        if self._row >= _COUNTER_ROWS:
+            self.blocks.append(torch.zeros(_COUNTER_ROWS, self.width, dtype=torch.int64, device=self.device))
+            self._row = 0
+        self._counters = self.blocks[-1].data_ptr() + 8 * self.width * self._row
+
+    def _count(self, column: int) -> Count:
+        """Return a counter of the current row."""
+        value = self.blocks[-1][self._row, column : column + 1]
+        return Count(value, ((len(self.blocks) - 1, self._row, column),))
+
+    def counted(self) -> tuple[Count, list[Count]]:
+        """See :meth:`torchpt.engines.kernels.engine.Calls.counted`."""
+        return self._count(0), [self._count(1 + k) for k in range(self.kernels.models + 2)]
+
+    def lanes(self, count: int) -> Count:
+        """Return a known number of lanes as a count."""
+        self.clear()
+        found = self._count(0)
+        found.value.fill_(count)
+        return found
+
+    def left(self, step: int) -> LaneCount:
+        """Return counter 0, or 0 once no rays were left at the check before."""
+        count = self._count(0)
+        return 0 if self._look.ended(step, count) else count
+
+    def running_sums(self, counts: Sequence[Count]) -> tuple[list[Any], Any]:
+        """See :meth:`torchpt.engines.kernels.engine.Calls.running_sums`; with the search in kernels nothing needs them."""
+        if self.kernels.fused:
+            return [None] * len(counts), None
+        if len(counts) == 1:
+            return [self._zero], counts[0]
+        values = torch.cat([count.value for count in counts])
+        sums = values.cumsum(0)
+        starts, every = sums - values, sum((count.counters for count in counts), ())
+        return [Count(starts[k : k + 1], ()) for k in range(len(counts))], Count(sums[-1:], every)
+
+    def write_from(self, start: Count) -> None:
+        """See :meth:`torchpt.engines.kernels.engine.Calls.write_from`: the kernel reads ``start`` as counter 0."""
+        # The tensor may be freed before the kernel runs: torch's allocator reuses memory in the order of the stream.
+        self._counters = start.address
+
+    def known(self, count: Count) -> int:
+        """Wait for a count and return it."""
+        return int(count.value)
+
+    # -- arguments that kernels share
+
+    def set_chunk(self, numbers: np.ndarray) -> None:
+        """See :meth:`torchpt.engines.kernels.engine.Calls.set_chunk`."""
+        self.place.copy_(self.cuda.to_device(torch.from_numpy(numbers)))
+
+    def set_dimensions(self, depth: int, step: int = 0) -> None:
+        """See :meth:`torchpt.engines.kernels.engine.Calls.set_dimensions`."""
+        known = self._salts.get((depth, step))
+        if known is None:
+            known = self._salts[depth, step] = salts(depth, self.device, step)
+        self._uniforms["salts"] = known.data_ptr()
+
+    def run(
+        self,
+        kernel: Kernel,
+        count: Count,
+        source: Any,
+        target: Any,
+        places: Any = None,
+        lists: list[Any] | None = None,
+        slots: Any = None,
+    ) -> None:
+        """Launch a kernel, see :meth:`torchpt.engines.kernels.engine.Calls.run`."""
+        known = self._prepared.get(id(kernel))
+        if known is None:
+            known = self._prepared[id(kernel)] = kernel, self._arguments(kernel)
+        words, function, uniforms, list_words = known[1]
+        words[0], words[1] = source.address, target.address
+        if places is not None:
+            words[2] = places.address
+        words[3] = self.slots.address if slots is None else slots.address
+        words[_WORD["counters"]] = self._counters
+        for place, name in uniforms:
+            words[place] = self._uniforms[name]
+        if lists is not None:
+            for place, memory in zip(list_words, lists, strict=False):
+                words[place] = memory.address
+        self.cuda.launch(function, words, count.address, self._max_lanes, self._stream)
+
+    def _arguments(self, kernel: Kernel) -> _Arguments:
+        """Return the arguments of a kernel, with constant words filled in."""
+        words, function, start = self._block(kernel)
+        uniforms = tuple((len(HEAD) + k, name) for k, name in enumerate(kernel.program.uniforms))
+        return _Arguments(words, function, uniforms, range(start, start + kernel.program.lists))
+
+    def _block(self, kernel: Kernel) -> tuple[Any, Function, int]:
+        """Return a new argument block of a kernel, its code on the device, and the index of the word after the uniforms."""
+        program = kernel.program
+        start = len(HEAD) + len(program.uniforms)
+        words = (ctypes.c_int64 * (start + program.lists + 2 * (program.tensors + program.results)))()
+        words[_WORD["stride"]] = self._row_length
+        words[_WORD["tables"]] = kernel.tables.address
+        if self.kernels.search is not None:
+            words[_WORD["search"]] = self.kernels.search.words.data_ptr()
+        return words, self.cuda.load(program.function.code, program.function.key), start
+
+    # -- adding samples to a film
+
+    def accumulate(
+        self, film: Film, chunk: Chunk, address: int, clamp: float | None, clamped: Any, lost: Count
+    ) -> None:
+        """Launch the kernels that add a chunk's samples to a film, in the order of samples.
+
+        Args:
+            film: the film.
+            chunk: pixels and samples.
+            address: of the samples ``(channels, samples * pixels)``, in rows of an arena's length.
+            clamp: largest component of a sample; None: unbounded.
+            clamped: memory for the clamped samples.
+            lost: is increased by the number of samples that are not finite.
+        """
+        kernel = self.kernels.accumulate(film.channels, clamp is not None)
+        words, function, start = self._block(kernel)
+        words[_WORD["counters"]] = lost.address
+        if clamp is not None:
+            limit = torch.full((1,), clamp, dtype=torch.float32, device=self.device)
+            words[len(HEAD)] = limit.data_ptr()
+        sums, n, pixels = film.sums, chunk.pixels, film.sums.shape[2]
+        lanes = self.lanes(n)
+        for k in range(chunk.samples):
+            group = (chunk.first_sample + k) % film.randomizations
+            offset = 4 * k * n
+            total = sums.data_ptr() + 8 * (group * film.channels * pixels + chunk.first_pixel)
+            words[start : start + 6] = (address + offset, self._row_length, total, pixels, total, pixels)
+            if clamp is not None:
+                words[start + 6], words[start + 7] = clamped.address + offset, self._row_length
+            self.cuda.launch(function, words, lanes.address, n, self._stream)
+
+
+# ---- Searches outside of kernels
+
+
+class DeviceSearch(ChunkSearch):
+    """As :class:`ChunkSearch`; searches outside of kernels are tensor operations and wait for the number of rays."""
+
+    def _nearest_outside(self, memory: Any, rows: Rows, o: str, d: str, t_max: str, count: LaneCount) -> None:
+        n = self.calls.known(count)
+        if n:
+            rays = (memory.floats[rows.first(name) :][:size, :n] for name, size in ((o, 3), (d, 3), (t_max, 1)))
+            origins, directions, limits = rays
+            found = self.kernels.wave.accel.intersect(origins, directions, limits[0])
+            for name, values in zip(HIT, found, strict=True):
+                memory.put(rows.first(name), 0, values[None])
+
+    def _occluded_outside(self, arena: Any, count: LaneCount) -> None:
+        kernels, rows, n = self.kernels, self.kernels.state, self.calls.known(count)
+        if n:
+            rays = (arena.floats[rows.first(f"shadow_{k}") :][:size, :n] for k, size in (("o", 3), ("d", 3), ("t", 1)))
+            origins, directions, limits = rays
+            blocked = kernels.wave.accel.occluded(origins, directions, limits[0]).to(torch.int32)
+            # 2: the transmittance of the ray is to be computed, see torchpt.search.base.mark_non_opaque.
+            arena.put(rows.first("blocked"), 0, (2 * blocked if kernels.has_opacity else blocked)[None])
+
+
+# ---- The engine
+
+
+class DeviceEngine(KernelsEngine):
+    """The engine of kernels on a device: traces chunks of paths.
+
+    Args:
+        kernels: of the render.
+
+    Attributes:
+        device_calls: launches the kernels; the same object as ``calls``.
+        spare: slots of the next wave.
+    """
+
+    def __init__(self, kernels: DeviceKernels) -> None:
+        self.device_calls = DeviceCalls(kernels)
+        super().__init__(kernels, calls=self.device_calls)
+        self.spare = self.device_calls.memory(3)
+        self._cuda = kernels.cuda
+        self._look = LateCheck(kernels.cuda)
+        #: Factors of counters in the sums of rays and of truncated paths: block, row, column and factor.
+        self._rays: list[tuple[tuple[int, int, int], int]] = []
+        self._truncated: list[tuple[tuple[int, int, int], int]] = []
+
+    def _make_search(self) -> ChunkSearch:
+        return DeviceSearch(self.calls)
+
+    def _count_rays(self, lanes: Count, each: int = 1) -> None:
+        self._rays += [(counter, each) for counter in lanes.counters] if each else []
+
+    def _count_truncated(self, lanes: Count) -> None:
+        self._truncated += [(counter, 1) for counter in lanes.counters]
+
+    def begin(self, chunk: Chunk) -> None:
+        """Begin a wave: a chunk, or its layers first and then the chunk."""
+        self._rays, self._truncated, self.tally = [], [], RayCounts()
+        self.device_calls.begin(chunk.pixels * chunk.samples)
+
+    def launch(self, chunk: Chunk) -> None:
+        """Launch all kernels that fill ``slots`` with the radiance of a chunk's samples, after :meth:`begin`."""
+        walk(self, self.spawn(chunk), self.wave.integrator.limits)
+        self.mark_lost()
+
+    def sort(self, paths: Paths) -> Counts:
+        """See :class:`torchpt.paths.walk.Engine`; all kinds of hits count as present until no paths are left."""
+        counts = super().sort(paths)
+        left = self.device_calls.counted()[0] if paths.listed else paths.count
+        if self._look.ended(paths.depth - 1, left):
+            return Counts((), 0, 0)
+        return counts
+
+    def tallies(self) -> Callable[[], RayCounts]:
+        """Start to copy the wave's counters to the host; return a function that waits for them and counts rays and paths."""
+        copied = self._cuda.to_host(torch.stack(self.device_calls.blocks))
+        rays, truncated, known = self._rays, self._truncated, self.tally
+
+        def counted() -> RayCounts:
+            counters = copied.values().tolist()
+
+            def total(factors: list[tuple[tuple[int, int, int], int]]) -> int:
+                return sum(each * counters[block][row][column] for (block, row, column), each in factors)
+
+            return RayCounts(known.rays + total(rays), known.truncated + total(truncated))
+
+        return counted
+
+    def _splat(self, paths: Paths) -> None:
+        """Record splats that arrive, as the engine of threads does; waits for the number of lanes."""
+        arena: Any = paths.arena
+        rows, n = self.kernels.state, self.calls.known(paths.count)
+        splat, shadow = (slice(rows.first(f"{name}_o"), rows.first(f"{name}_radiance")) for name in ("splat", "shadow"))
+        own = arena.words[shadow, :n].clone()  # saved: the search reads the rows of shadow rays
+        arena.words[shadow, :n] = arena.words[splat, :n]
+        self.search.light(arena, paths.count)
+        arena.words[shadow, :n] = own
+        if "transmittance" in rows:
+            transmittance = arena.floats[rows.first("transmittance"), :n]
+        else:
+            transmittance = (arena.words[rows.first("blocked"), :n] == 0).to(torch.float32)
+        arena.floats[rows.first("splat_transmittance"), :n] = transmittance
+        pixel, first = arena.words[rows.first("splat_pixel"), :n].long(), rows.first("splat_radiance")
+        value = arena.floats[first : first + 3, :n] * transmittance
+        comes, finite = (pixel >= 0) & (transmittance != 0), (value.abs() < LARGEST).all(0)
+        lane, on = arena.words[rows.first("lane"), :n].long(), comes & finite
+        self.splats.append(Splats(lane[on], pixel[on], value[:, on]))
+        lost: Any = lane[comes & ~finite]
+        self._lost.append(lost)
+
+
+# ---- The forward engine
+
+
+@dataclass
+class _Launched:
+    """A wave that was launched, and is finished on the host while the next one runs.
+
+    Attributes:
+        chunk: its pixels and samples.
+        pixel_set: the films.
+        tally: returns the counts of rays and paths, after a wait.
+        lost: number of samples that are not finite, on its way to the host.
+        slots: radiance of the samples.
+        light: sums of radiance before and after the clamp, on their way to the host.
+        rays: rays of layers.
+    """
+
+    chunk: Chunk
+    pixel_set: PixelSet
+    tally: Callable[[], RayCounts]
+    lost: HostCopy
+    slots: Any
+    light: HostCopy | None
+    rays: int
+
+
+def device_kernels(
+    wave: Wave, own: Sequence[int], cuda: Cuda, target: Target, brute: Any, before: Kernels | None = None
+) -> DeviceKernels:
+    """Return the kernels of a render on a device; its ``eager`` lists models that cannot be compiled, with the reasons.
+
+    Args:
+        wave: of the render, on the device.
+        own: indices of the user's own models, which are compiled at once to find out whether they can be.
+        cuda: the device.
+        target: see :class:`DeviceKernels`.
+        brute: :class:`torchpt.search.brute.Brute` of the scene, on the host; None: rays are searched outside of kernels.
+        before: kernels of another render; its tables are shared where they were made of the same tensors.
+    """
+    search = None if brute is None else packets_on_device(brute, cuda.device)
+    opaque = wave.context.world.materials.opacity is None and not wave.integrator.has_own_transmit
+    fused = search is not None and opaque and wave.first_surface is None and not wave.integrator.splats
+    kernels = DeviceKernels(wave, cuda, target, search, fused, before)
+    eager = kernels.probe(own) if wave.integrator.light else {}
+    if eager and kernels.fused:  # stages that run as tensor operations need searches between the stages
+        kernels = DeviceKernels(wave, cuda, target, search, False)
+    kernels.eager = eager
+    return kernels
+
+
+def device_forward(
+    wave: Wave,
+    own: Sequence[int],
+    packets: bool,
+    before: Kernels | None = None,
+    cuda: Cuda | None = None,
+    target: Callable[[int], Target] = ptx_target,
+    lanes: int = MAX_LANES,
+) -> DeviceForward:
+    """Return the forward engine of a wave on a device.
+
+    Args:
+        wave: of the render, on the device.
+        own: see :func:`device_kernels`.
+        packets: True: few primitives are searched inside of kernels; False: by the wave's acceleration structure.
+        before: see :func:`device_kernels`.
+        cuda: the device; None: that of the wave.
+        target: returns the target of a row length.
+        lanes: most lanes of a wave.
+
+    Raises:
+        RenderError: kernels cannot run on the device.
+    """
+    device = cuda_of(wave.centre.device) if cuda is None else cuda
+    brute = wave.accel if wave.accel.name == "brute" else None
+    if brute is None and packets:
+        brute = host_packet_search(wave.accel)
+    last = before
+
+    def make(row: int) -> DeviceKernels:
+        nonlocal last
+        last = device_kernels(wave, own, device, target(row), brute, last)
+        return last
+
+    return DeviceForward(make, device, wave, lanes, wave.integrator.strict)
+
+
+class DeviceForward:
+    """Forward engine of kernels on a device, see :class:`torchpt.engines.engine.Forward`.
+
+    Args:
+        make: makes the kernels for a row length.
+        cuda: the device.
+        wave: of the render.
+        lanes: most lanes of a wave.
+        strict: True: the render ends at the first sample that is not finite, so each wave is waited for.
+    """
+
+    compiled = True
+
+    def __init__(
+        self, make: Callable[[int], DeviceKernels], cuda: Cuda, wave: Wave, lanes: int = MAX_LANES, strict: bool = False
+    ) -> None:
+        self._make, self.cuda, self.wave, self.strict = make, cuda, wave, strict
+        self.budget = Budget(
+            cuda.device, lanes, what="a wave of the fewest lanes", fallback="waves of fewer lanes", min_lanes=MIN_LANES
+        )
+        self.kernels = make(lanes)
+        self._made: DeviceEngine | None = None
+        self._clamped: Any = None
+
+    @property
+    def seconds(self) -> float:
+        """Return the seconds spent on making kernels."""
+        return self.kernels.seconds
+
+    def rows(self, layers: Mapping[str, Any]) -> int:
+        """Return how many 32-bit numbers a lane takes, for these layers."""
+        return self.kernels.rows(layers) + 6  # slots of a second wave, and clamped samples
+
+    def release_workers(self, keeps: bool) -> None:
+        """Release the memory of waves; torch's allocator keeps it for the next render."""
+        self._made = self._clamped = None
+
+    def run(self, spans: Sequence[SampleRange], each: Callable[[TaskResult | None], bool]) -> bool:
+        """See :class:`torchpt.engines.engine.Forward`. The host is one wave behind the device."""
+        behind: deque[_Launched] = deque()  # waves that are not finished on the host
+        for pixel_set, first, count in spans:
+            pixels = pixel_set.film.width * pixel_set.film.height
+            self._engine()  # settles the number of lanes
+            launch = partial(self._launch, behind, pixel_set)
+            for _ in self.budget.run_in_chunks(launch, pixels, first, count):
+                while len(behind) > (0 if self.strict else 1):
+                    if each(self._result_of(behind.popleft())):
+                        return self._report_rest(behind, each)
+        while behind:
+            if each(self._result_of(behind.popleft())):
+                return False
+        return True
+
+    def _engine(self) -> DeviceEngine:
+        """Return the engine, with memory for as many lanes as the budget allows."""
+        while True:
+            row = max(self.budget.lanes // MIN_LANES * MIN_LANES, MIN_LANES)
+            if self._made is not None and self.kernels.row == row:
+                return self._made
+            self.release_workers(keeps=False)
+            self.budget.lanes = row
+            if row != self.kernels.row:
+                self.kernels = self._make(row)
+            if not fits_in_memory(self._make_engine):
+                self.budget.shrink()
+
+    def _make_engine(self) -> None:
+        self._made = DeviceEngine(self.kernels)
+
+    def _launch(self, behind: deque[_Launched], pixel_set: PixelSet, span: Span) -> None:
+        """Launch the kernels of a wave and append it to ``behind``.
+
+        Memory that runs out before samples are added to films leaves the films as they were.
+
+        Raises:
+            RenderError: memory ran out while samples were added.
+        """
+        engine, clamp, chunk = self._engine(), self.wave.integrator.clamp, Chunk(*span, pixel_set)
+        calls = engine.device_calls
+        engine.begin(chunk)
+        names, rays = tuple(pixel_set.layers), 0
+        if names:
+            rays = engine.layers(chunk, names)
+            engine.begin(chunk)  # its tally is that of the chunk alone
+        light = None
+        if self.wave.integrator.light:
+            # Slots of the wave before are read until it is finished.
+            calls.slots, engine.spare = engine.spare, calls.slots
+            engine.slots = calls.slots
+            engine.launch(chunk)
+        with explain_out_of_memory("the sums of a film"):
+            lost = calls.lanes(0)
+            if self.wave.integrator.light:
+                light = self._add(engine, chunk, pixel_set.film, clamp, lost)
+            shown: Any = engine.shown
+            first = 0
+            for film in pixel_set.layers.values():
+                address = shown.address + 4 * self.kernels.row * first
+                calls.accumulate(film, chunk, address, None, None, calls.lanes(0))
+                _count_samples(film, chunk, shown.floats[first : first + film.channels])
+                first += film.channels
+            copied = self.cuda.to_host(lost.value)
+            behind.append(_Launched(chunk, pixel_set, engine.tallies(), copied, calls.slots, light, rays))
+
+    def _add(self, engine: DeviceEngine, chunk: Chunk, film: Film, clamp: float | None, lost: Count) -> HostCopy | None:
+        """Add the radiance and the splats of a chunk to the film; return the light before and after the clamp."""
+        calls, used = engine.device_calls, chunk.pixels * chunk.samples
+        if clamp is not None and self._clamped is None:
+            self._clamped = calls.memory(3)
+        calls.accumulate(film, chunk, calls.slots.address, clamp, self._clamped, lost)
+        values = calls.slots.floats if clamp is None else self._clamped.floats
+        _count_samples(film, chunk, values)
+        light = None
+        if clamp is not None:
+            plain = calls.slots.floats[:, :used]
+            plain = torch.where(torch.isfinite(plain).all(0), plain, 0.0)
+            light = torch.stack((plain.double().sum(), values[:, :used].double().sum()))
+        for splats in engine.splats:
+            value = splats.value
+            if clamp is not None and light is not None:
+                value = value * clamp_scale(value, clamp)
+                light = light + torch.stack((splats.value.double().sum(), value.double().sum()))
+            assert film.splats is not None
+            stream = film.randomization_of(chunk.first_sample + splats.lane // chunk.pixels)
+            sums, place, total = film.splats.writes_of_add(stream, splats.pixel, value)
+            sums.index_copy_(2, place, total)
+        return None if light is None else self.cuda.to_host(light)
+
+    def _report_rest(self, behind: deque[_Launched], each: Callable[[TaskResult | None], bool]) -> bool:
+        """Report the waves that were launched before the render was to end; return False."""
+        while behind:
+            each(self._result_of(behind.popleft()))
+        return False
+
+    def _result_of(self, wave: _Launched) -> TaskResult:
+        """Return the result of a wave, after a wait."""
+        chunk, used = wave.chunk, wave.chunk.pixels * wave.chunk.samples
+        result = TaskResult(wave.tally(), used if self.wave.integrator.light or wave.rays else 0)
+        result.tally.rays += wave.rays
+        if wave.light is not None:
+            before, after = wave.light.values().tolist()
+            result.light = before, after
+        if int(wave.lost.values()):
+            radiance = wave.slots.floats[:, :used].view(3, chunk.samples, chunk.pixels)
+            result.lost = NonFinite.of(radiance, chunk.first_pixel, chunk.first_sample, self.wave.crop, wave.pixel_set)
+        return result
+
+
+def _count_samples(film: Film, chunk: Chunk, values: Tensor) -> None:
+    """Count a chunk's samples in a film, and keep the first sample of each pixel."""
+    film.count_samples(chunk.first_pixel, chunk.pixels, chunk.first_sample, chunk.samples)
+    if chunk.first_sample == 0:
+        film.set_first_samples(values[:, : chunk.pixels], chunk.first_pixel)
