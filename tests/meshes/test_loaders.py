@@ -164,7 +164,8 @@ def test_stl_binary_and_ascii_are_welded(tmp_path: Path) -> None:
         for corner in triangles
     )
     text = load_mesh(write(tmp_path / "a.stl", f"solid a\n{facets}endsolid a\n"))
-    for parts in (binary, text):
+    mixed_case = load_mesh(write(tmp_path / "c.stl", f"Solid a\n{facets.replace('vertex', 'Vertex')}EndSolid a\n"))
+    for parts in (binary, text, mixed_case):
         assert parts[0].vertices.shape == (4, 3)
         np.testing.assert_array_equal(corners(parts), corners([MeshPart("", SQUARE, np.array([[0, 1, 2], [0, 2, 3]]))]))
 

@@ -28,13 +28,13 @@ class Parameters(dict[str, np.ndarray]):
 
     Attributes:
         specs: the spec of each parameter by name.
-        stated: names of parameters whose texels are given in the scene, not in an image file.
+        texels_in_scene: names of texels that the scene gives as arrays, not by an image file.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.specs: dict[str, Spec] = {}
-        self.stated: set[str] = set()
+        self.texels_in_scene: set[str] = set()
 
     def declare(self, name: str, value: Any, spec: Spec) -> None:
         """Add a parameter, in float64 unless it is a float32 array (texels)."""

@@ -72,17 +72,21 @@ def _built(description: Description, vertex_params: Collection[str]) -> SceneBui
     parameters = Parameters()
     texture_loader = TextureLoader(description.textures, description, parameters)
     builder = ShapeBuilder(description, parameters, texture_loader)
-    entries = [ShapeEntry(name, number, shape) for number, (name, shape) in enumerate(description.shapes.items(), 1)]
+    entries = [
+        ShapeEntry(name=name, number=number, shape=shape)
+        for number, (name, shape) in enumerate(description.shapes.items(), 1)
+    ]
     # `copies` is True for the kind `instance`. Instances come after all meshes, which they may precede in the file.
     parts = [part for entry in entries if not entry.shape.kind.copies for part in builder.parts(entry)]
     copies = [copy for entry in entries if entry.shape.kind.copies for copy in builder.copies(entry, parts)]
     for name, material in description.materials.items():  # those that no shape uses have parameters too
         declare(resolved(material, f"materials.{name}", description.materials, texture_loader), parameters)
     sources = build_lights(description, parameters)
+    # `builder.sources` are the lights in mesh files.
     sources = sorted([*sources, *builder.sources], key=lambda source: sort_key(source.kind))
     parameters.declare_all("camera", description.camera.kind, description.camera.values)
     declare_vertex_attributes(parts, vertex_params, parameters)
-    check_coordinates(parts, parameters.stated, description.file)
+    check_coordinates(parts, parameters.texels_in_scene, description.file)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     centre, unit = centre_and_unit(parts, copies, sources, parameters, description.camera, description.file)
     warn_of_coplanar_refraction(parts, copies, description.file)

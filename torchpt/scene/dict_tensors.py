@@ -46,10 +46,9 @@ def with_all_intrinsics(description: Description, tensors: DictTensors) -> Descr
     camera = description.camera
     if not any(key[0] == "K" for key in tensors.under("camera")):
         return description
+    # `angles` leaves out the parameters that `K` gives their default values, which are None then and no parameters.
     values = {**camera.values, **angles(camera["K"], camera["size"])}
-    values |= {
-        key: default for key, default in DEFAULTS.items() if values[key] is None
-    }  # so that they become parameters
+    values |= {key: default for key, default in DEFAULTS.items() if values[key] is None}
     return replace(description, camera=ParsedParams(camera.kind, values, camera.given))
 
 
@@ -76,7 +75,8 @@ def params_from_tensors(
     Raises:
         SceneError: a tensor that requires gradients where no parameter depends on it.
     """
-    scene = _BuiltDict(tensors, description, built, params, next(iter(params.values())).device)
+    device = next(iter(params.values())).device
+    scene = _BuiltDict(tensors=tensors, description=description, built=built, params=params, device=device)
     found: dict[str, Tensor] = {}
     for key in dict.fromkeys(map(_up_to_index, tensors.keys)):  # once for a list with several tensors
         dependent = dict(_dependent_params(key, scene))

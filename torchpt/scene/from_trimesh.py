@@ -131,7 +131,7 @@ def _view(source: Any) -> dict[str, Any]:
         width, height = (int(size) for size in camera.resolution)
         matrix = np.array(source.camera_transform, np.float64)
         # A scale in the graph has no effect on a camera.
-        matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-300)
+        matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-300)  # no 0
         focal_x, focal_y = (float(length) for length in camera.focal)  # in pixels
         pose: dict[str, Any] = {"type": "perspective", "fov": float(camera.fov[0]), "fov_axis": "x"}
         if abs(focal_y / focal_x - 1.0) > 1e-9:  # more than rounding

@@ -138,7 +138,7 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
         absent.append("tangents (nothing is anisotropic)")
     if not any(model.refracts for model in world.materials.models):
         absent.append("refraction (no index along paths)")
-    if not any(model.lobed for model in world.materials.models):
+    if not any(model.lobed for model in world.materials.models):  # of several lobes, of which a sample chooses one
         absent.append("choice among lobes")
     if world.geometry.copies is None:
         absent.append("instances")

@@ -72,8 +72,8 @@ def _load(
         scene = Scene(
             with_all_intrinsics(description, tensors),  # a tensor `K` makes each of its numbers a parameter
             chosen_device,
-            tuple((bsdfs or {}).values()),
-            vertex_attributes_in(tensors),
+            own_models=tuple((bsdfs or {}).values()),
+            vertex_params=vertex_attributes_in(tensors),
         )
     # So that gradients reach the caller's tensors, and not only the numbers read from them.
     scene.params |= params_from_tensors(tensors, scene.description, scene.built, scene.params)

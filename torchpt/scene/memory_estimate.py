@@ -118,7 +118,7 @@ def memory_estimate(settings: Settings, device: torch.device, mode: str, models:
         code = 0
     # Kernels have `rows` numbers of 4 bytes a lane. Tensor operations get twice their measured bytes in the first, small wave.
     waves = FEWEST_OF_KERNELS * 4 * rows if mode == "compiled" else FIRST_WAVE_LANES * 2 * BYTES_PER_LANE
-    return MemoryEstimate(pixels * films, code, waves, pixels * picture)
+    return MemoryEstimate(films=pixels * films, code=code, waves=waves, picture=pixels * picture)
 
 
 def check_film(

@@ -23,7 +23,7 @@ from torchpt.scene.meshes.mesh import displaced
 from torchpt.scene.texture_loader import TextureLoader
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["MOST_FACES", "Mesh", "ignored", "mesh_of", "solid", "warn_of_coplanar_refraction"]
+__all__ = ["MOST_FACES", "Mesh", "faces_with_area", "ignored_features", "mesh_of", "warn_of_coplanar_refraction"]
 
 
 # ---- Triangles of a shape: reading, displacement, removal of faces without area
@@ -40,7 +40,7 @@ class Mesh:
     """Triangles of a shape.
 
     Attributes:
-        pieces: the parts, one for each material.
+        pieces: the parts, one for each material; a *piece* becomes a :class:`~torchpt.physics.parts.Part` of the scene.
         source: path of the file; "trimesh" for an object, "" for arrays.
         flat: True to shade with face normals.
     """
@@ -104,7 +104,7 @@ def _displaced(
     return displaced(piece, lambda uvs: displacement["scale"] * heights(uvs), displacement["subdivisions"])
 
 
-def ignored(piece: MeshPart, pose: np.ndarray) -> tuple[str, ...]:
+def ignored_features(piece: MeshPart, pose: np.ndarray) -> tuple[str, ...]:
     """Return the unsupported features of a part by name, and its file's cameras as blocks of a scene file."""
     own = piece.material
     cameras = [_camera_text(camera, pose) for camera in piece.cameras]
@@ -122,7 +122,7 @@ def _camera_text(camera: FileCamera, pose: np.ndarray) -> str:
     return f"camera {camera.name}: {{type: {camera.kind}, {rows}, {camera.film}}}"
 
 
-def solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
+def faces_with_area(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the faces ``(F, 3)`` that have an area under ``pose (4, 4)``, and the number of the others."""
     columns = pose[:3, :3] @ piece.vertices.T  # (3, V); a translation changes no area
     p0, p1, p2 = (columns[:, piece.faces[:, k]] for k in range(3))
@@ -202,6 +202,7 @@ def _refracting_faces(parts: Sequence[Part], copies: Sequence[Copy]) -> Iterator
     part_by_name = {part.name: part for part in parts}
     for part in parts:
         if any(material.model.refracts for material in part.material.with_inner()):
+            # `local`: where the part lies within its shape, as the cap of a cylinder.
             pose = part.to_world if part.local is None else part.to_world @ part.local
             yield from _faces(part.name, part, pose)
     for copy in copies:
@@ -274,7 +275,8 @@ def _overlaps_any(face: Array, others: Array, normal: Array) -> bool:
     separated = np.zeros(len(q), bool)
     for sides in (np.broadcast_to(np.roll(p, -1, 0) - p, (len(q), *p.shape)), np.roll(q, -1, 1) - q):
         across = np.stack((-sides[..., 1], sides[..., 0]), -1)
-        across = across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-30)
+        across = across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-30)  # a side may have length 0
+        # m: other faces, k: sides, j: corners, c: coordinates.
         own, their = np.einsum("mkc,jc->mkj", across, p), np.einsum("mkc,mjc->mkj", across, q)
         gap = np.maximum(own.min(-1) - their.max(-1), their.min(-1) - own.max(-1))
         separated |= (gap >= -MAX_PLANE_DISTANCE).any(1)

@@ -116,7 +116,7 @@ def make_wave(
         SceneError: a direction that is zero, or a ray that is not finite.
     """
     film, spp = settings.film, settings.render.spp
-    integrator = settings.integrator.counted_in(scene.space.unit)
+    integrator = settings.integrator.counted_in(scene.space.unit)  # its lengths, in the unit of lanes
     params = params or {}
     world_params = {name: value for name, value in params.items() if not name.startswith("camera.")}
     own = not world_params  # the world is the scene's own, so objects made from it may be cached
@@ -146,7 +146,9 @@ def make_wave(
         camera=camera,
         filter=_filter(film.filter.kind, tuple(film.filter.values.items()), scene.device),
         # `streams`: number of independent randomizations. The film's width numbers pixels alike in every crop.
-        sampler=Sampler(points, settings.render.seed, settings.streams, spp, film.width),
+        sampler=Sampler(
+            kind=points, seed=settings.render.seed, randomizations=settings.streams, spp=spp, width=film.width
+        ),
         crop=crop,
         centre=scene.space.shift,
         first_surface=_first_surface(scene, integrator, world, own=own) if like is None else like.first_surface,
@@ -279,7 +281,7 @@ def _context(
     plan: Plan, world: World, camera: Camera, crop: tuple[int, int, int, int], integrator: Integrator
 ) -> StageContext:
     """Return the stage context of a render; only integrators that splat, to any pixel, know the camera and the crop."""
-    context = StageContext(plan, world, _pixel_of(world, camera))
+    context = StageContext(plan=plan, world=world, pixel=_pixel_of(world, camera))
     return replace(context, camera=camera, crop=crop) if integrator.splats else context
 
 

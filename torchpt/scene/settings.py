@@ -97,7 +97,7 @@ def _aovs(value: Any) -> tuple[str, ...]:
         raise Refused(f"a list of {', '.join(LAYERS)}")
     for index, name in enumerate(names):
         if not isinstance(name, str) or name not in LAYERS or name in names[:index]:
-            raise Refused(f"a list of different ones of {', '.join(LAYERS)}", name, (index,))
+            raise Refused(f"a list of different ones of {', '.join(LAYERS)}", name, at=(index,))
     return tuple(names)
 
 
@@ -153,12 +153,12 @@ class Film(FrozenConfig):
         """Refuse a film of too many pixels, and a crop that reaches beyond it; see :class:`FrozenConfig`."""
         width, height, crop = values["width"], values["height"], values["crop"]
         if width * height > MAX_PIXELS:
-            raise Refused(f"a film of at most {MAX_PIXELS} pixels", [width, height], ("width",))
+            raise Refused(f"a film of at most {MAX_PIXELS} pixels", [width, height], at=("width",))
         if crop is None:
             return
         left, top, crop_width, crop_height = crop
         if left + crop_width > width or top + crop_height > height:
-            raise Refused(f"a crop inside the film of {width} x {height} pixels", list(crop), ("crop",))
+            raise Refused(f"a crop inside the film of {width} x {height} pixels", list(crop), at=("crop",))
 
 
 #: Names of devices: auto, cpu, cuda, cuda:N.
@@ -416,7 +416,7 @@ class Render(FrozenConfig):
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
         """Refuse ``resume`` without a checkpoint; see :class:`FrozenConfig`."""
         if values["resume"] and values["checkpoint"] is None:
-            raise Refused("false without render.checkpoint, the file to go on from", True, ("resume",))
+            raise Refused("false without render.checkpoint, the file to go on from", True, at=("resume",))
 
 
 class CallArguments(FrozenConfig):
@@ -576,7 +576,7 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
 
 
 #: Settings by the blocks that they were merged from: loops of renders merge the same ones again and again.
-_merged: ResultCache[Settings] = ResultCache(256)
+_merged: ResultCache[Settings] = ResultCache(most=256)
 
 
 def _plain_mappings(blocks: Mapping[str, Any]) -> Any:

@@ -23,7 +23,7 @@ from torchpt.physics.textures import Node
 from torchpt.scene.formats.description import Description
 from torchpt.scene.formats.materials import check_material, plain_material, read_material
 from torchpt.scene.materials import declare, resolved
-from torchpt.scene.mesh_triangles import Mesh, ignored, mesh_of, solid
+from torchpt.scene.mesh_triangles import Mesh, faces_with_area, ignored_features, mesh_of
 from torchpt.scene.meshes import FileMaterial, MeshPart
 from torchpt.scene.sources import build_file_lights, unique_labels
 from torchpt.scene.texture_loader import TextureLoader
@@ -39,7 +39,7 @@ class ShapeEntry:
 
     Attributes:
         name: name in the scene.
-        number: order in the scene, from 1; lanes have it as object id.
+        number: place in the order of the scene's shapes, from 1; lanes have it as object id.
         shape: the kind and its values.
     """
 
@@ -100,7 +100,17 @@ class ShapeBuilder:
             declare(material, self.parameters)
             flip = entry.shape["flip_normals"] != part.flip  # relative to the part
             pose = self.parameters[f"{key}.to_world"]
-            copies.append(Copy(key, entry.name, entry.number, part.name, material, flip, pose))
+            copies.append(
+                Copy(
+                    name=key,
+                    shape=entry.name,
+                    object_id=entry.number,
+                    of=part.name,
+                    material=material,
+                    flip=flip,
+                    to_world=pose,
+                )
+            )
         return copies
 
     def _primitives(self, entry: ShapeEntry) -> list[Part]:
@@ -229,7 +239,7 @@ class ShapeBuilder:
 
 def _with_triangles(part: Part, piece: MeshPart, mesh: Mesh) -> Part:
     """Return a part with its triangles."""
-    faces, dropped = solid(piece, part.to_world)
+    faces, dropped = faces_with_area(piece, part.to_world)
     return replace(
         part,
         vertices=piece.vertices,
@@ -240,5 +250,5 @@ def _with_triangles(part: Part, piece: MeshPart, mesh: Mesh) -> Part:
         smooth=not mesh.flat,
         dropped=dropped,
         source=mesh.source,
-        ignored=ignored(piece, part.to_world),
+        ignored=ignored_features(piece, part.to_world),
     )

@@ -44,20 +44,20 @@ def declare_vertex_attributes(parts: Sequence[Part], vertex_params: Collection[s
                 parameters.declare(f"{part.name}.{key}", value, VertexAttribute())
 
 
-def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str | None) -> None:
+def check_coordinates(parts: Sequence[Part], texels_in_scene: Collection[str], file: str | None) -> None:
     """Check that meshes with texels of the scene have texture coordinates.
 
     An image file would cover each triangle of such a mesh, as in Mitsuba, which is not what texels are written for.
 
     Args:
         parts: all parts of the scene.
-        stated: names of texels that the scene gives as arrays.
+        texels_in_scene: names of texels that the scene gives as arrays.
         file: scene file for the error.
 
     Raises:
         SceneError: a mesh without texture coordinates; names the texels.
     """
-    if not stated:
+    if not texels_in_scene:
         return
     from torchpt.physics.textures.atlas import ImageNode
 
@@ -65,7 +65,7 @@ def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str 
         if part.kind != "triangle" or part.uvs is not None:
             continue
         for node in part.material.textures():  # the uses of textures in the material
-            if isinstance(node, ImageNode) and node.texels in stated:
+            if isinstance(node, ImageNode) and node.texels in texels_in_scene:
                 expected = f"uvs (texture coordinates) for {part.name}, over which the texels lie"
                 raise SceneError(node.texels, "texels on a mesh without uvs", expected, file)
 
@@ -92,7 +92,7 @@ def build_lights(description: Description, parameters: Parameters) -> list[Sourc
             raise scene_error(error, key, None, description.file) from None
         for stem, (values, spec) in arrays.items():
             parameters.declare(f"{key}.{stem}", values, spec)
-    return [Source(f"lights.{name}", light.name, light.values) for name, light in lights.items()]
+    return [Source(name=f"lights.{name}", kind=light.name, values=light.values) for name, light in lights.items()]
 
 
 def _file_of(resolve: Callable[[Any, str], Path], key: str, light: ParsedParams, parameter: str) -> Path:
@@ -154,7 +154,7 @@ def build_file_lights(
         vectors = {"position": position, "direction": direction, "target": target}
         values = {key: vectors.get(key, light.numbers.get(key)) for key in parameters_of(LIGHTS[light.kind])}
         parameters.declare_all(stem, LIGHTS[light.kind], values)
-        sources.append(Source(stem, light.kind, values))
+        sources.append(Source(name=stem, kind=light.kind, values=values))
     return sources
 
 

@@ -164,7 +164,7 @@ def _reaches(
     found = [("camera", float(np.abs(parameters["camera.to_world"][:3, 3] - centre).max()))]
     found += [(f"camera.{key}", float(camera[key])) for key in camera.kind.reaches]
     for source in sources:
-        for parameter in LIGHTS[source.kind].places:
+        for parameter in LIGHTS[source.kind].places:  # those of the kind that are positions
             name = f"{source.name}.{parameter}"
             found.append((name, float(np.abs(parameters[name] - centre).max())))
     return found

@@ -127,7 +127,7 @@ def _build_with_texels(scene: Scene, texels: Mapping[str, Tensor]) -> SceneBuild
     parameters = Parameters()
     parameters |= before.parameters
     parameters.specs |= before.parameters.specs
-    parameters.stated |= before.parameters.stated | texels.keys()
+    parameters.texels_in_scene |= before.parameters.texels_in_scene | texels.keys()
     texture_loader = TextureLoader({}, scene.description, parameters)
     materials = {
         material.name: material for owner in (*before.parts, *before.copies) for material in owner.material.with_inner()

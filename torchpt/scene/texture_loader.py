@@ -63,7 +63,16 @@ class TextureLoader:
         if isinstance(texture, TextureReference):
             name, channel, texture = f"textures.{texture.texture}", texture.channel, self._textures[texture.texture]
         with self._description.reading_files() as resolve:
-            opening = Opening(slot, key, name, channel, parameters, resolve, self.file, self._pictures)
+            opening = Opening(
+                slot=slot,
+                key=key,
+                name=name,
+                channel=channel,
+                parameters=parameters,
+                resolve=resolve,
+                file=self.file,
+                image_cache=self._pictures,
+            )
             return texture.kind.open(texture.values, opening)
 
     def sharing(self, prefix: str) -> Callable[[TextureInput, str], Node]:

@@ -59,6 +59,8 @@ KEYS = ("version", "defaults", "camera", *BLOCKS, *NAMED)
 PATHS = ("path",)
 #: Most files of a scene, and the greatest depth of their ``defaults``.
 MAX_FILES, MAX_LEVELS = 64, 8
+#: Most names that an error lists, which is one line.
+MOST_NAMES_SHOWN = 20
 #: Blocks that keep the keys shared by both types when the type changes, by their key in the scene: table of kinds, default
 #: type.
 KEEPING: dict[tuple[str, ...], tuple[Mapping[str, Any], str]] = {
@@ -109,7 +111,7 @@ class Layers:
 
 
 def _known_length(tree: Any, key: str) -> int:
-    """Return the number of characters of the longest prefix of a dotted key that a tree of keys has."""
+    """Return the number of characters, dots included, of the longest prefix of a dotted key that a tree of keys has."""
     known = 0
     while isinstance(tree, dict) and key:
         name = next((name for name in prefixes(key) if name in tree), None)
@@ -140,7 +142,7 @@ def compose(
     """Merge a scene with the files in its ``defaults``; return it with the files of its keys.
 
     Args:
-        raw: the scene as written, bounded by :func:`torchpt.scene.formats.yaml.plain`.
+        raw: the scene as written, copied and checked by :func:`torchpt.scene.formats.yaml.plain`.
         file: the scene file, for errors.
         base: the folder that its relative paths start from.
         places: further folders to look up names in, before the scenes that ship.
@@ -363,5 +365,5 @@ def with_size(below: Mapping[str, Any], above: Mapping[str, Any]) -> Mapping[str
 def expected_name(block: str, name: str, known: Sequence[str]) -> str:
     """Return the phrase of what is accepted in place of an unknown name."""
     hint = did_you_mean(name, known)
-    shown = [*known[:20], "..."] if len(known) > 20 else known
+    shown = [*known[:MOST_NAMES_SHOWN], "..."] if len(known) > MOST_NAMES_SHOWN else known
     return f"the name of a {NAMED[block]} that is there{hint}: {', '.join(shown) or 'there is none'}"

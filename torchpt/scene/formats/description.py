@@ -118,6 +118,7 @@ class Description:
         raise problems[-1]
 
     def _existing(self, path: str, key: str) -> Path:
+        """Return the file of a single path; arguments and errors as of :meth:`resolve`."""
         file = self.layers.file_of(key, self.file)
         head, _, rest = path.partition("/")
         if head == ASSETS:
@@ -355,18 +356,18 @@ def _describe(
     lights = _named_items(raw, "lights", file, lambda item, key: read_typed("light", LIGHTS, item, key, file))
     film, integrator, sampler, render = (blocks[name] for name in BLOCKS)
     return Description(
-        file,
-        base,
-        camera,
-        version,
-        film,
-        integrator,
-        sampler,
-        render,
-        textures,
-        materials,
-        shapes,
-        lights,
+        file=file,
+        base=base,
+        camera=camera,
+        version=version,
+        film=film,
+        integrator=integrator,
+        sampler=sampler,
+        render=render,
+        textures=textures,
+        materials=materials,
+        shapes=shapes,
+        lights=lights,
         layers=layers,
     )
 

@@ -132,10 +132,9 @@ def model_of(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> t
         material: the material.
         materials: all materials by name, for blends.
     """
-    models = {
-        key: model_of(materials[item] if isinstance(item, str) else item, materials)[0]
-        for key, item in inner_of(material).items()
-    }
+    models: dict[str, Bsdf] = {}
+    for key, item in inner_of(material).items():
+        models[key], _ = model_of(materials[item] if isinstance(item, str) else item, materials)
     return model_and_values(material.kind, {**material.values, **models})
 
 

@@ -44,7 +44,7 @@ class DictTensors:
         """Return a scene dict with numbers in place of tensors, and remember both.
 
         Args:
-            raw: the dict, bounded by :func:`torchpt.scene.formats.yaml.plain`.
+            raw: the dict, copied and checked by :func:`torchpt.scene.formats.yaml.plain`.
 
         Raises:
             SceneError: a tensor whose numbers cannot be read.

@@ -53,11 +53,13 @@ def texture_of(raw: Mapping[str, Any], spec: Spec) -> TextureInput:
         raise as_refused(error) from None
     channel = texture.channel if isinstance(texture, TextureReference) else texture.values.get("channel")
     if coloured and channel is not None:
-        raise Refused("no channel where a colour is wanted", channel, ("channel",))
+        raise Refused("no channel where a colour is wanted", channel, at=("channel",))
     if isinstance(texture, ParsedParams):
         texture.kind.check_slot(texture.values, coloured)
     # `linear`: values are not colours, so images are not decoded from sRGB. `moves`: the geometry that moves with the values.
-    return TextureInput(texture, coloured, getattr(spec, "linear", True), low, high, spec.moves)
+    return TextureInput(
+        texture=texture, coloured=coloured, linear=getattr(spec, "linear", True), low=low, high=high, moves=spec.moves
+    )
 
 
 def check_texture(

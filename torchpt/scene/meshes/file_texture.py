@@ -9,12 +9,12 @@ from typing import Any
 
 from torchpt.images import EncodedImage
 
-__all__ = ["image_texture", "plain_scale"]
+__all__ = ["image_texture", "number_if_grey"]
 
 Rgb = tuple[float, float, float]
 
 
-def plain_scale(color: Rgb) -> float | list[float]:
+def number_if_grey(color: Rgb) -> float | list[float]:
     """Return a colour in the form of a scene file: one number where it is grey."""
     return color[0] if color[0] == color[1] == color[2] else list(color)
 

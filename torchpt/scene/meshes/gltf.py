@@ -30,6 +30,8 @@ _READ_EXTENSIONS = {*MATERIAL_EXTENSIONS, "KHR_texture_transform", "KHR_mesh_qua
 _ATTRIBUTES = ("POSITION", "NORMAL", "TEXCOORD_0", "COLOR_0")
 #: Values of `mode` of a primitive: those of OpenGL.
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+#: Numbers of a node's matrix are below this, so that products of a few matrices are finite.
+_LARGEST = 1e30
 #: Limit of the vertices or faces, whichever are more, over all nodes of a file (or the file's bytes, where those are more).
 MOST_PLACED = 20_000_000
 
@@ -147,7 +149,7 @@ class _Scene:
             matrix = np.eye(4)
             matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
             matrix[:3, 3] = node.get("translation", (0, 0, 0))
-        if not (np.abs(matrix) < 1e30).all():
+        if not (np.abs(matrix) < _LARGEST).all():  # False for NaN too
             raise AssetError(self.path, f"node {index} has a transform that is not finite")
         return matrix
 

@@ -58,7 +58,13 @@ def light_at(document: Document, node: dict[str, Any], matrix: NDArray[np.float6
     if not 0 < length < np.inf:
         raise reader.wrong("its node leaves it no direction (scaled to nothing, or not finite)")
     direction = direction / length
-    return FileLight(name, reader.kind, position, direction / np.linalg.norm(direction), reader.values())
+    return FileLight(
+        name=name,
+        kind=reader.kind,
+        position=position,
+        direction=direction / np.linalg.norm(direction),
+        numbers=reader.values(),
+    )
 
 
 class _LightReader(NumberReader):
@@ -86,6 +92,7 @@ class _LightReader(NumberReader):
     def cone(self) -> dict[str, float]:
         """Return the angles of a spot in degrees: where its light ends, and within which it has full intensity."""
         cone = self.block.get("spot", {})
+        # Radians from the axis, as the extension has them.
         inner = self.number(cone, "innerConeAngle", 0.0, _LARGEST)
         outer = self.number(cone, "outerConeAngle", math.pi / 4.0, _LARGEST)
         if not 0.0 < outer <= 0.5 * math.pi + 1e-6:  # a right angle in float32 is a little more than one
@@ -116,4 +123,4 @@ def camera_at(document: Document, node: dict[str, Any], matrix: NDArray[np.float
         return None
     name = str(block.get("name") or node.get("name") or f"camera{index}")[:80]
     film = f"fov: {math.degrees(size):.6g}, fov_axis: y" if kind == "perspective" else f"width: {2.0 * size:.6g}"
-    return FileCamera(name, str(kind), matrix, film)
+    return FileCamera(name=name, kind=str(kind), matrix=matrix, film=film)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
 from torchpt.images import EncodedImage, has_alpha
-from torchpt.scene.meshes.file_texture import image_texture, plain_scale
+from torchpt.scene.meshes.file_texture import image_texture, number_if_grey
 from torchpt.scene.meshes.gltf_document import Document, NumberReader
 from torchpt.scene.meshes.mesh import FileMaterial, Rgb
 from torchpt.scene.meshes.mtl_material import coat_gloss
@@ -114,7 +114,7 @@ class _Converter(NumberReader):
         pbr = self.block.get("pbrMetallicRoughness", {})
         factor = self.numbers(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0))
         self.base_color = (factor[0], factor[1], factor[2])
-        texture = self.texture(pbr, "baseColorTexture", plain_scale(self.base_color), None)
+        texture = self.texture(pbr, "baseColorTexture", number_if_grey(self.base_color), channel=None)
         if has_colors and texture is not None:
             self.ignored.append("COLOR_0 (beside baseColorTexture)")
         elif has_colors:
@@ -191,7 +191,7 @@ class _Converter(NumberReader):
             raise self.wrong(f"alphaMode {str(mode)[:40]!r}, expected OPAQUE, MASK or BLEND")
         if mode == "OPAQUE":
             return
-        alpha: Any = self.texture(pbr, "baseColorTexture", factor, "a")
+        alpha: Any = self.texture(pbr, "baseColorTexture", factor, channel="a")
         if alpha is None or not has_alpha(alpha["path"]):
             alpha = factor
         if mode == "MASK":
@@ -202,7 +202,7 @@ class _Converter(NumberReader):
 
     def set_normals(self, material: dict[str, Any]) -> None:
         """Set the normal map."""
-        normals = self.texture(self.block, "normalTexture", 1.0, None)
+        normals = self.texture(self.block, "normalTexture", 1.0, channel=None)
         if normals is None:
             return
         material["normal_map"] = normals
@@ -219,7 +219,9 @@ class _Converter(NumberReader):
         strength = self.number(block, "emissiveStrength", 1.0, high=_MAX_EMISSION)
         if max(color) * strength == 0:
             return
-        picture = self.texture(self.block, "emissiveTexture", plain_scale((color[0], color[1], color[2])), None)
+        picture = self.texture(
+            self.block, "emissiveTexture", number_if_grey((color[0], color[1], color[2])), channel=None
+        )
         material["emission"] = list(color) if picture is None else picture
         if strength != 1.0:
             material["emission_strength"] = strength
@@ -233,10 +235,10 @@ class _Converter(NumberReader):
 
     def scaled(self, block: dict[str, Any], key: str, factor: float, channel: str) -> Any:
         """Return ``factor``, or the texture ``key`` of ``block``, scaled by it, where the file has one."""
-        found = self.texture(block, key, factor, channel) if factor != 0 else None
+        found = self.texture(block, key, factor, channel=channel) if factor != 0 else None
         return factor if found is None else found
 
-    def texture(self, block: dict[str, Any], key: str, scale: float | list[float], channel: str | None) -> Any:
+    def texture(self, block: dict[str, Any], key: str, scale: float | list[float], *, channel: str | None) -> Any:
         """Return the texture that a textureInfo of the file refers to; None where it is missing or unsupported.
 
         Args:

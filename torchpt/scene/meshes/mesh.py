@@ -74,7 +74,7 @@ class FileMaterial:
     """A material of a mesh file.
 
     Attributes:
-        name: as in the file.
+        name: as in the file, cut to what errors can print.
         material: the block of a scene file: ``type``, parameters, textures inline with absolute paths or
             `EncodedImage`.
         ignored: unsupported features of the material, by the file's names.

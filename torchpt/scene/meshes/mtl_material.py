@@ -3,7 +3,7 @@
 The format was made for Phong's model (Alias Wavefront, *Object Files*, appendix B: MTL 3.0); ``Pr Pm Ps Pc Pcr aniso
 anisor norm`` are the extension of Clara.io's and Blender's exporters, whose meaning is Burley's principled model: roughness,
 metallic, sheen, clearcoat, its roughness, anisotropy, its rotation, normal map. Of the old format: ``Kd Ks Ke`` diffuse,
-specular and emitted colour, ``Tf`` colour of transmitted emitted, ``Ns`` Phong's exponent, ``Ni`` index of refraction, ``d``
+specular and emitted colour, ``Tf`` colour of transmitted light, ``Ns`` Phong's exponent, ``Ni`` index of refraction, ``d``
 opacity, ``Tr`` 1 - d, ``illum`` the number of an illumination model: 0 and 1 without highlights, 2 with them, 3, 5 and 8
 mirrors, 4, 6, 7 and 9 glass.
 """
@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any
 
-from torchpt.scene.meshes.file_texture import image_texture, plain_scale
+from torchpt.scene.meshes.file_texture import image_texture, number_if_grey
 
 __all__ = ["COLORS", "MAPS", "NUMBERS", "Map", "Statements", "coat_gloss", "material_of"]
 
@@ -101,7 +101,9 @@ class _Converter:
         self.colors, self.numbers, self.maps = statements.colors, statements.numbers, statements.maps
         self.files = files
         self.ignored = [name for found in self.maps.values() for name in found.ignored]
-        self.illum = int(self.numbers.get("illum", 2.0)) if abs(self.numbers.get("illum", 2.0)) < 100 else 2
+        # The format's models are 0 to 10; a number far from them counts as the default.
+        illum = self.numbers.get("illum", 2.0)
+        self.illum = int(illum) if abs(illum) < 100 else 2
         self.opacity = self._opacity()
 
     def surface(self) -> dict[str, Any]:
@@ -172,9 +174,9 @@ class _Converter:
 
     def _principled(self) -> dict[str, Any]:
         """Return Burley's model for the statements of the extension."""
-        given = self.numbers
-        if "pr" in given:
-            roughness = self._bounded(given["pr"], "Pr")
+        numbers = self.numbers
+        if "pr" in numbers:
+            roughness = self._bounded(numbers["pr"], "Pr")
         elif "map_pr" in self.maps:
             roughness = 1.0  # the factor of the map
         else:
@@ -187,17 +189,17 @@ class _Converter:
         features = {
             "metallic": self._number(self._amount("pm", "map_pm"), "map_pm"),
             "sheen": self._number(self._amount("ps", "map_ps"), "map_ps"),
-            "clearcoat": self._bounded(given.get("pc", 0.0), "Pc"),
-            "anisotropic": self._bounded(abs(given.get("aniso", 0.0)), "aniso"),
+            "clearcoat": self._bounded(numbers.get("pc", 0.0), "Pc"),
+            "anisotropic": self._bounded(abs(numbers.get("aniso", 0.0)), "aniso"),
         }
         material |= {name: value for name, value in features.items() if value != 0.0}
         if "clearcoat" in material:
-            material["clearcoat_gloss"] = coat_gloss(self._bounded(given.get("pcr", 0.0), "Pcr"))
-        index = given.get("ni", 1.0)
+            material["clearcoat_gloss"] = coat_gloss(self._bounded(numbers.get("pcr", 0.0), "Pcr"))
+        index = numbers.get("ni", 1.0)
         if 1.0 < index <= 1e3:
             material["eta"] = index
         self._ignore_specular()
-        if given.get("anisor", 0.0) != 0.0:
+        if numbers.get("anisor", 0.0) != 0.0:
             self.ignored.append("anisor")
         return material
 
@@ -233,7 +235,7 @@ class _Converter:
             if channel is None and self.files["map_d"] == self.files.get("map_kd"):
                 channel = "a" if PurePath(self.files["map_d"]).suffix.lower() not in (".jpg", ".jpeg") else None
             opacity = self.opacity if self.opacity > 0 else 1.0  # beside a map exporters write 0 for absent
-            material["opacity"] = self._image("map_d", opacity, channel or "luminance")
+            material["opacity"] = self._image("map_d", opacity, channel=channel or "luminance")
         elif self.opacity != 1.0:
             material["opacity"] = self.opacity
         glass = material["type"] in ("dielectric", "roughdielectric")
@@ -249,20 +251,23 @@ class _Converter:
             self.ignored.append(self.maps["bump"].key)
         found = self.maps[kind]
         stem = PurePath(self.files[kind]).stem.lower()
+        # Exporters that know no `norm` write normal maps as `bump`, with one of these names.
         if kind == "norm" or "normal" in stem or stem.endswith(("_n", "_nrm", "_nor", "_norm")):
-            material["normal_map"] = self._image(kind, 1.0, None)
+            material["normal_map"] = self._image(kind, 1.0, channel=None)
             if found.bump < 0.0:
                 self.ignored.append(f"{found.key} -bm")
             elif found.bump != 1.0:
                 material["normal_strength"] = found.bump
         else:
-            material["bump_map"] = self._image(kind, found.bump, found.channel or "luminance")
+            material["bump_map"] = self._image(kind, found.bump, channel=found.channel or "luminance")
 
     def set_emission(self, material: dict[str, Any]) -> None:
         """Set the emission: `Ke` times `map_Ke`."""
         emitted = self.colors.get("ke", (0.0, 0.0, 0.0))
         if "map_ke" in self.maps:
-            material["emission"] = self._image("map_ke", plain_scale(emitted if max(emitted) > 0 else _WHITE), None)
+            material["emission"] = self._image(
+                "map_ke", number_if_grey(emitted if max(emitted) > 0 else _WHITE), channel=None
+            )
         elif max(emitted) > 0:
             material["emission"] = list(emitted)
 
@@ -271,15 +276,15 @@ class _Converter:
         color = self._unit(key, _WHITE if kind in self.maps else default)
         if kind not in self.maps:
             return list(color)
-        return self._image(kind, plain_scale(color if max(color) > 0 else _WHITE), None)
+        return self._image(kind, number_if_grey(color if max(color) > 0 else _WHITE), channel=None)
 
     def _number(self, value: float, kind: str) -> Any:
         """Return a number times its map."""
         if kind not in self.maps:
             return value
-        return self._image(kind, value, self.maps[kind].channel or "luminance")
+        return self._image(kind, value, channel=self.maps[kind].channel or "luminance")
 
-    def _image(self, kind: str, scale: float | list[float], channel: str | None) -> dict[str, Any]:
+    def _image(self, kind: str, scale: float | list[float], *, channel: str | None) -> dict[str, Any]:
         """Return the texture of a map; ``channel``: None for a colour."""
         found = self.maps[kind]
         transform: dict[str, Any] = {}

@@ -83,7 +83,9 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     ends = np.searchsorted(group_of_triangle[order], np.arange(1, len(text.groups) + 1))
     for (name, _), rows in zip(text.groups.items(), np.split(order, ends[:-1]), strict=True):
         faces = all_faces[rows]
-        used, local = np.unique(faces, return_inverse=True)  # vertices of the part, and its faces as indices into them
+        used, part_faces = np.unique(
+            faces, return_inverse=True
+        )  # vertices of the part, and its faces as indices into them
         material = known.get(name)
         if material is None and name and materials:
             material = FileMaterial(name, ignored=("not defined in an MTL file",))
@@ -93,7 +95,7 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
             MeshPart(
                 name=name,
                 vertices=all_positions[used],
-                faces=local.reshape(-1, 3),
+                faces=part_faces.reshape(-1, 3),
                 normals=part_normals,
                 uvs=part_uvs,
                 material=material,

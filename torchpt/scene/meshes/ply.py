@@ -40,6 +40,8 @@ _UVS = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))
 
 @dataclass
 class _Property:
+    """A column of an element, as the header declares it."""
+
     name: str
     kind: str  # numpy type of the value or of the list's items
     count: str = ""  # numpy type of a list's length; empty for a scalar
@@ -47,8 +49,10 @@ class _Property:
 
 @dataclass
 class _Element:
+    """A table, as the header declares it."""
+
     name: str
-    size: int
+    size: int  # number of rows
     properties: list[_Property] = field(default_factory=list)
 
 
@@ -167,7 +171,9 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
         if words[0] == "format" and len(words) == 3:
             layout = words[1]
         elif words[0] == "element" and len(words) == 3:
-            if not words[2].isdecimal() or not words[2].isascii() or len(words[2]) > 15:
+            if (
+                not words[2].isdecimal() or not words[2].isascii() or len(words[2]) > 15
+            ):  # so many digits that no file has the rows
                 raise problem
             elements.append(_Element(words[1][:80], int(words[2])))
         elif words[0] == "property" and elements:

@@ -46,9 +46,10 @@ def load_stl(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
 def _ascii(path: Path, data: bytes) -> NDArray[np.float64]:
     """Return the corners ``(3 F, 3)`` of an ASCII file."""
     words = data.split()
-    if b"endsolid" not in words and b"ENDSOLID" not in words:
+    keys = [word.lower() for word in words]  # writers differ in case
+    if b"endsolid" not in keys:
         raise AssetError(path, "truncated: no endsolid")
-    is_vertex = np.array([word.lower() == b"vertex" for word in words])
+    is_vertex = np.array([key == b"vertex" for key in keys])
     starts = np.flatnonzero(is_vertex)  # three numbers follow each
     if len(starts) % 3 or (len(starts) and starts[-1] + 3 >= len(words)):
         raise AssetError(path, f"truncated: {len(starts)} corners are no whole number of triangles")

@@ -274,13 +274,23 @@ def parts_of(mesh: Any, name: str, converter: MaterialConverter) -> list[MeshPar
         faces = np.arange(len(corners)).reshape(-1, 3)
         return [
             MeshPart(
-                name, vertices[corners], faces, normals=normals[corners], uvs=None, colors=colors, material=material
+                name=name,
+                vertices=vertices[corners],
+                faces=faces,
+                normals=normals[corners],
+                uvs=None,
+                colors=colors,
+                material=material,
             )
         ]
     if visual.kind != "texture":
         colors = _linear(visual.vertex_colors) if visual.kind == "vertex" else None
         material, colors = converter.convert(None, colors)
-        return [MeshPart(name, vertices, faces, normals=normals, uvs=None, colors=colors, material=material)]
+        return [
+            MeshPart(
+                name=name, vertices=vertices, faces=faces, normals=normals, uvs=None, colors=colors, material=material
+            )
+        ]
     uvs = visual.uv
     if uvs is not None and len(uvs) == len(vertices) and uvs.shape[1] >= 2:
         uvs = np.stack((uvs[:, 0], 1.0 - uvs[:, 1]), axis=1).astype(np.float64)  # trimesh counts v from the bottom row
@@ -291,13 +301,27 @@ def parts_of(mesh: Any, name: str, converter: MaterialConverter) -> list[MeshPar
     several = getattr(visual.material, "materials", None)
     if several is None:
         material, colors = converter.convert(visual.material, colors)
-        return [MeshPart(name, vertices, faces, normals, uvs, colors, material)]
+        return [
+            MeshPart(
+                name=name, vertices=vertices, faces=faces, normals=normals, uvs=uvs, colors=colors, material=material
+            )
+        ]
     material_of_face = np.asarray(visual.face_materials)  # (F,) index into `several`
     parts = []
     for number, trimesh_material in enumerate(several):
         material, tinted = converter.convert(trimesh_material, colors)
         faces_of_material = faces[material_of_face == number]
-        parts.append(MeshPart(f"{name}{number}", vertices, faces_of_material, normals, uvs, tinted, material))
+        parts.append(
+            MeshPart(
+                name=f"{name}{number}",
+                vertices=vertices,
+                faces=faces_of_material,
+                normals=normals,
+                uvs=uvs,
+                colors=tinted,
+                material=material,
+            )
+        )
     return parts
 
 
@@ -341,7 +365,9 @@ def _cameras(scene: Any) -> Iterator[FileCamera]:
     if scene.has_camera:
         matrix = np.array(scene.camera_transform, np.float64)
         fov = float(scene.camera.fov[0])
-        yield FileCamera(str(scene.camera.name), "perspective", matrix, f"fov: {fov:.6g}, fov_axis: x")
+        yield FileCamera(
+            name=str(scene.camera.name), kind="perspective", matrix=matrix, film=f"fov: {fov:.6g}, fov_axis: x"
+        )
 
 
 class Notes(logging.Handler):

@@ -147,7 +147,9 @@ def _materials(
     ``key[slot + 1]`` is that of a slot, so that the slot -1 of a ray without a hit finds ``key[0]``.
     """
     count = len(groups.models)
-    group, row = zip(*(groups.place[owner.material.name] for owner in owners), strict=True) if owners else ((), ())
+    group, row = (
+        zip(*(groups.group_and_row[owner.material.name] for owner in owners), strict=True) if owners else ((), ())
+    )
     keys = dark * count + primitives.spread(group)
     missed = torch.full((1,), 2 * count, device=keys.device)  # the key of a ray without a hit
     return LaneMaterials(

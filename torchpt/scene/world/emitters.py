@@ -119,9 +119,9 @@ def lights_of(
     if column is not None:
         column = torch.cat((column, column.new_zeros(source_count)))
     textured = opacity_mapped or any(part.emission_texture is not None for part, _ in emitting)
-    # Data of the lights that are sampled by solid angle; `code` says which shape of these a kind has.
+    # Data of the lights that are sampled by solid angle; `code` of a kind says which of these shapes it has.
     codes = {name: emitter(name).code for name in kinds}
-    solid = table_of([codes[name] for name in names], joined["p0"], joined["e1"], joined["e2"])
+    solid_angle_table = table_of([codes[name] for name in names], joined["p0"], joined["e1"], joined["e2"])
     lights = Lights(
         choice=None,
         kinds=kinds,
@@ -134,8 +134,8 @@ def lights_of(
         quadrics=None if column is None else primitives.quadrics,
         # Stages look up textures by primitive.
         prim=torch.cat((prim, prim.new_zeros(source_count))) if textured else None,
-        solid=solid,
-        shapes=shapes_of(solid),
+        solid=solid_angle_table,
+        shapes=shapes_of(solid_angle_table),
     )
     low, high = (box.double() for box in primitive_bounds(select_primitives(geometry, prim)))
     return replace(lights, choice=light_sampler(lights, power, (low, high), choice))
@@ -165,28 +165,40 @@ def _surfaces(
         x.index_select(1, prim)
         for x in (primitives.p0, primitives.e1, primitives.e2, primitives.face, primitives.normal)
     )
-    # wholes: areas by which power is estimated, float64; columns: in the table of quadrics
-    areas, wholes, columns, needs_quadrics, start = [], [], [], False, 0
+    # world_areas: areas in the world, by which power is estimated, float64; columns: in the table of quadrics
+    areas, world_areas, columns, needs_quadrics, start = [], [], [], False, 0
     for number, name in enumerate(KINDS):  # the order of primitives
         stop = start + names.count(name)
         if start == stop:
             continue
         kind, span = SURFACES[name], slice(start, stop)
-        column = prim[span] - sum(primitives.counts[:number])
-        area, whole = kind.areas(Faces(e1[:, span], face[:, span], column, primitives.quadrics, primitives.frame))
+        column = prim[span] - sum(primitives.counts[:number])  # primitives of earlier kinds come before
+        faces = Faces(e1[:, span], face[:, span], column, quadrics=primitives.quadrics, frame=primitives.frame)
+        area, world_area = kind.areas(faces)
         areas.append(area)
-        wholes.append(whole)
+        world_areas.append(world_area)
         columns.append(column if kind.needs_quadrics else torch.zeros_like(column))
         needs_quadrics, start = needs_quadrics or kind.needs_quadrics, stop
     radiance = torch.cat([_emission(part, parameters, dtype)[:, None].expand(3, n) for part, n in emitting], 1)
     # A diffuse emitter of radiance L and area A has the power pi L A.
-    power = math.pi * luminance(radiance.detach().double().abs()) * torch.cat(wholes)
+    power = math.pi * luminance(radiance.detach().double().abs()) * torch.cat(world_areas)
     if any(part.emission_texture is not None for part, _ in emitting):
         means = [_mean_emission(part, parameters) for part, _ in emitting]
         power = power * torch.repeat_interleave(torch.tensor(means, dtype=torch.float64, device=device), counts)
     flip, bound = (x.index_select(0, prim) for x in (primitives.sign, primitives.bound))
-    made = _Rows(names, p0, e1, e2, normal, flip, torch.cat(areas).to(dtype), bound, radiance, power)
-    return made, torch.cat(columns) if needs_quadrics else None
+    rows = _Rows(
+        names,
+        p0,
+        e1,
+        e2,
+        normal,
+        flip=flip,
+        area=torch.cat(areas).to(dtype),
+        bound=bound,
+        radiance=radiance,
+        power=power,
+    )
+    return rows, torch.cat(columns) if needs_quadrics else None
 
 
 def _source(
@@ -206,11 +218,19 @@ def _source(
         return parameters[f"{source.name}.{key}"]
 
     try:
-        row = LIGHTS[source.kind].row(Setting(parameter, source.values, space.point, space.unit, radius, dtype))
+        row = LIGHTS[source.kind].row(
+            Setting(
+                given=parameter, values=source.values, place=space.point, unit=space.unit, reach=radius, dtype=dtype
+            )
+        )
     except Refused as error:
         raise scene_error(error, source.name, None, None) from None
     blank = torch.zeros(3, dtype=torch.float64, device=space.centre.device)
     columns = (blank if x is None else x for x in (row.p0, row.e1, row.e2, row.normal, row.radiance))
-    p0, e1, e2, normal, light = (x[:, None].to(dtype) for x in columns)
+    p0, e1, e2, normal, radiance = (x[:, None].to(dtype) for x in columns)
     one = torch.ones(1, dtype=dtype, device=space.centre.device)
-    return _Rows([source.kind], p0, e1, e2, normal, one, one, one, light, row.power.reshape(1)), row.environment
+    # It has no surface: flip, area and bound are 1.
+    rows = _Rows(
+        [source.kind], p0, e1, e2, normal, flip=one, area=one, bound=one, radiance=radiance, power=row.power.reshape(1)
+    )
+    return rows, row.environment

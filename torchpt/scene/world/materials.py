@@ -157,7 +157,7 @@ def lane_material(material: ResolvedMaterial, parameters: Mapping[str, Tensor], 
     else:
         device = next(iter(parameters.values())).device
         opacity = torch.zeros(1, dtype=dtype, device=device) if material.model.sheer else None
-        found = LaneMaterial(material.model, values, opacity, readings)
+        found = LaneMaterial(material.model, values, opacity=opacity, readings=readings)
     opacity, opacity_texture = found.opacity, found.opacity_texture
     if isinstance(material.opacity, Node):
         opacity_texture = OpacityTexture(material.opacity)
@@ -166,7 +166,9 @@ def lane_material(material: ResolvedMaterial, parameters: Mapping[str, Tensor], 
         opacity = outer if opacity is None else opacity * outer
     if opacity is not None and material.alpha_cutoff is not None and opacity_texture is None:
         opacity = (opacity >= material.alpha_cutoff).to(dtype)
-    return LaneMaterial(found.model, found.values, opacity, found.readings, opacity_texture)
+    return LaneMaterial(
+        found.model, found.values, opacity=opacity, readings=found.readings, opacity_texture=opacity_texture
+    )
 
 
 def _blended(
@@ -188,25 +190,33 @@ def _blended(
     if weight is None:  # a texture: only null may have an opacity below 1 beside it
         assert reading is not None
         if a.model.sheer:
-            return LaneMaterial(b.model, b.values, None, b.readings, OpacityTexture(reading))
+            return LaneMaterial(
+                b.model, b.values, opacity=None, readings=b.readings, opacity_texture=OpacityTexture(reading)
+            )
         if b.model.sheer:
-            return LaneMaterial(a.model, a.values, None, a.readings, OpacityTexture(reading, bias=1.0, factor=-1.0))
+            return LaneMaterial(
+                a.model,
+                a.values,
+                opacity=None,
+                readings=a.readings,
+                opacity_texture=OpacityTexture(reading, bias=1.0, factor=-1.0),
+            )
     elif a.opacity is not None or b.opacity is not None:
         first = (1.0 - weight) * (1.0 if a.opacity is None else a.opacity)
         second = weight * (1.0 if b.opacity is None else b.opacity)
         opacity = first + second
         weight = second / torch.where(opacity > 0, opacity, 1.0)
     if a.model.sheer:
-        return LaneMaterial(b.model, b.values, opacity, b.readings)
+        return LaneMaterial(b.model, b.values, opacity=opacity, readings=b.readings)
     if b.model.sheer:
-        return LaneMaterial(a.model, a.values, opacity, a.readings)
+        return LaneMaterial(a.model, a.values, opacity=opacity, readings=a.readings)
     values: Parameters = {"a": a.values, "b": b.values}
     readings = {side: inner.readings for side, inner in (("a", a), ("b", b)) if inner.readings}
     if weight is None:
         readings["weight"] = reading  # type: ignore[assignment]
     else:
         values["weight"] = weight
-    return LaneMaterial(kind(a.model, b.model), values, opacity, readings)
+    return LaneMaterial(kind(a.model, b.model), values, opacity=opacity, readings=readings)
 
 
 # ---- Groups of materials of the same BSDF and textures; opacity by primitive
@@ -225,14 +235,14 @@ class Groups:
     """Materials grouped by BSDF and structure of textures.
 
     Attributes:
-        place: group and row of each material, by name.
+        group_and_row: index of the group, and row in it, of each material by name.
         models: BSDF of each group.
         parameters: stacked parameters of each group.
         textures: textures of each group; None without.
         two_sided: ``(rows,)`` bool of each group; None where all materials are two-sided.
     """
 
-    place: dict[str, tuple[int, int]]
+    group_and_row: dict[str, tuple[int, int]]
     models: tuple[Bsdf, ...]
     parameters: tuple[Parameters, ...]
     textures: tuple[MaterialTextures | None, ...]
@@ -266,11 +276,11 @@ def groups_of(
     if not members:  # no surfaces: stages expect one group at least
         members[KINDS["diffuse"](), None] = []
     if len(members) > MOST_MODELS:
-        expected = f"at most {MOST_MODELS} models, blends and textured ones counted by what they are lane_materials of"
+        expected = f"at most {MOST_MODELS} models, blends and textured ones counted by what they are made of"
         raise SceneError("materials", len(members), expected)
-    place, stacks, textures, two_sided = {}, [], [], []
+    group_and_row, stacks, textures, two_sided = {}, [], [], []
     for number, ((model, form), names) in enumerate(members.items()):
-        place |= {name: (number, row) for row, name in enumerate(names)}
+        group_and_row |= {name: (number, row) for row, name in enumerate(names)}
         if form is None:  # without textures the BSDF computes once what depends on parameters alone
             stacks.append(stacked([model.prepare(lane_materials[name].values) for name in names], model.factors))
             textures.append(None)
@@ -287,7 +297,13 @@ def groups_of(
             textures.append(bindings)
         flags = [materials[name].two_sided for name in names]
         two_sided.append(None if all(flags) else torch.tensor(flags, device=device))
-    return Groups(place, tuple(model for model, _ in members), tuple(stacks), tuple(textures), tuple(two_sided))
+    return Groups(
+        group_and_row=group_and_row,
+        models=tuple(model for model, _ in members),
+        parameters=tuple(stacks),
+        textures=tuple(textures),
+        two_sided=tuple(two_sided),
+    )
 
 
 def _tabulated(model: Bsdf, values: Parameters) -> Parameters:
@@ -300,10 +316,10 @@ def _tabulated(model: Bsdf, values: Parameters) -> Parameters:
     return merged(values, model.tabulate(values))
 
 
-def _group_key(material: ResolvedMaterial, made: LaneMaterial) -> GroupKey:
+def _group_key(material: ResolvedMaterial, on_lanes: LaneMaterial) -> GroupKey:
     """Return the key of a material's group; materials without textures share that of their BSDF."""
-    if not made.readings and material.normal_map is None and material.bump_map is None:
-        return made.model, None
+    if not on_lanes.readings and material.normal_map is None and material.bump_map is None:
+        return on_lanes.model, None
 
     def form(value: Any) -> Any:
         if isinstance(value, dict):
@@ -311,7 +327,7 @@ def _group_key(material: ResolvedMaterial, made: LaneMaterial) -> GroupKey:
         return value.form if isinstance(value, Node) else "number"
 
     maps = form(material.normal_map), form(material.bump_map)
-    return made.model, (form(made.values), form(made.readings), maps)
+    return on_lanes.model, (form(on_lanes.values), form(on_lanes.readings), maps)
 
 
 def _textures(
@@ -325,7 +341,9 @@ def _textures(
     def binding(column: Sequence[Node]) -> TextureBinding:
         rows = torch.tensor([positions[node].row for node in column], device=device)
         table, first = positions[column[0]].table, column[0]  # a group has one form, so all its nodes are in one table
-        return TextureBinding(table, rows, first.channel, any(node.filtered for node in column))
+        return TextureBinding(
+            table=table, nodes=rows, channel=first.channel, filtered=any(node.filtered for node in column)
+        )
 
     def map_binding(column: list[Node | None]) -> TextureBinding | None:
         nodes = [node for node in column if node is not None]
@@ -340,9 +358,9 @@ def _textures(
     every = [node for material in materials for node in material.textures()]
     readings = bound([one.readings for one in lane_materials])
     return MaterialTextures(
-        readings,
-        map_binding([material.normal_map for material in materials]),
-        map_binding([material.bump_map for material in materials]),
+        bindings=readings,
+        normal=map_binding([material.normal_map for material in materials]),
+        bump=map_binding([material.bump_map for material in materials]),
         filtered=any(node.filtered for node in every),
         reads=tuple(sorted({node.reads for node in every})),
     )
@@ -362,8 +380,12 @@ def node_map_of(
 
     rows = spread([-1 if node is None else positions[node].row for node in nodes])
     if len(tables) == 1:
-        return NodeMap(rows, tables, None)
-    return NodeMap(rows, tables, spread([0 if node is None else tables.index(positions[node].table) for node in nodes]))
+        return NodeMap(nodes=rows, tables=tables, table=None)
+    return NodeMap(
+        nodes=rows,
+        tables=tables,
+        table=spread([0 if node is None else tables.index(positions[node].table) for node in nodes]),
+    )
 
 
 def opacity_maps_of(
@@ -389,12 +411,12 @@ def opacity_maps_of(
         for texture, part in zip(textures, parts, strict=True)
     ]
     return OpacityMaps(  # where no part has a cutoff, stages do not compare
-        maps.nodes,
-        maps.tables,
-        maps.table,
-        spread([0.0 if texture is None else texture.bias for texture in textures], dtype),
-        spread([1.0 if texture is None else texture.factor for texture in textures], dtype),
-        spread(cutoffs, dtype) if any(cutoff >= 0 for cutoff in cutoffs) else None,
+        nodes=maps.nodes,
+        tables=maps.tables,
+        table=maps.table,
+        bias=spread([0.0 if texture is None else texture.bias for texture in textures], dtype),
+        factor=spread([1.0 if texture is None else texture.factor for texture in textures], dtype),
+        cutoff=spread(cutoffs, dtype) if any(cutoff >= 0 for cutoff in cutoffs) else None,
     )
 
 

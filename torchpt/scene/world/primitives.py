@@ -66,6 +66,7 @@ def corners_of_all(
 def _pose_of(part: Part, parameters: Mapping[str, Tensor]) -> Tensor:
     """Return the pose of a part to the scene in float64, so that only the final product is rounded to the lanes' dtype."""
     pose = parameters[f"{part.name}.to_world"].double()
+    # `local`: where the part lies within its shape, as the cap of a cylinder.
     return pose if part.local is None else pose @ torch.from_numpy(part.local).to(pose.device)
 
 
@@ -128,7 +129,17 @@ def copies_of(maps: Tensor, copies: Sequence[Copy], dtype: torch.dtype) -> Insta
     scale = torch.stack(faces).detach().abs().amax((0, 1))
     nx, ny, nz = ((n * (front / scale)).to(dtype) for n in faces)
     mesh_first, copy_first = maps[12].detach().to(torch.int64), maps[14].detach().to(torch.int64)
-    return Instances(copy_first, mesh_first, x.to(dtype), y.to(dtype), z.to(dtype), move.to(dtype), nx, ny, nz)
+    return Instances(
+        start=copy_first,
+        first=mesh_first,
+        x=x.to(dtype),
+        y=y.to(dtype),
+        z=z.to(dtype),
+        move=move.to(dtype),
+        nx=nx,
+        ny=ny,
+        nz=nz,
+    )
 
 
 # ---- Table of all primitives of a scene, from the corners of its parts
@@ -177,7 +188,9 @@ class Primitives:
         table = None
         if self.quadrics is not None and self.frame is not None:
             table = table_of(self.quadrics, self.frame)
-        return Geometry(q0, q1, q2, self.counts, table, None if copies is None else copies.detach())
+        return Geometry(
+            p0=q0, p1=q1, p2=q2, counts=self.counts, quadrics=table, copies=None if copies is None else copies.detach()
+        )
 
 
 def primitives_of(
@@ -224,7 +237,8 @@ def primitives_of(
     # Largest coordinate magnitudes over each primitive, including its whole parallelogram or ellipse.
     largest = (p0.abs() + e1.abs() + e2.abs()).detach()
     bound = dot(normal.detach().abs(), largest)
-    if planar is not None:  # a sphere has its radius in e1[0]
+    # A sphere has its radius in e1[0]. Quadrics are bounded at each point of theirs (`Interaction.bound`): these are not read.
+    if planar is not None:
         bound = torch.where(planar, bound, (p0.abs().sum(0) + 2.0 * e1[0].abs()).detach())
     frames = [c.frame for c in corners if c.frame is not None]
     frame = torch.cat(frames, 1) if frames else None
@@ -237,4 +251,20 @@ def primitives_of(
             frame,
             dtype,
         )
-    return Primitives(kinds, sizes, counts, p0, p1, p2, e1, e2, face, sign, normal, normals, bound, frame, quadrics)
+    return Primitives(
+        kinds=kinds,
+        sizes=sizes,
+        counts=counts,
+        p0=p0,
+        p1=p1,
+        p2=p2,
+        e1=e1,
+        e2=e2,
+        face=face,
+        sign=sign,
+        normal=normal,
+        normals=normals,
+        bound=bound,
+        frame=frame,
+        quadrics=quadrics,
+    )

@@ -166,9 +166,9 @@ def _declare_texels(
     # The slack admits rounding at the bounds.
     spec = TexelsSpec(low=None, slack=1e-6, moves=opening.slot.moves, doc="texels `(H, W, C)`, linear")
     opening.declare(name, texels, opening.restricted(spec, scale))
-    # Texels of `data` were stated in the scene, not read from a file.
+    # Texels of `data` are in the scene itself, not read from a file.
     if label == f"{opening.name}.data":
-        opening.parameters.stated.add(name)
+        opening.parameters.texels_in_scene.add(name)
     return name
 
 
