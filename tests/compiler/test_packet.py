@@ -7,55 +7,28 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
+import ray_kernels
 import torch
 from accel_reference import SCENES, geometry, soup
 from few import few
+from ray_kernels import Search
 from torch import Tensor
 
-from torchpt.compiler import cpu
 from torchpt.compiler.form import SCALAR, VECTORS, Form
-from torchpt.compiler.kernel import HEAD, kernel_ir
-from torchpt.compiler.packet import KINDS
-from torchpt.compiler.program import TracedStage
-from torchpt.compiler.sinks import Sinks, Store
-from torchpt.compiler.tracing import LANES, Tracer
+from torchpt.compiler.packet import KINDS, PacketSearch
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.brute import Brute
-
-Search = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
 
 
 def searches(accel: Brute, kinds: Sequence[str] | None = None, form: Form = VECTORS) -> Search:
     """``t, prim, u, v, blocked`` of rays: a kernel around the nodes ``nearest`` and ``occluded``."""
-    tracer = Tracer(LANES[0], {})
-    graph = tracer.graph
-    ray = [graph.node("tensor", "f", extra=at) for at in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0))]
-    found = graph.node("nearest", "S", *ray)
-    types = ("f", "i", "f", "f")
-    stores = [Store((graph.node("part", ty, found, extra=k),), ty) for k, ty in enumerate(types)]
-    stores.append(Store((graph.node("occluded", "b", *ray),), "b"))
     if kinds is None:
         kinds = [kind for kind, count in zip(KINDS, accel.counts, strict=False) if count]
-    made = cpu.compile_ir(kernel_ir(TracedStage(graph, Sinks(store=stores), tensors=3, searched=tuple(kinds)), form))
-
-    def run(o: Tensor, d: Tensor, t_max: Tensor) -> list[Tensor]:
-        n = t_max.shape[0]
-        given = [o.contiguous(), d.contiguous(), t_max.contiguous()]
-        dtypes = (torch.float32, torch.int32, torch.float32, torch.float32, torch.bool)
-        results = [torch.empty(n, dtype=dtype) for dtype in dtypes]
-        block = (ctypes.c_int64 * (len(HEAD) + 16))()
-        block[HEAD.index("search")] = ctypes.addressof(accel.words)
-        for k, tensor in enumerate((*given, *results)):
-            block[len(HEAD) + 2 * k] = tensor.data_ptr()
-            block[len(HEAD) + 2 * k + 1] = n
-        made.call(ctypes.addressof(block), n)
-        return results
-
-    return run
+    return ray_kernels.searches(PacketSearch(tuple(kinds)), ctypes.addressof(accel.words), form)
 
 
 def rays(seed: int, n: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -18,7 +18,7 @@ from torchpt.compiler.codegen import MEMORY, LoopBody, generate_node
 from torchpt.compiler.form import WARP, Form
 from torchpt.compiler.fusing import fused_products
 from torchpt.compiler.graph import Graph, Unsupported
-from torchpt.compiler.packet import binary_searches, packet_search
+from torchpt.compiler.packet import binary_searches
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.remainder import float_remainders
 from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
@@ -355,8 +355,8 @@ def kernel_ir(stage: TracedStage, form: Form) -> str:
     writer = sink_writer(body, graph, names, sinks)
     writer.write()
     functions = [binary_searches(graph, needed, form), float_remainders(graph, needed, form)]
-    if stage.searched is not None:
-        functions.append(packet_search(stage.searched, form))
+    if stage.search is not None:
+        functions.append(stage.search(form))
     declarations = set().union(*(block.declarations for block in (body, *functions)))
     loop = _grid_stride_loop if form.threads else _cpu_loop
     lines = [

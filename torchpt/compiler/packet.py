@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
@@ -18,7 +19,7 @@ from torchpt.compiler.codegen import MEMORY
 from torchpt.compiler.form import Form
 from torchpt.compiler.graph import Graph
 
-__all__ = ["KINDS", "binary_searches", "packet_search", "scene_words"]
+__all__ = ["KINDS", "PacketSearch", "binary_searches", "scene_words"]
 
 
 # ---- Binary searches in sorted tables, as LLVM IR: functions that kernels call
@@ -93,20 +94,25 @@ _ROW = 13
 _RAY = ("ox", "oy", "oz", "dx", "dy", "dz")
 
 
-def packet_search(kinds: Sequence[str], form: Form) -> Block:
-    """Generate the functions ``nearest`` and ``occluded``, which take rays and the address of :func:`scene_words`.
+@dataclass(frozen=True)
+class PacketSearch:
+    """The functions ``nearest`` and ``occluded``, which take rays and the address of :func:`scene_words`.
 
-    Args:
+    Attributes:
         kinds: kinds of primitives in the scene, of :data:`KINDS`.
-        form: layout of lanes; a packet has ``form.width`` rays.
     """
-    whole = Block(form)
-    for any_hit in (False, True):
-        block = _SearchFunction(kinds, any_hit, form)
-        block.write()
-        whole.lines += block.lines
-        whole.declarations |= block.declarations
-    return whole
+
+    kinds: tuple[str, ...]
+
+    def __call__(self, form: Form) -> Block:
+        """Generate the functions; a packet has ``form.width`` rays."""
+        whole = Block(form)
+        for any_hit in (False, True):
+            block = _SearchFunction(self.kinds, any_hit, form)
+            block.write()
+            whole.lines += block.lines
+            whole.declarations |= block.declarations
+        return whole
 
 
 def scene_words(rows: Tensor, balls: Tensor, counts: Sequence[int], extent: float) -> Any:

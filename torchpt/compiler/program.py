@@ -7,7 +7,7 @@ A stage is traced once (:class:`TracedStage`), compiled (:class:`Program`), and 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.compiler.block import Block
 from torchpt.compiler.cpu import Function
+from torchpt.compiler.form import Form
 from torchpt.compiler.graph import Graph, Unsupported
 from torchpt.compiler.prologue import Guard, Source, Step, StepKey, Table, run_prologue, step_keys
 from torchpt.compiler.sinks import Sinks
@@ -40,7 +42,8 @@ class TracedStage:
         uniforms: names of the inputs that all lanes share.
         tensors: number of inputs that are tensors instead of rows of an arena.
         listed: lanes are read at the indices of a list; False: all lanes in order.
-        searched: kinds of primitives that rays are intersected with, see :mod:`torchpt.compiler.packet`; None: no rays.
+        search: generates the functions that nodes ``nearest`` and ``occluded`` call, such as
+            :class:`torchpt.compiler.packet.PacketSearch`; None: no rays are searched.
         sums: parameters whose derivatives are rows of the results, see :mod:`torchpt.engines.kernels.backward`.
     """
 
@@ -53,7 +56,7 @@ class TracedStage:
     uniforms: Sequence[str] = ()
     tensors: int = 0
     listed: bool = False
-    searched: Sequence[str] | None = None
+    search: Callable[[Form], Block] | None = None
     sums: Sequence[Sequence[Any]] = ()
 
     def needed(self) -> list[int]:

@@ -21,7 +21,7 @@ from torchpt.compiler import cache
 from torchpt.compiler.function import Lanewise
 from torchpt.compiler.graph import Graph
 from torchpt.compiler.kernel import HEAD
-from torchpt.compiler.packet import KINDS, scene_words
+from torchpt.compiler.packet import KINDS, PacketSearch, scene_words
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.sinks import Sinks, Store
 from torchpt.core.dispatch import dispatched
@@ -182,7 +182,7 @@ def _kernel(kinds: tuple[str, ...], any_hit: bool) -> Any:
         stores = [Store((graph.node("part", ty, hits, extra=k),), ty) for k, ty in enumerate("fiff")]
     compile_time.begin()
     try:
-        return cache.compile_stage(TracedStage(graph, Sinks(store=stores), tensors=3, searched=kinds)).call
+        return cache.compile_stage(TracedStage(graph, Sinks(store=stores), tensors=3, search=PacketSearch(kinds))).call
     finally:
         compile_time.end()
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchpt.compiler import cache, operators  # noqa: F401  (the operators register how they are lowered)
 from torchpt.compiler.graph import Unsupported
+from torchpt.compiler.packet import PacketSearch
 from torchpt.compiler.program import Program, Tables, TracedStage, bind_tables
 from torchpt.compiler.prologue import StepKey, without_unused_steps
 from torchpt.compiler.sinks import Sinks
@@ -183,7 +184,7 @@ def trace_stage(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], S
         uniforms=tuple(trace.uniforms),
         tensors=trace.tensors,
         listed=listed,
-        searched=kinds_of(layout.world) if searches else None,
+        search=PacketSearch(kinds_of(layout.world)) if searches else None,
         sums=tuple(trace.sums),
     )
 

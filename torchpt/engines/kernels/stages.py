@@ -114,7 +114,7 @@ def kinds_of(world: World) -> tuple[str, ...]:
 
 
 def search_words(wave: Wave) -> Any:
-    """Return the argument of :func:`torchpt.compiler.packet.packet_search`."""
+    """Return the argument of the functions of :class:`torchpt.compiler.packet.PacketSearch`."""
     accel: Any = wave.accel
     return accel.words
 
