@@ -90,4 +90,11 @@ def _built(description: Description, vertex_params: Collection[str]) -> SceneBui
     parts.sort(key=lambda part: KINDS.index(part.kind))
     centre, unit = centre_and_unit(parts, copies, sources, parameters, description.camera, description.file)
     warn_of_coplanar_refraction(parts, copies, description.file)
-    return SceneBuild(tuple(parts), parameters, centre, unit, tuple(sources), tuple(copies))
+    return SceneBuild(
+        parts=tuple(parts),
+        parameters=parameters,
+        centre=centre,
+        unit=unit,
+        sources=tuple(sources),
+        copies=tuple(copies),
+    )

@@ -334,7 +334,7 @@ def describe_engine(scene: Scene, settings: Settings) -> dict[str, Any]:
     with torch.no_grad():
         if not uses_kernels(settings, scene.device, torch.float32):
             return {"stages": "eager, by tensor operations"}
-        wave = make_wave(scene, settings, None, torch.float32)
+        wave = make_wave(scene, settings, params=None, dtype=torch.float32)
         on_cpu = scene.device.type == "cpu"
         kernels = kernels_of(scene, wave) if on_cpu else device_engine(scene, wave, settings, []).kernels
         return engine.describe_kernels(kernels)

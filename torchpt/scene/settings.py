@@ -436,7 +436,7 @@ class CallArguments(FrozenConfig):
             try:
                 values[name] = arguments_of(RenderOptions)[name].read(options[name])
             except Refused as error:
-                raise scene_error(error, name, options[name], None) from None
+                raise scene_error(error, key=name, value=options[name], file=None) from None
         return cls(**values)
 
 
@@ -588,17 +588,17 @@ def _merge(
     scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None, instance: Integrator | None = None
 ) -> Settings:
     """Merge without the cache; ``instance``: an integrator in place of the block."""
-    check_keys(overrides, BLOCKS, "", "the settings", None)
+    check_keys(overrides, BLOCKS, key="", what="the settings", file=None)
     blocks: dict[str, Any] = {}
     for block in BLOCKS:
-        below = _keys_that_are_set(scene.get(block), block, file)
-        above = _keys_that_are_set(overrides.get(block), block, None)
+        below = _keys_that_are_set(scene.get(block), key=block, file=file)
+        above = _keys_that_are_set(overrides.get(block), key=block, file=None)
         if block == "film":
             above = keep_aspect(below, above)
         raw = _merge_typed(block, below, above) if block in TYPED_BLOCKS else {**below, **above}
         if "filter" in raw:
-            below_filter = _keys_that_are_set(below.get("filter"), "film.filter", file)
-            above_filter = _keys_that_are_set(above.get("filter"), "film.filter", None)
+            below_filter = _keys_that_are_set(below.get("filter"), key="film.filter", file=file)
+            above_filter = _keys_that_are_set(above.get("filter"), key="film.filter", file=None)
             raw["filter"] = _merge_typed("filter", below_filter, above_filter)
         try:
             if block == "render":
@@ -671,17 +671,17 @@ def _read_block(block: str, raw: dict[str, Any]) -> Any:
     """Return a block in its final form: an integrator, a sampler's parameters, a film or render record."""
     if block in TYPED_BLOCKS:
         table, default = TYPED_BLOCKS[block]
-        refuse_unused_keys(block, table, raw, default, None)
+        refuse_unused_keys(block, table, raw, default=default, file=None)
         parsed = _typed(block, raw, block)
         return parsed.kind(**parsed.values) if block == "integrator" else parsed
     if block == "film":
         if "filter" in raw:
             raw["filter"] = _typed("filter", raw["filter"], "film.filter")
-        return Film(**read_params(Film, raw, block, None, "the film").values)
-    return Render(**read_params(Render, raw, block, None, "the render settings").values)
+        return Film(**read_params(Film, raw, key=block, file=None, words="the film").values)
+    return Render(**read_params(Render, raw, key=block, file=None, words="the render settings").values)
 
 
 def _typed(block: str, raw: dict[str, Any], key: str) -> ParsedParams:
     """Read a block of :data:`TYPED_BLOCKS`; ``key``: its dotted key, for errors."""
     table, default = TYPED_BLOCKS[block]
-    return read_typed(block, table, raw, key, None, default)
+    return read_typed(block, table, raw, key=key, file=None, default=default)

@@ -193,8 +193,8 @@ class ShapeBuilder:
             AssetError: a wrong key or value; names the file and the material.
         """
         try:
-            material = read_material(own.material, key, BSDFS, None)
-            check_material(material, key, {}, {}, None)
+            material = read_material(own.material, key=key, types=BSDFS, file=None)
+            check_material(material, key=key, materials={}, textures={}, file=None)
             return resolved(material, key, {}, self.texture_loader.sharing(f"{prefix}.textures"))
         except SceneError as error:
             raise AssetError(source, f"material {own.name[:80]!r}: {error}") from None

@@ -89,7 +89,7 @@ def build_lights(description: Description, parameters: Parameters) -> list[Sourc
             with description.reading_files() as resolve:
                 arrays = light.kind.files(light.values, partial(_file_of, resolve, key, light))
         except Refused as error:
-            raise scene_error(error, key, None, description.file) from None
+            raise scene_error(error, key=key, value=None, file=description.file) from None
         for stem, (values, spec) in arrays.items():
             parameters.declare(f"{key}.{stem}", values, spec)
     return [Source(name=f"lights.{name}", kind=light.name, values=light.values) for name, light in lights.items()]
@@ -120,7 +120,7 @@ def check_light_params(sources: Sequence[Source], given: Collection[str], parame
         try:
             kind.check({**source.values, **numbers}, frozenset(numbers))
         except Refused as error:
-            raise scene_error(error, f"params.{source.name}", None, None) from None
+            raise scene_error(error, key=f"params.{source.name}", value=None, file=None) from None
 
 
 def build_file_lights(

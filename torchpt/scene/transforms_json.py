@@ -252,7 +252,9 @@ def _read_camera(block: Any, size: tuple[int, int], key: str) -> tuple[Tensor, T
         raise SceneError(key, sorted(map(str, block)), expected)
     if "K" in block:
         block = {"size": list(size), **block}
-    values = read_typed("camera", {Perspective.name: Perspective}, block, key, None, Perspective.name).values
+    values = read_typed(
+        "camera", {Perspective.name: Perspective}, block, key=key, file=None, default=Perspective.name
+    ).values
     numbers = {
         name: torch.tensor(value, dtype=torch.float64) if isinstance(value, float) else value
         for name, value in values.items()

@@ -44,7 +44,7 @@ def view_attributes(
         raise SceneError("film", film, "a mapping")
     film_keys = description.film | {name: value for name, value in film.items() if value is not None}
     tensors = DictTensors()  # tensors of the block that require gradients; readers get plain numbers
-    new_camera = read_camera(tensors.extract(plain({"camera": camera}))["camera"], film_keys, None)
+    new_camera = read_camera(tensors.extract(plain({"camera": camera}))["camera"], film=film_keys, file=None)
     description = with_all_intrinsics(replace(description, camera=new_camera), tensors)
     new_camera, parameters = description.camera, Parameters()
     for name, value in built.parameters.items():

@@ -400,7 +400,7 @@ def read_typed(
         raise SceneError(dotted(key, "type"), name, f"a known {what} type{hint}: {types}", file)
     words = f"{what} type {name}"
     if name in not_built:
-        check_keys(raw, ("type", *not_built[name]), key, words, file)
+        check_keys(raw, ("type", *not_built[name]), key=key, what=words, file=file)
         raise NotBuiltError(dotted(key, "type"), name, ", ".join(table), file)
     kind = table[name]
 
@@ -424,10 +424,12 @@ def _read_kind(
     words = f"{what} type {name}"
     names = list(parameters_of(kind))
     unsupported_keys = {**unsupported.KEYS.get(what, {}), **unsupported.KEYS.get(name, {})}
-    check_keys({k: v for k, v in raw.items() if k not in unsupported_keys}, ("type", *names), key, words, file)
-    supported = refuse_not_built(raw, unsupported_keys, key, ", ".join(names), file)
+    check_keys(
+        {k: v for k, v in raw.items() if k not in unsupported_keys}, ("type", *names), key=key, what=words, file=file
+    )
+    supported = refuse_not_built(raw, unsupported_keys, key=key, available=", ".join(names), file=file)
     values = {name: value for name, value in supported.items() if name != "type"}
-    return read_params(kind, values, key, file, words, texture)
+    return read_params(kind, values, key=key, file=file, words=words, texture=texture)
 
 
 def read_params(
@@ -455,14 +457,14 @@ def read_params(
     """
     specs = parameters_of(kind)
     given = {name: value for name, value in raw.items() if value is not None}
-    check_keys(given, specs, key, words or getattr(kind, "name", "") or kind.__name__, file)
+    check_keys(given, specs, key=key, what=words or getattr(kind, "name", "") or kind.__name__, file=file)
     values: dict[str, Any] = {}
     for name, spec in specs.items():
         if name in given:
             try:
                 values[name] = _read_value(spec, given[name], texture)
             except Refused as error:
-                raise scene_error(error, dotted(key, name), given[name], file) from None
+                raise scene_error(error, key=dotted(key, name), value=given[name], file=file) from None
         elif spec.default is REQUIRED:
             raise SceneError(dotted(key, name), None, "a value (this key is required)", file)
         else:
@@ -476,7 +478,7 @@ def read_params(
         try:
             check(values, frozenset(given))
         except Refused as error:
-            raise scene_error(error, key, None, file) from None
+            raise scene_error(error, key=key, value=None, file=file) from None
     return ParsedParams(kind, values, frozenset(given))
 
 
@@ -529,6 +531,6 @@ def _read_block(spec: Block, texture: ReadTexture | None, value: Any) -> ParsedP
     if not isinstance(value, Mapping):
         raise Refused(spec.expected)
     try:
-        return read_params(spec.kind, value, "", None, spec.kind.__name__.lower(), texture)
+        return read_params(spec.kind, value, key="", file=None, words=spec.kind.__name__.lower(), texture=texture)
     except SceneError as error:
         raise as_refused(error) from None

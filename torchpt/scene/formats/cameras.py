@@ -26,5 +26,5 @@ def read_camera(raw: Any, film: Mapping[str, Any], file: str | None) -> ParsedPa
     if isinstance(raw, Mapping) and raw.get("K") is not None and raw.get("size") is None:
         size = [film.get("width"), film.get("height")]
         raw = raw if None in size else {**raw, "size": size}
-    refuse_unused_keys("camera", KINDS, raw, default, file)
-    return read_typed("camera", KINDS, raw, "camera", file, default)
+    refuse_unused_keys("camera", KINDS, raw, default=default, file=file)
+    return read_typed("camera", KINDS, raw, key="camera", file=file, default=default)

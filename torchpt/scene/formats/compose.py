@@ -280,7 +280,7 @@ def _merge_layers(
     result = dict(below)
     for block, value in above.items():
         if block in NAMED and isinstance(value, Mapping):
-            result[block] = merge_named(block, below.get(block), value, file, strict=strict)
+            result[block] = merge_named(block, below.get(block), value, file=file, strict=strict)
         else:
             result[block] = merge_values(below.get(block), value, (block,))
     return result

@@ -212,24 +212,24 @@ def read_description(
         return replace(found, overrides=override_words(overrides)) if overrides else found
 
     if isinstance(source, Mapping):
-        return describe(source, None, Path.cwd())
+        return describe(source, file=None, base=Path.cwd())
     if not isinstance(source, str | os.PathLike) and hasattr(source, "read"):
         name = getattr(source, "name", None)
         file = name if isinstance(name, str) and is_regular(name) else None
         base = Path.cwd() if file is None else Path(file).resolve().parent
-        return describe(read_open(source, file), file, base)
+        return describe(read_open(source, file), file=file, base=base)
     if not isinstance(source, str | os.PathLike):
         raise SceneError("scene", source, SOURCES)
     file = os.fspath(source)
     if isinstance(source, str) and "\n" in source:
-        return describe(parse_yaml(source), None, Path.cwd())
+        return describe(parse_yaml(source), file=None, base=Path.cwd())
     if file.endswith((".yaml", ".yml")):
         path = Path(file)
         _check_exists(path, file, places)
     else:
         path = _named_scene(file, places)
         file = str(path)
-    return describe(read_yaml(path, file), file, path.resolve().parent)
+    return describe(read_yaml(path, file), file=file, base=path.resolve().parent)
 
 
 def _named_scene(name: str, places: Sequence[Path]) -> Path:
@@ -338,22 +338,31 @@ def _describe(
     Raises:
         SceneError: the first wrong key or value.
     """
-    check_keys(raw, KEYS, "", "a scene", file)
+    check_keys(raw, KEYS, key="", what="a scene", file=file)
     version = raw.get("version")
     if version is not None and (isinstance(version, bool) or version != 1):
         raise SceneError("version", version, "1", file)
     if raw.get("camera") is None:
         raise SceneError("camera", None, "a camera (every scene needs one)", file)
     blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
-    camera = read_camera(raw["camera"], blocks["film"], file)
+    camera = read_camera(raw["camera"], film=blocks["film"], file=file)
     run_settings.merge(blocks, {}, file)  # only checks them; each render merges them with its own overrides
-    textures = _named_items(raw, "textures", file, lambda item, key: read_typed("texture", TEXTURES, item, key, file))
-    materials = _named_items(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
+    textures = _named_items(
+        raw, "textures", file, lambda item, key: read_typed("texture", TEXTURES, item, key=key, file=file)
+    )
+    materials = _named_items(
+        raw, "materials", file, lambda item, key: read_material(item, key=key, types=types, file=file)
+    )
     for name, material in materials.items():
         key = f"materials.{name}"
-        check_material(material, key, materials, textures, layers.file_of(key, file))
-    shapes = _named_items(raw, "shapes", file, lambda item, key: _shape(item, key, materials, textures, types, file))
-    lights = _named_items(raw, "lights", file, lambda item, key: read_typed("light", LIGHTS, item, key, file))
+        check_material(material, key=key, materials=materials, textures=textures, file=layers.file_of(key, file))
+    shapes = _named_items(
+        raw,
+        "shapes",
+        file,
+        lambda item, key: _shape(item, key=key, materials=materials, textures=textures, types=types, file=file),
+    )
+    lights = _named_items(raw, "lights", file, lambda item, key: read_typed("light", LIGHTS, item, key=key, file=file))
     film, integrator, sampler, render = (blocks[name] for name in BLOCKS)
     return Description(
         file=file,
@@ -420,14 +429,14 @@ def _shape(
         SceneError: a wrong key or value, an unknown material or texture, emission of both shape and material.
     """
     if isinstance(item, dict) and isinstance(item.get("material"), dict):
-        inline = read_material(item["material"], f"{key}.material", types, file)
-        check_material(inline, f"{key}.material", materials, textures, file)
+        inline = read_material(item["material"], key=f"{key}.material", types=types, file=file)
+        check_material(inline, key=f"{key}.material", materials=materials, textures=textures, file=file)
         item = {**item, "material": inline}
-    shape = read_typed("shape", SHAPES, item, key, file, texture=texture_of)
+    shape = read_typed("shape", SHAPES, item, key=key, file=file, texture=texture_of)
     displacement = shape.values.get("displacement")
     if displacement is not None:
         where = f"{key}.displacement.texture"
-        check_texture(displacement["texture"], where, textures, file, coordinates=True, points=True)
+        check_texture(displacement["texture"], key=where, textures=textures, file=file, coordinates=True, points=True)
     material, emission, where = shape["material"], shape["emission"], f"{key}.material"
     if isinstance(material, str):
         if material not in materials:

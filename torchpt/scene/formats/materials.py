@@ -105,14 +105,17 @@ def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | Non
         if depth == MAX_BLENDS:
             raise SceneError(key, name, f"blends nested at most {MAX_BLENDS} deep", file)
         inline = {side: raw[side] for side in sides if isinstance(raw.get(side), Mapping)}
-        inner = {side: read_material(item, f"{key}.{side}", types, file, depth + 1) for side, item in inline.items()}
+        inner = {
+            side: read_material(item, key=f"{key}.{side}", types=types, file=file, depth=depth + 1)
+            for side, item in inline.items()
+        }
         raw = {**raw, **inner}
-    return read_typed("material", types, raw, key, file, texture=texture_of)
+    return read_typed("material", types, raw, key=key, file=file, texture=texture_of)
 
 
 def plain_material() -> ParsedParams:
     """Return the default material of shapes: grey and diffuse."""
-    return read_params(KINDS["diffuse"], {}, "", None, texture=texture_of)
+    return read_params(KINDS["diffuse"], {}, key="", file=None, texture=texture_of)
 
 
 def _inner_keys(kind: Kind) -> tuple[str, ...]:
@@ -167,16 +170,16 @@ def check_material(
         name = key.removeprefix("materials.")
         # A material written in place has no name by which a blend inside could refer to it.
         trail = (name,) if materials.get(name) is material else ()
-        _check_blend(material, key, materials, file, trail, depth=1)
+        _check_blend(material, key=key, materials=materials, file=file, trail=trail, depth=1)
         for side, item in inner.items():
             if isinstance(item, ParsedParams):
-                check_material(item, f"{key}.{side}", materials, textures, file)
+                check_material(item, key=f"{key}.{side}", materials=materials, textures=textures, file=file)
     slots = {slot: value for slot, value in material.values.items() if isinstance(value, TextureInput)}
     for slot, value in slots.items():
         # The weight of a blend with a null surface acts as its opacity, so it has the limits of an opacity texture.
         is_opacity = slot == "weight" and any(item.kind.sheer for item in _inner_materials(material, materials))
         coordinates, points = slot in _NEED_COORDINATES or is_opacity, slot in POINTS or is_opacity
-        check_texture(value, f"{key}.{slot}", textures, file, coordinates=coordinates, points=points)
+        check_texture(value, key=f"{key}.{slot}", textures=textures, file=file, coordinates=coordinates, points=points)
     model, _ = model_of(material, materials)
     for slot in slots:
         if slot in model.tabulated:
@@ -229,12 +232,12 @@ def _check_blend(
         if inner["emission"] is not None:
             where, value = (at, item) if isinstance(item, str) else (f"{at}.emission", inner["emission"])
             raise SceneError(where, value, "a material without emission (give it to the blend itself)", file)
-        _check_maps(blend, inner, item, at, materials, file)
+        _check_maps(blend, inner, item, at=at, materials=materials, file=file)
         if not inner["two_sided"]:
             where, value = (at, item) if isinstance(item, str) else (f"{at}.two_sided", False)
             raise SceneError(where, value, "a two-sided material (say two_sided on the blend itself)", file)
         if inner_of(inner):
-            _check_blend(inner, at, materials, file, inner_trail, depth + 1)
+            _check_blend(inner, key=at, materials=materials, file=file, trail=inner_trail, depth=depth + 1)
 
 
 def _check_maps(

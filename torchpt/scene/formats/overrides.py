@@ -185,7 +185,7 @@ def _apply(raw: dict[str, Any], change: _Change) -> None:
     elif name == "type":
         _retype(container, change)
     elif change.key in NAMED and isinstance(change.value, Mapping):
-        container[name] = merge_named(name, container.get(name), change.value, None, strict=True)
+        container[name] = merge_named(name, container.get(name), change.value, file=None, strict=True)
     else:
         container[name] = merge_values(container.get(name), change.value, change.parts)
 

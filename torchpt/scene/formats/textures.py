@@ -25,14 +25,14 @@ def read_texture(raw: Any, key: str, file: str | None) -> ParsedParams | Texture
         SceneError: a wrong key or value.
     """
     if isinstance(raw, Mapping) and "texture" in raw and "type" not in raw:
-        check_keys(raw, ("texture", "channel"), key, "a reference to a texture", file)
+        check_keys(raw, ("texture", "channel"), key=key, what="a reference to a texture", file=file)
         name, channel = raw["texture"], raw.get("channel")
         if not isinstance(name, str) or not name:
             raise SceneError(dotted(key, "texture"), name, "the name of a texture", file)
         if channel is not None and channel not in CHANNELS:
             raise SceneError(dotted(key, "channel"), channel, f"one of {', '.join(CHANNELS)}", file)
         return TextureReference(name, channel)
-    return read_typed("texture", KINDS, raw, key, file)
+    return read_typed("texture", KINDS, raw, key=key, file=file)
 
 
 def texture_of(raw: Mapping[str, Any], spec: Spec) -> TextureInput:
@@ -48,7 +48,7 @@ def texture_of(raw: Mapping[str, Any], spec: Spec) -> TextureInput:
     low, high = getattr(spec, "bounds")  # noqa: B009  (specs of numbers and colours have them)
     coloured = spec.coloured
     try:
-        texture = read_texture(raw, "", None)
+        texture = read_texture(raw, key="", file=None)
     except SceneError as error:
         raise as_refused(error) from None
     channel = texture.channel if isinstance(texture, TextureReference) else texture.values.get("channel")

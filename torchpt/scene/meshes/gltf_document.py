@@ -318,7 +318,9 @@ class Document:
         sparse = accessor.get("sparse")
         if "bufferView" in accessor:
             offset = accessor.get("byteOffset", 0)
-            values = self._rows(accessor["bufferView"], offset, count, component, width, where).astype(np.float64)
+            values = self._rows(
+                accessor["bufferView"], offset=offset, count=count, component=component, width=width, where=where
+            ).astype(np.float64)
         elif sparse is None:
             raise AssetError(self.path, f"{where} has no data (no bufferView)")
         elif count > _MOST_ZEROS:
@@ -357,10 +359,24 @@ class Document:
         if type(count) is not int or not 0 <= count <= len(values) or indices["componentType"] not in _INDEX_COMPONENTS:
             raise AssetError(self.path, f"{where} has a count or a componentType out of range")
         kind = np.dtype(_COMPONENTS[indices["componentType"]])
-        at = self._rows(indices["bufferView"], indices.get("byteOffset", 0), count, kind, 1, where).reshape(-1)
+        at = self._rows(
+            indices["bufferView"],
+            offset=indices.get("byteOffset", 0),
+            count=count,
+            component=kind,
+            width=1,
+            where=where,
+        ).reshape(-1)
         if count and int(at.max()) >= len(values):
             raise AssetError(self.path, f"{where} has an index outside 0..{len(values) - 1}")
-        found = self._rows(rows["bufferView"], rows.get("byteOffset", 0), count, component, width, where)
+        found = self._rows(
+            rows["bufferView"],
+            offset=rows.get("byteOffset", 0),
+            count=count,
+            component=component,
+            width=width,
+            where=where,
+        )
         values[at.astype(np.int64)] = found
 
 

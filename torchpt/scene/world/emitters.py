@@ -224,7 +224,7 @@ def _source(
             )
         )
     except Refused as error:
-        raise scene_error(error, source.name, None, None) from None
+        raise scene_error(error, key=source.name, value=None, file=None) from None
     blank = torch.zeros(3, dtype=torch.float64, device=space.centre.device)
     columns = (blank if x is None else x for x in (row.p0, row.e1, row.e2, row.normal, row.radiance))
     p0, e1, e2, normal, radiance = (x[:, None].to(dtype) for x in columns)

@@ -84,7 +84,7 @@ def by_emission(harness: Harness, value: float) -> float:
     The floor has the irradiance E = π L / (1 + 1²) and the radiance 0.5 E / π.
     """
     turn = [{"rotate": {"axis": [1, 0, 0], "angle": 180}}, {"translate": [0, 0, 1]}]
-    scene = floor_seen(None, {"lamp": {"type": "disk", "emission": value, "transform": turn}})
+    scene = floor_seen(lights=None, shapes={"lamp": {"type": "disk", "emission": value, "transform": turn}})
     _, found = slope(harness, scene, "shapes.lamp.emission", spp=256)
     return derivative_error(found, 0.25)
 

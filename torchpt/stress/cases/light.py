@@ -33,27 +33,27 @@ def lamp(kind: str, height: float, **keys: Any) -> dict[str, Any]:
 def disk_above(harness: Harness, height: float) -> float:
     """Compare a one-sided disk of radius 1 with E = π / (1 + h²)."""
     expected = ALBEDO / (1.0 + height**2)
-    scene = floor_seen(None, lamp("disk", height), camera_height=min(1e-3, height / 2))
+    scene = floor_seen(lights=None, shapes=lamp("disk", height), camera_height=min(1e-3, height / 2))
     return relative(harness.render(scene, spp=256, max_depth=2), expected)
 
 
 def ball_above(harness: Harness, height: float) -> float:
     """Compare a ball of radius 1, its lowest point at ``height``, with E = π / (1 + h)²."""
     expected = ALBEDO / (1.0 + height) ** 2
-    scene = floor_seen(None, lamp("sphere", 1.0 + height), camera_height=min(1e-3, height / 2))
+    scene = floor_seen(lights=None, shapes=lamp("sphere", 1.0 + height), camera_height=min(1e-3, height / 2))
     return relative(harness.render(scene, spp=256, max_depth=2), expected)
 
 
 def point_above(harness: Harness, height: float) -> float:
     """Compare a point light with E = I / h²."""
     light = {"it": {"type": "point", "position": [0, 0, height], "intensity": 1.0}}
-    return relative(harness.render(floor_seen(light), max_depth=2), ALBEDO / math.pi / height**2)
+    return relative(harness.render(floor_seen(lights=light), max_depth=2), ALBEDO / math.pi / height**2)
 
 
 def inside_a_light(harness: Harness, radius: float) -> float:
     """Compare a floor inside an emissive ball with E = π."""
     ball = {"type": "sphere", "radius": radius, "emission": 1.0, "flip_normals": True}
-    return relative(harness.render(floor_seen(None, {"ball": ball}), spp=256, max_depth=2), ALBEDO)
+    return relative(harness.render(floor_seen(lights=None, shapes={"ball": ball}), spp=256, max_depth=2), ALBEDO)
 
 
 def radiance(harness: Harness, value: float) -> float:
@@ -69,14 +69,15 @@ def radiance(harness: Harness, value: float) -> float:
 def area_radiance(harness: Harness, value: float) -> float:
     """Compare an emissive disk of radius 1 and radiance ``value`` at height 1 with E = π value / 2."""
     return relative(
-        harness.render(floor_seen(None, lamp("disk", 1.0, emission=value)), max_depth=2), ALBEDO * value / 2
+        harness.render(floor_seen(lights=None, shapes=lamp("disk", 1.0, emission=value)), max_depth=2),
+        ALBEDO * value / 2,
     )
 
 
 def many(harness: Harness, number: float) -> float:
     """Compare ``number`` point lights at height 2, of intensity 1 together, with E = 1 / 2²."""
     lights = {f"p{k}": {"type": "point", "position": [0, 0, 2], "intensity": 1.0 / number} for k in range(int(number))}
-    return relative(harness.render(floor_seen(lights), max_depth=2), ALBEDO / math.pi / 4)
+    return relative(harness.render(floor_seen(lights=lights), max_depth=2), ALBEDO / math.pi / 4)
 
 
 def one_of_many(harness: Harness, number: float) -> float:
@@ -84,7 +85,7 @@ def one_of_many(harness: Harness, number: float) -> float:
     lights = {f"p{k}": {"type": "point", "position": [0, 0, 2], "intensity": 1e-6} for k in range(int(number) - 1)}
     lights["bright"] = {"type": "point", "position": [0, 0, 2], "intensity": 1.0}
     expected = (1.0 + 1e-6 * (number - 1)) * ALBEDO / math.pi / 4
-    return relative(harness.render(floor_seen(lights), max_depth=2, spp=256), expected)
+    return relative(harness.render(floor_seen(lights=lights), max_depth=2, spp=256), expected)
 
 
 def sun(harness: Harness, value: float) -> float:
