@@ -130,7 +130,10 @@ def _cast_like(value: Tensor, own: Tensor) -> Tensor:
 
 
 def _dependent_params(key: Key, scene: _BuiltDict) -> Iterator[tuple[str, Tensor]]:
-    """Yield the parameters that depend on the value at a key, by name."""
+    """Yield the parameters that depend on the value at a key, by name.
+
+    A key leads to the block, in most blocks to the name of an entry, and to its parameter: ``("lights", "sun", "radiance")``.
+    """
     block = key[0]
     if block == "camera" and len(key) > 1:
         yield from _camera_params(str(key[1]), scene)

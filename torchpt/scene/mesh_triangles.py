@@ -182,16 +182,16 @@ def warn_of_coplanar_refraction(parts: Sequence[Part], copies: Sequence[Copy], f
     boxes = [(one.corners.min((0, 1)), one.corners.max((0, 1))) for one in scaled]
     warned: set[tuple[str, str]] = set()
     for i, j in combinations(range(len(scaled)), 2):
-        pair = scaled[i].shape, scaled[j].shape
+        shape, other = pair = scaled[i].shape, scaled[j].shape
         (low_i, high_i), (low_j, high_j) = boxes[i], boxes[j]
         apart = (low_i > high_j + MAX_PLANE_DISTANCE).any() or (low_j > high_i + MAX_PLANE_DISTANCE).any()
-        if pair[0] == pair[1] or pair in warned or apart:
+        if shape == other or pair in warned or apart:
             continue
         if _overlap(scaled[i].corners, scaled[j].corners):
             warned.add(pair)
-            where = f"{file}: {pair[0]}" if file else pair[0]
+            where = f"{file}: {shape}" if file else shape
             warn_caller(
-                f"{where}: refracts and lies on {pair[1]}, which refracts too: rays meet one of the two surfaces only, and "
+                f"{where}: refracts and lies on {other}, which refracts too: rays meet one of the two surfaces only, and "
                 "energy is not kept there; leave a gap between them",
                 EnergyWarning,
             )

@@ -341,7 +341,8 @@ def lights_of(scene: Any, label: str) -> tuple[list[FileLight], list[str]]:
     left_out: list[str] = []
     for light in vars(scene).get("_lights") or ():  # the property `lights` would make some up
         try:
-            matrix = np.array(scene.graph[light.name][0], np.float64)
+            placed, _ = scene.graph[light.name]  # matrix, and the name of a geometry
+            matrix = np.array(placed, np.float64)
         except (KeyError, ValueError):
             raise AssetError(
                 label, f"the light {light.name!r} has no place: scene.graph[light.name] = matrix"

@@ -32,7 +32,9 @@ __all__ = ["lights_of"]
 
 def _emission(part: Part, parameters: Mapping[str, Tensor], dtype: torch.dtype) -> Tensor:
     """Return the radiance ``(3,)`` of an emissive part."""
-    radiance, *strength = (parameters[name].to(dtype) for name in part.emission_names)
+    radiance, *strength = (
+        parameters[name].to(dtype) for name in part.emission_names
+    )  # of a material: its strength too
     if part.emission_texture is not None:
         return radiance.expand(3)  # the strength alone: stages look up the texture
     return radiance if not strength else radiance * strength[0]

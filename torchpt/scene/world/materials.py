@@ -74,19 +74,19 @@ def vertex_attributes_of(
     needs_colors = any(reading.reads == "colors" for reading in readings)
     pairs = list(zip(parts, corners, strict=True))
     kinds = [PRIMITIVES[part.kind] for part in parts]
-    uvs = (
-        [kind.uvs(part, c) for kind, (part, c) in zip(kinds, pairs, strict=True)] if needs_uvs or needs_tangents else []
-    )
+    uvs = []  # of each part: (2, its primitives) at the three corners; tangents are computed from them
+    if needs_uvs or needs_tangents:
+        uvs = [kind.uvs(part, part_corners) for kind, (part, part_corners) in zip(kinds, pairs, strict=True)]
     found: dict[str, Any] = dict.fromkeys(("tangents", "bitangents", "uvs", "axes", "mirrored", "colors"))
     if needs_tangents:
-        derivatives = [  # of points by u and v, a pair for each part
-            kind.moves(part, c, corner, parameters[f"{part.name}.to_world"][:3, :3])
-            for kind, (part, c), corner in zip(kinds, pairs, uvs, strict=True)
+        derivatives = [  # of each part: of its points by u, and by v
+            kind.moves(part, part_corners, part_uvs, parameters[f"{part.name}.to_world"][:3, :3])
+            for kind, (part, part_corners), part_uvs in zip(kinds, pairs, uvs, strict=True)
         ]
-        found["tangents"] = torch.cat([pair[0] for pair in derivatives], 1)
-        found["bitangents"] = torch.cat([pair[1] for pair in derivatives], 1) if needs_bitangents else None
+        found["tangents"] = torch.cat([by_u for by_u, _ in derivatives], 1)
+        found["bitangents"] = torch.cat([by_v for _, by_v in derivatives], 1) if needs_bitangents else None
     if needs_uvs:
-        found["uvs"] = tuple(torch.cat([corner[k] for corner in uvs], 1) for k in range(3))
+        found["uvs"] = tuple(torch.cat([part_uvs[k] for part_uvs in uvs], 1) for k in range(3))
         spheres = [parameters[f"{part.name}.to_world"] for part in parts if part.kind == "sphere"]
         if spheres:
             from torchpt.physics.shapes.primitives.sphere import axes
