@@ -2,14 +2,15 @@
 
 ``renderer.py`` chooses one for each parameter by its spec (:func:`parametrization_of`). ``x``: the numbers that are optimized.
 
-=============  ======================================  =============================================================
-kind           range                                   parameter
-=============  ======================================  =============================================================
-``Bounded``    two ends: albedos, roughnesses, angles  ``low + (high - low) ((1 + 2 e) sigmoid(x) - e)``, clamped
-``LowerBounded``      one end: radiances, radii, indices      ``low + s (softplus(x) - e)``, clamped; ``s`` as below
-``Unbounded``       none: points, directions, vertices      ``x``
-``RigidMotion``      poses                                   ``exp(w)`` times the initial pose, at ``l t``; ``x = (w, t)``
-=============  ======================================  =============================================================
+================  ======================================  ===========================================================
+kind              range                                   parameter
+================  ======================================  ===========================================================
+``Bounded``       two ends: albedos, roughnesses, angles  ``low + (high - low) ((1 + 2 e) sigmoid(x) - e)``, clamped
+``LowerBounded``  one end: radiances, radii, indices      ``low + s (softplus(x) - e)``, clamped; ``s`` as below
+``Unbounded``     none: points, directions, vertices      ``x``
+``RigidMotion``   poses                                   initial pose turned by ``exp(w)``, its origin at ``length t``,
+                                                          with ``x = (w, t)``
+================  ======================================  ===========================================================
 
 A plain sigmoid never reaches 0 or 1, and is flat near them: an albedo of 0 would be ``x`` of minus infinity, and stay there.
 So it is stretched by ``e = 0.05`` at each closed end, which is then reached at a finite ``x`` with a sixth of the slope in
@@ -83,7 +84,10 @@ class Unbounded(Parametrization):
 
 
 class Bounded(Parametrization):
-    """A range between two ends; ``open_low`` and ``open_high``: True for an end that is excluded."""
+    """A range between two ends; ``open_low`` and ``open_high``: True for an end that is excluded.
+
+    A *share* is the parameter's place in the range: 0 at ``low``, 1 at ``high``.
+    """
 
     def __init__(self, low: float, high: float, *, open_low: bool, open_high: bool) -> None:
         super().__init__()
@@ -146,7 +150,7 @@ class RigidMotion(Parametrization):
     def __init__(self, start: Tensor, length: float = 1.0) -> None:
         super().__init__()
         self.length = length
-        self.register_buffer("frame", start.detach()[:3, :3].clone())
+        self.register_buffer("frame", start.detach()[:3, :3].clone())  # rotation, scale and shear of the initial pose
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
@@ -176,14 +180,18 @@ class RigidMotion(Parametrization):
 
 
 def parametrization_of(spec: Spec, start: Tensor, *, rigid: bool = True, length: float = 1.0) -> Parametrization:
-    """Return the range of a parameter with initial value ``start``.
+    """Return the parametrization of a parameter with initial value ``start``.
 
-    ``rigid``: poses move rigidly; ``length``: size of the scene.
+    Args:
+        spec: declares the parameter's range.
+        start: initial value.
+        rigid: True: poses move rigidly. False: only those that must keep angles do.
+        length: size of the scene, in scene units.
     """
     if isinstance(spec, Pose):
         return RigidMotion(start, length) if rigid or spec.angles or spec.rigid else Unbounded()
     low, high = getattr(spec, "low", None), getattr(spec, "high", None)
-    above, below = getattr(spec, "above", None), getattr(spec, "below", None)
+    above, below = getattr(spec, "above", None), getattr(spec, "below", None)  # open ends
     # Of a closed and an open end, the tighter one counts.
     open_low = above is not None and (low is None or above >= low)
     open_high = below is not None and (high is None or below <= high)

@@ -66,7 +66,7 @@ class Renderer(nn.Module):
         **options: Unpack[BatchOptions],
     ) -> None:
         super().__init__()
-        check_names("Renderer", options, RenderOptions, ("names", "rigid"))
+        check_names("Renderer", options, RenderOptions, own=("names", "rigid"))
         if type(rigid) is not bool:
             raise SceneError("rigid", rigid, "True or False")
         if "params" in options:
@@ -77,15 +77,16 @@ class Renderer(nn.Module):
         self.names = () if names is None else _matching_names(scene, (names,) if isinstance(names, str) else names)
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
-            ranges = [
+            parametrizations = [
                 parametrization_of(scene.spec(name), start, rigid=rigid, length=scene.length)
                 for name, start in zip(self.names, starts, strict=True)
             ]
             free = {
-                _key(name): nn.Parameter(found.inverse(start).clone())
-                for name, found, start in zip(self.names, ranges, starts, strict=True)
+                _key(name): nn.Parameter(parametrization.inverse(start).clone())
+                for name, parametrization, start in zip(self.names, parametrizations, starts, strict=True)
             }
-        self.ranges, self.free = nn.ModuleList(ranges), nn.ParameterDict(free)
+        # `ranges` and `free` begin keys of saved states: their names stay.
+        self.ranges, self.free = nn.ModuleList(parametrizations), nn.ParameterDict(free)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
     @expand_signature
@@ -110,14 +111,17 @@ class Renderer(nn.Module):
         """
         all_options: BatchOptions = {**self.options, **options}
         if seed is None:
-            seed = self._next_seed(all_options.get("ranks") is not None)
+            seed = self._next_seed(shares_picture=all_options.get("ranks") is not None)
         full = self.full if full is None else full
         return render(self.scene, params={**self.values(), **(params or {})}, seed=seed, full=full, **all_options)
 
     def values(self) -> dict[str, Tensor]:
         """Return the parameters in their ranges by dotted name, for ``torchpt.render(params=...)``; gradients flow."""
         with torch.autocast(self.steps.device.type, enabled=False):  # half precision would move poses
-            return {name: found(self.free[_key(name)]) for name, found in zip(self.names, self.ranges, strict=True)}
+            free = [self.free[_key(name)] for name in self.names]
+            return {
+                name: parametrization(x) for name, parametrization, x in zip(self.names, self.ranges, free, strict=True)
+            }
 
     @torch.no_grad()
     def assign(self, values: Mapping[str, Tensor]) -> None:
@@ -130,14 +134,14 @@ class Renderer(nn.Module):
             if name not in self.names:
                 raise SceneError(f"params.{name}", name, f"one of {', '.join(self.names)}")
         self.scene.check({**self.values(), **values})
-        found: dict[str, Tensor] = {}
+        new: dict[str, Tensor] = {}
         for name, value in values.items():
             try:
-                found[name] = self.ranges[self.names.index(name)].inverse(value.to(self.free[_key(name)]))  # pyright: ignore[reportCallIssue]
+                new[name] = self.ranges[self.names.index(name)].inverse(value.to(self.free[_key(name)]))  # pyright: ignore[reportCallIssue]
             except ValueError:
                 expected = "the pose at first, turned and moved (rigid=False takes any)"
                 raise SceneError(f"params.{name}", value.tolist(), expected) from None
-        for name, value in found.items():
+        for name, value in new.items():
             self.free[_key(name)].copy_(value)
 
     @torch.no_grad()
@@ -146,7 +150,8 @@ class Renderer(nn.Module):
         for name, value in self.values().items():
             self.scene.params[name] = value.detach().clone()
 
-    def _next_seed(self, shares_picture: bool) -> int:
+    def _next_seed(self, *, shares_picture: bool) -> int:
+        """Return the seed of the next call, and count it in training mode; ``shares_picture``: all ranks render one picture."""
         if not self.training:
             return self.seed
         rank, world = 0, 1
