@@ -35,11 +35,11 @@ tree.probability.register(Lanewise(tree.probability.function, ("row", "x", "n"),
 hashing.reverse_bits.register(bits.reverse_bits)
 
 
-def _times_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Any:
+def _times_opacity_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Any:
     if not tracing():
         return NotImplemented
     # Every lane of a kernel takes the same steps, so the texture is read in all lanes and selected by the mask.
     return torch.where(textured, opacity * opacity_map(world, interact(world, o, d, hit)), opacity)
 
 
-transmission.times_map.register(_times_map)
+transmission.times_opacity_map.register(_times_opacity_map)

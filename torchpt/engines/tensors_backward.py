@@ -152,16 +152,16 @@ class TensorsBackward(TensorsEngine):
                 self._under_tape.transmittance(splat.light) if self.tape.differentiates_opacity else take(kept, turn)
             )
             assert self._cotangent is not None
-            return adjoint.splatted(self.wave.integrator.clamp, self._cotangent, splat, through)
+            return adjoint.splat_contributions(self.wave.integrator.clamp, self._cotangent, splat, through)
 
         with recording_gathers(self.sums):
             context = self._at(depth, lane, self.wave.integrator.limits.roulette(depth))
             vertex = VertexInput(rows(state, index), rows(hit, index))
             stage = self.wave.integrator.bounce
-            input_cotangents = adjoint.bounce(
+            input_cotangents = adjoint.bounce_vjp(
                 stage, context, model, vertex, next_hit, passed, cotangents, self._tables, landed
             )
-        for name, found, like in input_cotangents.of_rays(vertex.state, self.plan.attached):
+        for name, found, like in input_cotangents.of_rays(vertex.state, attached=self.plan.attached):
             self._ray_cotangents[name].index_copy_(-1, lane, torch.zeros_like(like) if found is None else found)
         self.sums.add_each(input_cotangents.extra_leaves)
         if chance_cotangent is not None and input_cotangents.chance is not None:
@@ -190,10 +190,10 @@ class TensorsBackward(TensorsEngine):
         lane = take(state.lane, index)
         vertex = VertexInput(rows(state, index), rows(hit, index))
         with recording_gathers(self.sums):
-            input_cotangents = adjoint.gather(
+            input_cotangents = adjoint.emission_vjp(
                 stage, self._at(depth, lane), vertex, take(self._radiance_cotangent, lane), self._tables
             )
-        for name, found, _ in input_cotangents.of_rays(vertex.state, self.plan.attached):
+        for name, found, _ in input_cotangents.of_rays(vertex.state, attached=self.plan.attached):
             if found is not None:
                 cotangents = self._ray_cotangents[name]
                 cotangents.index_copy_(-1, lane, take(cotangents, lane) + found)

@@ -100,7 +100,7 @@ class _RecordedGathers:
 
 
 def bounce_vjp(trace: Trace, model: int, roulette: float, follow_ray: bool) -> Sinks:
-    """See :func:`torchpt.paths.adjoint.bounce`."""
+    """See :func:`torchpt.paths.adjoint.bounce_vjp`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
     state, hit, rows = _inputs(trace)
@@ -114,20 +114,20 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_ray: bool) -> S
     integrator, cotangent = trace.layout.wave.integrator, kernels.cotangent
 
     def landed(splat: Splat) -> tuple[Tensor, Tensor]:
-        return adjoint.splatted(integrator.clamp, cotangent, splat, rows["splat_transmittance"])
+        return adjoint.splat_contributions(integrator.clamp, cotangent, splat, rows["splat_transmittance"])
 
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
         context = kernels.taped.at(salts, follow_ray, roulette)
         vertex = VertexInput(state, hit)
-        input_cotangents = adjoint.bounce(
+        input_cotangents = adjoint.bounce_vjp(
             integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, gathers.leaves, landed
         )
     return _stores(trace, gathers, state, input_cotangents, {})
 
 
 def emit_vjp(trace: Trace, follow_ray: bool) -> Sinks:
-    """See :func:`torchpt.paths.adjoint.gather`."""
+    """See :func:`torchpt.paths.adjoint.emission_vjp`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
     state, hit, rows = _inputs(trace)
@@ -135,19 +135,21 @@ def emit_vjp(trace: Trace, follow_ray: bool) -> Sinks:
     with tracer, recording_gathers(gathers):
         context = kernels.taped.at(salts, follow_ray)
         stage, vertex = trace.layout.wave.integrator.emit, VertexInput(state, hit)
-        input_cotangents = adjoint.gather(stage, context, vertex, rows["radiance"], gathers.leaves)
+        input_cotangents = adjoint.emission_vjp(stage, context, vertex, rows["radiance"], gathers.leaves)
     return _stores(trace, gathers, state, input_cotangents, rows)
 
 
 def escape_vjp(trace: Trace) -> Sinks:
-    """See :func:`torchpt.paths.adjoint.gather`."""
+    """See :func:`torchpt.paths.adjoint.emission_vjp`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
     state, hit, rows = _inputs(trace)
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
         stage, vertex = trace.layout.wave.integrator.escape, VertexInput(state, hit)
-        input_cotangents = adjoint.gather(stage, kernels.taped.at(salts), vertex, rows["radiance"], gathers.leaves)
+        input_cotangents = adjoint.emission_vjp(
+            stage, kernels.taped.at(salts), vertex, rows["radiance"], gathers.leaves
+        )
     return _stores(trace, gathers, state, input_cotangents, rows)
 
 
@@ -199,7 +201,7 @@ def _stores(
     tracer, graph = trace.tracer, trace.tracer.graph
     fields: dict[str, Tensor] = {}
     with tracer:
-        for name, found, like in input_cotangents.of_rays(state, kernels.taped.plan.attached):
+        for name, found, like in input_cotangents.of_rays(state, attached=kernels.taped.plan.attached):
             if found is None and added:
                 continue
             found = torch.zeros_like(like) if found is None else found
@@ -453,7 +455,7 @@ class KernelsBackward(KernelsEngine):
 
         def landed(splat: Splat) -> tuple[Tensor, Tensor]:
             assert kernels.cotangent is not None
-            return adjoint.splatted(integrator.clamp, kernels.cotangent, splat, rows["splat_transmittance"])
+            return adjoint.splat_contributions(integrator.clamp, kernels.cotangent, splat, rows["splat_transmittance"])
 
         input_cotangents: InputCotangents
         with recording_gathers(self.sums):
@@ -463,15 +465,15 @@ class KernelsBackward(KernelsEngine):
                 next_hit = Hit(*(rows[name] for name in HIT)) if plan.attached else None
                 _, model, roulette, follow_ray = key
                 context = kernels.taped.at(salt, follow_ray, roulette)
-                input_cotangents = adjoint.bounce(
+                input_cotangents = adjoint.bounce_vjp(
                     integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, self._tables, landed
                 )
             else:
                 stage = integrator.emit if key[0] == "emit" else integrator.escape
-                input_cotangents = adjoint.gather(
+                input_cotangents = adjoint.emission_vjp(
                     stage, kernels.taped.at(salt, *key[1:]), vertex, rows["radiance"], self._tables
                 )
-        for name, found, like in input_cotangents.of_rays(state, plan.attached):
+        for name, found, like in input_cotangents.of_rays(state, attached=plan.attached):
             first = kernels.slots.first(name)
             values = np.zeros(like.shape, np.float32) if found is None else found.numpy()
             values = values.reshape(-1, count)
