@@ -143,7 +143,7 @@ FAULTS = (
         "physics/lights/choice.py",
         "lights integrators",
         "_local_probability",
-        "p * (1.0 - share)",
+        "p * (1.0 - p_uniform)",
         "p",
         "scenes of 3 to 64 lamps are too dark: probabilities of lights sum to more than 1",
     ),

@@ -99,7 +99,7 @@ def test_poses_of_cameras(given: dict[str, Any]) -> None:
 
 def test_calibrations() -> None:
     inner = np.array([[70.0, 0, 29.5], [0, 55.0, 27.25], [0, 0, 1]])
-    expected = opencv.angles(inner, (64, 48))
-    found = opencv.numbers_of(of_tensors(inner), (64, 48))
+    expected = opencv.parameters_of_k(inner, (64, 48))
+    found = opencv.numbers_of_k(of_tensors(inner), (64, 48))
     assert {**found, "fov_axis": "x"} == pytest.approx(expected)
     assert found.keys() | {"fov_axis"} == expected.keys()

@@ -14,7 +14,8 @@ from torchpt.core.dispatch import dispatched
 
 __all__ = ["HALVES", "as_int32", "logical_shift", "mix", "mix_int", "reverse_bits", "to_unit"]
 
-#: Steps of the reversal of 32 bits: a shift, and the mask of the bits that it swaps with higher ones.
+#: Pairs of a shift and a mask, from 1 to 16: groups of ``shift`` bits, of which every second one, the lower of two, is in the
+#: mask. Swapping the groups of each pair, for all shifts, reverses 32 bits.
 HALVES = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
 #: Multipliers of ``mix``; the second as a signed 32-bit value.
 _MULTIPLIER_0, _MULTIPLIER_1 = 0x7FEB352D, 0x846CA68B - (1 << 32)

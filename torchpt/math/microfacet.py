@@ -18,6 +18,7 @@ __all__ = [
     "INDEX_MATCHED",
     "Interface",
     "Reflection",
+    "clamp_alpha",
     "coat_reflectance",
     "coat_transmittance",
     "diffuse_transmittance",
@@ -32,7 +33,6 @@ __all__ = [
     "reflect",
     "reflection",
     "refract",
-    "roughness",
     "sample_normal",
     "schlick",
     "stretched_length",
@@ -71,15 +71,16 @@ def fresnel_dielectric(cos_i: Tensor, eta: Tensor, sin2_i: Tensor | None = None)
     c = cos_i.abs()
     sin2 = (1.0 - c) * (1.0 + c) if sin2_i is None else sin2_i
     cos2_t = 1.0 - eta_ti * eta_ti * sin2
-    open_ = (cos2_t > 0) & (c > 0)
+    open_ = (cos2_t > 0) & (c > 0)  # light passes: no total internal reflection, and not grazing
     # Safe inputs for the square root and the quotients below, so that gradients stay finite.
     t = torch.where(open_, cos2_t, 1.0).sqrt()
     i = torch.where(open_, c, 1.0)
+    # Amplitudes of light polarized perpendicular (s) and parallel (p) to the plane of incidence.
     s = (i - eta_it * t) / (i + eta_it * t)
     p = (t - eta_it * i) / (t + eta_it * i)
     r = torch.where(matched, 0.0, torch.where(open_, 0.5 * (s * s + p * p), 1.0))
     t = torch.where(matched, c, torch.where(open_, t, 0.0))
-    return Interface(r, torch.where(above, -t, t), eta_it, eta_ti)
+    return Interface(reflectance=r, cos_t=torch.where(above, -t, t), eta_it=eta_it, eta_ti=eta_ti)
 
 
 def refract(w: Tensor, m: Tensor, cos_i: Tensor, boundary: Interface) -> Tensor:
@@ -104,15 +105,17 @@ def fresnel_conductor(cos_i: Tensor, eta: Tensor, k: Tensor) -> Tensor:
     """
     cos2 = cos_i * cos_i
     sin2 = 1.0 - cos2
+    # The complex number (eta - i k)^2 - sin^2, whose root is a - i b: real part, imaginary part (negated), modulus a^2 + b^2.
     real = eta * eta - k * k - sin2
-    twice = 2.0 * eta * k
+    imaginary = 2.0 * eta * k
     tiny = torch.finfo(real.dtype).tiny
-    ab2 = (real * real + twice * twice).clamp_min(tiny).sqrt()
+    ab2 = (real * real + imaginary * imaginary).clamp_min(tiny).sqrt()
     a = (0.5 * (ab2 + real)).clamp_min(tiny).sqrt()
-    one, two = ab2 + cos2, 2.0 * cos_i * a
-    s = (one - two) / (one + two).clamp_min(tiny)
-    three, four = ab2 * cos2 + sin2 * sin2, two * sin2
-    p = s * (three - four) / (three + four).clamp_min(tiny)
+    # Reflectances Rs and Rp: quotients of a sum and a difference of the same two terms.
+    s_sum, s_cross = ab2 + cos2, 2.0 * cos_i * a
+    s = (s_sum - s_cross) / (s_sum + s_cross).clamp_min(tiny)
+    p_sum, p_cross = ab2 * cos2 + sin2 * sin2, s_cross * sin2
+    p = s * (p_sum - p_cross) / (p_sum + p_cross).clamp_min(tiny)
     # If the metal's index is that of air, the result is rounding error of either sign.
     return (0.5 * (s + p)).clamp_min(0.0)
 
@@ -133,7 +136,7 @@ def diffuse_transmittance(eta: Tensor) -> Tensor:
     """
     x = torch.where(eta < 1.0, eta, 1.0 / eta)
     fit = 5.3340758 + x * (1.9806515 + x * (-9.3608694 + x * (4.8516145 + x * (-2.5113928 + x * 0.7059204))))
-    passed = x * (fit + 8.0130667 * x * torch.log(x))
+    passed = x * (fit + 8.0130667 * x * torch.log(x))  # T(x)
     return torch.where(eta < 1.0, x * x * passed, passed)
 
 
@@ -158,7 +161,7 @@ def is_smooth(alpha: Tensor) -> Tensor:
     return alpha < 0.99 * ALPHA_MIN
 
 
-def roughness(alpha: Tensor) -> Tensor:
+def clamp_alpha(alpha: Tensor) -> Tensor:
     """Clamp a roughness to at least :data:`ALPHA_MIN`, as the formulas here need."""
     return alpha.clamp_min(ALPHA_MIN)
 
@@ -219,7 +222,7 @@ def _bound(wo: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> _Bound:
     s = 1.0 + torch.addcmul(wo[0] * wo[0], wo[1], wo[1]).clamp_min(torch.finfo(wo.dtype).tiny).sqrt()
     s2, z2 = s * s, wo[2] * wo[2]
     inverse = 1.0 / (s2 + a2 * z2)
-    return _Bound((1.0 - a2) * s2 * inverse, a2 * (s2 + z2) * inverse)
+    return _Bound(k=(1.0 - a2) * s2 * inverse, rest=a2 * (s2 + z2) * inverse)
 
 
 def sample_normal(wo: Tensor, alpha_u: Tensor, alpha_v: Tensor, u: Tensor, bounded: bool = False) -> Tensor:
@@ -231,23 +234,24 @@ def sample_normal(wo: Tensor, alpha_u: Tensor, alpha_v: Tensor, u: Tensor, bound
 
     Args:
         wo: ``(3, N)``.
-        alpha_u: ``(N,)``.
-        alpha_v: ``(N,)``.
-        u: ``(2, N)``.
+        alpha_u: roughness along x ``(N,)``.
+        alpha_v: roughness along y ``(N,)``.
+        u: ``(2, N)`` in [0, 1).
         bounded: avoid (most of) the normals that reflect ``wo`` below the surface.
     """
     x, y = wo[0] * alpha_u, wo[1] * alpha_v
-    l2 = torch.addcmul(x * x, y, y)
+    l2 = torch.addcmul(x * x, y, y)  # squared horizontal length of the stretched direction
     length = torch.addcmul(l2, wo[2], wo[2]).sqrt().clamp_min(torch.finfo(wo.dtype).tiny)
     inverse = 1.0 / length
     z = wo[2] * inverse  # of the stretched direction
     down = l2 * inverse / (length + wo[2])  # 1 - z
+    # The lower rim of the cap lies at -low: at -z, or bounded, higher up by `lift`.
     low, lift = z, 0.0
     if bounded:
         bound = _bound(wo, alpha_u, alpha_v)
         low, lift = bound.k * z, bound.rest * z
         down = down + lift
-    height = (1.0 - u[1]) * (1.0 + low)
+    height = (1.0 - u[1]) * (1.0 + low)  # of the drawn direction above the lower rim of the cap
     sine = ((height + down) * (u[1] * (1.0 + low))).clamp_min(0.0).sqrt()
     phi = (2.0 * math.pi) * u[0]
     nx = torch.addcmul(x * inverse, sine, torch.cos(phi)) * alpha_u
@@ -272,8 +276,8 @@ def reflection(
     Args:
         wo: ``(3, N)``.
         wi: ``(3, N)``.
-        alpha_u: ``(N,)``.
-        alpha_v: ``(N,)``.
+        alpha_u: roughness along x ``(N,)``.
+        alpha_v: roughness along y ``(N,)``.
         bounded: as for :func:`sample_normal`.
         by_height: masking and shadowing correlated by height, rather than the product ``G1(wo) G1(wi)``.
     """
@@ -285,7 +289,7 @@ def reflection(
     shadowing = height_correlated_masking(cos_o, s_o, cos_i, s_i) if by_height else masking(cos_i, s_i)
     value = 0.5 * d / (cos_o + s_o) * shadowing
     scaled = _bound(wo, alpha_u, alpha_v).k * cos_o if bounded else cos_o
-    return Reflection(m, dot(wo, m), value, 0.5 * d / (scaled + s_o))
+    return Reflection(m=m, cos_m=dot(wo, m), value=value, pdf=0.5 * d / (scaled + s_o))
 
 
 def _legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -322,21 +326,22 @@ def directional_albedo(
         azimuths: number of Gauss-Legendre nodes.
         heights: number of Gauss-Legendre nodes.
     """
-    (a, wa), (b, wb) = _legendre(azimuths), _legendre(heights)
+    (a, wa), (b, wb) = _legendre(azimuths), _legendre(heights)  # nodes and weights of u[0] and of u[1]
     u = wo.new_tensor(np.stack(np.meshgrid(a if alpha_v is not None else 0.5 * a, b, indexing="ij")).reshape(2, -1))
-    k, q = wo.shape[1], azimuths * heights
+    k, q = wo.shape[1], azimuths * heights  # directions, and nodes for each
     wo = wo.repeat_interleave(q, 1)
     au = alpha_u.expand(k * q)
     av = au if alpha_v is None else alpha_v.expand(k * q)
     m = sample_normal(wo, au, av, u.repeat(1, k), bounded=eta is None)
     cos, s_o = dot(wo, m), stretched_length(wo, au, av)
-    back = reflect(wo, m, cos)
+    back = reflect(wo, m, cos)  # the reflected direction
     out = height_correlated_masking(wo[2], s_o, back[2].clamp_min(0.0), stretched_length(back, au, av))
     if eta is None:
+        # Bounded sampling has another density; this is the ratio of both.
         out = out * (_bound(wo, au, av).k * wo[2] + s_o) / (wo[2] + s_o)
     else:
         boundary = fresnel_dielectric(cos, eta)
-        on = normalize(refract(wo, m, cos, boundary))
+        on = normalize(refract(wo, m, cos, boundary))  # the refracted direction
         through = height_correlated_masking(wo[2], s_o, (-on[2]).clamp_min(0.0), stretched_length(on, au, av))
         out = boundary.reflectance * out + (1.0 - boundary.reflectance) * through
     return (out.reshape(k, q) * wo.new_tensor(np.outer(wa, wb).ravel())).sum(1)
@@ -350,11 +355,11 @@ def _lanes(cosines: Tensor, alpha: Tensor, n: int) -> tuple[Tensor, Tensor]:
 
 def _cap_normals(cosines: Tensor, alpha: Tensor, azimuths: int = 32, heights: int = 32) -> _Normals:
     """Sample normals by :func:`sample_normal` at Gauss-Legendre nodes; by symmetry half the azimuths suffice."""
-    (a, wa), (b, wb) = _legendre(azimuths), _legendre(heights)
+    (a, wa), (b, wb) = _legendre(azimuths), _legendre(heights)  # nodes and weights of u[0] and of u[1]
     u = cosines.new_tensor(np.stack(np.meshgrid(0.5 * a, b, indexing="ij")).reshape(2, -1))
     wo, alphas = _lanes(cosines, alpha, u.shape[1])
     m = sample_normal(wo, alphas, alphas, u.repeat(1, len(cosines)))
-    return _Normals(wo, m, alphas, cosines.new_tensor(np.outer(wa, wb).ravel()))
+    return _Normals(wo=wo, m=m, alpha=alphas, weights=cosines.new_tensor(np.outer(wa, wb).ravel()))
 
 
 def _disk_normals(cosines: Tensor, alpha: Tensor, n: int = 32) -> _Normals:
@@ -373,7 +378,8 @@ def _disk_normals(cosines: Tensor, alpha: Tensor, n: int = 32) -> _Normals:
     z = (1.0 - x * x - y * y).clamp_min(1e-12).sqrt()
     along, up = stretched[0] * z - stretched[2] * y, stretched[0] * y + stretched[2] * z
     m = normalize(torch.stack((alphas * along, -alphas * x, up)))
-    return _Normals(wo, m, alphas, cosines.new_tensor(2.0 * np.outer(wa[:half], wb).ravel()))
+    weights = cosines.new_tensor(2.0 * np.outer(wa[:half], wb).ravel())  # 2: for the other half of the disk
+    return _Normals(wo=wo, m=m, alpha=alphas, weights=weights)
 
 
 def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor) -> Tensor:
@@ -384,11 +390,11 @@ def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor) -> Tensor:
         alpha: ``(1,)``.
         eta: ``(1,)`` index of the far side over that of the side of ``wo``.
     """
-    over = _cap_normals(cosines, alpha)
-    cos = dot(over.wo, over.m)
-    wi = reflect(over.wo, over.m, cos)
-    seen = masking(wi[2].clamp_min(0.0), stretched_length(wi, over.alpha, over.alpha))
-    return over.mean(fresnel_dielectric(cos, eta).reflectance * seen)
+    nodes = _cap_normals(cosines, alpha)
+    cos = dot(nodes.wo, nodes.m)
+    wi = reflect(nodes.wo, nodes.m, cos)
+    seen = masking(wi[2].clamp_min(0.0), stretched_length(wi, nodes.alpha, nodes.alpha))
+    return nodes.mean(fresnel_dielectric(cos, eta).reflectance * seen)
 
 
 def coat_transmittance(cosines: Tensor, alpha: Tensor, eta: Tensor) -> Tensor:
@@ -396,9 +402,9 @@ def coat_transmittance(cosines: Tensor, alpha: Tensor, eta: Tensor) -> Tensor:
 
     At the 32 x 32 nodes of Mitsuba: their error of up to 4e-4 is 1 % of a coat's small reflectance, and shows in comparisons.
     """
-    over = _disk_normals(cosines, alpha)
-    cos = dot(over.wo, over.m)
+    nodes = _disk_normals(cosines, alpha)
+    cos = dot(nodes.wo, nodes.m)
     side = fresnel_dielectric(cos, eta)
-    wi = normalize(refract(over.wo, over.m, cos, side))
-    seen = masking((-wi[2]).clamp_min(0.0), stretched_length(wi, over.alpha, over.alpha))
-    return over.mean((1.0 - side.reflectance) * seen)
+    wi = normalize(refract(nodes.wo, nodes.m, cos, side))
+    seen = masking((-wi[2]).clamp_min(0.0), stretched_length(wi, nodes.alpha, nodes.alpha))
+    return nodes.mean((1.0 - side.reflectance) * seen)

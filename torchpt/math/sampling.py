@@ -52,7 +52,7 @@ def concentric_disk(u: Tensor) -> Tensor:
 
 def _concentric(u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return ``wide``, the concentric map's signed radius, and its angle: from +x if ``wide``, else from +y (mirrored)."""
-    a, b = 2.0 * u[0] - 1.0, 2.0 * u[1] - 1.0
+    a, b = 2.0 * u[0] - 1.0, 2.0 * u[1] - 1.0  # in the square [-1, 1]^2
     wide = a.abs() > b.abs()
     r = torch.where(wide, a, b)
     # The quotient is 0/0 only at the centre, where r = 0 makes the angle irrelevant.
@@ -70,13 +70,14 @@ def uniform_polygon(u: Tensor, sides: int) -> Tensor:
     # Anticlockwise from the upper corner: half a turn on where the radius is negative, a quarter back from the x axis.
     turn = phi * (0.5 / math.pi)
     turn = torch.where(wide, turn - 0.25, -turn) + torch.where(r < 0, 0.5, 0.0)
-    place = turn * sides
-    edge = torch.floor(place)
-    middle = (edge + 0.5) * (2.0 * math.pi / sides)
+    position = turn * sides  # in edges from the upper corner, anticlockwise
+    edge = torch.floor(position)
+    middle = (edge + 0.5) * (2.0 * math.pi / sides)  # angle of the edge's middle from +y
     c, s = torch.cos(middle), torch.sin(middle)
+    # Of the point: across the edge (outward from the centre) and along it.
     size = r.abs()
     out = size * math.cos(math.pi / sides)
-    along = size * (2.0 * (place - edge) - 1.0) * math.sin(math.pi / sides)
+    along = size * (2.0 * (position - edge) - 1.0) * math.sin(math.pi / sides)
     return torch.stack((-s * out - c * along, c * out - s * along))
 
 
@@ -159,7 +160,7 @@ class Distribution1D:
         # 1 from the last possible outcome on, so that rounding never draws an impossible one.
         last = int((w > 0).nonzero().max())
         cdf[last:] = 1.0
-        return Distribution1D(cdf, w.to(dtype))
+        return Distribution1D(cdf=cdf, pmf=w.to(dtype))
 
     def draw(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Draw outcomes ``(N,)`` int64 by ``u (N,)`` in ``[0, 1]``; return them and remapped ``u``, float64 in ``[0, 1]``.
@@ -193,16 +194,18 @@ class Distribution2D:
     def of(weights: Tensor) -> Distribution2D:
         """Build the distribution of non-negative weights ``(R, C)``, at least one of them positive."""
         w = weights.detach().double()
-        number = w.shape[0]
-        along = torch.cumsum(w, 1)
+        num_rows = w.shape[0]
+        along = torch.cumsum(w, 1)  # (R, C) over the columns of each row
         total = along[:, -1:]
         # A row without weight is never drawn.
         along = torch.where(total > 0, along / torch.where(total > 0, total, 1.0), 1.0)
-        along += torch.arange(number, dtype=w.dtype, device=w.device)[:, None]
+        along += torch.arange(num_rows, dtype=w.dtype, device=w.device)[:, None]
         down = torch.cumsum(total[:, 0], 0)
         zero = down.new_zeros(1)
         width = torch.tensor(w.shape[1], dtype=torch.int64, device=w.device)
-        return Distribution2D(torch.cat((zero, down / down[-1])), torch.cat((zero, along.reshape(-1))), width)
+        return Distribution2D(
+            rows=torch.cat((zero, down / down[-1])), columns=torch.cat((zero, along.reshape(-1))), width=width
+        )
 
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Draw rows and columns ``(N,)`` int64 by ``u (2, N)`` in ``[0, 1)``; return them and remapped ``u``.
@@ -232,5 +235,6 @@ def invert_linear(u: Tensor, a: Tensor, b: Tensor) -> Tensor:
     largest = torch.maximum(a, b)
     scale = torch.where(largest > 0, largest, 1.0)
     a, b = a / scale, b / scale
+    # x = u (a + b) / (a + sqrt(a^2 + u (b^2 - a^2))).
     bottom = a + torch.addcmul(a * a, b * b - a * a, u).clamp_min(0.0).sqrt()
     return (u * (a + b) / torch.where(bottom > 0, bottom, 1.0)).clamp_max(1.0)

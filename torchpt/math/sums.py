@@ -16,9 +16,9 @@ sample is in memory at this vertex. The terms of a look-up are added to an entry
 - one after the other, in all other tables.
 
 The first suits a GPU's warp, with one thread a column; the second can be done by a stable sort by entry and one thread an
-entry: the bits are the same. Sums are float64, in tables of more than :data:`MAX_FLOAT64` numbers of the lanes' precision.
-    Chunks
-are added in their order: the chunk's sums in tables of up to :data:`MAX_DENSE` numbers, its terms one by one in larger ones.
+entry: the bits are the same. Sums are float64; in tables of more than :data:`MAX_FLOAT64` numbers they have the lanes'
+precision. Chunks are added in their order: the chunk's sums in tables of up to :data:`MAX_DENSE` numbers, its terms one by one
+in larger ones.
 
 A stage that runs by tensor operations has no slots: the number of a term is used instead. If all of a chunk runs by tensor
 operations, the terms of a look-up are added one after the other on a CPU; on other devices they are sorted by entry, and the
@@ -64,7 +64,8 @@ class _TableSums(ABC):
     def take(self, table: Tensor, index: Tensor) -> Tensor | None:
         """Return columns ``index (N,)`` of a table, whose derivative adds to the sums; None for a table that is not among them.
 
-        This makes sums a :class:`torchpt.math.gathers.GatherRecorder`.
+        This makes sums a :class:`torchpt.math.gathers.GatherRecorder`: inside ``recording_gathers(sums)`` every look-up by
+        :func:`torchpt.math.vectors.take` on the thread comes here first.
         """
         number = self._number_by_id.get(id(table))
         return None if number is None else _LookUp.apply(table, index, self, number)

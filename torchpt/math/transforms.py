@@ -45,12 +45,12 @@ Matrix = NDArray[np.float64]
 Array = Any
 Device = torch.device | None
 
-#: Text of errors about a matrix that is not usable.
+#: Words of errors about a matrix that is not usable: they follow a phrase such as "a matrix that can be inverted".
 FINITE_WORDS = "it and its inverse finite in float32 (up to 3.4e38)"
 
-_SINGULAR = 1e-12  # smallest singular value over the largest; float64 products of a few matrices stay near 1e-15
+_SINGULAR = 1e-12  # smallest singular value over the largest; rounding of a few float64 products stays near 1e-15
 _LARGEST = float(np.finfo(np.float32).max)
-_PARALLEL = 1e-6  # sine of the angle between up and the viewing direction
+_PARALLEL = 1e-6  # up to this sine of their angle, up and the viewing direction count as parallel
 
 
 def tensor_of(value: Any, device: torch.device) -> Tensor:
@@ -69,7 +69,7 @@ def constant(values: Any, like: Array) -> Array:
 
 def affine(linear: Array, origin: Array) -> Array:
     """Return the ``(4, 4)`` matrix of a linear part ``(3, 3)`` and a translation ``(3,)``, both arrays or both tensors."""
-    xp = _library(linear)
+    xp = _library(linear)  # numpy or torch
     rows = xp.concatenate((linear, origin[:, None]), 1)
     return xp.concatenate((rows, constant([[0.0, 0.0, 0.0, 1.0]], linear)), 0)
 
@@ -93,20 +93,21 @@ def _unit(vector: Array) -> Array:
     return scaled / _library(vector).linalg.norm(scaled)
 
 
-def _number(value: Any) -> bool:
+def _is_number(value: Any) -> bool:
+    """Return True for a number of Python or numpy; a bool is none."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
 def _vector(
     value: Any, key: str, device: Device, expected: str = "three finite numbers [x, y, z]", spread: bool = False
 ) -> Array:
-    """Return three numbers; with ``spread`` one number stands for all three."""
+    """Return three numbers; with ``spread`` one stands for all three. ``key`` and ``expected`` are words of the error."""
     if device is not None:
         return tensor_of(value, device).expand(3)
-    items = [value] * 3 if spread and _number(value) else value
+    items = [value] * 3 if spread and _is_number(value) else value
     if not isinstance(items, Sequence | np.ndarray) or isinstance(items, str) or len(items) != 3:
         raise SceneError(key, value, expected)
-    if not all(_number(item) for item in items):
+    if not all(_is_number(item) for item in items):
         raise SceneError(key, value, expected)
     vector = np.array([_float(item) for item in items])
     if not np.isfinite(vector).all():
@@ -115,6 +116,7 @@ def _vector(
 
 
 def _float(value: Any) -> float:
+    """Return a number as a float, inf for an integer beyond float64."""
     try:
         return float(value)
     except OverflowError:
@@ -200,7 +202,7 @@ def rotate(argument: Any, key: str = "rotate", device: Device = None) -> Array:
     angle = argument["angle"]
     if device is not None:
         angle = tensor_of(angle, device)
-    elif not _number(angle) or not np.isfinite(_float(angle)):
+    elif not _is_number(angle) or not np.isfinite(_float(angle)):
         raise SceneError(f"{key}.angle", angle, "a finite number of degrees")
     else:
         angle = _float(angle)
@@ -223,7 +225,7 @@ def matrix4(rows: Any, key: str = "matrix", device: Device = None) -> Array:
         entries = [list(row) for row in rows]
     except TypeError:
         raise SceneError(key, rows, expected) from None
-    if len(entries) != 4 or any(len(row) != 4 or not all(_number(item) for item in row) for row in entries):
+    if len(entries) != 4 or any(len(row) != 4 or not all(_is_number(item) for item in row) for row in entries):
         raise SceneError(key, rows, expected)
     matrix = np.array([[_float(item) for item in row] for row in entries])
     if not np.isfinite(matrix).all() or not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
@@ -235,6 +237,8 @@ def matrix4(rows: Any, key: str = "matrix", device: Device = None) -> Array:
 
 def look_at(origin: Any, target: Any, up: Any = (0.0, 1.0, 0.0), key: str = "look_at", device: Device = None) -> Array:
     """Return the frame at ``origin`` whose +z points to ``target``, with ``up`` in its yz half-plane (as Mitsuba's look_at).
+
+    Errors name ``key.target`` or the like; with an empty ``key``, ``target``.
 
     Raises:
         SceneError: ``target`` coincides with ``origin``, or ``up`` is zero or parallel to the viewing direction.
@@ -256,6 +260,7 @@ def look_at(origin: Any, target: Any, up: Any = (0.0, 1.0, 0.0), key: str = "loo
 
 
 def _look_at_operation(argument: Any, key: str, device: Device) -> Array:
+    """Return :func:`look_at` for a mapping of its arguments."""
     _check_keys(argument, ("origin", "target", "up"), key, optional=("up",))
     return look_at(argument["origin"], argument["target"], argument.get("up", (0.0, 1.0, 0.0)), key, device)
 
@@ -299,6 +304,7 @@ def compose(operations: Any, device: Device = None) -> Array:
 
 
 def _check_keys(argument: Any, keys: tuple[str, ...], key: str, optional: tuple[str, ...] = ()) -> None:
+    """Refuse an argument that is no mapping with these keys; ``key`` is its own dotted key, for errors."""
     form = "{" + ", ".join(keys) + "}"
     if not isinstance(argument, Mapping):
         raise SceneError(key, argument, f"a mapping {form}")
@@ -311,4 +317,5 @@ def _check_keys(argument: Any, keys: tuple[str, ...], key: str, optional: tuple[
 
 
 def _join(key: str, name: str) -> str:
+    """Return ``key.name``, or the name alone where the key is empty."""
     return f"{key}.{name}" if key else name

@@ -138,7 +138,7 @@ class Frame:
         """Return the frame about unit normals ``n (3, N)`` with ``s`` nearest to ``tangent (3, N)``; any frame if parallel."""
         s = torch.addcmul(tangent, n, dot(n, tangent), value=-1)
         square, whole = dot(s, s), dot(tangent, tangent)
-        usable = square > 1e-12 * whole
+        usable = square > 1e-12 * whole  # up to a sine of 1e-6 the two count as parallel
         s = torch.where(usable, s / torch.where(usable, square, 1.0).sqrt(), Frame.about(n).s)
         return Frame(s, cross(n, s), n)
 

@@ -28,7 +28,7 @@ class Parameters(dict[str, np.ndarray]):
 
     Attributes:
         specs: the spec of each parameter by name.
-        texels_in_scene: names of texels that the scene gives as arrays, not by an image file.
+        texels_in_scene: names of parameters whose texels are given in the scene, not in an image file.
     """
 
     def __init__(self) -> None:
@@ -71,7 +71,8 @@ class Part:
         emission_names: dotted names of the parameters of radiance and, if it has one, strength.
         flip: whether to flip the normals.
         to_world: ``(4, 4)`` float64.
-        local: ``(4, 4)`` float64 applied before the parameter ``to_world``, which several parts may share, or None.
+        part_to_shape: ``(4, 4)`` float64 from the part's space to the shape's, applied before ``to_world``, which several parts
+            of a shape may share; None: the identity.
         quadric: the surface in object space, for the kind ``quadric``.
         piece: name within the shape, if the shape has several parts of one name.
         vertices: ``(V, 3)`` float64 in the file's own space; None for analytic shapes.
@@ -94,7 +95,7 @@ class Part:
     emission_names: tuple[str, ...]
     flip: bool
     to_world: np.ndarray
-    local: np.ndarray | None = None
+    part_to_shape: np.ndarray | None = None
     quadric: type[Quadric] | None = None
     piece: str = ""
     vertices: np.ndarray | None = None

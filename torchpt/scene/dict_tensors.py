@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError
 from torchpt.math.transforms import tensor_of
-from torchpt.physics.cameras.opencv import DEFAULTS, angles, numbers_of
+from torchpt.physics.cameras.opencv import DEFAULTS, numbers_of_k, parameters_of_k
 from torchpt.physics.cameras.poses import POSES, posed
 from torchpt.physics.shapes.base import Place, Size
 from torchpt.scene.build import SceneBuild
@@ -46,8 +46,8 @@ def with_all_intrinsics(description: Description, tensors: DictTensors) -> Descr
     camera = description.camera
     if not any(key[0] == "K" for key in tensors.under("camera")):
         return description
-    # `angles` leaves out the parameters that `K` gives their default values, which are None then and no parameters.
-    values = {**camera.values, **angles(camera["K"], camera["size"])}
+    # `parameters_of_k` leaves out the parameters that `K` gives their default values, which are None then and no parameters.
+    values = {**camera.values, **parameters_of_k(camera["K"], camera["size"])}
     values |= {key: default for key, default in DEFAULTS.items() if values[key] is None}
     return replace(description, camera=ParsedParams(camera.kind, values, camera.given))
 
@@ -166,7 +166,7 @@ def _camera_params(name: str, scene: _BuiltDict) -> Iterator[tuple[str, Tensor]]
     elif name == "K":
         intrinsics = tensor_of(scene.tensors.at(("camera", "K")), scene.device)
         yield from (
-            (f"camera.{parameter}", value) for parameter, value in numbers_of(intrinsics, camera["size"]).items()
+            (f"camera.{parameter}", value) for parameter, value in numbers_of_k(intrinsics, camera["size"]).items()
         )
     elif name in specs and specs[name].differentiable:
         yield f"camera.{name}", scene.at(("camera", name))

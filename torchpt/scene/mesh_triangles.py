@@ -202,8 +202,7 @@ def _refracting_faces(parts: Sequence[Part], copies: Sequence[Copy]) -> Iterator
     part_by_name = {part.name: part for part in parts}
     for part in parts:
         if any(material.model.refracts for material in part.material.with_inner()):
-            # `local`: where the part lies within its shape, as the cap of a cylinder.
-            pose = part.to_world if part.local is None else part.to_world @ part.local
+            pose = part.to_world if part.part_to_shape is None else part.to_world @ part.part_to_shape
             yield from _faces(part.name, part, pose)
     for copy in copies:
         if copy.of in part_by_name and any(material.model.refracts for material in copy.material.with_inner()):

@@ -133,7 +133,7 @@ class ShapeBuilder:
 
     def _declare_pose(self, stem: str, pose: np.ndarray, surfaces: list[Surface]) -> None:
         """Declare ``STEM.to_world``; some kinds of primitives accept only poses that keep angles."""
-        angles = any(PRIMITIVES[surface.kind].angles for surface in surfaces)
+        angles = any(PRIMITIVES[surface.kind].needs_similarity for surface in surfaces)
         self.parameters.declare(f"{stem}.to_world", pose, Pose(angles=angles))
 
     def _meshes(self, entry: ShapeEntry, triangles: Triangles) -> list[Part]:
@@ -231,7 +231,7 @@ class ShapeBuilder:
             emission_texture=texture,
             flip=entry.shape["flip_normals"],
             to_world=pose,
-            local=surface.local,
+            part_to_shape=surface.local,
             quadric=surface.quadric,
             piece=surface.label,
         )

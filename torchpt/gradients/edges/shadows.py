@@ -30,7 +30,7 @@ from torchpt.math.vectors import cross, dot, largest, luminance, rows, take
 from torchpt.paths.roulette import russian_roulette, survival_probability
 from torchpt.paths.vertex import light_radiance
 from torchpt.physics.lights import KINDS, SURFACES, from_digits
-from torchpt.physics.lights.base import Environment, taken
+from torchpt.physics.lights.base import Environment, lane_rows
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.samplers import Dimension, Draws
 from torchpt.physics.shapes import quadrics
@@ -101,7 +101,7 @@ class Sources:
             mine = self._of(k, row).nonzero().squeeze(1)
             if name in SURFACES or not len(mine):
                 continue
-            at = taken(lights, take(row, mine) if len(lights.area) > 1 else None)
+            at = lane_rows(lights, take(row, mine) if len(lights.area) > 1 else None)
             if KINDS[name].distant:
                 drawn = KINDS[name].sample(
                     at, torch.zeros_like(take(e, mine)).to(at.p0), take(u, mine).to(at.p0), False
@@ -137,7 +137,7 @@ class Sources:
             if not len(mine):
                 continue
             part = rows(beam, mine)
-            at = taken(lights, part.row if len(lights.area) > 1 else None)
+            at = lane_rows(lights, part.row if len(lights.area) > 1 else None)
             if name in SURFACES:
                 found[:, mine] = self._shone(name, lights, at, part, take(x, mine))
                 continue

@@ -54,7 +54,8 @@ class Bsdf:
             make the back black (``two_sided``).
         refracts: whether ``sample`` returns ``eta``.
         anisotropic: whether the tangent matters.
-        conserves: whether it reflects no more than it receives, for parameters in their ranges.
+        conserves: whether it reflects no more than it receives, for all parameters in their ranges. Tests read this attribute
+            and the next.
         reciprocal: whether ``f(wo, wi) = f(wi, wo)`` (for refraction: divided by the squared indices).
     """
 
@@ -86,13 +87,13 @@ class Bsdf:
     anisotropic: bool = False
 
     def __init_subclass__(cls, part: bool = False, **kwargs: Any) -> None:
-        """Check that the subclass can be evaluated; with ``part=True`` it is a mixin, not a model."""
+        """Check that the subclass can be evaluated; with ``part=True`` it is a mixin of models, which need not be."""
         super().__init_subclass__(**kwargs)
         if not part and cls.eval_pdf is Bsdf.eval_pdf and (cls.eval is Bsdf.eval or cls.pdf is Bsdf.pdf):
             raise TypeError(f"{cls.__name__} has to define eval_pdf, or eval and pdf")
 
     def has(self, **traits: Any) -> None:
-        """Set attributes of this class that depend on fields of the variant. Called from ``__post_init__``."""
+        """Set attributes, such as ``delta``, that depend on fields of the variant. Called from ``__post_init__``."""
         for name, value in traits.items():
             object.__setattr__(self, name, value)  # variants are frozen dataclasses
 
@@ -187,11 +188,11 @@ class Bsdf:
         raise NotImplementedError
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
-        """Return the material for split-sum shading; by default diffuse with the colour of :meth:`albedo`."""
+        """Return the split-sum material for the integrator ``ibl``; by default diffuse, in the colour of :meth:`albedo`."""
         return diffuse_split_sum(self.albedo(parameters))
 
     def preview(self, parameters: Parameters, shade: Callable[[SplitSumMaterial], Tensor]) -> Tensor:
-        """Return radiance ``(3, N)`` in the preview; ``shade`` computes it for one split-sum material."""
+        """Return radiance ``(3, N)`` for the integrator ``ibl``; ``shade`` computes it for one split-sum material."""
         return shade(self.split_sum(parameters))
 
     def weights(self) -> Iterator[Tensor]:
@@ -217,8 +218,8 @@ def model_and_values(kind: Any, values: Values) -> tuple[Bsdf, dict[str, Any]]:
 
 def diffuse_split_sum(color: Tensor) -> SplitSumMaterial:
     """Return a split-sum material that is diffuse only, of colour ``(3, N)``."""
-    none = torch.zeros_like(color[0])
-    return SplitSumMaterial(color, none, none, torch.ones_like(none), None)
+    zero = torch.zeros_like(color[0])
+    return SplitSumMaterial(diffuse=color, f0=zero, f90=zero, roughness=torch.ones_like(zero), over=None)
 
 
 @dataclass(frozen=True)
@@ -272,7 +273,7 @@ def stacked(prepared: Sequence[Parameters], factors: Sequence[str] = Bsdf.factor
             out[name] = stacked([value or {} for value in column], factors)
         elif isinstance(like, Table):
             values = torch.cat([torch.zeros_like(like.values) if table is None else table.values for table in column])
-            out[name] = Table(values, like.count)
+            out[name] = Table(values, count=like.count)
         else:
             absent = torch.ones_like(like) if name in factors else torch.zeros_like(like)
             out[name] = torch.cat([absent if value is None else value for value in column], -1)

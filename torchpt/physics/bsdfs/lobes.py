@@ -107,7 +107,7 @@ def mixture_sample(
     value, pdf = model.eval_pdf(parameters, wo, wi)
     pdf = pdf.detach() if valid is None else pdf.detach() * valid
     drawn = pdf > 0
-    return BsdfSample(wi, pdf, torch.where(drawn, value / torch.where(drawn, pdf, 1.0), 0.0))
+    return BsdfSample(wi=wi, pdf=pdf, weight=torch.where(drawn, value / torch.where(drawn, pdf, 1.0), 0.0))
 
 
 def with_delta(drawn: BsdfSample, chosen: Tensor, wi: Tensor, weight: Tensor) -> BsdfSample:
@@ -179,10 +179,10 @@ def sample_smooth_interface(parameters: Parameters, wo: Tensor, lobe: Tensor) ->
         tinted(weight_of_choice * side.eta_ti * side.eta_ti, parameters["specular_transmittance"]),
     )
     return BsdfSample(
-        wi,
-        torch.where(wo[2] != 0, math.inf, 0.0).to(wo.dtype),
-        weight,
-        torch.where(reflects, 1.0, side.eta_it).detach(),
+        wi=wi,
+        pdf=torch.where(wo[2] != 0, math.inf, 0.0).to(wo.dtype),
+        weight=weight,
+        eta=torch.where(reflects, 1.0, side.eta_it).detach(),
     )
 
 
@@ -202,7 +202,7 @@ def dielectric_split_sum(parameters: Parameters, roughness: Tensor, f0: Tensor, 
         f0=tinted(f0, reflected),
         f90=tinted(one, reflected),
         roughness=roughness,
-        over=f0,
+        over=f0,  # transmitted light loses what the interface reflects
         through=tinted(one, transmitted),
         eta=eta,
     )
@@ -257,7 +257,13 @@ def coated_split_sum(parameters: Parameters, roughness: Tensor) -> SplitSumMater
     one = torch.ones_like(eta)
     base = parameters["base"] * diffuse_transmittance(eta)
     f0 = reflectance_at_normal(eta)
-    return SplitSumMaterial(diffuse=base, f0=tinted(f0, factor), f90=tinted(one, factor), roughness=roughness, over=f0)
+    return SplitSumMaterial(
+        diffuse=base,
+        f0=tinted(f0, factor),
+        f90=tinted(one, factor),
+        roughness=roughness,
+        over=f0,  # of the coat without its tint: the base loses what the coat reflects
+    )
 
 
 # ---- Phong models: a Lambertian lobe and a power of a cosine
@@ -301,7 +307,13 @@ def phong_split_sum(parameters: Parameters, alpha2: Tensor, peak: Tensor | float
     """
     specular = parameters["specular"] * peak
     roughness = alpha2.clamp(0.0, 1.0).sqrt().sqrt()
-    return SplitSumMaterial(diffuse=parameters["diffuse"], f0=specular, f90=specular, roughness=roughness, over=None)
+    return SplitSumMaterial(
+        diffuse=parameters["diffuse"],
+        f0=specular,
+        f90=specular,
+        roughness=roughness,
+        over=None,  # the lobes are added
+    )
 
 
 # ---- A diffuse base under GGX facets with the approximate masking ``G1(v) = nv / (nv (1 - k) + k)``, ``k = (r + 1)^2 / 8``
@@ -335,7 +347,7 @@ class Glossy(Bsdf):
         return {
             **values,
             "smooth": microfacet.is_smooth(alpha),
-            "alpha": microfacet.roughness(alpha),
+            "alpha": microfacet.clamp_alpha(alpha),
             "k": (roughness + 1.0) * (roughness + 1.0) * 0.125,
         }
 
@@ -347,7 +359,7 @@ class Glossy(Bsdf):
         diffuse_probability = lobe_probability(mean(diffuse), mean(specular))
         cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].clamp_min(0.0)
         facets = microfacet.reflection(wo, wi, alpha, alpha, bounded=microfacet.BOUNDED)
-        # Divides Smith's masking out, to put the approximation in its place.
+        # `facets.value` is D G / (4 cos_o) with Smith's masking; this factor divides it out, for the approximation below.
         smith = (cos_o + microfacet.stretched_length(wo, alpha, alpha)) * (
             cos_i + microfacet.stretched_length(wi, alpha, alpha)
         )
@@ -368,8 +380,7 @@ class Glossy(Bsdf):
         reflected = microfacet.reflect(wo, m, wo[0] * m[0] + wo[1] * m[1] + wo[2] * m[2])
         drawn = mixture_sample(self, parameters, wo, torch.where(is_specular, reflected, cosine_hemisphere(u)))
         mirror = torch.stack((-wo[0], -wo[1], wo[2]))
-        masking = wo[2] / (
-            wo[2] - wo[2] * parameters["k"] + parameters["k"]
-        )  # of wo, and of wi: it has the same cosine
+        # Of wo, and of wi: it has the same cosine.
+        masking = wo[2] / (wo[2] - wo[2] * parameters["k"] + parameters["k"])
         weight = specular * (masking * masking / torch.where(is_specular, 1.0 - diffuse_probability, 1.0))
         return with_delta(drawn, is_specular & parameters["smooth"] & (wo[2] > 0), mirror, weight)

@@ -104,10 +104,14 @@ def metal_colour(parameters: Parameters, cos: Tensor) -> Tensor:
 
 
 def metal_split_sum(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
-    """Return the split-sum material of a metal with roughness ``(N,)``: its specular lobe alone, over no diffuse base."""
+    """Return the split-sum material of a metal with roughness ``(N,)``: its specular lobe alone."""
     factor, one = parameters["specular_reflectance"], torch.ones_like(roughness)
     f0 = metal_colour(parameters, one)
     black = torch.zeros_like(f0)
     return SplitSumMaterial(
-        diffuse=black, f0=tinted(one, factor) * f0, f90=tinted(one, factor), roughness=roughness, over=None
+        diffuse=black,
+        f0=tinted(one, factor) * f0,
+        f90=tinted(one, factor),
+        roughness=roughness,
+        over=None,  # no diffuse lobe below, which would lose light
     )

@@ -46,9 +46,8 @@ class Facet(NamedTuple):
     cos: Tensor  # (N,) dot(wo, m) >= 0
     schlick: Tensor  # (N,) Schlick's weight for this cosine
     reflected: Tensor  # (3, N) factor of the reflection lobe
-    refracted: (
-        Tensor | None
-    )  # (3, N) factor of the refraction lobe, without the 1 / eta^2 of radiance; None: opaque model
+    #: (3, N) factor of the refraction lobe, without the 1 / eta^2 of radiance; None: opaque model
+    refracted: Tensor | None
 
 
 class Probabilities(NamedTuple):
@@ -111,7 +110,7 @@ def fake_subsurface(
 
     Arguments as for :func:`retro_diffuse`; ``cos_o`` and ``cos_i`` are the cosines of ``wo`` and ``wi``, at least 0.
     """
-    grazing = roughness * cos_d * cos_d
+    grazing = roughness * cos_d * cos_d  # value of each factor where its direction grazes the surface
     both = lerp(1.0, grazing, fresnel_o) * lerp(1.0, grazing, fresnel_i)
     cosines = cos_o + cos_i
     usable = cosines > 0

@@ -37,7 +37,9 @@ class LaneMaterials:
     """
 
     row: Tensor  # (P + I,) int64 row in the parameters of the model
-    key: Tensor  # (P + I + 1,) uint8 sort key of lanes, shifted by one so that a miss (slot -1) reads the first entry
+    #: (P + I + 1,) uint8: lanes are sorted by it, so that those of one model, emissive or not, are together. Shifted by one, so
+    #: that a miss (slot -1) reads the first entry.
+    key: Tensor
     models: tuple[Bsdf, ...]
     parameters: tuple[Parameters, ...]  # stacked, by model; before Bsdf.prepare where the model reads textures
     textures: tuple[MaterialTextures | None, ...]  # by model; None without textures

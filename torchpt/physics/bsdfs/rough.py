@@ -80,8 +80,8 @@ def roughness_parameters(values: Parameters, *, anisotropic: bool) -> Parameters
     assert u is not None and v is not None
     smooth = microfacet.is_smooth(torch.maximum(u, v))
     return {
-        "alpha_u": microfacet.roughness(u),
-        "alpha_v": microfacet.roughness(v) if anisotropic else None,
+        "alpha_u": microfacet.clamp_alpha(u),
+        "alpha_v": microfacet.clamp_alpha(v) if anisotropic else None,
         "smooth": smooth,
     }
 
@@ -120,9 +120,12 @@ def energy_table(parameters: Parameters, etas: Sequence[Tensor | None]) -> Table
         # many; for anisotropic surfaces, whose tables are larger, that would take too long.
         nodes = 64 if isotropic and eta is not None else 32
         index = None if eta is None else eta.double()
-        blocks.append(microfacet.directional_albedo(wo, au, None if isotropic else av, index, nodes, nodes))
+        albedo = microfacet.directional_albedo(
+            wo, au, alpha_v=None if isotropic else av, eta=index, azimuths=nodes, heights=nodes
+        )
+        blocks.append(albedo)
     values = torch.cat(blocks).clamp_max(1.0).to(alpha_u.dtype)
-    return Table(values, len(values))
+    return Table(values, count=len(values))
 
 
 def energy_at(table: Table, parameters: Parameters, wo: Tensor, block: Tensor | None = None) -> Tensor:

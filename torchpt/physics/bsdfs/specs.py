@@ -1,7 +1,8 @@
 """Specs of material parameters: fractions, indices of refraction, normal and bump maps, inner materials.
 
 A spec declares one key of a scene file: default, range, documentation, and ``read``, which checks a value of the file and
-returns it or raises ``Refused``. Models list theirs in ``Bsdf.parameters``.
+returns it or raises ``Refused``. Models list theirs in ``Bsdf.parameters``. ``expected`` is the phrase of
+all that a key accepts, which errors print; ``accepted`` is the same without textures.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ GREY, WHITE = (0.5, 0.5, 0.5), (1.0, 1.0, 1.0)  # linear RGB
 
 def fraction(default: Any, doc: str) -> Scalar:
     """Return the spec of a number in 0..1, or a texture."""
-    return Scalar(default, high=1.0, texture=True, doc=doc)
+    return Scalar(default, low=0.0, high=1.0, texture=True, doc=doc)
 
 
 def reflectance(default: Any, doc: str) -> Color:
     """Return the spec of a colour in 0..1, or a texture."""
-    return Color(default, high=1.0, texture=True, doc=doc)
+    return Color(default, low=0.0, high=1.0, texture=True, doc=doc)
 
 
 def refraction_index(default: float, doc: str) -> Index:
@@ -83,7 +84,7 @@ class Heights(Scalar):
     """Spec of a bump map: a texture of heights along the normal."""
 
     default: Any = None
-    low: float | None = field(default=None, kw_only=True)
+    low: float | None = field(default=None, kw_only=True)  # heights may be negative
     texture: bool = field(default=True, kw_only=True)
 
     differentiable: ClassVar[bool] = False

@@ -29,9 +29,9 @@ class Camera(ABC):
         name: the ``type`` in a scene file.
         parameters: specs of the parameters; those whose spec is ``differentiable`` are tensors.
         lens: whether rays also depend on a point on a lens.
-        reaches: parameters that bound the distance of ray origins from the camera's origin.
+        reaches: names of parameters that bound the distance of ray origins from the camera's origin, such as a lens radius.
         projects: whether :meth:`project` is implemented.
-        sized_by: hint for the error about a pose with a scale.
+        sized_by: hint for the error about a pose with a scale: the parameter that sizes the picture instead.
         to_world: pose ``(4, 4)``; its scale is ignored, as only the axes' directions and the origin matter.
         resolution: width and height of the whole film in pixels.
         film: the resolution as a tensor ``(2,)`` of the world's dtype.

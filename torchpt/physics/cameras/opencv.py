@@ -25,10 +25,10 @@ __all__ = [
     "DEFAULTS",
     "K_WORDS",
     "PinholeMatrices",
-    "angles",
     "calibration",
     "extrinsics",
-    "numbers_of",
+    "numbers_of_k",
+    "parameters_of_k",
     "pose",
     "rotation",
     "size",
@@ -39,7 +39,7 @@ __all__ = [
 _TOLERANCE = 1e-3
 #: From OpenCV's axes (right, down, ahead) to those of cameras here (left, up, ahead).
 _TURN = np.diag([-1.0, -1.0, 1.0])
-#: Default values of parameters that ``K`` determines; :func:`angles` leaves them out.
+#: Default values of parameters that ``K`` determines; :func:`parameters_of_k` leaves them out.
 DEFAULTS = {"principal_point_offset_x": 0.0, "principal_point_offset_y": 0.0, "pixel_aspect": 1.0}
 #: Accepted form of ``K``, for errors.
 K_WORDS = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy > 0"
@@ -113,7 +113,7 @@ def extrinsics(to_world: Tensor) -> tuple[Tensor, Tensor]:
     return turn, -(turn @ to_world[:3, 3])
 
 
-def numbers_of(matrix: Any, picture: tuple[int, int]) -> dict[str, Any]:
+def numbers_of_k(matrix: Any, picture: tuple[int, int]) -> dict[str, Any]:
     """Return a pinhole's numeric parameters for ``K (3, 3)``, an array or a tensor, of a ``picture (width, height)``."""
     (width, height), fx, fy = picture, matrix[0, 0], matrix[1, 1]
     is_tensor = isinstance(fx, Tensor)
@@ -126,8 +126,8 @@ def numbers_of(matrix: Any, picture: tuple[int, int]) -> dict[str, Any]:
     }
 
 
-def angles(matrix: NDArray[np.float64], picture: tuple[int, int]) -> dict[str, float | str]:
+def parameters_of_k(matrix: NDArray[np.float64], picture: tuple[int, int]) -> dict[str, float | str]:
     """Return a pinhole's parameters for ``K`` of a ``picture (width, height)``, without those at their defaults."""
-    found = {key: float(value) for key, value in numbers_of(matrix, picture).items()}
+    found = {key: float(value) for key, value in numbers_of_k(matrix, picture).items()}
     others = {key: found[key] for key, default in DEFAULTS.items() if found[key] != default}
     return {"fov": found["fov"], "fov_axis": "x", **others}

@@ -17,7 +17,7 @@ __all__ = ["FOV_AXES", "Pinhole"]
 
 #: Values of ``fov_axis``: ``fov`` spans the film's width, height, smaller or larger side, or diagonal.
 FOV_AXES = ("x", "y", "smaller", "larger", "diagonal")
-#: Parameters that ``K`` determines, and which must not be given beside it.
+#: Parameters that ``K`` determines, and that a scene file must not set beside it.
 _FROM_K = ("fov", "fov_axis", "principal_point_offset_x", "principal_point_offset_y", "pixel_aspect")
 
 
@@ -34,6 +34,7 @@ class Pinhole(Camera):
         pixel_aspect: width of a pixel over its height, a 0-d tensor; None: 1.
     """
 
+    # All of them move points of the film relative to surfaces, as ``Moves.SURFACES`` says of surfaces and of the camera.
     parameters: ClassVar = {
         "fov": Angle(
             39.3,
@@ -93,11 +94,11 @@ class Pinhole(Camera):
             raise Refused(
                 "[width, height] of the picture that K belongs to, or film.width and film.height", None, ("size",)
             )
-        values |= opencv.angles(values["K"], values["size"])
+        values |= opencv.parameters_of_k(values["K"], values["size"])
         try:
             for name in ("fov", "pixel_aspect"):
                 if values[name] is not None:
-                    Pinhole.parameters[name].read(values[name])
+                    Pinhole.parameters[name].read(values[name])  # refuses values out of range
         except Refused:
             expected = f"{opencv.K_WORDS}, each of the size of a picture"
             raise Refused(expected, values["K"].tolist(), ("K",)) from None
@@ -126,8 +127,8 @@ class Pinhole(Camera):
             x = x + self.principal_point_offset_x * self.film[0]
         if self.principal_point_offset_y is not None:
             y = y + self.principal_point_offset_y * self.film[1]
-        right, up = self.place(x, y)
-        half = self.half_width()
+        right, up = self.place(x, y)  # from the film's centre, both in half widths of the film
+        half = self.half_width()  # slope of the film's edge
         if self.pixel_aspect is not None:
             up = up / self.pixel_aspect
         return right * half, up * half
@@ -138,8 +139,9 @@ class Pinhole(Camera):
 
     def project_homogeneous(self, away: Tensor) -> Tensor:
         """Return :meth:`film_of` for points at offsets ``away (3, N)`` from the camera's origin."""
-        right, up, depth = self.covectors() @ away
+        right, up, depth = self.covectors() @ away  # components of `away` along the axes of the picture, (N,) each
         half, (width, height) = self.half_width(), self.film
+        # In half widths of the film, times the depth.
         across, along = right / half, up / half
         if self.pixel_aspect is not None:
             along = along * self.pixel_aspect
@@ -148,13 +150,13 @@ class Pinhole(Camera):
             x = x - self.principal_point_offset_x * width * depth
         if self.principal_point_offset_y is not None:
             y = y - self.principal_point_offset_y * height * depth
-        return torch.stack((x, y, depth, depth))
+        return torch.stack((x, y, depth, depth))  # x h, y h, h and depth: here h is the depth
 
     def pixel(self) -> Tensor:
-        """Return the footprint of a pixel ``(5,)``, as :meth:`Camera.pixel`."""
-        spread = self.half_width() * (2.0 / self.film[0])
+        """Return the footprint of a pixel ``(5,)``: origin of the rays, ``w`` 1, ``spread``; see :meth:`Camera.pixel`."""
+        spread = self.half_width() * (2.0 / self.film[0])  # width of a pixel at distance 1
         if self.pixel_aspect is not None:
-            spread = spread / self.pixel_aspect.sqrt()
+            spread = spread / self.pixel_aspect.sqrt()  # the root of the area of a pixel that is not square
         return torch.cat((self.origin()[:, 0], torch.stack((torch.ones_like(spread), spread))))
 
     def intrinsics(self) -> Tensor:

@@ -36,7 +36,7 @@ class _UntracedPoint(Point):
     """Spec of a vector from which the pose is computed. It is no parameter tensor; ``to_world`` is."""
 
     differentiable: ClassVar[bool] = False
-    place: ClassVar[bool] = False
+    place: ClassVar[bool] = False  # as no tensor holds it, none has to stay in float64
 
 
 #: Specs of the pose, which every camera has.
@@ -76,7 +76,8 @@ def posed(values: Mapping[str, Any], device: torch.device | None = None) -> Any:
     """
     known = {name: value for name, value in values.items() if name in POSES and value is not None}
     if "to_world" not in known and "R" not in known:
-        return look_at(known["origin"], known["target"], known.get("up", UP), "", device)
+        # Errors of `look_at` name `origin`, `target` or `up` after `key`, here without a prefix.
+        return look_at(known["origin"], known["target"], known.get("up", UP), key="", device=device)
     if device is not None:
         known = {name: tensor_of(value, device) for name, value in known.items()}
     if "R" in known:
@@ -90,7 +91,7 @@ def pose_of(values: Mapping[str, Any], given: frozenset[str], sized_by: str = ""
     Args:
         values: values of the parameters by name.
         given: names of the parameters that the file sets.
-        sized_by: hint for the error about a pose with a scale.
+        sized_by: hint for the error about a pose with a scale; "": none.
 
     Raises:
         Refused: no pose, two poses, or a pose that is no rotation and translation.

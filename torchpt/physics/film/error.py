@@ -77,8 +77,7 @@ def _pareto_shape(x: NDArray[np.float64]) -> float:
     """Return the posterior mean of the shape of a generalized Pareto distribution, from ``x (n,)``, positive and ascending.
 
     Zhang and Stephens 2009, in their notation: theta is the ratio of shape and scale, of which m candidates are weighted by
-        their
-    profile likelihood.
+    their profile likelihood.
     """
     n = len(x)
     m = 30 + math.isqrt(n)
@@ -396,11 +395,13 @@ def _first_value_factor(a: Tensor, b: Tensor, b_variance: Tensor | None) -> floa
 
     Second values made of two randomizations of half the length vary more, as the error of Sobol' points falls faster than that
     of random ones. The fraction of the difference's variance that first values have is estimated over all pilots and clamped to
-    1/3 .. 1/2; arguments as for :func:`error_estimate`.
+    1/3 .. 1/2: it is 1/2 where the variance falls as one over the number of samples, 1/3 where it falls as the square of that.
+    Arguments as for :func:`error_estimate`.
     """
     if b_variance is None:
         return 1.0
     scale = relative(1.0, (a + b) / 2)
+    # Relative squares above 1 count as 1, so that no single pilot decides.
     both, second = (float(sum_all((x * scale).clamp_max(1.0))) for x in ((a - b).square(), b_variance))
     return 2.0 * min(max(1.0 - second / both, 1 / 3), 0.5) if both > 0.0 else 1.0
 

@@ -55,7 +55,7 @@ class Filter(ABC):
     def __init__(self, values: Mapping[str, Any], device: torch.device) -> None:
         self.values = dict(values)
         self.radius = self.half_width()
-        self._radius = torch.tensor(self.radius, dtype=torch.float32, device=device)
+        self._radius = torch.tensor(self.radius, dtype=torch.float32, device=device)  # the radius again, for lanes
 
     @abstractmethod
     def half_width(self) -> float:

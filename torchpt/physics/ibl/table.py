@@ -42,7 +42,7 @@ def _table(size: int, samples: int) -> Tensor:
     z = steps.repeat_interleave(samples)
     wo = torch.stack(((1.0 - z * z).clamp_min(0.0).sqrt(), torch.zeros_like(z), z))
     u = (hammersley(samples) + 0.5 / samples).repeat(1, size)
-    return torch.stack([_row(wo, u, microfacet.roughness(step * step), samples) for step in steps])
+    return torch.stack([_row(wo, u, microfacet.clamp_alpha(step * step), samples) for step in steps])
 
 
 def _row(wo: Tensor, u: Tensor, alpha: Tensor, samples: int) -> Tensor:
@@ -60,6 +60,7 @@ def _row(wo: Tensor, u: Tensor, alpha: Tensor, samples: int) -> Tensor:
     m = microfacet.sample_normal(wo, alphas, alphas, u)
     cos = dot(wo, m).clamp(0.0, 1.0)
     wi = microfacet.reflect(wo, m, cos)
+    # Smith's G1 of `wi`, from its cosine and its stretched length.
     visible = microfacet.masking(wi[2].clamp_min(0.0), microfacet.stretched_length(wi, alphas, alphas))
     grazing = 1.0 - cos
     schlick = (grazing * grazing) * (grazing * grazing) * grazing

@@ -36,15 +36,15 @@ __all__ = [
     "Row",
     "Setting",
     "bright",
+    "lane_rows",
     "sort_key",
-    "taken",
 ]  # fmt: skip
 
 #: Columns of the table that every row has, fields of :class:`Lights` by name.
 COLUMNS = ("p0", "e1", "e2", "normal", "flip", "area", "bound", "radiance")
 
 
-def taken(lights: Lights, row: Tensor | None) -> Lights:
+def lane_rows(lights: Lights, row: Tensor | None) -> Lights:
     """Return the rows ``row (N,)`` of the table, one a lane; for None the table itself, whose single row broadcasts."""
     quadrics = lights.quadrics
     if quadrics is not None:
@@ -211,7 +211,7 @@ class Light(Emitter):
         """Sample a point on the light or a direction toward it.
 
         Args:
-            at: rows of the table, one a lane, as from :func:`taken`.
+            at: rows of the table, one a lane, as from :func:`lane_rows`.
             x: points to be lit ``(3, N)``.
             u: ``(2, N)`` in [0, 1).
             mis: whether the sample is combined with BSDF sampling by MIS.

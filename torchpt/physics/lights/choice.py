@@ -75,7 +75,7 @@ def bounds_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor]) -> Bo
         at = replace(lights, **{name: column.index_select(-1, rows) for name, column in columns.items()})
         cone = kind.bounds(at, intensity[rows])
         cos_o[rows], cos_e[rows], intensity[rows] = cone.cos_o, cone.cos_e, cone.intensity
-    return Bounds(low, high, columns["normal"], cos_o, cos_e, intensity)
+    return Bounds(low=low, high=high, axis=columns["normal"], cos_o=cos_o, cos_e=cos_e, intensity=intensity)
 
 
 # ---- Choice of a light
@@ -132,12 +132,12 @@ def light_sampler(
         tree_or_distant = Distribution1D.of(weights, dtype)
     shining = (power[:count] > 0).double()  # 1 for lights of positive power, else 0
     mixed = count <= UNIFORM_MAX_COUNT
-    share = min(UNIFORM_MOST, UNIFORM_LIGHTS / max(float(shining.sum()), 1.0)) if mixed else 0.0
+    uniform_probability = min(UNIFORM_MOST, UNIFORM_LIGHTS / max(float(shining.sum()), 1.0)) if mixed else 0.0
     return TreeSampler(
-        tree=tree.build(*astuple(bounds)),
+        tree=tree.build(*astuple(bounds)),  # its arguments are the fields, in their order
         tree_or_distant=tree_or_distant,
         uniform=Distribution1D.of(shining, dtype) if mixed else None,
-        uniform_probability=torch.tensor(share, dtype=torch.float64, device=power.device),
+        uniform_probability=torch.tensor(uniform_probability, dtype=torch.float64, device=power.device),
     )
 
 
@@ -175,10 +175,10 @@ def _draw_local(choice: TreeSampler, u: Tensor, x: Tensor, n: Tensor | None) -> 
     """Choose among local lights; arguments and results as for :func:`draw`."""
     if choice.uniform is None:
         return tree.sample(choice.tree, x, n, u)
-    share = choice.uniform_probability
-    is_uniform = u < share
-    row, _, remapped = tree.sample(choice.tree, x, n, ((u - share) / (1.0 - share)).clamp_min(0.0))
-    uniform_row, uniform_remapped = choice.uniform.draw((u / share).clamp_max(_BELOW_ONE))
+    p_uniform = choice.uniform_probability
+    is_uniform = u < p_uniform
+    row, _, remapped = tree.sample(choice.tree, x, n, ((u - p_uniform) / (1.0 - p_uniform)).clamp_min(0.0))
+    uniform_row, uniform_remapped = choice.uniform.draw((u / p_uniform).clamp_max(_BELOW_ONE))
     row, remapped = torch.where(is_uniform, uniform_row, row), torch.where(is_uniform, uniform_remapped, remapped)
     # Either way may have chosen the row, so the probability is that of the mixture.
     return row, _local_probability(choice, row, x, n), remapped
@@ -189,8 +189,8 @@ def _local_probability(choice: TreeSampler, row: Tensor, x: Tensor, n: Tensor | 
     p = tree.probability(choice.tree, row, x, n)
     if choice.uniform is None:
         return p
-    share = choice.uniform_probability.to(p.dtype)
-    return p * (1.0 - share) + take(choice.uniform.pmf, row) * share
+    p_uniform = choice.uniform_probability.to(p.dtype)
+    return p * (1.0 - p_uniform) + take(choice.uniform.pmf, row) * p_uniform
 
 
 def probability(choice: Distribution1D | TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
@@ -225,4 +225,5 @@ def without_last(choice: Distribution1D | TreeSampler) -> Distribution1D | TreeS
 
 
 def _without_last_outcome(distribution: Distribution1D) -> Distribution1D:
+    """Return the distribution of the other outcomes than the last."""
     return Distribution1D.of(distribution.pmf[:-1], distribution.pmf.dtype)

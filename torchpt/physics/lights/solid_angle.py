@@ -1,7 +1,7 @@
 """Sample triangles and parallelograms uniformly by solid angle, as seen from each reference point.
 
 Triangles: Arvo, *Stratified Sampling of Spherical Triangles*, 1995. The map is written with vectors instead of angles: a
-subtriangle of the share ``u`` of the area ends where the reflection of a corner falls (van Oosterom and Strackee's
+subtriangle of the fraction ``u`` of the area ends where the reflection of a corner falls (van Oosterom and Strackee's
 ``tan(E / 2)``, *The Solid Angle of a Plane Triangle*, 1983, solved for the corner), so that nothing cancels in slivers, and
 the point comes out as its own barycentric coordinates, inside the triangle whatever the rounding.
 Rectangles: Urena, Fajardo, King, *An Area-Preserving Parametrization for Spherical Rectangles*, 2013. A parallelogram that
@@ -49,9 +49,9 @@ LEAST, MOST = 3e-4, 2.0 * math.pi - 1e-5
 #: One plus the cosine between two corners of a triangle below which float64 loses the angle: seen from a millionth of an
 #: edge's length away, its ends lie in opposite directions. Then the triangle is sampled by area.
 OPPOSITE = 1e-12
-#: Distance from the centre of a light, over its radius, beyond which it is sampled by area.
+#: Distance from the centre of a light, over its radius, beyond which it is sampled by area: there that has as little noise.
 NEAR = 2.0
-#: Cosine of the edges below which a parallelogram is a rectangle: rounding of its corners in float32.
+#: Cosine between the edges up to which a parallelogram is a rectangle: rounding of its corners in float32.
 SQUARE = 1e-6
 
 
@@ -203,7 +203,7 @@ def _arc(
     ``half`` is :func:`_excess`, the next four are its arguments, and ``u``, ``v`` are in [0, 1).
     """
     c, s = torch.cos(half * u), torch.sin(half * u)
-    # C' on the arc from A to C cuts off the share u: along x A + y C, reflected.
+    # C' on the arc from A to C cuts off the fraction u of the area: along x A + y C, reflected.
     x, y = volume * c - (bc + ca) * s, (1.0 + ab) * s
     k = 2.0 * (x + y * ca) * _reciprocal(x * x + y * y + 2.0 * x * y * ca)
     p, q = k * x - 1.0, k * y

@@ -67,12 +67,12 @@ class Surface(Emitter):
     Attributes:
         name: kind of primitive, from :data:`torchpt.physics.shapes.geometry.KINDS`.
         convex: whether it emits to all sides.
-        share: area over the length of the cross product of the edges: 1/2 for a triangle.
+        area_factor: area over the length of the cross product of the edges: 1/2 for a triangle.
         needs_quadrics: whether sampling reads :class:`~torchpt.physics.shapes.geometry.Quadrics`.
     """
 
     convex: ClassVar[bool] = False
-    share: ClassVar[float] = 1.0
+    area_factor: ClassVar[float] = 1.0
     needs_quadrics: ClassVar[bool] = False
 
     @classmethod
@@ -82,7 +82,7 @@ class Surface(Emitter):
         cross_product = faces.face.double()
         area = dot(cross_product, cross_product).clamp_min(
             torch.finfo(torch.float64).tiny
-        ).sqrt() * faces.face.new_tensor(cls.share)
+        ).sqrt() * faces.face.new_tensor(cls.area_factor)
         return area, area.detach()
 
     @classmethod

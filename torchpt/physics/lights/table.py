@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import dot, safe_reciprocal, take
 from torchpt.physics.lights import choice, solid_angle
-from torchpt.physics.lights.base import COLUMNS, KINDS, Environment, EnvironmentImage, taken
+from torchpt.physics.lights.base import COLUMNS, KINDS, Environment, EnvironmentImage, lane_rows
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.lights.surface import SURFACES, Surface, emitter, flat_inverse_pdf, flat_point
 from torchpt.physics.shapes.geometry import Interaction
@@ -70,7 +70,7 @@ def sample(
     if lights.choice is not None and which is not None:
         row, probability, remapped = choice.draw(lights.choice, which, x, n)
         u = torch.stack((remapped.to(u.dtype).clamp_max(_BELOW_ONE), u[1]))
-    at, number = taken(lights, row), _kind_indices(lights, row)
+    at, number = lane_rows(lights, row), _kind_indices(lights, row)
     surfaces = _surfaces(lights)
     drawn = _on_surfaces(lights, at, row, number, x, u, offset, probability) if surfaces else None
     bare: Tensor | None = None
@@ -147,7 +147,9 @@ def _on_surfaces(
     # Shadow rays end off the surface of the light, so that they do not hit it.
     target = torch.addcmul(target, normal, bound * offset)
     radiance = at.radiance if at.opacity is None else at.radiance * at.opacity
-    return LightSample(wi, target, distant=None, radiance=radiance.expand_as(wi), pdf=pdf, weight=inverse, at=point)
+    return LightSample(
+        wi=wi, target=target, distant=None, radiance=radiance.expand_as(wi), pdf=pdf, weight=inverse, at=point
+    )
 
 
 def _inverse_pdf(
@@ -184,7 +186,7 @@ def _textured(
     assert lights.prim is not None
     prim = lights.prim.expand(p.shape[1]) if row is None else take(lights.prim, row)
     return Interaction(
-        p,
+        p=p,
         ng=normal,
         ns=normal,
         tangent=None,
@@ -213,7 +215,7 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | 
     """
     assert lights.row_of_prim is not None
     row = take(lights.row_of_prim, at.slot) if len(lights.area) > 1 else None
-    table = taken(lights, row)
+    table = lane_rows(lights, row)
     with torch.no_grad():
         to = at.p - x
         angle = None if lights.solid is None else solid_angle.angles(lights.solid, row, x, lights.shapes)

@@ -91,6 +91,7 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
     nodes = np.zeros((max_nodes, len(FIELDS), WIDTH), np.float32)
     child = np.zeros((max_nodes, WIDTH), np.int32)
     full, trail, depth = np.zeros(max_nodes, np.int32), np.zeros(count, np.int64), np.zeros(count, np.int32)
+    # Memory of the builder: for each node a span of `ids`, its level, and its path from the root.
     scratch = np.zeros((max_nodes, 2), np.int64), np.zeros(max_nodes, np.int64), np.zeros(max_nodes, np.int64)
     num_nodes = kernel("light_tree", "build")(lights, cone, ids, nodes, child, full, trail, depth, *scratch)
     levels = int(depth.max())
@@ -184,6 +185,7 @@ def _weigh(nodes: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
 
 
 def _root(a: Tensor) -> Tensor:
+    """Return the root ``(N, 8)``, of 0 where rounding has made ``a`` negative."""
     return a.clamp_min(0.0).sqrt()
 
 

@@ -32,7 +32,8 @@ ADAPTIVE: dict[str, Spec] = {
 class SamplerTensors:
     """The numbers of one ``Sampler`` as tensors, so that one compiled kernel serves all samplers of a kind."""
 
-    seeds: Tensor  # (randomizations,) int32, those of the picture and spare ones
+    #: (randomizations,) int32: those of the picture, then spare ones for pixels that are sampled again, as error probes are
+    seeds: Tensor
     points_each: Tensor  # () int64 number of points of each randomization; 0 if unknown
     with_one_more: Tensor  # () int64 number of randomizations, the first ones, that have one point more
     index_bits: Tensor  # () int64 number of bits of the largest index of a point

@@ -13,10 +13,10 @@ from torchpt.math.hashing import HALVES, as_int32, logical_shift, mix, reverse_b
 
 __all__ = [
     "ROUNDS",
-    "W",
-    "X",
-    "Y",
-    "Z",
+    "SEED_W",
+    "SEED_X",
+    "SEED_Y",
+    "SEED_Z",
     "fourth_dimension",
     "jittered",
     "point_in_stratum",
@@ -45,7 +45,7 @@ __all__ = [
 
 
 #: Arbitrary constants that are mixed into a seed, so that each of up to four coordinates is scrambled by itself.
-X, Y, Z, W = as_int32(0x68BC21EB), as_int32(0x02E5BE93), as_int32(0x967A889B), as_int32(0x368CC8B7)
+SEED_X, SEED_Y, SEED_Z, SEED_W = as_int32(0x68BC21EB), as_int32(0x02E5BE93), as_int32(0x967A889B), as_int32(0x368CC8B7)
 #: Multipliers of Vegdahl's scrambling hash.
 _HASH_0, _HASH_1, _HASH_2 = 0x3D20ADEA, 0x05526C56, 0x53A22864
 #: Low bits of the base-4 digits whose position, from the lowest, is 0, 1 or 2 modulo 3: powers of w repeat after three.
@@ -67,7 +67,9 @@ def scramble(x: Tensor, seed: Tensor) -> Tensor:
 
 def second_dimension(index: Tensor) -> Tensor:
     """Return the bit-reversed second Sobol' coordinate of point ``index``: the coefficients of ``p(x + 1)``."""
-    for shift, mask in reversed(HALVES):
+    for shift, mask in reversed(
+        HALVES
+    ):  # shifts 16 to 1, each with the mask of the lower one of each two groups of bits
         index = index ^ ((index >> shift) & mask)
     return index
 
@@ -85,7 +87,7 @@ def fourth_dimension(index: Tensor) -> Tensor:
 
 def _shifted(index: Tensor) -> Tensor:
     """Return the coefficients of ``p(x + 1)`` for a ``p`` whose coefficients, in ``index``, have two bits each."""
-    for shift, mask in reversed(HALVES[1:]):
+    for shift, mask in reversed(HALVES[1:]):  # without the shift by 1, which would mix the two bits of a coefficient
         index = index ^ ((index >> shift) & mask)
     return index
 
@@ -162,4 +164,4 @@ def jittered(key: Tensor, salt: Tensor | int) -> Tensor:
     pixel_seed, point, count = key[0], key[1], key[2]
     seed = mix(pixel_seed ^ salt)
     stratum = shuffle(point, count, seed)
-    return point_in_stratum(stratum.double(), to_unit(mix(mix(seed ^ X) ^ stratum)).double(), count.double())
+    return point_in_stratum(stratum.double(), to_unit(mix(mix(seed ^ SEED_X) ^ stratum)).double(), count.double())

@@ -24,10 +24,14 @@ class Dimension(IntEnum):
     BSDF = 5  # 2D, direction from a BSDF
     ROULETTE = 6  # 1D, whether the path survives Russian roulette
     OPACITY = 7  # 1D, hit or pass through
-    PREVIOUS_DIRECTION = 8  # an alias of the dimension that led to the vertex: BSDF of the previous vertex, or PIXEL
+    #: An alias of the dimension that led to the vertex: BSDF of the previous vertex, or PIXEL. With it, samplers that have sets
+    #: of four numbers draw the last two of that set for the point on a light: so direction and light are stratified together.
+    PREVIOUS_DIRECTION = 8
     DISTANCE = 9  # 1D, free-flight distance in a medium
     PHASE = 10  # 2D, direction from a phase function
-    EDGE = 11  # 2D, choice of an edge of the scene and point on it; choice of its line if it has two
+    #: 2D: the first number chooses an edge of the scene and the point on it, the second one of the two silhouette lines of a
+    #: cone or cylinder.
+    EDGE = 11
 
 
 #: Stride between the dimensions of two vertices: more than there are, so that a new dimension does not change the others.

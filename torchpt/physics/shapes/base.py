@@ -48,7 +48,7 @@ class Surface:
 
     Attributes:
         kind: kind of primitive, one of :data:`torchpt.physics.shapes.geometry.KINDS`.
-        label: name within the shape, if it has several primitives.
+        label: name within the shape, if it has several primitives, such as `side` and `top`.
         local: ``(4, 4)`` from the primitive's space to the shape's; None for the identity.
         quadric: the surface in object space, for the kind ``quadric``.
     """
@@ -72,7 +72,7 @@ class Triangles:
         flat: use face normals even if vertex normals are given.
         displacement: ``texture``, ``scale`` and ``subdivisions`` of :class:`~torchpt.physics.shapes.kinds.mesh.Displacement`,
             or None.
-        object: an object of trimesh, or a tuple of meshes, in place of a file; None otherwise.
+        object: in place of a file an object of trimesh, or a tuple of :class:`~torchpt.scene.meshes.MeshPart`; None otherwise.
     """
 
     path: tuple[str, ...] | None = None
@@ -168,8 +168,10 @@ def placed(origin: Sequence[Any], size: Sequence[Any], turn: Matrix) -> Any:
     The result is a tensor, on the device of the first tensor among the numbers, if any is one; else an array.
     """
     device = next((number.device for number in (*origin, *size) if isinstance(number, Tensor)), None)
-    place, factors = (np.array(three) if device is None else tensor_of([*three], device) for three in (origin, size))
-    return affine(constant(turn, factors) * factors, place)
+    translation, factors = (
+        np.array(three) if device is None else tensor_of([*three], device) for three in (origin, size)
+    )
+    return affine(constant(turn, factors) * factors, translation)  # columns of the rotation times the sizes
 
 
 #: Rotates z to y about x: in scene files axes of rotation lie along y, those of quadrics along z.

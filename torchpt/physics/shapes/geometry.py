@@ -78,7 +78,7 @@ class Quadrics:
     n1: Tensor  # (3, Q) columns of the cofactor matrix of (e1, e2, e3), toward the front, up to a common scale
     n2: Tensor  # (3, Q)
     n3: Tensor  # (3, Q)
-    reach: Tensor  # (3, Q) largest coordinate magnitudes that enter a point's sum, see LaneGeometry.bound
+    coordinate_bound: Tensor  # (3, Q) largest coordinate magnitudes that enter a point's sum, see LaneGeometry.bound
 
 
 @dataclass(frozen=True)

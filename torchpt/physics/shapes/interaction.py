@@ -31,7 +31,10 @@ NEAR = 2.0**-15
 
 
 def _plane_uv(o: Tensor, d: Tensor, p0: Tensor, e1: Tensor, e2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return ``u, v`` of rays in the primitives' planes, differentiable in all arguments (Moeller and Trumbore, 1997)."""
+    """Return ``u, v`` of rays in the primitives' planes, differentiable in all arguments.
+
+    Moeller and Trumbore, *Fast, Minimum Storage Ray-Triangle Intersection*, 1997, in their notation.
+    """
     pvec = cross(d, e2)
     det = dot(e1, pvec)
     inverse = 1.0 / torch.where(det == 0, 1.0, det)
@@ -59,7 +62,8 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_ray: bool = Fa
     not_flat = _not_flat(world, prim)
     if follow_ray:
         u, v = _plane_uv(o, d, p0, e1, e2)
-    # In lanes of other kinds u and v are no affine coordinates; at 0 the sum below stays finite. ``hit_points`` replaces it.
+    # In lanes of kinds that are not flat u and v are no affine coordinates: at 0 the sum below stays finite until
+    # ``hit_points`` replaces it.
     for _, is_kind in not_flat:
         u, v = torch.where(is_kind, 0.0, u), torch.where(is_kind, 0.0, v)
     p = affine(p0, e1, u, e2, v)
@@ -69,12 +73,12 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_ray: bool = Fa
         else primitives.normals_to_instance(take(geometry.normal, prim))
     )
     bound, own = None, None  # fields of Interaction: rounding bound, point in object space
-    if primitives.is_instanced is not None and primitives.reach is not None:
+    if primitives.is_instanced is not None and primitives.coordinate_bound is not None:
         bound = torch.where(
-            primitives.is_instanced, dot(ng.detach().abs(), primitives.reach), take(geometry.bound, prim)
+            primitives.is_instanced, dot(ng.detach().abs(), primitives.coordinate_bound), take(geometry.bound, prim)
         )
     for kind, is_kind in not_flat:
-        points = kind.hit_points(world, primitives, Rays(o, d, hit, follow_ray), is_kind)
+        points = kind.hit_points(world, primitives, Rays(o=o, d=d, hit=hit, follow_ray=follow_ray), is_kind)
         p, ng = torch.where(is_kind, points.p, p), torch.where(is_kind, points.ng, ng)
         if points.bound is not None:
             bound = torch.where(is_kind, points.bound, take(geometry.bound, prim) if bound is None else bound)
@@ -88,7 +92,9 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_ray: bool = Fa
         if any(geometry.counts[1:]):  # only triangles, which come first, have normals at their corners
             ns = torch.where(prim < geometry.ends[0], ns, ng)
     slot = geometry.slot(hit.prim)
-    at = Interaction(p, ng, ns, tangent=None, bitangent=None, prim=prim, slot=slot, bound=bound, u=u, v=v, own=own)
+    at = Interaction(
+        p=p, ng=ng, ns=ns, tangent=None, bitangent=None, prim=prim, slot=slot, bound=bound, u=u, v=v, own=own
+    )
     return _framed(world, primitives, at)
 
 
@@ -136,7 +142,7 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
     area = cross(primitives.e1, primitives.e2)
     not_flat = _not_flat(world, primitives.prim)
     if not_flat:
-        rays = Rays(x, wi, replace(hit, t=torch.where(missed, 0.0, hit.t)))
+        rays = Rays(o=x, d=wi, hit=replace(hit, t=torch.where(missed, 0.0, hit.t)))
         for kind, is_kind in not_flat:
             fixed = kind.fixed_points(world, primitives, rays, is_kind)
             y, area = torch.where(is_kind, fixed.p, y), torch.where(is_kind, fixed.area, area)

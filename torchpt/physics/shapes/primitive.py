@@ -40,6 +40,8 @@ Triple = tuple[Tensor, Tensor, Tensor]
 class Corners:
     """Geometry of the primitives of one part: ``(3, P)`` each, see :class:`~torchpt.physics.shapes.geometry.Geometry`.
 
+    Flat kinds have corners in ``p0 p1 p2``; a quadric has ``p0 e1 e2`` there, a sphere its centre and its radius.
+
     Attributes:
         normals: normals at the corners, or None.
         faces: ``(P, 3)`` vertex indices of the corners; meshes only.
@@ -68,7 +70,9 @@ class LanePrimitives:
     e2: Tensor  # (3, N)
     copies: Instances | None = None  # columns (., N); None without instances
     is_instanced: Tensor | None = None  # (N,) bool: primitives of instances
-    reach: Tensor | None = None  # (3, N) sums of coordinate magnitudes, for rounding bounds; None without instances
+    coordinate_bound: Tensor | None = (
+        None  # (3, N) sums of coordinate magnitudes, for rounding bounds; None without instances
+    )
 
     def vectors_to_instance(self, w: Tensor) -> Tensor:
         """Transform vectors ``(3, N)`` from the mesh to its instance."""
@@ -91,15 +95,27 @@ def lane_primitives(world: World, prim: Tensor) -> LanePrimitives:
     """Return the geometry of primitives by their ids in the search, none of them a miss."""
     geometry = world.geometry
     if geometry.copies is None:
-        return LanePrimitives(prim, take(geometry.p0, prim), take(geometry.e1, prim), take(geometry.e2, prim))
+        return LanePrimitives(
+            prim=prim, p0=take(geometry.p0, prim), e1=take(geometry.e1, prim), e2=take(geometry.e2, prim)
+        )
     column = geometry.instance_column(prim)
     table = rows(geometry.copies, column)
     prim = prim - table.start + table.first  # from the instance's ids to those of the mesh
     p0, e1, e2 = take(geometry.p0, prim), take(geometry.e1, prim), take(geometry.e2, prim)
     size = (p0.abs() + e1.abs() + e2.abs()).detach()
-    reach = affine(table.x.abs() * size[0], table.y.abs(), size[1], table.z.abs(), size[2]) + table.move.abs()
+    coordinate_bound = (
+        affine(table.x.abs() * size[0], table.y.abs(), size[1], table.z.abs(), size[2]) + table.move.abs()
+    )
     p0, e1, e2 = _linear(table, p0) + table.move, _linear(table, e1), _linear(table, e2)
-    return LanePrimitives(prim, p0, e1, e2, copies=table, is_instanced=column > 0, reach=reach.detach())
+    return LanePrimitives(
+        prim=prim,
+        p0=p0,
+        e1=e1,
+        e2=e2,
+        copies=table,
+        is_instanced=column > 0,
+        coordinate_bound=coordinate_bound.detach(),
+    )
 
 
 @dataclass(frozen=True)
@@ -152,14 +168,15 @@ class Primitive:
     Attributes:
         name: one of :data:`torchpt.physics.shapes.geometry.KINDS`.
         flat: whether points lie in the plane ``p0 + u e1 + v e2``. Flat kinds come first in the order of kinds.
-        has_own_uv: whether texture coordinates are not affine in ``u, v``: then :meth:`tangents` and :meth:`uv` compute them.
-        angles: whether only similarity transforms keep the kind: a sheared sphere is none.
+        has_own_uv: whether :meth:`uv` and :meth:`tangents` of the kind compute texture coordinates, which are not affine in
+            ``u, v``.
+        needs_similarity: whether only similarity transforms keep the kind: a sheared sphere is none.
     """
 
     name: ClassVar[str] = ""
     flat: ClassVar[bool] = True
     has_own_uv: ClassVar[bool] = False
-    angles: ClassVar[bool] = False
+    needs_similarity: ClassVar[bool] = False
 
     # -- when a world is built
 

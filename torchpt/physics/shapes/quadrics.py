@@ -161,12 +161,12 @@ def quadrics_of(kinds: Sequence[type[Quadric]], turned: Sequence[bool], frames: 
     front = front * torch.sign(dot(e1, cofactors[0]).detach())  # the sign of the determinant: mirroring maps
     scale = torch.stack(cofactors).detach().abs().amax((0, 1))
     n1, n2, n3 = ((n * (front / scale)).to(dtype) for n in cofactors)
-    reach = (p0.abs() + e1.abs() + e2.abs() + e3.abs()).detach().to(dtype)
+    coordinate_bound = (p0.abs() + e1.abs() + e2.abs() + e3.abs()).detach().to(dtype)
     present = tuple(sorted(set(kinds), key=lambda kind: kind.name))
     code = None
     if len(present) > 1:
         code = torch.tensor([present.index(kind) for kind in kinds], dtype=torch.int64, device=p0.device)
-    return Quadrics(present, code, e3.to(dtype), n1, n2, n3, reach)
+    return Quadrics(kinds=present, code=code, e3=e3.to(dtype), n1=n1, n2=n2, n3=n3, coordinate_bound=coordinate_bound)
 
 
 def table_of(table: Quadrics, frames: Tensor) -> QuadricTable:
@@ -176,7 +176,12 @@ def table_of(table: Quadrics, frames: Tensor) -> QuadricTable:
     p0, e1, e2, e3 = frames[0:3], frames[3:6], frames[6:9], frames[9:12]
     low, high = zip(*(kind.box(e1, e2, e3) for kind in table.kinds), strict=True)
     form = forms.expand(-1, frames.shape[1]) if table.code is None else forms[:, table.code]
-    return QuadricTable(frames, form, _select_by_kind(table, low) + p0, _select_by_kind(table, high) + p0)
+    return QuadricTable(
+        frame=frames,
+        form=form,
+        low=_select_by_kind(table, low) + p0,
+        high=_select_by_kind(table, high) + p0,
+    )
 
 
 def areas(table: Quadrics, frames: Tensor) -> tuple[Tensor, Tensor]:
@@ -208,7 +213,9 @@ def areas(table: Quadrics, frames: Tensor) -> tuple[Tensor, Tensor]:
 def rows(world: World, prim: Tensor) -> Quadrics:
     """Return the columns ``(., N)`` of primitives ``prim (N,)``; arbitrary ones where a primitive is no quadric."""
     assert world.geometry.quadrics is not None
-    index = (prim - world.geometry.ends[3]).clamp_min(0)
+    index = (prim - world.geometry.ends[3]).clamp_min(
+        0
+    )  # quadrics are the last of five kinds: they begin where spheres end
     return columns(world.geometry.quadrics, index)
 
 

@@ -159,7 +159,8 @@ class Node:
 
     def mean(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Return the mean colour ``(3,)`` over a unit square of texture coordinates, float64, detached; for colours only."""
-        side = (torch.arange(64, dtype=torch.float64) + 0.5) / 64  # centres of a grid of 64 x 64 points
+        # Centres of a grid of 64 x 64 cells: the mean decides how often a light is chosen, not what it emits.
+        side = (torch.arange(64, dtype=torch.float64) + 0.5) / 64
         uv = torch.stack(torch.meshgrid(side, side, indexing="xy")).reshape(2, -1)
         detached = {name: value.detach().cpu() for name, value in parameters.items()}
         table = self.table([self], detached, torch.float64, uv.device)

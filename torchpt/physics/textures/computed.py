@@ -85,7 +85,7 @@ class Computed(Mapped):
             channel=channel,
             transform=cls.matrix(values),
             constants=tuple(variant.constants(values).items()),
-            filtered=values.get("filter") in cls.filters,
+            filtered=values.get("filter") in cls.filters,  # the values of `filter` that average over footprints
         )
 
 

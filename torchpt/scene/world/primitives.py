@@ -66,8 +66,7 @@ def corners_of_all(
 def _pose_of(part: Part, parameters: Mapping[str, Tensor]) -> Tensor:
     """Return the pose of a part to the scene in float64, so that only the final product is rounded to the lanes' dtype."""
     pose = parameters[f"{part.name}.to_world"].double()
-    # `local`: where the part lies within its shape, as the cap of a cylinder.
-    return pose if part.local is None else pose @ torch.from_numpy(part.local).to(pose.device)
+    return pose if part.part_to_shape is None else pose @ torch.from_numpy(part.part_to_shape).to(pose.device)
 
 
 # ---- Instances: transforms of copied meshes, for the search and for lanes

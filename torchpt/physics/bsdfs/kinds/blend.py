@@ -46,7 +46,8 @@ class Blend(Bsdf):
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
         """See :meth:`Bsdf.of`."""
-        return cls(values["a"], values["b"]), cls.given(values)
+        # `values` has the models of both inner materials in place of the materials.
+        return cls(a=values["a"], b=values["b"]), cls.given(values)
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
@@ -150,7 +151,7 @@ class _TwoSided(Bsdf):
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         side = torch.copysign(torch.ones_like(wo[2]), wo[2])
         drawn = self.inner.sample(parameters, _flipped(wo, side), lobe, u)
-        return BsdfSample(_flipped(drawn.wi, side), drawn.pdf, drawn.weight, drawn.eta)
+        return replace(drawn, wi=_flipped(drawn.wi, side))
 
 
 def _flipped(w: Tensor, side: Tensor) -> Tensor:

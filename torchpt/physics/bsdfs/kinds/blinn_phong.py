@@ -94,5 +94,5 @@ class BlinnPhong(PhongBase):
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Return facets of GGX alpha ``sqrt(2 / (n + 2))``, with the lobe's albedo at normal incidence."""
         n = parameters["exponent"]
-        peak = 4.0 * (n + torch.exp(-0.34657359 * n)) / (n + 4.0)  # as in prepare; the number is log(2) / 2
+        peak = 4.0 * (n + torch.exp(-0.34657359 * n)) / (n + 4.0)  # as in `prepare`: 0.34657359 is log(2) / 2
         return phong_split_sum(parameters, alpha2=2.0 / (n + 2.0), peak=peak)

@@ -56,7 +56,7 @@ class Conductor(Metal):
         colour = metal_colour(parameters, wo[2].clamp_min(0.0))
         if parameters["specular_reflectance"] is not None:
             colour = colour * parameters["specular_reflectance"]
-        return BsdfSample(wi, torch.where(wo[2] > 0, math.inf, 0.0).to(wo.dtype), colour)
+        return BsdfSample(wi=wi, pdf=torch.where(wo[2] > 0, math.inf, 0.0).to(wo.dtype), weight=colour)
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Return the reflectance at normal incidence."""

@@ -31,7 +31,7 @@ class Diffuse(Bsdf):
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """Sample the cosine-weighted hemisphere."""
         wi = cosine_hemisphere(u)
-        return BsdfSample(wi, wi[2] * (1.0 / math.pi), parameters["reflectance"])
+        return BsdfSample(wi=wi, pdf=wi[2] * (1.0 / math.pi), weight=parameters["reflectance"])
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Return the reflectance."""

@@ -54,5 +54,5 @@ class Microfacet(Glossy):
             f0=f0 * specular,
             f90=specular,
             roughness=self.roughness(parameters),
-            over=f0,
+            over=f0,  # the facets lie above the diffuse base, which loses what they reflect
         )

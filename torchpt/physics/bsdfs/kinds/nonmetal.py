@@ -41,4 +41,10 @@ class Nonmetal(Glossy):
         """Return facets with the same reflectance at every angle, over the diffuse base."""
         s = parameters["specular"]
         roughness = self.roughness(parameters)
-        return SplitSumMaterial(diffuse=parameters["base_color"], f0=s, f90=s, roughness=roughness, over=s)
+        return SplitSumMaterial(
+            diffuse=parameters["base_color"],
+            f0=s,
+            f90=s,
+            roughness=roughness,
+            over=s,  # the facets lie above the diffuse base, which loses what they reflect
+        )

@@ -44,7 +44,7 @@ class Null(Bsdf):
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """Continue straight on."""
-        return BsdfSample(-wo, torch.full_like(wo[2], math.inf), torch.ones_like(wo))
+        return BsdfSample(wi=-wo, pdf=torch.full_like(wo[2], math.inf), weight=torch.ones_like(wo))
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Return white, as all light passes."""
@@ -52,6 +52,6 @@ class Null(Bsdf):
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Return a material that transmits all light."""
-        none = torch.zeros(3, len(parameters["row"]), device=parameters["row"].device)
-        zero = none[0]
-        return SplitSumMaterial(diffuse=none, f0=zero, f90=zero, roughness=zero, over=zero, through=none + 1.0)
+        black = torch.zeros(3, len(parameters["row"]), device=parameters["row"].device)
+        zero = black[0]
+        return SplitSumMaterial(diffuse=black, f0=zero, f90=zero, roughness=zero, over=zero, through=black + 1.0)

@@ -11,7 +11,7 @@ of the shading normal; only a transmissive model is seen from the back.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -86,7 +86,7 @@ class Principled(Bsdf):
         "spec_trans": fraction(0.0, "fraction of glass in the part that is not metal"),
         "flatness": fraction(0.0, "from the diffuse lobe at 0 to the fake subsurface lobe at 1"),
     }
-    lobed = True
+    lobed = True  # `sample` reads a number `lobe`, which chooses between the lobes
     conserves = False
 
     @classmethod
@@ -207,14 +207,13 @@ class Principled(Bsdf):
             side = torch.copysign(torch.ones_like(wo[2]), wo[2])
             above, _, eta, front = flip_to_upper(wo, wo, eta)
         alpha_u, alpha_v = alphas(parameters)
-        m = microfacet.sample_normal(above, alpha_u, alpha_v, u, self._bounded)
+        m = microfacet.sample_normal(above, alpha_u, alpha_v, u, bounded=self._bounded)
         cos = dot(above, m)
         facet = self._facet(parameters, above, m, cos.clamp_min(0.0), eta, front)
         probability = self.probabilities(parameters, above, facet, front)
         wi = microfacet.reflect(above, m, cos)
-        threshold = (
-            probability.diffuse
-        )  # lobes take intervals of `lobe` in the order diffuse, coat, refraction, reflection
+        # Lobes take intervals of the number `lobe` in the order diffuse, coat, refraction, reflection.
+        threshold = probability.diffuse
         wi = torch.where(lobe < threshold, cosine_hemisphere(u), wi)
         if probability.clearcoat is not None:
             coat = sample_gtr1(clearcoat_alpha(or_zero(parameters["clearcoat_gloss"], lobe)), u)
@@ -228,7 +227,7 @@ class Principled(Bsdf):
         # A reflection that ends up below the surface must not count as a refraction, nor the other way round.
         valid = ((wi[2] < 0) == refracts).to(wi.dtype)
         drawn = mixture_sample(self, parameters, wo, torch.stack((wi[0], wi[1], wi[2] * side)), valid)
-        return BsdfSample(drawn.wi, drawn.pdf, drawn.weight, torch.where(refracts, eta, 1.0).detach())
+        return replace(drawn, eta=torch.where(refracts, eta, 1.0).detach())
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Return the base colour."""
@@ -256,7 +255,7 @@ class Principled(Bsdf):
             f0=f0,
             f90=torch.ones_like(eta),
             roughness=(alpha_u * alpha_v).sqrt().sqrt(),
-            over=dielectric_f0,
+            over=dielectric_f0,  # the diffuse lobe lies below the dielectric one alone, not below metal
             through=transmitted,
             eta=None if spec_trans is None else eta,
         )
@@ -310,11 +309,11 @@ class Principled(Bsdf):
             scale = torch.where(positive, 1.0 / torch.where(positive, total, 1.0), 0.0)
             diffuse, main, coat = diffuse * scale, main * scale, None if coat is None else coat * scale
             if facet.refracted is None:
-                return Probabilities(diffuse, coat, main, None)
+                return Probabilities(diffuse=diffuse, clearcoat=coat, reflect=main, refract=None)
             reflected, refracted = luminance(facet.reflected), luminance(facet.refracted)
             positive = reflected + refracted > 0
             main = main / torch.where(positive, reflected + refracted, 1.0) * positive
-            return Probabilities(diffuse, coat, main * reflected, main * refracted)
+            return Probabilities(diffuse=diffuse, clearcoat=coat, reflect=main * reflected, refract=main * refracted)
 
     @property
     def _bounded(self) -> bool:
@@ -396,14 +395,15 @@ class Principled(Bsdf):
         reflected = torch.where(eta == 1.0, 0.0, reflected)
         spec_trans = parameters.get("spec_trans")
         if spec_trans is None:
-            return Facet(interface, cos, schlick, reflected, refracted=None)
+            return Facet(interface=interface, cos=cos, schlick=schlick, reflected=reflected, refracted=None)
         glass = nonmetallic * spec_trans
         if front is not None:  # inside there is glass alone
             reflected = torch.where(front > 0, reflected, glass * f)
         # The root of the base colour; the inner `where` keeps its infinite derivative at 0 from becoming 0 * inf.
         positive = base > 0
         root = torch.where(positive, torch.where(positive, base, 1.0).sqrt(), 0.0)
-        return Facet(interface, cos, schlick, reflected, refracted=root * (glass * (1.0 - f)))
+        refracted = root * (glass * (1.0 - f))
+        return Facet(interface=interface, cos=cos, schlick=schlick, reflected=reflected, refracted=refracted)
 
     def _diffuse(self, parameters: Parameters, cos_o: Tensor, cos_i: Tensor, cos_d: Tensor) -> Tensor:
         """Return the diffuse and sheen lobes ``(3, N)`` without the cosine; ``cos_d`` is between ``wo`` and the half vector."""

@@ -86,9 +86,8 @@ class RoughConductor(Anisotropic, Metal):
         facets = microfacet.reflection(
             wo, wi, *alphas(parameters), bounded=microfacet.BOUNDED, by_height=self.energy_compensation
         )
-        is_rough = (~parameters["smooth"]).to(
-            wo.dtype
-        )  # 1, or 0 where the surface is a mirror: `eval` leaves deltas out
+        # 1, or 0 where the surface is a mirror: `eval` leaves deltas out.
+        is_rough = (~parameters["smooth"]).to(wo.dtype)
         value = self._colour(parameters, facets.cos_m) * (facets.value * is_rough)
         if self.energy_compensation:
             f0 = metal_colour(parameters, cos=torch.ones_like(wo[2]))

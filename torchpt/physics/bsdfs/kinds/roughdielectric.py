@@ -152,10 +152,10 @@ class RoughDielectric(Anisotropic, Glass):
         delta = sample_smooth_interface(parameters, wo, lobe)
         assert delta.eta is not None
         return BsdfSample(
-            torch.where(smooth, delta.wi, drawn.wi),
-            torch.where(smooth, delta.pdf, drawn.pdf),
-            torch.where(smooth, delta.weight, drawn.weight),
-            torch.where(smooth, delta.eta, torch.where(reflects, 1.0, side.eta_it)).detach(),
+            wi=torch.where(smooth, delta.wi, drawn.wi),
+            pdf=torch.where(smooth, delta.pdf, drawn.pdf),
+            weight=torch.where(smooth, delta.weight, drawn.weight),
+            eta=torch.where(smooth, delta.eta, torch.where(reflects, 1.0, side.eta_it)).detach(),
         )
 
     def albedo(self, parameters: Parameters) -> Tensor:

@@ -68,7 +68,7 @@ class RoughPlastic(Rough, Coat):
         transmittance = microfacet.coat_transmittance(cosines, alpha, index)
         from_below = microfacet.coat_reflectance(cosines, alpha, 1.0 / index)
         inner = 2.0 * (from_below * cosines).mean()[None].to(eta.dtype)  # the integral over cosines of 2 R cos
-        return {"transmittance": Table(transmittance.to(eta.dtype), _COSINES), "inner": inner}
+        return {"transmittance": Table(transmittance.to(eta.dtype), count=_COSINES), "inner": inner}
 
     def prepare(self, values: Parameters) -> Parameters:
         """Return the parameters of one material, or of all lanes, from its values; see :meth:`Bsdf.prepare`."""
@@ -87,9 +87,8 @@ class RoughPlastic(Rough, Coat):
         facets = microfacet.reflection(wo, wi, alpha, alpha, bounded=microfacet.BOUNDED)
         f = fresnel_dielectric(facets.cos_m, parameters["eta"]).reflectance
         t_o, t_i = parameters["transmittance"].at(wo[2]), parameters["transmittance"].at(wi[2])
-        rough_coat = (~parameters["smooth"]).to(
-            wo.dtype
-        )  # 1, or 0 where the coat is a mirror: `eval` leaves deltas out
+        # 1, or 0 where the coat is a mirror: `eval` leaves deltas out.
+        rough_coat = (~parameters["smooth"]).to(wo.dtype)
         # Over pi; 0 where wo is not above the surface.
         cosine = wi[2].clamp_min(0.0) * (1.0 / math.pi) * wo[2].sign().clamp_min(0.0)
         coat = tinted(f * facets.value * rough_coat, parameters["specular_reflectance"])

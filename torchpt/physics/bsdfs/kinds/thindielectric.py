@@ -61,7 +61,7 @@ class ThinDielectric(Glass):
             tinted(weight_of_choice, parameters["specular_transmittance"]),
         )
         pdf = torch.where(wo[2] != 0, math.inf, 0.0).to(wo.dtype)
-        return BsdfSample(torch.stack((-wo[0], -wo[1], z)), pdf, weight)
+        return BsdfSample(wi=torch.stack((-wo[0], -wo[1], z)), pdf=pdf, weight=weight)
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Return white, as nothing is absorbed."""

@@ -34,20 +34,21 @@ class Orthographic(Camera):
     def rays(self, x: Tensor, y: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
         """See :meth:`Camera.rays`."""
         right, up, ahead = self.axes()
-        across, along = self.place(x, y)
+        across, along = self.place(x, y)  # right and up, in half widths of the film
         half = 0.5 * self.width
         o = self.origin() + up * (along * half) + right * (across * half)
         return o, ahead.expand_as(o).clone()
 
     def film_of(self, p: Tensor) -> Tensor:
         """See :meth:`Camera.film_of`."""
-        right, up, depth = self.covectors() @ (p - self.origin())
+        right, up, depth = self.covectors() @ (p - self.origin())  # components along the axes of the picture
         width, height = self.film[0], self.film[1]
         x = 0.5 * width + right * (width / self.width)
         y = 0.5 * height - up * (width / self.width)
-        return torch.stack((x, y, torch.ones_like(x), depth))
+        return torch.stack((x, y, torch.ones_like(x), depth))  # x h, y h, h and depth, with h = 1
 
     def pixel(self) -> Tensor:
         """See :meth:`Camera.pixel`."""
         spread = self.width / self.film[0]
-        return torch.cat((-self.axes()[2][:, 0], torch.stack((torch.zeros_like(spread), spread))))
+        _, _, ahead = self.axes()
+        return torch.cat((-ahead[:, 0], torch.stack((torch.zeros_like(spread), spread))))  # e, w = 0, spread

@@ -29,7 +29,8 @@ class Perspective(Pinhole):
 
     def project(self, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See :meth:`Camera.project`."""
-        x, y, depth, _ = self.project_homogeneous(offset)
+        x, y, depth, _ = self.project_homogeneous(offset)  # x and y times the depth
+        # Pixels per unit of slope, squared; the solid angle of an area on a plane falls with the third power of the depth.
         scale = (0.5 * self.film[0] / self.half_width()) ** 2 / depth.abs() ** 3
-        scale = scale * torch.linalg.det(self.covectors()).abs()
+        scale = scale * torch.linalg.det(self.covectors()).abs()  # 1 for orthogonal axes
         return x / depth, y / depth, scale if self.pixel_aspect is None else scale * self.pixel_aspect

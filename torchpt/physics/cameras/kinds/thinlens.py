@@ -51,7 +51,7 @@ class ThinLens(Pinhole):
         assert u is not None
         left, high = concentric_disk(u) if self.blades == 0 else uniform_polygon(u, self.blades)
         right, up, ahead = self.axes()
-        across, along = self.slopes(x, y)
+        across, along = self.slopes(x, y)  # of the pinhole's ray: right and up per unit of depth
         # From the point on the lens to the point in focus, divided by the larger of radius and distance: nothing overflows, and
         # a lens of radius 0 gives exactly the rays of a pinhole.
         unit = torch.maximum(self.aperture_radius, self.focus_distance).detach()

@@ -31,11 +31,14 @@ class Directional(Light):
         """See :meth:`Light.row`."""
         color = scene["irradiance"]
         axis = normalize(scene["direction"][:, None])[:, 0]
-        return Row(color, math.pi * scene.reach**2 * bright(color), normal=axis)
+        # Through a disk as wide as the scene, whose radius is `reach`; `bright` is the detached luminance.
+        power = math.pi * scene.reach**2 * bright(color)
+        return Row(radiance=color, power=power, normal=axis)
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
         """See :meth:`Light.sample`."""
         one = torch.ones_like(u[0], dtype=at.radiance.dtype)
         wi = (-at.normal).expand(3, u.shape[1])
-        return LightSample(wi, wi, None, at.radiance.expand_as(wi), one * torch.inf, one)
+        radiance = at.radiance.expand_as(wi)
+        return LightSample(wi=wi, target=wi, distant=None, radiance=radiance, pdf=one * torch.inf, weight=one)

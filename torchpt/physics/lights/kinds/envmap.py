@@ -112,7 +112,9 @@ def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None
         texels = texels.expand(2, -1, -1)
     height, width, _ = texels.shape
     planes = texels.permute(2, 0, 1).reshape(3, -1)
-    angle = torch.linspace(0.0, 0.5 * math.pi, height, dtype=torch.float64, device=texels.device)
+    angle = torch.linspace(
+        0.0, 0.5 * math.pi, height, dtype=torch.float64, device=texels.device
+    )  # theta / 2 of the rows
     sine, cosine = torch.sin(angle), torch.cos(angle)
     # cos(pi / 2) is not quite 0 in floating point.
     sine[0] = cosine[-1] = 0.0
@@ -125,6 +127,7 @@ def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None
         weights = _weights(light, heights)
         mean = sum_all(weights)
         black = not bool(mean > 0)
+        # With a floor of -1 every texel of a black map has the value 1: a uniform density.
         plain = _grid(_weights(torch.ones_like(light), heights), zero - 1.0) if black else _grid(weights, zero)
         compensated = None
         if not black and compensation is not False:
@@ -163,11 +166,12 @@ def _uneven(weights: Tensor, mean: Tensor, heights: Tensor) -> bool:
 
 def _grid(weights: Tensor, floor: Tensor) -> Grid:
     """Return the density of integrals over the cells, in which the sphere has measure 1."""
-    return Grid(Distribution2D.of(weights), floor, (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype))
+    factor = (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype)
+    return Grid(cells=Distribution2D.of(weights), floor=floor, factor=factor)
 
 
-def _place(map: EnvironmentMap, d: Tensor) -> Cell:
-    """Return the cells of unit directions ``(3, N)`` of the world."""
+def _cell_of(map: EnvironmentMap, d: Tensor) -> Cell:
+    """Return the cells in which unit directions ``(3, N)`` of the world lie."""
     local = [dot(map.turn[k][:, None], d) for k in range(3)]
     around, down = angles(local, torch.finfo(d.dtype).tiny)
     tall, wide = map.size[0].to(d.dtype), map.size[1].to(d.dtype)
@@ -182,11 +186,13 @@ _Corners = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def _corners(map: EnvironmentMap, at: Cell) -> _Corners:
+    """Return the colours of the four texels around points in cells ``at``."""
     a, b, c, d = (take(map.texels, texel) for texel in at.texels(map.size[1]))
     return a, b, c, d
 
 
 def _mix(corners: tuple[Tensor, Tensor, Tensor, Tensor], x: Tensor, y: Tensor) -> Tensor:
+    """Interpolate the values at the corners bilinearly, at fractions ``x, y (N,)`` of the cell."""
     a, b, c, d = corners
     top, bottom = a + (b - a) * x, c + (d - c) * x
     return top + (bottom - top) * y
@@ -199,28 +205,29 @@ def _values(grid: Grid, corners: _Corners) -> tuple[Tensor, Tensor, Tensor, Tens
 
 
 def _density(map: EnvironmentMap, grid: Grid, at: Cell, corners: _Corners) -> Tensor:
+    """Return the density ``(N,)`` per steradian of points in cells ``at``, whose texels have the colours ``corners``."""
     step = math.pi / (map.size[0] - 1).to(at.y.dtype)
     y = at.y.detach()
-    # A difference of cosines, written as a product to avoid cancellation.
+    # The fraction of the cell's cos(theta): a difference of cosines, written as a product to avoid cancellation.
     down = torch.sin((0.5 * step) * y) * torch.sin(step * (at.row + 0.5 * y)) * take(map.steps, at.row)
     return _mix(_values(grid, corners), at.x.detach(), down.clamp_max(1.0)) * grid.factor
 
 
 def radiance(map: EnvironmentMap, d: Tensor) -> Tensor:
     """Return radiance ``(3, N)`` from unit directions ``d (3, N)``."""
-    at = _place(map, d)
+    at = _cell_of(map, d)
     return _mix(_corners(map, at), at.x, at.y) * map.scale
 
 
 def pdf(map: EnvironmentMap, d: Tensor, mis: bool) -> Tensor:
     """Return the pdf ``(N,)`` of unit directions ``d (3, N)`` under :func:`sample`, per steradian; detached."""
-    at = _place(map, d.detach())
+    at = _cell_of(map, d.detach())
     return _density(map, map.grid(mis), at, _corners(map, at))
 
 
 def environment(map: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
     """Return :func:`radiance` and :func:`pdf`, with one look-up."""
-    at = _place(map, d)
+    at = _cell_of(map, d)
     corners = _corners(map, at)
     return _mix(corners, at.x, at.y) * map.scale, _density(map, map.grid(mis), at, corners)
 
@@ -238,15 +245,16 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
         directions. A pdf of 0 means that sampling failed.
     """
     grid = map.grid(mis)
-    row, column, rest = grid.cells.sample(u)
-    corners = _corners(map, Cell(row, column, rest[0], rest[1]))
+    row, column, rest = grid.cells.sample(u)  # `rest (2, N)`: `u` remapped to [0, 1) within the cell
+    corners = _corners(map, Cell(row=row, column=column, x=rest[0], y=rest[1]))
     with torch.no_grad():
         a, b, c, d = _values(grid, corners)
+        # Within the cell the density is bilinear in the column and in `down`, the fraction of the cell's cos(theta).
         down = invert_linear(rest[1], a + b, c + d)
         x = invert_linear(rest[0], a + (c - a) * down, b + (d - b) * down)
         density = _mix((a, b, c, d), x, down) * grid.factor
         above, below = take(map.halves, row), take(map.halves, row + 1)
-        half = above + (below - above) * down
+        half = above + (below - above) * down  # sin^2 and cos^2 of theta / 2
         tall, wide = map.size[0].to(u.dtype), map.size[1].to(u.dtype)
         phi = (x + (column + 0.5)) * (2.0 * math.pi / wide)
         radius = 2.0 * (half[0] * half[1]).sqrt()
@@ -254,6 +262,7 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
         # The inverse of an orthogonal matrix is its transpose.
         turn = map.turn
         wi = torch.stack([local[0] * turn[0, k] + local[1] * turn[1, k] + local[2] * turn[2, k] for k in range(3)])
+        # The fraction of the cell in theta, in which the look-up is bilinear.
         y = (azimuth(local[1], radius) * ((tall - 1.0) * (1.0 / math.pi)) - row).clamp(0.0, 1.0)
     if map.turn.requires_grad:
         return wi, density, radiance(map, wi)  # differentiable in the rotation
@@ -305,14 +314,16 @@ class Envmap(Environment):
         turn = torch.linalg.inv(linear) * torch.linalg.det(linear).abs() ** (1.0 / 3.0)
         around = build(texels, turn.to(scene.dtype), scale)
         color = (around.mean * around.scale.detach()).expand(3)
-        return Row(color, 4.0 * math.pi**2 * scene.reach**2 * bright(color), environment=around)
+        # From each direction through a disk as wide as the scene, whose radius is `reach`; `bright` is the detached luminance.
+        power = 4.0 * math.pi**2 * scene.reach**2 * bright(color)
+        return Row(radiance=color, power=power, environment=around)
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
         """See :meth:`Light.sample`."""
         wi, density, light = sample(at.environment, u, mis)
         weight = torch.where(density > 0, safe_reciprocal(density), 0.0)
-        return LightSample(wi, wi, None, light, density, weight)
+        return LightSample(wi=wi, target=wi, distant=None, radiance=light, pdf=density, weight=weight)
 
     @classmethod
     def radiance_pdf(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
@@ -323,7 +334,7 @@ class Envmap(Environment):
     def environment_image(cls, around: EnvironmentMap) -> EnvironmentImage:
         """See :meth:`Environment.environment_image`."""
         texels = (around.texels * around.scale).T.reshape(around.height, around.width, 3)
-        return EnvironmentImage(texels, around.turn)
+        return EnvironmentImage(texels=texels, turn=around.turn)
 
     @classmethod
     def info(cls, around: EnvironmentMap) -> dict[str, Any]:

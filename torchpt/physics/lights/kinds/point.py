@@ -32,17 +32,19 @@ class Point(Light):
         "position": spec.Point(moves=Moves.SHADOWS, doc="position"),
         "intensity": Color((1.0, 1.0, 1.0), doc="radiant intensity: power per solid angle"),
     }
-    places = ("position",)
+    places = ("position",)  # parameters that are points, by which the world's unit is chosen
 
     @classmethod
     def row(cls, scene: Setting) -> Row:
         """See :meth:`Light.row`."""
         color = scene.intensity("intensity")
-        return Row(color, (4.0 * math.pi) * bright(color), scene.point("position"))
+        power = (4.0 * math.pi) * bright(color)  # `bright` is the detached luminance
+        return Row(radiance=color, power=power, p0=scene.point("position"))
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
         """See :meth:`Light.sample`."""
         wi, weight = toward(x, at.p0)
         infinite = torch.full_like(weight, torch.inf)
-        return LightSample(wi, at.p0.expand_as(wi), None, at.radiance.expand_as(wi), infinite, weight)
+        target, radiance = at.p0.expand_as(wi), at.radiance.expand_as(wi)
+        return LightSample(wi=wi, target=target, distant=None, radiance=radiance, pdf=infinite, weight=weight)

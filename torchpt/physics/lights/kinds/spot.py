@@ -57,7 +57,9 @@ class Spot(Light):
             doc="angle from the axis up to which the intensity is constant; it falls linearly from there to 0 at the cutoff",
         ),
     }
-    places = ("position",)
+    places = (
+        "position",
+    )  # parameters that are points, by which the world's unit is chosen; the target is a direction only
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
@@ -78,20 +80,25 @@ class Spot(Light):
         slope = 1.0 / (cutoff - beam).clamp_min(1e-6)
         # The solid angle of a linear falloff from a to b depends on the mean cosine between them, which is this product.
         mean = torch.cos(0.5 * (cutoff + beam)) * torch.sinc((cutoff - beam) * (0.5 / math.pi))
-        share = 2.0 * math.pi * (1.0 - mean).detach()
+        solid_angle = 2.0 * math.pi * (1.0 - mean).detach()
         numbers = torch.stack((cutoff, slope, torch.zeros_like(cutoff)))
-        return Row(color, share * bright(color), scene.point("position"), numbers, normal=axis)
+        power = solid_angle * bright(color)  # `bright` is the detached luminance
+        return Row(radiance=color, power=power, p0=scene.point("position"), e1=numbers, normal=axis)
 
     @classmethod
     def bounds(cls, at: Lights, intensity: Tensor) -> Cone:
         """See :meth:`Emitter.bounds`: the cone of the beam, extended by the angle from its edge to the cutoff."""
         cutoff, slope = at.e1[0], at.e1[1]
-        edge = 1.0 / slope
-        return Cone(torch.cos((cutoff - edge).clamp_min(0.0)), torch.cos(edge), luminance(at.radiance.abs()))
+        edge = 1.0 / slope  # angle from the beam's edge to the cutoff
+        return Cone(
+            cos_o=torch.cos((cutoff - edge).clamp_min(0.0)),
+            cos_e=torch.cos(edge),
+            intensity=luminance(at.radiance.abs()),
+        )
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
         """See :meth:`Light.sample`."""
         drawn = point.Point.sample(at, x, u, mis)
-        share = falloff(drawn.wi, at.normal, at.e1[0], at.e1[1])
-        return replace(drawn, radiance=drawn.radiance * share)
+        fraction = falloff(drawn.wi, axis=at.normal, cutoff=at.e1[0], slope=at.e1[1])
+        return replace(drawn, radiance=drawn.radiance * fraction)

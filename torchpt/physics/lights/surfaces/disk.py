@@ -17,10 +17,10 @@ class Disk(Surface):
     """An ellipse."""
 
     name = "disk"
-    share = math.pi
+    area_factor = math.pi  # area of an ellipse over the product of its half axes, which `e1` and `e2` are
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
         """See :meth:`Surface.sample`."""
         uv = concentric_disk(u)
-        return SurfaceSample(flat_point(at.p0, at.e1, at.e2, uv), at.normal, uv)
+        return SurfaceSample(p=flat_point(at.p0, at.e1, at.e2, uv), normal=at.normal, uv=uv)

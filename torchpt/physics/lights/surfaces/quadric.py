@@ -22,9 +22,9 @@ def world_area(area: Tensor, e1: Tensor, e2: Tensor, e3: Tensor, normal: Tensor)
 
     Args:
         area: area in object space times ``|det|`` ``(N,)``.
-        e1: ``(3, N)``.
-        e2: ``(3, N)``.
-        e3: ``(3, N)``.
+        e1: images of the axes of object space ``(3, N)``: this one of x.
+        e2: of y ``(3, N)``.
+        e3: of z ``(3, N)``.
         normal: unit normal in the world ``(3, N)``.
     """
     a, b, c = dot(e1, normal), dot(e2, normal), dot(e3, normal)
@@ -50,9 +50,9 @@ class Quadric(Surface):
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
         """See :meth:`Surface.sample`."""
         assert at.quadrics is not None
-        own = quadrics.sample(at.quadrics, u)
+        own = quadrics.sample(at.quadrics, u)  # (3, N) in object space
         p = affine(at.p0 + at.e1 * own[0], at.e2, own[1], at.quadrics.e3, own[2])
-        return SurfaceSample(p, quadrics.outward(at.quadrics, own), own=own)
+        return SurfaceSample(p=p, normal=quadrics.outward(at.quadrics, own), own=own)
 
     @classmethod
     def size(cls, at: Lights, normal: Tensor) -> Tensor | None:
@@ -64,4 +64,4 @@ class Quadric(Surface):
     def bound(cls, at: Lights, normal: Tensor) -> Tensor | None:
         """See :meth:`Surface.bound`."""
         assert at.quadrics is not None
-        return dot(normal.detach().abs(), at.quadrics.reach)
+        return dot(normal.detach().abs(), at.quadrics.coordinate_bound)

@@ -20,16 +20,19 @@ __all__ = ["Sphere", "inverse_pdf", "sample"]
 
 
 def _cone(x: Tensor, centre: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return axis, distance, mask of points outside, and ``1 - cos`` of the half angle of the visible cone."""
+    """Return the vector to the centre, distance, mask of points outside, and ``1 - cos`` of the visible cone's half angle."""
     axis = centre - x
     square = dot(axis, axis)
     outside = square > radius * radius * (1.0 + 2.0**-18)  # nearer, the cone is a half space up to rounding
-    safe = torch.where(outside, square, 4.0 * radius * radius)
+    safe = torch.where(outside, square, 4.0 * radius * radius)  # any distance outside keeps unused lanes finite
     return axis, safe.sqrt(), outside, one_minus_cos(radius * radius / safe)
 
 
 def sample(x: Tensor, centre: Tensor, radius: Tensor, flip: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Sample points ``(3, N)`` on spheres as seen from ``x (3, N)``; return them and unit normals on the emitting side."""
+    """Sample points ``(3, N)`` on spheres as seen from ``x (3, N)``; return them and unit normals on the emitting side.
+
+    ``flip (N,)`` is -1 for spheres that emit inward, else 1; ``u (2, N)`` is in [0, 1).
+    """
     axis, distance, outside, width = _cone(x, centre, radius)
     local = uniform_cone(u, width)
     sin2 = local[0] * local[0] + local[1] * local[1]
@@ -69,7 +72,7 @@ class Sphere(Surface):
         radius = at.e1[0]
         p, normal = sample(x.detach(), at.p0.detach(), radius.detach(), at.flip, u)
         grown = radius / torch.where(radius == 0, 1.0, radius).detach()  # 1; rows of other kinds may have radius 0
-        return SurfaceSample(at.p0 + (p - at.p0).detach() * grown, normal)
+        return SurfaceSample(p=at.p0 + (p - at.p0).detach() * grown, normal=normal)
 
     @classmethod
     def inverse_pdf(

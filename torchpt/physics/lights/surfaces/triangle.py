@@ -13,4 +13,4 @@ class Triangle(Surface):
 
     name = "triangle"
     code = TRIANGLE
-    share = 0.5
+    area_factor = 0.5  # a triangle is half of the parallelogram of its edges

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchpt.math.hashing import mix, to_unit
 from torchpt.physics.samplers.base import Points
-from torchpt.physics.samplers.bits import X, Y, jittered, point_in_stratum, reverse_bits, scramble, shuffle
+from torchpt.physics.samplers.bits import SEED_X, SEED_Y, jittered, point_in_stratum, reverse_bits, scramble, shuffle
 
 __all__ = ["Hammersley"]
 
@@ -27,8 +27,8 @@ class Hammersley(Points):
     """``(i/n, van der Corput)``, the first jittered, the second Owen-scrambled, for a fixed number n of points."""
 
     name = "hammersley"
-    needs_count = True
-    rows = 3
+    needs_count = True  # the number of points must be known beforehand
+    rows = 3  # of a key
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """Return a jittered number, one in each of n intervals; arguments as for :meth:`Points.draw_1d`."""
@@ -39,5 +39,5 @@ class Hammersley(Points):
         pixel_seed, point, count = key[0], key[1], key[2]
         seed = mix(pixel_seed ^ salt)
         index = shuffle(point, count, seed)
-        x = point_in_stratum(index.double(), to_unit(mix(mix(seed ^ X) ^ index)).double(), count.double())
-        return torch.stack((x, to_unit(reverse_bits(scramble(index, mix(seed ^ Y))))))
+        x = point_in_stratum(index.double(), to_unit(mix(mix(seed ^ SEED_X) ^ index)).double(), count.double())
+        return torch.stack((x, to_unit(reverse_bits(scramble(index, mix(seed ^ SEED_Y))))))

@@ -31,7 +31,7 @@ class Independent(Points):
     """Independent random numbers, for comparisons and for tests."""
 
     name = "independent"
-    parameters = ADAPTIVE
+    parameters = ADAPTIVE  # the scene key `adaptive`, which the renderer reads: no field
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """Return a uniform number; arguments as for :meth:`Points.draw_1d`."""

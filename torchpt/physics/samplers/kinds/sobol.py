@@ -4,7 +4,8 @@ Sets of one or two dimensions are Sobol' points. The numbers of a light sample a
 vertex (or of the film position) are the two halves of a set of four dimensions, stratified together.
 
 A key has two rows: seed of the pixel, index of the point. The functions of ``bits.py`` take and return bit-reversed numbers, so
-the last step of each coordinate reverses it.
+the last step of each coordinate reverses it. The index itself is the first coordinate, bit-reversed. ``SEED_X`` to ``SEED_W``
+are mixed into the seed, so that each coordinate is scrambled by itself.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from torch import Tensor
 from torchpt.math.hashing import mix, to_unit
 from torchpt.physics.samplers.base import ADAPTIVE, Points
 from torchpt.physics.samplers.bits import (
-    W,
-    X,
-    Y,
-    Z,
+    SEED_W,
+    SEED_X,
+    SEED_Y,
+    SEED_Z,
     fourth_dimension,
     reverse_bits,
     scramble,
@@ -47,25 +48,25 @@ class Sobol(Points):
     """An Owen-scrambled (0, 2)-sequence for each pixel and set of dimensions, for any number of samples."""
 
     name = "sobol"
-    parameters = ADAPTIVE
-    joint = True
+    parameters = ADAPTIVE  # the scene key `adaptive`, which the renderer reads: no field
+    joint = True  # `draw_further` continues sets of two numbers to four
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """Return the first coordinate of a shuffled point; arguments as for :meth:`Points.draw_1d`."""
         # Shuffled before scrambling: by scrambling alone all 1D sets would share their order and be correlated.
         seed, index = _shuffled(key, salt)
-        return to_unit(reverse_bits(scramble(index, mix(seed ^ X))))
+        return to_unit(reverse_bits(scramble(index, mix(seed ^ SEED_X))))
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """Return the first two coordinates of a shuffled point; arguments as for :meth:`Points.draw_1d`."""
         seed, index = _shuffled(key, salt)
-        x = scramble(index, mix(seed ^ X))
-        y = scramble(second_dimension(index), mix(seed ^ Y))
+        x = scramble(index, mix(seed ^ SEED_X))
+        y = scramble(second_dimension(index), mix(seed ^ SEED_Y))
         return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))
 
     def draw_further(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """Return the third and fourth coordinate of the point of :meth:`draw_2d`: the same seed gives the same shuffle."""
         seed, index = _shuffled(key, salt)
-        x = scramble(third_dimension(index), mix(seed ^ Z))
-        y = scramble(fourth_dimension(index), mix(seed ^ W))
+        x = scramble(third_dimension(index), mix(seed ^ SEED_Z))
+        y = scramble(fourth_dimension(index), mix(seed ^ SEED_W))
         return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchpt.math.hashing import mix, to_unit
 from torchpt.physics.samplers.base import Points
-from torchpt.physics.samplers.bits import X, Y, jittered, point_in_stratum, shuffle
+from torchpt.physics.samplers.bits import SEED_X, SEED_Y, jittered, point_in_stratum, shuffle
 
 __all__ = ["Stratified"]
 
@@ -25,8 +25,8 @@ class Stratified(Points):
     """Jittered: one point in each of n strata of equal area, nearly square, for any n."""
 
     name = "stratified"
-    needs_count = True
-    rows = 3
+    needs_count = True  # the number of points must be known beforehand
+    rows = 3  # of a key
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """Return a jittered number, one in each of n intervals; arguments as for :meth:`Points.draw_1d`."""
@@ -37,8 +37,8 @@ class Stratified(Points):
         pixel_seed, point, points = key[0], key[1], key[2]
         seed = mix(pixel_seed ^ salt)
         stratum = shuffle(point, points, seed)
-        jitter_x = to_unit(mix(mix(seed ^ X) ^ stratum)).double()
-        jitter_y = to_unit(mix(mix(seed ^ Y) ^ stratum)).double()
+        jitter_x = to_unit(mix(mix(seed ^ SEED_X) ^ stratum)).double()
+        jitter_y = to_unit(mix(mix(seed ^ SEED_Y) ^ stratum)).double()
         # Integers below 2^53, so that quotients are floored correctly.
         k, count = stratum.double(), points.double()
         columns = (count.sqrt() + 0.5).floor()

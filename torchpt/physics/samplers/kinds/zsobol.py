@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchpt.math.hashing import logical_shift, mix, to_unit
 from torchpt.physics.samplers.base import Points, SamplerTensors
-from torchpt.physics.samplers.bits import X, Y, reverse_bits, scramble, second_dimension
+from torchpt.physics.samplers.bits import SEED_X, SEED_Y, reverse_bits, scramble, second_dimension
 
 __all__ = ["ZSobol"]
 
@@ -62,8 +62,8 @@ class ZSobol(Points):
     """One Sobol' sequence for the film along a Z-order curve: with few samples a pixel the error is blue noise."""
 
     name = "zsobol"
-    needs_count = True
-    of_film = True
+    needs_count = True  # the number of points must be known beforehand
+    of_film = True  # points depend on the position of a pixel on the film
 
     def key(self, tensors: SamplerTensors, pixel: Tensor, randomization: Tensor, point: Tensor) -> Tensor:
         """Return ``(2, N)`` int32: the seed of the block, and the position of the point on the curve within it.
@@ -85,12 +85,12 @@ class ZSobol(Points):
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """Return the first coordinate of the sample's Sobol' point; arguments as for :meth:`Points.draw_1d`."""
         seed = mix(key[0] ^ salt)
-        return to_unit(reverse_bits(scramble(_index(key[1], seed), mix(seed ^ X))))
+        return to_unit(reverse_bits(scramble(_index(key[1], seed), mix(seed ^ SEED_X))))
 
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """Return the sample's Sobol' point; arguments as for :meth:`Points.draw_1d`."""
         seed = mix(key[0] ^ salt)
         index = _index(key[1], seed)
-        x = scramble(index, mix(seed ^ X))
-        y = scramble(second_dimension(index), mix(seed ^ Y))
+        x = scramble(index, mix(seed ^ SEED_X))
+        y = scramble(second_dimension(index), mix(seed ^ SEED_Y))
         return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))

@@ -50,6 +50,7 @@ class Cone(Shape, Quadric):
     def own(cls, values: Mapping[str, Any]) -> Any:
         """See :meth:`Shape.own`."""
         height, slope = values["height"], values["slope"]
+        # In object space the apex is at z = 1. Where the base lies above it, half a turn about x puts the cone on its apex.
         turn = UPRIGHT if height < 0 else UPRIGHT * [[1.0], [-1.0], [-1.0]]
         (x, y, z), length = values["apex"], abs(height)
         return placed((x, y + height, z), (slope * length, slope * length, length), turn)
@@ -59,7 +60,8 @@ class Cone(Shape, Quadric):
         """See :meth:`Shape.surfaces`."""
         if not values["capped"]:
             return [Surface("quadric", quadric=cls)]
-        return [Surface("quadric", "side", quadric=cls), Surface("disk", "bottom", BOTTOM)]
+        side = Surface("quadric", label="side", quadric=cls)
+        return [side, Surface("disk", label="bottom", local=BOTTOM)]
 
     @classmethod
     def place(cls, u: Tensor, v: Tensor) -> Tensor:
@@ -72,9 +74,9 @@ class Cone(Shape, Quadric):
     def normal(cls, q: Tensor) -> Tensor:
         """See :meth:`Quadric.normal`. The length is ``sqrt(2)``, but 1 at the apex."""
         radius = (1.0 - q[2]).detach()
-        below = radius > 0
-        share = 1.0 / torch.where(below, radius, 1.0)
-        return torch.stack((q[0] * share, q[1] * share, torch.where(below, 1.0 - q[2], 1.0) * share))
+        below = radius > 0  # the apex
+        scale = 1.0 / torch.where(below, radius, 1.0)
+        return torch.stack((q[0] * scale, q[1] * scale, torch.where(below, 1.0 - q[2], 1.0) * scale))
 
     @classmethod
     def climb(cls, q: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,5 +95,5 @@ class Cone(Shape, Quadric):
     @classmethod
     def box(cls, e1: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Quadric.box`; the side is the hull of an ellipse and the apex."""
-        reach = (e1.square() + e2.square()).sqrt()
-        return torch.minimum(-reach, e3), torch.maximum(reach, e3)
+        extent = (e1.square() + e2.square()).sqrt()
+        return torch.minimum(-extent, e3), torch.maximum(extent, e3)

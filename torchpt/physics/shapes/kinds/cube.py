@@ -20,14 +20,14 @@ _SIDES = (
     ((-1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ((0, 0, -1), (0, -1, 0), (1, 0, 0)),
 )
-_UVS = ((0, 1), (1, 1), (1, 0), (0, 0))
+_UVS = ((0, 1), (1, 1), (1, 0), (0, 0))  # of the four vertices of a side
 
 
 class Cube(Shape):
     """The cube ``[-1, 1]^3`` with outward face normals, then transformed."""
 
     name = "cube"
-    meshed = True
+    meshed = True  # made of triangles, which instances may share
 
     @classmethod
     def triangles(cls, values: Mapping[str, Any]) -> Triangles:
@@ -39,4 +39,10 @@ class Cube(Shape):
             normals += [normal] * 4
             faces += [[4 * side, 4 * side + 1, 4 * side + 2], [4 * side + 3, 4 * side, 4 * side + 2]]
         uvs = np.tile(np.array(_UVS, dtype=np.float64), (6, 1))
-        return Triangles(None, np.array(vertices), np.array(faces, dtype=np.int64), np.array(normals), uvs, flat=True)
+        return Triangles(
+            vertices=np.array(vertices),
+            faces=np.array(faces, dtype=np.int64),
+            normals=np.array(normals),
+            uvs=uvs,
+            flat=True,
+        )

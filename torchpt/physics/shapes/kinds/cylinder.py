@@ -42,8 +42,8 @@ class Cylinder(Shape, Quadric):
         """See :meth:`Shape.surfaces`."""
         if not values["capped"]:
             return [Surface("quadric", quadric=cls)]
-        side = Surface("quadric", "side", quadric=cls)
-        return [side, Surface("disk", "bottom", BOTTOM), Surface("disk", "top", TOP)]
+        side = Surface("quadric", label="side", quadric=cls)
+        return [side, Surface("disk", label="bottom", local=BOTTOM), Surface("disk", label="top", local=TOP)]
 
     @classmethod
     def place(cls, u: Tensor, v: Tensor) -> Tensor:
@@ -65,5 +65,5 @@ class Cylinder(Shape, Quadric):
     @classmethod
     def box(cls, e1: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Quadric.box`; the side is the hull of two ellipses."""
-        reach = (e1.square() + e2.square()).sqrt()
-        return torch.minimum(-reach, e3 - reach), torch.maximum(reach, e3 + reach)
+        extent = (e1.square() + e2.square()).sqrt()
+        return torch.minimum(-extent, e3 - extent), torch.maximum(extent, e3 + extent)

@@ -12,6 +12,7 @@ __all__ = ["Instance"]
 
 
 def _of(value: Any) -> str:
+    """Return the name of a shape, or refuse another value."""
     if isinstance(value, str) and value:
         return value
     raise Refused("the name of a mesh among the shapes")
@@ -29,7 +30,7 @@ class Instance(Shape):
             doc="the mesh: its triangles are used, and its material unless one is given",
         )
     }
-    copies = True
+    copies = True  # the shape `of` is drawn once more, in place of primitives of its own
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:

@@ -24,7 +24,8 @@ class Displacement:
 
 
 def _object(value: Any) -> Any:
-    """Return an object of trimesh, or a tuple of parts from Python code; the scene builder converts them."""
+    """Return an object of trimesh, or a tuple of :class:`~torchpt.scene.meshes.MeshPart`, which the scene builder converts."""
+    # `torchpt.scene` cannot be imported here, so mesh parts are known by their faces.
     if isinstance(value, tuple | list) and value and all(hasattr(part, "faces") for part in value):
         return tuple(value)
     if all(kind.__module__.partition(".")[0] != "trimesh" for kind in type(value).__mro__):
@@ -66,7 +67,7 @@ class Mesh(Shape):
         "face_normals": Flag(False, doc="whether to shade with face normals even if vertex normals exist"),
         "displacement": Block(None, kind=Displacement, doc="moves the vertices when the scene is loaded"),
     }
-    meshed = True
+    meshed = True  # made of triangles, which instances may share
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
@@ -98,7 +99,8 @@ class Mesh(Shape):
     @classmethod
     def triangles(cls, values: Mapping[str, Any]) -> Triangles:
         """See :meth:`Shape.triangles`."""
-        arrays = (values[name] for name in ("path", "vertices", "faces", "normals", "uvs"))
+        # Parameters that have the same name in both.
+        same = {name: values[name] for name in ("path", "vertices", "faces", "normals", "uvs")}
         return Triangles(
-            *arrays, flat=values["face_normals"], displacement=values["displacement"], object=values["mesh"]
+            **same, flat=values["face_normals"], displacement=values["displacement"], object=values["mesh"]
         )

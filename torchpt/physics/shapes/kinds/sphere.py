@@ -53,8 +53,8 @@ class Ellipsoid(Quadric):
     @classmethod
     def box(cls, e1: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Quadric.box`."""
-        reach = (e1.square() + e2.square() + e3.square()).sqrt()
-        return -reach, reach
+        extent = (e1.square() + e2.square() + e3.square()).sqrt()
+        return -extent, extent
 
 
 class Sphere(Shape):

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchpt.physics.shapes.primitive import Corners, Triple
 
-__all__ = ["axes_of", "axes_of_all", "corner_moves", "unit_uvs"]
+__all__ = ["axes_of", "axes_of_all", "corner_tangents", "unit_uvs"]
 
 
 def axes_of(pose: Tensor) -> tuple[Tensor, Tensor, Tensor, bool]:
@@ -39,11 +39,11 @@ def unit_uvs(corners: Corners) -> Triple:
     return first, second, third
 
 
-def corner_moves(corners: Corners, uvs: Triple) -> tuple[Tensor, Tensor]:
+def corner_tangents(corners: Corners, uvs: Triple) -> tuple[Tensor, Tensor]:
     """Return derivatives ``(3, P)`` of points by the texture coordinates ``u`` and ``v``, from those at the corners."""
     e1, e2 = corners.p1 - corners.p0, corners.p2 - corners.p0
     a, b = uvs[1] - uvs[0], uvs[2] - uvs[0]
     det = a[0] * b[1] - a[1] * b[0]
-    some = det != 0
-    inverse = torch.where(some, 1.0, 0.0) / torch.where(some, det, 1.0)
+    usable = det != 0  # else the texture coordinates of the corners lie on a line: derivatives 0
+    inverse = torch.where(usable, 1.0, 0.0) / torch.where(usable, det, 1.0)
     return (e1 * b[1] - e2 * a[1]) * inverse, (e2 * a[0] - e1 * b[0]) * inverse

@@ -26,14 +26,14 @@ class Disk(Primitive):
     """An ellipse about its centre ``p0``."""
 
     name = "disk"
-    has_own_uv = True
+    has_own_uv = True  # texture coordinates are computed here, not interpolated
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
         """See :meth:`Primitive.corners`."""
         move, x, y, mirrored = axes_of(pose)
         p1, p2 = move + x, move + y
-        return Corners(move.to(dtype), p1.to(dtype), p2.to(dtype), mirrored=mirrored)
+        return Corners(p0=move.to(dtype), p1=p1.to(dtype), p2=p2.to(dtype), mirrored=mirrored)
 
     @classmethod
     def tangents(
@@ -43,8 +43,8 @@ class Disk(Primitive):
         u, v, e1, e2 = at.u, at.v, primitives.e1, primitives.e2
         away = torch.addcmul(e1 * u, e2, v)
         square = torch.where(is_kind, u * u + v * v, 1.0)
-        some = square > 0
-        tangent = torch.where(some, away / torch.where(some, square, 1.0).sqrt(), e1)
+        off_centre = square > 0
+        tangent = torch.where(off_centre, away / torch.where(off_centre, square, 1.0).sqrt(), e1)
         if at.bitangent is None:
             return tangent, None
         around = torch.addcmul(e2 * u, e1, v, value=-1) * (2.0 * math.pi)

@@ -21,11 +21,11 @@ __all__ = ["Quadric"]
 
 
 class Quadric(Primitive):
-    """A quadric; ``p0``, ``e1`` and ``e2`` of its map are stored as for flat primitives."""
+    """A quadric; ``p0``, ``e1`` and ``e2`` of its map take the places of the corners ``p0 p1 p2`` of flat primitives."""
 
     name = "quadric"
     flat = False
-    has_own_uv = True
+    has_own_uv = True  # texture coordinates are computed here, not interpolated
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
@@ -33,7 +33,7 @@ class Quadric(Primitive):
         linear, move = pose.split((3, 1), 1)
         x, y = linear[:, 0:1], linear[:, 1:2]
         frame = torch.cat((move, x, y, linear[:, 2:3]))
-        return Corners(move.to(dtype), x.to(dtype), y.to(dtype), frame=frame)
+        return Corners(p0=move.to(dtype), p1=x.to(dtype), p2=y.to(dtype), frame=frame)
 
     @classmethod
     def hit_points(cls, world: World, primitives: LanePrimitives, rays: Rays, is_kind: Tensor) -> HitPoints:
@@ -44,15 +44,19 @@ class Quadric(Primitive):
             moved = quadrics.follow_ray(table, primitives.p0, primitives.e1, rays.o, rays.d, rays.hit.t, own)
             own = torch.where(is_kind, moved, own)
         ng = quadrics.outward(table, own)
-        # The bound at the point, not of the whole primitive: a needle is far thinner than it is long.
-        return HitPoints(_point(table, primitives, own), ng, dot(ng.detach().abs(), table.reach), own)
+        # The rounding bound at the point, by the normal and the magnitudes of coordinates, not of the whole primitive: a
+        # needle is far thinner than it is long.
+        bound = dot(ng.detach().abs(), table.coordinate_bound)
+        return HitPoints(p=_point(table, primitives, own), ng=ng, bound=bound, own=own)
 
     @classmethod
     def fixed_points(cls, world: World, primitives: LanePrimitives, rays: Rays, is_kind: Tensor) -> FixedPoints:
         """See :meth:`Primitive.fixed_points`; points stay fixed in object space."""
         table = quadrics.rows(world, primitives.prim)
         own = _object_point(table, rays, is_kind)
-        return FixedPoints(_point(table, primitives, own), quadrics.direction(table, quadrics.normal(table, own)))
+        # Along the normal, as long as the map scales area.
+        area = quadrics.direction(table, quadrics.normal(table, own))
+        return FixedPoints(p=_point(table, primitives, own), area=area)
 
     @classmethod
     def tangents(
@@ -79,4 +83,5 @@ def _object_point(table: Quadrics, rays: Rays, is_kind: Tensor) -> Tensor:
 
 
 def _point(table: Quadrics, primitives: LanePrimitives, own: Tensor) -> Tensor:
+    """Return points ``(3, N)`` in the world for those of object space, ``own (3, N)``."""
     return affine(primitives.p0 + primitives.e1 * own[0], primitives.e2, own[1], table.e3, own[2])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.physics.shapes.primitive import Corners, Primitive, Triple
-from torchpt.physics.shapes.primitives._affine import axes_of_all, corner_moves, unit_uvs
+from torchpt.physics.shapes.primitives._affine import axes_of_all, corner_tangents, unit_uvs
 
 if TYPE_CHECKING:
     from torchpt.physics.parts import Part
@@ -33,8 +33,12 @@ class Rectangle(Primitive):
         move, x, y, mirrored = axes_of_all(poses)
         x, y = 2.0 * x, 2.0 * y
         p0 = move - 0.5 * (x + y)
-        places = (place.to(dtype).split(1, 1) for place in (p0, p0 + x, p0 + y))
-        return [Corners(*own, mirrored=flag) for *own, flag in zip(*places, mirrored, strict=True)]
+        # For each corner its columns, one a part.
+        c0, c1, c2 = (corner.to(dtype).split(1, 1) for corner in (p0, p0 + x, p0 + y))
+        return [
+            Corners(p0=own0, p1=own1, p2=own2, mirrored=flag)
+            for own0, own1, own2, flag in zip(c0, c1, c2, mirrored, strict=True)
+        ]
 
     @classmethod
     def uvs(cls, part: Part, corners: Corners) -> Triple:
@@ -44,4 +48,4 @@ class Rectangle(Primitive):
     @classmethod
     def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Primitive.moves`."""
-        return corner_moves(corners, uvs)
+        return corner_tangents(corners, uvs)

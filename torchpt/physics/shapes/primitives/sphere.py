@@ -27,9 +27,9 @@ class Sphere(Primitive):
     """A sphere. Masks ``is_kind (N,)`` are True in lanes whose primitive is a sphere; results in other lanes are arbitrary."""
 
     name = "sphere"
-    has_own_uv = True
+    has_own_uv = True  # texture coordinates are computed here, not interpolated
     flat = False
-    angles = True  # under a transform that is no similarity a sphere becomes a quadric
+    needs_similarity = True  # under a transform that is no similarity a sphere becomes a quadric
 
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
@@ -38,7 +38,7 @@ class Sphere(Primitive):
         radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)  # the pose scales equally along all axes
         zero = torch.zeros_like(radius)
         p1 = torch.stack((radius, zero, zero))[:, None]
-        return Corners(move.to(dtype), p1.to(dtype), torch.zeros_like(move).to(dtype))
+        return Corners(p0=move.to(dtype), p1=p1.to(dtype), p2=torch.zeros_like(move).to(dtype))
 
     @classmethod
     def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
@@ -61,14 +61,15 @@ class Sphere(Primitive):
         t = torch.where(is_kind, t, 0.0)
         away = o + d * t - p0
         outward = normalize(torch.where(is_kind, away, torch.ones_like(away)))
-        return HitPoints(p0 + outward * radius, outward * take(world.geometry.flip, primitives.prim))
+        return HitPoints(p=p0 + outward * radius, ng=outward * take(world.geometry.flip, primitives.prim))
 
     @classmethod
     def fixed_points(cls, world: World, primitives: LanePrimitives, rays: Rays, is_kind: Tensor) -> FixedPoints:
         """See :meth:`Primitive.fixed_points`; points keep their normal."""
         radius = torch.where(is_kind, primitives.e1[0], 1.0)
         outward = normalize((rays.o + rays.d * rays.hit.t - primitives.p0).detach())
-        return FixedPoints(primitives.p0 + outward * radius, outward * (radius * radius))
+        # A sphere is parametrized by the directions of its normals: a unit of solid angle has the area radius^2.
+        return FixedPoints(p=primitives.p0 + outward * radius, area=outward * (radius * radius))
 
     @classmethod
     def tangents(
@@ -84,10 +85,8 @@ class Sphere(Primitive):
     def uv(cls, world: World, at: Interaction) -> Tensor | None:
         """See :meth:`Primitive.uv`."""
         assert world.geometry.axes is not None
-        first, end = (
-            world.geometry.ends[_NUMBER - 1],
-            world.geometry.ends[_NUMBER],
-        )  # ids of the spheres: first .. end - 1
+        # Ids of the spheres: first .. end - 1.
+        first, end = world.geometry.ends[_NUMBER - 1], world.geometry.ends[_NUMBER]
         column = torch.minimum((at.prim - first).clamp_min(0), end - first - 1)  # in the axes, which only spheres have
         away = at.p - take(world.geometry.p0, at.prim)
         x, y, z = (dot(take(axis, column), away) for axis in world.geometry.axes)

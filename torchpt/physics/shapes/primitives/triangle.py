@@ -11,7 +11,7 @@ from torch import Tensor
 from torchpt.math.vectors import cross, dot, normalize
 from torchpt.physics.shapes.normals import smooth_normals
 from torchpt.physics.shapes.primitive import Corners, Primitive, Triple
-from torchpt.physics.shapes.primitives._affine import corner_moves, unit_uvs
+from torchpt.physics.shapes.primitives._affine import corner_tangents, unit_uvs
 
 if TYPE_CHECKING:
     from torchpt.physics.parts import Part
@@ -36,7 +36,7 @@ class Triangle(Primitive):
         points = points.to(dtype)
         p0, p1, p2 = (points.index_select(1, faces[:, k]) for k in range(3))
         if not part.smooth:
-            return Corners(p0, p1, p2, None, faces, uvs=own.get("uvs"))
+            return Corners(p0=p0, p1=p1, p2=p2, faces=faces, uvs=own.get("uvs"))
         if part.normals is None:
             normals = smooth_normals(points, faces)
         else:
@@ -46,7 +46,7 @@ class Triangle(Primitive):
         if not bool((dot(normals, normals) > 0).all()):  # a corner without a normal gets that of its face
             flat = normalize(cross(p1 - p0, p2 - p0))
             n0, n1, n2 = (torch.where(dot(n, n) > 0, n, flat) for n in (n0, n1, n2))
-        return Corners(p0, p1, p2, (n0, n1, n2), faces, uvs=own.get("uvs"))
+        return Corners(p0=p0, p1=p1, p2=p2, normals=(n0, n1, n2), faces=faces, uvs=own.get("uvs"))
 
     @classmethod
     def uvs(cls, part: Part, corners: Corners) -> Triple:
@@ -62,4 +62,4 @@ class Triangle(Primitive):
     @classmethod
     def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Primitive.moves`."""
-        return super().moves(part, corners, uvs, linear) if part.uvs is None else corner_moves(corners, uvs)
+        return super().moves(part, corners, uvs, linear) if part.uvs is None else corner_tangents(corners, uvs)

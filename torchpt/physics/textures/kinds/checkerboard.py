@@ -37,7 +37,7 @@ class Checkerboard(Mapped):
         channel = opening.channel_index(CHANNELS[:4], "squares have no alpha")
         opening.declare_all(cls, values)
         matrix = cls.matrix(values, repeats=values["scale"])
-        filtered = values["filter"] in cls.filters
+        filtered = values["filter"] in cls.filters  # the values that average over footprints
         return ImageNode(
             texels=opening.name,  # the name that `_squares` finds the colours by
             channel=channel,

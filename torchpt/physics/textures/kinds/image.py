@@ -122,7 +122,7 @@ class Image(Mapped):
             nearest=values["filter"] == "nearest",
             transform=cls.matrix(values),
             scale=scale,
-            filtered=values["filter"] in cls.filters,
+            filtered=values["filter"] in cls.filters,  # the values that average over footprints
         )
 
 
@@ -166,7 +166,7 @@ def _declare_texels(
     # The slack admits rounding at the bounds.
     spec = TexelsSpec(low=None, slack=1e-6, moves=opening.slot.moves, doc="texels `(H, W, C)`, linear")
     opening.declare(name, texels, opening.restricted(spec, scale))
-    # Texels of `data` are in the scene itself, not read from a file.
+    # Texels of `data` stand in the scene, not in a file: meshes that read them need texture coordinates.
     if label == f"{opening.name}.data":
         opening.parameters.texels_in_scene.add(name)
     return name
