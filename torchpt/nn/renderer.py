@@ -82,9 +82,10 @@ class Renderer(nn.Module):
                 for name, start in zip(self.names, starts, strict=True)
             ]
             free = {
-                _key(name): nn.Parameter(found.inverse(start).clone())
-                for name, found, start in zip(self.names, ranges, starts, strict=True)
+                _key(name): nn.Parameter(parametrization.inverse(start).clone())
+                for name, parametrization, start in zip(self.names, ranges, starts, strict=True)
             }
+        # `free` has the numbers that are optimized, `ranges` maps them to parameters; both names are in saved state dicts
         self.ranges, self.free = nn.ModuleList(ranges), nn.ParameterDict(free)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
@@ -110,7 +111,7 @@ class Renderer(nn.Module):
         """
         all_options: BatchOptions = {**self.options, **options}
         if seed is None:
-            seed = self._next_seed(all_options.get("ranks") is not None)
+            seed = self._next_seed(shares_picture=all_options.get("ranks") is not None)
         full = self.full if full is None else full
         return render(self.scene, params={**self.values(), **(params or {})}, seed=seed, full=full, **all_options)
 
@@ -146,7 +147,8 @@ class Renderer(nn.Module):
         for name, value in self.values().items():
             self.scene.params[name] = value.detach().clone()
 
-    def _next_seed(self, shares_picture: bool) -> int:
+    def _next_seed(self, *, shares_picture: bool) -> int:
+        """Return the seed of a call, and count it in training mode; ``shares_picture``: ranks render one picture together."""
         if not self.training:
             return self.seed
         rank, world = 0, 1
@@ -183,7 +185,7 @@ def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if not isinstance(name, str):
             raise SceneError("names", name, "a name of scene.params or a pattern of some, as text")
-        matches = [each for each in scene.params if each == name or fnmatchcase(each, name)]
+        matches = [parameter for parameter in scene.params if parameter == name or fnmatchcase(parameter, name)]
         if not matches:
             examples = example_names(name, list(scene.params))
             raise SceneError("names", name, f"a parameter of this scene or a pattern of some, such as {examples}")
