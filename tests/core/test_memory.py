@@ -64,6 +64,23 @@ def test_pieces_take_each_sample_once_and_those_of_a_pixel_in_their_order():
         list(found.run_in_chunks(lambda _: 1 // 0, 1, 0, 1))
 
 
+def test_a_chunk_of_one_lane_is_taken_whole_once_one_thread_goes_on_alone(capsys):
+    found, tried = budget(4, threads=2), list[Span]()
+
+    def work(span: Span) -> None:
+        tried.append(span)
+        if len(tried) == 1:
+            raise MemoryError
+
+    assert list(found.run_in_chunks(work, 1, 0, 1)) == [(0, 1, 0, 1)]
+    assert tried == [(0, 1, 0, 1)] * 2 and (found.threads, found.lanes) == (1, 4)
+
+
+def test_a_limit_without_an_expected_size_of_a_lane_is_refused():
+    with pytest.raises(ValueError, match="a limit needs the expected bytes of a lane"):
+        Budget(CPU, 8, what="a thing", limit=1000)
+
+
 def test_lanes_grow_to_what_was_measured(monkeypatch):
     held = {"now": 1000, "peak": 1000}
     monkeypatch.setattr(memory.MemoryMeter, "base", lambda _: 0)

@@ -47,6 +47,11 @@ def test_pixels_that_are_not_finite_are_counted_and_out_of_the_means_alone() -> 
     assert set(found.reasons) == set(METRICS) and all("not finite" in reason for reason in found.reasons.values())
 
 
+def test_errors_beyond_float64_are_no_fault_of_the_pictures() -> None:
+    found = compare(torch.full((2, 2, 1), 1e200, dtype=torch.float64), torch.zeros(2, 2, 1).double(), colours=False)
+    assert found.reasons["mse"] == "an error is beyond the range of float64" and found.nonfinite == (0, 0)
+
+
 def test_infinite_pixels_are_no_white() -> None:
     image = REFERENCE.clone()
     image[3, 3] = math.inf

@@ -10,7 +10,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from torchpt.core.errors import RenderError
 from torchpt.ranks import blocks, dealt, share
+from torchpt.ranks.launch import REQUIRED_VARIABLES, LaunchedProcess
 
 
 def ranks(size: int) -> list[Any]:
@@ -52,3 +54,12 @@ def test_nobody_has_a_column_to_himself(size: int) -> None:
         owner[dealt(len(owner), rank, size)] = rank
     for column in range(0, width, 64):
         assert len(owner.view(-1, width)[:, column].unique()) == size
+
+
+def test_what_the_launcher_left_out_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in REQUIRED_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(
+        RenderError, match="^there is no RANK, WORLD_SIZE, MASTER_ADDR, MASTER_PORT: start it by torchrun$"
+    ):
+        LaunchedProcess()

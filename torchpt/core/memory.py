@@ -53,6 +53,8 @@ FIRST_WAVE_LANES = 4096
 WAVE_FRACTION = 0.88
 #: Largest growth of a wave, as a factor, over the one before.
 MAX_GROWTH = 2
+#: Factor on the expected bytes of a lane for the second wave, the first one that is measured.
+UNMEASURED_FACTOR = 4
 #: Bytes of address space that libraries may need to make code; some of them abort the process without it.
 CODE_BYTES = 96 << 20
 
@@ -340,7 +342,7 @@ class Budget:
         what: names, in the error, what does not fit even with the fewest lanes of one thread.
         fallback: tells the user how the job goes on after memory ran out.
         limit: ``render.max_memory`` in bytes if the memory of lanes is to be measured; else None.
-        bytes_per_lane: expected bytes of a lane, until it is measured.
+        bytes_per_lane: expected bytes of a lane, until it is measured; above 0 where there is a ``limit``.
         min_lanes: least number of lanes.
 
     Attributes:
@@ -348,6 +350,9 @@ class Budget:
         lanes: current number of lanes of a thread.
         has_shrunk: True once memory ran out.
         limit: largest memory of the process in bytes (that after import included); None if lanes are not measured.
+
+    Raises:
+        ValueError: a ``limit`` without ``bytes_per_lane``.
     """
 
     def __init__(
@@ -362,6 +367,8 @@ class Budget:
         bytes_per_lane: int = 0,
         min_lanes: int = 1,
     ) -> None:
+        if limit is not None and bytes_per_lane <= 0:
+            raise ValueError("a limit needs the expected bytes of a lane")
         self.meter, self.threads = MemoryMeter(device), threads
         self.min_lanes, self.bytes_per_lane = min_lanes, bytes_per_lane
         self.what, self.fallback, self.has_shrunk = what, fallback, False
@@ -393,9 +400,10 @@ class Budget:
             self.limit, self.lanes = None, self._max_lanes
 
     def run_in_chunks(self, work: Callable[[Span], object], pixels: int, first: int, count: int) -> Iterator[Span]:
-        """Call ``work`` for chunks of some samples of all pixels; yield each finished chunk.
+        """Call ``work`` for chunks, each of some samples of some pixels; yield each finished chunk.
 
-        A chunk has some pixels; samples of a pixel are taken in order, so that sums do not depend on the chunks.
+        All pixels get their next samples before any gets more. The samples of a pixel are taken in order, so that sums do not
+        depend on the chunks.
 
         Args:
             work: takes all samples of a chunk, or raises and takes none.
@@ -428,6 +436,9 @@ class Budget:
                     yield span
                     continue
                 self.shrink(pixels * samples)
+                if pixels * samples <= self.lanes:  # fewer threads, but as many lanes: the whole chunk again
+                    stack.append(span)
+                    continue
             # The second half is pushed first, so that the first is popped first.
             half = pixels // 2 if pixels > 1 else samples // 2
             if pixels > 1:
@@ -464,15 +475,14 @@ class Budget:
         if self.limit is None:
             return
         if self._in_use is None:
-            # The first wave also loaded code, so its peak says nothing: the second counts with four times what is expected.
+            # The first wave also loaded code, so its peak says nothing about lanes.
             release_memory()
             self._in_use = self.meter.now()
-            self._grow(self.limit, self._in_use, 4 * self.bytes_per_lane, measured=False)
+            self._grow(self.limit, self._in_use, UNMEASURED_FACTOR * self.bytes_per_lane, measured=False)
             return
         peak = self.meter.peak()
-        measured = (
-            peak > self._peak_before
-        )  # this wave set the peak; else an earlier one did, with at least as much memory
+        # True: this wave set the peak. False: an earlier one did, with at least as much memory.
+        measured = peak > self._peak_before
         if measured or (peak <= self.limit and 2 * taken >= self.lanes):  # a small wave below the peak tells nothing
             self._grow(self.limit, self._in_use, max(peak - self._in_use, 1) / taken, measured=measured)
 
@@ -486,7 +496,7 @@ class Budget:
             measured: True if ``bytes_per_lane`` is that of the last wave, False if it is an upper bound.
         """
         fit = int(WAVE_FRACTION * max(limit - in_use, 0) / bytes_per_lane)
-        if measured and self._peak_before > 0 and self.meter.peak() > limit:
+        if measured and self.meter.peak() > limit:
             self.lanes = max(min(fit, self.lanes), 1)
         else:
             growth = MAX_GROWTH * self.lanes if measured else max(fit, 1)

@@ -27,7 +27,7 @@ class DisplayTransform:
     tonemap: str = "none"
     gamma: str | float = "srgb"
 
-    def of(self, image: Tensor) -> Tensor:
+    def apply(self, image: Tensor) -> Tensor:
         """Return display values 0..1; values that are not finite become NaN, not black or white."""
         shown = display(image.double(), self.exposure, self.tonemap, self.gamma)
         return torch.where(torch.isfinite(image), shown, math.nan)
@@ -70,7 +70,7 @@ def compare(
         raise ValueError(f"images differ in shape: {tuple(image.shape)} and {tuple(reference.shape)}")
     values: dict[str, float] = {}
     reasons: dict[str, str] = {}
-    finite = [torch.isfinite(picture).all(-1) for picture in (image, reference)]
+    finite = [torch.isfinite(picture).all(-1) for picture in (image, reference)]  # (H, W) each
     for name in METRICS:
         values[name] = math.nan
         if not colours and name in COLOUR_METRICS:
@@ -86,8 +86,12 @@ def compare(
             continue
         if math.isfinite(values[name]):
             continue
-        equal = values[name] == math.inf and name == "psnr"
-        reasons[name] = "infinite: a screen shows both alike" if equal else "a picture holds values that are not finite"
+        if values[name] == math.inf and name == "psnr":
+            reasons[name] = "infinite: a screen shows both alike"
+        elif bool(finite[0].all()) and bool(finite[1].all()):
+            reasons[name] = "an error is beyond the range of float64"
+        else:
+            reasons[name] = "a picture holds values that are not finite"
     finite_in_both = finite[0] & finite[1]
     means = [picture[finite_in_both].double().mean(0) for picture in (image, reference)]
     totals = [float(mean.mean()) for mean in means]
@@ -109,4 +113,4 @@ def _as_metric_takes(name: str, image: Tensor, reference: Tensor, shown: Display
     """Return both images as a metric takes them: with three channels, or as display values."""
     if name in COLOUR_METRICS and image.shape[-1] == 1:
         image, reference = image.expand(*image.shape[:2], 3), reference.expand(*image.shape[:2], 3)
-    return (shown.of(image), shown.of(reference)) if name in DISPLAY_METRICS else (image, reference)
+    return (shown.apply(image), shown.apply(reference)) if name in DISPLAY_METRICS else (image, reference)

@@ -37,9 +37,12 @@ _SIGNATURES = {
     b"#?RADIANCE": ".hdr",
     b"#?RGBE": ".hdr",
 }
+_WHITE_OF_16_BITS = 65535
 # Most pixels that one byte of a file can encode: 8 of a 1-bit PNG, deflated by at most 1032 (zlib's technical notes); JPEG,
 # TGA, BMP and PNM encode fewer.
 _PIXELS_PER_BYTE = 8 * 1032
+_HEAD_BYTES = 32  # bytes read to recognize a format; a PNG's depth and colour type are bytes 24 and 25
+_LONGEST_REASON = 120  # most characters of a decoder's message in an error
 _VALUES_PER_BAND = 2**20  # values read at a time, so that a truncated file fails before all of its memory is touched
 
 
@@ -67,7 +70,7 @@ class Pixels:
 
     Attributes:
         values: ``(H, W, C)``, row 0 at the top: integers, booleans or float32.
-        white: the stored value that stands for 1.
+        white: the stored value that stands for 1; of no meaning for float32.
         channels: channel names of an EXR or HDR; else empty.
     """
 
@@ -116,15 +119,16 @@ def decode_image(source: Path | EncodedImage, max_pixels: int) -> Pixels:
         if ending not in READABLE:
             known = " ".join(READABLE)
             raise AssetError(label, f"unknown kind of image {ending.strip('.')!r}; known: {known}")
-        # byte 24 of a PNG: bits a value; byte 25: what they mean. Pillow keeps 8 bits of 16-bit colours.
+        # Byte 24 of a PNG: bits a value, here 16. Byte 25: colour type, here RGB, grey with alpha or RGBA. Pillow keeps
+        # 8 bits a value of these.
         if ending == ".png" and data[24:26] in (b"\x10\x02", b"\x10\x04", b"\x10\x06"):
             whole = read_regular(source) if isinstance(source, Path) else source.data
-            width, height = (int.from_bytes(whole[at : at + 4], "big") for at in (16, 20))
-            _check_size(label, width, height, 4, max_pixels, len(whole))
-            source = EncodedImage(label, sanitize_png(whole), "png")
-            return _decode_by_oiio(source, label, ending, "uint16", max_pixels)
+            width, height = (int.from_bytes(whole[offset : offset + 4], "big") for offset in (16, 20))
+            _check_size(label, width, height, channels=4, max_pixels=max_pixels, file_bytes=len(whole))
+            source = EncodedImage(label, sanitize_png(whole), kind="png")
+            return _decode_by_oiio(source, label, ending, stored="uint16", max_pixels=max_pixels)
         if ending in FLOAT_FORMATS:
-            return _decode_by_oiio(source, label, ending, "float", max_pixels)
+            return _decode_by_oiio(source, label, ending, stored="float", max_pixels=max_pixels)
         return _decode_by_pillow(source, label, ending, max_pixels)
     except AssetError:
         raise
@@ -136,24 +140,26 @@ def decode_image(source: Path | EncodedImage, max_pixels: int) -> Pixels:
 
 def _head(source: Path | EncodedImage) -> bytes:
     if isinstance(source, EncodedImage):
-        return source.data[:32]
+        return source.data[:_HEAD_BYTES]
     with source.open("rb") as file:
-        return file.read(32)
+        return file.read(_HEAD_BYTES)
 
 
-def _check_size(label: str, width: int, height: int, channels: int, max_pixels: int, size: int | None = None) -> None:
-    """Raise an AssetError for an image that is empty, too large, or larger than a file of ``size`` bytes can encode."""
+def _check_size(
+    label: str, width: int, height: int, channels: int, max_pixels: int, file_bytes: int | None = None
+) -> None:
+    """Raise an AssetError for an image that is empty, too large, or larger than a file of ``file_bytes`` bytes can encode."""
     if width < 1 or height < 1 or channels < 1:
         raise AssetError(label, f"has no pixels ({width} x {height}, {channels} channels)")
     if width * height > max_pixels or width * height * channels > _MOST_CHANNELS * max_pixels:
         limit = f"{max_pixels / 2**20:g} Mpixel" if max_pixels >= 2**20 else f"{max_pixels} pixels"
         raise AssetError(label, f"{width} x {height} pixels, {channels} channels: more than {limit} are not read")
-    if size is not None and width * height > _PIXELS_PER_BYTE * size:
-        raise AssetError(label, f"cannot be read ({width} x {height} pixels declared in {size} bytes)")
+    if file_bytes is not None and width * height > _PIXELS_PER_BYTE * file_bytes:
+        raise AssetError(label, f"cannot be read ({width} x {height} pixels declared in {file_bytes} bytes)")
 
 
 def _decode_by_oiio(source: Path | EncodedImage, label: str, ending: str, stored: str, max_pixels: int) -> Pixels:
-    """Decode all channels of the first part of a file with OpenImageIO."""
+    """Decode all channels of the first part of a file with OpenImageIO, as ``stored`` values: ``uint16`` or ``float``."""
     if isinstance(source, EncodedImage):  # OpenImageIO reads files only
         with tempfile.NamedTemporaryFile(suffix=ending) as file:
             file.write(source.data)
@@ -163,7 +169,7 @@ def _decode_by_oiio(source: Path | EncodedImage, label: str, ending: str, stored
 
     options = oiio.ImageSpec()
     options.attribute("oiio:UnassociatedAlpha", 1)  # a PNG's colours as stored, not multiplied by alpha
-    options.attribute("oiio:RawColor", 1)
+    options.attribute("oiio:RawColor", 1)  # nor converted to another colour space
     picture = oiio.ImageInput.open(str(source), options)
     if picture is None:
         raise AssetError(label, f"cannot be read ({oiio_error(oiio) or 'unknown format'})")
@@ -177,7 +183,8 @@ def _decode_by_oiio(source: Path | EncodedImage, label: str, ending: str, stored
             values = picture.read_image(stored)
             if values is None:
                 raise AssetError(label, f"cannot be read ({oiio_error(picture) or 'truncated'})")
-            return Pixels(values.reshape(spec.height, spec.width, spec.nchannels), 65535, tuple(spec.channelnames))
+            values = values.reshape(spec.height, spec.width, spec.nchannels)
+            return Pixels(values, white=_WHITE_OF_16_BITS, channels=tuple(spec.channelnames))
         step = max(1, _VALUES_PER_BAND // (spec.width * spec.nchannels))
         for start in range(0, spec.height, step):
             end = min(start + step, spec.height)
@@ -188,7 +195,7 @@ def _decode_by_oiio(source: Path | EncodedImage, label: str, ending: str, stored
                 values = np.empty((spec.height, spec.width, spec.nchannels), band.dtype)
             values[start:end] = band.reshape(end - start, spec.width, spec.nchannels)
         assert values is not None
-        return Pixels(values, 65535, tuple(spec.channelnames))
+        return Pixels(values, white=_WHITE_OF_16_BITS, channels=tuple(spec.channelnames))
     finally:
         picture.close()
 
@@ -224,13 +231,14 @@ def _pillow_pixels(picture: Any, label: str, size: int, max_pixels: int) -> Pixe
         picture.load()
         picture = picture.convert(picture.palette.mode if picture.palette.mode in ("RGB", "RGBA") else "RGB")
     values = np.array(picture)
-    return Pixels(values[..., None] if values.ndim == 2 else values, _MODES[picture.mode])
+    return Pixels(values[..., None] if values.ndim == 2 else values, white=_MODES[picture.mode])
 
 
 # Pillow's modes that are supported, with the value that stands for 1
 _MODES = {
     **{"1": 1, "L": 255, "LA": 255, "P": 255, "RGB": 255, "RGBA": 255},
-    **{"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I": 65535},
+    # 16 bits a value, in three byte orders; "I" (32 bits) is what Pillow makes of 16-bit grey in some formats.
+    **dict.fromkeys(("I;16", "I;16B", "I;16L", "I"), _WHITE_OF_16_BITS),
 }
 
 
@@ -245,4 +253,4 @@ def oiio_error(source: Any) -> str:
 
 def _first_line(problem: object) -> str:
     """Return the first line of a decoder's message, shortened."""
-    return (str(problem).strip().splitlines() or [type(problem).__name__])[0][:120]
+    return (str(problem).strip().splitlines() or [type(problem).__name__])[0][:_LONGEST_REASON]

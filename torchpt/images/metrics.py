@@ -38,6 +38,8 @@ __all__ = [
 FLOOR = 1e-2
 #: Fraction of the pixels that :func:`relmse_trimmed` leaves out.
 TRIMMED = 1e-3
+#: Largest value of a reference up to which the FLIP evaluator ends the process.
+_LEAST_FLIP_REFERENCE = 1e-5
 #: Width of the windows of SSIM, in pixels (Wang et al. 2004).
 SSIM_WINDOW = 11
 
@@ -151,10 +153,10 @@ def ssim(image: Tensor, reference: Tensor, peak: float = 1.0, window: int = SSIM
     Raises:
         ValueError: an image smaller than the window.
     """
-    return float(_ssim_map(image, reference, peak, window, "valid").mean())
+    return float(_ssim_map(image, reference, peak=peak, window=window, padding="valid").mean())
 
 
-def _ssim_map(image: Tensor, reference: Tensor, peak: float, window: int, padding: str) -> Tensor:
+def _ssim_map(image: Tensor, reference: Tensor, *, peak: float, window: int, padding: str) -> Tensor:
     """Return the structural similarity ``(H, W, C)`` of each pixel; ``padding``: "same" mirrors at the edges, "valid" crops."""
     from kornia.metrics import ssim as kornia_ssim
 
@@ -191,7 +193,7 @@ def _flip(image: Tensor, reference: Tensor) -> tuple[Tensor, float]:
             "torchpt.metrics.flip needs the package flip-evaluator: pip install '.[compare]' in the checkout of torchpt"
         ) from None
     arrays = [values.clamp(min=0).float().contiguous().numpy() for values in (ref, x)]
-    if not float(arrays[0].max()) > 1e-5:  # below it the evaluator ends the process
+    if not float(arrays[0].max()) > _LEAST_FLIP_REFERENCE:
         raise ValueError("flip: the reference is black, so there is no exposure to look at it by")
     errors, mean, _ = flip_evaluator.evaluate(arrays[0], arrays[1], "HDR", applyMagma=False)
     return torch.from_numpy(errors)[..., 0].double(), float(mean)
@@ -213,7 +215,9 @@ MAPS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "relmse": lambda image, reference: _relative(image, reference).mean(-1),
     "mse": lambda image, reference: _squared(image, reference).mean(-1),
     "smape": lambda image, reference: _symmetric(image, reference).mean(-1),
-    "ssim": lambda image, reference: 1.0 - _ssim_map(image, reference, 1.0, SSIM_WINDOW, "same").mean(-1),
+    "ssim": lambda image, reference: (
+        1.0 - _ssim_map(image, reference, peak=1.0, window=SSIM_WINDOW, padding="same").mean(-1)
+    ),
     "flip": lambda image, reference: _flip(image, reference)[0],
 }
 

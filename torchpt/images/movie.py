@@ -79,7 +79,8 @@ def _write_gif(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
             # Whole hundredths of a second, whose sum never differs from the exact time by more than half of one.
             durations.append(10 * (round(100 * (number + 1) / fps) - round(100 * number / fps)))
             # Written at the end of the context, with the last call's options: the list is complete by then. Pillow merges
-            # equal frames and adds up their durations; of a single frame it takes no list.
+            # equal frames and adds up their durations; of a single frame it takes no list. `bits` are those of the palette, and
+            # `loop` 0 stands for ever.
             shown_for = durations if number else durations[0]
             writer.write(frame, format="GIF", is_batch=False, bits=8, duration=shown_for, loop=0)
     temporary.write_bytes(encoded.getvalue())
@@ -89,6 +90,7 @@ def _write_mp4(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
     """Write frames as H.264 in an MP4, which needs even widths and heights."""
     import imageio.v2 as iio
 
+    # quality: of 0 to 10, where imageio's default is 5. macro_block_size 1: no scaling to a multiple of 16 pixels.
     codec = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "macro_block_size": 1}
     options = {"output_params": _H264, "ffmpeg_log_level": "error"}
     writer: Any = iio.get_writer(temporary, "FFMPEG", "I", fps=fps, **codec, **options)

@@ -71,7 +71,7 @@ def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MA
             raise AssetError(label, f"holds a value that is not finite (row {bad[0]})")
     else:
         scaled /= np.float32(pixels.white)
-    return Texels(scaled, pixels.eight_bit)
+    return Texels(scaled, eight_bit=pixels.eight_bit)
 
 
 def texels_from_array(value: Any) -> Texels:
@@ -98,22 +98,22 @@ def texels_from_array(value: Any) -> Texels:
         raise Refused(ACCEPTED_TEXELS, f"a value that is not finite (row {bad[0]})")
     if array.dtype in (np.uint8, np.uint16):
         values /= np.float32(np.iinfo(array.dtype).max)
-    return Texels(values, array.dtype == np.uint8)
+    return Texels(values, eight_bit=array.dtype == np.uint8)
 
 
-def texels_to_radiance(read: Texels, source: str, key: str) -> NDArray[np.float32]:
+def texels_to_radiance(texels: Texels, source: str, key: str) -> NDArray[np.float32]:
     """Return an image as radiance ``(H, W, 3)``: grey repeated in all channels, 8-bit values decoded from sRGB, alpha dropped.
 
     Args:
-        read: the image.
+        texels: the image.
         source: its name for errors.
         key: the scene parameter that refers to it, for errors.
 
     Raises:
         Refused: a negative value.
     """
-    values = read.values[..., :3] if read.values.shape[2] >= 3 else read.values[..., :1].repeat(3, 2)
-    if read.eight_bit:
+    values = texels.values[..., :3] if texels.values.shape[2] >= 3 else texels.values[..., :1].repeat(3, 2)
+    if texels.eight_bit:
         values = srgb_to_linear(torch.from_numpy(np.ascontiguousarray(values))).numpy()
     if values.min() < 0:
         raise Refused(f"numbers >= 0 in the texels of {source}", float(values.min()), (key,))
@@ -140,10 +140,10 @@ def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:
         return False
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         return False
-    if data[25:26] in (b"\x04", b"\x06"):  # colour types grey and RGB with alpha
+    if data[25:26] in (b"\x04", b"\x06"):  # the colour type: grey with alpha, or RGB with alpha
         return True
     # A transparent colour is a chunk tRNS before the pixels (IDAT). A chunk is size, name, data and checksum.
-    chunk = 8
+    chunk = 8  # offset of the first one, after the signature
     while chunk + 8 <= len(data) and data[chunk + 4 : chunk + 8] not in (b"IDAT", b"tRNS"):
         chunk += 12 + int.from_bytes(data[chunk : chunk + 4], "big")
     return data[chunk + 4 : chunk + 8] == b"tRNS"

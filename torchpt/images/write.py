@@ -38,6 +38,10 @@ __all__ = [
     "write_image",
 ]
 
+#: Largest radiance in an ``.hdr``: RGBE holds numbers up to 2^127.
+_LARGEST_RGBE = 1e30
+#: Quality of JPEGs: the highest that Pillow's manual advises.
+_JPEG_QUALITY = 95
 #: Supported endings of file names.
 WRITABLE = (".exr", ".hdr", ".png", ".jpg", ".jpeg", ".ppm")
 
@@ -88,7 +92,7 @@ def write_image(
             raise ValueError(f"two layers have the channel {duplicates[0]} (a picture of 4 channels has its alpha: A)")
         encode = partial(_encode_float, temporary, np.concatenate(list(by_name.values()), axis=2), channels, facts)
     elif temporary.suffix == ".hdr":  # RGBE has no sign: the encoder would wrap around
-        rgb = np.nan_to_num(_rgb(pixels), nan=0.0, posinf=1e30).clip(0, 1e30)
+        rgb = np.nan_to_num(_rgb(pixels), nan=0.0, posinf=_LARGEST_RGBE).clip(0, _LARGEST_RGBE)
         encode = partial(_encode_float, temporary, rgb, ["R", "G", "B"], {})
     else:
         levels = _display_bytes(pixels, exposure, tonemap, gamma, with_alpha=temporary.suffix == ".png")
@@ -201,7 +205,7 @@ def _openexr_threads() -> Iterator[None]:
             yield
         finally:
             oiio.attribute("exr_threads", -1)  # none
-            oiio.ImageOutput.create("picture.exr")  # which heeds it
+            oiio.ImageOutput.create("picture.exr")  # applies the attribute; nothing is written
             oiio.attribute("exr_threads", thread_count)
 
 
@@ -248,7 +252,7 @@ def _write_zeros(path: Path, size: int) -> None:
 def _encode_integer(temporary: Path, levels: np.ndarray) -> None:
     """Write bytes ``(H, W, 3 or 4)`` as PNG, PPM or JPEG, by the file's ending."""
     kind = {".png": "PNG", ".ppm": "PPM"}.get(temporary.suffix, "JPEG")
-    options: dict[str, Any] = {"quality": 95} if kind == "JPEG" else {}
+    options: dict[str, Any] = {"quality": _JPEG_QUALITY} if kind == "JPEG" else {}
     encoded = BytesIO()
     with open_pillow_writer(encoded) as writer:
         writer.write(levels, format=kind, is_batch=False, **options)

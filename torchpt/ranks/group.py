@@ -27,7 +27,7 @@ TIMEOUT = 1800.0
 #: Largest timeout in seconds that torch can count in milliseconds.
 LONGEST_TIMEOUT = 1e6
 #: Numbers in a message: a status, a step, and up to six of the caller's.
-MESSAGE_LENGTH = 8
+MESSAGE_LENGTH, _HEADER_LENGTH = 8, 2
 #: Seconds between two checks for answers, at first and at most: signals are handled in between.
 SHORTEST_PAUSE, LONGEST_PAUSE = 5e-5, 5e-3
 #: Names of the steps at which a rank sends its last message, and a message after an error.
@@ -70,21 +70,17 @@ class Group:
         try:
             own = dist.new_group(
                 members,
-                timedelta(seconds=timeout),
-                "gloo",
+                timeout=timedelta(seconds=timeout),
+                backend="gloo",
                 use_local_synchronization=len(members) < dist.get_world_size(),
             )
         except RuntimeError as error:
             raise LostRankError(f"ranks: no connection between all of them ({_first_line(error)})") from None
         assert isinstance(own, dist.ProcessGroup)
         self._dist, self._process_group = dist, own
-        self._transfer: Any = None
-        self.rank, self.size, self.timeout, self.has_ended = (
-            members.index(dist.get_rank()),
-            len(members),
-            timeout,
-            False,
-        )
+        self._transfer: Any = None  # the latest one, see _wait
+        self.rank, self.size = members.index(dist.get_rank()), len(members)
+        self.timeout, self.has_ended = timeout, False
 
     # -- a few numbers
 
@@ -100,39 +96,42 @@ class Group:
             OtherRankError: a rank failed.
             RenderError: ranks are at different steps.
         """
-        return self._exchange_step(what, 0, numbers)
+        return self._exchange_step(what, status=0, numbers=numbers)
 
     def end(self, code: int) -> int:
         """Send the exit code of this finished rank; return the highest code of all ranks."""
-        every = self._exchange(END, code, ())
+        messages = self._exchange(END, status=code, numbers=())
         self.has_ended = True
-        return max(status for status, _, _ in every)
+        return max(status for status, _, _ in messages)
 
     def _exchange_step(self, what: str, status: int, numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
         """Return the numbers of every rank; raise unless all are at the same step.
 
         ``status``: 0, or after an error of this rank another number.
         """
-        messages = self._exchange(what, status, numbers)
-        if status:
+        messages = self._exchange(what, status=status, numbers=numbers)
+        if status:  # this rank raises its own error, whatever the others do
             return []
         own_step = zlib.crc32(what.encode())
         for rank, (other_status, step, _) in enumerate(messages):
             if step == own_step:
                 continue
+            # A rank that failed still takes part in the last step, END. Any other step means that ranks no longer agree.
             self.has_ended = step != zlib.crc32(FAILED.encode())
             if other_status:
-                raise OtherRankError(f"ranks: rank {rank} ended with an error of its own", other_status)
+                raise OtherRankError(f"ranks: rank {rank} ended with an error of its own", code=other_status)
             raise RenderError(f"ranks: rank {rank} does something else than rank {self.rank}, which is at: {what}")
         return [numbers for _, _, numbers in messages]
 
     def _exchange(self, what: str, status: int, numbers: tuple[float, ...]) -> list[tuple[int, int, tuple[float, ...]]]:
         """Return status, step (the CRC-32 of its name) and numbers of every rank."""
         own = torch.zeros(MESSAGE_LENGTH, dtype=torch.float64)
-        own[: 2 + len(numbers)] = torch.tensor([status, zlib.crc32(what.encode()), *numbers], dtype=torch.float64)
-        every = [torch.empty_like(own) for _ in range(self.size)]
-        self._wait(lambda: self._dist.all_gather(every, own, group=self._process_group, async_op=True))
-        lists = [message[: 2 + len(numbers)].tolist() for message in every]
+        own[: _HEADER_LENGTH + len(numbers)] = torch.tensor(
+            [status, zlib.crc32(what.encode()), *numbers], dtype=torch.float64
+        )
+        received = [torch.empty_like(own) for _ in range(self.size)]
+        self._wait(lambda: self._dist.all_gather(received, own, group=self._process_group, async_op=True))
+        lists = [message[: _HEADER_LENGTH + len(numbers)].tolist() for message in received]
         return [(int(status), int(step), tuple(rest)) for status, step, *rest in lists]
 
     def broadcast_numbers(self, what: str, *numbers: float) -> tuple[float, ...]:
@@ -158,7 +157,7 @@ class Group:
         except Exception as error:
             if not self.has_ended and not getattr(error, _KNOWN_MARK, False):
                 with suppress(LostRankError):
-                    self._exchange_step(FAILED, FAILED_STATUS, ())
+                    self._exchange_step(FAILED, status=FAILED_STATUS, numbers=())
                 _mark_known(error)
             raise
 
@@ -173,17 +172,17 @@ class Group:
         sizes = [int(n) for (n,) in self.all_gather_numbers("gather", len(own))]
         sent = torch.zeros(max(sizes), dtype=own.dtype)
         sent[: len(own)] = own.cpu()
-        every = [torch.empty_like(sent) for _ in sizes]
-        self._wait(lambda: self._dist.all_gather(every, sent, group=self._process_group, async_op=True))
-        return [values[:size].to(own.device) for values, size in zip(every, sizes, strict=True)]
+        received = [torch.empty_like(sent) for _ in sizes]
+        self._wait(lambda: self._dist.all_gather(received, sent, group=self._process_group, async_op=True))
+        return [values[:size].to(own.device) for values, size in zip(received, sizes, strict=True)]
 
-    def first(self, own: Tensor) -> Tensor:
+    def broadcast(self, own: Tensor) -> Tensor:
         """Return the tensor ``(n,)`` of the first rank; n may differ, the dtype may not.
 
         Raises:
             LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
         """
-        (size,) = self.broadcast_numbers("first", len(own))
+        (size,) = self.broadcast_numbers("broadcast", len(own))
         return self._broadcast(own if self.rank == 0 else own.new_empty(int(size)), 0)
 
     def sum(self, own: Tensor) -> Tensor:

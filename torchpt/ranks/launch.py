@@ -42,8 +42,9 @@ class LaunchedProcess:
 
         missing = [name for name in REQUIRED_VARIABLES if not os.environ.get(name)]
         if missing:
-            size, names = os.environ["WORLD_SIZE"], ", ".join(missing)
-            raise RenderError(f"WORLD_SIZE is {size}, but there is no {names}: start it by torchrun")
+            size, names = os.environ.get("WORLD_SIZE", ""), ", ".join(missing)
+            found = f"WORLD_SIZE is {size}, but there" if size else "there"
+            raise RenderError(f"{found} is no {names}: start it by torchrun")
         if not dist.is_available() or not dist.is_gloo_available():
             raise RenderError("this build of PyTorch has no gloo, by which ranks talk to each other")
         self._timeout = timeout
@@ -93,13 +94,15 @@ class LaunchedProcess:
             dist.init_process_group("gloo", store=own_store, rank=rank, world_size=size, timeout=timeout)
             self.group = Group(timeout=self._timeout)
         local_rank = os.environ.get("LOCAL_RANK", "")
-        if (
-            torch.cuda.is_available() and local_rank.isdigit()
-        ):  # `auto` and `cuda` mean one GPU for each rank of a machine
+        # `auto` and `cuda` mean one GPU for each rank of a machine.
+        if torch.cuda.is_available() and local_rank.isdigit():
             torch.cuda.set_device(int(local_rank) % torch.cuda.device_count())
 
     def is_first_to_say(self, line: str) -> bool:
-        """Return True if no other rank said this line before, or none can be asked."""
+        """Return True if no other rank said this line before, or none can be asked.
+
+        The store counts how often each line was said, by its CRC-32.
+        """
         with suppress(RuntimeError):
             return self._store is None or self._store.add(f"said/{zlib.crc32(line.encode())}", 1) == 1
         return True

@@ -19,7 +19,7 @@ __all__ = ["blocks", "dealt", "share"]
 
 #: Consecutive pixels that stay together: neighbours tend to hit the same surfaces.
 PIXELS_TOGETHER = 64
-#: Lanes of a block, and the least number of blocks of a rank.
+#: Lanes of a block, one for each sample of its pixels, and the least number of blocks of a rank.
 LANES_PER_BLOCK, FEWEST_BLOCKS = 1 << 16, 4
 
 #: Type of an item.
@@ -27,13 +27,13 @@ T = TypeVar("T")
 
 
 def _indices_of_rank(count: int, rank: int, size: int) -> range | list[int]:
-    """Return the indices below ``count`` of a rank.
+    """Return the indices below ``count`` of a rank, of ``size`` ranks.
 
     Each round gives an index to every rank; rounds begin with different ranks, so that no rank gets a column of pixels.
     """
     if size == 1:
         return range(count)
-    rounds = -(-count // size)
+    rounds = -(-count // size)  # -(-a // b) is a / b rounded up
     return [number for k in range(rounds) if (number := k * size + (rank + k) % size) < count]
 
 

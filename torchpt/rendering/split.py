@@ -104,7 +104,7 @@ class DistributedRender:
 
     def from_first_rank(self, own: Tensor) -> Tensor:
         """Return the integers ``(n,)`` of the first rank in place of ``own``: other processors may round differently."""
-        return self.group.first(own)
+        return self.group.broadcast(own)
 
     def broadcast_state(self, own: RenderState | None, like: RenderState) -> RenderState | None:
         """Return the state that the first rank read from a checkpoint; None if it read none.
@@ -114,13 +114,13 @@ class DistributedRender:
             like: a state whose arrays have the names, shapes and dtypes of the checkpoint's.
         """
         text = "" if own is None else json.dumps(own.facts)
-        sent = bytes(self.group.first(torch.tensor(list(text.encode()), dtype=torch.uint8)).tolist())
+        sent = bytes(self.group.broadcast(torch.tensor(list(text.encode()), dtype=torch.uint8)).tolist())
         if not sent:
             return None
         arrays = {}
         for name, value in like.arrays.items():
             values = value if own is None else own.arrays[name]
-            arrays[name] = self.group.first(values.reshape(-1)).view(value.shape)
+            arrays[name] = self.group.broadcast(values.reshape(-1)).view(value.shape)
         return RenderState(json.loads(sent), arrays)
 
     def _part(self, pixel_set: PixelSet) -> PixelSet:
