@@ -300,7 +300,7 @@ FAULTS = (
         "emission_without_mis",
         "paths/vertex.py",
         "integrators lights",
-        "_gathered",
+        "_emission_of",
         "throughput * radiance * weight",
         "throughput * radiance",
         "missing MIS weight: lamps that paths meet by chance count beside their own light samples",

@@ -159,13 +159,13 @@ def test_the_page_and_the_plots_tell_them_apart(folder: Path) -> None:
 @there
 def test_no_figure_of_the_others_is_found_by_them(small: SceneReport) -> None:
     found = small
-    assert [line.of is None for line in found.lines] == [True, False, True, False]
+    assert [line.denoised_from is None for line in found.lines] == [True, False, True, False]
     (level,) = found.targets
-    noisy = [line for line in found.lines if line.of is None]
+    noisy = [line for line in found.lines if line.denoised_from is None]
     assert level == float(f"{max(line.steps[-1].estimate('relmse').mean for line in noisy):.2g}")
-    assert all(line.floor == 0.0 for line in found.lines if line.of is not None)
+    assert all(line.floor == 0.0 for line in found.lines if line.denoised_from is not None)
     for line in found.lines:
-        if line.of is not None:
+        if line.denoised_from is not None:
             assert all(item["seconds"] is None or not item["extrapolated"] for item in line.times)
 
 

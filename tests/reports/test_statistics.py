@@ -32,10 +32,10 @@ def test_a_power_law_is_found_and_followed() -> None:
     line = fit([4.0, 16.0, 64.0], [[0.5 / n * f for f in (0.9, 1.0, 1.1)] for n in (4.0, 16.0, 64.0)])
     assert line is not None and line.slope.mean == pytest.approx(-1.0)
     assert line.slope.low < -1.0 < line.slope.high  # type: ignore[operator]
-    inside, beyond = line.reach(math.log(0.5 / 20.0)) or (None, None)
+    inside, beyond = line.x_at(math.log(0.5 / 20.0)) or (None, None)
     assert inside is not None and math.exp(inside.mean) == pytest.approx(20.0) and beyond is False
     assert inside.low < inside.mean < inside.high  # type: ignore[operator]
-    outside, beyond = line.reach(math.log(0.5 / 1000.0)) or (None, None)
+    outside, beyond = line.x_at(math.log(0.5 / 1000.0)) or (None, None)
     assert outside is not None and math.exp(outside.mean) == pytest.approx(1000.0) and beyond is True
     assert outside.high - outside.low > inside.high - inside.low  # type: ignore[operator]
 
@@ -44,7 +44,7 @@ def test_what_has_no_line_has_none() -> None:
     assert fit([4.0, 16.0], [[0.1, 0.2], [-0.1, 0.0]]) is None  # one step drowned in the reference's noise
     assert fit([4.0, 4.0], [[0.1, 0.2], [0.1, 0.1]]) is None
     rising = fit([4.0, 16.0], [[0.1, 0.2], [0.3, 0.3]])
-    assert rising is not None and rising.reach(-5.0) is None
+    assert rising is not None and rising.x_at(-5.0) is None
     single = fit([1.0, 2.0], [[0.2], [0.1]])
     assert single is not None and single.slope.low is None
 
@@ -56,7 +56,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
         line = fit([4, 16, 64], [[(1 + 0.2 * random.standard_normal()) / n for _ in range(5)] for n in (4, 16, 64)])
         assert line is not None and line.slope.low is not None and line.slope.high is not None
         held += line.slope.low <= -1.0 <= line.slope.high
-        place = line.reach(math.log(1 / 30))
+        place = line.x_at(math.log(1 / 30))
         assert place is not None and place[0].low is not None and place[0].high is not None
         reached += place[0].low <= math.log(30) <= place[0].high
     assert 364 <= held <= 394

@@ -199,7 +199,7 @@ def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interr
                 "curves": [
                     {
                         "label": line.label,
-                        "denoised": line.of is not None,  # it has the denoised pictures of that line
+                        "denoised": line.denoised_from is not None,
                         "slope": line.by_spp.slope.mean if line.by_spp else None,
                         "times": line.times,
                         "biased": line.bias["biased"] if line.bias else None,

@@ -38,7 +38,7 @@ tree.probability.register(Lanewise(tree.probability.function, lanes=("row", "x",
 hashing.reverse_bits.register(bits.reverse_bits)
 
 
-def _times_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Any:
+def _times_opacity_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Any:
     """Return opacities ``(N,)``, times the texture in lanes where the mask ``textured`` is set, while a stage is traced."""
     if not tracing():
         return NotImplemented
@@ -46,4 +46,4 @@ def _times_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, te
     return torch.where(textured, opacity * opacity_map(world, interact(world, o, d, hit)), opacity)
 
 
-transmission.times_map.register(_times_map)
+transmission.times_opacity_map.register(_times_opacity_map)

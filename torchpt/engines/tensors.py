@@ -25,7 +25,7 @@ from torchpt.paths.integrators.base import check_fields, check_output
 from torchpt.paths.integrators.path import Ends, follows_ray, partition
 from torchpt.paths.layers import LAYERS
 from torchpt.paths.state import Emission, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
-from torchpt.paths.transmission import beyond, non_opaque, opacity_at
+from torchpt.paths.transmission import non_opaque, opacity_at, origins_behind
 from torchpt.paths.walk import Counts, Observer, find_hits, walk
 from torchpt.paths.wave import PixelSet, RayCounts, Wave
 from torchpt.physics.film.splats import LARGEST, Splats
@@ -325,7 +325,7 @@ class TensorsEngine:
             lanes, t_max = take(lanes, passing), (take(t_max, passing) - passed.t).clamp_min(0.0)
             if len(lanes):
                 with torch.no_grad():
-                    o = beyond(self.world, o, d, passed)
+                    o = origins_behind(self.world, o, d, passed)
         return transmittance
 
     def terminate(self, paths: Paths, truncated: bool) -> None:

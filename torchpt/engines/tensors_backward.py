@@ -177,17 +177,17 @@ class TensorsBackward(TensorsEngine):
         def of_splat(splat: Splat) -> tuple[Tensor, Tensor]:
             arrived = transmittance_of(splat.light, next(splat_transmittance))
             assert self._cotangent is not None
-            return adjoint.splatted(self.wave.integrator.clamp, self._cotangent, splat, arrived)
+            return adjoint.splat_contributions(self.wave.integrator.clamp, self._cotangent, splat, arrived)
 
         with recording_gathers(self.sums):
             roulette = self.wave.integrator.limits.roulette(depth)
             context = self._taped_context(depth, lane.device, roulette)
             vertex = VertexInput(rows(state, index), rows(hit, index))
             stage = self.wave.integrator.bounce
-            input_cotangents = adjoint.bounce(
+            input_cotangents = adjoint.bounce_vjp(
                 stage, context, model, vertex, next_hit, of_shadow, cotangents, self._tables, of_splat
             )
-        for name, value, like in input_cotangents.of_rays(vertex.state, self.plan.attached):
+        for name, value, like in input_cotangents.of_rays(vertex.state, attached=self.plan.attached):
             self._ray_cotangents[name].index_copy_(-1, lane, torch.zeros_like(like) if value is None else value)
         self.sums.add_each(input_cotangents.extra_leaves)
         if chance_cotangent is not None and input_cotangents.chance is not None:
@@ -217,14 +217,14 @@ class TensorsBackward(TensorsEngine):
         lane = take(state.lane, index)
         vertex = VertexInput(rows(state, index), rows(hit, index))
         with recording_gathers(self.sums):
-            input_cotangents = adjoint.gather(
+            input_cotangents = adjoint.emission_vjp(
                 stage,
                 self._taped_context(depth, lane.device),
                 vertex,
                 take(self._radiance_cotangent, lane),
                 self._tables,
             )
-        for name, value, _ in input_cotangents.of_rays(vertex.state, self.plan.attached):
+        for name, value, _ in input_cotangents.of_rays(vertex.state, attached=self.plan.attached):
             if value is not None:
                 cotangents = self._ray_cotangents[name]
                 cotangents.index_copy_(-1, lane, take(cotangents, lane) + value)

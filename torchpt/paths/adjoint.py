@@ -22,7 +22,7 @@ from torchpt.paths.wave import Bounce, Wave, clamp_scale
 from torchpt.physics.film.splats import LARGEST
 from torchpt.physics.shapes.geometry import Hit
 
-__all__ = ["InputCotangents", "Tape", "VertexCotangents", "bounce", "gather", "splatted"]
+__all__ = ["InputCotangents", "Tape", "VertexCotangents", "bounce_vjp", "emission_vjp", "splat_contributions"]
 
 
 @dataclass
@@ -55,8 +55,10 @@ class Tape:
         opacity, maps = world.materials.opacity, world.textures.opacity
         if opacity is None:
             return False
-        texels = [] if maps is None else [x for k in maps.tables for x in leaves(world.textures.tables[k])]
-        return any(x.requires_grad for x in (opacity, *texels))
+        # maps.tables: indices of the texture tables that opacities are read from.
+        tables = [] if maps is None else [world.textures.tables[k] for k in maps.tables]
+        texels = [tensor for table in tables for tensor in leaves(table)]
+        return any(tensor.requires_grad for tensor in (opacity, *texels))
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ class InputCotangents:
     extra_leaves: tuple[Tensor | None, ...]
     extra: Mapping[str, Tensor | None] = field(default_factory=dict)
 
-    def of_rays(self, state: PathState, attached: bool) -> Iterator[tuple[str, Tensor | None, Tensor]]:
+    def of_rays(self, state: PathState, *, attached: bool) -> Iterator[tuple[str, Tensor | None, Tensor]]:
         """Yield name, cotangent (None: zero) and a tensor of the cotangent's shape, for each field of the incoming rays.
 
         ``attached``: True where geometry is differentiated, so that origins and directions have cotangents.
@@ -111,7 +113,7 @@ class InputCotangents:
 LeafSource = Callable[[], Sequence[Tensor]]
 
 
-def bounce(
+def bounce_vjp(
     stage: Bounce,
     context: StageContext,
     model: int,
@@ -150,6 +152,7 @@ def bounce(
             pairs += [(leaving.o, cotangents.o), (leaving.d, cotangents.d)]
         pairs += [(leaving.extra[name], cotangent) for name, cotangent in cotangents.extra.items()]
         if shadow is not None:
+            # A transmittance without a derivative weighs the cotangent, off the tape.
             arriving = transmittance(shadow)
             if arriving.requires_grad:
                 pairs.append((shadow.radiance * arriving, cotangents.radiance))
@@ -160,7 +163,7 @@ def bounce(
         return _vjp(pairs, input_leaves, extra_leaves)
 
 
-def gather(
+def emission_vjp(
     stage: Callable[[StageContext, VertexInput], Emission],
     context: StageContext,
     vertex: VertexInput,
@@ -171,17 +174,20 @@ def gather(
 
     Args:
         stage: such as :func:`torchpt.paths.vertex.emit` or :func:`torchpt.paths.vertex.escape`.
-        context: as for :func:`bounce`.
+        context: as for :func:`bounce_vjp`.
         vertex: as for the stage.
         radiance: cotangent of the radiance of the samples ``(3, n)``.
-        extra_leaves: as for :func:`bounce`.
+        extra_leaves: as for :func:`bounce_vjp`.
     """
     with torch.enable_grad():
         vertex, input_leaves = _with_leaves(context.plan, vertex)
-        return _vjp([(stage(context, vertex).brought, radiance)], input_leaves, extra_leaves)
+        contribution = stage(context, vertex).brought
+        return _vjp([(contribution, radiance)], input_leaves, extra_leaves)
 
 
-def splatted(clamp: float | None, cotangent: Tensor, splat: Splat, transmittance: Tensor) -> tuple[Tensor, Tensor]:
+def splat_contributions(
+    clamp: float | None, cotangent: Tensor, splat: Splat, transmittance: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return the contributions of splats to their pixels ``(3, n)``, differentiable, and their cotangents.
 
     Args:
@@ -193,8 +199,8 @@ def splatted(clamp: float | None, cotangent: Tensor, splat: Splat, transmittance
     value = splat.light.radiance * transmittance
     with torch.no_grad():
         counted = (splat.pixel >= 0) & (value.abs() < LARGEST).all(0)  # the splats that the film adds
-        of_pixels = torch.where(counted, take(cotangent, splat.pixel.clamp_min(0)), 0.0)
-    return value if clamp is None else value * clamp_scale(value, clamp), of_pixels
+        pixel_cotangents = torch.where(counted, take(cotangent, splat.pixel.clamp_min(0)), 0.0)
+    return value if clamp is None else value * clamp_scale(value, clamp), pixel_cotangents
 
 
 @dataclass(frozen=True)
@@ -226,7 +232,8 @@ def _with_leaves(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _InputLe
         extra={**state.extra, **extra},
     )
     chance = None if hit.chance is None else leaf(hit.chance)
-    return VertexInput(state, replace(hit, chance=chance)), _InputLeaves(throughput, o, d, chance, extra)
+    input_leaves = _InputLeaves(throughput=throughput, o=o, d=d, chance=chance, extra=extra)
+    return VertexInput(state, replace(hit, chance=chance)), input_leaves
 
 
 def _vjp(pairs: list[tuple[Tensor, Tensor]], input_leaves: _InputLeaves, extra_leaves: LeafSource) -> InputCotangents:
@@ -237,6 +244,7 @@ def _vjp(pairs: list[tuple[Tensor, Tensor]], input_leaves: _InputLeaves, extra_l
     if pairs:
         outputs, cotangents = [output for output, _ in pairs], [cotangent for _, cotangent in pairs]
         grads = torch.autograd.grad(outputs, [*inputs, *extra_inputs], cotangents, allow_unused=True)
+    # Those of the inputs come first; the extra leaves follow.
     gradients = {id(leaf): gradient for leaf, gradient in zip(inputs, grads, strict=False)}
 
     def gradient_of(leaf: Tensor | None) -> Tensor | None:

@@ -160,27 +160,31 @@ class Explainer(Observer[ReadablePopulation]):
 
     def on_start(self, state: PathState) -> None:
         """Record camera rays."""
-        self.record(CameraRay(state.lane, state))
+        self.record(CameraRay(lanes=state.lane, state=state))
 
     def on_hits(self, paths: ReadablePopulation) -> bool:
         """Record the hits; return False, so that the walk goes on."""
         state = paths.state
-        self.record(Intersection(paths.depth, state.lane, replace(state, radiance=state.radiance.clone()), paths.hits))
+        # Cloned, since engines add to the radiance in place.
+        state = replace(state, radiance=state.radiance.clone())
+        self.record(Intersection(depth=paths.depth, lanes=state.lane, state=state, hit=paths.hits))
         return False
 
     def on_emission(self, paths: ReadablePopulation) -> None:
         """Record the emission that was added, of emitters or of the environment."""
         for index, light in paths.emissions:
-            prim = take(paths.hits.prim, index)
+            prim = take(paths.hits.prim, index)  # -1: no hit, so the environment
             slot = None if bool((prim < 0).any()) else self.world.geometry.slot(prim)
-            self.record(EmitterHit(paths.depth, take(paths.state.lane, index), slot, light))
+            self.record(EmitterHit(depth=paths.depth, lanes=take(paths.state.lane, index), slot=slot, light=light))
 
     def on_scattered(self, paths: ReadablePopulation) -> None:
         """Record light and BSDF samples of the vertex that the paths leave; ``paths`` are at the next one already."""
         transmittances = iter(paths.transmittance)
         for model, lanes, output in paths.outputs:
             transmittance = None if output.shadow is None else next(transmittances)
-            self.record(Scattering(paths.depth - 1, lanes, model, output, transmittance))
+            self.record(
+                Scattering(depth=paths.depth - 1, lanes=lanes, model=model, output=output, transmittance=transmittance)
+            )
 
 
 #: Names of causes, and their descriptions.
@@ -235,7 +239,8 @@ def causes_of_samples(trace: Trace, wave: Wave, samples: Sequence[SampleId]) -> 
     # Samples of the picture and of error probes have other randomizations: each group is traced as one wave.
     for first, count in sorted({(sample.first_randomization, sample.randomizations) for sample in samples}):
         group = [sample for sample in samples if (sample.first_randomization, sample.randomizations) == (first, count)]
-        found |= zip(group, _find_causes(trace, wave, group, Randomizations(first, count)), strict=True)
+        causes = _find_causes(trace, wave, group, Randomizations(first=first, count=count))
+        found |= zip(group, causes, strict=True)
     return [found[sample] for sample in samples]
 
 
@@ -307,7 +312,8 @@ class _CauseFinder(Explainer):
             lane = int(lanes[i])
             if self.causes[lane] is None:
                 nan = bool(torch.isnan(value[:, i]).any())
-                self.causes[lane] = NonFiniteCause(cause, nan, depth, -1 if slot is None else int(slot[i]))
+                surface = -1 if slot is None else int(slot[i])
+                self.causes[lane] = NonFiniteCause(cause, nan=nan, depth=depth, slot=surface)
 
 
 def _checks(event: Event, world: World) -> Iterator[tuple[str, Tensor]]:
@@ -318,16 +324,17 @@ def _checks(event: Event, world: World) -> Iterator[tuple[str, Tensor]]:
         hit = event.hit
         yield "surface", torch.where(hit.prim >= 0, torch.stack((hit.t, hit.u, hit.v)), 0.0)
     elif isinstance(event, EmitterHit):
-        yield "environment" if event.slot is None else "emission", event.light.brought
+        contribution = event.light.brought
+        yield "environment" if event.slot is None else "emission", contribution
     else:
-        yield from _of_vertex(event, world)
+        yield from _checks_of_vertex(event, world)
 
 
-def _of_vertex(event: Scattering, world: World) -> Iterator[tuple[str, Tensor]]:
+def _checks_of_vertex(event: Scattering, world: World) -> Iterator[tuple[str, Tensor]]:
     """Yield causes and values of a vertex at which paths scatter."""
     output = event.output
     leaving, surface, at, direct, drawn = output.leaving, output.surface, output.at, output.direct, output.drawn
-    goes_on = leaving.t_max > 0
+    goes_on = leaving.t_max > 0  # (n,), False where the path ended
     ray = torch.where(goes_on, torch.cat((leaving.o, leaving.d)), 0.0)
     light = torch.zeros_like(leaving.throughput) if output.shadow is None else output.shadow.radiance
     # Without a BSDF sample the integrator stops here, and its stage added the shading of the first surface to the radiance.

@@ -260,11 +260,11 @@ def values(
         centre: ``(3,)`` float64 origin of the lanes' coordinates, as in :class:`torchpt.paths.wave.Wave`.
     """
     world = context.world
-    at = interact(world, o, d, hit, context.follow_ray)
+    at = interact(world, o, d, hit, follow_ray=context.follow_ray)
     if context.follow_ray:  # the distance follows the point, which was intersected anew
         hit = replace(hit, t=dot(at.p - o, d))
     point = texture_point_at(world, model, at, context.pixel)
-    seen = Seen(world, model, d, hit, at, point, centre, context.plan.dtype)
+    seen = Seen(world=world, model=model, d=d, hit=hit, at=at, point=point, centre=centre, dtype=context.plan.dtype)
     found = {name: surface_layer(name).values(seen) for name in names}
     # `chance` is 1, with the derivative of the probability that the ray passed the surfaces before.
     return found if hit.chance is None else {name: value * hit.chance for name, value in found.items()}

@@ -21,6 +21,8 @@ __all__ = ["KEPT", "NonFinite", "SampleId"]
 #: How many of the samples are recorded, and traced again: the first by :attr:`SampleId.sort_key`, independent of threads.
 #: Enough to name the causes, few enough that tracing them again takes no time.
 KEPT = 64
+#: Numbers in a checkpoint are below this; no render takes so many samples.
+_LARGEST_NUMBER = 2**62
 
 
 @dataclass(frozen=True)
@@ -92,13 +94,14 @@ class NonFinite:
             counts, places = [facts["nan"], facts["infinite"]], facts["places"]
             # Each place is five numbers and the flag `nan`.
             numbers = [counts, *(place[:-1] for place in places)]
-            whole = all(type(n) is int and 0 <= n < 2**62 for row in numbers for n in row)
+            whole = all(type(n) is int and 0 <= n < _LARGEST_NUMBER for row in numbers for n in row)
             formed = all(len(place) == 6 and type(place[-1]) is bool for place in places)
             if not whole or not formed or len(places) > KEPT:
                 raise ValueError("lost samples")
         except (KeyError, TypeError, IndexError):
             raise ValueError("lost samples") from None
-        return NonFinite(facts["nan"], facts["infinite"], [SampleId(*place) for place in places])
+        samples = [SampleId(*place) for place in places]
+        return NonFinite(nan=facts["nan"], infinite=facts["infinite"], samples=samples)
 
     @staticmethod
     def of(
@@ -137,4 +140,4 @@ class NonFinite:
                     nan=bool(nan[s, p]),
                 )
             )
-        return NonFinite(nans, count - nans, samples)
+        return NonFinite(nan=nans, infinite=count - nans, samples=samples)

@@ -17,7 +17,7 @@ from torchpt.physics.textures import MaterialTextures
 
 __all__ = ["PerturbedNormal", "perturb_normal"]
 
-#: Lower bound of squared cosines that are divided by.
+#: Lower bound of squared cosines that are divided by, so that quotients stay finite.
 _LEAST_SQUARE = 1e-12
 #: Lower bound of the z component of a map's normals, which must point out of the surface.
 _LEAST_Z = 1e-3
@@ -36,16 +36,15 @@ class PerturbedNormal:
         Smith's masking function in place of the hard edge between the horizons of the two normals (Conty Estevez, Lecocq,
         Stein, *A Microfacet-Based Shadowing Function to Solve the Bump Terminator Problem*, Ray Tracing Gems, 2019).
         """
-        square = (
-            dot(w, self.normal).square().clamp_min(_LEAST_SQUARE)
-        )  # cos^2 of the angle to the normal; 1 / it - 1 is tan^2
+        # cos^2 of the angle to the normal; (1 - square) / square is tan^2.
+        square = dot(w, self.normal).square().clamp_min(_LEAST_SQUARE)
         return 2.0 / (1.0 + (1.0 + self.alpha2 * (1.0 - square).clamp_min(0.0) / square).sqrt())
 
 
 def perturb_normal(
     textures: MaterialTextures,
     row: Tensor,
-    local: Tensor | None,
+    colour: Tensor | None,
     slope: tuple[Tensor, Tensor] | None,
     d: Tensor,
     at: Interaction,
@@ -63,7 +62,7 @@ def perturb_normal(
     Args:
         textures: textures of the model.
         row: ``(N,)`` rows of the materials in the tables of that model.
-        local: ``(3, N)`` colours of the normal map, 0 to 1; None for a bump map.
+        colour: ``(3, N)`` colours of the normal map, 0 to 1; None for a bump map.
         slope: derivatives of the bump map's height with respect to u and v, ``(N,)`` each; None for a normal map.
         d: ``(3, N)`` directions of the incoming rays.
         at: the surface points.
@@ -71,9 +70,9 @@ def perturb_normal(
     """
     assert at.tangent is not None
     base = Frame.along(at.ns, at.tangent)  # s along the tangent, t across, n the shading normal
-    if local is not None:
-        local = local * 2.0 - 1.0  # colours 0 to 1 to components -1 to 1
-        x, y, z = local[0], local[1], local[2].clamp_min(_LEAST_Z)
+    if colour is not None:
+        vector = colour * 2.0 - 1.0  # colours 0 to 1 to components -1 to 1
+        x, y, z = vector[0], vector[1], vector[2].clamp_min(_LEAST_Z)
         if textures.strength is not None:
             strength = take(textures.strength, row)
             x, y = x * strength, y * strength
@@ -88,7 +87,7 @@ def perturb_normal(
         sign = torch.copysign(torch.ones_like(z), z.detach())
         x, y, z = x * sign, y * sign, z * sign
     n = at.ns if side is None else at.ns * side
-    normal = normalize(affine(base.s * x, base.t, y, n, z))
+    normal = normalize(affine(base.s * x, base.t, y, n, z))  # x s + y t + z n
     away = (dot(d, n) * dot(d, normal) <= 0).detach()  # the ray meets the two normals from different sides
     normal = torch.where(away, normalize(affine(base.s * -x, base.t, -y, n, z)), normal)
     flat = dot(normal, normal) == 0  # no texture coordinates, so no slope
@@ -96,4 +95,4 @@ def perturb_normal(
     square = dot(normal, n).square().clamp_min(_LEAST_SQUARE)
     # alpha^2 of the tilt, tan^2 / 8, as in the paper at `shadowing`.
     alpha2 = (0.125 * (1.0 - square).clamp_min(0.0) / square).clamp_max(1.0)
-    return Frame.along(normal, at.tangent), PerturbedNormal(n, alpha2)
+    return Frame.along(normal, at.tangent), PerturbedNormal(normal=n, alpha2=alpha2)

@@ -37,7 +37,7 @@ def russian_roulette(chance: Tensor, draws: Draws, alive: Tensor, throughput: Te
 
 
 def survival_probability(
-    rr_prob: float | None, cap: float, brightest: Tensor, eta: Tensor | None, tape: bool = False
+    rr_prob: float | None, cap: float, brightest: Tensor, eta: Tensor | None, *, tape: bool = False
 ) -> Tensor:
     """Return the survival probability of paths ``(N,)``.
 

@@ -113,7 +113,7 @@ def no_search(state: PathState) -> Hit:
 def no_shadow(state: PathState) -> Shadow:
     """Return shadow rays of length 0 and radiance 0, one for each path."""
     nothing = torch.zeros_like(state.o)
-    return Shadow(nothing, nothing, torch.zeros_like(state.t_max), nothing)
+    return Shadow(o=nothing, d=nothing, t_max=torch.zeros_like(state.t_max), radiance=nothing)
 
 
 #: Prefix of an integrator's fields where their names stand beside those of the path state.

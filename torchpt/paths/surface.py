@@ -51,9 +51,9 @@ def texture_point_at(world: World, number: int, at: Interaction, pixel: Tensor |
     if textures is None:
         return None
     return TexturePoint(
-        surface_uv(world, at) if "uv" in textures.reads else None,
-        _footprint(at, pixel) if textures.filtered and pixel is not None else None,
-        vertex_colors(world, at) if "colors" in textures.reads else None,
+        uv=surface_uv(world, at) if "uv" in textures.reads else None,
+        footprint=_footprint(at, pixel) if textures.filtered and pixel is not None else None,
+        colors=vertex_colors(world, at) if "colors" in textures.reads else None,
     )
 
 
@@ -114,7 +114,12 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
         ns = ns if side is None else ns * side
         frame = Frame.along(ns, at.tangent) if model.anisotropic and at.tangent is not None else Frame.about(ns)
     return Surface(
-        frame, side, front_mask, parameters_at(world, number, row, at, point), frame.to_local(-d), perturbed_normal
+        frame=frame,
+        side=side,
+        front_mask=front_mask,
+        parameters=parameters_at(world, number, row, at, point),
+        wo=frame.to_local(-d),
+        perturbed_normal=perturbed_normal,
     )
 
 
@@ -129,30 +134,30 @@ def parameters_at(
     if textures is None:
         return values
     assert point is not None
-    return world.materials.models[number].prepare(_filled(world, values, textures.bindings, row, point))
+    return world.materials.models[number].prepare(_with_texture_values(world, values, textures.bindings, row, point))
 
 
-def _filled(
+def _with_texture_values(
     world: World,
     values: bsdfs.Parameters,
-    readings: dict[str, Any],
+    bindings: dict[str, Any],
     row: Tensor,
     point: TexturePoint,
 ) -> bsdfs.Parameters:
     """Return the parameters with textured ones replaced by their texture values.
 
-    ``readings`` has a :class:`TextureBinding` for each textured parameter, in nested dicts where ``values`` nests them.
+    ``bindings`` has a :class:`TextureBinding` for each textured parameter, in nested dicts where ``values`` nests them.
     """
     filled = dict(values)
-    for key, reading in readings.items():
-        if isinstance(reading, TextureBinding):
-            filled[key] = _read(world, reading, row, point)
+    for key, binding in bindings.items():
+        if isinstance(binding, TextureBinding):
+            filled[key] = _texture_values(world, binding, row, point)
         else:
-            filled[key] = _filled(world, values.get(key, {}), reading, row, point)
+            filled[key] = _with_texture_values(world, values.get(key, {}), binding, row, point)
     return filled
 
 
-def _read(world: World, binding: TextureBinding, row: Tensor, point: TexturePoint) -> Tensor:
+def _texture_values(world: World, binding: TextureBinding, row: Tensor, point: TexturePoint) -> Tensor:
     """Return the texture values of a parameter, a colour ``(3, n)`` or a number ``(n,)``, for materials ``row (n,)``."""
     table = world.textures.tables[binding.table]
     point = point if binding.filtered else point.unfiltered
@@ -164,8 +169,9 @@ def _value_by_slot(world: World, maps: NodeMap, at: Interaction, *, coloured: bo
 
     ``coloured``: True: colours ``(3, n)``. False: numbers ``(n,)``.
     """
-    node, point = take(maps.nodes, at.slot).clamp_min(0), TexturePoint(surface_uv(world, at))
+    node, point = take(maps.nodes, at.slot).clamp_min(0), TexturePoint(uv=surface_uv(world, at))
     first, *others = (world.textures.tables[number] for number in maps.tables)
+    # maps.tables: indices in world.textures.tables; maps.table: which of these each slot reads.
     if maps.table is None:  # all nodes are rows of the first table
         return first.look_up(node, point, coloured=coloured)
     table_of_lane = take(maps.table, at.slot)
@@ -227,11 +233,11 @@ def _perturbed_frame(
     side: Tensor | None,
 ) -> tuple[Frame, PerturbedNormal]:
     """Return the shading frame of a normal or bump map, and the unperturbed normal; arguments as for :func:`perturb_normal`."""
-    local = None if textures.normal is None else _read(world, textures.normal, row, point)
+    colour = None if textures.normal is None else _texture_values(world, textures.normal, row, point)
     slope = None
-    if local is None:
+    if colour is None:
         assert textures.bump is not None
         table = world.textures.tables[textures.bump.table]
         point = point if textures.bump.filtered else point.unfiltered
         slope = table.slope(take(textures.bump.nodes, row), point)
-    return perturb_normal(textures, row, local, slope, d, at, side)
+    return perturb_normal(textures, row, colour, slope, d, at, side)

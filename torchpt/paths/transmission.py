@@ -20,7 +20,7 @@ from torchpt.physics.shapes import interact, offset_origin
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.physics.world import World
 
-__all__ = ["beyond", "non_opaque", "opacity_at", "times_map", "transmit"]
+__all__ = ["non_opaque", "opacity_at", "origins_behind", "times_opacity_map", "transmit"]
 
 
 def opacity_at(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:
@@ -32,18 +32,21 @@ def opacity_at(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Ten
     if world.textures.opacity is None:
         return opacity
     textured = ~missed & (take(world.textures.opacity.nodes, slot) >= 0)
-    return times_map(world, o, d, hit, opacity, textured)
+    return times_opacity_map(world, o, d, hit, opacity, textured)
 
 
 @dispatched
-def times_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Tensor:
-    """Multiply ``opacity (N,)`` by the opacity texture in the lanes where the mask ``textured (N,)`` is True."""
+def times_opacity_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Tensor:
+    """Multiply ``opacity (N,)`` by the opacity texture in the lanes where the mask ``textured (N,)`` is True.
+
+    Traced kernels cannot list lanes: they run another implementation (:mod:`torchpt.engines.dispatch`).
+    """
     lanes = textured.nonzero().squeeze(1)
     at = interact(world, take(o, lanes), take(d, lanes), rows(hit, lanes))
     return opacity.index_copy(0, lanes, take(opacity, lanes) * opacity_map(world, at))
 
 
-def beyond(world: World, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
+def origins_behind(world: World, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
     """Return ray origins ``(3, N)`` just behind the surfaces that were hit, off them by their rounding bound."""
     return offset_origin(world, interact(world, o, d, hit), d)
 
@@ -73,5 +76,5 @@ def transmit(context: StageContext, vertex: VertexInput) -> Transmission:
         # Of value 1, with the derivative of the logarithm of the probability. An opacity of 1 has none: 1 - opacity is 0.
         chance = torch.where(opacity.detach() < 1, probability / probability.detach(), 1.0)
     with torch.no_grad():
-        o = beyond(world, state.o.detach(), state.d.detach(), hit)
-    return Transmission(~stops, o, chance=chance)
+        o = origins_behind(world, state.o.detach(), state.d.detach(), hit)
+    return Transmission(on=~stops, o=o, chance=chance)

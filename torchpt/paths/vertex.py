@@ -100,7 +100,7 @@ def shade(
     weight = weight if share is None else weight * share
     emitted = light_radiance(world, light)
     radiance = state.throughput * reflected * emitted * weight
-    direct = DirectLight(light, emitted, reflected, share, pdf, heuristic)
+    direct = DirectLight(sample=light, radiance=emitted, reflected=reflected, share=share, pdf=pdf, weight=heuristic)
     return surface, direct, _shadow_ray(plan, world, at, light, radiance, weight)
 
 
@@ -159,7 +159,7 @@ def light_radiance(world: World, light: LightSample) -> Tensor:
         factor = factor * emission_map(world, light.at)
     if world.textures.opacity is not None:
         factor = factor * opacity_map(world, light.at)
-    # `bare` lights have no surface, so their factor is meaningless.
+    # light.bare: (N,) bool, True for lights without a surface, whose factor is meaningless; None: all have one.
     return light.radiance * (factor if light.bare is None else torch.where(light.bare, 1.0, factor))
 
 
@@ -178,7 +178,7 @@ def _shadow_ray(
     if light.distant is not None:
         d = torch.where(light.distant, light.wi, d)
         t_max = torch.where(light.distant & lit, math.inf, t_max)
-    return Shadow(o, d, t_max, radiance)
+    return Shadow(o=o, d=d, t_max=t_max, radiance=radiance)
 
 
 def has_shading_normals(world: World, model: int) -> bool:
@@ -251,13 +251,13 @@ def sample_bsdf(context: StageContext, model: int, at: Interaction, surface: Sur
         wi = uniform_sphere(u) if kind.transmits else uniform_hemisphere(u)
         # 1 / (4 pi) over the sphere, 1 / (2 pi) over the hemisphere, per steradian.
         pdf = torch.full_like(wi[2], (0.25 if kind.transmits else 0.5) / math.pi)
-        sample = BsdfSample(wi, pdf, kind.eval(surface.parameters, surface.wo, wi) / pdf)
+        sample = BsdfSample(wi=wi, pdf=pdf, weight=kind.eval(surface.parameters, surface.wo, wi) / pdf)
     else:
         # The number that chooses a lobe; models that are not `lobed` need none.
         lobe = draws.one(Dimension.LOBE).to(plan.dtype) if kind.lobed else None
         sample = kind.sample(surface.parameters, surface.wo, lobe, u)
     pdf = sample.pdf.detach()
-    sharp = torch.isinf(pdf) if kind.delta else None
+    sharp = torch.isinf(pdf) if kind.delta else None  # (n,), True where a delta lobe was sampled
     d = surface.frame.to_world(sample.wi).detach()
     o = offset_origin(world, at, d)
     # The minimum of all values that must be positive for a valid sample: minima are cheaper than comparisons.
@@ -266,7 +266,7 @@ def sample_bsdf(context: StageContext, model: int, at: Interaction, surface: Sur
         least = torch.minimum(least, same_hemisphere(at, surface, d, sample.wi.detach()))
     if surface.front_mask is not None:
         least = torch.minimum(least, surface.front_mask)
-    return Drawn(o, d, sample.wi, pdf, sample.weight, least, sharp, sample.eta)
+    return Drawn(o=o, d=d, wi=sample.wi, pdf=pdf, weight=sample.weight, least=least, sharp=sharp, eta=sample.eta)
 
 
 def attach(
@@ -314,10 +314,10 @@ def continue_paths(
     if eta is not None and drawn.eta is not None:
         eta = eta * drawn.eta.detach()
     if not roulette:
-        return Continuation(alive, throughput, eta, throughput, None)
-    chance = survival_probability(plan.rr_prob, roulette, brightest, eta, plan.tape)
+        return Continuation(alive=alive, throughput=throughput, eta=eta, carried=throughput, chance=None)
+    chance = survival_probability(plan.rr_prob, roulette, brightest, eta, tape=plan.tape)
     alive, survivors = russian_roulette(chance, draws, alive, throughput)
-    return Continuation(alive, survivors, eta, throughput, chance)
+    return Continuation(alive=alive, throughput=survivors, eta=eta, carried=throughput, chance=chance)
 
 
 def next_ray(
@@ -385,46 +385,64 @@ def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, k
     forever = torch.full((n,), math.inf, dtype=plan.dtype, device=d.device)
     lane = torch.arange(n, device=d.device)
     # Cloned, since `radiance` is added to in place and no two tensors of a state may share memory.
-    return PathState(o.expand(3, n).clone(), d, forever, ones, torch.zeros_like(d), forever.clone(), lane, key)
+    return PathState(
+        o=o.expand(3, n).clone(),
+        d=d,
+        t_max=forever,
+        throughput=ones,
+        radiance=torch.zeros_like(d),
+        pdf=forever.clone(),
+        lane=lane,
+        key=key,
+    )
 
 
 def emit(context: StageContext, vertex: VertexInput) -> Emission:
     """Return the emission of the emitters that paths hit, weighted by MIS."""
     world, state = context.world, vertex.state
     assert world.lights is not None
-    at = interact(world, state.o, state.d, vertex.hit, context.follow_ray)
+    at = interact(world, state.o, state.d, vertex.hit, follow_ray=context.follow_ray)
     # Where the light sampler depends on the point, its pdf is that at the vertex itself, which differs from the ray's origin.
     x = state.o if state.p is None else state.p
     radiance, pdf = lights.emitted(world.lights, x, at, state.d, state.n)
     if world.textures.emission is not None:
         radiance = radiance * emission_map(world, at)
-    return _gathered(vertex, radiance, pdf)
+    return _emission_of(vertex, radiance, light_pdf=pdf)
 
 
 def escape(context: StageContext, vertex: VertexInput) -> Emission:
     """Return the radiance of the environment along rays that hit nothing, weighted by MIS."""
     assert context.world.lights is not None
-    return _gathered(vertex, *lights.environment(context.world.lights, vertex.state.d))
+    radiance, pdf = lights.environment(context.world.lights, vertex.state.d)
+    return _emission_of(vertex, radiance, light_pdf=pdf)
 
 
-def _gathered(vertex: VertexInput, radiance: Tensor, light_pdf: Tensor) -> Emission:
+def _emission_of(vertex: VertexInput, radiance: Tensor, light_pdf: Tensor) -> Emission:
     """Return emitted ``radiance (3, n)`` as a contribution; light sampling finds it with ``light_pdf (n,)`` per steradian."""
     state, hit = vertex.state, vertex.hit
     # `chance` is 1 with the derivative of the probability that the ray passed the surfaces before.
     throughput = state.throughput if hit.chance is None else state.throughput * hit.chance
     # PathState.pdf is inf where emission counts whole and 0 where it does not count: limits of the power heuristic.
     weight = power_heuristic(state.pdf, light_pdf).detach()
-    return Emission(radiance, light_pdf, weight, throughput * radiance * weight)
+    return Emission(radiance=radiance, pdf=light_pdf, weight=weight, brought=throughput * radiance * weight)
 
 
 def bounce(context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
     """Return the outputs of a vertex on surfaces of one BSDF model: light sample, next ray, roulette."""
     world, state, hit = context.world, vertex.state, vertex.hit
-    at = interact(world, state.o, state.d, hit, context.follow_ray)
+    at = interact(world, state.o, state.d, hit, follow_ray=context.follow_ray)
     if hit.chance is not None:
         state = replace(state, throughput=state.throughput * hit.chance)
     surface, direct, shadow = shade(context, model, state, at)
     leaving, next_hit, drawn, continuation = scatter(context, model, state, at, surface)
     return VertexOutput(
-        leaving, next_hit, shadow, at, surface, direct, drawn, continuation.carried, continuation.chance
+        leaving=leaving,
+        next_hit=next_hit,
+        shadow=shadow,
+        at=at,
+        surface=surface,
+        direct=direct,
+        drawn=drawn,
+        carried=continuation.carried,
+        chance=continuation.chance,
     )

@@ -15,7 +15,7 @@ from torchpt.core.errors import AssetError
 from torchpt.images import colour, metrics, read_image
 from torchpt.images.metrics import relative
 from torchpt.reports.runs import Curve, Job, Measured, ReferencePicture, Run, film_size, from_file, from_runs
-from torchpt.reports.statistics import Estimate, Fit, estimate, f_tail, fit, t_quantile
+from torchpt.reports.statistics import LARGEST_EXPONENT, Estimate, Fit, estimate, f_tail, fit, t_quantile
 from torchpt.reports.study import ERRORS, Extra, Study, denoised_label
 
 __all__ = [
@@ -57,6 +57,10 @@ SIGNIFICANCE = 1e-3
 _GRIDS = (1, 4, 16)
 #: Relative difference of equal pictures by rounding.
 _ROUNDING = 1e-6
+#: Keeps quotients of variances finite where both are 0.
+_TINY = 1e-300
+#: Degrees of freedom that are as good as infinitely many, for F and for t.
+_MANY_FOR_F, _MANY_FOR_T = 1e5, 1e6
 
 
 @dataclass(frozen=True)
@@ -86,39 +90,42 @@ class BiasTest:
 
 def tiles(image: Tensor, count: int) -> Tensor:
     """Return means ``(C, count²)`` over ``count x count`` disjoint tiles of a picture ``(H, W, C)``."""
-    high, wide, channels = image.shape
-    rows, columns = torch.arange(high) * count // high, torch.arange(wide) * count // wide
-    cells = (rows[:, None] * count + columns).flatten()
+    height, width, channels = image.shape
+    rows, columns = torch.arange(height) * count // height, torch.arange(width) * count // width
+    cells = (rows[:, None] * count + columns).flatten()  # index of each pixel's tile
     sums = torch.zeros(channels, count * count, dtype=image.dtype).index_add_(1, cells, image.movedim(-1, 0).flatten(1))
     return sums / torch.bincount(cells, minlength=count * count)
 
 
-def bias_test(runs: Sequence[Tensor], reference: ReferencePicture, more: float = 0.0) -> BiasTest:
+def bias_test(runs: Sequence[Tensor], reference: ReferencePicture, sample_ratio: float = 0.0) -> BiasTest:
     """Test independent pictures ``(H, W, 3)`` of one setting for bias against their reference.
 
     Args:
         runs: two or more pictures.
         reference: the reference; a file without variance counts as exact.
-        more: samples of the reference over those of all runs, if known (else 0). The reference has seen rare bright paths that
-            the runs may have missed, so the variance of the runs is taken to be at least the reference's at as many samples.
+        sample_ratio: samples of the reference over those of all runs, if known (else 0). The reference has seen rare bright
+            paths that the runs may have missed, so the variance of the runs is taken to be at least the reference's at as many
+            samples.
     """
-    high, wide = reference.image.shape[:2]
-    grids = [count for count in _GRIDS if count == 1 or min(high, wide) >= 2 * count]
+    height, width = reference.image.shape[:2]
+    grids = [count for count in _GRIDS if count == 1 or min(height, width) >= 2 * count]
     chances: list[float] = []
-    for known_by in (0.0, more):
-        sides = [
-            _difference(torch.stack([tiles(x, n) for x in runs]), *_reference_tiles(reference, n), known_by)
+    # Twice: with the variance of the runs (0), and with that of the reference. The larger probability of each test counts.
+    for ratio in (0.0, sample_ratio):
+        differences = [
+            _tile_differences(torch.stack([tiles(x, n) for x in runs]), *_reference_tiles(reference, n), ratio)
             for n in grids
         ]
-        found = [chance for side in sides[1:] for chance in _p_values_of_f(side)] + _p_values_of_means(
-            sides[0], sides[-1]
-        )
+        whole, *finer = differences
+        found = [chance for tile_differences in finer for chance in _p_values_of_f(tile_differences)]
+        found += _p_values_of_means(whole, differences[-1])
         chances = [max(pair) for pair in zip(chances, found, strict=True)] if chances else found
     chance = min(1.0, min(chances) * len(chances))
     stack = torch.stack(list(runs))
     mean, variance = stack.mean(0), stack.var(0) / len(runs)
     squared = float((((mean - reference.image).square() - variance - reference.variance) * reference.weight).mean())
-    return BiasTest(chance < SIGNIFICANCE, chance, squared, *_share(runs, reference))
+    share, low, high = _excess_of_light(runs, reference)
+    return BiasTest(biased=chance < SIGNIFICANCE, chance=chance, squared=squared, share=share, low=low, high=high)
 
 
 def _reference_tiles(reference: ReferencePicture, count: int) -> tuple[Tensor, Tensor, float]:
@@ -131,51 +138,76 @@ def _reference_tiles(reference: ReferencePicture, count: int) -> tuple[Tensor, T
 
 
 @dataclass(frozen=True)
-class _Side:
-    """Tiles ``(C, tiles)``: difference of runs and reference, its variance with degrees of freedom, and weights."""
+class _TileDifferences:
+    """Runs and reference compared tile by tile, ``(C, tiles)`` each.
 
-    away: Tensor
+    Attributes:
+        difference: mean of the runs minus the reference.
+        variance: variance of the difference.
+        freedom: degrees of freedom of the variance.
+        weight: weight that makes squared differences relative, ``1 / (ref² + 0.01)``.
+    """
+
+    difference: Tensor
     variance: Tensor
     freedom: Tensor
     weight: Tensor
 
 
-def _difference(own: Tensor, reference: Tensor, known: Tensor, freedom: float, more: float) -> _Side:
-    """Compare tiles ``own (runs, C, tiles)`` with the reference's; with ``more`` > 0 the variance is the reference's alone."""
-    count, rounding = len(own), (_ROUNDING * reference.abs()).square()
-    if more > 0:
-        total = (1.0 + more) * known + rounding
-        return _Side(own.mean(0) - reference, total, torch.full_like(total, freedom), relative(1.0, reference))
-    spread = own.var(0) / count + rounding
-    total = spread + known
-    freedoms = total.square() / (spread.square() / (count - 1.0) + known.square() / freedom).clamp_min(1e-300)
-    freedoms = freedoms.clamp_min(min(count - 1.0, freedom))  # the true lower bound; 0 / 0 for black tiles
-    return _Side(own.mean(0) - reference, total, freedoms, relative(1.0, reference))
+def _tile_differences(
+    tiles_of_runs: Tensor, reference: Tensor, reference_variance: Tensor, reference_freedom: float, sample_ratio: float
+) -> _TileDifferences:
+    """Compare the tiles of runs with those of the reference.
+
+    Args:
+        tiles_of_runs: ``(runs, C, tiles)``.
+        reference: ``(C, tiles)``.
+        reference_variance: variance of ``reference``.
+        reference_freedom: degrees of freedom of that variance.
+        sample_ratio: 0: the variance of the runs is that among them. Above 0: it is the reference's, times this ratio.
+    """
+    count, rounding = len(tiles_of_runs), (_ROUNDING * reference.abs()).square()
+    difference, weight = tiles_of_runs.mean(0) - reference, relative(1.0, reference)
+    if sample_ratio > 0:
+        variance = (1.0 + sample_ratio) * reference_variance + rounding
+        freedom = torch.full_like(variance, reference_freedom)
+        return _TileDifferences(difference=difference, variance=variance, freedom=freedom, weight=weight)
+    run_variance = tiles_of_runs.var(0) / count + rounding
+    variance = run_variance + reference_variance
+    parts = run_variance.square() / (count - 1.0) + reference_variance.square() / reference_freedom
+    freedom = variance.square() / parts.clamp_min(_TINY)  # Satterthwaite
+    freedom = freedom.clamp_min(min(count - 1.0, reference_freedom))  # the true lower bound; 0 / 0 for black tiles
+    return _TileDifferences(difference=difference, variance=variance, freedom=freedom, weight=weight)
 
 
-def _p_values_of_f(side: _Side) -> list[float]:
+def _p_values_of_f(tile_differences: _TileDifferences) -> list[float]:
     """Return the p-value of each channel's F."""
     found = []
-    for x, u, d, w in zip(side.away, side.variance, side.freedom, side.weight, strict=True):
+    # By channel, (tiles,) each: difference, variance, degrees of freedom, weight.
+    rows = tile_differences.difference, tile_differences.variance, tile_differences.freedom, tile_differences.weight
+    for x, u, d, w in zip(*rows, strict=True):
         explained = w * u
         if not float(explained.sum()) > 0:  # black in all runs and the reference
             found.append(0.0 if float(x.abs().max()) > 0 else 1.0)
             continue
         squares = (explained.square() * d / (d + 2.0)).sum()  # unbiased: E u² exceeds (E u)² by the variance of u
-        upper = (explained.sum().square() / squares).clamp(1.0, float(len(x)))
+        upper = (explained.sum().square() / squares).clamp(
+            1.0, float(len(x))
+        )  # degrees of freedom of the numerator (Box)
         ratio = (w * x.square()).sum() / explained.sum()
         found.append(f_tail(float(ratio), float(upper), _freedom(explained, d)))
     return found
 
 
-def _p_values_of_means(whole: _Side, fine: _Side) -> list[float]:
+def _p_values_of_means(whole: _TileDifferences, fine: _TileDifferences) -> list[float]:
     """Return the p-value of each channel's mean over the picture.
 
     The variance is estimated twice: from the means of runs, with few degrees of freedom, and from tiles, with many, if those
     are independent. The larger estimate is used.
     """
     found = []
-    for x, u, parts, d in zip(whole.away, whole.variance, fine.variance, fine.freedom, strict=True):
+    # By channel: difference (1,) and its variance (1,), variances of the fine tiles (tiles,) and their degrees of freedom.
+    for x, u, parts, d in zip(whole.difference, whole.variance, fine.variance, fine.freedom, strict=True):
         pooled = float(parts.sum()) / len(parts) ** 2
         variance = max(float(u), pooled)
         if not variance > 0:
@@ -187,30 +219,30 @@ def _p_values_of_means(whole: _Side, fine: _Side) -> list[float]:
 
 def _freedom(parts: Tensor, freedom: Tensor) -> float:
     """Return the degrees of freedom of a sum of variances (Satterthwaite)."""
-    return min(float(parts.sum().square() / (parts.square() / freedom).sum().clamp_min(1e-300)), 1e5)
+    return min(float(parts.sum().square() / (parts.square() / freedom).sum().clamp_min(_TINY)), _MANY_FOR_F)
 
 
-def _share(runs: Sequence[Tensor], reference: ReferencePicture) -> tuple[float, float, float]:
+def _excess_of_light(runs: Sequence[Tensor], reference: ReferencePicture) -> tuple[float, float, float]:
     """Return the relative excess of light of the whole picture, with its interval (Welch)."""
-    own = torch.stack([run.mean() for run in runs])
+    means = torch.stack([run.mean() for run in runs])
     light = float(reference.image.mean())
     if not light > 0:
         return 0.0, 0.0, 0.0
-    spread = float(own.var()) / len(own)
-    made = torch.stack([run.mean() for run in reference.runs]) if len(reference.runs) > 1 else None
-    known = (
-        float(made.var()) / len(made)
-        if made is not None
-        else float(reference.variance.mean()) / reference.image.numel()
-    )
-    share = float(own.mean()) / light - 1.0
-    total = spread + known
+    variance = float(means.var()) / len(means)
+    if len(reference.runs) > 1:
+        reference_means = torch.stack([run.mean() for run in reference.runs])
+        reference_variance = float(reference_means.var()) / len(reference_means)
+        reference_part = reference_variance**2 / (len(reference_means) - 1.0)
+    else:  # a file, whose variance counts as known
+        reference_variance = float(reference.variance.mean()) / reference.image.numel()
+        reference_part = 0.0
+    share = float(means.mean()) / light - 1.0
+    total = variance + reference_variance
     if total == 0:
         return share, share, share
-    rest = known**2 / (len(made) - 1.0) if made is not None else 0.0
-    freedom = min(total**2 / max(spread**2 / (len(own) - 1.0) + rest, 1e-300), 1e6)
-    reach = t_quantile(freedom) * math.sqrt(total) / light
-    return share, share - reach, share + reach
+    freedom = min(total**2 / max(variance**2 / (len(means) - 1.0) + reference_part, _TINY), _MANY_FOR_T)
+    half_width = t_quantile(freedom) * math.sqrt(total) / light
+    return share, share - half_width, share + half_width
 
 
 # ---- Error measures against a noisy reference
@@ -231,10 +263,11 @@ def relmse(image: Tensor, reference: ReferencePicture) -> float:
 
 def relmse_trimmed(image: Tensor, reference: ReferencePicture) -> float:
     """Return relMSE without the 0.1 % of pixels with the largest errors (rounded down)."""
-    found, own = error_map(image, reference).flatten(), (reference.variance * reference.weight).mean(-1).flatten()
-    if not torch.isfinite(found).all():
+    errors = error_map(image, reference).flatten()
+    reference_noise = (reference.variance * reference.weight).mean(-1).flatten()
+    if not torch.isfinite(errors).all():
         return math.nan
-    return float((found - own)[metrics.trimmed(found)].mean())
+    return float((errors - reference_noise)[metrics.trimmed(errors)].mean())
 
 
 def mse(image: Tensor, reference: ReferencePicture) -> float:
@@ -242,11 +275,13 @@ def mse(image: Tensor, reference: ReferencePicture) -> float:
     return float(((image - reference.image).square() - reference.variance).mean())
 
 
+#: Measures from which the variance of the reference is subtracted.
 _SQUARED: dict[str, Callable[[Tensor, ReferencePicture], float]] = {
     "relmse": relmse,
     "relmse_trimmed": relmse_trimmed,
     "mse": mse,
 }
+#: Measures of displayed pictures.
 _SHOWN = ("psnr", "ssim")
 
 
@@ -260,11 +295,11 @@ def measures(image: Tensor, reference: ReferencePicture, names: tuple[str, ...],
         film: exposure, tonemap and gamma, for PSNR and SSIM of displayed pictures.
     """
     found: dict[str, float] = {}
-    plain = shown = image, reference.image
+    linear = displayed = image, reference.image
     if set(_SHOWN) & set(names):
-        shown = colour.display(image, film.exposure, film.tonemap, film.gamma), reference.shown(film)
+        displayed = colour.display(image, film.exposure, film.tonemap, film.gamma), reference.shown(film)
     for name in names:
-        pair = shown if name in _SHOWN else plain
+        pair = displayed if name in _SHOWN else linear
         try:
             found[name] = _SQUARED[name](image, reference) if name in _SQUARED else metrics.METRICS[name](*pair)
         except ValueError:
@@ -277,8 +312,7 @@ def measures(image: Tensor, reference: ReferencePicture, names: tuple[str, ...],
 
 #: A reference with a larger share of the least error of a scene is reported as noisy.
 _NOISY = 0.5
-#: Expensive measures that hardly differ between runs: evaluated for the first run of a step, unless curves show them.
-#: where curves show them.
+#: Expensive measures that hardly differ between runs: evaluated for the first run of a step alone, unless curves show them.
 _EXPENSIVE = ("flip",)
 #: Runs of fewer seconds are mostly fixed cost.
 _SHORT = 0.05
@@ -319,9 +353,10 @@ class Step:
         if len(self.variance) < 2:
             return None
         spread = estimate(self.variance)
+        # The largest variance gives the least efficiency.
         bounds = (1.0 / (x * self.seconds) if x else None for x in (spread.mean, spread.high, spread.low))
-        middle, low, high = bounds
-        return None if middle is None else Estimate(middle, low, high)
+        mean, low, high = bounds
+        return None if mean is None else Estimate(mean, low=low, high=high)
 
 
 @dataclass
@@ -334,8 +369,8 @@ class ErrorCurve:
         reference: the reference.
         measured: True for runs of the study; False for other renderers' pictures.
         settings: complete settings of the study's runs.
-        of: the curve that this one is denoised from; else None. A denoised curve has no slope and no efficiency.
-        look: index of colour and marker; that of ``of`` for a denoised curve.
+        denoised_from: the curve that this one is denoised from; else None. A denoised curve has no slope and no efficiency.
+        style_index: index of colour and marker; that of ``denoised_from`` for a denoised curve.
         by_spp: fit of error over samples.
         by_seconds: fit of error over seconds.
         bias: result of the bias test.
@@ -347,29 +382,29 @@ class ErrorCurve:
     reference: ReferencePicture
     measured: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
-    of: ErrorCurve | None = None
-    look: int = 0
+    denoised_from: ErrorCurve | None = None
+    style_index: int = 0
     by_spp: Fit | None = None
     by_seconds: Fit | None = None
     bias: dict[str, Any] | None = None
     times: list[dict[str, Any]] = field(default_factory=list)
 
     @property
-    def estimates(self) -> bool:
+    def is_render_of_study(self) -> bool:
         """True for pictures that a renderer of the study made: neither other renderers' nor denoised ones."""
-        return self.measured and self.of is None
+        return self.measured and self.denoised_from is None
 
     @property
     def floor(self) -> float:
         """Error at which the curve ends; 0 if no bias was found. Denoised curves go on falling."""
-        return self.bias["squared"] if self.estimates and self.bias and self.bias["biased"] else 0.0
+        return self.bias["squared"] if self.is_render_of_study and self.bias and self.bias["biased"] else 0.0
 
     def plain(self) -> dict[str, Any]:
         """Return the curve, ready for JSON."""
         return {
             "label": self.label,
             "measured": self.measured,
-            "denoised": self.of is not None,
+            "denoised": self.denoised_from is not None,
             "settings": self.settings,
             "reference": {**self.reference.origin, "relmse": self.reference.noise},
             "slope_over_spp": asdict(self.by_spp.slope) if self.by_spp else None,
@@ -432,28 +467,32 @@ def check_files(study: Study, prepared: Sequence[Measured]) -> None:
 def analyse(study: Study, measured: Measured) -> SceneReport:
     """Analyse the runs of one scene."""
     names, first = study.options["metrics"], measured.curves[0]
-    truths: dict[str, ReferencePicture] = {}
+    references: dict[str, ReferencePicture] = {}
 
-    def truth_of(curve: Curve) -> ReferencePicture:
-        key = str(curve.truths[0].file) if curve.truths else repr(film_size(curve.job.settings))
-        if key not in truths:
+    def reference_of(curve: Curve) -> ReferencePicture:
+        runs, size = curve.reference_runs, film_size(curve.job.settings)
+        key = str(runs[0].file) if runs else repr(size)
+        if key not in references:
             file = study.reference.files.get(measured.name, "")
-            truths[key] = from_runs(curve.truths) if curve.truths else from_file(file, film_size(curve.job.settings))
-        return truths[key]
+            references[key] = from_runs(runs) if runs else from_file(file, size)
+        return references[key]
 
-    scene_report = SceneReport(measured.name, [], first.job.settings.film)
+    scene_report = SceneReport(name=measured.name, lines=[], film=first.job.settings.film)
     for curve in measured.curves:
-        line = _line(curve.variant.label, curve.job, curve.steps, truth_of(curve), names)
+        line = _line(curve.variant.label, curve.job, curve.steps, reference_of(curve), names)
         scene_report.lines.append(line)
         if curve.denoised is not None:
             label = denoised_label(line.label)
-            scene_report.lines.append(_line(label, curve.denoised, curve.denoised_steps, line.reference, names, line))
-    scene_report.lines += _extra_lines(study, measured, truth_of(first), names)
-    for look, line in enumerate(line for line in scene_report.lines if line.of is None):
-        line.look = look
+            scene_report.lines.append(
+                _line(label, curve.denoised, curve.denoised_steps, line.reference, names, denoised_from=line)
+            )
+    scene_report.lines += _extra_lines(study, measured, reference_of(first), names)
+    for index, line in enumerate(line for line in scene_report.lines if line.denoised_from is None):
+        line.style_index = index
     for line in scene_report.lines:
-        line.look = line.look if line.of is None else line.of.look
-    main = names[0]
+        if line.denoised_from is not None:
+            line.style_index = line.denoised_from.style_index
+    main = names[0]  # the first measure, which curves, targets and notes are about
     scene_report.targets = list(study.options["target"] or common_targets(scene_report.lines, main))
     for line in scene_report.lines:
         _fits(line, main, scene_report.targets)
@@ -464,22 +503,30 @@ def analyse(study: Study, measured: Measured) -> SceneReport:
 def _line(
     label: str,
     job: Job,
-    steps_of: Mapping[int, Sequence[Run]],
+    runs_by_spp: Mapping[int, Sequence[Run]],
     reference: ReferencePicture,
     names: tuple[str, ...],
-    of: ErrorCurve | None = None,
+    denoised_from: ErrorCurve | None = None,
 ) -> ErrorCurve:
+    """Return a curve of the report from its runs by samples a pixel; ``names``: the measures."""
     film, steps = job.settings.film, []
     images: list[Tensor] = []
-    for spp, runs in steps_of.items():
+    for spp, runs in runs_by_spp.items():
         images = [run.image() for run in runs]
         steps.append(_step(spp, runs, images, reference, names, film))
-        if of is not None:
+        if denoised_from is not None:
             steps[-1].variance = []  # low variance does not make a denoised picture better
-    last, origin = steps[-1], reference.origin
-    more = origin["spp"] * origin["seeds"] / ((last.spp or 1) * len(images)) if origin["made"] else 0.0
-    verdict = bias_test(images, reference, more)
-    return ErrorCurve(label, steps, reference, settings=job.facts["settings"], of=of, bias=verdict.plain())
+    last, origin = steps[-1], reference.origin  # `made`: rendered by this study, not read from a file
+    ratio = origin["spp"] * origin["seeds"] / ((last.spp or 1) * len(images)) if origin["made"] else 0.0
+    verdict = bias_test(images, reference, sample_ratio=ratio)  # of the last step
+    return ErrorCurve(
+        label,
+        steps,
+        reference,
+        settings=job.facts["settings"],
+        denoised_from=denoised_from,
+        bias=verdict.plain(),
+    )
 
 
 def _step(
@@ -490,19 +537,21 @@ def _step(
     names: tuple[str, ...],
     film: Any,
 ) -> Step:
+    """Return the step of runs of one number of samples; ``images`` are their pictures."""
     cheap = tuple(name for name in names if name not in _EXPENSIVE or name == names[0])
     found = [measures(image, reference, cheap if index else names, film) for index, image in enumerate(images)]
     mean, count = torch.stack(list(images)).mean(0), len(images)
-    spread = [float(((image - mean).square() * reference.weight).mean()) * count / (count - 1) for image in images]
+    # Relative to ref² + 0.01; count / (count - 1) makes the mean of these unbiased (Bessel).
+    variance = [float(((image - mean).square() * reference.weight).mean()) * count / (count - 1) for image in images]
     return Step(
-        spp,
-        median(run.seconds for run in runs),
-        {name: [item[name] for item in found if name in item] for name in names},
-        sum(run.facts["nonfinite_samples"] for run in runs),
-        spread,
-        [run.image for run in runs],
-        [run.seconds for run in runs],
-        [run.facts["seed"] for run in runs],
+        spp=spp,
+        seconds=median(run.seconds for run in runs),
+        errors={name: [item[name] for item in found if name in item] for name in names},
+        nonfinite=sum(run.facts["nonfinite_samples"] for run in runs),
+        variance=variance,
+        pictures=[run.image for run in runs],
+        times=[run.seconds for run in runs],
+        seeds=[run.facts["seed"] for run in runs],
     )
 
 
@@ -510,40 +559,41 @@ def _extra_lines(
     study: Study, measured: Measured, reference: ReferencePicture, names: tuple[str, ...]
 ) -> list[ErrorCurve]:
     """Return curves of other renderers' pictures, grouped by name, and into steps by time."""
-    film, lines = measured.curves[0].job.settings, {}
+    settings, lines = measured.curves[0].job.settings, {}
     for extra in sorted(study.extras, key=lambda extra: extra.seconds):
         if extra.scene != measured.name:
             continue
-        image = _picture(extra, film_size(film))
-        found = measures(torch.nan_to_num(image, 0.0, 0.0, 0.0), reference, names, film.film)
+        image = _picture(extra, film_size(settings))
+        finite = torch.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0)
+        found = measures(finite, reference, names, settings.film)
         bad = int((~torch.isfinite(image)).any(-1).sum())
         line = lines.setdefault(extra.name, ErrorCurve(extra.name, [], reference, measured=False))
         step = next((s for s in line.steps if s.seconds == extra.seconds and s.spp == extra.spp), None)
         if step is None:
-            step = Step(extra.spp, extra.seconds, {name: [] for name in names}, 0)
+            step = Step(spp=extra.spp, seconds=extra.seconds, errors={name: [] for name in names}, nonfinite=0)
             line.steps.append(step)
         for name in names:
             step.errors[name].append(found[name])
         step.nonfinite += bad
         step.times.append(extra.seconds)
-        step.pictures.append(lambda extra=extra: _picture(extra, film_size(film)))
+        step.pictures.append(lambda extra=extra: _picture(extra, film_size(settings)))
     return list(lines.values())
 
 
 def _picture(extra: Extra, size: tuple[int, int]) -> Tensor:
+    """Return another renderer's picture ``(H, W, 3)`` float64; ``size``: width and height that it must have."""
     image = read_image(extra.file)
     image = image.expand(-1, -1, 3) if image.shape[2] == 1 else image[..., :3]
-    high, wide = image.shape[:2]
-    if image.shape[2] != 3 or (wide, high) != size:
-        raise AssetError(
-            extra.file, f"expected a picture of {size[0]} x {size[1]} pixels as the film is, got {wide} x {high}"
-        )
+    (height, width), (film_width, film_height) = image.shape[:2], size
+    if image.shape[2] != 3 or (width, height) != size:
+        expected = f"expected a picture of {film_width} x {film_height} pixels as the film is"
+        raise AssetError(extra.file, f"{expected}, got {width} x {height}")
     return image.double()
 
 
 def common_targets(lines: Sequence[ErrorCurve], main: str) -> tuple[float, ...]:
     """Return an error that all unbiased curves reach: the largest of their least errors."""
-    measured = [line for line in lines if line.estimates]
+    measured = [line for line in lines if line.is_render_of_study]
     lines = [line for line in measured if not (line.bias and line.bias["biased"])] or measured
     least = [min((e.mean for s in line.steps if (e := s.estimate(main)).mean > 0), default=0.0) for line in lines]
     return (float(f"{max(least):.2g}"),) if least and max(least) > 0 else ()
@@ -556,28 +606,32 @@ def _fits(line: ErrorCurve, main: str, targets: Sequence[float]) -> None:
         line.by_spp = fit([float(step.spp or 0) for step in line.steps], values)
     line.by_seconds = fit([step.seconds for step in line.steps], values)
     for target in targets:
-        found = line.by_seconds.reach(math.log(target)) if line.by_seconds else None
+        found = line.by_seconds.x_at(math.log(target)) if line.by_seconds else None  # x: logarithm of seconds
         reached: dict[str, Any] = {"error": target, "seconds": None}
         if found is not None:
-            place, beyond = found
-            inside = abs(place.mean - math.log(line.steps[0].seconds)) < _FARTHEST
-            if beyond and line.of is not None:  # denoised curves are not extrapolated
+            log_seconds, is_extrapolated = found
+            is_near = abs(log_seconds.mean - math.log(line.steps[0].seconds)) < _FARTHEST
+            if is_extrapolated and line.denoised_from is not None:  # denoised curves are not extrapolated
                 pass
-            elif beyond and line.floor >= target:  # bias keeps the error above the target
+            elif is_extrapolated and line.floor >= target:  # bias keeps the error above the target
                 reached["never"] = True
-            elif inside or not beyond:
-                bounds = [None if x is None else _exp(x) for x in (place.mean, place.low, place.high)]
-                reached |= dict(zip(("seconds", "low", "high"), bounds, strict=True)) | {"extrapolated": beyond}
+            elif is_near or not is_extrapolated:
+                logarithms = (log_seconds.mean, log_seconds.low, log_seconds.high)
+                bounds = [None if x is None else _exp(x) for x in logarithms]
+                reached |= dict(zip(("seconds", "low", "high"), bounds, strict=True))
+                reached["extrapolated"] = is_extrapolated
         line.times.append(reached)
-    if line.of is not None:
+    if line.denoised_from is not None:
         line.by_spp = line.by_seconds = None
 
 
 def _exp(x: float) -> float | None:
-    return math.exp(x) if x < 700 else None
+    """Return the exponential; None where a float cannot hold it."""
+    return math.exp(x) if x < LARGEST_EXPONENT else None
 
 
 def _notes(scene_report: SceneReport, main: str) -> list[str]:
+    """Return remarks for the reader on what limits the results; ``main``: the first measure."""
     notes = []
     least = min(
         (e.mean for line in scene_report.lines for s in line.steps if (e := s.estimate(main)).mean > 0), default=0.0
@@ -597,8 +651,9 @@ def _notes(scene_report: SceneReport, main: str) -> list[str]:
     origin = scene_report.lines[0].reference.origin
     if not origin["made"] and not origin["variance"]:
         notes.append("The reference file has no variance, so it is taken to be exact; its noise counts as error.")
+    # Curves with steps whose error is not positive once the reference's variance is subtracted.
     drowned = [line.label for line in scene_report.lines if any(s.estimate(main).mean <= 0 for s in line.steps)]
-    if any(line.of is not None for line in scene_report.lines):
+    if any(line.denoised_from is not None for line in scene_report.lines):
         notes.append(
             "Denoised pictures are guesses: their bias falls with samples by no known law. So their curves have no slope, no "
             "efficiency, and no time to an error beyond their runs."

@@ -22,16 +22,21 @@ from torchpt.reports.analysis import ErrorCurve, SceneReport, Step, error_map
 from torchpt.reports.plots import COLOURS, NAMES
 from torchpt.reports.study import Study
 
-__all__ = ["Figure", "ImageStrip", "Panel", "closest_step", "largest_errors", "page", "sheet_of"]
+__all__ = ["Figure", "ImageStrip", "Panel", "closest_step", "image_strip_of", "largest_errors", "page"]
 
 
 # ---- Pictures of the report: crops at equal time, where errors are largest, and maps of the errors
 
 
 #: Largest side of a map in pixels; larger maps are averaged over squares.
-_WIDE = 400
-#: A crop has 1 / _PART of the picture's smaller side, but at least _LEAST and at most _MOST pixels.
-_PART, _LEAST, _MOST = 5, 16, 64  # crops are enlarged three times or more
+_LONGEST_SIDE = 400
+#: A crop has 1 / _CROP_PART of the picture's smaller side, but at least _LEAST_CROP and at most _LARGEST_CROP pixels, which are
+#: shown _ENLARGED times as large.
+_CROP_PART, _LEAST_CROP, _LARGEST_CROP, _ENLARGED = 5, 16, 64, 3
+#: Quantiles of errors that the colour map spans, and its largest number of decades.
+_LOW_QUANTILE, _TOP_QUANTILE, _MOST_DECADES = 0.1, 0.995, 4
+#: Colours of the key to the colour map, evenly along it.
+_RAMP_COLOURS = 9
 
 
 @dataclass
@@ -89,7 +94,7 @@ def largest_errors(errors: Tensor, side: int) -> tuple[int, int]:
     return x, y
 
 
-def sheet_of(scene_report: SceneReport) -> ImageStrip | None:
+def image_strip_of(scene_report: SceneReport) -> ImageStrip | None:
     """Return pictures of all curves with the first one's film, at the longest time that all of them have.
 
     The position of the crop does not depend on denoised curves.
@@ -101,50 +106,63 @@ def sheet_of(scene_report: SceneReport) -> ImageStrip | None:
     # `pictures` are functions that load the pictures of the runs; the first run is shown.
     images = [torch.nan_to_num(step.pictures[0](), nan=0.0, posinf=0.0, neginf=0.0) for step in chosen]
     maps = [error_map(image, line.reference) for image, line in zip(images, lines, strict=True)]
-    high, wide = maps[0].shape
-    side = min(max(min(high, wide) // _PART, _LEAST), _MOST, high, wide)
-    # `line.of` is the curve that a denoised curve was made from.
-    rendered = [found for found, line in zip(maps, lines, strict=True) if line.of is None]
+    height, width = maps[0].shape
+    side = min(max(min(height, width) // _CROP_PART, _LEAST_CROP), _LARGEST_CROP, height, width)
+    rendered = [found for found, line in zip(maps, lines, strict=True) if line.denoised_from is None]
     x, y = largest_errors(torch.stack(rendered).mean(0), side)
     smaller = [_reduced(found) for found in maps]
     scale = _scale(smaller)
     panels = [
-        Panel(line, step, _png(_shown(image[y : y + side, x : x + side], film)), _png(_coloured(found, scale)))
+        Panel(
+            line=line,
+            step=step,
+            crop=_png(_display_bytes(image[y : y + side, x : x + side], film)),
+            errors=_png(_coloured(found, scale)),
+        )
         for line, step, image, found in zip(lines, chosen, images, smaller, strict=True)
     ]
-    whole, crop = _png(_shown(reference.image, film)), _png(_shown(reference.image[y : y + side, x : x + side], film))
-    return ImageStrip(seconds, (x, y, side, side), whole, crop, (wide, high), panels, scale)
+    whole = _png(_display_bytes(reference.image, film))
+    crop = _png(_display_bytes(reference.image[y : y + side, x : x + side], film))
+    return ImageStrip(
+        seconds=seconds,
+        place=(x, y, side, side),
+        whole=whole,
+        crop=crop,
+        size=(width, height),
+        panels=panels,
+        scale=scale,
+    )
 
 
-def _shown(image: Tensor, film: Any) -> np.ndarray:
+def _display_bytes(image: Tensor, film: Any) -> np.ndarray:
     """Return a linear picture as 8-bit display values, by the exposure, tone map and gamma of the film."""
     levels = colour.display(image, film.exposure, film.tonemap, film.gamma)
     return (levels * 255 + 0.5).to(torch.uint8).numpy()
 
 
 def _reduced(errors: Tensor) -> Tensor:
-    """Return a map averaged over squares, so that no side is larger than _WIDE."""
-    side = -(-max(errors.shape) // _WIDE)
+    """Return a map averaged over squares, so that no side is larger than _LONGEST_SIDE."""
+    side = -(-max(errors.shape) // _LONGEST_SIDE)
     return torch.nn.functional.avg_pool2d(errors[None, None], side, ceil_mode=True)[0, 0]
 
 
 def _scale(maps: Sequence[Tensor]) -> tuple[float, float]:
-    """Return powers of ten that enclose the values between the quantiles 0.1 and 0.995, four decades at most."""
+    """Return powers of ten that enclose the values between two quantiles, few decades at most."""
     values = torch.cat([found.flatten() for found in maps])
     values = values[values > 0].log10()
     if not len(values):
         return 1e-4, 1.0
     ordered = values.sort().values
-    low, top = (float(ordered[int(share * (len(ordered) - 1))]) for share in (0.1, 0.995))
+    low, top = (float(ordered[int(share * (len(ordered) - 1))]) for share in (_LOW_QUANTILE, _TOP_QUANTILE))
     floor, ceiling = math.floor(low), math.ceil(top)
-    return 10.0 ** max(floor, ceiling - 4), 10.0 ** max(ceiling, floor + 1)
+    return 10.0 ** max(floor, ceiling - _MOST_DECADES), 10.0 ** max(ceiling, floor + 1)
 
 
 def _coloured(errors: Tensor, scale: tuple[float, float]) -> np.ndarray:
     """Return an error map in false colours, on a logarithmic scale."""
     low, top = (math.log10(x) for x in scale)
-    level = (errors.clamp_min(1e-30).log10() - low) / (top - low)
-    return (false_colour(level, 1.0).numpy() * 255 + 0.5).astype(np.uint8)
+    level = (errors.clamp_min(1e-30).log10() - low) / (top - low)  # 0 to 1 between the ends; 1e-30: below any map
+    return (false_colour(level, top=1.0).numpy() * 255 + 0.5).astype(np.uint8)
 
 
 def _png(levels: np.ndarray) -> bytes:
@@ -201,10 +219,7 @@ def _scene(
 ) -> dict[str, Any]:
     """Return the values of the template for one scene."""
     names = study.options["metrics"]
-    main, most = (
-        NAMES[names[0]],
-        formatting.count(study.options["spp"][-1]),
-    )  # the first measure; samples of the last step
+    main, most = NAMES[names[0]], formatting.count(study.options["spp"][-1])  # first measure; samples of the last step
     columns = ["Setting", *(f"Time to {main} {formatting.number(target, 2)}" for target in scene_report.targets)]
     columns += [f"{main} at {most} samples", "Slope over samples", "Efficiency", "Bias", "Not finite"]
     return {
@@ -224,8 +239,9 @@ def _scene(
 
 def _headline(scene_report: SceneReport, main: str) -> str:
     """Return a sentence on the fastest unbiased setting and its lead, or that it is not significant; "" for a single one."""
-    # `estimates` is False for denoised curves and for other renderers' pictures.
-    unbiased = [line for line in scene_report.lines if line.estimates and not (line.bias and line.bias["biased"])]
+    unbiased = [
+        line for line in scene_report.lines if line.is_render_of_study and not (line.bias and line.bias["biased"])
+    ]
     # Of each curve the time to the last target, the smallest error: its label, the seconds and their interval.
     timed = [(line.label, line.times[-1]) for line in unbiased if line.times and line.times[-1]["seconds"]]
     timed.sort(key=lambda item: item[1]["seconds"])
@@ -248,8 +264,8 @@ def _headline(scene_report: SceneReport, main: str) -> str:
 def _about(scene_report: SceneReport) -> str:
     """Return sentences on the size of the picture and on the reference."""
     reference = scene_report.lines[0].reference
-    high, wide = reference.image.shape[:2]
-    size = f"{wide} × {high} pixels."
+    height, width = reference.image.shape[:2]
+    size = f"{width} × {height} pixels."
     if not reference.origin["made"]:  # not rendered by this study, but read from a file
         return f"{size} Reference: {reference.origin['file']}."
     origin, spp = reference.origin, formatting.count(reference.origin["spp"])
@@ -277,9 +293,9 @@ def _row(scene_report: SceneReport, line: ErrorCurve, main: str) -> dict[str, An
     cells.append(_bias_cell(line))
     bad = sum(step.nonfinite for step in line.steps)
     cells.append(_cell(formatting.count(bad), tone="bad" if bad else ""))
-    # A denoised curve has the `look` of the curve that it is made from (`line.of`), but hollow marks.
-    colour, marks = COLOURS[line.look % len(COLOURS)], _MARKS if line.of is None else _HOLLOW
-    return {"label": line.label, "mark": marks[line.look % len(marks)], "colour": colour, "cells": cells}
+    # A denoised curve has the style of the curve that it is made from, but hollow marks.
+    colour, marks = COLOURS[line.style_index % len(COLOURS)], _MARKS if line.denoised_from is None else _HOLLOW
+    return {"label": line.label, "mark": marks[line.style_index % len(marks)], "colour": colour, "cells": cells}
 
 
 def _time_cell(scene_report: SceneReport, line: ErrorCurve, number: int) -> dict[str, Any]:
@@ -289,7 +305,9 @@ def _time_cell(scene_report: SceneReport, line: ErrorCurve, number: int) -> dict
         return _cell("never", "its bias is larger", tone="bad")
     if reached["seconds"] is None:
         # Denoised curves are not extrapolated; others are unless they do not fall, or the time is too far from the runs.
-        reason = "cannot be extrapolated" if line.by_seconds else "not reached in its runs" if line.of else ""
+        reason = (
+            "cannot be extrapolated" if line.by_seconds else "not reached in its runs" if line.denoised_from else ""
+        )
         return _cell("–", reason)
     parts = [formatting.span(reached["low"], reached["high"]), "extrapolated" if reached["extrapolated"] else ""]
     if line is not scene_report.lines[0] and first["seconds"]:
@@ -316,7 +334,7 @@ def _bias_cell(line: ErrorCurve) -> dict[str, Any]:
     share = f"mean brightness {100 * line.bias['share']:+.2g} %".replace("-", "−")
     if line.bias["biased"]:
         return _cell("biased", share, f"p {_chance(line.bias['chance'])}", tone="bad")
-    if line.of is not None:
+    if line.denoised_from is not None:
         return _cell("none found", share, f"p {_chance(line.bias['chance'])}", "may be hidden by noise")
     return _cell("none found", share, f"p {_chance(line.bias['chance'])}", tone="good")
 
@@ -345,15 +363,17 @@ def _step_row(line: ErrorCurve, step: Any, names: Sequence[str]) -> list[dict[st
 
 
 def _sheet(sheet: ImageStrip, main: str) -> dict[str, Any]:
-    x, y, wide, high = sheet.place
-    across, down = sheet.size
+    """Return the values of the template for the pictures of a scene; ``main``: the first measure."""
+    # The frame of the crop, as CSS in percent of the whole picture.
+    x, y, width, height = sheet.place
+    picture_width, picture_height = sheet.size
     frame = "; ".join(
         f"{name}: {100 * part / whole:.3f}%"
         for name, part, whole in (
-            ("left", x, across),
-            ("top", y, down),
-            ("width", wide, across),
-            ("height", high, down),
+            ("left", x, picture_width),
+            ("top", y, picture_height),
+            ("width", width, picture_width),
+            ("height", height, picture_height),
         )
     )
     panels = []
@@ -370,10 +390,10 @@ def _sheet(sheet: ImageStrip, main: str) -> dict[str, Any]:
         )
     return {
         "about": f"The run of each setting that is closest to {formatting.seconds(sheet.seconds)}, cropped to the "
-        f"{wide} × {high} pixels with the largest errors, enlarged. Times differ, as steps of samples do not match exactly.",
+        f"{width} × {height} pixels with the largest errors, enlarged. Times differ, as steps of samples do not match exactly.",
         "whole": _data(sheet.whole, "png"),
         "crop": _data(sheet.crop, "png"),
-        "side": 3 * wide,
+        "side": _ENLARGED * width,
         "frame": frame,
         "panels": panels,
         "low": formatting.number(sheet.scale[0], 1),
@@ -385,19 +405,22 @@ def _plot(figure: Figure, alt: str) -> dict[str, Any]:
     """Return an SVG and its size in pixels, which reserves its space while it loads."""
     _, svg = figure
     text = svg.decode()
-    wide, high = (float(text.partition(f'{name}="')[2].partition("pt")[0]) for name in ("width", "height"))
-    return {"data": _data(svg, "svg+xml"), "alt": alt, "width": round(wide), "height": round(high)}
+    # Matplotlib writes width="352.8pt".
+    width, height = (float(text.partition(f'{name}="')[2].partition("pt")[0]) for name in ("width", "height"))
+    return {"data": _data(svg, "svg+xml"), "alt": alt, "width": round(width), "height": round(height)}
 
 
 def _data(content: bytes, kind: str) -> str:
+    """Return a picture as a data URI."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def _ramp() -> str:
+    """Return colours of the colour map as CSS, for the key to error maps."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    return ", ".join(to_hex(colormaps[MAP](k / 8)) for k in range(9))
+    return ", ".join(to_hex(colormaps[MAP](k / (_RAMP_COLOURS - 1))) for k in range(_RAMP_COLOURS))
 
 
 def _method(study: Study) -> list[str]:
@@ -429,7 +452,9 @@ def _settings(scene_reports: Sequence[SceneReport]) -> str:
 
     shown: dict[str, Any] = {}
     for scene_report in scene_reports:
-        shown[scene_report.name] = {line.label: _listed(line.settings) for line in scene_report.lines if line.estimates}
+        shown[scene_report.name] = {
+            line.label: _listed(line.settings) for line in scene_report.lines if line.is_render_of_study
+        }
     return yaml.safe_dump(shown, sort_keys=False, allow_unicode=True, width=100)
 
 

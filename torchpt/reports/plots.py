@@ -6,6 +6,7 @@ prints in grey.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from io import BytesIO
@@ -69,12 +70,13 @@ def curves(scene_report: SceneReport, measure: str, over: str) -> Any:
     with matplotlib.rc_context(_STYLE):
         lines = [line for line in scene_report.lines if over == "seconds" or all(step.spp for step in line.steps)]
         rows = len(lines) + (1 if over == "spp" else 0)
+        # Inches: the axes, and a row of the legend for each curve.
         figure = Figure(figsize=(4.9, 3.4 + 0.23 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
         for line in scene_report.lines:
             if line in lines:
-                _draw(axes, line, measure, over)
+                _draw(axes, line, measure, over, slopes=True)
         if over == "spp":
             _guide(axes, lines, measure)
         _finish(axes, measure, over)
@@ -96,11 +98,13 @@ def overview(scene_report: SceneReport, measures: Sequence[str]) -> Any:
 
     with matplotlib.rc_context(_STYLE):
         rows = -(-len(measures) // 2)
+        # Inches, as in `curves`.
         figure = Figure(figsize=(7.2, 2.3 * rows + 0.21 * len(scene_report.lines)), layout="constrained")
         FigureCanvasAgg(figure)
         for number, measure in enumerate(measures):
             axes = figure.add_subplot(rows, 2, number + 1)
             for line in scene_report.lines:
+                # The curves enter the common legend once, with the first plot.
                 _draw(axes, line, measure, "seconds", slopes=False if number == 0 else None)
             _finish(axes, measure, "seconds")
             axes.set_title(NAMES[measure], loc="left", fontsize=10.0)
@@ -128,18 +132,13 @@ def _points(line: ErrorCurve, measure: str, over: str) -> list[tuple[float, floa
     points = []
     for step in line.steps:
         found, x = step.estimate(measure), step.seconds if over == "seconds" else step.spp
-        if (
-            x
-            and found.mean == found.mean
-            and abs(found.mean) != float("inf")
-            and (found.mean > 0 or measure not in ERRORS)
-        ):
+        if x and math.isfinite(found.mean) and (found.mean > 0 or measure not in ERRORS):
             low = found.mean if found.low is None else found.low
             points.append((float(x), found.mean, low, found.mean if found.high is None else found.high))
     return points
 
 
-def _draw(axes: Any, line: ErrorCurve, measure: str, over: str, slopes: bool | None = True) -> None:
+def _draw(axes: Any, line: ErrorCurve, measure: str, over: str, *, slopes: bool | None) -> None:
     """Draw one curve with its band.
 
     Args:
@@ -149,11 +148,12 @@ def _draw(axes: Any, line: ErrorCurve, measure: str, over: str, slopes: bool | N
         over: ``seconds`` or ``spp``.
         slopes: its entry in the legend: True: name and slope; False: the name; None: no entry.
     """
-    look, inside = line.look, "auto" if line.of is None else "white"
+    style_index, inside = line.style_index, "auto" if line.denoised_from is None else "white"
     # The dashes change with each curve and once more with each round of colours, so colour and dashes do not repeat together.
-    colour, mark = COLOURS[look % len(COLOURS)], _MARKS[look % len(_MARKS)]
-    dash: Any = _DASHES[(look // len(COLOURS) + look) % len(_DASHES)] if line.measured else ":"
-    dash = dash if line.of is None else _DENOISED
+    colour, mark = COLOURS[style_index % len(COLOURS)], _MARKS[style_index % len(_MARKS)]
+    dash_index = (style_index // len(COLOURS) + style_index) % len(_DASHES)
+    dash: Any = _DASHES[dash_index] if line.measured else ":"  # dotted: another renderer's pictures
+    dash = dash if line.denoised_from is None else _DENOISED
     points = _points(line, measure, over)
     if not points:
         return
@@ -182,7 +182,7 @@ def _slope(line: ErrorCurve, over: str) -> str:
 
 def _guide(axes: Any, lines: Sequence[ErrorCurve], measure: str) -> None:
     """Draw the error ``1 / samples`` of an unbiased estimator, from the worst curve's first point; squared errors only."""
-    points = [point for line in lines if line.of is None for point in _points(line, measure, "spp")]
+    points = [point for line in lines if line.denoised_from is None for point in _points(line, measure, "spp")]
     if measure not in ("relmse", "mse", "relmse_trimmed") or not points:
         return
     left, right = min(x for x, *_ in points), max(x for x, *_ in points)
@@ -207,7 +207,7 @@ def _finish(axes: Any, measure: str, over: str) -> None:
         axes.set_yscale("log")
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     low, high = axes.get_xlim()
-    if high / low < 20:
+    if high / low < 20:  # little more than a decade: powers of ten alone would be one or two ticks
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(plain)
     axes.xaxis.set_minor_formatter(NullFormatter())

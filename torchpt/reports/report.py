@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import time
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from typing import Any
 
 from torchpt.core.version import __version__
 from torchpt.reports.analysis import SceneReport, analyse
-from torchpt.reports.page import Figure, page, sheet_of
+from torchpt.reports.page import Figure, image_strip_of, page
 from torchpt.reports.plots import curves, encoded, overview
 from torchpt.reports.runs import Measured, machine, write_whole
 from torchpt.reports.study import Study
@@ -35,10 +36,11 @@ def write_report(study: Study, measured: Sequence[Measured], folder: Path) -> li
         OutputError: a file cannot be written.
     """
     scene_reports = [analyse(study, scene) for scene in measured]
-    sheets = [sheet_of(scene_report) for scene_report in scene_reports]
+    sheets = [image_strip_of(scene_report) for scene_report in scene_reports]
     figures = [_figures(scene_report, study.options["metrics"]) for scene_report in scene_reports]
     made = time.strftime("%Y-%m-%d %H:%M")
     facts = json.dumps(plain(facts_of(study, scene_reports, made)), indent=1, allow_nan=False)
+    # Such as "AMD EPYC, 8 cores, 4 threads".
     where = ", ".join(
         f"{value} {key}" if key in ("cores", "threads") else str(value) for key, value in machine().items()
     )
@@ -47,11 +49,9 @@ def write_report(study: Study, measured: Sequence[Measured], folder: Path) -> li
     plots.mkdir(exist_ok=True)
     for scene_report, found in zip(scene_reports, figures, strict=True):
         for name, (png, svg) in found.items():
-            stem = re.sub(
-                r"\W+",
-                "_",
-                Path(scene_report.name).stem if scene_report.name.endswith((".yaml", ".yml")) else scene_report.name,
-            )
+            is_path = scene_report.name.endswith((".yaml", ".yml"))
+            # Everything that is no letter, digit or underscore becomes an underscore.
+            stem = re.sub(r"\W+", "_", Path(scene_report.name).stem if is_path else scene_report.name)
             write_whole(plots / f"{stem}_{name}.png", png)
             write_whole(plots / f"{stem}_{name}.svg", svg)
     write_whole(folder / "report.json", facts.encode())
@@ -60,6 +60,7 @@ def write_report(study: Study, measured: Sequence[Measured], folder: Path) -> li
 
 
 def _figures(scene_report: SceneReport, measures: tuple[str, ...]) -> dict[str, Figure]:
+    """Return the figures of a scene by name: the first measure over seconds and over samples, and all measures."""
     found = {
         "seconds": encoded(curves(scene_report, measures[0], "seconds")),
         "spp": encoded(curves(scene_report, measures[0], "spp")),
@@ -99,5 +100,5 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if isinstance(value, float):
-        return value if value == value and abs(value) != float("inf") else None
+        return value if math.isfinite(value) else None
     return value

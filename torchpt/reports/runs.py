@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -62,8 +62,8 @@ __all__ = [
 # picture: it marks a complete run.
 
 
-#: Packages and files on which no picture depends.
-_WITHOUT_EFFECT = ("reports", "commands", "cli/main.py", "__main__.py", "share")
+#: Packages and files above rendering, on which no picture depends.
+_WITHOUT_EFFECT = ("cli", "reports", "stress", "__main__.py", "share")
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,8 @@ def write_whole(path: Path, content: bytes) -> None:
 
 def name_of(facts: Mapping[str, Any]) -> str:
     """Return the name of a run: a hash of these facts, the renderer and the machine."""
-    whole = {"facts": facts, "torchpt": __version__, "source": _source(), "torch": torch.__version__, **machine()}
-    return fingerprint(json.dumps(whole, sort_keys=True)).hex()
+    all_facts = {"facts": facts, "torchpt": __version__, "source": _source(), "torch": torch.__version__, **machine()}
+    return fingerprint(json.dumps(all_facts, sort_keys=True)).hex()
 
 
 @lru_cache(maxsize=1)
@@ -185,7 +185,8 @@ class ReferencePicture:
         image: ``(H, W, 3)`` float64.
         variance: variance of ``image``, of the same shape; 0 if unknown.
         runs: independent pictures ``(H, W, 3)`` of which ``image`` is the mean; empty for a file.
-        origin: its origin, for the report.
+        origin: its origin, for the report: ``made`` is True for runs of the study, with their ``spp``, ``seeds``, ``seconds``
+            and ``settings``; False for a ``file``, and ``variance`` is True if that has one.
     """
 
     image: Tensor
@@ -227,7 +228,7 @@ def from_runs(runs: Sequence[Run]) -> ReferencePicture:
         "seconds": sum(run.seconds for run in runs),
         "settings": runs[0].facts["settings"],
     }
-    return ReferencePicture(stack.mean(0), stack.var(0) / len(runs), images, origin)
+    return ReferencePicture(image=stack.mean(0), variance=stack.var(0) / len(runs), runs=images, origin=origin)
 
 
 def from_file(path: str, size: tuple[int, int]) -> ReferencePicture:
@@ -245,17 +246,17 @@ def from_file(path: str, size: tuple[int, int]) -> ReferencePicture:
     image = image.expand(-1, -1, 3) if image.shape[2] == 1 else image[..., :3]
     if image.shape[2] != 3:
         raise AssetError(path, f"expected a picture of 1, 3 or 4 channels, got {image.shape[2]}")
-    high, wide = image.shape[:2]
-    if (wide, high) != size:
-        raise AssetError(
-            path, f"expected a picture of {size[0]} x {size[1]} pixels as the film is, got {wide} x {high}"
-        )
+    (height, width), (film_width, film_height) = image.shape[:2], size
+    if (width, height) != size:
+        expected = f"expected a picture of {film_width} x {film_height} pixels as the film is"
+        raise AssetError(path, f"{expected}, got {width} x {height}")
     if not torch.isfinite(image).all():
         raise AssetError(path, "expected finite values in a reference")
     variance = layers.get("variance")
     usable = variance is not None and variance.shape == image.shape and bool(torch.isfinite(variance).all())
-    spread = variance.double().clamp_min(0.0) if variance is not None and usable else torch.zeros_like(image).double()
-    return ReferencePicture(image.double(), spread, (), {"made": False, "file": path, "variance": usable})
+    known = variance.double().clamp_min(0.0) if variance is not None and usable else torch.zeros_like(image).double()
+    origin = {"made": False, "file": path, "variance": usable}
+    return ReferencePicture(image=image.double(), variance=known, runs=(), origin=origin)
 
 
 # ---- The runs of a study: which there are, and how they are timed
@@ -296,20 +297,20 @@ class Job:
         settings: complete settings; spp and seed are replaced for each run.
         facts: everything that runs depend on besides spp and seed.
         purpose: ``run`` or ``reference``, whose seeds differ.
-        left: the scene's cache after the latest of these runs, while other settings use the scene.
+        kept_cache: the scene's cache after the latest of these runs, while other settings use the scene.
     """
 
     scene: Scene
     settings: Settings
     facts: dict[str, Any]
     purpose: str
-    left: SceneCache | None = None
+    kept_cache: SceneCache | None = None
 
     @property
     def pixels(self) -> int:
         """Number of pixels of the picture."""
-        wide, high = film_size(self.settings)
-        return wide * high
+        width, height = film_size(self.settings)
+        return width * height
 
 
 @dataclass
@@ -323,7 +324,7 @@ class Curve:
         denoised: job of the runs that are denoised; None without ``denoise``.
         denoised_steps: runs with denoised pictures, by spp.
         reference: job of the reference; None if it is a file.
-        truths: runs of the reference.
+        reference_runs: runs of the reference.
     """
 
     variant: Variant
@@ -332,7 +333,7 @@ class Curve:
     denoised: Job | None = None
     denoised_steps: dict[int, list[Run]] = field(default_factory=dict)
     reference: Job | None = None
-    truths: list[Run] = field(default_factory=list)
+    reference_runs: list[Run] = field(default_factory=list)
 
 
 @dataclass
@@ -351,7 +352,10 @@ class Measured:
 def film_size(settings: Settings) -> tuple[int, int]:
     """Return width and height of the picture."""
     film = settings.film
-    return (film.width, film.height) if film.crop is None else film.crop[2:]
+    if film.crop is None:
+        return film.width, film.height
+    _, _, width, height = film.crop
+    return width, height
 
 
 def seed_of(study_seed: int, purpose: str, spp: int, number: int) -> int:
@@ -370,6 +374,7 @@ def prepare(study: Study) -> list[Measured]:
         check_denoiser()
     found = []
     for name in study.scenes:
+        # By the words of the overrides of the scene's keys: the description, and by device the scene with its fingerprint.
         known: dict[tuple[str, ...], tuple[Description, dict[str, tuple[Scene, str]]]] = {}
         curves = []
         for variant in study.variants:
@@ -393,6 +398,7 @@ def _job(
     loaded: dict[str, tuple[Scene, str]],
     purpose: str,
 ) -> Job:
+    """Return the job of a description with overrides; ``loaded``: scenes by device with fingerprints, which it may add to."""
     description, settings = overridden(description, overrides)
     # These settings of a scene concern files.
     film, render = settings.film.but(denoise=False, aovs=()), settings.render.without(Role.FILES)
@@ -403,15 +409,16 @@ def _job(
     if device not in loaded:
         scene = Scene(description, device_of(device))
         loaded[device] = scene, fingerprint_of(scene)
-    scene, named = loaded[device]
-    return Job(scene, settings, {"scene": named, "device": device, "settings": settings.plain(_FREE)}, purpose)
+    scene, scene_fingerprint = loaded[device]
+    facts = {"scene": scene_fingerprint, "device": device, "settings": settings.plain(_FREE)}
+    return Job(scene=scene, settings=settings, facts=facts, purpose=purpose)
 
 
 def _denoised(job: Job) -> Job:
     """Return the job of the same runs with the AOVs that the denoiser needs."""
     settings = replace(job.settings, film=job.settings.film.but(denoise=True))
     facts = {**job.facts, "settings": settings.plain(_FREE), "denoiser": denoiser_version()}
-    return Job(job.scene, settings, facts, job.purpose)
+    return Job(scene=job.scene, settings=settings, facts=facts, purpose=job.purpose)
 
 
 def measure(
@@ -431,46 +438,53 @@ def measure(
     Raises:
         Stopped: ``on_progress`` returned True; finished runs are kept.
     """
-    wanted = _all_runs(study, prepared)
-    names = [_name(job, spp, seed) for job, spp, seed, _ in wanted]
-    missing = {name: job.pixels * spp for name, (job, spp, _, _) in zip(names, wanted, strict=True)}
+    planned = _all_runs(study, prepared)
+    names = [_name(run.job, run.spp, run.seed) for run in planned]
+    missing = {name: run.job.pixels * run.spp for name, run in zip(names, planned, strict=True)}  # samples by run
     missing = {name: samples for name, samples in missing.items() if store.get(name) is None}
-    clock = _Clock(sum(missing.values()), on_progress)
+    progress = _StudyProgress(sum(missing.values()), on_progress)
     latest: Job | None = None
-    for name, (job, spp, seed, place) in zip(names, wanted, strict=True):
+    for name, (job, spp, seed, runs_of_step) in zip(names, planned, strict=True):
         run = store.get(name)
         if run is None:
             if job is not latest:  # other settings: warm up, so that caches are filled
                 _swap_kernels(latest, job)
-                thrown = _render(job, min(study.options["spp"][0], spp), seed, clock, counts=False)
-                if not clock.stop:
-                    _denoise(job, thrown)  # the first call takes longer
+                warm_up = _render(job, min(study.options["spp"][0], spp), seed, progress, counts=False)
+                if not progress.stop:
+                    _denoise(job, warm_up)  # the first call takes longer
                 latest = job
-            rendering = None if clock.stop else _render(job, spp, seed, clock)
+            rendering = None if progress.stop else _render(job, spp, seed, progress, counts=True)
             if rendering is None or not rendering.complete:
-                raise Stopped(sum(store.get(other) is not None for other in set(names)), len(set(names)))
+                finished = sum(store.get(other) is not None for other in set(names))
+                raise Stopped(done=finished, total=len(set(names)))
             denoising = _denoise(job, rendering)
             picture = rendering.image if rendering.denoised is None else rendering.denoised
-            run = store.put(name, picture, _told(job, spp, seed, rendering, denoising))
-        place.append(run)
+            run = store.put(name, picture, _facts_of_run(job, spp, seed, rendering, denoising))
+        runs_of_step.append(run)
 
 
 def _swap_kernels(latest: Job | None, job: Job) -> None:
     """Swap cached kernels when settings change: a scene has those of its latest render only, and making them takes seconds."""
     if latest is not None:
-        latest.left = replace(scene_cache(latest.scene))
-    if job.left is not None:
-        keeper = scene_cache(job.scene)
-        keeper.kernels, keeper.first_surface = job.left.kernels, job.left.first_surface
-        keeper.without_lights = job.left.without_lights
+        latest.kept_cache = replace(scene_cache(latest.scene))  # a copy: the scene's own is about to change
+    if job.kept_cache is not None:
+        cache = scene_cache(job.scene)
+        cache.kernels, cache.first_surface = job.kept_cache.kernels, job.kept_cache.first_surface
+        cache.without_lights = job.kept_cache.without_lights
 
 
-Wanted = tuple[Job, int, int, list[Run]]
+class _PlannedRun(NamedTuple):
+    """A run of a study, and ``runs_of_step``, the list that it is added to once it is finished."""
+
+    job: Job
+    spp: int
+    seed: int
+    runs_of_step: list[Run]
 
 
-def _all_runs(study: Study, prepared: list[Measured]) -> list[Wanted]:
-    """Return all runs in order, each with the list that it is added to."""
-    found: list[Wanted] = []
+def _all_runs(study: Study, prepared: list[Measured]) -> list[_PlannedRun]:
+    """Return all runs in the order in which they are rendered."""
+    planned: list[_PlannedRun] = []
     for measured in prepared:
         for number in range(study.options["seeds"]):
             for curve in measured.curves:
@@ -480,27 +494,29 @@ def _all_runs(study: Study, prepared: list[Measured]) -> list[Wanted]:
                 for job, steps in pairs:
                     for spp in study.options["spp"]:
                         seed = seed_of(study.options["seed"], "run", spp, number)
-                        found.append((job, spp, seed, steps.setdefault(spp, [])))
-        shared: dict[str, Job] = {}
+                        planned.append(_PlannedRun(job, spp, seed, runs_of_step=steps.setdefault(spp, [])))
+        shared: dict[str, Job] = {}  # curves with the same reference render it once
         for curve in measured.curves:
             if curve.reference is None:
                 continue
             job = shared.setdefault(_name(curve.reference, 0, 0), curve.reference)
             for number in range(study.reference.seeds):
                 seed = seed_of(study.options["seed"], "reference", study.reference.spp, number)
-                found.append((job, study.reference.spp, seed, curve.truths))
-    return found
+                planned.append(_PlannedRun(job, study.reference.spp, seed, runs_of_step=curve.reference_runs))
+    return planned
 
 
 def _name(job: Job, spp: int, seed: int) -> str:
+    """Return the name of a run in the store."""
     return name_of({**job.facts, "purpose": job.purpose, "spp": spp, "seed": seed})
 
 
-def _render(job: Job, spp: int, seed: int, clock: _Clock, counts: bool = True) -> Rendering:
+def _render(job: Job, spp: int, seed: int, progress: _StudyProgress, *, counts: bool) -> Rendering:
+    """Render a run; ``counts``: False for a warm-up, which is no part of the study's progress."""
     settings = replace(job.settings, render=job.settings.render.but(spp=spp, seed=seed))
-    rendering = render_scene(job.scene, settings, on_progress=clock.watch if counts else clock.glance)
+    rendering = render_scene(job.scene, settings, on_progress=progress.on_run if counts else progress.on_warm_up)
     if counts:
-        clock.passed(rendering)
+        progress.add(rendering)
     return rendering
 
 
@@ -509,7 +525,8 @@ def _denoise(job: Job, rendering: Rendering) -> float | None:
     return denoise_rendering(rendering, job.settings) if job.settings.film.denoise else None
 
 
-def _told(job: Job, spp: int, seed: int, rendering: Rendering, denoising: float | None) -> dict[str, Any]:
+def _facts_of_run(job: Job, spp: int, seed: int, rendering: Rendering, denoising: float | None) -> dict[str, Any]:
+    """Return the facts of a finished run for its JSON file; ``denoising``: seconds of it, or None."""
     set_up = rendering.build_seconds + rendering.compile_seconds
     seconds = getattr(rendering, "render_seconds", None) or max(rendering.seconds - set_up, 1e-9)
     return {
@@ -527,27 +544,35 @@ def _told(job: Job, spp: int, seed: int, rendering: Rendering, denoising: float 
     }
 
 
-class _Clock:
-    """Progress of the whole study."""
+class _StudyProgress:
+    """Progress of the whole study.
 
-    def __init__(self, total: int, tell: Callable[[int, int, int, float], bool | None] | None) -> None:
-        self.total, self.tell = total, tell
+    Args:
+        total: samples of all missing runs.
+        report: called with samples done, samples in total, rays and seconds; returning True stops.
+
+    Attributes:
+        stop: True once the study is to stop.
+    """
+
+    def __init__(self, total: int, report: Callable[[int, int, int, float], bool | None] | None) -> None:
+        self.total, self.report = total, report
         self.done, self.rays, self.seconds, self.stop = 0, 0, 0.0, False
 
-    def watch(self, state: Progress) -> bool:
+    def on_run(self, state: Progress) -> bool:
         """Report the progress of a run; return True to stop."""
-        if self.tell is not None:
+        if self.report is not None:
             done = self.done + state.done
-            self.stop |= bool(self.tell(done, self.total, self.rays + state.rays, self.seconds + state.seconds))
+            self.stop |= bool(self.report(done, self.total, self.rays + state.rays, self.seconds + state.seconds))
         return self.stop
 
-    def glance(self, state: Progress) -> bool:
+    def on_warm_up(self, state: Progress) -> bool:
         """Return True to stop, during a run that is not counted."""
-        if self.tell is not None:
-            self.stop |= bool(self.tell(self.done, self.total, self.rays, self.seconds))
+        if self.report is not None:
+            self.stop |= bool(self.report(self.done, self.total, self.rays, self.seconds))
         return self.stop
 
-    def passed(self, rendering: Rendering) -> None:
+    def add(self, rendering: Rendering) -> None:
         """Count a finished run."""
         self.done, self.rays = self.done + rendering.paths, self.rays + rendering.rays
         self.seconds += rendering.seconds

@@ -13,9 +13,11 @@ from functools import lru_cache
 
 import mpmath
 
-__all__ = ["Estimate", "Fit", "Level", "estimate", "f_tail", "fit", "t_quantile"]
+__all__ = ["LARGEST_EXPONENT", "Estimate", "Fit", "Level", "estimate", "f_tail", "fit", "t_quantile"]
 
-_LEVEL = 0.95
+_LEVEL = 0.95  # confidence of all intervals
+#: Largest exponent whose exponential a float64 holds (709.8), rounded down.
+LARGEST_EXPONENT = 700.0
 
 
 def f_tail(f: float, d1: float, d2: float) -> float:
@@ -29,7 +31,8 @@ def f_tail(f: float, d1: float, d2: float) -> float:
 
 @lru_cache(maxsize=4096)
 def t_quantile(freedom: float, level: float = _LEVEL) -> float:
-    """Return the half-width of a two-sided interval in standard errors, by Student's t."""
+    """Return the half-width of a two-sided interval in standard errors, by Student's t with ``freedom`` degrees of freedom."""
+    # Bisection: the square of a t has the distribution of an F with 1 and `freedom` degrees of freedom.
     low, high = 0.0, 1.0
     while f_tail(high * high, 1.0, freedom) > 1 - level:
         low, high = high, 2 * high
@@ -73,18 +76,18 @@ def _moments(values: Sequence[float]) -> tuple[float, float]:
     return mean, math.fsum((x - mean) ** 2 for x in values) / (count - 1) / count
 
 
-def estimate(values: Sequence[float], positive: bool = True) -> Estimate:
+def estimate(values: Sequence[float], *, positive: bool = True) -> Estimate:
     """Return the mean of independent values with its interval; of the logarithm for ``positive`` quantities."""
     mean, variance = _moments(values)
     if len(values) < 2 or not math.isfinite(variance):
         return Estimate(mean)
-    reach = t_quantile(len(values) - 1.0) * math.sqrt(variance)
+    half_width = t_quantile(len(values) - 1.0) * math.sqrt(variance)
     if not positive:
-        return Estimate(mean, mean - reach, mean + reach)
+        return Estimate(mean, low=mean - half_width, high=mean + half_width)
     if mean <= 0:
         return Estimate(mean)
-    factor = math.exp(min(reach / mean, 700.0))
-    return Estimate(mean, mean / factor, mean * factor)
+    factor = math.exp(min(half_width / mean, LARGEST_EXPONENT))
+    return Estimate(mean, low=mean / factor, high=mean * factor)
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,7 @@ class Fit:
     middle: tuple[float, float]
     levels: tuple[Level, ...]
 
-    def reach(self, y: float) -> tuple[Estimate, bool] | None:
+    def x_at(self, y: float) -> tuple[Estimate, bool] | None:
         """Return the x with its interval at which the line falls to ``y``, and True if that lies outside of the levels.
 
         None if the line does not fall. Without an interval if its fall is not significant.
@@ -109,18 +112,18 @@ class Fit:
         slope = self.slope.mean
         if not slope < 0:
             return None
-        away = (y - self.middle[1]) / slope
-        x = self.middle[0] + away
+        middle_x, middle_y = self.middle
+        from_middle = (y - middle_y) / slope
+        x = middle_x + from_middle
+        # Derivatives of x by each level's y: middle_y is the mean of all y, and the slope depends on them too.
         share = 1.0 / len(self.levels)
-        parts = [
-            -(share + away * c) / slope for c in _slope_derivatives(self.levels)
-        ]  # derivatives of x by each level's y
+        derivatives = [-(share + from_middle * c) / slope for c in _slope_derivatives(self.levels)]
         falls = self.slope.high is not None and self.slope.high < 0  # otherwise the line may never reach y
-        spread = _combined(self.levels, parts) if falls else None
-        beyond = not self.levels[0].x <= x <= self.levels[-1].x
-        if spread is None:
-            return Estimate(x), beyond
-        return Estimate(x, x - spread, x + spread), beyond
+        half_width = _half_width(self.levels, derivatives) if falls else None
+        is_outside = not self.levels[0].x <= x <= self.levels[-1].x
+        if half_width is None:
+            return Estimate(x), is_outside
+        return Estimate(x, low=x - half_width, high=x + half_width), is_outside
 
 
 def fit(xs: Sequence[float], values: Sequence[Sequence[float]]) -> Fit | None:
@@ -138,16 +141,17 @@ def fit(xs: Sequence[float], values: Sequence[Sequence[float]]) -> Fit | None:
     for x, step in zip(xs, values, strict=True):
         mean, variance = _moments(step)
         if mean > 0 and x > 0 and math.isfinite(mean):
-            levels.append(Level(math.log(x), math.log(mean), variance / mean**2, len(step) - 1.0))
+            # The variance of a logarithm is the relative variance, to first order.
+            levels.append(Level(x=math.log(x), y=math.log(mean), variance=variance / mean**2, freedom=len(step) - 1.0))
     levels.sort(key=lambda level: level.x)
     if len(levels) < 2 or levels[0].x == levels[-1].x:
         return None
     middle = math.fsum(v.x for v in levels) / len(levels), math.fsum(v.y for v in levels) / len(levels)
-    pulls = _slope_derivatives(levels)
-    slope = math.fsum(c * v.y for c, v in zip(pulls, levels, strict=True))
-    spread = _combined(levels, pulls)
-    bounds = () if spread is None else (slope - spread, slope + spread)
-    return Fit(Estimate(slope, *bounds), middle, tuple(levels))
+    derivatives = _slope_derivatives(levels)  # the slope is linear in the y
+    slope = math.fsum(c * v.y for c, v in zip(derivatives, levels, strict=True))
+    half_width = _half_width(levels, derivatives)
+    bounds = () if half_width is None else (slope - half_width, slope + half_width)
+    return Fit(slope=Estimate(slope, *bounds), middle=middle, levels=tuple(levels))
 
 
 def _slope_derivatives(levels: Sequence[Level]) -> list[float]:
@@ -157,13 +161,18 @@ def _slope_derivatives(levels: Sequence[Level]) -> list[float]:
     return [(v.x - middle) / square for v in levels]
 
 
-def _combined(levels: Sequence[Level], parts: Sequence[float]) -> float | None:
-    """Return the half-width of the interval of ``Σ part y``; None if a level's variance is unknown."""
-    shares = [part * part * level.variance for part, level in zip(parts, levels, strict=True)]
+def _half_width(levels: Sequence[Level], derivatives: Sequence[float]) -> float | None:
+    """Return the half-width of the interval of a quantity with these derivatives by each level's y.
+
+    None if a level's variance is unknown.
+    """
+    shares = [c * c * level.variance for c, level in zip(derivatives, levels, strict=True)]
     total = math.fsum(shares)
     if not math.isfinite(total):
         return None
     if total == 0:
         return 0.0
     freedom = total**2 / math.fsum(s * s / v.freedom for s, v in zip(shares, levels, strict=True))
-    return t_quantile(round(freedom, 1)) * math.sqrt(total)
+    return t_quantile(round(freedom, 1)) * math.sqrt(
+        total
+    )  # rounded, so that the cache of t_quantile has it more often

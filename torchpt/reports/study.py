@@ -111,7 +111,8 @@ def variants_of(
         SceneError: an unknown key, an empty list, a repeated value, or a setting that a study refuses.
     """
     for key in settings:
-        check_keys({key.partition(".")[0]: 0}, BLOCKS, "", "a study", file)  # looks at the key alone
+        # The value is not looked at.
+        check_keys({key.partition(".")[0]: None}, BLOCKS, key="", what="a study", file=file)
         if key in _REFUSED:
             raise SceneError(key, settings[key], _REFUSED[key], file)
     axes = {key: _values(key, value, file) for key, value in settings.items() if _is_axis(key, value)}
@@ -179,34 +180,34 @@ def blocks_of(settings: Mapping[str, Any], file: str | None) -> dict[str, dict[s
     blocks: dict[str, dict[str, Any]] = {}
     for key, value in sorted(settings.items(), key=lambda item: item[0] not in BLOCKS):  # whole blocks first
         if key in BLOCKS:
-            blocks[key] = dict(value) if isinstance(value, Mapping) else _group(key, value, file)
+            blocks[key] = dict(value) if isinstance(value, Mapping) else _block_of_config(key, value, file)
             if refused := next((name for name in blocks[key] if f"{key}.{name}" in _REFUSED), None):
                 raise SceneError(f"{key}.{refused}", blocks[key][refused], _REFUSED[f"{key}.{refused}"], file)
             continue
         block, *inner, last = key.split(".")
-        place = blocks.setdefault(block, {})
+        parent = blocks.setdefault(block, {})
         for name in inner:
-            below = place.get(name)
+            child = parent.get(name)
             # A bare value is short for a block with this type.
-            place[name] = dict(below) if isinstance(below, Mapping) else {} if below is None else {"type": below}
-            place = place[name]
-        place[last] = value
+            parent[name] = dict(child) if isinstance(child, Mapping) else {} if child is None else {"type": child}
+            parent = parent[name]
+        parent[last] = value
     return blocks
 
 
-def _group(group: str, name: Any, file: str | None) -> dict[str, Any]:
+def _block_of_config(block: str, name: Any, file: str | None) -> dict[str, Any]:
     """Return the settings of a block's file in ``configs/``: ``integrator=path`` is ``configs/integrator/path.yaml``."""
-    folder = configs() / group
+    folder = configs() / block
     names = sorted(path.stem for path in folder.glob("*.yaml"))
     if name not in names:
-        raise SceneError(group, name, f"one of {', '.join(names)}", file)
-    return dict(_set(read_yaml(folder / f"{name}.yaml", str(folder / f"{name}.yaml"))))
+        raise SceneError(block, name, f"one of {', '.join(names)}", file)
+    return dict(_without_unset(read_yaml(folder / f"{name}.yaml", str(folder / f"{name}.yaml"))))
 
 
-def _set(block: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def _without_unset(block: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield the keys and values of a block that are set: without nulls and empty blocks."""
     for key, value in block.items():
-        kept = dict(_set(value)) if isinstance(value, Mapping) else value
+        kept = dict(_without_unset(value)) if isinstance(value, Mapping) else value
         if kept is not None and kept != {}:
             yield key, kept
 
@@ -220,15 +221,20 @@ def _set(block: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 MEASURES = tuple(dict.fromkeys(("relmse", "relmse_trimmed", *METRICS)))
 #: The measures that fall toward 0: slopes, and times to an error, are computed for these.
 ERRORS = tuple(name for name in MEASURES if name not in ("psnr", "ssim"))
+#: Most steps of a curve.
 _MOST_STEPS = 64
 
 
-def _list(value: Any) -> list[Any]:
+def _as_list(value: Any) -> list[Any]:
+    """Return a list or tuple as a list, any other value as a list of one."""
     return list(value) if isinstance(value, list | tuple) else [value]
 
 
+# Readers of the settings below: each returns the value as it is used, or raises Refused.
+
+
 def _steps(value: Any) -> tuple[int, ...]:
-    steps = _list(value)
+    steps = _as_list(value)
     if not 2 <= len(steps) <= _MOST_STEPS or not all(type(n) is int and 1 <= n <= 2**30 for n in steps):
         raise Refused("a list of two or more growing numbers of samples a pixel, such as [4, 16, 64]")
     if any(a >= b for a, b in pairwise(steps)):
@@ -237,7 +243,7 @@ def _steps(value: Any) -> tuple[int, ...]:
 
 
 def _metrics(value: Any) -> tuple[str, ...]:
-    names = _list(value)
+    names = _as_list(value)
     for index, name in enumerate(names):
         if name not in MEASURES or name in names[:index]:
             raise Refused(f"a list of different ones of {', '.join(MEASURES)}", name)
@@ -247,7 +253,7 @@ def _metrics(value: Any) -> tuple[str, ...]:
 
 
 def _targets(value: Any) -> tuple[float, ...]:
-    levels = _list(value)
+    levels = _as_list(value)
     for level in levels:
         if isinstance(level, bool) or not isinstance(level, int | float) or not 0 < level < 1e12:
             raise Refused("errors > 0, one or a list", level)
@@ -276,7 +282,7 @@ class Extra:
 def _extras(value: Any) -> tuple[dict[str, Any], ...]:
     known = ("name", "seconds", "file", "scene", "spp")
     expected = "a list of {name, seconds, file}, each perhaps with scene and spp"
-    for index, item in enumerate(_list(value)):
+    for index, item in enumerate(_as_list(value)):
         if not isinstance(item, Mapping) or not {"name", "seconds", "file"} <= item.keys() <= set(known):
             raise Refused(expected, item, (index,))
         seconds, spp = item["seconds"], item.get("spp")
@@ -287,7 +293,7 @@ def _extras(value: Any) -> tuple[dict[str, Any], ...]:
         for key in ("name", "file"):
             if not isinstance(item[key], str) or not item[key].strip():
                 raise Refused("text", item[key], (index, key))
-    return tuple(dict(item) for item in _list(value))
+    return tuple(dict(item) for item in _as_list(value))
 
 
 class StudyOptions(FrozenConfig):
@@ -314,6 +320,10 @@ class StudyOptions(FrozenConfig):
     }
 
 
+#: Samples a pixel of a reference's runs, over those of the largest step, where `reference.spp` is not given.
+_REFERENCE_FACTOR = 4
+
+
 class Reference(FrozenConfig):
     """Settings of a reference that is rendered."""
 
@@ -323,6 +333,7 @@ class Reference(FrozenConfig):
     }
 
 
+#: Keys of a study that are no settings of the renderer.
 OWN_KEYS = (*StudyOptions.parameters, "scene", "reference", "overrides")
 #: For the tables of the docs.
 UNTYPED_BLOCKS = {"study": StudyOptions, "reference": Reference}
@@ -397,31 +408,35 @@ def read_study(name: str) -> tuple[dict[str, Any], str]:
     raw = plain(raw, path)
     base = Path(path).parent
 
-    def placed(file: Any) -> Any:  # a path, relative to the study file's folder
+    def beside_study(file: Any) -> Any:  # a path, relative to the study file's folder
         return str(base / file) if isinstance(file, str) else file
 
-    def named(scene: Any) -> Any:  # a scene: a path, or the name of one that ships
-        return placed(scene) if str(scene).endswith((".yaml", ".yml")) else scene
+    def scene_name(scene: Any) -> Any:  # a scene: a path, or the name of one that ships
+        return beside_study(scene) if str(scene).endswith((".yaml", ".yml")) else scene
 
     if "scene" in raw:
-        raw["scene"] = [named(scene) for scene in _list(raw["scene"])]
+        raw["scene"] = [scene_name(scene) for scene in _as_list(raw["scene"])]
     reference = raw.get("reference")
     if isinstance(reference, str):
-        raw["reference"] = placed(reference)
+        raw["reference"] = beside_study(reference)
     elif isinstance(reference, Mapping) and "file" in reference:
         files = reference["file"]
-        files = {named(k): placed(v) for k, v in files.items()} if isinstance(files, Mapping) else placed(files)
+        files = (
+            {scene_name(k): beside_study(v) for k, v in files.items()}
+            if isinstance(files, Mapping)
+            else beside_study(files)
+        )
         raw["reference"] = {**reference, "file": files}
     if isinstance(raw.get("extra"), list):
-        raw["extra"] = [_extra_placed(item, placed, named) for item in raw["extra"]]
+        raw["extra"] = [_extra_beside_study(item, beside_study, scene_name) for item in raw["extra"]]
     return raw, path
 
 
-def _extra_placed(item: Any, placed: Callable[[Any], Any], named: Callable[[Any], Any]) -> Any:
+def _extra_beside_study(item: Any, beside_study: Callable[[Any], Any], scene_name: Callable[[Any], Any]) -> Any:
     if not isinstance(item, Mapping):
         return item
-    scene = {"scene": named(item["scene"])} if "scene" in item else {}
-    return {**item, "file": placed(item.get("file")), **scene}
+    scene = {"scene": scene_name(item["scene"])} if "scene" in item else {}
+    return {**item, "file": beside_study(item.get("file")), **scene}
 
 
 def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
@@ -430,13 +445,17 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
     Raises:
         SceneError: a key or value is not accepted.
     """
-    scenes = tuple(_list(raw.get("scene") or []))
+    scenes = tuple(_as_list(raw.get("scene") or []))
     if not scenes or not all(isinstance(name, str) for name in scenes) or len(set(scenes)) < len(scenes):
         raise SceneError(
             "scene", raw.get("scene"), "the name of a scene, a path ending in .yaml, or a list of them", file
         )
     options = read_params(
-        StudyOptions, {key: raw[key] for key in StudyOptions.parameters if key in raw}, "", file, "a study"
+        StudyOptions,
+        {key: raw[key] for key in StudyOptions.parameters if key in raw},
+        key="",
+        file=file,
+        words="a study",
     )
     if "flip" in options["metrics"] and find_spec("flip_evaluator") is None:
         if "metrics" in options.given:
@@ -458,11 +477,21 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
             raise SceneError(f"extra.{index}.scene", scene, f"one of {', '.join(scenes)}", file)
         if item["name"] in labels:
             raise SceneError(f"extra.{index}.name", item["name"], "a name that no curve has", file)
-        extras.append(Extra(item["name"], float(item["seconds"]), item["file"], scene, item.get("spp")))
+        extras.append(
+            Extra(
+                name=item["name"],
+                seconds=float(item["seconds"]),
+                file=item["file"],
+                scene=scene,
+                spp=item.get("spp"),
+            )
+        )
     plan = _plan(raw.get("reference"), scenes, largest_spp=options["spp"][-1], file=file)
     if plan.files and (several := next((key for key, values in changes.items() if len(values) > 1), None)):
         raise SceneError(several, changes[several], "one value where reference= is a file, which shows one scene", file)
-    return Study(scenes, variants, options.values, tuple(extras), plan, file)
+    return Study(
+        scenes=scenes, variants=variants, options=options.values, extras=tuple(extras), reference=plan, file=file
+    )
 
 
 def _plan(raw: Any, scenes: tuple[str, ...], largest_spp: int, file: str | None) -> ReferencePlan:
@@ -478,12 +507,13 @@ def _plan(raw: Any, scenes: tuple[str, ...], largest_spp: int, file: str | None)
         files = {scenes[0]: files} if isinstance(files, str) and len(scenes) == 1 else files
         if not isinstance(files, Mapping) or set(files) != set(scenes):
             raise SceneError("reference.file", files, f"a file for each of {', '.join(scenes)}", file)
-        return ReferencePlan(dict(files), spp=0, seeds=0, settings={})  # not rendered
+        return ReferencePlan(files=dict(files), spp=0, seeds=0, settings={})  # not rendered
     own = {key: value for key, value in raw.items() if key in parameters_of(Reference)}
-    options = read_params(Reference, own, "reference", file, "a reference")
+    options = read_params(Reference, own, key="reference", file=file, words="a reference")
     settings = flat({key: value for key, value in raw.items() if key not in own})
     for key, value in settings.items():
         if isinstance(value, list) and key not in LISTS:
             raise SceneError(f"reference.{key}", value, "one value: there is one reference", file)
     variants_of(settings, file)  # for its errors: unknown keys, and settings that a study refuses
-    return ReferencePlan({}, options["spp"] or 4 * largest_spp, options["seeds"], settings)
+    spp = options["spp"] or _REFERENCE_FACTOR * largest_spp
+    return ReferencePlan(files={}, spp=spp, seeds=options["seeds"], settings=settings)

@@ -111,7 +111,7 @@ class _RecordedGathers:
 
 
 def bounce_vjp(trace: Trace, model: int, roulette: float, follow_ray: bool) -> Sinks:
-    """Pull cotangents back through the surfaces of a BSDF model, see :func:`torchpt.paths.adjoint.bounce`.
+    """Pull cotangents back through the surfaces of a BSDF model, see :func:`torchpt.paths.adjoint.bounce_vjp`.
 
     Besides sinks, a VJP sets ``trace.sums``: for each table with gradients its number, the row of the index (-1: the gradient
     of the whole table comes from every lane), the first row of the values, and their number.
@@ -129,20 +129,20 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_ray: bool) -> S
     integrator, cotangent = trace.layout.wave.integrator, kernels.cotangent
 
     def of_splat(splat: Splat) -> tuple[Tensor, Tensor]:
-        return adjoint.splatted(integrator.clamp, cotangent, splat, rows["splat_transmittance"])
+        return adjoint.splat_contributions(integrator.clamp, cotangent, splat, rows["splat_transmittance"])
 
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
         context = kernels.taped.at(salts, follow_ray=follow_ray, roulette=roulette)
         vertex = VertexInput(state, hit)
-        input_cotangents = adjoint.bounce(
+        input_cotangents = adjoint.bounce_vjp(
             integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, gathers.leaves, of_splat
         )
     return _stores(trace, gathers, state, input_cotangents, added={})
 
 
 def emit_vjp(trace: Trace, follow_ray: bool) -> Sinks:
-    """Pull cotangents back through the emission of emitters, see :func:`torchpt.paths.adjoint.gather`."""
+    """Pull cotangents back through the emission of emitters, see :func:`torchpt.paths.adjoint.emission_vjp`."""
     kernels, tracer = _begin_vjp(trace)
     salts = trace.salts()
     state, hit, rows = _inputs(trace)
@@ -150,19 +150,21 @@ def emit_vjp(trace: Trace, follow_ray: bool) -> Sinks:
     with tracer, recording_gathers(gathers):
         context = kernels.taped.at(salts, follow_ray=follow_ray)
         stage, vertex = trace.layout.wave.integrator.emit, VertexInput(state, hit)
-        input_cotangents = adjoint.gather(stage, context, vertex, rows["radiance"], gathers.leaves)
+        input_cotangents = adjoint.emission_vjp(stage, context, vertex, rows["radiance"], gathers.leaves)
     return _stores(trace, gathers, state, input_cotangents, added=rows)
 
 
 def escape_vjp(trace: Trace) -> Sinks:
-    """Pull cotangents back through the emission of the environment, see :func:`torchpt.paths.adjoint.gather`."""
+    """Pull cotangents back through the emission of the environment, see :func:`torchpt.paths.adjoint.emission_vjp`."""
     kernels, tracer = _begin_vjp(trace)
     salts = trace.salts()
     state, hit, rows = _inputs(trace)
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
         stage, vertex = trace.layout.wave.integrator.escape, VertexInput(state, hit)
-        input_cotangents = adjoint.gather(stage, kernels.taped.at(salts), vertex, rows["radiance"], gathers.leaves)
+        input_cotangents = adjoint.emission_vjp(
+            stage, kernels.taped.at(salts), vertex, rows["radiance"], gathers.leaves
+        )
     return _stores(trace, gathers, state, input_cotangents, added=rows)
 
 
@@ -224,7 +226,7 @@ def _stores(
     tracer, graph = trace.tracer, trace.tracer.graph
     fields: dict[str, Tensor] = {}
     with tracer:
-        for name, cotangent, like in input_cotangents.of_rays(state, kernels.taped.plan.attached):
+        for name, cotangent, like in input_cotangents.of_rays(state, attached=kernels.taped.plan.attached):
             if cotangent is None and added:
                 continue
             cotangent = torch.zeros_like(like) if cotangent is None else cotangent
@@ -492,7 +494,7 @@ class KernelsBackward(KernelsEngine):
 
         def of_splat(splat: Splat) -> tuple[Tensor, Tensor]:
             assert kernels.cotangent is not None
-            return adjoint.splatted(integrator.clamp, kernels.cotangent, splat, rows["splat_transmittance"])
+            return adjoint.splat_contributions(integrator.clamp, kernels.cotangent, splat, rows["splat_transmittance"])
 
         input_cotangents: InputCotangents
         with recording_gathers(self.sums):
@@ -502,7 +504,7 @@ class KernelsBackward(KernelsEngine):
                 next_hit = Hit(*(rows[name] for name in HIT)) if plan.attached else None
                 _, model, roulette, follow_ray = key
                 context = kernels.taped.at(salt, follow_ray=follow_ray, roulette=roulette)
-                input_cotangents = adjoint.bounce(
+                input_cotangents = adjoint.bounce_vjp(
                     integrator.bounce,
                     context,
                     model,
@@ -516,10 +518,10 @@ class KernelsBackward(KernelsEngine):
             else:
                 stage_name, *follow_ray = key  # the environment does not depend on `follow_ray`
                 stage = integrator.emit if stage_name == "emit" else integrator.escape
-                input_cotangents = adjoint.gather(
+                input_cotangents = adjoint.emission_vjp(
                     stage, kernels.taped.at(salt, *follow_ray), vertex, rows["radiance"], self._tables
                 )
-        for name, cotangent, like in input_cotangents.of_rays(state, plan.attached):
+        for name, cotangent, like in input_cotangents.of_rays(state, attached=plan.attached):
             first = kernels.slots.first(name)
             values = np.zeros(like.shape, np.float32) if cotangent is None else cotangent.numpy()
             values = values.reshape(-1, count)

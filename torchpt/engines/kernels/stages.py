@@ -20,7 +20,7 @@ from torchpt.paths import layers as aov
 from torchpt.paths import vertex
 from torchpt.paths.integrators.base import check_fields, check_output
 from torchpt.paths.state import PathState, Shadow, Splat, VertexInput, no_shadow
-from torchpt.paths.transmission import beyond, non_opaque, opacity_at
+from torchpt.paths.transmission import non_opaque, opacity_at, origins_behind
 from torchpt.paths.wave import camera_state
 from torchpt.physics.samplers import Dimension, Draws
 from torchpt.physics.shapes.geometry import Hit
@@ -410,7 +410,7 @@ def attenuate_shadow_rays(trace: Trace) -> Sinks:
         transmittance = transmittance * (1.0 - opacity)
         goes_on = (hit.prim >= 0) & (opacity < 1)
         is_known = ~goes_on
-        behind = beyond(layout.world, o, d, hit)
+        behind = origins_behind(layout.world, o, d, hit)
         t_left = (t_max - hit.t).clamp_min(0.0)
     onward = layout.passed.nodes(tracer, pass_o=behind, pass_d=d, pass_t=t_left, home=home, transmittance=transmittance)
     return _shadow_ray_sinks(trace, goes_on, onward, is_known, home, transmittance)

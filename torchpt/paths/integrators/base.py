@@ -131,7 +131,9 @@ class Integrator(FrozenConfig):
 
     def plan(self, sampler: Points, dtype: torch.dtype, *, tape: bool = False, attached: bool = False) -> Plan:
         """Return the static configuration of the stages; the arguments are fields of :class:`torchpt.paths.state.Plan`."""
-        return Plan(sampler, self.strategy, self.rr_prob, dtype, tape, attached)
+        return Plan(
+            sampler=sampler, strategy=self.strategy, rr_prob=self.rr_prob, dtype=dtype, tape=tape, attached=attached
+        )
 
     def counted_in(self, unit: float) -> Self:
         """Return a copy with parameters that are lengths divided by ``unit``, the world unit in scene units."""
@@ -160,7 +162,7 @@ class Integrator(FrozenConfig):
         reach their surface. Only surfaces block shadow rays: ``bounce`` has to weaken them by media in between.
         """
         if context.world.materials.opacity is None:
-            return Transmission(torch.zeros_like(vertex.hit.prim, dtype=torch.bool), vertex.state.o)
+            return Transmission(on=torch.zeros_like(vertex.hit.prim, dtype=torch.bool), o=vertex.state.o)
         return transmission.transmit(context, vertex)
 
     @property

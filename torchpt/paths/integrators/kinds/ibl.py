@@ -57,11 +57,12 @@ class Preview(FirstSurface):
         """Return the shading for a world; differentiable in its environment."""
         environment = lights.environment_image(world.lights)
         if environment is None:
-            return Preview(None)
+            return Preview(sky=None)
         if environment.even:  # constant radiance: every prefiltered map is the image itself
             texels = environment.texels
-            return Preview(Sky.of(IblMaps(texels, (texels, texels), brdf_table().to(texels))), environment.turn)
-        return Preview(Sky.of(maps(environment.texels)), environment.turn)
+            prefiltered = IblMaps(irradiance=texels, specular=(texels, texels), brdf=brdf_table().to(texels))
+            return Preview(sky=Sky.of(prefiltered), turn=environment.turn)
+        return Preview(sky=Sky.of(maps(environment.texels)), turn=environment.turn)
 
     def turned(self, d: Tensor) -> Tensor:
         """Return world directions ``(3, N)`` in the space of the maps."""
@@ -78,7 +79,7 @@ class Preview(FirstSurface):
         without_sky = replace(context, world=replace(world, lights=lights.without_environment(world.lights)))
         throughput = state.throughput if hit.chance is None else state.throughput * hit.chance
         arriving = replace(state, throughput=throughput)
-        at = interact(world, state.o, state.d, hit, context.follow_ray)
+        at = interact(world, state.o, state.d, hit, follow_ray=context.follow_ray)
         surface, direct, shadow = stages.shade(without_sky, model, arriving, at)
         radiance = torch.zeros_like(state.radiance)
         if self.sky is not None:
@@ -86,4 +87,5 @@ class Preview(FirstSurface):
             radiance = throughput * shade_under(self.sky, world.materials.models[model], surface.parameters, n, v)
             if surface.front_mask is not None:
                 radiance = radiance * surface.front_mask
-        return VertexOutput(replace(state, radiance=state.radiance + radiance), None, shadow, at, surface, direct)
+        leaving = replace(state, radiance=state.radiance + radiance)
+        return VertexOutput(leaving=leaving, next_hit=None, shadow=shadow, at=at, surface=surface, direct=direct)
