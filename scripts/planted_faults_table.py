@@ -526,8 +526,8 @@ FAULTS = (
         "rendering/split.py",
         "ranks",
         "DistributedRender.take",
-        "rays + sum(int(said[1]) for said in every)",
-        "rays + own[1]",
+        "rays + sum(int(rank.rays) for rank in counts)",
+        "rays + int(own.rays)",
         "counts wrong: a render of several ranks tells the rays of one of them",
     ),
     Fault(

@@ -44,8 +44,8 @@ def render(scene: Scene, *, full: bool = False, **options: Unpack[CommonOptions]
         RenderError: a device, compiler or denoiser is missing; a rank is lost, or renders something else.
         TypeError: an unknown argument.
     """
-    check_names("render", options, CommonOptions, ("full",))
-    rendering = execute_request(prepare_request(scene, full, **options))
+    check_names("render", options, CommonOptions, own=("full",))
+    rendering = execute_request(prepare_request(scene, full=full, **options))
     return rendering if full else rendering.image
 
 
@@ -83,7 +83,7 @@ def trace(
         RenderError: a device or compiler is missing.
         TypeError: an unknown argument.
     """
-    check_names("trace", options, TraceOptions, ("spp", "seed", "params"))
+    check_names("trace", options, TraceOptions, own=("spp", "seed", "params"))
     request = prepare_trace_request(scene, o, d, spp=spp, seed=seed, params=params, **options)
     assert request.rays is not None
     o, d = request.rays

@@ -344,7 +344,8 @@ def ends_a_pass(run: Run, taken: int) -> bool:
     stop_rules = StopRules(
         run.settings.render.but(spp=taken + BLOCK, time_limit=None), run.picture.randomizations.count
     )
-    end = taken - taken % (4 * BLOCK)  # passes from here on are whole blocks
+    # A pass is at most a quarter of the samples before it, so from 4 * BLOCK on passes are whole blocks.
+    end = taken - taken % (4 * BLOCK)
     while end < taken:
         end += stop_rules.next_pass_spp(end)
     return end == taken

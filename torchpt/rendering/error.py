@@ -122,11 +122,11 @@ class ErrorProbes:
             outliers, uncertain = from_first_rank(outliers), from_first_rank(uncertain)
         pixels = torch.cat((outliers, uncertain)).to(film.sums.device)
         randomizations = Randomizations(
-            self.pixel_set.randomizations.first + self.pixel_set.randomizations.count, RESAMPLING_RANDOMIZATIONS
+            first=self.pixel_set.randomizations.first + self.pixel_set.randomizations.count,
+            count=RESAMPLING_RANDOMIZATIONS,
         )
-        pixel_set = PixelSet(
-            Film(len(pixels), 1, RESAMPLING_RANDOMIZATIONS, film.sums.device), {}, randomizations, pixels
-        )
+        third_values = Film(len(pixels), 1, RESAMPLING_RANDOMIZATIONS, film.sums.device)  # one row of pixels
+        pixel_set = PixelSet(third_values, layers={}, randomizations=randomizations, indices=pixels)
         self.resampled = pixel_set, len(outliers)
         self.resampled_at = float(film.counts.double().mean())
         samples = round(self.resampled_at)
@@ -161,11 +161,11 @@ def error_probes(wave: Wave, settings: Settings, device: torch.device) -> ErrorP
     """Return the error probes of a render, before any sample."""
     film = settings.film
     pilots = pilots_of(settings.render.seed, (film.width, film.height), wave.crop)
-    randomizations = Randomizations(wave.sampler.randomizations, 2 if settings.adaptive else 1)
+    # The first ones are the picture's.
+    randomizations = Randomizations(first=wave.sampler.randomizations, count=2 if settings.adaptive else 1)
     sums = Film(len(pilots), 1, randomizations.count, device)
-    return ErrorProbes(
-        pilots, PixelSet(sums, {}, randomizations, pilots.pixels.to(device)), counts_second_values=not settings.adaptive
-    )
+    pixel_set = PixelSet(sums, layers={}, randomizations=randomizations, indices=pilots.pixels.to(device))
+    return ErrorProbes(pilots=pilots, pixel_set=pixel_set, counts_second_values=not settings.adaptive)
 
 
 # ---- Adaptive sampling: error probes decide where samples go
@@ -242,7 +242,7 @@ class SampleAllocation:
         for name, film in (("", pixel_set.film), *pixel_set.layers.items()):
             films[name] = film.extract(members)
             self._parts.append((film, members, films[name]))
-        return PixelSet(films.pop(""), films, pixel_set.randomizations, pixels)
+        return PixelSet(film=films.pop(""), layers=films, randomizations=pixel_set.randomizations, indices=pixels)
 
     def _block_counts(self, counts: Tensor) -> Tensor:
         """Return the samples a pixel of each block; the pixels of a block have the same number."""

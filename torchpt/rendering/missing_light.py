@@ -120,10 +120,11 @@ def _share_of_dark_pixels(search: _Search, black: Tensor) -> float:
         torch.linspace(0, count - 1, min(count, DARK_PIXELS), dtype=torch.float64).round().long()
     )  # evenly among them
     state = _camera_rays(wave, pixels[chosen].to(wave.centre.device))
-    hit = hits(wave, state)
+    hit = hits(wave, state)  # the nearest ones
     reflects = hit.prim >= 0  # (n,), True where a surface was hit
     with suppress(NotImplementedError):  # a model of the caller's own without an albedo
-        reflects = seen(wave, ("albedo",), state)["albedo"].abs().amax(0) > 0
+        albedo = seen(wave, ("albedo",), state)["albedo"]  # (3, n), a layer of the surfaces that rays hit
+        reflects = albedo.abs().amax(0) > 0
     lanes = reflects.nonzero()[:, 0]
     if not len(lanes) or not _any_surface_visible(wave, rows(state, lanes), rows(hit, lanes)):
         return 0.0

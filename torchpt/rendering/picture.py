@@ -98,7 +98,7 @@ def error_estimate_of(run: Run, picture: Tensor) -> tuple[ErrorEstimate | None, 
         estimate = run.probes.estimate(film, picture)
     else:
         relmse = film.relmse()
-        estimate = None if relmse is None else ErrorEstimate(relmse, None, False)
+        estimate = None if relmse is None else ErrorEstimate(relmse, interval=None, heavy_tailed=False)
     if estimate is None or not run.done:
         return estimate, ""
     from torchpt.rendering.missing_light import find_missing_light

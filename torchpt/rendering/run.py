@@ -247,7 +247,7 @@ class Run:
         return self._finish()
 
     def _finish(self) -> Rendering:
-        mark_loaded(self._how())
+        mark_loaded(self._how())  # code is loaded now: later estimates of memory leave it out
         self.engine.release_workers(keeps=self.settings.render.max_memory is None)
         return finished_rendering(self)
 
@@ -468,7 +468,7 @@ class Run:
         """Restore the counts before outliers were resampled: the picture gets more samples, and they will be again."""
         assert self.probes is not None
         counts, self.clamp_sums = self._before_resampling
-        self.done, self.ray_counts = counts["done"], RayCounts(counts["rays"], counts["truncated"])
+        self.done, self.ray_counts = counts["done"], RayCounts(rays=counts["rays"], truncated=counts["truncated"])
         self.nonfinite = NonFinite.read(counts["lost"])
         self.probes.resampled, self.probes.resampled_at = None, None
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,6 +34,26 @@ if TYPE_CHECKING:
     from torchpt.rendering.run import Run
 
 __all__ = ["DistributedRender", "render_fingerprint"]
+
+
+class _PassCounts(NamedTuple):
+    """What one rank reports after a pass, as numbers: counts of this pass, and two flags (0 or 1).
+
+    Attributes:
+        paths: paths traced.
+        rays: rays traced.
+        truncated: truncated paths.
+        nonfinite: non-finite samples.
+        stopped: ``on_progress`` stopped the render.
+        failed: a kernel could not be made.
+    """
+
+    paths: float
+    rays: float
+    truncated: float
+    nonfinite: float
+    stopped: float
+    failed: float
 
 
 class DistributedRender:
@@ -66,23 +86,30 @@ class DistributedRender:
             run.take_alone([(self._part(pixel_set), first, count) for pixel_set, first, count in spans])
         except Unsupported as error:
             reason = str(error) or "unsupported"
-        own = run.done - done, run.ray_counts.rays - rays, run.ray_counts.truncated - truncated, run.nonfinite.count
-        # Of each rank: paths, rays, truncated paths, non-finite samples, stopped by the caller, failed.
-        every = self.group.all_gather_numbers("a pass", *own, run.stopped_by_caller, bool(reason))
-        if any(failed for *_, failed in every):
+        own = _PassCounts(
+            paths=run.done - done,
+            rays=run.ray_counts.rays - rays,
+            truncated=run.ray_counts.truncated - truncated,
+            nonfinite=run.nonfinite.count,
+            stopped=run.stopped_by_caller,
+            failed=bool(reason),
+        )
+        counts = [_PassCounts(*numbers) for numbers in self.group.all_gather_numbers("a pass", *own)]  # by rank
+        if any(rank.failed for rank in counts):
             raise Unsupported(reason or "what another rank met")
-        run.done = done + sum(int(paths) for paths, *_ in every)
+        run.done = done + sum(int(rank.paths) for rank in counts)
         run.done_before_pass, run.sharing_ranks = 0, 1
         run.ray_counts = RayCounts(
-            rays + sum(int(said[1]) for said in every), truncated + sum(int(said[2]) for said in every)
+            rays=rays + sum(int(rank.rays) for rank in counts),
+            truncated=truncated + sum(int(rank.truncated) for rank in counts),
         )
-        if any(said[3] for said in every):
+        if any(rank.nonfinite for rank in counts):
             nonfinite.add(self._gather_nonfinite(run.nonfinite))
         run.nonfinite = nonfinite
         for part in self.group.gather(run.clamp_sums) if run.integrator.clamp is not None else ():
             clamp_sums = clamp_sums + part
         run.clamp_sums = clamp_sums
-        stopped = any(said[4] for said in every)
+        stopped = any(rank.stopped for rank in counts)
         run.stopped_by_caller = stopped and run.done < run.requested_paths()
         return not stopped
 

@@ -122,7 +122,7 @@ def render_batch(
         RenderError: as :func:`torchpt.render`.
         TypeError: an unknown argument.
     """
-    check_names("render_batch", options, RenderOptions, ("cameras", "on_progress"))
+    check_names("render_batch", options, RenderOptions, own=("cameras", "on_progress"))
     if on_progress is not None and not callable(on_progress):
         raise SceneError("on_progress", on_progress, "a function")
     scenes = scenes_of(scenes)
@@ -250,7 +250,7 @@ def _request(
         params = {**params, "camera.to_world": camera}
     elif camera is not None:
         scene = scene.seen_by(camera, options.get("film"))
-    request = prepare_request(scene, full, params=params, seed=seed, **options)
+    request = prepare_request(scene, full=full, params=params, seed=seed, **options)
     if any(map(is_transformed, request.params.values())):
         raise SceneError(
             "params", "tensors under a transform of torch.func", "plain ones: transforms go through render"
