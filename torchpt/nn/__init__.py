@@ -4,6 +4,8 @@
 ``renderer.py``          a scene with chosen parameters as ``nn.Parameter``
 ``parametrizations.py``  maps unconstrained numbers to the ranges of parameters
 =======================  ===========================================================
+
+May import: ``rendering``, ``scene`` and what lies below.
 """
 
 from __future__ import annotations

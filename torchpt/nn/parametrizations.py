@@ -1,16 +1,18 @@
 """Map unconstrained numbers to the ranges of parameters, so that an optimizer may take any step.
 
-``renderer.py`` chooses one for each parameter by its spec (:func:`parametrization_of`). ``x``: the numbers that are optimized.
+``renderer.py`` chooses a map for each parameter by its spec, the declaration of its range (:func:`parametrization_of`). ``x``
+are the numbers that are optimized, ``low`` and ``high`` the ends of the range.
 
-================  ======================================  ===========================================================
-kind              range                                   parameter
-================  ======================================  ===========================================================
+================  ======================================  =============================================================
+map               range                                   parameter
+================  ======================================  =============================================================
 ``Bounded``       two ends: albedos, roughnesses, angles  ``low + (high - low) ((1 + 2 e) sigmoid(x) - e)``, clamped
-``LowerBounded``  one end: radiances, radii, indices      ``low + s (softplus(x) - e)``, clamped; ``s`` as below
+``LowerBounded``  one end: radiances, radii, indices      ``low + s (softplus(x) - e)``, clamped
 ``Unbounded``     none: points, directions, vertices      ``x``
-``RigidMotion``   poses                                   initial pose turned by ``exp(w)``, its origin at ``length t``,
-                                                          with ``x = (w, t)``
-================  ======================================  ===========================================================
+``RigidMotion``   poses                                   ``exp(w)`` times the initial pose, at ``l t``; ``x = (w, t)``
+================  ======================================  =============================================================
+
+In a rigid motion ``w`` is a rotation as axis times angle, ``exp(w)`` its matrix, ``l`` a length of the scene, ``t`` a position.
 
 A plain sigmoid never reaches 0 or 1, and is flat near them: an albedo of 0 would be ``x`` of minus infinity, and stay there.
 So it is stretched by ``e = 0.05`` at each closed end, which is then reached at a finite ``x`` with a sixth of the slope in
@@ -35,7 +37,8 @@ __all__ = ["Bounded", "LowerBounded", "Parametrization", "RigidMotion", "Unbound
 OVERSHOOT = 0.05
 #: Closest distance to an open end, as a share of the range.
 OPEN_END_MARGIN = 1e-6
-#: A range that is wider than the parameter by more than this factor counts as open-ended.
+#: A range that is wider than the initial value by more than this factor counts as one without an upper end: a sigmoid would be
+#: flat there.
 OPEN_ENDED_FACTOR = 100.0
 
 
@@ -180,13 +183,13 @@ class RigidMotion(Parametrization):
 
 
 def parametrization_of(spec: Spec, start: Tensor, *, rigid: bool = True, length: float = 1.0) -> Parametrization:
-    """Return the parametrization of a parameter with initial value ``start``.
+    """Return the map for a parameter.
 
     Args:
-        spec: declares the parameter's range.
-        start: initial value.
+        spec: declaration of the parameter.
+        start: its initial value.
         rigid: True: poses move rigidly. False: only those that must keep angles do.
-        length: size of the scene, in scene units.
+        length: size of the scene, the unit of a pose's position.
     """
     if isinstance(spec, Pose):
         return RigidMotion(start, length) if rigid or spec.angles or spec.rigid else Unbounded()

@@ -83,10 +83,10 @@ class Renderer(nn.Module):
             ]
             free = {
                 _key(name): nn.Parameter(parametrization.inverse(start).clone())
-                for name, parametrization, start in zip(self.names, parametrizations, starts, strict=True)
+                for name, parametrization, start in zip(self.names, ranges, starts, strict=True)
             }
-        # `ranges` and `free` begin keys of saved states: their names stay.
-        self.ranges, self.free = nn.ModuleList(parametrizations), nn.ParameterDict(free)
+        # `free` has the numbers that are optimized, `ranges` maps them to parameters; both names are in saved state dicts
+        self.ranges, self.free = nn.ModuleList(ranges), nn.ParameterDict(free)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
     @expand_signature
@@ -151,7 +151,7 @@ class Renderer(nn.Module):
             self.scene.params[name] = value.detach().clone()
 
     def _next_seed(self, *, shares_picture: bool) -> int:
-        """Return the seed of the next call, and count it in training mode; ``shares_picture``: all ranks render one picture."""
+        """Return the seed of a call, and count it in training mode; ``shares_picture``: ranks render one picture together."""
         if not self.training:
             return self.seed
         rank, world = 0, 1
@@ -188,7 +188,7 @@ def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if not isinstance(name, str):
             raise SceneError("names", name, "a name of scene.params or a pattern of some, as text")
-        matches = [each for each in scene.params if each == name or fnmatchcase(each, name)]
+        matches = [parameter for parameter in scene.params if parameter == name or fnmatchcase(parameter, name)]
         if not matches:
             examples = example_names(name, list(scene.params))
             raise SceneError("names", name, f"a parameter of this scene or a pattern of some, such as {examples}")
