@@ -134,14 +134,14 @@ class Renderer(nn.Module):
             if name not in self.names:
                 raise SceneError(f"params.{name}", name, f"one of {', '.join(self.names)}")
         self.scene.check({**self.values(), **values})
-        new: dict[str, Tensor] = {}
+        numbers: dict[str, Tensor] = {}  # the unconstrained numbers of each value
         for name, value in values.items():
             try:
-                new[name] = self.ranges[self.names.index(name)].inverse(value.to(self.free[_key(name)]))  # pyright: ignore[reportCallIssue]
+                numbers[name] = self.ranges[self.names.index(name)].inverse(value.to(self.free[_key(name)]))  # pyright: ignore[reportCallIssue]
             except ValueError:
                 expected = "the pose at first, turned and moved (rigid=False takes any)"
                 raise SceneError(f"params.{name}", value.tolist(), expected) from None
-        for name, value in new.items():
+        for name, value in numbers.items():
             self.free[_key(name)].copy_(value)
 
     @torch.no_grad()
@@ -184,7 +184,7 @@ def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
     names = tuple(names)
     if not names:
         raise SceneError("names", [], "one name at least, or None for a module without parameters")
-    found: set[str] = set()
+    matched: set[str] = set()
     for name in names:
         if not isinstance(name, str):
             raise SceneError("names", name, "a name of scene.params or a pattern of some, as text")
@@ -192,5 +192,5 @@ def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
         if not matches:
             examples = example_names(name, list(scene.params))
             raise SceneError("names", name, f"a parameter of this scene or a pattern of some, such as {examples}")
-        found.update(matches)
-    return tuple(name for name in scene.params if name in found)
+        matched.update(matches)
+    return tuple(name for name in scene.params if name in matched)
