@@ -102,7 +102,7 @@ class Instanced(Accel):
         blocked = self.base._occluded(o, d, t_max)
         for lanes, mesh, copy in self._pairs(o, d, torch.where(blocked, 0.0, t_max)):
             hit = self.trees[mesh]._occluded(*self._to_mesh_space(o, d, lanes, copy), t_max[lanes])
-            blocked[lanes[hit]] = True
+            blocked |= torch.zeros_like(blocked, dtype=torch.int32).index_add_(0, lanes, hit.int()) > 0
         return blocked
 
     def _pairs(self, o: Tensor, d: Tensor, reach: Tensor) -> list[tuple[Tensor, int, Tensor]]:
@@ -131,12 +131,15 @@ class Instanced(Accel):
                 near = torch.maximum(near, torch.minimum(at_low, at_high))
                 far = torch.minimum(far, torch.maximum(at_low, at_high))
             lane, copy = torch.nonzero(near <= far * (1.0 + MARGIN), as_tuple=True)
-            mesh_of_pair = self.tables.mesh[copy]
-            for mesh in range(len(self.trees)):
-                of_mesh = mesh_of_pair == mesh
-                # with a single mesh the question whether there are pairs would only wait for the device
-                if len(self.trees) == 1 or bool(of_mesh.any()):
-                    groups.append((lanes[lane[of_mesh]], mesh, copy[of_mesh]))
+            if len(self.trees) > 1:
+                mesh_of_pair, order = torch.sort(self.tables.mesh[copy], stable=True)
+                # the number of pairs of each mesh: all that the host has to wait for
+                mesh = torch.arange(len(self.trees), device=copy.device)
+                sizes = (mesh_of_pair == mesh[:, None]).sum(1).tolist()
+                pairs = zip(lane[order].split(sizes), copy[order].split(sizes), strict=True)
+            else:
+                pairs = ((lane, copy),)
+            groups += [(lanes[of_mesh], mesh, copies) for mesh, (of_mesh, copies) in enumerate(pairs) if len(of_mesh)]
         return groups
 
     def _to_mesh_space(self, o: Tensor, d: Tensor, lanes: Tensor, copy: Tensor) -> tuple[Tensor, Tensor]:
@@ -172,19 +175,15 @@ def _nearer(best: Hits, lanes: Tensor, hits: Hits, shift: Tensor) -> Hits:
         shift: ``(K,)``, added to these ids.
     """
     t, prim, u, v = best
-    hit = hits[1] >= 0
-    lanes, shift = lanes[hit], shift[hit]
-    new_t, new_prim, new_u, new_v = (x[hit] for x in hits)
-    new_prim = new_prim.long() + shift
+    new_t, new_prim, new_u, new_v = hits
     least = t.scatter_reduce(0, lanes, new_t, "amin")
-    nearest = new_t == least[lanes]
-    lanes, new_t, new_prim, new_u, new_v = (x[nearest] for x in (lanes, new_t, new_prim, new_u, new_v))
-    # A hit of the other primitives at the same distance stays: its id is lower.
     no_id = torch.iinfo(torch.int64).max
-    old_prim = torch.where((prim >= 0) & (t == least), prim.long(), no_id)
-    lowest = old_prim.scatter_reduce(0, lanes, new_prim, "amin")
-    won = new_prim == lowest[lanes]
+    new_id = torch.where((new_prim >= 0) & (new_t == least[lanes]), new_prim.long() + shift, no_id)
+    # A hit of the other primitives at the same distance stays: its id is lower.
+    old_id = torch.where((prim >= 0) & (t == least), prim.long(), no_id)
+    lowest = old_id.scatter_reduce(0, lanes, new_id, "amin")
+    won = torch.nonzero((new_id == lowest[lanes]) & (new_id < no_id))[:, 0]
     lanes = lanes[won]
     t, prim, u, v = t.clone(), prim.clone(), u.clone(), v.clone()
-    t[lanes], prim[lanes], u[lanes], v[lanes] = new_t[won], new_prim[won].int(), new_u[won], new_v[won]
+    t[lanes], prim[lanes], u[lanes], v[lanes] = new_t[won], new_id[won].int(), new_u[won], new_v[won]
     return t, prim, u, v

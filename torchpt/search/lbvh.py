@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import torch
@@ -149,11 +150,17 @@ def _depth(parent: Tensor) -> int:
     return int(steps.max()) + 1
 
 
-# ---- Traversal by all lanes in lockstep: each step moves every active lane by one node
+# ---- Traversal by all lanes in lockstep
+#
+# In a step either the lanes at inner nodes descend, or the lanes at leaves test their primitives; the others wait. A step
+# computes on all lanes of a chunk, and masks keep the state of those that it is not for: to choose them, the host would have
+# to wait for the device. It asks once a round, after eight steps, which lanes are left, and drops the others from the state.
 
 
 #: Lanes that are traversed together; bounds memory to about 100 MB.
 CHUNK = 1 << 18
+#: Steps of a round that descend before each of its steps that test leaves.
+DESCENTS = (3, 3)
 _DONE = 1 << 30
 #: Boxes are enlarged by 16 ulps of the distance; the slab test errs by 3 (Ize, "Robust BVH Ray Traversal", 2013).
 _SLACK = 1.0 + 2.0**-20
@@ -163,122 +170,111 @@ def intersect(
     o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the nearest hits; ``tensors``, ``counts`` and ``depth`` are those of :class:`Lbvh`."""
-    t, prim = torch.full_like(t_max, torch.inf), torch.full_like(t_max, -1, dtype=torch.int32)
-    u, v = torch.zeros_like(t_max), torch.zeros_like(t_max)
-    for lanes in _live(o, d, t_max):
-        hit, found = _Wave(o, d, t_max, lanes, tensors, counts, depth).run(any_hit=False)
-        t[hit], prim[hit], u[hit], v[hit] = found[0], found[1].int(), found[2], found[3]
-    return t, prim, u, v
+    chunks = [_Chunk(*rays, tensors, counts, depth).run(any_hit=False) for rays in _chunks(o, d, t_max)]
+    t, prim, u, v = (torch.cat(x) for x in zip(*chunks, strict=True)) if len(chunks) > 1 else chunks[0]
+    missed = prim < 0
+    return torch.where(missed, torch.inf, t), prim.int(), torch.where(missed, 0.0, u), torch.where(missed, 0.0, v)
 
 
 def occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> Tensor:
     """Return True where a ray hits anything; arguments as for :func:`intersect`."""
-    blocked = torch.zeros_like(t_max, dtype=torch.bool)
-    for lanes in _live(o, d, t_max):
-        hit, _ = _Wave(o, d, t_max, lanes, tensors, counts, depth).run(any_hit=True)
-        blocked[hit] = True
-    return blocked
+    chunks = [_Chunk(*rays, tensors, counts, depth).run(any_hit=True)[1] for rays in _chunks(o, d, t_max)]
+    return torch.cat(chunks) >= 0
 
 
-def _live(o: Tensor, d: Tensor, t_max: Tensor) -> list[Tensor]:
-    """Return the indices of the rays that can hit anything, in chunks."""
-    good = (t_max > 0) & torch.isfinite(o).all(0) & torch.isfinite(d).all(0) & (d != 0).any(0)
-    return [c for c in torch.nonzero(good)[:, 0].split(CHUNK) if c.numel()]
+def _chunks(o: Tensor, d: Tensor, t_max: Tensor) -> Iterable[tuple[Tensor, Tensor, Tensor]]:
+    return zip(o.split(CHUNK, 1), d.split(CHUNK, 1), t_max.split(CHUNK), strict=True)
 
 
-class _Wave:
-    """The traversal of a chunk: state of the active lanes, and hits of the finished ones."""
+class _Chunk:
+    """The traversal of a chunk of N rays: hits of all, and the state of the n lanes that are not finished."""
 
     def __init__(
-        self, o: Tensor, d: Tensor, t_max: Tensor, lanes: Tensor, tensors: list[Tensor], counts: list[int], depth: int
+        self, o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int
     ) -> None:
         self.corners, self.rows, self.quadrics, self.children, self.boxes, self.order = tensors
         self.counts = counts
-        self.lanes = lanes
-        self.rays = prepare_rays(o[:, lanes], d[:, lanes])
-        self.t = t_max[lanes].clone()
-        self.prim = torch.full_like(lanes, -1)
-        self.u, self.v = torch.zeros_like(self.t), torch.zeros_like(self.t)
-        self.node = torch.full_like(lanes, 0 if self.children.shape[1] else _DONE)
-        self.top = torch.zeros_like(lanes)  # entries on the stack
-        self.stack = torch.full((depth + 1, len(lanes)), _DONE, dtype=torch.int32, device=lanes.device)
-        self.finished: list[tuple[Tensor, ...]] = []
+        self.rays = prepare_rays(o, d)
+        self.t = t_max.clone()
+        self.prim = torch.full_like(t_max, -1, dtype=torch.int64)
+        self.u, self.v = torch.zeros_like(t_max), torch.zeros_like(t_max)
+        good = (t_max > 0) & torch.isfinite(o).all(0) & torch.isfinite(d).all(0) & (d != 0).any(0)
+        self.node = torch.where(good, 0, _DONE)
+        self.top = torch.zeros_like(self.node)  # entries on the stack
+        # Row 0 holds `_DONE`; a lane that waits at the deepest leaf writes a row above its `depth` entries.
+        self.stack = torch.full((depth + 2, len(t_max)), _DONE, dtype=torch.int32, device=o.device)
+        self.lanes: Tensor | None = None  # numbers of the lanes in the chunk; None: all
+        self.found: tuple[Tensor, ...] = ()  # hits of all rays
 
-    def run(self, any_hit: bool) -> tuple[Tensor, list[Tensor]]:
-        """Traverse to the end; return the indices of the rays that hit, and ``t, prim, u, v``."""
-        step = 0
-        while True:
-            inner = torch.nonzero((self.node >= 0) & (self.node < _DONE))[:, 0]
-            leaf = torch.nonzero(self.node < 0)[:, 0]
-            live = inner.numel() + leaf.numel()
-            if live == 0:
+    def _hits(self) -> tuple[Tensor, ...]:
+        return self.t, self.prim, self.u, self.v
+
+    def run(self, any_hit: bool) -> tuple[Tensor, ...]:
+        """Traverse to the end; return ``t, prim, u, v`` of all rays, where a miss has prim -1."""
+        while self.children.shape[1]:
+            for descents in DESCENTS:
+                for _ in range(descents):
+                    self._descend()
+                self._test(any_hit)
+            live = torch.nonzero(self.node < _DONE)[:, 0]
+            if not len(live):
                 break
-            if step % 8 == 7 and 2 * live < self.node.numel():
-                self._compact()
-            else:
-                if inner.numel():
-                    self._descend(inner)
-                if leaf.numel():
-                    self._test(leaf, any_hit)
-            step += 1
-        self._retire(slice(None))
-        lanes, *found = (torch.cat(x) for x in zip(*self.finished, strict=True))
-        hit = found[1] >= 0
-        return lanes[hit], [x[hit] for x in found]
+            if 8 * len(live) < 7 * len(self.node):
+                self._compact(live)
+        self._store()
+        return self.found
 
-    def _retire(self, which: Tensor | slice) -> None:
-        self.finished.append(tuple(x[which] for x in (self.lanes, self.t, self.prim, self.u, self.v)))
+    def _store(self) -> None:
+        """Store the hits of the lanes in those of all rays."""
+        if self.lanes is None:
+            self.found = self._hits()
+        else:
+            for all_rays, value in zip(self.found, self._hits(), strict=True):
+                all_rays[self.lanes] = value
 
-    def _compact(self) -> None:
-        """Move finished lanes out of the state."""
-        done = self.node == _DONE
-        self._retire(done)
-        keep = torch.nonzero(~done)[:, 0]
-        self.rays = self.rays.take(keep)
-        self.lanes, self.t, self.prim = self.lanes[keep], self.t[keep], self.prim[keep]
-        self.u, self.v, self.node, self.top = self.u[keep], self.v[keep], self.node[keep], self.top[keep]
-        self.stack = self.stack[:, keep]
+    def _compact(self, live: Tensor) -> None:
+        """Store all hits, and go on with the lanes ``live`` alone."""
+        self._store()
+        self.lanes = live if self.lanes is None else self.lanes[live]
+        self.rays = self.rays.take(live)
+        self.t, self.prim, self.u, self.v = (x[live] for x in self._hits())
+        self.node, self.top, self.stack = self.node[live], self.top[live], self.stack[:, live]
 
-    def _pop(self, lanes: Tensor) -> Tensor:
-        """Pop the next node of lanes; row 0 of the stack holds ``_DONE``."""
-        top = self.top[lanes]
-        self.top[lanes] = (top - 1).clamp(min=0)
-        return self.stack[top, lanes].long()
+    def _descend(self) -> None:
+        """Move the lanes at inner nodes: to the nearer child that the ray hits, else to the last node on the stack."""
+        inner = (self.node >= 0) & (self.node < _DONE)
+        node = torch.where(inner, self.node, 0)
+        near, hit = _slabs(self.rays, self.boxes[:, node].view(2, 6, -1), self.t)
+        first, second = self.children[:, node].unbind(0)
+        both, either, swap = hit[0] & hit[1], hit[0] | hit[1], near[1] < near[0]
+        top = self.top[None]
+        popped = self.stack.gather(0, top)[0]
+        # All lanes write the farther child above their entries; where it is no entry, the next one replaces it.
+        self.stack.scatter_(0, top + 1, torch.where(swap, first, second)[None])
+        child = torch.where(torch.where(both, swap, hit[1]), second, first)
+        self.node = torch.where(inner, torch.where(either, child, popped), self.node)
+        step = torch.where(both, 1, torch.where(either, 0, -1))
+        self.top = torch.where(inner, self.top + step, self.top).clamp_(min=0)
 
-    def _descend(self, lanes: Tensor) -> None:
-        node = self.node[lanes]
-        ray, box, t = self.rays.take(lanes), self.boxes[:, node], self.t[lanes]
-        near0, hit0 = _slabs(ray, box[0:6], t)
-        near1, hit1 = _slabs(ray, box[6:12], t)
-        first, second = self.children[:, node].long().unbind(0)
-        swap = near1 < near0
-        nearer, farther = torch.where(swap, second, first), torch.where(swap, first, second)
-        both = hit0 & hit1
-        deeper = torch.nonzero(both)[:, 0]
-        rows = self.top[lanes[deeper]] + 1
-        self.stack[rows, lanes[deeper]] = farther[deeper].int()
-        self.top[lanes[deeper]] = rows
-        self.node[lanes] = torch.where(both, nearer, torch.where(hit0, first, second))
-        none = lanes[~(hit0 | hit1)]
-        self.node[none] = self._pop(none)
-
-    def _test(self, lanes: Tensor, any_hit: bool) -> None:
-        prim = self.order[~self.node[lanes]].long()
-        t, u, v = distances(self.rays.take(lanes), prim, self.corners, self.rows, self.quadrics, self.counts)
-        best = self.t[lanes]
-        better = (t > 0) & ((t < best) | ((t == best) & (prim < self.prim[lanes])))
-        won = lanes[better]
-        self.t[won], self.prim[won], self.u[won], self.v[won] = t[better], prim[better], u[better], v[better]
-        self.node[lanes] = self._pop(lanes)
+    def _test(self, any_hit: bool) -> None:
+        """Test the primitives of the lanes at leaves, and move them to the last node on the stack."""
+        leaf = self.node < 0
+        prim = self.order[torch.where(leaf, ~self.node, 0)].long()
+        t, u, v = distances(self.rays, prim, self.corners, self.rows, self.quadrics, self.counts)
+        better = leaf & (t > 0) & ((t < self.t) | ((t == self.t) & (prim < self.prim)))
+        self.t, self.prim = torch.where(better, t, self.t), torch.where(better, prim, self.prim)
+        self.u, self.v = torch.where(better, u, self.u), torch.where(better, v, self.v)
+        self.node = torch.where(leaf, self.stack.gather(0, self.top[None])[0], self.node)
+        self.top = torch.where(leaf, self.top - 1, self.top).clamp_(min=0)
         if any_hit:
-            self.node[won] = _DONE
+            self.node = torch.where(better, _DONE, self.node)
 
 
 def _slabs(ray: Rays, box: Tensor, t_max: Tensor) -> tuple[Tensor, Tensor]:
-    """Return entry distances into boxes ``(6, N)``, and True where they are hit before ``t_max`` (conservative)."""
-    a, b = (box[0:3] - ray.o) * ray.inverse, (box[3:6] - ray.o) * ray.inverse
-    near = torch.minimum(a, b).amax(0).clamp(min=0.0)
-    far = torch.minimum(torch.maximum(a, b).amin(0), t_max) * _SLACK
+    """Return entry distances into boxes ``(2, 6, N)``, and True where they are hit before ``t_max`` (conservative)."""
+    a, b = (box[:, 0:3] - ray.o) * ray.inverse, (box[:, 3:6] - ray.o) * ray.inverse
+    near = torch.minimum(a, b).amax(1).clamp(min=0.0)
+    far = torch.minimum(torch.maximum(a, b).amin(1), t_max) * _SLACK
     return near, near <= far
 
 

@@ -122,7 +122,8 @@ class Sampler:
         index_bits = max(most_points - 1, 0).bit_length()
 
         def number(value: int) -> Tensor:
-            return torch.tensor(value, dtype=torch.int64, device=device)
+            # A fill, for which the host does not wait as for a copy to the device.
+            return torch.full((), value, dtype=torch.int64, device=device)
 
         return SamplerTensors(
             seeds=torch.tensor(seeds, dtype=torch.int32, device=device),

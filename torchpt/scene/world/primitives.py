@@ -106,12 +106,13 @@ def copy_maps(
         name: torch.linalg.inv(parameters[f"{name}.to_world"].double()) for name in {copy.of for copy in copies}
     }
     lanes_to_scene = space.matrix()
+    scene_to_lanes = torch.linalg.inv(lanes_to_scene)
     columns = []
     for copy in copies:
         start, size = spans[copy.of]
         pose = parameters[f"{copy.name}.to_world"].double()
         # Read from the right: lanes to scene, to the mesh's own space, to the copy in the scene, back to lanes.
-        matrix = (torch.linalg.inv(lanes_to_scene) @ pose @ from_scene[copy.of] @ lanes_to_scene)[:3]
+        matrix = (scene_to_lanes @ pose @ from_scene[copy.of] @ lanes_to_scene)[:3]
         columns.append(torch.cat((matrix.reshape(-1), matrix.new_tensor([start, size, next_id]))))
         next_id += size
     return torch.stack(columns, 1)
@@ -179,6 +180,7 @@ class Primitives:
         return torch.repeat_interleave(
             torch.tensor(values, dtype=torch.int64, device=device),
             torch.tensor(repeats, dtype=torch.int64, device=device),
+            output_size=sum(repeats),
         )
 
     def geometry(self, copies: Tensor | None) -> Geometry:
