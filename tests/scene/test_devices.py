@@ -27,6 +27,7 @@ def card(monkeypatch):
     """A machine with two CUDA devices."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: CARD)
     monkeypatch.setattr(device_checks, "driver_version", lambda: DRIVER)
 
@@ -62,7 +63,7 @@ def test_a_damaged_result_counts_as_none(tmp_path):
 @pytest.mark.usefixtures("card")
 def test_auto_takes_a_card_that_was_checked(capfd):
     record(CheckResult(CARD, DRIVER, True))
-    assert device_of("auto") == torch.device("cuda")
+    assert device_of("auto") == torch.device("cuda:1")
     assert capfd.readouterr().err == ""
 
 
@@ -83,7 +84,7 @@ def test_auto_says_once_why_it_takes_the_cpu(capfd):
 
 @pytest.mark.usefixtures("card")
 def test_cuda_is_taken_by_name_without_a_check():
-    assert device_of("cuda") == torch.device("cuda") and device_of("cuda:1").index == 1
+    assert device_of("cuda") == torch.device("cuda:1") and device_of("cuda:0") == torch.device("cuda:0")
     with pytest.raises(torchpt.RenderError) as caught:
         device_of("cuda:2")
     assert str(caught.value) == "render.device: cuda:2 is not available; this machine has 2 CUDA devices, from cuda:0"

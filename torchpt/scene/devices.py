@@ -11,7 +11,7 @@ __all__ = ["device_of"]
 
 
 def device_of(name: str | torch.device) -> torch.device:
-    """Return the device for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
+    """Return the device for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``; a CUDA device with its index, as tensors have it.
 
     ``auto`` takes CUDA only where ``scripts/first_gpu.py`` has found its kernels right with this card and driver. Where there
     is a CUDA device and it was not checked, one line on stderr says so.
@@ -37,7 +37,12 @@ def device_of(name: str | torch.device) -> torch.device:
             raise RenderError(
                 f"render.device: {name} is not available; this machine has {count} CUDA devices, from cuda:0"
             )
+        return device if device.index is not None else _current_cuda_device()
     return device
+
+
+def _current_cuda_device() -> torch.device:
+    return torch.device("cuda", torch.cuda.current_device())
 
 
 def _auto() -> torch.device:
@@ -50,7 +55,7 @@ def _auto() -> torch.device:
         return cpu
     result = device_checks.last_check()
     if result is not None and result.passed:
-        return torch.device("cuda")
+        return _current_cuda_device()
     card, driver = device_checks.card_name(), device_checks.driver_version()
     if result is None:
         reason = "was never checked: scripts/first_gpu.py does that"

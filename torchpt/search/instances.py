@@ -139,7 +139,7 @@ class Instanced(Accel):
                 pairs = zip(lane[order].split(sizes), copy[order].split(sizes), strict=True)
             else:
                 pairs = ((lane, copy),)
-            groups += [(lanes[of_mesh], mesh, copies) for mesh, (of_mesh, copies) in enumerate(pairs) if len(of_mesh)]
+            groups += [(lanes[rays_of_mesh], mesh, on) for mesh, (rays_of_mesh, on) in enumerate(pairs) if len(on)]
         return groups
 
     def _to_mesh_space(self, o: Tensor, d: Tensor, lanes: Tensor, copy: Tensor) -> tuple[Tensor, Tensor]:
