@@ -451,8 +451,8 @@ FAULTS = (
         "scene/world/primitives.py",
         "scene shapes search",
         "copy_maps",
-        "torch.linalg.inv(lanes_to_scene) @ pose @ from_scene[copy.of] @ lanes_to_scene",
-        "torch.linalg.inv(lanes_to_scene) @ pose @ lanes_to_scene",
+        "scene_to_lanes @ pose @ from_scene[copy.of] @ lanes_to_scene",
+        "scene_to_lanes @ pose @ lanes_to_scene",
         "an instance of a mesh that has a transform is moved by both transforms",
     ),
     Fault(

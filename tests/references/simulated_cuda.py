@@ -556,6 +556,8 @@ def simulated_cuda(cards: int = 1, name: str = "Simulated GPU") -> Iterator[Log]
         for place, values in (
             (torch.cuda, _cuda()),
             (torch, _functions()),
+            # `nn.Module.to` replaces parameters: wrappers cannot become the data of CPU tensors.
+            (torch, {"_has_compatible_shallow_copy_type": nothing}),
             (torch.Tensor, _methods()),
             # These run code of the package, and calls in there are looked at for themselves.
             (torch.autograd, {"has_torch_function": nothing}),
