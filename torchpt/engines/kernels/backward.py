@@ -360,16 +360,17 @@ class KernelsBackward(KernelsEngine):
 
     Args:
         kernels: of the backward pass.
+        calls: see :class:`KernelsEngine`.
     """
 
     keeps_splats = False  # their VJP needs the vertices, not the splats
 
-    def __init__(self, kernels: VjpKernels) -> None:
-        super().__init__(kernels)
+    def __init__(self, kernels: VjpKernels, calls: Any = None) -> None:
+        super().__init__(kernels, calls=calls)
         self.back = kernels
         self._levels: list[Paths] = []  # memory of the vertices of a walk that are kept
-        self._sample_slots = Memory(kernels.slots.count)
-        self._results = Memory(1)  # rows that a VJP's kernel writes
+        self._sample_slots = self.calls.memory(kernels.slots.count)
+        self._results = self.calls.memory(1)  # rows that a VJP's kernel writes
         self._sorted_slots = Memory(2)  # slots of a list's lanes, sorted, and scratch memory
         self._slot_is_taken = np.zeros(CAPACITY, np.uint8)  # scratch memory for sorting
         self._first = 1  # depth of the first vertex of the walk
@@ -477,7 +478,7 @@ class KernelsBackward(KernelsEngine):
     def _results_of(self, kernel: Kernel) -> Memory:
         """Return memory with at least the rows that a kernel writes."""
         rows = max((max(index + 1, first + width) for _, index, first, width in kernel.program.sums), default=1)
-        return self._results if len(self._results.words) >= rows else Memory(rows)
+        return self._results if len(self._results.words) >= rows else self.calls.memory(rows)
 
     def _vjp_eagerly(self, key: tuple, paths: Paths, places: Memory, count: int, *, added: bool) -> None:
         """Pull cotangents back through a stage by tensor operations, if it cannot be compiled; arguments as above."""
@@ -542,6 +543,10 @@ class KernelsBackward(KernelsEngine):
             pairs = [(x, first(name)) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
             if not pairs:
                 return
-            cotangents = [torch.from_numpy(self._sample_slots.floats[row : row + 3, :n].copy()) for _, row in pairs]
+            cotangents = [self._ray_cotangents(row, n) for _, row in pairs]
             gradients = torch.autograd.grad([x for x, _ in pairs], self._tables(), cotangents, allow_unused=True)
         self.sums.add_each(gradients)
+
+    def _ray_cotangents(self, row: int, n: int) -> Tensor:
+        """Return a copy of three rows of the slots ``(3, n)``."""
+        return torch.from_numpy(self._sample_slots.floats[row : row + 3, :n].copy())
