@@ -83,10 +83,10 @@ class Renderer(nn.Module):
             ]
             free = {
                 _key(name): nn.Parameter(parametrization.inverse(start).clone())
-                for name, parametrization, start in zip(self.names, ranges, starts, strict=True)
+                for name, parametrization, start in zip(self.names, parametrizations, starts, strict=True)
             }
         # `free` has the numbers that are optimized, `ranges` maps them to parameters; both names are in saved state dicts
-        self.ranges, self.free = nn.ModuleList(ranges), nn.ParameterDict(free)
+        self.ranges, self.free = nn.ModuleList(parametrizations), nn.ParameterDict(free)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
     @expand_signature
