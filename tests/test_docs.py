@@ -47,6 +47,34 @@ def test_the_last_column_of_the_glossary_is_in_the_code() -> None:
     assert found > 100
 
 
+@pytest.mark.parametrize("name", ["architecture.md", "gradients.md", "lanes.md"])
+def test_explanations_name_what_is_in_the_code(name: str) -> None:
+    package = DOCS.parent / "torchpt"
+    sources = {str(path.relative_to(DOCS.parent)): path.read_text(encoding="utf-8") for path in package.rglob("*.py")}
+    tests = [
+        str(path.relative_to(DOCS.parent))
+        for folder in ("tests", "scripts")
+        for path in (DOCS.parent / folder).rglob("*.py")
+    ]
+    found = 0
+    for word in re.findall(r"`([^`\s]+)`", (DOCS / "explanations" / name).read_text(encoding="utf-8")):
+        if re.fullmatch(r"[\w/]+\.py", word):
+            assert any(f"/{path}".endswith(f"/{word}") for path in [*sources, *tests]), (
+                f"{name}: there is no file {word}"
+            )
+        elif member := re.fullmatch(r"([A-Z]\w+)\.(\w+)", word):
+            owners = [code for code in sources.values() if re.search(rf"^class {member[1]}\b", code, re.MULTILINE)]
+            assert any(re.search(rf"\b{member[2]}\b", code) for code in owners), f"{name}: there is no {word}"
+        elif re.fullmatch(r"_?[a-z]+(_[a-z]+)+", word):
+            assert any(re.search(rf"\b{word}\b", code) for code in sources.values()), (
+                f"{name}: {word} is not in the code"
+            )
+        else:
+            continue
+        found += 1
+    assert found > 10
+
+
 def test_a_changed_table_is_noticed() -> None:
     text = (DOCS / "reference/lights.md").read_text(encoding="utf-8")
     assert page(text.replace("power per solid angle", "power")) == text
