@@ -87,7 +87,10 @@ def cuda_of_driver() -> tuple[int, int] | None:
 
 
 def why_unavailable() -> str | None:
-    """Return why torch finds no CUDA device, as a clause for the end of a sentence; None if it finds one."""
+    """Return why torch can use no CUDA device, as a clause for the end of a sentence; None if it can."""
+    if torch.cuda._is_in_bad_fork():
+        remedy = "multiprocessing_context='spawn' starts workers that may use it"
+        return f"this process was forked from one that uses CUDA ({remedy})"
     with warnings.catch_warnings():  # torch warns, in a whole paragraph, about a driver that is too old
         warnings.simplefilter("ignore")
         if torch.cuda.is_available():

@@ -50,7 +50,7 @@ def _auto() -> torch.device:
     cpu = torch.device("cpu")
     missing = device_checks.why_unavailable()
     if missing is not None:
-        if device_checks.driver_too_old():
+        if torch.cuda._is_in_bad_fork() or device_checks.driver_too_old():
             warn_once(f"torchpt: device=auto takes the CPU, as {missing}")
         return cpu
     result = device_checks.last_check()
