@@ -22,6 +22,8 @@ FILM = {"width": 6, "height": 5, "filter": "box"}
 #: Large enough for blocks of pilots.
 LARGE = {"width": 16, "height": 12}
 WALL = "materials.wall.reflectance"
+#: Light on all surfaces, without which the error of a picture is not known.
+SKY = {"sky": {"type": "constant", "radiance": 0.3}}
 
 #: Called with a device and an empty folder.
 Feature = Callable[[str, Path], list[Tensor]]
@@ -33,11 +35,14 @@ def options(device: str, **changes: Any) -> dict[str, Any]:
 
 
 def picture(**changes: Any) -> Feature:
-    """Return a feature: the picture with these options, and its layers."""
+    """Return a feature: the picture with these options, its layers, and the estimate of its error."""
 
     def call(device: str, folder: Path) -> list[Tensor]:
-        found = torchpt.render(torchpt.load(room(1), device), full=True, **options(device, **changes))
-        return [found.image, *found.layers.values()]
+        scene = torchpt.load({**room(1), "lights": SKY}, device)
+        found = torchpt.render(scene, full=True, **options(device, **changes))
+        assert found.relmse_unknown == ""
+        error = [] if found.relmse is None else [torch.tensor(found.relmse)]
+        return [found.image, *found.layers.values(), *error]
 
     return call
 
@@ -121,8 +126,9 @@ def resumed(**changes: Any) -> Feature:
 
     def call(device: str, folder: Path) -> list[Tensor]:
         wish = {"checkpoint": str(folder / f"{device}.npz"), **changes}
-        torchpt.render(torchpt.load(room(1), device), **options(device, spp=4, **wish))
-        return [torchpt.render(torchpt.load(room(1), device), resume=True, **options(device, spp=8, **wish))]
+        scene = torchpt.load({**room(1), "lights": SKY}, device)
+        torchpt.render(scene, **options(device, spp=4, **wish))
+        return [torchpt.render(scene, resume=True, **options(device, spp=8, **wish))]
 
     return call
 
