@@ -27,11 +27,6 @@ def test_only_rounding_differs_between_devices(pictures):
     assert abs(float(pictures["cpu"].mean() / pictures["cuda"].mean()) - 1) < 2e-3
 
 
-def test_there_are_no_kernels():
-    with pytest.raises(torchpt.SceneError, match="render.compile: expected auto or off"):
-        torchpt.render(torchpt.load("cornell_box", "cuda"), spp=1, film=FILM, compile="on")
-
-
 def test_gradients_agree_with_the_cpu():
     grads = []
     for device in ("cpu", "cuda"):
