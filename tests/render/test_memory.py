@@ -73,7 +73,7 @@ def map_in_pieces(which: Callable[[int], bool], error: Callable[[], Exception]) 
         return work
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(TensorsForward, "_take", failing(TensorsForward._take))
+        patched.setattr(TensorsForward, "_render_piece", failing(TensorsForward._render_piece))
         yield counted
 
 

@@ -1,6 +1,9 @@
 """Implementations that engines register for dispatched functions of physics.
 
-On a CPU, functions of whole tensors run as kernels of the lane compiler. Two others have another form while a stage is traced.
+A *dispatched* function (:mod:`torchpt.core.dispatch`) asks its registered implementations first; one that answers
+NotImplemented leaves the call to the function itself. On a CPU some functions of whole tensors run as kernels of the lane
+compiler (:class:`~torchpt.compiler.function.Lanewise`). Two others have another form while a stage is traced for the lane
+compiler.
 """
 
 from __future__ import annotations
@@ -25,17 +28,18 @@ from torchpt.physics.world import World
 __all__: list[str] = []
 
 for _draw in (samplers.draw_1d, samplers.draw_2d, samplers.draw_further):
-    _draw.register(Lanewise(_draw.function, ("key",), ("salt",)))
+    _draw.register(Lanewise(_draw.function, lanes=("key",), uniforms=("salt",)))
 
-solid_angle.sample.register(Lanewise(solid_angle.sample.function, ("row", "x", "u"), detached=True))
-solid_angle.angles.register(Lanewise(solid_angle.angles.function, ("row", "x"), detached=True))
-tree.sample.register(Lanewise(tree.sample.function, ("x", "n", "u"), detached=True))
-tree.probability.register(Lanewise(tree.probability.function, ("row", "x", "n"), detached=True))
+solid_angle.sample.register(Lanewise(solid_angle.sample.function, lanes=("row", "x", "u"), detached=True))
+solid_angle.angles.register(Lanewise(solid_angle.angles.function, lanes=("row", "x"), detached=True))
+tree.sample.register(Lanewise(tree.sample.function, lanes=("x", "n", "u"), detached=True))
+tree.probability.register(Lanewise(tree.probability.function, lanes=("row", "x", "n"), detached=True))
 
 hashing.reverse_bits.register(bits.reverse_bits)
 
 
 def _times_opacity_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Any:
+    """Return opacities ``(N,)``, times the texture in lanes where the mask ``textured`` is set, while a stage is traced."""
     if not tracing():
         return NotImplemented
     # Every lane of a kernel takes the same steps, so the texture is read in all lanes and selected by the mask.

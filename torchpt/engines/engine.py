@@ -51,6 +51,7 @@ __all__ = [
     "why_no_kernels",
 ]
 
+#: Of a backward engine: its populations, its marks, and the gradient sums that it adds to.
 P = TypeVar("P", bound=Population)
 M = TypeVar("M")
 S = TypeVar("S", contravariant=True)
@@ -135,12 +136,13 @@ def kernels_of(wave: Wave, own: Sequence[int], before: Kernels | None = None) ->
         before: kernels of another render; its tables are shared where they were made of the same tensors.
     """
     packets = uses_packets(wave)
+    # the search is part of the stages (fused) if it is by packets, and nothing has to happen between search and stage
     opaque = wave.context.world.materials.opacity is None and not wave.integrator.has_own_transmit
     fused = packets and opaque and wave.first_surface is None and not wave.integrator.splats
     kernels = Kernels(wave, packets, fused, before, fixed=not own)
     eager = kernels.probe(own) if wave.integrator.light else {}
     if eager and kernels.fused:  # stages that run as tensor operations need searches between the stages
-        kernels = Kernels(wave, packets, False)
+        kernels = Kernels(wave, packets, fused=False)
     kernels.eager = eager
     return kernels
 
@@ -241,7 +243,8 @@ class BackwardKernels(Protocol):
     """The kernels of a backward pass.
 
     Attributes:
-        eager_vjps: stages that run as tensor operations (``("bounce", model, ...)``, ``("emit", ...)``), with the reasons.
+        eager_vjps: stages whose VJP runs as tensor operations, since it cannot be compiled, with the reasons. Keys begin with
+            the name of the stage: ``("bounce", model, ...)``, ``("emit", ...)``.
     """
 
     eager_vjps: dict[tuple[Any, ...], str]
@@ -256,8 +259,9 @@ class BackwardKernels(Protocol):
 
 
 def uses_packets(wave: Wave) -> bool:
-    """Return True where packet kernels search the primitives; they do not support quadrics."""
-    return wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
+    """Return True if packet kernels search the primitives, inside or between the stages; they do not support quadrics."""
+    *_, quadrics = wave.context.world.geometry.counts
+    return wave.accel.name == "brute" and not quadrics
 
 
 def backward_tensors(tape: Tape, cotangent: Tensor | None) -> Backward[Any, Any, GradientSums]:

@@ -1,7 +1,11 @@
 """The engine of tensor operations: any device, float32 or float64, with or without autograd, models of any kind.
 
-It is the readable reference for kernels. Each method is a few operations on all lanes of a wave, or a stage
-(:mod:`torchpt.paths.vertex`) on some of the lanes.
+It is the readable reference for kernels. A *wave* is a range of pixels and samples whose paths are traced together, one path a
+*lane*; :func:`torchpt.paths.walk.walk` calls the methods of the engine in their order along a path. Each method is a few
+operations on all lanes, or a stage (:mod:`torchpt.paths.vertex`) on some of the lanes.
+
+N is the number of samples of a wave, n that of the lanes at hand: ended paths leave the population, so lanes move, and
+``PathState.lane`` says which sample a path belongs to.
 """
 
 from __future__ import annotations
@@ -39,10 +43,11 @@ class RaysInTransit:
     """Rays that have passed surfaces, or may pass their next hit.
 
     Attributes:
-        lanes: ``(n,)`` their lanes in the population.
+        lanes: ``(n,)`` int64, their lanes in the population.
         state: the rays, with origins behind the surfaces that they passed.
         hit: their next hits.
-        before: ``(n,)`` distance from the start of the path segment to the origin.
+        before: ``(n,)`` distance from the start of the path segment (the vertex, or where a medium scattered the ray) to the
+            present origin.
         step: number of steps so far.
     """
 
@@ -64,13 +69,14 @@ class Paths:
         in_transit: rays that may still pass their hits; None where everything is opaque.
         ends: lanes that hit an emitter or nothing, once they are sorted.
         groups: index and lanes of each BSDF model that was hit; None before lanes are sorted.
-        pending: shadow rays from the vertex before, with the first lane of each group.
+        pending: shadow rays from the vertex before, which are not traced yet: for each BSDF model of that vertex the first lane
+            of its paths, and one shadow ray for each of them.
         transmittance: ``(n,)`` of each of ``pending``, once they are traced.
-        splats: splats from the vertex before, with the lanes of the wave that they come from.
-        splat_transmittance: ``(n,)`` of each of ``splats``, likewise.
-        emissions: lanes and emission at this vertex, where the engine keeps them.
-        outputs: index of the BSDF model, lanes of the wave and stage outputs of the vertex before, where the engine keeps them.
-        passed: ``transmittance`` and ``splat_transmittance`` of the shadow rays that leave this vertex, in a backward engine.
+        splats: splats from the vertex before, with the samples ``(n,)`` that they come from.
+        splat_transmittance: ``(n,)`` of each of ``splats``, once their shadow rays are traced.
+        emissions: lanes and emission at this vertex, if the engine keeps them.
+        outputs: index of the BSDF model, samples ``(n,)`` and stage outputs of the vertex before, if the engine keeps them.
+        passed: in a backward engine ``transmittance`` and ``splat_transmittance`` of the shadow rays that leave this vertex.
     """
 
     state: PathState
@@ -101,11 +107,11 @@ class TensorsEngine:
         wave: stages, acceleration structure and settings.
         lanes: number of camera samples.
         tally: counts rays and truncated paths.
-        keeps: True: populations keep stage outputs, for an observer.
+        keeps: True: populations keep stage outputs (``Paths.emissions``, ``Paths.outputs``), for an observer.
         splats: a list to append splats to; None: splats are dropped.
 
     Attributes:
-        radiance: ``(3, lanes)`` radiance of samples whose paths have ended.
+        radiance: ``(3, lanes)`` radiance of samples whose paths have ended, by sample.
         lost: ``(lanes,)`` bool, True for samples with a splat that is not finite; None: the integrator has no splats.
     """
 
@@ -153,10 +159,10 @@ class TensorsEngine:
     def _may_transmit(self, state: PathState, hit: Hit) -> Tensor:
         """Return the lanes that the stage ``transmit`` runs for."""
         if self.wave.integrator.has_own_transmit:
-            some = state.t_max > 0
+            may_pass = state.t_max > 0
         else:
-            some = (hit.prim >= 0) & non_opaque(self.world, hit.prim)
-        return some.nonzero().squeeze(1)
+            may_pass = (hit.prim >= 0) & non_opaque(self.world, hit.prim)
+        return may_pass.nonzero().squeeze(1)
 
     def transmit(self, paths: Paths) -> bool:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -165,36 +171,37 @@ class TensorsEngine:
             return False
         salt = salts(paths.depth, in_transit.lanes.device, in_transit.step)
         out = self.wave.integrator.transmit(self.context.at(salt), VertexInput(in_transit.state, in_transit.hit))
-        hit, on = paths.hits, out.on.nonzero().squeeze(1)
+        hit, passing = paths.hits, out.on.nonzero().squeeze(1)  # indices into the rays in transit
         if out.chance is not None:
             chance = torch.ones_like(hit.t) if hit.chance is None else hit.chance
             hit = replace(
                 hit, chance=chance.index_copy(0, in_transit.lanes, take(chance, in_transit.lanes) * out.chance)
             )
-        home, state = take(in_transit.lanes, on), replace(rows(in_transit.state, on), o=take(out.o, on))
-        before = take(in_transit.before, on) + take(in_transit.hit.t, on)
-        if out.state is not None and out.scattered is not None:
-            turned, own = take(out.scattered, on), rows(out.state, on)
-            state = map_leaves(lambda new, old: torch.where(turned, new, old), own, state)
-            before = torch.where(turned, 0.0, before)
-            some = turned.nonzero().squeeze(1)
-            there, own = take(home, some), rows(own, some)
-            check_fields(self.wave.integrator, own)
-            paths.state = map_leaves(lambda all, new: all.index_copy(-1, there, new), paths.state, own)
+        # From here on of the rays that pass: their lanes in the population, the rays behind the surface, their distance.
+        lanes, state = take(in_transit.lanes, passing), replace(rows(in_transit.state, passing), o=take(out.o, passing))
+        before = take(in_transit.before, passing) + take(in_transit.hit.t, passing)
+        if out.state is not None and out.scattered is not None:  # in a medium: those paths go on with a new state
+            scattered, new_state = take(out.scattered, passing), rows(out.state, passing)
+            state = map_leaves(lambda new, old: torch.where(scattered, new, old), new_state, state)
+            before = torch.where(scattered, 0.0, before)
+            index = scattered.nonzero().squeeze(1)
+            scattered_lanes, new_state = take(lanes, index), rows(new_state, index)
+            check_fields(self.wave.integrator, new_state)
+            paths.state = map_leaves(lambda old, new: old.index_copy(-1, scattered_lanes, new), paths.state, new_state)
         behind = self._nearest(state.o, state.d.detach(), state.t_max)
         # Distances are counted from the start of the segment; the offset across a surface is below their rounding error.
         values = {"t": behind.t + before, "prim": behind.prim, "u": behind.u, "v": behind.v}
-        paths.hit = replace(hit, **{name: getattr(hit, name).index_copy(0, home, x) for name, x in values.items()})
+        paths.hit = replace(hit, **{name: getattr(hit, name).index_copy(0, lanes, x) for name, x in values.items()})
         again = self._may_transmit(state, behind)
         state = rows(state, again)
-        lanes, before = take(home, again), take(before, again)
+        lanes, before = take(lanes, again), take(before, again)
         paths.in_transit = RaysInTransit(lanes, state, rows(behind, again), before, in_transit.step + 1)
         return True
 
     def hits(self, state: PathState, depth: int) -> Hit:
         """Return the hits of rays on their way to a vertex, behind all surfaces that they pass; the rays are not counted."""
         paths = Paths(state, depth)
-        find_hits(TensorsEngine(self.wave, 0), paths)
+        find_hits(TensorsEngine(self.wave, lanes=0), paths)  # another engine, so that this one counts no rays
         return paths.hits
 
     def sort(self, paths: Paths) -> Counts:
@@ -214,19 +221,18 @@ class TensorsEngine:
         self._end(paths, paths.ends.missed)
 
     def _gather(self, paths: Paths, index: Tensor, stage: Callable[[StageContext, VertexInput], Emission]) -> None:
-        """Run an emission stage on the lanes ``index`` and add the contributions."""
-        found = stage(self._context(paths), self._input(paths, index))
-        paths.state.radiance.scatter_add_(1, index.expand(3, -1), found.brought)
+        """Run an emission stage on the lanes ``index`` and add the contributions to the radiance of their paths."""
+        emission = stage(self._context(paths), self._input(paths, index))
+        paths.state.radiance.scatter_add_(1, index.expand(3, -1), emission.brought)
         if self.keeps:
-            paths.emissions.append((index, found))
+            paths.emissions.append((index, emission))
 
     def _context(self, paths: Paths, roulette: float = 0.0) -> StageContext:
         """Return the stage context of a vertex."""
-        follow_ray, salt = (
-            follows_ray(self.plan, self.world, paths.depth),
-            salts(paths.depth, paths.state.lane.device),
-        )
-        return self.context.at(salt, follow_ray, roulette, partial(self.hits, depth=paths.depth + 1))
+        follow_ray = follows_ray(self.plan, self.world, paths.depth)
+        salt = salts(paths.depth, paths.state.lane.device)
+        search = partial(self.hits, depth=paths.depth + 1)
+        return self.context.at(salt, follow_ray=follow_ray, roulette=roulette, search=search)
 
     def _input(self, paths: Paths, index: Tensor) -> VertexInput:
         return VertexInput(rows(paths.state, index), rows(paths.hits, index))
@@ -238,7 +244,7 @@ class TensorsEngine:
         leaving: list[PathState] = []
         next_hit: list[Hit] = []
         after = Paths(paths.state, paths.depth + 1)
-        start = 0
+        start = 0  # the first lane, in the new population, of the paths of a model
         for model, index in paths.groups:
             output = bounce(context, model, self._input(paths, index))
             check_output(self.wave.integrator, output)
@@ -260,18 +266,19 @@ class TensorsEngine:
 
     def occlude(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
-        whole = paths.state.radiance
+        # The radiance of all lanes is put together of lanes with a shadow ray and of those between, which stay as they are.
+        radiance = paths.state.radiance
         parts, done = [], 0
         for start, shadow in paths.pending:
             paths.transmittance.append(self.transmittance(shadow))
             end = start + len(shadow.t_max)
             if start > done:
-                parts.append(whole[:, done:start])
-            parts.append(torch.addcmul(whole[:, start:end], shadow.radiance, paths.transmittance[-1]))
+                parts.append(radiance[:, done:start])
+            parts.append(torch.addcmul(radiance[:, start:end], shadow.radiance, paths.transmittance[-1]))
             done = end
         if parts:
-            if done < whole.shape[1]:
-                parts.append(whole[:, done:])
+            if done < radiance.shape[1]:
+                parts.append(radiance[:, done:])
             paths.state = replace(paths.state, radiance=parts[0] if len(parts) == 1 else torch.cat(parts, 1))
         paths.pending.clear()
         for lane, splat in paths.splats:
@@ -279,15 +286,21 @@ class TensorsEngine:
             self._splat(lane, splat, paths.splat_transmittance[-1])
 
     def _splat(self, lane: Tensor, splat: Splat, transmittance: Tensor) -> None:
-        """Record splats that arrive. One that is not finite is left out and makes its sample NaN."""
+        """Record splats that reach the film. One that is not finite is left out and makes its sample NaN.
+
+        Args:
+            lane: ``(n,)`` the samples that the splats come from.
+            splat: the splats; their pixel is -1 where there is none.
+            transmittance: ``(n,)`` of their shadow rays.
+        """
         value = splat.light.radiance * transmittance
         finite = (value.detach().abs() < LARGEST).all(0)
-        comes = (splat.pixel >= 0) & (transmittance.detach() != 0)
+        arrives = (splat.pixel >= 0) & (transmittance.detach() != 0)
         assert self.lost is not None
-        self.lost = self.lost.index_copy(0, lane, take(self.lost, lane) | (comes & ~finite))
+        self.lost = self.lost.index_copy(0, lane, take(self.lost, lane) | (arrives & ~finite))
         if self.splats is not None:
-            on = (comes & finite).nonzero().squeeze(1)
-            self.splats.append(Splats(take(lane, on), take(splat.pixel, on), take(value, on)))
+            index = (arrives & finite).nonzero().squeeze(1)
+            self.splats.append(Splats(take(lane, index), take(splat.pixel, index), take(value, index)))
 
     def path_radiance(self) -> Tensor:
         """Return the radiance ``(3, lanes)`` of all samples, once all paths ended; NaN where a splat is not finite."""
@@ -305,11 +318,11 @@ class TensorsEngine:
         lanes = torch.arange(len(t_max), device=t_max.device)
         while len(lanes):
             hit = self._nearest(o, d, t_max)
-            opacity = opacity_at(self.world, o, d, hit, 0.0)
+            opacity = opacity_at(self.world, o, d, hit, miss=0.0)
             transmittance = transmittance.index_copy(0, lanes, take(transmittance, lanes) * (1.0 - opacity))
-            on = ((hit.prim >= 0) & (opacity.detach() < 1)).nonzero().squeeze(1)
-            passed, o, d = rows(hit, on), take(o, on), take(d, on)
-            lanes, t_max = take(lanes, on), (take(t_max, on) - passed.t).clamp_min(0.0)
+            passing = ((hit.prim >= 0) & (opacity.detach() < 1)).nonzero().squeeze(1)
+            passed, o, d = rows(hit, passing), take(o, passing), take(d, passing)
+            lanes, t_max = take(lanes, passing), (take(t_max, passing) - passed.t).clamp_min(0.0)
             if len(lanes):
                 with torch.no_grad():
                     o = origins_behind(self.world, o, d, passed)
@@ -317,8 +330,8 @@ class TensorsEngine:
 
     def terminate(self, paths: Paths, truncated: bool) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
-        if paths.groups is None:
-            self._end(paths, None)
+        if paths.groups is None:  # not sorted: all paths end here
+            self._end(paths, index=None)
             return
         for _, index in paths.groups:
             self._end(paths, index)
@@ -333,7 +346,10 @@ class TensorsEngine:
 
 
 def escaped(wave: Wave, state: PathState, ends: Ends) -> Tensor:
-    """Return the lanes that get the radiance of the environment: rays without a hit, but for those that a medium ended."""
+    """Return the lanes that get the radiance of the environment: rays without a hit, except for those that a medium has ended.
+
+    A medium ends a path by setting ``t_max`` to 0.
+    """
     index = ends.missed
     return index[take(state.t_max, index) > 0] if wave.integrator.has_own_transmit else index
 
@@ -354,7 +370,7 @@ def trace(
         observer: gets the callbacks of the walk; populations then keep stage outputs.
         splats: a list to append splats to; None: splats are dropped.
     """
-    engine = TensorsEngine(wave, len(state.lane), tally, observer is not None, splats)
+    engine = TensorsEngine(wave, len(state.lane), tally, keeps=observer is not None, splats=splats)
     if len(state.lane):
         walk(engine, engine.spawn(state), wave.integrator.limits, observer)
     return engine.path_radiance()
@@ -362,8 +378,8 @@ def trace(
 
 def hits(wave: Wave, state: PathState) -> Hit:
     """Return the first hits of camera rays, behind all surfaces that they pass."""
-    engine = TensorsEngine(wave, 0)
-    return engine.hits(engine.spawn(state).state, 1)
+    engine = TensorsEngine(wave, lanes=0)
+    return engine.hits(engine.spawn(state).state, depth=1)
 
 
 def weighted_radiance(
@@ -374,8 +390,9 @@ def weighted_radiance(
     splats: list[Splats] | None = None,
 ) -> Tensor:
     """Return the radiance ``(3, N)`` of camera rays times their filter weights; arguments as for :func:`trace`."""
-    found = trace(wave, state, tally, observer, splats)
-    return found * wave.weight(state) if wave.filter.signed else found
+    samples = trace(wave, state, tally, observer, splats)
+    # other filters are importance sampled, with weight 1
+    return samples * wave.weight(state) if wave.filter.signed else samples
 
 
 def radiance(
@@ -393,21 +410,25 @@ def radiance(
 
 
 class _Layers(Observer[Paths]):
-    """Evaluates layers of first surfaces, and ends the walk there."""
+    """Evaluates layers (AOVs) of first surfaces, and ends the walk there.
 
-    def __init__(self, wave: Wave, names: tuple[str, ...], follow_ray: bool) -> None:
+    Attributes:
+        values: the layers by name, each ``(C, N)``; 0 where a ray hits nothing.
+    """
+
+    def __init__(self, wave: Wave, names: tuple[str, ...], *, follow_ray: bool) -> None:
         self.names, self.context, self.centre = names, replace(wave.context, follow_ray=follow_ray), wave.centre
-        self.found: dict[str, Tensor] = {}
+        self.values: dict[str, Tensor] = {}
 
     def on_sorted(self, paths: Paths, counts: Counts) -> bool:
         """See :class:`Observer`."""
         state, hit = paths.state, paths.hits
-        self.found = {k: state.d.new_zeros(len(LAYERS[k].channels), len(state.lane)) for k in self.names}
+        self.values = {k: state.d.new_zeros(len(LAYERS[k].channels), len(state.lane)) for k in self.names}
         for model, index in paths.groups or ():
-            o, d, met = take(state.o, index), take(state.d, index), rows(hit, index)
-            here = aov.values(self.names, self.context, model, o, d, met, self.centre)
-            for name, value in here.items():
-                self.found[name].scatter_(1, index.expand(len(value), -1), value)
+            o, d = take(state.o, index), take(state.d, index)
+            of_model = aov.values(self.names, self.context, model, o, d, rows(hit, index), self.centre)
+            for name, value in of_model.items():
+                self.values[name].scatter_(1, index.expand(len(value), -1), value)
         return True
 
 
@@ -416,9 +437,9 @@ def seen(wave: Wave, names: tuple[str, ...], state: PathState, follow_ray: bool 
 
     They are not weighted by the filter. ``follow_ray``: True: points are intersected anew along their rays, for derivatives.
     """
-    engine, layer = TensorsEngine(wave, len(state.lane)), _Layers(wave, names, follow_ray)
-    walk(engine, engine.spawn(state), wave.integrator.limits, layer)
-    return layer.found
+    engine, observer = TensorsEngine(wave, len(state.lane)), _Layers(wave, names, follow_ray=follow_ray)
+    walk(engine, engine.spawn(state), wave.integrator.limits, observer)
+    return observer.values
 
 
 def layers(
@@ -433,7 +454,7 @@ def layers(
 ) -> dict[str, Tensor]:
     """Return the layers ``names`` of consecutive pixels, each ``(C, samples, pixels)``, weighted by the filter."""
     state = wave.rays(first_pixel, pixels, first_sample, samples, pixel_set)
-    found = seen(wave, names, state, follow_ray)
+    values = seen(wave, names, state, follow_ray=follow_ray)
     if wave.filter.signed:
-        found = aov.weighted(found, wave.weight(state))
-    return {name: value.view(-1, samples, pixels) for name, value in found.items()}
+        values = aov.weighted(values, wave.weight(state))
+    return {name: value.view(-1, samples, pixels) for name, value in values.items()}

@@ -1,4 +1,8 @@
-"""A forward engine of tensor operations. A piece is added to the films whole or not at all, even if an allocation fails."""
+"""The forward engine of tensor operations: samples of a picture, in *pieces* that are traced as one wave each.
+
+A piece is a range of pixels and samples (:data:`torchpt.core.memory.Span`). It is added to the films whole or not at all, even
+if an allocation fails, so that it can be rendered again with fewer lanes.
+"""
 
 from __future__ import annotations
 
@@ -39,22 +43,23 @@ class TensorsForward:
         self.wave, self.budget = wave, budget
 
     def rows(self, layers: Mapping[str, Any]) -> int:
-        """Return 0: no memory is allocated beforehand."""
+        """Return 0: no memory is allocated beforehand, the budget measures what pieces take."""
         return 0
 
     def run(self, spans: Sequence[work.SampleRange], each: Callable[[TaskResult | None], bool]) -> bool:
         """See :class:`torchpt.engines.engine.Forward`."""
         for pixel_set, first, count in spans:
             pixels = pixel_set.film.width * pixel_set.film.height
-            for _ in self.budget.run_in_chunks(partial(self._take, pixel_set), pixels, first, count):
+            for _ in self.budget.run_in_chunks(partial(self._render_piece, pixel_set), pixels, first, count):
                 if each(self._result):
                     return False
         return True
 
-    def _take(self, pixel_set: PixelSet, span: Span) -> None:
+    def _render_piece(self, pixel_set: PixelSet, span: Span) -> None:
         """Render a piece and add it to the films; if it raises, nothing was added."""
-        piece = _piece(self.wave, pixel_set, span)
-        self._result = TaskResult(piece.tally, span[1] * span[3], piece.lost, piece.light)
+        _, pixels, _, samples = span
+        piece = _computed_piece(self.wave, pixel_set, span)
+        self._result = TaskResult(piece.tally, pixels * samples, piece.lost, piece.light)
         piece.write()
 
     def release_workers(self, keeps: bool) -> None:
@@ -68,9 +73,10 @@ class Piece:
     Attributes:
         tally: counts of rays and truncated paths.
         lost: samples that were not finite.
-        light: sum of radiance before and after the clamp.
-        writes: views of films, and the new values for them.
-        splats: sums of splats, indices along their last axis, and the new values there.
+        light: sums of radiance before and after the firefly clamp; zeros without a clamp.
+        writes: views of the sums of films, and the new values for them.
+        splats: sums of splats, indices along their last axis, and the new values there
+            (:class:`~torchpt.physics.film.splats.Splats`).
     """
 
     tally: RayCounts = field(default_factory=RayCounts)
@@ -86,49 +92,50 @@ class Piece:
             RenderError: all attempts ran out of memory.
         """
         for _ in range(ATTEMPTS):
-            if fits_in_memory(self._copied):
+            if fits_in_memory(self._store):
                 return
         raise RenderError("not enough memory to add samples to the film")
 
-    def _copied(self) -> None:
-        for place, value in self.writes:
-            place.copy_(value)
-        for sums, place, value in self.splats:
-            sums.index_copy_(2, place, value)
+    def _store(self) -> None:
+        for view, value in self.writes:
+            view.copy_(value)
+        for sums, index, value in self.splats:
+            sums.index_copy_(2, index, value)
 
 
-def _piece(wave: Wave, pixel_set: PixelSet, span: Span) -> Piece:
+def _computed_piece(wave: Wave, pixel_set: PixelSet, span: Span) -> Piece:
     """Compute a piece: the samples ``span`` of a pixel set."""
     piece = Piece()
-    first, pixels, sample, samples = span
+    first_pixel, pixels, first_sample, samples = span
     if wave.integrator.light:
         splats: list[Splats] = []
         radiance = tensors.weighted_radiance(wave, wave.rays(*span, pixel_set), piece.tally, splats=splats)
         radiance = radiance.view(3, samples, pixels)
         finite = torch.isfinite(radiance).all(0)
         if not bool(finite.all()):
-            piece.lost = NonFinite.of(radiance, first, sample, wave.crop, pixel_set)
+            piece.lost = NonFinite.of(radiance, first_pixel, first_sample, wave.crop, pixel_set)
             radiance = torch.where(finite, radiance, 0.0)
         clamp = wave.integrator.clamp
         if clamp is not None:
-            before = _light(radiance, splats)
+            before = _sum_of_light(radiance, splats)
             radiance = radiance * clamp_scale(radiance, clamp)
-            splats = [replace(one, value=one.value * clamp_scale(one.value, clamp)) for one in splats]
-            before, after = torch.stack((before, _light(radiance, splats))).tolist()  # one transfer
+            splats = [replace(x, value=x.value * clamp_scale(x.value, clamp)) for x in splats]
+            before, after = torch.stack((before, _sum_of_light(radiance, splats))).tolist()  # one transfer
             piece.light = before, after
-        piece.writes += pixel_set.film.writes_of_add(radiance, first, sample)
+        piece.writes += pixel_set.film.writes_of_add(radiance, first_pixel, first_sample)
         if pixel_set.film.splats is not None and splats:
             lane, pixel, value = (
-                torch.cat([getattr(one, name) for one in splats], -1) for name in ("lane", "pixel", "value")
+                torch.cat([getattr(x, name) for x in splats], -1) for name in ("lane", "pixel", "value")
             )
-            stream = pixel_set.film.randomization_of(sample + lane // pixels)
+            # lanes run over the pixels of a sample, then over samples
+            stream = pixel_set.film.randomization_of(first_sample + lane // pixels)
             piece.splats.append(pixel_set.film.splats.writes_of_add(stream, pixel, value))
-    if pixel_set.layers:
+    if pixel_set.layers:  # AOVs, by camera rays of their own
         piece.tally.rays += pixels * samples
         for name, values in tensors.layers(wave, tuple(pixel_set.layers), *span, pixel_set).items():
-            piece.writes += pixel_set.layers[name].writes_of_add(values, first, sample)
+            piece.writes += pixel_set.layers[name].writes_of_add(values, first_pixel, first_sample)
     return piece
 
 
-def _light(radiance: Tensor, splats: Sequence[Splats]) -> Tensor:
-    return radiance.double().sum() + sum(one.value.double().sum() for one in splats)
+def _sum_of_light(radiance: Tensor, splats: Sequence[Splats]) -> Tensor:
+    return radiance.double().sum() + sum(x.value.double().sum() for x in splats)

@@ -1,4 +1,8 @@
-"""Units of work of a forward engine, and the result of a task."""
+"""Units of work of a forward engine, and the result of a task.
+
+A *pass* of a render asks an engine for some samples of every pixel of its pixel sets (:data:`SampleRange`). The engine of
+kernels cuts them into blocks of pixels (:data:`Block`), one a *task*, which threads take one after the other.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ TASKS = 6
 
 #: A pixel set, the index of the first sample of each of its pixels, and the number of samples of each.
 SampleRange = tuple[PixelSet, int, int]
-#: Part of a pixel set: the set, first pixel in it, number of pixels, first sample and number of samples of each pixel.
+#: Consecutive pixels of a pixel set: the set, first pixel, number of pixels, first sample and number of samples of each.
 Block = tuple[PixelSet, int, int, int, int]
 
 
@@ -26,12 +30,13 @@ class TaskResult:
         tally: counts of rays and truncated paths.
         samples: number of camera samples.
         lost: samples that were not finite.
-        light: sums of radiance before and after the firefly clamp, from which the summary reports the light that was lost.
-        rest: blocks that ran out of memory, to be rendered again.
+        light: sums of radiance before and after the firefly clamp, from which the summary reports the light that was lost;
+            zeros without a clamp.
+        unfinished: blocks that ran out of memory, to be rendered again.
     """
 
     tally: RayCounts
     samples: int = 0
     lost: NonFinite = field(default_factory=NonFinite)
     light: tuple[float, float] = (0.0, 0.0)
-    rest: list[Block] = field(default_factory=list)
+    unfinished: list[Block] = field(default_factory=list)

@@ -4,6 +4,9 @@ A kernel of a VJP traces a stage with its autograd tape, so operators of the bac
 do. A look-up in a differentiated table becomes an input of the lane; its gradient is written to rows beside a row of the index,
 and the engine adds them up after the kernel. Cotangents between vertices are stored in *slots* by sample: a VJP reads the
 cotangents of the rays that left the vertex, and writes those of the rays that came.
+
+*Tables* are the tensors of the scene that stages read. Their differentiated copies are the *leaves* of the tape
+(:class:`torchpt.paths.adjoint.Tape`), ``primals`` their values without derivatives, all three in the same order.
 """
 
 from __future__ import annotations
@@ -61,24 +64,32 @@ SLOTS: Fields = {
     "transmittance": ((), "f"),
     **HIT,
 }
-#: Field of slots with splats: transmittance of the latest splat.
+#: Field of slots if the integrator has splats: transmittance of the latest splat.
 _SPLAT: Fields = {"splat_transmittance": ((), "f")}
+#: Mask of a :class:`~torchpt.compiler.sinks.Scatter` that stores in every lane.
+_ALL_LANES = -1
+#: Largest leaf whose gradient may come from every lane as a whole: each lane outputs a row for each of its elements.
+_MOST_ELEMENTS = 64
 
 
 def slots_of(layout: Layout) -> Fields:
-    """Return the fields of slots, with the cotangents of the integrator's own fields."""
-    carried = layout.wave.integrator.fields
-    extra = {EXTRA + own.name: ((own.rows,) if own.rows > 1 else (), "f") for own in carried if not own.whole}
+    """Return the fields of slots, with the cotangents of the integrator's own fields; whole numbers have none."""
+    own_fields = layout.wave.integrator.fields
+    extra = {EXTRA + own.name: ((own.rows,) if own.rows > 1 else (), "f") for own in own_fields if not own.whole}
     return {**SLOTS, **extra, **(_SPLAT if layout.wave.integrator.splats else {})}
 
 
 class _RecordedGathers:
-    """Records the gathers of a trace from differentiated tables, and makes them inputs of the lane."""
+    """Records the gathers of a trace from differentiated tables, and makes them inputs of the lane.
+
+    Attributes:
+        taken: for each look-up the number of the table, the index ``(N,)``, and the values, which are autograd leaves.
+    """
 
     def __init__(self, tracer: Tracer, kernels: VjpKernels) -> None:
         self.tracer, self.kernels = tracer, kernels
         self.taken: list[tuple[int, Tensor, Tensor]] = []
-        self._known: dict[tuple[int, int], Tensor] = {}
+        self._values: dict[tuple[int, int], Tensor] = {}  # by number of the table and id of the index
 
     def take(self, table: Tensor, index: Tensor) -> Tensor | None:
         """See :class:`torchpt.math.gathers.GatherRecorder`."""
@@ -86,13 +97,13 @@ class _RecordedGathers:
         if number is None or not self.tracer.is_traced(index):
             return None
         key = number, id(index)
-        if key not in self._known:
-            primals = self.kernels.primals[number]
+        if key not in self._values:
+            primal = self.kernels.primals[number]
             with torch.no_grad():
-                found = torch.index_select(primals, primals.dim() - 1, index)
-            self._known[key] = found.detach().requires_grad_()
-            self.taken.append((number, index, self._known[key]))
-        return self._known[key]
+                values = torch.index_select(primal, primal.dim() - 1, index)
+            self._values[key] = values.detach().requires_grad_()
+            self.taken.append((number, index, self._values[key]))
+        return self._values[key]
 
     def leaves(self) -> list[Tensor]:
         """Return the gathered values as inputs of the lane, then the tables themselves."""
@@ -100,8 +111,12 @@ class _RecordedGathers:
 
 
 def bounce_vjp(trace: Trace, model: int, roulette: float, follow_ray: bool) -> Sinks:
-    """See :func:`torchpt.paths.adjoint.bounce_vjp`."""
-    kernels, tracer = _begun(trace)
+    """Pull cotangents back through the surfaces of a BSDF model, see :func:`torchpt.paths.adjoint.bounce_vjp`.
+
+    Besides sinks, a VJP sets ``trace.sums``: for each table with gradients its number, the row of the index (-1: the gradient
+    of the whole table comes from every lane), the first row of the values, and their number.
+    """
+    kernels, tracer = _begin_vjp(trace)
     salts = trace.salts()
     state, hit, rows = _inputs(trace)
     extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
@@ -113,35 +128,35 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_ray: bool) -> S
 
     integrator, cotangent = trace.layout.wave.integrator, kernels.cotangent
 
-    def landed(splat: Splat) -> tuple[Tensor, Tensor]:
+    def of_splat(splat: Splat) -> tuple[Tensor, Tensor]:
         return adjoint.splat_contributions(integrator.clamp, cotangent, splat, rows["splat_transmittance"])
 
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
-        context = kernels.taped.at(salts, follow_ray, roulette)
+        context = kernels.taped.at(salts, follow_ray=follow_ray, roulette=roulette)
         vertex = VertexInput(state, hit)
         input_cotangents = adjoint.bounce_vjp(
-            integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, gathers.leaves, landed
+            integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, gathers.leaves, of_splat
         )
-    return _stores(trace, gathers, state, input_cotangents, {})
+    return _stores(trace, gathers, state, input_cotangents, added={})
 
 
 def emit_vjp(trace: Trace, follow_ray: bool) -> Sinks:
-    """See :func:`torchpt.paths.adjoint.emission_vjp`."""
-    kernels, tracer = _begun(trace)
+    """Pull cotangents back through the emission of emitters, see :func:`torchpt.paths.adjoint.emission_vjp`."""
+    kernels, tracer = _begin_vjp(trace)
     salts = trace.salts()
     state, hit, rows = _inputs(trace)
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
-        context = kernels.taped.at(salts, follow_ray)
+        context = kernels.taped.at(salts, follow_ray=follow_ray)
         stage, vertex = trace.layout.wave.integrator.emit, VertexInput(state, hit)
         input_cotangents = adjoint.emission_vjp(stage, context, vertex, rows["radiance"], gathers.leaves)
-    return _stores(trace, gathers, state, input_cotangents, rows)
+    return _stores(trace, gathers, state, input_cotangents, added=rows)
 
 
 def escape_vjp(trace: Trace) -> Sinks:
-    """See :func:`torchpt.paths.adjoint.emission_vjp`."""
-    kernels, tracer = _begun(trace)
+    """Pull cotangents back through the emission of the environment, see :func:`torchpt.paths.adjoint.emission_vjp`."""
+    kernels, tracer = _begin_vjp(trace)
     salts = trace.salts()
     state, hit, rows = _inputs(trace)
     gathers = _RecordedGathers(tracer, kernels)
@@ -150,7 +165,7 @@ def escape_vjp(trace: Trace) -> Sinks:
         input_cotangents = adjoint.emission_vjp(
             stage, kernels.taped.at(salts), vertex, rows["radiance"], gathers.leaves
         )
-    return _stores(trace, gathers, state, input_cotangents, rows)
+    return _stores(trace, gathers, state, input_cotangents, added=rows)
 
 
 def store_hits(trace: Trace) -> Sinks:
@@ -166,7 +181,7 @@ def store_hits(trace: Trace) -> Sinks:
         if "blocked" in light and "transmittance" not in light:
             transmittance = (light["blocked"] == 0).to(torch.float32)
     rows = tuple(slots.nodes(tracer, transmittance=transmittance, **hit, **splat))
-    return Sinks(scatter=[Scatter(-1, trace.node(lane), rows, slots=True)])
+    return Sinks(scatter=[Scatter(_ALL_LANES, trace.node(lane), rows, slots=True)])
 
 
 def slots_read(kernels: VjpKernels) -> tuple[str, ...]:
@@ -175,13 +190,14 @@ def slots_read(kernels: VjpKernels) -> tuple[str, ...]:
     return (*SLOTS, *extra) if kernels.taped.plan.attached else ("radiance", "throughput", "transmittance", *extra)
 
 
-def _begun(trace: Trace) -> tuple[Any, Tracer]:
+def _begin_vjp(trace: Trace) -> tuple[Any, Tracer]:
+    """Trace derivatives from now on; return the kernels of the backward pass (:class:`VjpKernels`) and the tracer."""
     trace.tracer.graph.derivatives = True
     return trace.layout, trace.tracer
 
 
 def _inputs(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
-    """Return path state, hits, and the fields of the slots."""
+    """Return path state, hits, and the fields of the slots of the lanes' samples by name."""
     state, _ = trace.state()
     hit = trace.hit()
     tracer, lane, slots = trace.tracer, trace.node(state.lane), Rows(slots_of(trace.layout))
@@ -196,56 +212,69 @@ def _stores(
     input_cotangents: InputCotangents,
     added: dict[str, Tensor],
 ) -> Sinks:
-    """Return stores of table gradients to rows, and of cotangents of the incoming ray to slots, plus ``added`` if given."""
+    """Return the stores of a VJP.
+
+    Args:
+        trace: the trace; its ``sums`` are set.
+        gathers: look-ups in differentiated tables.
+        state: path state.
+        input_cotangents: cotangents of the stage's inputs, the results.
+        added: cotangents of the incoming ray by name, to which those found here are added; empty: they replace what the slots
+            have.
+    """
     kernels: Any = trace.layout
     tracer, graph = trace.tracer, trace.tracer.graph
     fields: dict[str, Tensor] = {}
     with tracer:
-        for name, found, like in input_cotangents.of_rays(state, attached=kernels.taped.plan.attached):
-            if found is None and added:
+        for name, cotangent, like in input_cotangents.of_rays(state, attached=kernels.taped.plan.attached):
+            if cotangent is None and added:
                 continue
-            found = torch.zeros_like(like) if found is None else found
-            fields[name] = found + added[name] if added else found
+            cotangent = torch.zeros_like(like) if cotangent is None else cotangent
+            fields[name] = cotangent + added[name] if added else cotangent
     sinks = Sinks()
     if fields:
         rows = tuple(Rows(slots_of(trace.layout)).nodes(tracer, **fields))
-        sinks.scatter.append(Scatter(-1, trace.node(state.lane), rows, slots=True))
-    columns: dict[tuple[int, int], list[int]] = {}
+        sinks.scatter.append(Scatter(_ALL_LANES, trace.node(state.lane), rows, slots=True))
+    # Gradients of look-ups: by number of the table and node of the index the nodes of an entry's gradient. Look-ups at the same
+    # index are added up in the lane.
+    entries: dict[tuple[int, int], list[int]] = {}
     for (number, index, _), gradient in zip(gathers.taken, input_cotangents.extra_leaves, strict=False):
         if gradient is None:
             continue
-        places = tracer.get(index).nodes.reshape(-1)
-        values: Any = tracer.get(gradient).nodes.reshape(-1, len(places))
-        for k, place in enumerate(places):
-            key = number, graph.cast(place, "i")
-            mine, known = [int(x) for x in values[:, k]], columns.get(key)
-            if known is not None:
-                mine = [graph.binary("add", "f", a, b) for a, b in zip(known, mine, strict=True)]
-            columns[key] = mine
-    places_of: dict[int, int] = {}  # row of each node of an index
+        index_nodes = tracer.get(index).nodes.reshape(-1)
+        values: Any = tracer.get(gradient).nodes.reshape(-1, len(index_nodes))
+        for k, index_node in enumerate(index_nodes):
+            key = number, graph.cast(index_node, "i")
+            nodes, earlier = [int(x) for x in values[:, k]], entries.get(key)
+            if earlier is not None:
+                nodes = [graph.binary("add", "f", a, b) for a, b in zip(earlier, nodes, strict=True)]
+            entries[key] = nodes
+    row_of_index: dict[int, int] = {}  # by node of the index
 
-    def written(nodes: list[int]) -> int:
+    def append_rows(nodes: list[int]) -> int:
         """Append stores of nodes to consecutive new rows; return the first row."""
         first = len(sinks.write)
         sinks.write += [(first + k, node) for k, node in enumerate(nodes)]
         return first
 
     zero = graph.constant("f", 0)
-    for (number, place), nodes in columns.items():
+    for (number, index_node), nodes in entries.items():
         if all(node == zero for node in nodes):
             continue
-        if place not in places_of:
-            places_of[place] = written([place])
-        trace.sums.append((number, places_of[place], written(nodes), len(nodes)))
+        if index_node not in row_of_index:
+            row_of_index[index_node] = append_rows([index_node])
+        trace.sums.append((number, row_of_index[index_node], append_rows(nodes), len(nodes)))
+    # Gradients of whole tables are sums over lanes; a lane outputs its summand.
     for number, gradient in enumerate(input_cotangents.extra_leaves[len(gathers.taken) :]):
         if gradient is None:
             continue
         nodes = np.broadcast_to(tracer.get(gradient).nodes, tuple(kernels.primals[number].shape)).reshape(-1)
-        lanes = [summand_of(graph, int(node)) for node in nodes]
-        if any(node is not None for node in lanes):
-            if len(lanes) > 64:
+        summands = [summand_of(graph, int(node)) for node in nodes]
+        if any(node is not None for node in summands):
+            if len(summands) > _MOST_ELEMENTS:
                 raise Unsupported("a derivative by all of a table in every lane")
-            trace.sums.append((number, -1, written([zero if node is None else node for node in lanes]), len(lanes)))
+            first = append_rows([zero if node is None else node for node in summands])
+            trace.sums.append((number, -1, first, len(summands)))
     return sinks
 
 
@@ -264,19 +293,21 @@ class VjpKernels(Kernels):
         cotangent: ``(3, H W)`` float32 of the picture, divided by the samples a pixel, for the VJP of splats.
 
     Attributes:
-        taped: stage context with autograd leaves.
-        numbers_of: index of a leaf by its id.
+        taped: stage context whose tables are autograd leaves.
+        primals: the tables without derivatives.
+        numbers_of: number of a table by the id of its leaf.
         eager_vjps: stages that cannot be compiled, with the reasons.
         slots: rows of :func:`torchpt.engines.kernels.backward.slots_of`.
     """
 
     def __init__(self, tape: Tape, packets: bool, cotangent: Tensor | None = None) -> None:
-        super().__init__(with_detached_geometry(tape.wave), packets, False, cotangent=cotangent)
+        super().__init__(with_detached_geometry(tape.wave), packets, fused=False, cotangent=cotangent)
         self.tape, self.cotangent = tape, cotangent
         self.taped = tape.taped.context
         self.primals = tape.primals
         self.numbers_of = {id(leaf): number for number, leaf in enumerate(tape.leaves)}
-        paths = [self._leaves.ids[id(one)][0] if id(one) in self._leaves.ids else None for one in tape.primals]
+        # A trace that reads a leaf reads the primal's memory. The path of a primal is None if no record has it.
+        paths = [self._leaves.ids[id(x)][0] if id(x) in self._leaves.ids else None for x in tape.primals]
         for path, leaf in zip(paths, tape.leaves, strict=True):
             if path is not None:
                 self._leaves.ids[id(leaf)] = path, leaf
@@ -298,7 +329,7 @@ class VjpKernels(Kernels):
             return None
 
     def store_hits(self) -> Kernel:
-        """See :func:`torchpt.engines.kernels.backward.store_hits`."""
+        """Return the kernel :func:`torchpt.engines.kernels.backward.store_hits`."""
         return self._get(False, store_hits)
 
     def engine(self) -> KernelsBackward:
@@ -307,6 +338,7 @@ class VjpKernels(Kernels):
 
     def bytes_per_lane(self, levels: int) -> int:
         """Return the bytes that a lane takes if ``levels`` vertices are kept."""
+        # of 32-bit words: an arena and lists for each kept vertex, and for the two that alternate behind them
         return 4 * (levels + 2) * (self.state.count + self.models + 2)
 
 
@@ -315,7 +347,7 @@ class VjpKernels(Kernels):
 
 @dataclass(frozen=True)
 class Mark:
-    """Checkpoint of a replay: copy of an arena before its lanes were listed."""
+    """Checkpoint of a replay: depth of a vertex, and a copy of its arena before its lanes were listed."""
 
     depth: int
     words: np.ndarray
@@ -335,14 +367,12 @@ class KernelsBackward(KernelsEngine):
     def __init__(self, kernels: VjpKernels) -> None:
         super().__init__(kernels)
         self.back = kernels
-        self._levels: list[Paths] = []
+        self._levels: list[Paths] = []  # memory of the vertices of a walk that are kept
         self._sample_slots = Memory(kernels.slots.count)
-        self._results = Memory(1)
-        self._sorted = (
-            Memory(2),
-            np.zeros(CAPACITY, np.uint8),
-        )  # slots of a list's lanes, and scratch memory for sorting
-        self._first = 1
+        self._results = Memory(1)  # rows that a VJP's kernel writes
+        self._sorted_slots = Memory(2)  # slots of a list's lanes, sorted, and scratch memory
+        self._slot_is_taken = np.zeros(CAPACITY, np.uint8)  # scratch memory for sorting
+        self._first = 1  # depth of the first vertex of the walk
 
     def begin(self, span: Span, sums: ChunkGradientSums) -> Paths:
         """See :class:`torchpt.engines.engine.Backward`."""
@@ -398,50 +428,59 @@ class KernelsBackward(KernelsEngine):
             for model, count in enumerate(paths.groups):
                 if count:
                     key = ("bounce", model, limits.roulette(depth), follow_ray)
-                    self._one(key, paths, paths.lists[model], count, False)
+                    self._vjp_of_stage(key, paths, paths.lists[model], count, added=False)
         if kernels.has_emitters and paths.places[kernels.emissive]:
-            place = kernels.emissive
-            self._one(("emit", follow_ray), paths, paths.lists[place], paths.places[place], True)
+            number = kernels.emissive
+            self._vjp_of_stage(("emit", follow_ray), paths, paths.lists[number], paths.places[number], added=True)
         if kernels.has_environment and paths.places[kernels.missed]:
-            place = kernels.missed
-            self._one(("escape",), paths, paths.lists[place], paths.places[place], True)
+            number = kernels.missed
+            self._vjp_of_stage(("escape",), paths, paths.lists[number], paths.places[number], added=True)
         if depth > 1:
             calls.run(kernels.store_hits(), paths.count, paths.arena, paths.arena, slots=self._sample_slots)
 
-    def _one(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
-        """Pull cotangents back through one stage on the lanes of a list, by its kernel or by tensor operations."""
+    def _vjp_of_stage(self, key: tuple, paths: Paths, places: Memory, count: int, *, added: bool) -> None:
+        """Pull cotangents back through one stage on the lanes of a list, by its kernel or by tensor operations.
+
+        Args:
+            key: see :meth:`VjpKernels.vjp_kernel`.
+            paths: the vertex.
+            places: the list of lanes; sorted by sample if gradients are added.
+            count: number of lanes.
+            added: True: cotangents of the rays that came are added to those in the slots; False: they replace them.
+        """
         kernel = self.back.vjp_kernel(key)
-        slots = self._by_sample(paths, places, count) if kernel is None or kernel.program.sums else None
+        slots = self._sort_by_sample(paths, places, count) if kernel is None or kernel.program.sums else None
         if kernel is None:
-            self._eagerly(key, paths, places, count, added)
+            self._vjp_eagerly(key, paths, places, count, added=added)
             return
         self._results = self._results_of(kernel)
         self.calls.run(kernel, count, paths.arena, self._results, places, slots=self._sample_slots)
         if slots is None:
             return
         floats, words = self._results.floats, self._results.words
-        for number, index, first, width in kernel.program.sums:
+        for number, index_row, first, width in kernel.program.sums:
             values = floats[first : first + width, :count]
-            if index < 0:
+            if index_row < 0:
                 self.sums.add_all(number, values, slots)
             else:
-                self.sums.add_rows(number, words[index, :count], values, slots)
+                self.sums.add_rows(number, words[index_row, :count], values, slots)
 
-    def _by_sample(self, paths: Paths, places: Memory, count: int) -> np.ndarray:
-        """Sort the lanes of a list by sample; return their slots in rising order."""
+    def _sort_by_sample(self, paths: Paths, places: Memory, count: int) -> np.ndarray:
+        """Sort the lanes of a list by sample, in place; return their slots in ascending order."""
         from torchpt.math.sum_kernels import sort_by_sample
 
-        lanes, (memory, taken) = paths.arena.words[self.back.state.first("lane")], self._sorted
-        slots, found = memory.words
-        sort_by_sample(places.words[0], count, lanes, slots, found, taken)
+        slot_of_lane = paths.arena.words[self.back.state.first("lane")]
+        slots, lane_of_slot = self._sorted_slots.words
+        sort_by_sample(places.words[0], count, slot_of_lane, slots, lane_of_slot, self._slot_is_taken)
         return slots[:count]
 
     def _results_of(self, kernel: Kernel) -> Memory:
+        """Return memory with at least the rows that a kernel writes."""
         rows = max((max(index + 1, first + width) for _, index, first, width in kernel.program.sums), default=1)
         return self._results if len(self._results.words) >= rows else Memory(rows)
 
-    def _eagerly(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
-        """Pull cotangents back through a stage by tensor operations, if it cannot be compiled."""
+    def _vjp_eagerly(self, key: tuple, paths: Paths, places: Memory, count: int, *, added: bool) -> None:
+        """Pull cotangents back through a stage by tensor operations, if it cannot be compiled; arguments as above."""
         kernels, integrator, salt = self.back, self.wave.integrator, salts(paths.depth, torch.device("cpu"))
         plan = kernels.taped.plan
         lanes = places.words[0, :count]
@@ -453,7 +492,7 @@ class KernelsBackward(KernelsEngine):
         def transmittance(_: Shadow) -> Tensor:
             return rows["transmittance"]
 
-        def landed(splat: Splat) -> tuple[Tensor, Tensor]:
+        def of_splat(splat: Splat) -> tuple[Tensor, Tensor]:
             assert kernels.cotangent is not None
             return adjoint.splat_contributions(integrator.clamp, kernels.cotangent, splat, rows["splat_transmittance"])
 
@@ -464,21 +503,30 @@ class KernelsBackward(KernelsEngine):
                 cotangents = VertexCotangents(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
                 next_hit = Hit(*(rows[name] for name in HIT)) if plan.attached else None
                 _, model, roulette, follow_ray = key
-                context = kernels.taped.at(salt, follow_ray, roulette)
+                context = kernels.taped.at(salt, follow_ray=follow_ray, roulette=roulette)
                 input_cotangents = adjoint.bounce_vjp(
-                    integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, self._tables, landed
+                    integrator.bounce,
+                    context,
+                    model,
+                    vertex,
+                    next_hit,
+                    transmittance,
+                    cotangents,
+                    self._tables,
+                    of_splat,
                 )
             else:
-                stage = integrator.emit if key[0] == "emit" else integrator.escape
+                stage_name, *follow_ray = key  # the environment does not depend on `follow_ray`
+                stage = integrator.emit if stage_name == "emit" else integrator.escape
                 input_cotangents = adjoint.emission_vjp(
-                    stage, kernels.taped.at(salt, *key[1:]), vertex, rows["radiance"], self._tables
+                    stage, kernels.taped.at(salt, *follow_ray), vertex, rows["radiance"], self._tables
                 )
-        for name, found, like in input_cotangents.of_rays(state, attached=plan.attached):
+        for name, cotangent, like in input_cotangents.of_rays(state, attached=plan.attached):
             first = kernels.slots.first(name)
-            values = np.zeros(like.shape, np.float32) if found is None else found.numpy()
+            values = np.zeros(like.shape, np.float32) if cotangent is None else cotangent.numpy()
             values = values.reshape(-1, count)
-            held = self._sample_slots.floats[first : first + len(values)]
-            held[:, lane] = values + held[:, lane] if added else values
+            slots = self._sample_slots.floats[first : first + len(values)]
+            slots[:, lane] = values + slots[:, lane] if added else values
         self.sums.add_each(input_cotangents.extra_leaves)
 
     def _tables(self) -> Sequence[Tensor]:
@@ -495,5 +543,5 @@ class KernelsBackward(KernelsEngine):
             if not pairs:
                 return
             cotangents = [torch.from_numpy(self._sample_slots.floats[row : row + 3, :n].copy()) for _, row in pairs]
-            found = torch.autograd.grad([x for x, _ in pairs], self._tables(), cotangents, allow_unused=True)
-        self.sums.add_each(found)
+            gradients = torch.autograd.grad([x for x, _ in pairs], self._tables(), cotangents, allow_unused=True)
+        self.sums.add_each(gradients)

@@ -7,6 +7,7 @@ part of the stages (``fused``), paths arrive with their hits and lists of lanes:
 rays, lists lanes and ends paths. A path that ends writes its radiance to the *slot* of its sample;
 :mod:`~torchpt.engines.kernels.threads` adds slots to the film.
 
+The methods of :class:`KernelsEngine` are the stages that :func:`torchpt.paths.walk.walk` calls in their order along a path.
 A stage is a list of *steps*: kernel calls that name the kernel, the memory that it reads and writes, and where its lanes are
 counted. :class:`Calls` runs a step at once, in the calling thread: a count is an int, and steps without lanes are left out.
 On a device (:mod:`~torchpt.engines.kernels.device`) all steps are launched, and counts stay in memory, where kernels read
@@ -20,7 +21,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -47,6 +48,7 @@ __all__ = ["LANES", "Calls", "Chunk", "ChunkSearch", "Halted", "KernelsEngine", 
 # ---- Kernel calls of one thread: counters, and arguments that are prepared once
 
 
+#: Index of each word at the head of a kernel's arguments.
 _WORD = {name: k for k, name in enumerate(HEAD)}
 #: A number of lanes: an int, or on a device a :class:`torchpt.engines.kernels.device.Count`, which is always true.
 LaneCount = Any
@@ -54,6 +56,24 @@ LaneCount = Any
 
 class Halted(Exception):
     """Raised where a kernel is called after the render was cancelled."""
+
+
+class _PreparedCall(NamedTuple):
+    """A kernel with its argument words.
+
+    Attributes:
+        words: the words, of which those that differ from call to call are set anew each time.
+        call: machine code.
+        address: of the words.
+        uniforms: index of the word and name of each uniform.
+        lists: indices of the words of the lists that it appends to.
+    """
+
+    words: Any
+    call: Any
+    address: int
+    uniforms: tuple[tuple[int, str], ...]
+    lists: range
 
 
 class Calls:
@@ -64,9 +84,9 @@ class Calls:
         halt: set to cancel the render.
 
     Attributes:
-        counters: see :class:`torchpt.engines.kernels.layout.Layout`.
+        counters: int64: number of lanes in the arena, then in each list (:class:`torchpt.engines.kernels.layout.Layout`).
         place: pixels and samples of the chunk, see :data:`torchpt.engines.kernels.stages.CHUNK_FIELDS`.
-        slots: radiance of the chunk's samples.
+        slots: radiance of the chunk's samples, three rows.
     """
 
     def __init__(self, kernels: Kernels, halt: threading.Event) -> None:
@@ -74,10 +94,10 @@ class Calls:
         self.counters = np.zeros(kernels.models + 6, np.int64)
         self.place = np.zeros(len(CHUNK_FIELDS), np.int32)
         self.slots = Memory(3)
-        self._prepared: dict[int, tuple[Any, Any, int, tuple[tuple[int, str], ...], range]] = {}
-        self._keep: list[Kernel] = []
-        self._salts: dict[tuple[int, int], Any] = {}
-        self._uniforms = {"place": self.place.ctypes.data}
+        self._prepared: dict[int, _PreparedCall] = {}  # by id of the kernel
+        self._keep: list[Kernel] = []  # the kernels of `_prepared`, so that their ids are not reused
+        self._salts: dict[tuple[int, int], Any] = {}  # by depth and step
+        self._uniforms = {"place": self.place.ctypes.data}  # address of each uniform
 
     def unbind(self) -> None:
         """Drop all references to the render and its kernels."""
@@ -98,7 +118,7 @@ class Calls:
         self.counters[:] = 0
 
     def counted(self) -> tuple[LaneCount, list[LaneCount]]:
-        """Return how many lanes are in the arena, and how many in each list."""
+        """Return how many lanes are in the arena, and how many in each list: one a model, on emitters, without a hit."""
         return int(self.counters[0]), self.counters[1 : self.kernels.models + 3].tolist()
 
     def lanes(self, count: int) -> LaneCount:
@@ -128,10 +148,10 @@ class Calls:
 
     def set_dimensions(self, depth: int, step: int = 0) -> None:
         """Set the random dimensions of kernels to those of a vertex, and of a step of transmission before it."""
-        known = self._salts.get((depth, step))
-        if known is None:
-            known = self._salts[depth, step] = salts(depth, torch.device("cpu"), step)
-        self._uniforms["salts"] = known.data_ptr()
+        vertex_salts = self._salts.get((depth, step))
+        if vertex_salts is None:
+            vertex_salts = self._salts[depth, step] = salts(depth, torch.device("cpu"), step)
+        self._uniforms["salts"] = vertex_salts.data_ptr()
 
     def run(
         self,
@@ -161,21 +181,21 @@ class Calls:
             raise Halted
         prepared = self._prepared.get(id(kernel))
         if prepared is None:
-            prepared = self._prepared[id(kernel)] = self._arguments(kernel)
-        words, call, address, uniforms, first = prepared
-        words[0], words[1] = source.address, target.address
+            prepared = self._prepared[id(kernel)] = self._prepare(kernel)
+        words, call, address, uniforms, list_words = prepared
+        words[0], words[1] = source.address, target.address  # the first words of HEAD: src, dst, list, slots
         if places is not None:
             words[2] = places.address
         words[3] = self.slots.address if slots is None else slots.address
-        for place, name in uniforms:
-            words[place] = self._uniforms[name]
+        for word, name in uniforms:
+            words[word] = self._uniforms[name]
         if lists is not None:
-            for place, memory in zip(first, lists, strict=False):
-                words[place] = memory.address
+            for word, memory in zip(list_words, lists, strict=False):
+                words[word] = memory.address
         call(address, count)
 
-    def _arguments(self, kernel: Kernel) -> tuple[Any, Any, int, tuple[tuple[int, str], ...], range]:
-        """Return the argument words of a kernel with constant ones filled in, and the indices of the others."""
+    def _prepare(self, kernel: Kernel) -> _PreparedCall:
+        """Return a kernel with the argument words that stay the same filled in."""
         program = kernel.program
         start = len(HEAD) + len(program.uniforms)
         words = (ctypes.c_int64 * (start + program.lists))()
@@ -185,8 +205,9 @@ class Calls:
         if self.kernels.search is not None:
             words[_WORD["search"]] = ctypes.addressof(self.kernels.search)
         uniforms = tuple((len(HEAD) + k, name) for k, name in enumerate(program.uniforms))
-        self._keep.append(kernel)  # a reference, so that its id is not reused
-        return words, program.call, ctypes.addressof(words), uniforms, range(start, start + program.lists)
+        self._keep.append(kernel)
+        lists = range(start, start + program.lists)
+        return _PreparedCall(words, program.call, ctypes.addressof(words), uniforms, lists)
 
 
 # ---- A vertex by tensor operations on lanes of an arena, for models that cannot be compiled
@@ -226,18 +247,20 @@ def bounce_eagerly(
         context = kernels.wave.context.at(salts(depth, state.t_max.device), roulette=roulette)
         output = kernels.wave.bounce(context, model, vertex)
         check_output(kernels.wave.integrator, output)
-        after, none = output.leaving, no_shadow(output.leaving)
-        shadow = none if output.shadow is None else output.shadow
-        splat = Splat(torch.full_like(after.lane, -1), none) if output.splat is None else output.splat
+        after, no_ray = output.leaving, no_shadow(output.leaving)
+        shadow = no_ray if output.shadow is None else output.shadow
+        splat = Splat(torch.full_like(after.lane, -1), no_ray) if output.splat is None else output.splat
     values: dict[str, Tensor | None] = {**state_values(after)}
     values |= rows.take(source, lanes, ("weight",))
-    values |= {f"shadow_{name}": value for name, value in _named(shadow).items()}
-    values |= {f"splat_{name}": value for name, value in _named(splat.light).items()} | {"splat_pixel": splat.pixel}
+    values |= {f"shadow_{name}": value for name, value in _values_of_shadow(shadow).items()}
+    values |= {f"splat_{name}": value for name, value in _values_of_shadow(splat.light).items()}
+    values["splat_pixel"] = splat.pixel
     rows.put(target, start, values)
     return count * (int(output.shadow is not None) + int(output.splat is not None))
 
 
-def _named(light: Shadow) -> dict[str, Tensor]:
+def _values_of_shadow(light: Shadow) -> dict[str, Tensor]:
+    """Return the tensors of shadow rays by the ends of their rows' names."""
     return {"o": light.o, "d": light.d, "t": light.t_max, "radiance": light.radiance}
 
 
@@ -252,12 +275,16 @@ class ChunkSearch:
 
     Args:
         calls: of the thread.
+
+    Attributes:
+        passed: two arenas for rays in transit, which move from one to the other; none if rays pass nothing.
+        transmitting: list of the lanes that the stage ``transmit`` runs for.
     """
 
     def __init__(self, calls: Calls) -> None:
         self.calls, self.kernels = calls, calls.kernels
-        own = range(2 if self.kernels.has_transmission else 0)
-        self.passed = [calls.memory(self.kernels.passed.count) for _ in own]
+        arenas = 2 if self.kernels.has_transmission else 0
+        self.passed = [calls.memory(self.kernels.passed.count) for _ in range(arenas)]
         self.transmitting = calls.memory(1)
 
     def nearest(self, arena: Memory, count: LaneCount) -> None:
@@ -282,14 +309,14 @@ class ChunkSearch:
         if step == 0:
             calls.clear()
             calls.run(kernels.list_transmitting(), count, arena, arena, lists=[self.transmitting])
-            some = calls.left(0)
-            if not some:
+            transmitting = calls.left(0)
+            if not transmitting:
                 return 0
             calls.clear()
-            calls.run(kernels.transmit(False), some, arena, target, self.transmitting, slots=arena)
+            calls.run(kernels.transmit(again=False), transmitting, arena, target, self.transmitting, slots=arena)
         else:
             calls.clear()
-            calls.run(kernels.transmit(True), count, source, target, slots=arena)
+            calls.run(kernels.transmit(again=True), count, source, target, slots=arena)
         left = calls.left(step + 1)
         if left:
             self._trace(target, kernels.passed, "pass_o", "pass_d", "pass_t", left)
@@ -318,7 +345,8 @@ class ChunkSearch:
     def _trace(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: LaneCount) -> None:
         """Find the nearest hit, opaque or not, of each ray in the rows ``o, d, t_max``."""
         if self.kernels.packets:
-            self.calls.run(self.kernels.search_nearest(rows is self.kernels.passed), count, memory, memory)
+            kernel = self.kernels.search_nearest(passed=rows is self.kernels.passed)
+            self.calls.run(kernel, count, memory, memory)
         else:
             self._nearest_outside(memory, rows, o, d, t_max, count)
 
@@ -346,6 +374,7 @@ class ChunkSearch:
 
 
 def _row(memory: np.ndarray, rows: Rows, name: str, count: int) -> np.ndarray:
+    """Return the ``count`` rows of a field."""
     first = rows.first(name)
     return memory[first : first + count]
 
@@ -425,7 +454,7 @@ class KernelsEngine:
         self.tally = RayCounts()
         self.splats: list[Splats] = []
         self._lost: list[np.ndarray] = []  # samples with splats that are not finite
-        self._rooms = [self._room() for _ in range(2)]
+        self._rooms = [self._room() for _ in range(2)]  # memory of even and of odd vertices
 
     def _make_search(self) -> ChunkSearch:
         return ChunkSearch(self.calls)
@@ -449,17 +478,17 @@ class KernelsEngine:
 
     def unbind(self) -> int:
         """Drop all references to the render; return the bytes of memory kept for another one of the same structure."""
-        held = [
+        memories = [
             self.slots,
             *self.search.passed,
             self.search.transmitting,
             *([] if self.shown is None else [self.shown]),
         ]
-        held += [memory for room in self._rooms for memory in (room.arena, *room.lists)]
+        memories += [memory for room in self._rooms for memory in (room.arena, *room.lists)]
         self.calls.unbind()
         self.splats, self._lost = [], []
         del self.kernels, self.wave, self.search.kernels
-        return sum(memory.words.nbytes for memory in held)
+        return sum(memory.words.nbytes for memory in memories)
 
     def rebind(self, kernels: Kernels, halt: threading.Event) -> None:
         """Reuse the memory for another render of the same structure, after `unbind`."""
@@ -495,10 +524,12 @@ class KernelsEngine:
         wave, pixel_set = self.wave, chunk.pixel_set
         streams = wave.sampler.streams if pixel_set is None else pixel_set.randomizations
         x, y, width, _ = wave.crop
+        # samples go to the randomizations in turn
         point, turn = divmod(chunk.first_sample, streams.count)
-        numbers = (
-            chunk.first_pixel, chunk.pixels, turn, (point + (1 << 31)) % (1 << 32) - (1 << 31),
-            streams.first, streams.count, x, y, width, wave.camera.resolution[0],
+        point = (point + (1 << 31)) % (1 << 32) - (1 << 31)  # its lower 32 bits, as int32
+        film_width, _ = wave.camera.resolution
+        numbers = (  # the fields of CHUNK_FIELDS
+            chunk.first_pixel, chunk.pixels, turn, point, streams.first, streams.count, x, y, width, film_width,
         )  # fmt: skip
         self.calls.set_chunk(np.array(numbers, np.int64).astype(np.int32))
 
@@ -507,29 +538,29 @@ class KernelsEngine:
         self.start(chunk)
         kernels, calls, given = self.kernels, self.calls, self.wave.start_rays
         self.splats, self._lost = [], []
-        count, places = chunk.pixels * chunk.samples, None if chunk.pixel_set is None else chunk.pixel_set.indices
+        count, pixels = chunk.pixels * chunk.samples, None if chunk.pixel_set is None else chunk.pixel_set.indices
         if given is not None:
-            places = given.number
+            pixels = given.number
         paths, source = self._begin(self.room(1), 1, calls.lanes(count)), self.room(1).arena
         calls.clear()
-        calls.set_dimensions(0)
-        own = slice(chunk.first_pixel, chunk.first_pixel + chunk.pixels)
-        if places is not None or given is not None:  # the kernel reads them from the arena of the next vertex
+        calls.set_dimensions(depth=0)
+        of_chunk = slice(chunk.first_pixel, chunk.first_pixel + chunk.pixels)
+        if pixels is not None or given is not None:  # the kernel reads them from the arena of the next vertex
             source = self.room(2).arena
-        if places is not None:
-            source.repeat(kernels.state.first("prim"), places[own][None], chunk.samples)
+        if pixels is not None:
+            source.repeat(kernels.state.first("prim"), pixels[of_chunk][None], chunk.samples)
         if given is not None:
             for name, vectors in (("o", given.o), ("d", given.d)):
-                source.repeat(kernels.state.first(name), vectors[:, own], chunk.samples)
+                source.repeat(kernels.state.first(name), vectors[:, of_chunk], chunk.samples)
         lists = paths.lists if kernels.fused else None
-        kernel = kernels.generate(places is not None, given is not None)
+        kernel = kernels.generate(chosen=pixels is not None, given=given is not None)
         calls.run(kernel, paths.count, source, paths.arena, lists=lists)
         if kernels.fused:
             self._count_rays(paths.count)
         return paths
 
     def _begin(self, paths: Paths, depth: int, count: LaneCount) -> Paths:
-        """Initialize the memory of a vertex."""
+        """Initialize the memory of a vertex for ``count`` paths, and return it."""
         paths.depth, paths.count, paths.shadows, paths.groups = depth, count, False, ()
         paths.in_transit = paths.step = 0
         paths.arrived = paths.listed = self.kernels.fused
@@ -577,6 +608,7 @@ class KernelsEngine:
         self._on_list(self.kernels.escape(), paths, self.kernels.missed)
 
     def _on_list(self, kernel: Kernel, paths: Paths, number: int) -> None:
+        """Run a kernel on the lanes of list ``number``."""
         self.calls.set_dimensions(paths.depth)
         self.calls.run(kernel, paths.places[number], paths.arena, paths.arena, paths.lists[number])
 
@@ -586,6 +618,7 @@ class KernelsEngine:
         if not paths.groups:  # not sorted: all paths end
             if paths.listed:  # compacted: paths that had ended are not in the arena
                 paths.count, _ = calls.counted()
+            # as rays without a hit that a medium has ended, so that they do not see the environment
             paths.arena.words[kernels.state.first("prim")] = -1
             paths.arena.floats[kernels.state.first("t_max")] = 0.0
             self._sort_lanes(paths)
@@ -609,9 +642,9 @@ class KernelsEngine:
                 continue
             lanes = paths.lists[model]
             if model in kernels.eager:
-                known, first = calls.known(count), calls.known(start)
+                lane_count, first_lane = calls.known(count), calls.known(start)
                 self.tally.rays += bounce_eagerly(
-                    kernels, model, roulette, paths.arena, after.arena, lanes, known, first, paths.depth
+                    kernels, model, roulette, paths.arena, after.arena, lanes, lane_count, first_lane, paths.depth
                 )
                 continue
             if not kernels.fused:
@@ -632,13 +665,14 @@ class KernelsEngine:
             self.search.light(paths.arena, paths.count)
 
     def _splat(self, paths: Paths) -> None:
-        """Record splats that arrive. One that is not finite is left out and makes its sample NaN."""
+        """Record splats that reach the film. One that is not finite is left out and makes its sample NaN."""
         rows, floats, words, n = self.kernels.state, paths.arena.floats, paths.arena.words, paths.count
+        # the rows o, d and t of the splats' shadow rays, and of those to lights
         splat, shadow = (slice(rows.first(f"{name}_o"), rows.first(f"{name}_radiance")) for name in ("splat", "shadow"))
-        own = words[shadow, :n].copy()  # saved: the search reads the rows of shadow rays
+        saved = words[shadow, :n].copy()  # the search reads the rows of shadow rays
         words[shadow, :n] = words[splat, :n]
         self.search.light(paths.arena, n)
-        words[shadow, :n] = own
+        words[shadow, :n] = saved
         transmittance = (
             floats[rows.first("transmittance"), :n]
             if "transmittance" in rows
@@ -647,12 +681,12 @@ class KernelsEngine:
         floats[rows.first("splat_transmittance"), :n] = transmittance
         pixel, first = words[rows.first("splat_pixel"), :n], rows.first("splat_radiance")
         value = floats[first : first + 3, :n] * floats[rows.first("splat_transmittance"), :n]
-        comes, finite = (pixel >= 0) & (transmittance != 0), (np.abs(value) < LARGEST).all(0)
-        lane, on = words[rows.first("lane"), :n].astype(np.int64), comes & finite
+        arrives, finite = (pixel >= 0) & (transmittance != 0), (np.abs(value) < LARGEST).all(0)
+        lane, counts = words[rows.first("lane"), :n].astype(np.int64), arrives & finite
         if self.keeps_splats:
-            parts = lane[on], pixel[on].astype(np.int64), value[:, on]
-            self.splats.append(Splats(*(torch.from_numpy(part) for part in parts)))
-        lost = comes & ~finite
+            arrays = lane[counts], pixel[counts].astype(np.int64), value[:, counts]
+            self.splats.append(Splats(*(torch.from_numpy(array) for array in arrays)))
+        lost = arrives & ~finite
         if lost.any():
             self._lost.append(lane[lost])
 

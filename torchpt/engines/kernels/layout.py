@@ -1,4 +1,9 @@
-"""Memory of kernels: the rows of the path state in an arena, and the trace that turns a stage into a kernel."""
+"""Memory of kernels: the rows of the path state in an arena, and the trace that turns a stage into a kernel.
+
+An *arena* holds the paths of a vertex: a *row* of 32-bit elements for each component of each field, a column for each lane.
+*Slots* are rows of results by sample, such as its radiance, where a path writes when it ends. *Lists* hold the lanes that a
+kernel works on, such as those on one BSDF model. *Counters* hold how many lanes an arena or a list has.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +46,7 @@ __all__ = [
 # ---- Rows of an arena: fields of the path state, of a hit, of a shadow ray
 
 
-#: Fields by name: shape without the lanes, and node type.
+#: Fields by name: shape without the lanes, and node type (a letter, see :mod:`torchpt.compiler.graph`).
 Fields = dict[str, tuple[tuple[int, ...], str]]
 
 #: Fields of a hit, and of a shadow ray.
@@ -76,11 +81,14 @@ _STATE = tuple(field.name for field in fields(PathState) if field.name != "extra
 _DTYPES = {ty: dtype for dtype, ty in DTYPES.items()}
 
 
-def path_state(given: Mapping[str, Tensor]) -> PathState:
-    """Return the path state from tensors by row name; other names are ignored."""
-    extra = {name.removeprefix(EXTRA): value for name, value in given.items() if name.startswith(EXTRA)}
-    known: dict[str, Any] = {name: value for name, value in given.items() if name in _STATE}
-    return PathState(**known, extra=extra)
+def path_state(values: Mapping[str, Tensor]) -> PathState:
+    """Return the path state from tensors by row name; other names are ignored.
+
+    Rows of an integrator's own fields have the prefix ``EXTRA`` in their name.
+    """
+    extra = {name.removeprefix(EXTRA): value for name, value in values.items() if name.startswith(EXTRA)}
+    common: dict[str, Any] = {name: value for name, value in values.items() if name in _STATE}
+    return PathState(**common, extra=extra)
 
 
 def state_values(state: PathState) -> dict[str, Tensor]:
@@ -91,7 +99,13 @@ def state_values(state: PathState) -> dict[str, Tensor]:
 
 
 class Memory:
-    """Rows of 32-bit words, padded at the end since kernels write whole vectors."""
+    """Rows of 32-bit words, padded at the end since kernels write whole vectors.
+
+    Attributes:
+        words: ``(rows, CAPACITY)`` int32.
+        floats: the same memory as float32.
+        address: its address.
+    """
 
     def __init__(self, rows: int) -> None:
         self.words = np.zeros((rows, CAPACITY), np.int32)
@@ -99,20 +113,20 @@ class Memory:
         self.address = self.words.ctypes.data
 
     def repeat(self, first: int, values: Tensor, times: int) -> None:
-        """Write ``values (rows, n)`` to the rows from ``first`` on, ``times`` one after the other."""
-        held = self.floats if values.is_floating_point() else self.words
+        """Write ``values (rows, n)`` to the rows from ``first`` on, ``times`` times side by side."""
+        memory = self.floats if values.is_floating_point() else self.words
         # By numpy: torch would start a team of threads for each thread that renders.
-        held[first : first + len(values), : times * values.shape[1]] = np.tile(values.numpy(), times)
+        memory[first : first + len(values), : times * values.shape[1]] = np.tile(values.numpy(), times)
 
     def take(self, first: int, rows: int, lanes: np.ndarray, dtype: torch.dtype) -> Tensor:
-        """Return ``(rows, lanes)`` of the rows from ``first`` on."""
-        held = self.floats if dtype.is_floating_point else self.words
-        return torch.from_numpy(held[first : first + rows, lanes]).to(dtype)
+        """Return ``(rows, n)``: the values at ``lanes (n,)`` of the rows from ``first`` on."""
+        memory = self.floats if dtype.is_floating_point else self.words
+        return torch.from_numpy(memory[first : first + rows, lanes]).to(dtype)
 
     def put(self, first: int, start: int, values: Tensor) -> None:
         """Write ``values (rows, n)`` to the rows from ``first`` on, at lanes from ``start`` on."""
-        held = self.floats if values.is_floating_point() else self.words
-        held[first : first + len(values), start : start + values.shape[1]] = values.numpy()
+        memory = self.floats if values.is_floating_point() else self.words
+        memory[first : first + len(values), start : start + values.shape[1]] = values.numpy()
 
 
 class Rows:
@@ -169,7 +183,7 @@ class Rows:
         return inputs
 
     def take(self, memory: Memory, lanes: np.ndarray, names: tuple[str, ...]) -> dict[str, Tensor]:
-        """Return fields of some lanes as tensors; names without rows are left out."""
+        """Return fields of some lanes as tensors by name; names without rows are left out."""
         values = {}
         for name in names:
             if name in self._fields:
@@ -193,9 +207,9 @@ class Rows:
             nodes = tracer.nodes(value)
             if len(nodes) != math.prod(shape):
                 raise ValueError(f"{name}: {len(nodes)} numbers for {math.prod(shape)} rows")
-            held = ty if ty != "l" else None
+            # nodes of int64 may be of type l or L; the store converts both
             pairs += [
-                (self._first[name] + k, node if held is None else tracer.graph.cast(node, held))
+                (self._first[name] + k, node if ty == "l" else tracer.graph.cast(node, ty))
                 for k, node in enumerate(nodes)
             ]
         return pairs
@@ -210,17 +224,17 @@ class Layout:
     Args:
         wave: the render.
         packets: True: few primitives, searched by packet kernels. False: the acceleration structure is called.
-        fused: True: the search is part of the stages.
+        fused: True: the search is part of the stages. False: it runs between them.
 
     Attributes:
-        state: rows of the path state.
-        passed: rows of rays in transit.
+        state: rows of an arena of paths.
+        passed: rows of an arena of rays in transit.
         models: number of BSDF models.
-        has_environment: the scene has an environment light.
-        has_emitters: a ray may hit an emitter.
-        has_opacity: some surface is not opaque.
-        has_transmission: rays may pass surfaces, or the integrator has its own ``transmit``.
-        listed: kernels read lanes by lists. False: all lanes of the arena are on the only model.
+        has_environment: True: the scene has an environment light.
+        has_emitters: True: a ray may hit an emitter.
+        has_opacity: True: some surface is not opaque.
+        has_transmission: True: rays may pass surfaces, or the integrator has its own ``transmit``.
+        listed: True: kernels read lanes by lists. False: all lanes of the arena are on the only model.
         numbers: tensors of the sampler.
     """
 
@@ -252,14 +266,16 @@ class Layout:
 
 
 def _key_field(wave: Wave) -> Fields:
+    """Return the field of the random sequence of a path, of as many integers as the sampler needs."""
     return {"key": ((wave.sampler.points.rows,), "i")}
 
 
 def _path_fields(layout: Layout) -> Fields:
     """Return the fields of the arena: the path state of this scene, filter weight, hit, shadow ray, splat."""
     wave, world = layout.wave, layout.world
-    d = torch.zeros(3, 1)
-    state = wave.with_optional_fields(camera_state(d, d, torch.zeros(wave.sampler.points.rows, 1, dtype=torch.int32)))
+    # the state of one lane, of which only names, shapes and types are read
+    vector, key = torch.zeros(3, 1), torch.zeros(wave.sampler.points.rows, 1, dtype=torch.int32)
+    state = wave.with_optional_fields(camera_state(vector, vector, key))
     fields: Fields = {name: (tuple(x.shape[:-1]), DTYPES[x.dtype]) for name, x in state_values(state).items()}
     if wave.filter.signed:
         fields["weight"] = ((), "f")
@@ -291,7 +307,7 @@ class Trace:
     Attributes:
         uniforms: names of the arguments that all lanes share, in order.
         tensors: number of inputs that are tensors instead of rows of an arena.
-        sums: see :class:`torchpt.compiler.program.Program`.
+        sums: what a VJP outputs for the gradients of tables, see :func:`torchpt.engines.kernels.backward.bounce_vjp`.
     """
 
     def __init__(self, tracer: Tracer, layout: Layout) -> None:
@@ -308,7 +324,7 @@ class Trace:
         return self.tracer.uniform(like)
 
     def salts(self) -> Tensor:
-        """Return the hashed random dimensions of the vertex."""
+        """Return the salts of the vertex, hashes of its sampling dimensions, one for each :class:`Dimension`."""
         return self.uniform("salts", torch.zeros(len(Dimension), dtype=torch.int32))
 
     def state(self) -> tuple[PathState, dict[str, Tensor]]:
@@ -317,7 +333,7 @@ class Trace:
         return path_state(rows.read(self.tracer, *rows.state)), rows.read(self.tracer, "weight")
 
     def hit(self, rows: Rows | None = None) -> Hit:
-        """Return the hits of the rays."""
+        """Return the hits of the rays; ``rows``: of which arena, None: of paths."""
         return Hit(**(rows or self.layout.state).read(self.tracer, *HIT))
 
     def place(self) -> Tensor:
@@ -332,7 +348,7 @@ class Trace:
         return self.tracer.nodes(result)[0]
 
     def kept(self, state: PathState, passthrough: dict[str, Tensor]) -> list[tuple[int, int]]:
-        """Return the path state as pairs of row and node."""
+        """Return the stores of a path state to an arena of paths, as pairs of row and node."""
         return self.layout.state.nodes(self.tracer, **state_values(state), **passthrough)
 
     def ended(self, mask: int, lane: Tensor, radiance: Tensor, passthrough: dict[str, Tensor]) -> Scatter:
@@ -353,18 +369,19 @@ class Trace:
         """
         layout, world = self.layout, self.layout.world
         with self.tracer:
+            # keys: m for an emissive surface of model m, models + m for another surface of it, 2 models for a miss
             key = torch.index_select(world.materials.key, 0, world.geometry.slot(prim) + 1)
-            met, alive = prim >= 0, state.t_max > 0
-            masks = [(key == m) | (key == layout.models + m) for m in range(layout.models)]
-            shining = (key < layout.models) & met
-            out = ~met & alive
-            on = met | out if layout.has_environment else met
-            off = ~on
-        lists: list[tuple[int, Tensor]] = list(enumerate(masks)) if layout.listed else []
+            has_hit, alive = prim >= 0, state.t_max > 0  # a medium ends paths by t_max = 0
+            of_models = [(key == m) | (key == layout.models + m) for m in range(layout.models)]
+            emissive = (key < layout.models) & has_hit
+            missed = ~has_hit & alive
+            goes_on = has_hit | missed if layout.has_environment else has_hit
+            ends = ~goes_on
+        lists: list[tuple[int, Tensor]] = list(enumerate(of_models)) if layout.listed else []
         if layout.has_emitters:
-            lists.append((layout.emissive, shining))
+            lists.append((layout.emissive, emissive))
         if layout.has_environment:
-            lists.append((layout.missed, out))
-        appends = [AppendIndex(self.node(mask), number, number + 1) for number, mask in lists]
-        sinks.scatter.append(self.ended(self.node(off), state.lane, state.radiance, passthrough))
-        return self.node(on), appends
+            lists.append((layout.missed, missed))
+        appends = [AppendIndex(self.node(mask), list=number, counter=number + 1) for number, mask in lists]
+        sinks.scatter.append(self.ended(self.node(ends), state.lane, state.radiance, passthrough))
+        return self.node(goes_on), appends

@@ -67,11 +67,14 @@ class NamedTensors:
     """
 
     def __init__(self, records: dict[str, Any], before: NamedTensors | None = None) -> None:
-        known = {} if before is None else before._walked
-        self._walked: dict[str, tuple[Any, list[tuple[str, Tensor]]]] = {}
+        earlier = {} if before is None else before._walked
+        self._walked: dict[str, tuple[Any, list[tuple[str, Tensor]]]] = {}  # each record, and its tensors by path
         for name, record in records.items():
-            same = name in known and known[name][0] is record and not isinstance(record, dict)
-            self._walked[name] = known[name] if same else (record, list(named_leaves(record, name)))
+            earlier_record, _ = earlier.get(name, (None, []))
+            same = (
+                name in earlier and earlier_record is record and not isinstance(record, dict)
+            )  # a dict may have changed
+            self._walked[name] = earlier[name] if same else (record, list(named_leaves(record, name)))
         self.tensors = dict(leaf for _, leaves in self._walked.values() for leaf in leaves)
         self.ids = {id(tensor): (path, tensor) for path, tensor in self.tensors.items()}
         # Writes in place change the version; inference tensors have none, so they never count as unchanged.
@@ -82,15 +85,17 @@ class NamedTensors:
 
     def has(self, path: str, state: TensorVersion) -> bool:
         """Return True if the tensor at ``path`` is the same object with the same contents as in ``state``."""
-        tensor, version = self.states[path]
-        return tensor is state[0] and version == state[1]
+        (tensor, version), (kept_tensor, kept_version) = self.states[path], state
+        return tensor is kept_tensor and version == kept_version
 
 
 # ---- The cache that renders of one structure share: kernels, and tables of unchanged tensors
 
 
 class KernelCache:
-    """Cache of the latest kernel of each stage and the latest table of each tensor, valid for unchanged tensors.
+    """Cache of the latest kernel of each stage and the latest table of each tensor.
+
+    Each is stored with the versions of the tensors that it was made of, and returned only if these are unchanged.
 
     Renders on several threads may share it at the same time.
     """
@@ -103,25 +108,29 @@ class KernelCache:
 
     def kernel(self, key: Any, program: Program, leaves: NamedTensors) -> Kernel | None:
         """Return the cached kernel of a stage, if it was made of the same program and tensors; else None."""
-        found = self._kernels.get(key)
-        if found is None or found[0].program is not program or program.constants:
+        entry = self._kernels.get(key)
+        if entry is None:
             return None
-        same = all(leaves.has(path, state) for path, state in found[1].items())
-        return found[0] if same else None
+        kernel, states = entry
+        if kernel.program is not program or program.constants:
+            return None
+        return kernel if all(leaves.has(path, state) for path, state in states.items()) else None
 
     def tables(self, leaves: NamedTensors) -> dict[Any, Tensor]:
         """Return the cached tables of a render's tensors, by path and axis."""
         with self._lock:
-            return {key: table for key, (state, table) in self._tables.items() if leaves.has(key[0], state)}
+            return {
+                (path, axis): table for (path, axis), (state, table) in self._tables.items() if leaves.has(path, state)
+            }
 
     def results(self, leaves: NamedTensors) -> dict[StepKey, Tensor]:
-        """Return the cached results of prologue steps on a render's tensors, by name."""
-        found: dict[StepKey, Tensor] = {}
+        """Return the cached results of prologue steps on a render's tensors, by key of the step."""
+        valid: dict[StepKey, Tensor] = {}
         with self._lock:
             for states, results in self._results.values():
                 if all(leaves.has(path, state) for path, state in states.items()):
-                    found |= results
-        return found
+                    valid |= results
+        return valid
 
     def keep(
         self,
@@ -132,14 +141,14 @@ class KernelCache:
         leaves: NamedTensors,
     ) -> None:
         """Store a kernel, and all tables and results of prologue steps of its render."""
-        groups: dict[frozenset[str], dict[StepKey, Tensor]] = {}
-        for name, result in results.items():
-            groups.setdefault(name.leaves, {})[name] = result
+        groups: dict[frozenset[str], dict[StepKey, Tensor]] = {}  # by the paths that the steps depend on
+        for step, result in results.items():
+            groups.setdefault(step.leaves, {})[step] = result
         with self._lock:
             self._kernels[key] = kernel, {path: leaves.states[path] for path in kernel.program.leaves()}
             for paths, group in groups.items():
                 self._results[paths] = {path: leaves.states[path] for path in paths}, group
-            self._tables |= {place: (leaves.states[place[0]], table) for place, table in tables.items()}
+            self._tables |= {(path, axis): (leaves.states[path], table) for (path, axis), table in tables.items()}
 
 
 # ---- Programs: each stage is traced and compiled once for all scenes of one structure
@@ -220,10 +229,10 @@ class Kernels(Layout):
 
     Args:
         wave: the render.
-        packets: see :class:`~torchpt.engines.kernels.layout.Layout`.
-        fused: see there.
+        packets: True: few primitives, searched by packet kernels. False: the acceleration structure is called.
+        fused: True: the search is part of the stages. False: it runs between them.
         before: kernels of another render; its tables are shared where they were made of the same tensors.
-        fixed: True: the structure of a world object never changes. False with models of a user's own, whose code may.
+        fixed: True: the structure of a world object never changes. False with models of a user's own, whose code may change.
         cotangent: see :class:`~torchpt.engines.kernels.backward.VjpKernels`.
 
     Attributes:
@@ -270,20 +279,24 @@ class Kernels(Layout):
         prims = torch.arange(sum(self.world.geometry.counts))
         return None, non_opaque(self.world, prims).to(torch.uint8).numpy()
 
-    def probe(self, numbers: Iterable[int]) -> dict[int, str]:
-        """Compile the stages of models; return those that cannot be compiled, with the reasons."""
+    def probe(self, models: Iterable[int]) -> dict[int, str]:
+        """Compile the stages of BSDF models, by index; return those that cannot be compiled, with the reasons."""
         reasons = {}
-        for number in numbers:
+        for model in models:
             try:
-                self.bounce(number, 0.0)
+                self.bounce(model, roulette=0.0)
             except Unsupported as error:
-                reasons[number] = str(error)
+                reasons[model] = str(error)
         return reasons
 
     def rows(self, layers: Mapping[str, Any]) -> int:
-        """Return how many 32-bit numbers a thread allocates for each lane, see :mod:`torchpt.engines.kernels.engine`."""
-        shown = sum(len(layer.channels) for layer in layers.values())
-        return 2 * self.state.count + 2 * (self.models + 2) + 3 + shown
+        """Return how many 32-bit numbers a thread allocates for each lane.
+
+        They are two arenas of paths, two sets of lists, the radiance of the samples, and the channels of layers
+        (:class:`torchpt.engines.kernels.engine.KernelsEngine`).
+        """
+        channels = sum(len(layer.channels) for layer in layers.values())
+        return 2 * self.state.count + 2 * (self.models + 2) + 3 + channels
 
     # -- vertices of paths
 
@@ -352,7 +365,10 @@ class Kernels(Layout):
     # -- compilation
 
     def _get(self, listed: bool, build: Callable[..., Sinks], *arguments: Any) -> Kernel:
-        """Return the kernel that ``build(trace, *arguments)`` traces; ``listed``: it reads lanes by a list, else in order."""
+        """Return the kernel that ``build(trace, *arguments)`` traces, compiled when it is first asked for.
+
+        ``listed``: True: it reads the lanes of a list; False: all lanes in order.
+        """
         key = (build.__name__, *arguments)
         made = self._made.get(key)
         if made is not None:

@@ -66,12 +66,14 @@ def nearest(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
     graph = tracer.graph
     hits = graph.node("nearest", "S", *_ray(tracer, o, d, t_max))
 
-    def part(number: int, dtype: torch.dtype, ty: str) -> Tensor:
-        node = graph.node("part", ty, hits, extra=number)
+    def part(position: int, dtype: torch.dtype, ty: str) -> Tensor:
+        """Return one of t, prim, u, v as a traced tensor."""
+        node = graph.node("part", ty, hits, extra=position)
         return tracer.lane(torch.zeros(tracer.lanes, dtype=dtype), lambda _: node)
 
     t, prim = part(0, torch.float32, "f"), part(1, torch.int64, "l")
-    return Hit(t, prim, part(2, torch.float32, "f"), part(3, torch.float32, "f"))
+    u, v = part(2, torch.float32, "f"), part(3, torch.float32, "f")
+    return Hit(t, prim, u, v)
 
 
 def occluded(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
@@ -101,8 +103,8 @@ def search_occluded(trace: Trace) -> Sinks:
     rows, tracer = trace.layout.state, trace.tracer
     blocked = occluded(tracer, *rows.read(tracer, "shadow_o", "shadow_d", "shadow_t").values())
     with tracer:
-        number = blocked.to(torch.int32)
-    return Sinks(write=rows.nodes(tracer, blocked=number))
+        zero_or_one = blocked.to(torch.int32)
+    return Sinks(write=rows.nodes(tracer, blocked=zero_or_one))
 
 
 # -- arguments of the search
@@ -132,13 +134,15 @@ CHUNK_FIELDS = ("first", "pixels", "turn", "point", "stream", "streams", "x", "y
 
 
 def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
-    """Write the first rays of paths; with their hits where the search is part of the stages.
+    """Write the first rays of paths, and their hits if the search is part of the stages.
 
-    ``chosen``: row ``prim`` has the indices of the pixels, else they are consecutive. ``given``: rows ``o`` and ``d`` have the
-    rays, else they are camera rays.
+    ``chosen``: True: row ``prim`` of the source arena has the indices of the pixels; False: they are consecutive. ``given``:
+    True: its rows ``o`` and ``d`` have the rays; False: they are camera rays.
     """
     layout, tracer, wave = trace.layout, trace.tracer, trace.layout.wave
-    chunk_fields = trace.uniform("place", torch.ones(len(CHUNK_FIELDS), dtype=torch.int32))
+    chunk_fields = trace.uniform(
+        "place", torch.ones(len(CHUNK_FIELDS), dtype=torch.int32)
+    )  # ones: they divide in the trace
     salts = trace.salts()
     pixels = layout.state.read(tracer, "prim")["prim"] if chosen else torch.empty(0)
     rays = layout.state.read(tracer, "o", "d") if given else {}
@@ -176,20 +180,20 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
 def sort_lanes(trace: Trace, shadow: bool) -> Sinks:
     """Append lanes to lists by their hits, and end paths that hit nothing, unless the scene has an environment.
 
-    ``shadow``: first add the contributions of the shadow rays of the vertex before.
+    ``shadow``: True: the contributions of the shadow rays from the vertex before are added first.
     """
     tracer, rows = trace.tracer, trace.layout.state
     state, passthrough = trace.state()
     prim = rows.read(tracer, "prim")["prim"]
     sinks = Sinks()
     if shadow:
-        arrived = rows.read(tracer, "shadow_radiance", "transmittance", "blocked")
+        shadow_rays = rows.read(tracer, "shadow_radiance", "transmittance", "blocked")
         with tracer:
-            light = arrived["shadow_radiance"]
-            if "transmittance" in arrived:
-                radiance = torch.addcmul(state.radiance, light, arrived["transmittance"])
+            light = shadow_rays["shadow_radiance"]
+            if "transmittance" in shadow_rays:
+                radiance = torch.addcmul(state.radiance, light, shadow_rays["transmittance"])
             else:
-                radiance = state.radiance + torch.where(arrived["blocked"] != 0, 0.0, light)
+                radiance = state.radiance + torch.where(shadow_rays["blocked"] != 0, 0.0, light)
         state = replace(state, radiance=radiance)
         sinks.write += rows.nodes(tracer, radiance=radiance)
     _, appends = trace.sorted(sinks, state, prim, passthrough)
@@ -198,7 +202,7 @@ def sort_lanes(trace: Trace, shadow: bool) -> Sinks:
 
 
 def emit(trace: Trace) -> Sinks:
-    """Add the emission of emitters that were hit to the radiance of the paths, which go on: to the arena, in place."""
+    """Add the emission of emitters that were hit to the radiance of the paths, in place in the arena: these paths go on."""
     tracer, layout = trace.tracer, trace.layout
     context = layout.wave.context.at(trace.salts())
     state, _ = trace.state()
@@ -258,10 +262,10 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
 def _searched(trace: Trace, sinks: Sinks, state: PathState, passthrough: dict[str, Tensor]) -> None:
     """Search inside the kernel: compact the lanes that go on, end the others; the stores are added to ``sinks``."""
     hit = nearest(trace.tracer, state.o, state.d, state.t_max)
-    on, appends = trace.sorted(sinks, state, hit.prim, passthrough)
+    goes_on, appends = trace.sorted(sinks, state, hit.prim, passthrough)
     rows = trace.kept(state, passthrough)
     rows += trace.layout.state.nodes(trace.tracer, t=hit.t, prim=hit.prim, u=hit.u, v=hit.v)
-    sinks.compact.append(Compact(on, tuple(rows), counter=0, appends=tuple(appends)))
+    sinks.compact.append(Compact(goes_on, tuple(rows), counter=0, appends=tuple(appends)))
 
 
 def _with_shadow(
@@ -319,17 +323,17 @@ def list_transmitting(trace: Trace) -> Sinks:
     them pass.
     """
     rows, tracer, layout = trace.layout.state, trace.tracer, trace.layout
-    given = rows.read(tracer, "prim", "t_max")
+    ray = rows.read(tracer, "prim", "t_max")
     with tracer:
         if layout.wave.integrator.has_own_transmit:
-            may_pass = given["t_max"] > 0
+            may_pass = ray["t_max"] > 0
         else:
-            may_pass = non_opaque(layout.world, given["prim"]) & (given["prim"] >= 0)
+            may_pass = non_opaque(layout.world, ray["prim"]) & (ray["prim"] >= 0)
     return Sinks(appends=[AppendIndex(trace.node(may_pass), list=0, counter=0)])
 
 
 def transmit(trace: Trace, again: bool) -> Sinks:
-    """Stop rays at their hits or move them on; ``again``: for rays in transit, else for rays of the list.
+    """Stop rays at their hits or move them on; ``again``: True: rays in transit, False: the rays of the list, at first.
 
     A ray in transit keeps the distance that it has come since its vertex (row ``before``), so that the hit of its path has the
     whole distance, and the lane of its path (row ``home``), which gets that hit. A ray that a medium scatters starts anew: its
@@ -340,29 +344,30 @@ def transmit(trace: Trace, again: bool) -> Sinks:
     rows = layout.passed if again else layout.state
     hit = trace.hit(rows)
     if again:
-        given = rows.read(tracer, "pass_o", "pass_d", "pass_t", "before", "home", "key")
-        o, d, t_max, before, home, key = given.values()
+        ray = rows.read(tracer, "pass_o", "pass_d", "pass_t", "before", "home", "key")
+        o, d, t_max, before, home, key = ray.values()
         path = layout.state.read(tracer, *layout.state.state, place=trace.node(home))
         state = replace(path_state(path), o=o, d=d, t_max=t_max, key=key)
     else:
-        state, before, home = trace.state()[0], None, trace.place()
+        state, _ = trace.state()
+        before, home = None, trace.place()
     with tracer:
         out = layout.wave.integrator.transmit(layout.wave.context.at(salts), VertexInput(state, hit))
-        on = out.on & (state.t_max > 0) if layout.wave.integrator.has_own_transmit else out.on
-        stops = ~on
+        passes = out.on & (state.t_max > 0) if layout.wave.integrator.has_own_transmit else out.on
+        stops = ~passes
         distance = hit.t if before is None else hit.t + before  # from the vertex to this hit
-        after, come, scatters = replace(state, o=out.o), distance, None
+        after, distance_after, scatters = replace(state, o=out.o), distance, None
         if out.state is not None and out.scattered is not None:
-            scatters = on & out.scattered
-            ray = {
+            scatters = passes & out.scattered
+            scattered_ray = {
                 name: torch.where(scatters, getattr(out.state, name), getattr(after, name))
                 for name in ("o", "d", "t_max")
             }
-            after, come = replace(after, **ray), torch.where(scatters, 0.0, distance)
+            after, distance_after = replace(after, **scattered_ray), torch.where(scatters, 0.0, distance)
     onward = layout.passed.nodes(
-        tracer, pass_o=after.o, pass_d=after.d, pass_t=after.t_max, before=come, home=home, key=state.key
+        tracer, pass_o=after.o, pass_d=after.d, pass_t=after.t_max, before=distance_after, home=home, key=state.key
     )
-    sinks = Sinks(compact=[Compact(trace.node(on), tuple(onward), counter=0)])
+    sinks = Sinks(compact=[Compact(trace.node(passes), tuple(onward), counter=0)])
     # The slots of this kernel are the arena of the paths. In the first step a ray that stops has its hit there already.
     if again:
         final_hit = layout.state.nodes(tracer, t=distance, prim=hit.prim, u=hit.u, v=hit.v)
@@ -378,18 +383,19 @@ def begin_shadow_rays(trace: Trace) -> Sinks:
     """Start the rays in transit of shadow rays that may pass surfaces; write the transmittance of all others."""
     layout, tracer = trace.layout, trace.tracer
     ray = layout.state.read(tracer, "shadow_o", "shadow_d", "shadow_t", "blocked")
-    # Row ``blocked``: 0 free, 1 blocked, 2 only surfaces that may let light pass. Packets have none: every live ray is traced.
-    o, d, t_max = list(ray.values())[:3]
+    # Row ``blocked``: 0 free, 1 blocked, 2 only surfaces that may let light pass. Without it, if packets search, every ray with
+    # a positive ``t_max`` is traced.
+    o, d, t_max = (ray[name] for name in ("shadow_o", "shadow_d", "shadow_t"))
     home = trace.place()
     with tracer:
         one = torch.ones_like(t_max)
         if "blocked" in ray:
-            on, off = ray["blocked"] == 2, ray["blocked"] != 2
+            goes_on, is_known = ray["blocked"] == 2, ray["blocked"] != 2
             transmittance = torch.where(ray["blocked"] == 0, one, 0.0)
         else:
-            on, off, transmittance = t_max > 0, t_max <= 0, one
+            goes_on, is_known, transmittance = t_max > 0, t_max <= 0, one
     onward = layout.passed.nodes(tracer, pass_o=o, pass_d=d, pass_t=t_max, home=home, transmittance=one)
-    return _passed(trace, on, onward, off, home, transmittance)
+    return _shadow_ray_sinks(trace, goes_on, onward, is_known, home, transmittance)
 
 
 def attenuate_shadow_rays(trace: Trace) -> Sinks:
@@ -402,30 +408,35 @@ def attenuate_shadow_rays(trace: Trace) -> Sinks:
     with tracer:
         opacity = opacity_at(layout.world, o, d, hit, miss=0.0)
         transmittance = transmittance * (1.0 - opacity)
-        on = (hit.prim >= 0) & (opacity < 1)
-        off = ~on
+        goes_on = (hit.prim >= 0) & (opacity < 1)
+        is_known = ~goes_on
         behind = origins_behind(layout.world, o, d, hit)
-        rest = (t_max - hit.t).clamp_min(0.0)
-    onward = layout.passed.nodes(tracer, pass_o=behind, pass_d=d, pass_t=rest, home=home, transmittance=transmittance)
-    return _passed(trace, on, onward, off, home, transmittance)
+        t_left = (t_max - hit.t).clamp_min(0.0)
+    onward = layout.passed.nodes(tracer, pass_o=behind, pass_d=d, pass_t=t_left, home=home, transmittance=transmittance)
+    return _shadow_ray_sinks(trace, goes_on, onward, is_known, home, transmittance)
 
 
-def _passed(
-    trace: Trace, on: Tensor, onward: list[tuple[int, int]], off: Tensor, home: Tensor, transmittance: Tensor
+def _shadow_ray_sinks(
+    trace: Trace,
+    goes_on: Tensor,
+    onward: list[tuple[int, int]],
+    is_known: Tensor,
+    home: Tensor,
+    transmittance: Tensor,
 ) -> Sinks:
     """Compact shadow rays that go on; write the transmittance of the others to the arena of their paths.
 
     Args:
         trace: the trace.
-        on: mask ``(N,)`` of rays that go on.
+        goes_on: mask ``(N,)`` of rays that go on.
         onward: rows and nodes of these rays in transit.
-        off: mask ``(N,)`` of rays whose transmittance is known.
-        home: their lanes in the arena of the paths ``(N,)``.
+        is_known: mask ``(N,)`` of rays whose transmittance is known.
+        home: lanes of all rays in the arena of the paths ``(N,)``.
         transmittance: ``(N,)``.
     """
-    known = tuple(trace.layout.state.nodes(trace.tracer, transmittance=transmittance))
-    done = Scatter(trace.node(off), trace.node(home), known, slots=True)
-    return Sinks(compact=[Compact(trace.node(on), tuple(onward), counter=0)], scatter=[done])
+    rows = tuple(trace.layout.state.nodes(trace.tracer, transmittance=transmittance))
+    to_paths = Scatter(trace.node(is_known), trace.node(home), rows, slots=True)
+    return Sinks(compact=[Compact(trace.node(goes_on), tuple(onward), counter=0)], scatter=[to_paths])
 
 
 # ---- Kernels of results: layers of first surfaces, and adding samples to the film
@@ -447,7 +458,8 @@ def layers(trace: Trace, model: int, names: tuple[str, ...]) -> Sinks:
 def accumulate(trace: Trace, channels: int, clamp: bool) -> Sinks:
     """Add one sample of each pixel to the film's sums; samples that are not finite are counted, and added as black.
 
-    ``clamp``: scale samples down to the uniform ``clamp`` as :func:`torchpt.paths.wave.clamp_scale` does, and return them too.
+    ``clamp``: True: samples are scaled down to the uniform ``clamp`` as :func:`torchpt.paths.wave.clamp_scale` does, and are
+    results, too.
     """
     tracer, graph = trace.tracer, trace.tracer.graph
     trace.tensors = 2  # inputs: the samples and the sums

@@ -1,4 +1,8 @@
-"""The forward engine of kernels: tasks on threads, adding samples to films, and memory that renders reuse."""
+"""The forward engine of kernels: tasks on threads, adding samples to films, and memory that renders reuse.
+
+A *block* (some pixels, all their samples of a pass) is one task. A thread renders it in *chunks*, as many samples at a time as
+its memory has lanes for, with an engine of its own (a *worker*), and adds each chunk to the films.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +37,9 @@ __all__ = ["KernelsForward", "keep_worker", "reuse_worker"]
 MAX_KEPT_BYTES = 64 << 20
 
 _lock = threading.Lock()
-_kept: deque[tuple[Hashable, KernelsEngine, int]] = deque()
+_kept: deque[tuple[Hashable, KernelsEngine, int]] = (
+    deque()
+)  # structure of the render, engine, its bytes; the oldest first
 
 
 def keep_worker(structure: Hashable, worker: KernelsEngine) -> None:
@@ -41,18 +47,19 @@ def keep_worker(structure: Hashable, worker: KernelsEngine) -> None:
     size = worker.unbind()
     with _lock:
         _kept.append((structure, worker, size))
-        total = sum(one[2] for one in _kept)
+        total = sum(kept_size for _, _, kept_size in _kept)
         while total > MAX_KEPT_BYTES:
-            total -= _kept.popleft()[2]
+            _, _, dropped_size = _kept.popleft()
+            total -= dropped_size
 
 
 def reuse_worker(structure: Hashable) -> KernelsEngine | None:
     """Remove and return the latest kept engine for a structure; None if there is none."""
     with _lock:
-        for number in reversed(range(len(_kept))):
-            if _kept[number][0] == structure:
-                worker = _kept[number][1]
-                del _kept[number]
+        for index in reversed(range(len(_kept))):
+            kept_structure, worker, _ = _kept[index]
+            if kept_structure == structure:
+                del _kept[index]
                 return worker
     return None
 
@@ -76,7 +83,7 @@ if hasattr(os, "register_at_fork"):
 # ---- The forward engine
 
 
-#: Fewest lanes of a task, unless the picture has fewer.
+#: Fewest lanes of a task, unless the picture has fewer, so that the calls of kernels cost little beside their lanes.
 MIN_TASK_LANES = 1024
 #: Fewest pixels of a task, unless threads would be idle: samples of a pixel are added one step each, so few pixels cost time.
 MIN_TASK_PIXELS = 128
@@ -94,6 +101,7 @@ class KernelsForward:
         strict: True: a task ends at its first chunk with a sample that is not finite; the caller has to end the render.
 
     Attributes:
+        compiled: True, see :class:`torchpt.engines.engine.Forward`.
         budget: number of threads, and greatest number of lanes of a chunk.
     """
 
@@ -156,15 +164,15 @@ class KernelsForward:
 
     def _round(self, blocks: list[Block], each: Callable[[TaskResult | None], bool]) -> list[Block]:
         """Render blocks on threads; return the blocks that ran out of memory."""
-        rest: list[Block] = []
+        unfinished: list[Block] = []
 
-        def told(share: TaskResult | None) -> bool:
-            if share is not None:
-                rest.extend(share.rest)
-            return each(share)
+        def on_result(result: TaskResult | None) -> bool:
+            if result is not None:
+                unfinished.extend(result.unfinished)
+            return each(result)
 
-        map_in_order(blocks, self.task, self.budget.threads, told, self._halt)
-        return rest
+        map_in_order(blocks, self.task, self.budget.threads, on_result, self._halt)
+        return unfinished
 
     def _smaller(self, blocks: list[Block]) -> list[Block]:
         """Shrink the budget, and return the blocks split so that each fits into a chunk.
@@ -182,12 +190,13 @@ class KernelsForward:
         ]
 
     def _cut(self, pixel_set: PixelSet, samples: int, tasks: int) -> Iterator[tuple[int, int]]:
-        """Yield the consecutive pixels of each task."""
+        """Yield first pixel and number of pixels of each task."""
         pixels = pixel_set.film.width * pixel_set.film.height
         size = pixels
         threads = self.budget.threads
         if tasks > 1 and threads > 1:
             size = max(-(-pixels // tasks), -(-MIN_TASK_LANES // samples), min(MIN_TASK_PIXELS, -(-pixels // threads)))
+        # whole vectors, but not more than fit in memory
         size = max(min(-(-size // VECTORS.width) * VECTORS.width, self.budget.lanes), 1)
         for start in range(0, pixels, size):
             yield start, min(size, pixels - start)
@@ -206,17 +215,17 @@ class KernelsForward:
     def task(self, block: Block) -> TaskResult:
         """Render a block; called on any thread."""
         pixel_set, start, size, first, count = block
-        share = TaskResult(RayCounts())
+        result = TaskResult(RayCounts())
         sample = first
         try:
-            worker = self._worker()
-            step = max(self.budget.lanes // size, 1)
+            worker = self._take_worker()
+            samples_per_chunk = max(self.budget.lanes // size, 1)
             while sample < first + count:
-                chunk = Chunk(start, size, sample, min(step, first + count - sample), pixel_set)
-                self._chunk(worker, chunk, pixel_set, share)
+                chunk = Chunk(start, size, sample, min(samples_per_chunk, first + count - sample), pixel_set)
+                self._render_chunk(worker, chunk, pixel_set, result)
                 sample += chunk.samples
-                share.samples += size * chunk.samples
-                if self.strict and share.lost.count:
+                result.samples += size * chunk.samples
+                if self.strict and result.lost.count:
                     break
             self._workers.append(worker)
         except Halted:
@@ -224,10 +233,11 @@ class KernelsForward:
         except Exception as error:
             if not is_out_of_memory(error):
                 raise
-            share.rest = [(pixel_set, start, size, sample, first + count - sample)]
-        return share
+            result.unfinished = [(pixel_set, start, size, sample, first + count - sample)]
+        return result
 
-    def _worker(self) -> KernelsEngine:
+    def _take_worker(self) -> KernelsEngine:
+        """Return an idle engine of this render, or of an earlier one of the same structure, or a new one."""
         try:
             return self._workers.pop()
         except IndexError:
@@ -237,41 +247,49 @@ class KernelsForward:
         worker.rebind(self.kernels, self._halt)
         return worker
 
-    def _chunk(self, worker: KernelsEngine, chunk: Chunk, pixel_set: PixelSet, share: TaskResult) -> None:
+    def _render_chunk(self, worker: KernelsEngine, chunk: Chunk, pixel_set: PixelSet, result: TaskResult) -> None:
         """Render a chunk and add it to the films: all of it, or nothing if memory runs out."""
         names, light = tuple(pixel_set.layers), self.kernels.wave.integrator.light
         rays = worker.layers(chunk, names) if names else 0
+        # kernels that add to films are compiled before anything is added
         for film in pixel_set.layers.values():
-            self.kernels.accumulate(film.channels, False)
+            self.kernels.accumulate(film.channels, clamp=False)
         if light:
-            self.kernels.accumulate(3, self.clamp is not None)
+            self.kernels.accumulate(channels=3, clamp=self.clamp is not None)
             tally = worker.trace(chunk)
-            share.tally.truncated += tally.truncated
+            result.tally.truncated += tally.truncated
             rays += tally.rays
         # From here on a failure would leave half a chunk in the films, so running out of memory ends the render.
         with explain_out_of_memory("the sums of a film"):
             if light:
-                self._radiance(worker, chunk, pixel_set, share)
-                self._splats(worker, chunk, pixel_set.film, share)
+                self._add_radiance(worker, chunk, pixel_set, result)
+                self._add_splats(worker, chunk, pixel_set.film, result)
             if names:
-                self._layers(worker, chunk, pixel_set)
-        share.tally.rays += rays
+                self._add_layers(worker, chunk, pixel_set)
+        result.tally.rays += rays
 
-    def _radiance(self, worker: KernelsEngine, chunk: Chunk, pixel_set: PixelSet, share: TaskResult) -> None:
+    def _add_radiance(self, worker: KernelsEngine, chunk: Chunk, pixel_set: PixelSet, result: TaskResult) -> None:
+        """Add the radiance of a chunk's samples to the film."""
         values = worker.slots.floats
-        used = values[:, : chunk.pixels * chunk.samples]
+        samples = values[:, : chunk.pixels * chunk.samples]
         if self.clamp is None:
-            if self._accumulate(worker, values, chunk, pixel_set.film, 3, None):
-                share.lost.add(self._lost(used, chunk))
+            if self._accumulate(values, chunk, pixel_set.film, channels=3, clamp=None):
+                result.lost.add(self._lost(samples, chunk))
             return
-        finite = np.isfinite(used).all(0)
+        finite = np.isfinite(samples).all(0)
         if not finite.all():
-            share.lost.add(self._lost(used, chunk))  # the clamp writes over them
-        before = float(np.where(finite, used, 0.0).sum(dtype=np.float64))
-        self._accumulate(worker, values, chunk, pixel_set.film, 3, self.clamp)
-        share.light = share.light[0] + before, share.light[1] + float(np.ascontiguousarray(used).sum(dtype=np.float64))
+            result.lost.add(self._lost(samples, chunk))  # before the clamp writes over them
+        before = float(np.where(finite, samples, 0.0).sum(dtype=np.float64))
+        self._accumulate(values, chunk, pixel_set.film, channels=3, clamp=self.clamp)
+        after = float(np.ascontiguousarray(samples).sum(dtype=np.float64))
+        self._count_light(result, before, after)
 
-    def _splats(self, worker: KernelsEngine, chunk: Chunk, film: Film, share: TaskResult) -> None:
+    def _count_light(self, result: TaskResult, before: float, after: float) -> None:
+        """Add to the sums of radiance before and after the firefly clamp."""
+        sum_before, sum_after = result.light
+        result.light = sum_before + before, sum_after + after
+
+    def _add_splats(self, worker: KernelsEngine, chunk: Chunk, film: Film, result: TaskResult) -> None:
         """Add the splats of a chunk's samples to the film."""
         before = after = 0.0
         for splats in worker.splats:
@@ -281,48 +299,57 @@ class KernelsForward:
                 before += float(value.sum(dtype=torch.float64))
                 value = value * clamp_scale(value, self.clamp)
                 after += float(value.sum(dtype=torch.float64))
+            # lanes run over the pixels of a sample, then over samples
             stream = film.randomization_of(chunk.first_sample + splats.lane // chunk.pixels)
             film.splats.add(stream, splats.pixel, value)
-        share.light = share.light[0] + before, share.light[1] + after
+        self._count_light(result, before, after)
 
-    def _layers(self, worker: KernelsEngine, chunk: Chunk, pixel_set: PixelSet) -> None:
+    def _add_layers(self, worker: KernelsEngine, chunk: Chunk, pixel_set: PixelSet) -> None:
+        """Add the layers of a chunk's samples to their films."""
         assert worker.shown is not None
         first = 0
         for film in pixel_set.layers.values():
             values = worker.shown.floats[first : first + film.channels]
-            self._accumulate(worker, values, chunk, film, film.channels, None)
+            self._accumulate(values, chunk, film, film.channels, clamp=None)
             first += film.channels
 
-    def _accumulate(
-        self, worker: KernelsEngine, values: np.ndarray, chunk: Chunk, film: Film, channels: int, clamp: float | None
-    ) -> int:
-        """Add samples to a film in their order; return how many were not finite."""
-        made = self.kernels.accumulate(channels, clamp is not None)
-        kernel = made.program
-        counters = np.zeros(1, np.int64)
+    def _accumulate(self, values: np.ndarray, chunk: Chunk, film: Film, channels: int, clamp: float | None) -> int:
+        """Add samples to a film in their order; return how many were not finite.
+
+        Args:
+            values: ``(channels, CAPACITY)`` float32: the chunk's samples, those of the first sample of all pixels first.
+            chunk: pixels and samples.
+            film: the film.
+            channels: its channels.
+            clamp: largest component of a sample, and clamped samples are written back to ``values``; None: no clamp.
+        """
+        kernel = self.kernels.accumulate(channels, clamp=clamp is not None)
+        program = kernel.program
+        counters = np.zeros(1, np.int64)  # of samples that are not finite
         limit = np.array([clamp or 0.0], np.float32)
-        words = (ctypes.c_int64 * (len(HEAD) + len(kernel.uniforms) + 2 * (kernel.tensors + kernel.results)))()
+        words = (ctypes.c_int64 * (len(HEAD) + len(program.uniforms) + 2 * (program.tensors + program.results)))()
         words[HEAD.index("counters")] = counters.ctypes.data
-        words[HEAD.index("tables")] = made.tables.address
-        if kernel.uniforms:
+        words[HEAD.index("tables")] = kernel.tables.address
+        if program.uniforms:
             words[len(HEAD)] = limit.ctypes.data
-        rest = len(HEAD) + len(kernel.uniforms)  # input and output tensors: addresses and lengths of rows
-        sums, n = film.sums, chunk.pixels
+        # Then address and row length of each tensor: samples and sums in, sums and, with a clamp, samples out.
+        first_tensor = len(HEAD) + len(program.uniforms)
+        sums, n = film.sums, chunk.pixels  # sums: (randomizations, channels, pixels) float64
         pixels = sums.shape[2]
         for k in range(chunk.samples):
             group = (chunk.first_sample + k) % film.randomizations
             source = values.ctypes.data + 4 * k * n
             total = sums.data_ptr() + 8 * (group * channels * pixels + chunk.first_pixel)
-            words[rest : rest + 6] = (source, CAPACITY, total, pixels, total, pixels)
+            words[first_tensor : first_tensor + 6] = (source, CAPACITY, total, pixels, total, pixels)
             if clamp is not None:
-                words[rest + 6], words[rest + 7] = source, CAPACITY
-            kernel.call(ctypes.addressof(words), n)
+                words[first_tensor + 6 : first_tensor + 8] = (source, CAPACITY)
+            program.call(ctypes.addressof(words), n)
         film.count_samples(chunk.first_pixel, n, chunk.first_sample, chunk.samples)
         if chunk.first_sample == 0:
             film.set_first_samples(values[:, :n], chunk.first_pixel)
         return int(counters[0])
 
-    def _lost(self, used: np.ndarray, chunk: Chunk) -> NonFinite:
-        """Return the counts of non-finite samples of a chunk with radiance ``used (3, samples * pixels)``."""
-        radiance = torch.from_numpy(used).view(3, chunk.samples, chunk.pixels)
+    def _lost(self, samples: np.ndarray, chunk: Chunk) -> NonFinite:
+        """Return the counts of non-finite samples of a chunk with radiance ``samples (3, samples * pixels)``."""
+        radiance = torch.from_numpy(samples).view(3, chunk.samples, chunk.pixels)
         return NonFinite.of(radiance, chunk.first_pixel, chunk.first_sample, self.kernels.wave.crop, chunk.pixel_set)
