@@ -96,12 +96,19 @@ def _constants(source: ast.Module) -> Iterator[str]:
 
 
 def _code(text: str) -> str:
-    words, fresh = [], True  # whether a statement begins here
+    """Return the tokens of a source without comments and docstrings."""
+    words, begins, in_docstring = [], True, False  # begins: a statement begins here
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type in (tokenize.COMMENT, tokenize.NL) or (token.type == tokenize.STRING and fresh):
+        if token.type in (tokenize.COMMENT, tokenize.NL):
             continue
-        fresh = token.type in (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
-        words.append(token.string if not fresh else tokenize.tok_name[token.type])
+        if token.type == tokenize.STRING and begins:
+            in_docstring = True
+            continue
+        if in_docstring and token.type == tokenize.NEWLINE:  # the end of the docstring's line
+            in_docstring = False
+            continue
+        begins = token.type in (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
+        words.append(token.string if not begins else tokenize.tok_name[token.type])
     return " ".join(words)
 
 

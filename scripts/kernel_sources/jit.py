@@ -1,4 +1,8 @@
-"""Decorators of kernels and of the functions that they call, and the types of a kernel's arguments."""
+"""Decorators of kernels and of the functions that they call, and the types of a kernel's arguments.
+
+Kernels are written in the subset of Python that numba compiles. Importing a source only registers its kernels
+(:data:`KERNELS`); ``scripts/make_kernels.py`` lowers them.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +36,8 @@ FLOATS, DOUBLES = types.CPointer(types.float32), types.CPointer(types.float64)
 INTS, LONGS = types.CPointer(types.int32), types.CPointer(types.int64)
 BYTES = types.CPointer(types.uint8)
 
-#: ``error_model="numpy"``: Python's check for division by zero would raise, and prevents vectorization.
+#: Options of numba. ``error_model="numpy"``: Python's check for division by zero would raise, and prevents vectorization. The
+#: wrappers would be numba's own ways to call the function from Python and C.
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 

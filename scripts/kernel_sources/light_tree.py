@@ -34,6 +34,7 @@ _PI = math.pi
 
 @inner()
 def _clear(groups, k):
+    """Set group ``k`` to one without lights."""
     for c in range(3):
         groups[k, c], groups[k, 3 + c], groups[k, 6 + c] = _INF, -_INF, 0.0
     groups[k, 9], groups[k, 10], groups[k, 11] = 1.0, 0.0, 0.0
@@ -41,6 +42,7 @@ def _clear(groups, k):
 
 @inner()
 def _add(groups, k, others, i):
+    """Add the lights of group ``i`` of ``others`` to group ``k``."""
     for c in range(3):
         groups[k, c] = min(groups[k, c], others[i, c])
         groups[k, 3 + c] = max(groups[k, 3 + c], others[i, 3 + c])
@@ -81,6 +83,7 @@ def _cost(groups, k):
 
 @inner()
 def _gather(groups, k, lights, ids, start, stop):
+    """Set group ``k`` to the lights ``ids[start:stop]``."""
     _clear(groups, k)
     for i in range(start, stop):
         _add(groups, k, lights, ids[i])
@@ -88,6 +91,7 @@ def _gather(groups, k, lights, ids, start, stop):
 
 @inner()
 def _bin(lights, i, axis, low, scale):
+    """Return the bin of a light by twice its centre, whose least value is ``low``; ``scale`` is bins for each unit."""
     return min(max(int((lights[i, axis] + lights[i, 3 + axis] - low) * scale), 0), _BINS - 1)
 
 

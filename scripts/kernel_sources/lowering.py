@@ -1,4 +1,8 @@
-"""Lower kernels to LLVM IR that any 64-bit CPU can compile: numba types and lowers them, LLVM optimizes them."""
+"""Lower kernels to LLVM IR that any 64-bit CPU can compile: numba types and lowers them, LLVM optimizes them.
+
+The text is then stripped of all that depends on numba or on the version of LLVM (attributes, metadata, long names), so that
+other versions of llvmlite can read it and a change of a source changes little of it.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +72,12 @@ def _lowered(kernel: Kernel) -> tuple[str, str, Any]:
 
 
 def _entry(kernel: Kernel, function: str, result: Any) -> str:
-    """Return a module with the function that Python calls: it fills in what numba's function wants to know of arrays."""
+    """Return a module with the function that Python calls, which calls numba's ``function``.
+
+    For an array numba's function takes the members of its array structure: two pointers to Python objects (here null), number
+    of elements, bytes of an element, address, shape and strides. Before all arguments it takes the address of its result and
+    that of an exception, and it returns a status code, which is ignored, since kernels raise nothing.
+    """
     head, inner, lines = [], [], []
     for k, kind in enumerate(kernel.arguments):
         if isinstance(kind, types.Array):
@@ -110,19 +119,24 @@ def _entry(kernel: Kernel, function: str, result: Any) -> str:
 
 
 def _without_host(text: str) -> str:
-    """Return a module without what names the machine that numba compiles for."""
+    """Return a module without what names the machine that numba compiles for: its target lines and target attributes."""
     text = re.sub(r"^target (?:triple|datalayout) = .*$", "", text, flags=re.MULTILINE)
     return re.sub(r'"target-(?:cpu|features)"="[^"]*"', "", text)
 
 
 def _internal(text: str, names: set[str]) -> str:
-    """Return a module in which all but these functions are internal, and square roots are LLVM's."""
+    """Return a module in which all but these functions are internal, and square roots are LLVM's.
+
+    Internal functions and constants may be inlined and dropped.
+    """
+    # a line `define ... @name(`, with or without a linkage before its type
     text = re.sub(
         r'^define (?:linkonce_odr |hidden |dso_local |internal )*(.*?@("[^"]*"|[\w.$]+)\()',
         lambda line: f"define {line[1]}" if line[2].strip('"') in names else f"define internal {line[1]}",
         text,
         flags=re.MULTILINE,
     )
+    # a global constant `@name = linkage ...`
     text = re.sub(r"^(@\S.* = )(?:common|linkonce_odr|linkonce) ", r"\1internal ", text, flags=re.MULTILINE)
     return re.sub(r"@sqrt\(", "@llvm.sqrt.f64(", text)
 
@@ -143,6 +157,8 @@ def _optimize(module: Any) -> None:
 def _plain(text: str) -> str:
     """Return a module without attributes, metadata and comments, and with short names."""
     text = _without_host(text)
+    # whole lines of metadata and attributes; comments; references to metadata and to attributes; address hints; hints of
+    # parameters
     text = re.sub(r"^(?:source_filename|attributes|!|;).*$", "", text, flags=re.MULTILINE)
     text = re.sub(r"\s*;.*$", "", text, flags=re.MULTILINE)
     text = re.sub(r",? ![\w.]+ !\d+", "", text)
@@ -164,6 +180,7 @@ _HINTS = re.compile(
     r" (?:readonly|writeonly|readnone|noundef|nonnull|noalias|nofree|returned|captures\(.*?\)|initializes\(\(.*?\)\)"
     r"|(?:align|dereferenceable|range)(?:\(.*?\)| \d+))(?=[ ,)])"
 )
+#: The name of a value (``%name``), or of a basic block at the start of its line (``name:``); names may be quoted.
 _LOCAL = re.compile(r'%("[^"]*"|[\w.$-]+)|^("[^"]*"|[\w.$-]+):', re.MULTILINE)
 
 

@@ -1,4 +1,8 @@
-"""Add values to entries of a table in a fixed order, and sort lanes by sample."""
+"""Add values to entries of a table in a fixed order, and sort lanes by sample, for gradient sums.
+
+:mod:`torchpt.math.sum_kernels` calls these kernels and documents their arguments. A table has ``entries`` of ``width`` numbers
+each; ``values`` are rows of ``stride`` numbers, one for each number of an entry.
+"""
 
 from __future__ import annotations
 
@@ -42,11 +46,13 @@ def sort_by_sample(
 
 @inner(forceinline=True)
 def _add(total, k, value):
+    """Add a value to number ``k``."""
     put(total, k, item(total, k) + value)
 
 
 @inner()
 def _add_at(total: Any, entries: int, width: int, index: Any, count: int, values: Any, stride: int) -> None:
+    """Add column ``k`` of the values to entry ``index[k]``, in the order of k; indices out of range are left out."""
     first = 0
     while first + 3 <= width:  # unrolled by three: colours and vectors take half as long
         x, y, z = first * stride, (first + 1) * stride, (first + 2) * stride
@@ -81,6 +87,7 @@ for _totals, _total in ((DOUBLES, "f8"), (FLOATS, "f4")):
 
 @inner()
 def _add_by_columns(total, entries, width, index, count, values, stride, slots, sums, column_index):
+    """Add values in ``COLUMNS`` sums that are then added pairwise; a value's column is its slot modulo ``COLUMNS``."""
     for number in range(COLUMNS * entries * width):
         put(sums, number, 0.0)
     for k in range(count):

@@ -1,4 +1,8 @@
-"""Build an eight-wide BVH: a binary tree by the surface area heuristic, collapsed, then laid out in memory."""
+"""Build an eight-wide BVH: a binary tree by the surface area heuristic, collapsed, then laid out in memory.
+
+:mod:`torchpt.search.tree_build` calls these kernels in this order. A *box* is a row of six: low x, y, z, high x, y, z. The
+layout in memory is explained in :mod:`torchpt.search.tree_layout`.
+"""
 
 from __future__ import annotations
 
@@ -39,9 +43,11 @@ __all__ = [
 ]
 
 
-# ---- Binary trees by the surface area heuristic (numba): binned (Wald 2007); the last few primitives by a full sweep
+# ---- Binary trees by the surface area heuristic: binned (Wald, "On fast Construction of SAH-based Bounding Volume
+# Hierarchies", 2007); the last few primitives by a full sweep
 
 
+#: Bins of an axis, as in the paper.
 _BINS = 16
 #: Bins of three axes, and the numbers of their boxes and of one more box.
 _COUNTS, _BIN_NUMBERS = 3 * _BINS, 6 * (3 * _BINS + 1)
@@ -58,6 +64,7 @@ def _half_area(b, k):
 
 @inner(forceinline=True)
 def _clear(b, k):
+    """Set box ``k`` to the empty box."""
     for c in range(3):
         b[k, c] = _INF
         b[k, 3 + c] = -_INF
@@ -65,6 +72,7 @@ def _clear(b, k):
 
 @inner(forceinline=True)
 def _grow(b, k, x, i):
+    """Extend box ``k`` of ``b`` by box ``i`` of ``x``."""
     for c in range(3):
         b[k, c] = min(b[k, c], x[i, c])
         b[k, 3 + c] = max(b[k, 3 + c], x[i, 3 + c])
@@ -72,13 +80,18 @@ def _grow(b, k, x, i):
 
 @inner(forceinline=True)
 def _bin(box, i, axis, low, scale):
+    """Return the bin of a primitive by twice its centre, whose least value is ``low``; ``scale`` is bins for each unit."""
     k = int((box[i, axis] + box[i, 3 + axis] - low) * scale)
     return min(max(k, 0), _BINS - 1)
 
 
 @inner()
 def _best_split(box, start, stop, low, scale, bins, counts, suffix):
-    """Find the split of least SAH cost (Wald 2007): axis (-1: none), first bin of the upper side."""
+    """Find the split of least SAH cost (Wald 2007): axis (-1: none), first bin of the upper side.
+
+    ``bins`` and ``counts`` are boxes and numbers of primitives of the bins of three axes; ``suffix[k]`` is the cost of the bins
+    from ``k`` on.
+    """
     counts[:] = 0
     for k in range(3 * _BINS):
         _clear(bins, k)
@@ -224,7 +237,7 @@ def build_binary(box, ids, nodes, spans, common):
     return used
 
 
-# ---- Collapse of a binary tree to the wide tree of least SAH cost (numba)
+# ---- Collapse of a binary tree to the wide tree of least SAH cost
 #
 # By dynamic programming over the binary tree, as in section 3.1 of Ylitie, Karras and Laine, "Efficient Incoherent Ray
 # Traversal on GPUs Through Compressed Wide BVHs" (2017): each subtree becomes a leaf, a wide node, or up to seven of its
@@ -232,7 +245,7 @@ def build_binary(box, ids, nodes, spans, common):
 
 
 _INF, _ZERO = np.float32(np.inf), np.float32(0.0)
-#: Cost of testing a leaf's eight triangles, its rectangles, and each other primitive; a wide node costs 1.
+#: Cost of testing a leaf's eight triangles, its rectangles, and each other primitive, in units of a visit of a wide node.
 _TRIANGLES, _RECTANGLES, _OTHER = np.float32(1.0), np.float32(1.3), np.float32(2.0)
 
 
@@ -242,6 +255,7 @@ _TWO_NODES = 2 * WIDTH
 
 @inner()
 def _leaf_cost(ids, start, stop, rectangle, other):
+    """Return the cost of testing the primitives ``ids[start:stop]`` as a leaf; arguments as for :func:`choose_collapse`."""
     ruled, more = False, _ZERO
     for i in range(start, stop):
         ruled = ruled or rectangle <= ids[i] < other
@@ -288,7 +302,11 @@ def choose_collapse(nodes, spans, ids, rectangle, other, cost, share):
 
 @inner()
 def _children(root, spans, share, slots, nodes, room):
-    """Fill ``slots`` with the binary nodes that are the children of a wide node; return their number."""
+    """Fill ``slots`` with the binary nodes that are the children of a wide node; return their number.
+
+    ``root`` is the binary node of the wide one. ``nodes`` and ``room`` are a stack: a binary node, and the number of children
+    that its subtree may become.
+    """
     count, top, first = 0, 2, share[root, 0]
     left = spans[root, 2]
     nodes[0], room[0], nodes[1], room[1] = left + 1, WIDTH - first, left, first
@@ -355,7 +373,7 @@ def collapse(nodes, spans, share, boxes, child, first, pending, found):
     found[0], found[1], found[2] = used, leaves, depth
 
 
-# ---- Memory layout: blocks of cache lines (numba)
+# ---- Memory layout: blocks of cache lines
 
 
 _INF, _NAN = np.float32(np.inf), np.float32(np.nan)
@@ -469,11 +487,12 @@ def lay_out(boxes, child, ids, p0, p1, p2, planes, corner, rows, triangles, disk
             codes[base + CHILDREN + 8 + k] = 0
 
 
-# ---- Planes and boxes of triangles (numba): the float64 operations of ``tables.affine_rows`` and ``bounds`` in one pass
+# ---- Planes and boxes of triangles: the float64 operations of ``tables.affine_rows`` and ``bounds`` in one pass
 #
 # Eight triangles are processed together, as vectors of float64.
 
 
+#: As in :mod:`torchpt.search.bounds`.
 _MARGIN = 2.0**-22
 
 
@@ -489,7 +508,7 @@ def _dot(a, b):
 
 @inner(forceinline=True)
 def _finite(row, p):
-    """Return a mask: affine rows through points are finite in float32."""
+    """Return the mask of the affine rows ``row . (x - p)`` whose numbers are finite in float32."""
     total, zero = narrow(row[0]) + narrow(row[1]) + narrow(row[2]) + narrow(-_dot(row, p)), splat(_ZERO, 8)
     return total * zero == zero
 
@@ -524,6 +543,7 @@ def _down(x):
 
 @inner(forceinline=True)
 def _span(a, b, c):
+    """Return the least and the greatest of three values, lane by lane."""
     return minimum(minimum(a, b), c), maximum(maximum(a, b), c)
 
 

@@ -1,4 +1,8 @@
-"""Traverse instances of meshes: a tree over their boxes, and for each instance that a ray hits the tree of its mesh."""
+"""Traverse instances of meshes: a tree over their boxes, and for each instance whose box a ray hits the tree of its mesh.
+
+A *copy* is an instance, by index. In the leaves of the upper tree instances stand where ids of primitives do, as ``-2 - copy``.
+For the names of values see :mod:`kernel_sources.tree_nodes`.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +48,19 @@ def _moved(table, copy, o, d):
 
 @inner()
 def _ray(o, d, best, prim, upper, lower, copies, work, any_hit):
-    """Find the nearest hit of one ray with instances nearer than ``best``, or any such hit: ``t, prim, u, v``."""
+    """Find the nearest hit of one ray with instances nearer than ``best``, or any such hit: ``t, prim, u, v``.
+
+    Args:
+        o: origin, a tuple.
+        d: direction, a tuple.
+        best: distance of the nearest hit so far, or ``t_max``.
+        prim: id of that hit, or -1.
+        upper: the upper tree as float32 and as int32.
+        lower: the trees of the meshes, as the ``scene`` of :func:`kernel_sources.tree_single.trace_single`.
+        copies: of the instances: transforms, shifts of ids, codes of the roots of their meshes.
+        work: keys and parents of the stack, which both levels share, and scratch memory.
+        any_hit: True: stop at the first hit.
+    """
     tree, codes = upper
     table, shift, roots = copies
     keys, parents, scratch = work
@@ -81,6 +97,7 @@ def _ray(o, d, best, prim, upper, lower, copies, work, any_hit):
 
 @inner(inline="always")
 def _search(first, last, memory, o, d, t_max, stride, words, t, prim, u, v, any_hit):
+    """Search rays ``first <= i < last``, see :func:`nearest`; of any-hit rays ``prim`` is 1 or 0, and t, u, v are not used."""
     stack_length = item(words, 5)
     scratch, keys = part(memory, 0, np.float32), part(memory, INSTANCE_MEMORY, np.int32)
     work = (keys, part(keys, stack_length, np.int32), scratch)

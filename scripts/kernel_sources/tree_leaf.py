@@ -1,4 +1,7 @@
-"""Intersect one ray with the primitives of a leaf that are not triangles: rectangles, disks, spheres, quadrics (numba)."""
+"""Intersect one ray with the primitives of a leaf that are not triangles: rectangles, disks, spheres, quadrics.
+
+For the names of values see :mod:`kernel_sources.tree_nodes`.
+"""
 
 from __future__ import annotations
 
@@ -139,7 +142,10 @@ _ONE = np.float32(1.0)
 
 @inner(forceinline=True)
 def setup_ray(dx, dy, dz):
-    """Return the axes, that of the largest component last, the shear, and reciprocals of the direction, which are finite."""
+    """Return the axes, that of the largest component last, the shear, and reciprocals of the direction, which are finite.
+
+    They are the values of :class:`torchpt.search.leaf.Rays`, by the same operations.
+    """
     x, y, z = abs(dx), abs(dy), abs(dz)
     kz = 0 if x >= y and x >= z else (1 if y >= z else 2)
     kx, ky = (1, 2) if kz == 0 else ((2, 0) if kz == 1 else (0, 1))
@@ -196,7 +202,10 @@ def intersect_primitive(prim, corner, rows, quadrics, n2, n3, n4, o, d):
 
 @inner(forceinline=True)
 def _corner(tree, at, axes, p, s):
-    """Return a corner of eight rectangles in sheared space; see :func:`kernel_sources.tree_nodes.crossed_triangles`."""
+    """Return a corner of eight rectangles in sheared space, as splats ``p`` and ``s`` of the ray's origin and shear define it.
+
+    See :func:`kernel_sources.tree_nodes.crossed_triangles`.
+    """
     z = load(tree, at + axes[2] * 8, 8) - p[2]
     x = (load(tree, at + axes[0] * 8, 8) - p[0]) - s[0] * z
     return x, (load(tree, at + axes[1] * 8, 8) - p[1]) - s[1] * z, z * s[2]
@@ -204,7 +213,10 @@ def _corner(tree, at, axes, p, s):
 
 @inner(forceinline=True)
 def _rectangles(tree, at, axes, o, d, p, s):
-    """Intersect eight rectangles: mask of hits, ``t``, u and v, by the operations of :func:`torchpt.search.leaf.distances`."""
+    """Intersect eight rectangles, by the operations of :func:`torchpt.search.leaf.distances`: mask of hits, ``t``, u and v.
+
+    ``at`` is the offset of the rectangles in the tree; ``o``, ``d`` are tuples; ``p`` and ``s`` splats, see :func:`_corner`.
+    """
     zero = splat(_ZERO, 8)
     n0, n1 = load(tree, at + RULED, 8), load(tree, at + RULED + 8, 8)
     n2, n3 = load(tree, at + RULED + 16, 8), load(tree, at + RULED + 24, 8)
@@ -242,7 +254,7 @@ def intersect_others(scene, code, base, o, d, axes, shear, floor, best, prim, sc
         best: distance of the nearest hit so far.
         prim: primitive of that hit, or -1; for any-hit rays see :func:`kernel_sources.tree_nodes.blocking`.
         scratch: 24 float32.
-        any_hit: stop at the first opaque hit; of the results only ``prim`` is defined then.
+        any_hit: True: stop at the first opaque hit; of the results only ``prim`` is defined then.
 
     Returns:
         ``best, prim, u, v``; ``u`` and ``v`` are undefined if ``prim`` has not changed.

@@ -1,6 +1,13 @@
 """Tests of one ray with a node's eight boxes or a leaf's eight triangles, and the stack of a traversal.
 
 The layout of nodes and leaves, codes and entries are explained in :mod:`torchpt.search.tree_layout`.
+
+Names in the traversals: ``tree`` is the buffer as float32, ``codes`` the same memory as int32, ``base`` the offset of a block
+    in
+it; ``ox`` to ``dz`` origin and direction of a ray, ``ix, iy, iz`` its reciprocal direction, ``sx, sy, sz`` its shear,
+``px, py, pz`` its origin in the order of the sheared axes; ``best`` the distance of the nearest hit so far; ``met`` what a test
+returns, beginning with the mask of what was hit. A *splat* is a number repeated in all lanes. ``scene`` is the tuple that
+:func:`kernel_sources.tree_leaf.intersect_others` describes.
 """
 
 from __future__ import annotations
@@ -42,13 +49,16 @@ _ZERO = np.float32(0.0)
 
 @inner(forceinline=True)
 def block_offset(code):
-    """Return the offset of a code's block in the buffer."""
+    """Return the offset, in float32, of a code's block in the buffer.
+
+    ``code >> 63`` is 0 for a node and -1 for a leaf, whose bits the exclusive or inverts; the last two bits are the kinds.
+    """
     return ((code ^ (code >> 63)) & ~3) * (LINE // 4)
 
 
 @inner(forceinline=True)
 def triangles_alone(code):
-    """Return True if a leaf holds only triangles, by its code."""
+    """Return True if a leaf holds only triangles, by its code: ``kinds`` is 0, and inverted in the code of a leaf."""
     return code & 3 == 3
 
 
@@ -72,7 +82,9 @@ def is_valid_ray(ox, oy, oz, dx, dy, dz, t_max):
 def boxes(tree, base, nx, ny, nz, ox, oy, oz, ix, iy, iz, far):
     """Return the entries of a node's eight boxes, and the mask of those hit before ``far``.
 
-    ``nx, ny, nz`` are the offsets of the near planes; origin, reciprocal direction and ``far`` are splats.
+    ``nx, ny, nz`` are the offsets in the node of the planes that the ray meets first: 0, 8, 16 for the lower x, y, z, and 24,
+        32,
+    40 for the upper ones. Origin, reciprocal direction and ``far`` are splats.
     """
     ax, bx = (load(tree, base + nx, 8) - ox) * ix, (load(tree, base + (24 - nx), 8) - ox) * ix
     ay, by = (load(tree, base + ny, 8) - oy) * iy, (load(tree, base + (40 - ny), 8) - oy) * iy
@@ -86,8 +98,9 @@ def boxes(tree, base, nx, ny, nz, ox, oy, oz, ix, iy, iz, far):
 def push(keys, parents, top, base, a, met):
     """Push the boxes that were hit on the stack, the nearest on top; return the new top.
 
-    A key is an entry whose last three bits are the child's number. Eight keys are always written, which avoids a branch on the
-    number of hits.
+    The stack has two rows: ``keys``, and ``parents``, the offset of the node. ``a`` are the entries and ``met`` the mask of
+    :func:`boxes`. A key is the bits of an entry, which order as the numbers do, with the child's number in the last three; of a
+    box that was not hit it is -1. Eight keys are always written, which avoids a branch on the number of hits.
     """
     key = select(met, (as_int(a) & splat(np.int32(-8), 8)) | lane_numbers(8), splat(np.int32(-1), 8))
     store(keys, top, sort_descending(key))
@@ -115,7 +128,10 @@ def crossed_triangles(tree, base, kx, ky, kz, px, py, pz, sx, sy):
 
 @inner(forceinline=True)
 def planes(tree, base, o, d, za, zb, zc, sz, floor):
-    """Return ``t`` of a leaf's planes, clamped to the corners' depths and to at least ``floor``, and the mask of valid ones."""
+    """Return ``t`` of a leaf's planes, clamped to the corners' depths and to at least ``floor``, and the mask of positive ones.
+
+    ``za, zb, zc`` are the depths that :func:`crossed_triangles` returns; ``o``, ``d`` are tuples, ``sz`` is a splat.
+    """
     zero = splat(_ZERO, 8)
     n0, n1, n2 = load(tree, base + PLANES, 8), load(tree, base + PLANES + 8, 8), load(tree, base + PLANES + 16, 8)
     away = n0 * splat(o[0], 8) + n1 * splat(o[1], 8) + n2 * splat(o[2], 8) + load(tree, base + PLANES + 24, 8)

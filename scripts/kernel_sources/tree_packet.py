@@ -1,4 +1,9 @@
-"""Traverse a wide tree by packets of sixteen rays, and by single rays where rays are not coherent (numba)."""
+"""Traverse a wide tree by packets of sixteen rays, and by single rays where rays are not coherent.
+
+Rays are loaded sixteen at a time to columns of memory (:func:`load_rays`). If they are *coherent*, of one octant of directions,
+they are traced as a packet at once; else they stay in their columns, until these are full and all of them are traced as
+interleaved single rays. For the names of values see :mod:`kernel_sources.tree_nodes`.
+"""
 
 from __future__ import annotations
 
@@ -78,12 +83,17 @@ def _inverse(d, least):
 
 @inner(forceinline=True)
 def _facing(inverse, at):
+    """Return the offset in a node of the planes that rays meet first: ``at`` for the lower ones, 24 more for the upper ones."""
     return select(inverse > splat(_ZERO, 16), splat(np.int32(at), 16), splat(np.int32(at + 24), 16))
 
 
 @inner(forceinline=True)
 def load_rays(i, rays, c, rows, ids):
-    """Fill columns ``c`` to ``c + 15`` with rays ``i`` to ``i + 15``; return the mask of those that can hit anything."""
+    """Fill columns ``c`` to ``c + 15`` with rays ``i`` to ``i + 15``; return the mask of those that can hit anything.
+
+    ``rays`` are origins, directions, ends and the length of their rows. The operations are those of
+    :func:`kernel_sources.tree_leaf.setup_ray`.
+    """
     o, d, t_max, n = rays
     ox, oy, oz = load(o, i, 16), load(o, n + i, 16), load(o, 2 * n + i, 16)
     dx, dy, dz = load(d, i, 16), load(d, n + i, 16), load(d, 2 * n + i, 16)
@@ -126,6 +136,7 @@ def load_rays(i, rays, c, rows, ids):
 # ---- Interleaved single rays: each advances by one block in turn, while the next blocks of the others are prefetched
 
 
+#: Numbers of the state of a ray in flight, and of all of them.
 _ROW = 4
 STATE = RAYS_IN_FLIGHT * _ROW
 _ZERO = np.float32(0.0)
@@ -135,17 +146,19 @@ _RAY, _CODE, _KEY, _TOP = 0, 1, 2, 3
 
 @inner(forceinline=True)
 def _splats(rows, at):
+    """Return three rows of a column, the first at ``at``, as splats."""
     return splat(item(rows, at), 8), splat(item(rows, at + COLUMNS), 8), splat(item(rows, at + 2 * COLUMNS), 8)
 
 
 @inner(forceinline=True)
 def _scalars(rows, at):
+    """Return three rows of a column, the first at ``at``."""
     return item(rows, at), item(rows, at + COLUMNS), item(rows, at + 2 * COLUMNS)
 
 
 @inner(forceinline=True)
 def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
-    """Test a leaf and store nearer hits; return True if an any-hit ray is finished."""
+    """Test the ray in column ``c`` with a leaf and store a nearer hit; return True if it is an any-hit ray that is finished."""
     tree, codes = scene[0], scene[1]
     base, mixed = block_offset(code), not triangles_alone(code)
     kx, ky, kz = _scalars(ids, AXIS + c)
@@ -201,7 +214,7 @@ def trace_interleaved(count, scene, stack_length, rows, ids, work, any_hit):
         ids: rows of int32, likewise.
         work: memory: keys and parents of the stacks (``RAYS_IN_FLIGHT * stack_length`` int32), ``STATE`` int64, ``SCRATCH``
             float32.
-        any_hit: stop at the first opaque hit.
+        any_hit: True: stop at the first opaque hit.
     """
     tree, codes = scene[0], scene[1]
     keys, parents, slots, scratch = work
@@ -262,10 +275,11 @@ def trace_interleaved(count, scene, stack_length, rows, ids, work, any_hit):
 # tests of Boulos, Wald and Shirley, "Geometric and Arithmetic Culling Methods for Entire Ray Packets" (2006).
 
 
+#: Rays of a packet.
 RAYS = 16
-#: Float32 of scratch memory that a packet needs.
+#: Float32 of scratch memory that a packet needs: origin, direction, floor, best distance, u and v of its rays.
 SPARE = 10 * RAYS
-#: Fewest active rays of a packet.
+#: Fewest active rays of a packet; fewer are traced one by one.
 FEWEST = 4
 _ZERO, _INF = np.float32(0.0), np.float32(np.inf)
 
@@ -321,7 +335,7 @@ def _met(tree, base, nx, ny, nz, x, y, z, limit):
 
 @inner(forceinline=True)
 def _box(tree, at, nx, ny, nz, o, inverse, best):
-    """Return every ray's entry into one box, whose first number is at ``at``, and the mask of rays that hit it."""
+    """Return every ray's entry into the box that begins at ``at``, and the mask of rays that hit it before ``best``."""
     ax = (splat(item(tree, at + nx), 16) - o[0]) * inverse[0]
     bx = (splat(item(tree, at + (24 - nx)), 16) - o[0]) * inverse[0]
     ay = (splat(item(tree, at + ny), 16) - o[1]) * inverse[1]
@@ -348,7 +362,10 @@ def _corner(tree, at, m, p, s):
 
 @inner(forceinline=True)
 def _triangle(tree, at, axes, s, o, d, floor):
-    """Intersect 16 rays with the triangle whose first number is at ``at``: mask, ``t``, two edge functions, determinant."""
+    """Intersect 16 rays with the triangle whose first number is at ``at``: mask, ``t``, two edge functions, determinant.
+
+    ``axes`` are the masks ``m`` of :func:`_corner`, ``s`` the shear; hits are clamped to at least ``floor``.
+    """
     zero = splat(_ZERO, 16)
     ax, ay, za = _corner(tree, at, axes, o, s)
     bx, by, zb = _corner(tree, at + 24, axes, o, s)
@@ -524,7 +541,10 @@ def trace_packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, 
 
 @inner(inline="always")
 def _trace(first, last, rays, scene, stack_length, groups, columns, work, spare, out, any_hit):
-    """Trace rays ``first`` to ``last``; their number is a multiple of 16."""
+    """Trace rays ``first <= i < last``; their number is a multiple of 16.
+
+    ``columns`` are the rows of :func:`load_rays`, ``groups`` the first ray of each sixteen columns.
+    """
     rows, ids = columns
     i, count = first, np.int64(0)
     while i < last:
@@ -544,7 +564,8 @@ def _trace(first, last, rays, scene, stack_length, groups, columns, work, spare,
             count = np.int64(0)
 
 
-#: Offsets in the scratch memory, in bytes: int64 first, then numbers of 32 bits, then the stacks.
+#: Offsets in the scratch memory, in bytes: int64 first, then numbers of 32 bits, then the stacks. The edge is the remainder of
+#: fewer than 16 rays: ten rows of float32, and primitives.
 _SLOTS = 0
 _GROUPS = _SLOTS + 8 * STATE
 _ROWS = _GROUPS + 8 * (COLUMNS >> 4)

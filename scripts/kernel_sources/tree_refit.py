@@ -1,4 +1,8 @@
-"""Refit a wide tree to primitives that have moved: the same nodes, leaves and ids, with new boxes and triangles."""
+"""Refit a wide tree to primitives that have moved: the same nodes, leaves and ids, with new boxes and triangles.
+
+``tree`` is the buffer of the new tree as float32 and ``codes`` the same memory as int32; ``before`` and ``old`` are those of
+the tree that is refitted. ``at`` is an offset in a buffer. The layout is explained in :mod:`torchpt.search.tree_layout`.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +36,7 @@ _INF, _NAN = np.float32(np.inf), np.float32(np.nan)
 
 @inner(forceinline=True)
 def _moved(tree, at, p, ids, here):
-    """Copy a corner of a leaf's triangles to the tree, NaN where the mask is not set; return it in float64."""
+    """Copy corners ``p (3, P)`` of a leaf's triangles to the tree, NaN where the mask ``here`` is not set; return float64."""
     n, none = np.int32(p.shape[1]), splat(_NAN, 8)
     x = gather(p, ids, here, none)
     y = gather(p, ids + splat(n, 8), here, none)
@@ -54,7 +58,7 @@ def _half_area(tree, at):
 
 @inner(forceinline=True)
 def _union(boxes, first, out, at):
-    """Write the bounding box of eight boxes to ``at``, in the layout of a node."""
+    """Write the bounding box of the eight boxes from ``first`` on to ``out`` at ``at``, in the layout of a node."""
     for j in range(0, 24, 8):
         put(out, at + j, lowest(load(boxes, first + j, 8)))
         put(out, at + 24 + j, highest(load(boxes, first + 24 + j, 8)))

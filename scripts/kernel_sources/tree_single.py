@@ -1,4 +1,7 @@
-"""Traverse a tree of triangles from one of its nodes by a single ray (numba): the lower level of instances."""
+"""Traverse a tree of triangles from one of its nodes by a single ray: the lower level of instances.
+
+For the names of values see :mod:`kernel_sources.tree_nodes`.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,10 @@ SCRATCH = 24
 
 @inner(forceinline=True)
 def pop(codes, keys, parents, top, bottom, limit):
-    """Pop the next box with an entry below ``limit``; return top of the stack (below ``bottom`` if none is left), code, key."""
+    """Pop the next box with an entry of at most ``limit``; return top of the stack, code of the child, key.
+
+    The top is below ``bottom`` if no such box is left. ``keys``, ``parents``: see :func:`kernel_sources.tree_nodes.push`.
+    """
     code, key = np.int64(0), np.int32(0)
     while True:
         top -= 1
@@ -34,7 +40,7 @@ def pop(codes, keys, parents, top, bottom, limit):
 
 @inner(forceinline=True)
 def nearest_triangle(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch):
-    """Update the nearest hit by a leaf's triangles that :func:`crossed_triangles` has found.
+    """Update the nearest hit by a leaf's triangles; ``met`` is the result of :func:`crossed_triangles` for the leaf.
 
     Returns ``best``, ``prim`` (ids plus ``shift``) and the lane of ``scratch`` that holds u and v, -1 if no triangle is nearer.
     """
@@ -57,7 +63,10 @@ def nearest_triangle(tree, codes, base, met, sz, o, d, floor, best, prim, shift,
 
 @inner(forceinline=True)
 def occluding_triangle(scene, base, met, sz, o, d, floor, best, prim, shift):
-    """Return the id of an opaque triangle of those that the ray hits, else :data:`MAY_PASS` for a hit, or ``prim``."""
+    """Return the id of an opaque triangle of the leaf that the ray hits before ``best``.
+
+    Else :data:`MAY_PASS` if it hits one that may let light pass, or ``prim``. ``met``: see :func:`nearest_triangle`.
+    """
     tree, codes = scene[0], scene[1]
     t, ahead = planes(tree, base, o, d, met[1], met[2], met[3], splat(sz, 8), floor)
     w = bits(met[0] & ahead & (t < splat(best, 8)))
@@ -83,7 +92,7 @@ def trace_single(scene, root, o, d, best, prim, shift, keys, parents, bottom, sc
         parents: parent nodes of the stack.
         bottom: first free entry of the stack.
         scratch: ``(SCRATCH,)`` float32.
-        any_hit: stop at the first opaque hit.
+        any_hit: True: stop at the first opaque hit.
 
     Returns:
         ``t, prim, u, v``; ``u`` and ``v`` are undefined if ``prim`` has not changed.

@@ -60,7 +60,7 @@ def gradients(
         params: parameters in place of the scene's.
         wanted: names of the parameters to differentiate.
         dtype: of the lanes.
-        attached: True: geometry is differentiated.
+        attached: True: geometry is differentiated (a parameter moves points, so directions and distances have derivatives).
         method: ``replay`` or ``autograd``.
         cotangent: derivatives of the loss with respect to the pixels ``(3, H W)``.
         film_space: True: first hits stay in place while the camera moves, see :func:`film_space_applies`.
@@ -94,7 +94,8 @@ def gradients(
             differentiates_rays=differentiates_rays,
         )
         if settings.render.max_memory is not None:
-            need = memory_estimate(settings, scene.device, "tape", len(scene_tape.wave.context.world.materials.models))
+            models = len(scene_tape.wave.context.world.materials.models)
+            need = memory_estimate(settings, scene.device, "tape", models)
             check_memory(settings.render.max_memory, scene.device, need.backward_bytes, 0)
         # Fields are what an integrator carries along a path; those of whole numbers have no derivatives.
         differentiates_fields = any(not own.whole for own in integrator.fields)

@@ -1,5 +1,8 @@
 """Gradients with respect to the camera in film space: first hits stay in place, and their projections move over the film.
 
+``gradients/__init__.py`` chooses this method where the camera is differentiated and no surface moves
+(:func:`film_space_applies`); :func:`film_space_backward` is its entry.
+
 A loss is an integral over the film, ``∫ C(p) L(p) dp``, where ``C`` is the cotangent of the pixels under their filters and
 ``L`` the radiance seen at ``p``. A first hit that stays on its surface while the camera moves is projected to ``p(θ)``. Its
 radiance toward the camera changes only because the BSDF depends on the direction. Integration by parts gives
@@ -9,8 +12,11 @@ radiance toward the camera changes only because the BSDF depends on the directio
 The first term weights paths by the change of their film area and by the slope of the filters. A path is added to all pixels
 whose filters cover it, since the slopes of neighbouring filters nearly cancel for a smooth loss. A box filter has jumps instead
 of slopes: there, paths through the borders of pixels carry light from one pixel to the next. The second term is the derivative
-of the BSDF. This is the material form of Zhang et al. (*Path-Space Differentiable Rendering*, 2020) with the first hit held
-too; the borders are the boundary of its pixel.
+of the BSDF. This is the material form of Zhang et al. (*Path-Space Differentiable Rendering*, 2020), in which surface points
+keep their place on the primitive, with the first hit kept in place as well; the borders are the boundary of its pixel.
+
+In the code a *primal* wave has detached parameters, and its twin *on the tape* carries their derivatives. Terms are returned as
+values whose derivative is that of the loss: a factor ``1 + x - x.detach()`` is 1 and has the derivative of ``x``.
 
 Nothing behind the first hit is differentiated. If the first hit slid along its surface while later vertices stay, the geometry
 term of two points at distance r would have a derivative of order 1/r: near the corners of a room it is not absolutely
@@ -47,12 +53,14 @@ from torchpt.spec import Moves
 
 __all__ = ["film_space_applies", "film_space_backward", "needs_direction_gradients"]
 
-#: Xor mask that gives the paths of borders and splats a seed of their own.
+#: Xor mask that gives the paths of borders and splats a seed of their own, any constant.
 _BORDER_SEED = 0x2545F491
 #: A border has 1 / BORDER_FRACTION of a pixel's samples: of two borders a pixel, half as many paths as for the pixels.
 BORDER_FRACTION = 4
 #: Intervals by which the integral of a filter's profile is computed.
 FILTER_STEPS = 1 << 12
+#: Step of the central difference that gives the slope of a filter's profile, relative to the filter's radius.
+_SLOPE_STEP = 1e-5
 
 #: Maps samples ``(3, ...)`` to the values that are added to pixels: finite, and clamped.
 SampleValue = Callable[[Tensor], Tensor]
@@ -64,8 +72,8 @@ def film_space_applies(scene: Scene, settings: Settings, wanted: Iterable[str]) 
     The camera moves and no surface does, and everything is opaque: a ray that passes surfaces has no first hit to hold.
     """
     moving = [name for name in wanted if scene.spec(name).moves is Moves.SURFACES]
-    of_camera = bool(moving) and all(name.startswith("camera.") for name in moving)
-    if not of_camera or any(owner.material.opacity != 1.0 for owner in (*scene.built.parts, *scene.built.copies)):
+    only_camera = bool(moving) and all(name.startswith("camera.") for name in moving)
+    if not only_camera or any(owner.material.opacity != 1.0 for owner in (*scene.built.parts, *scene.built.copies)):
         return False
     return scene.description.camera.kind.projects and isinstance(settings.integrator, PathIntegrator)
 
@@ -73,8 +81,8 @@ def film_space_applies(scene: Scene, settings: Settings, wanted: Iterable[str]) 
 def needs_direction_gradients(scene: Scene, wanted: Iterable[str]) -> bool:
     """Return True if directions need derivatives in film space: behind delta lobes, or for parameters of other objects."""
     owners = [*scene.built.parts, *scene.built.copies]
-    bent = any(material.model.delta for owner in owners for material in owner.material.with_inner())
-    return bent or attached(scene, [name for name in wanted if not name.startswith("camera.")])
+    has_delta = any(material.model.delta for owner in owners for material in owner.material.with_inner())
+    return has_delta or attached(scene, [name for name in wanted if not name.startswith("camera.")])
 
 
 def film_space_backward(scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums) -> None:
@@ -92,7 +100,7 @@ def film_space_backward(scene_tape: SceneTape, settings: Settings, cotangent: Te
     primal, wave, spp = scene_tape.wave, scene_tape.taped, settings.render.spp
     sample_value = partial(clamped_samples, settings)
 
-    # Each returns the values of a chunk, which depend on the leaves of the tape, and their cotangents.
+    # Each of these returns the values of a chunk, which depend on the leaves of the tape, and the cotangents of the values.
 
     def interior_loss(span: Span) -> tuple[Tensor, Tensor]:
         first_pixel, pixel_count, _, _ = span
@@ -108,7 +116,7 @@ def film_space_backward(scene_tape: SceneTape, settings: Settings, cotangent: Te
         return values, torch.ones_like(values)
 
     _, _, width, height = primal.crop
-    if not primal.filter.jumps:
+    if not primal.filter.jumps:  # every filter but the box is 0 at its radius
         chunk_by_chunk(scene_tape, settings, sums, splat_loss, cells(primal), spp)
         return
     border_spp = -(-spp // BORDER_FRACTION)
@@ -124,7 +132,7 @@ class _HeldPoints:
     state: PathState  # camera rays to the points, differentiable in the camera
     x: Tensor  # (N,) position on the film in pixels, differentiable
     y: Tensor  # (N,) likewise
-    stretch: Tensor  # (N,) relative film area: 1, differentiable
+    stretch: Tensor  # (N,) film area of the point's surroundings, relative to that of now: value 1, differentiable
 
 
 def interior(primal: Wave, wave: Wave, span: Span) -> Tensor:
@@ -133,7 +141,7 @@ def interior(primal: Wave, wave: Wave, span: Span) -> Tensor:
     Args:
         primal: the wave with detached parameters.
         wave: the same wave on a tape.
-        span: arguments of :func:`torchpt.engines.engine.radiance`.
+        span: first pixel, number of pixels, first sample, number of samples.
     """
     with torch.no_grad():
         state = primal.rays(*span)
@@ -165,14 +173,14 @@ def borders(
     """
     left, top, width, _ = primal.crop
     columns = width + 1 if vertical else width
-    column, row, offset, key = _cells(primal, span, columns, samples, int(vertical))
+    column, row, offset, key = _cells(primal, span, columns, samples, stream=int(vertical))
     along = offset[0]  # position on the border, 0..1
     with torch.no_grad():
         state = _rays(
             primal, column + left + (0.0 if vertical else along), row + top + (along if vertical else 0.0), key
         )
         radiance = sample_value(_radiance(primal, state))
-        # What the loss gains where light moves from the pixel before the border to the one behind it.
+        # What the loss gains if light moves from the pixel before the border (left or above) to the one behind it.
         before = _pixel_cotangents(cotangent, column - (1 if vertical else 0), row - (0 if vertical else 1), width)
         film_cotangent = _pixel_cotangents(cotangent, column, row, width) - before
     held = _hold_points(primal, wave, state)
@@ -201,7 +209,7 @@ def splats(primal: Wave, wave: Wave, span: Span, samples: int, cotangent: Tensor
     """
     left, top, width, _ = primal.crop
     beyond = _pixels_beyond(primal)
-    column, row, offset, key = _cells(primal, span, width + 2 * beyond, samples, 0)
+    column, row, offset, key = _cells(primal, span, width + 2 * beyond, samples, stream=0)
     column, row = column - beyond, row - beyond  # of the picture's pixels, or beyond them
     with torch.no_grad():
         state = _rays(primal, column + left + offset[0], row + top + offset[1], key)
@@ -235,15 +243,15 @@ def _filter(primal: Wave, away: Tensor) -> Tensor:
     """Return the normalized profile of the filter ``(N,)`` at distances ``away``, differentiable."""
     filter, distance = primal.filter, away.detach().cpu().double().numpy()
     ends = np.linspace(-filter.radius, filter.radius, FILTER_STEPS + 1, dtype=np.float64)
-    middle = 0.5 * (ends[1:] + ends[:-1])
-    integral, step = filter.profile(middle).mean() * 2.0 * filter.radius, 1e-5 * filter.radius
+    middle = 0.5 * (ends[1:] + ends[:-1])  # of each interval
+    integral, step = filter.profile(middle).mean() * 2.0 * filter.radius, _SLOPE_STEP * filter.radius
     slope = (filter.profile(distance + step) - filter.profile(distance - step)) / (2.0 * step * integral)
     value = torch.from_numpy(filter.profile(distance) / integral).to(away)
     return value + torch.from_numpy(slope).to(away) * (away - away.detach())
 
 
 def _pixel_cotangents(cotangent: Tensor, column: Tensor, row: Tensor, width: int) -> Tensor:
-    """Return the cotangents ``(3, N)`` of pixels; 0 outside the picture."""
+    """Return the cotangents ``(3, N)`` of pixels of the picture by column and row; 0 outside of it. ``width``: its columns."""
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < cotangent.shape[1] // width)
     return torch.where(inside, take(cotangent, torch.where(inside, row * width + column, 0)), 0.0)
 
@@ -286,11 +294,12 @@ def _hold_points(primal: Wave, wave: Wave, state: PathState) -> _HeldPoints:
     with torch.no_grad():
         hit = hits(primal, state)
         missed = hit.prim < 0
-        at = interact(world, state.o, state.d, replace(hit, prim=hit.prim.clamp_min(0)), follow_ray=True)
-        p, n = torch.where(missed, 0.0, at.p), torch.where(missed, 0.0, at.ng)
+        surface = interact(world, state.o, state.d, replace(hit, prim=hit.prim.clamp_min(0)), follow_ray=True)
+        p, n = torch.where(missed, 0.0, surface.p), torch.where(missed, 0.0, surface.ng)
     origin = wave.camera.origin()
     offset = torch.where(missed, state.d, p - origin)  # infinitely far points do not move with the camera
     x, y, scale = wave.camera.project(offset)
+    # film area of a small piece of the surface, up to a constant factor
     area = scale * torch.where(missed, 1.0, dot(n, offset).abs())
     primal_area = area.detach()
     stretch = torch.where(primal_area > 0, area / torch.where(primal_area > 0, primal_area, 1.0), 1.0)

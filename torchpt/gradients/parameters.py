@@ -3,6 +3,8 @@
 :mod:`torchpt.scene.world` builds world and camera from the parameters on an autograd tape. Chunks of lanes are differentiated
 with respect to the tensors of the world; their gradient sums are pulled back to the parameters once, at the end. Those tensors,
 cut from the tape of the parameters, are the leaves; their detached twins are the primals.
+
+``rendering/requests.py`` makes a :class:`SceneTape` for each backward pass, through :func:`torchpt.gradients.gradients`.
 """
 
 from __future__ import annotations
@@ -41,7 +43,8 @@ def attached(scene: Scene, names: Iterable[str]) -> bool:
     def is_attached(name: str) -> bool:
         moves = scene.spec(name).moves
         if moves is Moves.RAYS:  # of a bending material, or of a texture that it may read
-            return any(name.startswith(f"{own}.") for own in bending) or bool(bending and "textures." in name)
+            of_bending = any(name.startswith(f"{material}.") for material in bending)
+            return of_bending or bool(bending and "textures." in name)
         return moves is Moves.SURFACES
 
     return any(map(is_attached, names))

@@ -6,7 +6,8 @@ state), and each part is traced again; a part that is still too long is split in
 memory grows with the logarithm of the depth.
 
 A population is an engine's record of all paths of a chunk at one vertex; a chunk, or span, is first pixel, number of pixels,
-first sample and number of samples.
+first sample and number of samples. The VJP of a vertex takes the cotangents of the rays that leave it, adds to the gradient
+sums of the parameters, and gives the cotangents of the rays that come to it.
 
 Vicini, Speierer, Jakob 2021, *Path Replay Backpropagation*; for the marks Griewank, Walther 2000, *Revolve*.
 """
@@ -48,17 +49,21 @@ MARKS = 8
 
 
 class VertexRecorder(Observer[Any]):
-    """Records the populations of a walk; of a walk with too many vertices, marks instead.
+    """Records the populations of a walk; of a walk with more vertices than an engine keeps, marks instead.
 
     Args:
         engine: the engine of the walk.
         first: number of the vertex that the walk starts at.
         mark: the mark of that vertex; None: the walk starts with camera rays.
+
+    Attributes:
+        kept: the populations, one a vertex; empty if there are marks.
+        marks: numbers of vertices and their marks, the first of the walk included; empty if all vertices were kept.
     """
 
     def __init__(self, engine: Backward[Any, Any, Any], first: int, mark: Any) -> None:
-        self.kept: list[Any] = []  # populations by vertex
-        self.marks: list[tuple[int, Any]] = []  # vertex and state
+        self.kept: list[Any] = []
+        self.marks: list[tuple[int, Any]] = []
         self._engine, self._first_vertex, self._first_mark, self._vertices_per_mark = engine, first, mark, KEPT
 
     def on_hits(self, paths: Population) -> bool:
@@ -233,7 +238,7 @@ def _budget_of_tensors(device: torch.device, settings: Settings) -> Budget:
     # One vertex at a time is on a tape, which takes about as much as a wave does.
     per_lane = 2 * BYTES_PER_LANE + BYTES_PER_VERTEX * _kept_vertices(settings)
     lanes, limit = LANES.get(device.type, LANES["cpu"]), settings.render.max_memory
-    return budget_of_chunks(device, lanes, "the vertices of a single lane", limit, per_lane)
+    return budget_of_chunks(device, lanes, what="the vertices of a single lane", limit=limit, per_lane=per_lane)
 
 
 def _kept_vertices(settings: Settings) -> int:
@@ -243,7 +248,7 @@ def _kept_vertices(settings: Settings) -> int:
 
 
 def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
-    """Yield the chunks of blocks of pixels (first, number), independent of threads."""
+    """Yield the chunks of blocks of pixels, given by first pixel and number; they do not depend on threads."""
     for sample in range(0, samples, LANES_OF_KERNELS):
         count = min(LANES_OF_KERNELS, samples - sample)
         step = max(LANES_OF_KERNELS // count, 1)

@@ -66,9 +66,9 @@ def clamped_samples(settings: Settings, values: Tensor) -> Tensor:
 
 #: Lanes of a chunk by device. Fixed, since sums over other chunks would round differently.
 LANES = {"cpu": 1 << 16, "cuda": 1 << 18}
-#: Bytes of a chunk's tape where memory is not limited.
+#: Bytes that a chunk's tape may take (512 MiB), if ``render.max_memory`` does not set less.
 TAPE_BYTES = 1 << 29
-#: Vertices of a path that memory is estimated for where ``max_depth`` is -1.
+#: Most vertices of a path that memory is estimated for, also if ``max_depth`` is -1: hardly a path is longer.
 ASSUMED_DEPTH = 64
 
 #: Maps a chunk to values that depend on the leaves of a tape, and their cotangents.
@@ -150,11 +150,19 @@ def _budget(settings: Settings, scene_tape: SceneTape) -> Budget:
     device, per_lane = scene_tape.wave.centre.device, tape_per_lane(settings)
     lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE_BYTES // per_lane, 1))
     limit = settings.render.max_memory
-    return budget_of_chunks(device, lanes, "the tape of a single lane", limit, per_lane)
+    return budget_of_chunks(device, lanes, what="the tape of a single lane", limit=limit, per_lane=per_lane)
 
 
-def budget_of_chunks(device: torch.device, lanes: int, what: str, limit: int | None, per_lane: int) -> Budget:
-    """Return a budget of ``lanes`` a chunk, whatever the limit as long as they fit: sums of other chunks round differently."""
+def budget_of_chunks(device: torch.device, lanes: int, *, what: str, limit: int | None, per_lane: int) -> Budget:
+    """Return a budget of ``lanes`` a chunk, and of fewer only if the limit needs it: sums of other chunks round differently.
+
+    Args:
+        device: of the lanes.
+        lanes: number of lanes of a chunk.
+        what: names, in the error, what does not fit even with a single lane.
+        limit: ``render.max_memory`` in bytes; None: no limit.
+        per_lane: expected bytes of a lane.
+    """
     budget = Budget(device, lanes, what=what, limit=limit, bytes_per_lane=per_lane)
     budget.drop_unneeded_limit()
     return budget

@@ -3,6 +3,10 @@
 ``x = load(a, i, 8)`` is an LLVM vector ``<8 x float>`` (or int32); control flow stays Python. LLVM compiles the same code to
 AVX-512, AVX2, SSE or NEON, with several instructions a vector if the machine's are shorter. No operation is fused or reordered:
 each lane has the bits of the scalar operation. Indices are not checked: neither bounds nor negative ones.
+
+A *mask* is a vector of booleans, as comparisons give it. Functions here are *intrinsics* of numba: each is written as a
+function of numba's types that returns the signature and a function that writes LLVM instructions, or None for types that it
+does not accept. Kernels call them without the first parameter, ``context``.
 """
 
 from kernel_sources.simd.arithmetic import (

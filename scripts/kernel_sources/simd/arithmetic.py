@@ -34,6 +34,8 @@ def _binary(symbol: Any, for_floats: str | None, for_others: str | None) -> None
 
 
 def _compare(symbol: Any, code: str) -> None:
+    """Define a comparison of vectors, whose result is a mask; ``code`` is llvmlite's name of it."""
+
     def typed(a, b):
         return Vector(types.boolean, a.lanes) if isinstance(a, Vector) and a == b else None
 
@@ -48,6 +50,8 @@ def _compare(symbol: Any, code: str) -> None:
 
 
 def _unary(symbol: Any, generate: Any, allowed: Any) -> None:
+    """Define an operator of one vector, of the types for which ``allowed`` is True."""
+
     def typed(a):
         return a if isinstance(a, Vector) and allowed(a) else None
 
@@ -84,6 +88,7 @@ def select(context, m, a, b):
 
 
 def _chosen(builder: Any, code: str, kind: Any, a: Any, b: Any) -> Any:
+    """Select lanes of ``a`` where the comparison ``code`` of ``a`` with ``b`` holds, else of ``b``."""
     met = builder.fcmp_ordered(code, a, b) if _is_float(kind) else builder.icmp_signed(code, a, b)
     return builder.select(met, a, b)
 
@@ -145,6 +150,7 @@ def square_root(context, x):
 
 
 def _of_floats(builder: Any, name: str, kind: Vector, x: Any) -> Any:
+    """Call LLVM's intrinsic ``name`` on float lanes."""
     shape = ir.FunctionType(x.type, [x.type])
     return builder.call(cgutils.get_or_insert_function(builder.module, shape, f"llvm.{name}.{kind.code}"), [x])
 

@@ -66,6 +66,8 @@ def _ordered(builder: Any, kind: Vector, code: str, a: Any, b: Any) -> Any:
 
 
 def _extreme(code: str) -> Any:
+    """Return the generator of a minimum (``<``) or maximum (``>``) over lanes: halves of the vector are compared in turn."""
+
     def generate(context, builder, signature, args):
         kind, x = signature.args[0], args[0]
         step = kind.lanes // 2
@@ -94,7 +96,7 @@ def highest(context, x):
 
 
 def _network(lanes: int) -> list[list[int]]:
-    """Return a sorting network: the partner of each lane in each layer (Batcher 1968, bitonic merging)."""
+    """Return a sorting network: for each layer the lane with which each lane is compared (Batcher 1968, bitonic merging)."""
     layers, size = [], 2
     while size <= lanes:
         layers.append([k ^ (size - 1) for k in range(lanes)])

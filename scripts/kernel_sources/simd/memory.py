@@ -16,14 +16,17 @@ _I64 = ir.IntType(64)
 
 
 def _base(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    """Return the address of an array or pointer; ``kind`` is its type."""
     return value if isinstance(kind, types.CPointer) else context.make_array(kind)(context, builder, value).data
 
 
 def _place(context: Any, builder: Any, kind: Any, value: Any, i: Any) -> Any:
+    """Return the address of element ``i``."""
     return builder.gep(_base(context, builder, kind, value), [i], inbounds=True)
 
 
 def _address(context: Any, builder: Any, kind: Any, value: Any, i: Any, target: Any) -> Any:
+    """Return the address of element ``i`` as a pointer to the LLVM type ``target``."""
     return builder.bitcast(_place(context, builder, kind, value, i), target.as_pointer())
 
 
@@ -36,6 +39,7 @@ def _contiguous(array: Any) -> bool:
 
 
 def _holds(array: Any) -> bool:
+    """Return True for a type of memory that vectors can be loaded from: contiguous float32 or int32."""
     return _contiguous(array) and array.dtype in (types.float32, types.int32)
 
 
