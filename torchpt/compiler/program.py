@@ -140,7 +140,7 @@ class Program:
 
     @cached_property
     def names(self) -> tuple[StepKey | None, ...]:
-        """Return the names of the steps, see :func:`torchpt.compiler.prologue.step_keys`."""
+        """Return the keys by which steps share their results, see :func:`torchpt.compiler.prologue.step_keys`."""
         return step_keys(self.steps)
 
     @cached_property
@@ -175,7 +175,9 @@ class Tables:
 
 
 def lay_out_table(tensor: Tensor, axis: int | None) -> Tensor:
-    """Return a table in the layout of kernels: entries first, contiguous, integers and bools in 32 bits.
+    """Return a table in the layout of kernels: contiguous, integers and bools in 32 bits.
+
+    The axis that lanes index comes first, so that the numbers of an entry lie together; None: the layout stays.
 
     Raises:
         Unsupported: integers beyond 32 bits, or 2^31 elements or more.
@@ -211,8 +213,8 @@ def bind_tables(
         steps: prologue of the trace.
         constants: constant tensors of the trace.
         leaves: the scene's tensors by path.
-        known: leaves laid out before, by path and axis; filled.
-        names: names of the steps.
+        known: leaves that were laid out before, by path and axis; those laid out now are added.
+        names: keys of the steps, :attr:`Program.names`.
         results: results of steps of other kernels, see :func:`torchpt.compiler.prologue.run_prologue`; filled.
         device: of the leaves, if kernels read tables on a device; None: on the host.
     """
@@ -222,14 +224,15 @@ def bind_tables(
     keep: list[Tensor] = []
     for table in tables:
         key = (table.source.name, table.axis) if table.source.kind == "leaf" else None
-        numbers = known.get(key) if key is not None else None
-        plain = tensor(table.source)
-        if numbers is None:
-            numbers = lay_out_table(plain, table.axis)
+        laid_out = known.get(key) if key is not None else None
+        original = tensor(table.source)
+        if laid_out is None:
+            laid_out = lay_out_table(original, table.axis)
             if key is not None:
-                known[key] = numbers
-        keep.append(numbers)
-        words += [numbers.data_ptr(), plain.numel() if table.axis is None else plain.shape[table.axis]]
+                known[key] = laid_out
+        keep.append(laid_out)
+        entries = original.numel() if table.axis is None else original.shape[table.axis]
+        words += [laid_out.data_ptr(), entries]
     if device is not None:
         pairs = torch.tensor(words or [0], dtype=torch.int64, device=device)
         return Tables(pairs.data_ptr(), (pairs, keep))

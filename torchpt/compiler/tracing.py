@@ -39,6 +39,7 @@ LANES = (97, 89, 101, 83, 103, 79, 107, 109, 113, 127)
 #: Most elements of a table that become a node each, where a stage computes with a whole table in every lane.
 _MOST_ELEMENTS = 4096
 
+#: A function that lowers an operator, see :func:`register_lowering`.
 Handler = Callable[..., None]
 #: Lowering of each torch operator, by its name without overload.
 LOWERINGS: dict[str, Handler] = {}
