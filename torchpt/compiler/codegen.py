@@ -214,15 +214,16 @@ def _floordiv(block: Block, ty: str, a: str, b: str) -> str:
     # As in Python and torch: the exact quotient rounded down, not the rounded quotient; 1 // 0.1 is 9.
     zero, one = block.constant(ty, 0.0), block.constant(ty, 1.0)
     r = _fmod(block, ty, a, b)
-    q = block.div(ty, block.sub(ty, a, r), b)
+    q = block.div(ty, block.sub(ty, a, r), b)  # an integer up to rounding
     q = block.select(ty, _against(block, ty, r, b), block.sub(ty, q, one), q)
-    whole = block.call("llvm.floor", ty, q)
-    up = block.compare("ogt", ty, block.sub(ty, q, whole), block.constant(ty, 0.5))
-    whole = block.select(ty, up, block.add(ty, whole, one), whole)
-    plain = block.div(ty, a, b)
-    nothing = block.call("llvm.copysign", ty, zero, plain)
-    whole = block.select(ty, block.compare("oeq", ty, q, zero), nothing, whole)
-    return block.select(ty, block.compare("oeq", ty, b, zero), plain, whole)
+    floored = block.call("llvm.floor", ty, q)
+    up = block.compare("ogt", ty, block.sub(ty, q, floored), block.constant(ty, 0.5))
+    floored = block.select(ty, up, block.add(ty, floored, one), floored)
+    # a quotient of 0 has the sign of a / b, and a division by 0 gives what a / b gives
+    quotient = block.div(ty, a, b)
+    signed_zero = block.call("llvm.copysign", ty, zero, quotient)
+    floored = block.select(ty, block.compare("oeq", ty, q, zero), signed_zero, floored)
+    return block.select(ty, block.compare("oeq", ty, b, zero), quotient, floored)
 
 
 def _truncdiv(block: Block, ty: str, a: str, b: str) -> str:

@@ -77,9 +77,9 @@ class Lanewise:
         if tracing():
             return NotImplemented
         if kwargs or len(args) < len(self._kinds):
-            given = self._signature.bind(*args, **kwargs)
-            given.apply_defaults()
-            args = given.args
+            bound = self._signature.bind(*args, **kwargs)
+            bound.apply_defaults()
+            args = bound.args
         structure: list[Any] = []
         inputs: list[Tensor] = []
         uniforms: list[Tensor] = []

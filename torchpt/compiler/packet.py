@@ -28,7 +28,7 @@ __all__ = ["KINDS", "PacketSearch", "binary_searches", "scene_words"]
 def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
     """Generate the binary searches that a graph uses; all lanes take the same number of steps, log2 of the table's length."""
     searches = {extra[1:] for op, _, _, extra in map(graph.nodes.__getitem__, needed) if op == "search"}
-    whole = Block(form)
+    functions = Block(form)
     for ty, right in sorted(searches):
         block, element = Block(form), MEMORY[ty]
         vector, places = block.vector(ty), block.each("i32")
@@ -67,9 +67,9 @@ def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
         ]
         block.do(f"ret {places} {block.call('llvm.umin', 'i', '%found', most)}")
         block.lines.append("}")
-        whole.lines += block.lines
-        whole.declarations |= block.declarations
-    return whole
+        functions.lines += block.lines
+        functions.declarations |= block.declarations
+    return functions
 
 
 def _attributes(form: Form) -> str:
@@ -106,13 +106,13 @@ class PacketSearch:
 
     def __call__(self, form: Form) -> Block:
         """Generate the functions; a packet has ``form.width`` rays."""
-        whole = Block(form)
+        functions = Block(form)
         for any_hit in (False, True):
             block = _SearchFunction(self.kinds, any_hit, form)
             block.write()
-            whole.lines += block.lines
-            whole.declarations |= block.declarations
-        return whole
+            functions.lines += block.lines
+            functions.declarations |= block.declarations
+        return functions
 
 
 def scene_words(rows: Tensor, balls: Tensor, counts: Sequence[int], extent: float) -> Any:
@@ -331,8 +331,8 @@ class _SearchFunction(Block):
         # An unordered comparison, so that overflow and NaN take the exact test.
         near = self.compare("ule", "f", square, self.mul("f", reach, reach))
         near = self.op(f"and {self.b} {near}, {self.compare('ogt', 'f', f'%{kind}_t', self.constant('f', 0.0))}")
-        some = self.some(near)
-        self.lines += [f"  br i1 {some}, label %{kind}_exact, label %{kind}_last", f"{kind}_exact:"]
+        any_near = self.some(near)
+        self.lines += [f"  br i1 {any_near}, label %{kind}_exact, label %{kind}_last", f"{kind}_exact:"]
 
     def _sphere(self, kind: str) -> tuple[str, str | None]:
         """Intersect a sphere as ``sphere_distance`` of ``scripts/kernel_sources/tree_leaf.py``; return t, NaN for a miss."""

@@ -95,18 +95,22 @@ def why_unavailable() -> str | None:
     wanted = torch.version.cuda
     if wanted is None:
         return f"torch {torch.__version__} was built without CUDA"
-    found = cuda_of_driver()
-    if found is None:
+    supported = cuda_of_driver()
+    if supported is None:
         return "there is no NVIDIA driver"
     if driver_too_old():
-        return f"the NVIDIA driver is too old: it has CUDA {found[0]}.{found[1]}, and torch was built for CUDA {wanted}"
+        major, minor = supported
+        return f"the NVIDIA driver is too old: it has CUDA {major}.{minor}, and torch was built for CUDA {wanted}"
     return "no CUDA device was found"
 
 
 def driver_too_old() -> bool:
     """Return True if there is a driver, and torch was built for a later major version of CUDA than the driver supports."""
-    wanted, found = torch.version.cuda, cuda_of_driver()
-    return wanted is not None and found is not None and found[0] < int(wanted.partition(".")[0])
+    wanted, supported = torch.version.cuda, cuda_of_driver()
+    if wanted is None or supported is None:
+        return False
+    major, _ = supported
+    return major < int(wanted.partition(".")[0])
 
 
 def _entry(card: str, driver: str) -> str:

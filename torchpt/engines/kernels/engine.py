@@ -536,24 +536,24 @@ class KernelsEngine:
     def spawn(self, chunk: Chunk) -> Paths:
         """Return the population of a chunk's camera rays, with their first hits if the search is part of the stages."""
         self.start(chunk)
-        kernels, calls, given = self.kernels, self.calls, self.wave.start_rays
+        kernels, calls, start_rays = self.kernels, self.calls, self.wave.start_rays
         self.splats, self._lost = [], []
         count, pixels = chunk.pixels * chunk.samples, None if chunk.pixel_set is None else chunk.pixel_set.indices
-        if given is not None:
-            pixels = given.number
+        if start_rays is not None:  # the user's rays, in place of camera rays
+            pixels = start_rays.number
         paths, source = self._begin(self.room(1), 1, calls.lanes(count)), self.room(1).arena
         calls.clear()
         calls.set_dimensions(depth=0)
         of_chunk = slice(chunk.first_pixel, chunk.first_pixel + chunk.pixels)
-        if pixels is not None or given is not None:  # the kernel reads them from the arena of the next vertex
+        if pixels is not None or start_rays is not None:  # the kernel reads them from the arena of the next vertex
             source = self.room(2).arena
         if pixels is not None:
             source.repeat(kernels.state.first("prim"), pixels[of_chunk][None], chunk.samples)
-        if given is not None:
-            for name, vectors in (("o", given.o), ("d", given.d)):
+        if start_rays is not None:
+            for name, vectors in (("o", start_rays.o), ("d", start_rays.d)):
                 source.repeat(kernels.state.first(name), vectors[:, of_chunk], chunk.samples)
         lists = paths.lists if kernels.fused else None
-        kernel = kernels.generate(chosen=pixels is not None, given=given is not None)
+        kernel = kernels.generate(chosen=pixels is not None, given=start_rays is not None)
         calls.run(kernel, paths.count, source, paths.arena, lists=lists)
         if kernels.fused:
             self._count_rays(paths.count)

@@ -370,16 +370,16 @@ class Kernels(Layout):
         ``listed``: True: it reads the lanes of a list; False: all lanes in order.
         """
         key = (build.__name__, *arguments)
-        made = self._made.get(key)
-        if made is not None:
-            return made
+        kernel = self._made.get(key)
+        if kernel is not None:
+            return kernel
         with self._lock:
-            made = self._made.get(key)
-            if made is None:
+            kernel = self._made.get(key)  # another thread may have made it
+            if kernel is None:
                 start = time.perf_counter()
-                made = self._made[key] = self._make(key, listed, build, arguments)
+                kernel = self._made[key] = self._make(key, listed, build, arguments)
                 self.seconds += time.perf_counter() - start
-            return made
+            return kernel
 
     def _make(
         self, key: tuple[Any, ...], listed: bool, build: Callable[..., Sinks], arguments: tuple[Any, ...]
@@ -388,12 +388,12 @@ class Kernels(Layout):
             return build(trace, *arguments)
 
         program = self._program(key, listed, traced)
-        old = self.kernel_cache.kernel(key, program, self._leaves)
-        if old is not None:
-            return old
-        made = Kernel(program, self._bind(program))
-        self.kernel_cache.keep(key, made, self._laid_out, self._results, self._leaves)
-        return made
+        cached = self.kernel_cache.kernel(key, program, self._leaves)
+        if cached is not None:
+            return cached
+        kernel = Kernel(program, self._bind(program))
+        self.kernel_cache.keep(key, kernel, self._laid_out, self._results, self._leaves)
+        return kernel
 
     def _program(self, key: tuple[Any, ...], listed: bool, build: Callable[[Trace], Sinks]) -> Program:
         return program_of(key, self.structure, self._leaves, self, build, listed)
