@@ -130,7 +130,7 @@ def _collect(queue: TaskQueue[QueuedRender, TaskResult], started: dict[int, Queu
             elif isinstance(result, BaseException):
                 raise result
             else:
-                entry.unfinished += result.unfinished
+                entry.unfinished += result.unfinished  # blocks for which memory ran out
                 entry.run.task_finished(result)
             if entry.tasks_left == 0:
                 del started[id(entry)]

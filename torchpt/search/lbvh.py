@@ -1,4 +1,8 @@
-"""A linear BVH by tensor operations on any device: built from Morton codes, traversed by all rays in lockstep."""
+"""A linear BVH by tensor operations on any device: built from Morton codes, traversed by all rays in lockstep.
+
+It is the search on GPUs, and the reference for the other backends. A *lane* is a ray of those that are traversed together. A
+node is the index of an inner node, ``~k`` for leaf k, or ``_DONE`` for a lane that is finished.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +28,7 @@ __all__ = ["Lbvh", "RadixTree", "build_tree", "intersect", "morton_codes", "occl
 # Karras, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees", HPG 2012.
 
 
+#: Bits of a Morton code for each axis: three times as many fit in an int64.
 _BITS = 21
 
 
@@ -48,6 +53,7 @@ def morton_codes(centre: Tensor) -> Tensor:
     low = centre.amin(1, keepdim=True)
     size = (centre.amax(1, keepdim=True) - low).clamp(min=torch.finfo(torch.float64).tiny)
     cell = ((centre - low) / size * 2**_BITS).long().clamp(0, 2**_BITS - 1)
+    # Spread the bits of each axis, two zeros after each: halves of the remaining groups of bits move apart in turn.
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -89,11 +95,16 @@ def build_tree(low: Tensor, high: Tensor, ids: Tensor) -> RadixTree:
 
 
 def _below(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
-    """Return True where the highest set bit of a is below that of b; a and b are (xor of codes, xor of indices)."""
-    (ca, ia), (cb, ib) = a, b
-    codes = (ca < cb) & (ca < (ca ^ cb))
-    places = (ia < ib) & (ia < (ia ^ ib))
-    return torch.where(ca | cb != 0, codes, places)
+    """Return True where the highest set bit of a is below that of b.
+
+    ``a`` and ``b`` are pairs: xor of two leaves' codes, and of their indices, which count where both of the codes' are 0. In
+        the
+    terms of Karras the common prefix of the leaves of ``a`` is longer than that of ``b``.
+    """
+    (codes_a, indices_a), (codes_b, indices_b) = a, b
+    by_codes = (codes_a < codes_b) & (codes_a < (codes_a ^ codes_b))
+    by_indices = (indices_a < indices_b) & (indices_a < (indices_a ^ indices_b))
+    return torch.where(codes_a | codes_b != 0, by_codes, by_indices)
 
 
 def _ranges(codes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -103,10 +114,13 @@ def _ranges(codes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     big = torch.full_like(i, torch.iinfo(torch.int64).max)
 
     def differ(j: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the xor of codes and of indices of leaves i and j; the largest numbers where j is no leaf."""
         inside = (j >= 0) & (j < n)
         k = j.clamp(0, n - 1)
         return torch.where(inside, codes[i] ^ codes[k], big), torch.where(inside, i ^ k, big)
 
+    # Node i covers the leaves from i on in direction d, +1 or -1, as long as they have more in common with leaf i than the leaf
+    # on its other side has. Their number, then the split within them, by binary search.
     d = torch.where(_below(differ(i + 1), differ(i - 1)), 1, -1)
     limit = differ(i - d)
     steps = math.ceil(math.log2(n)) + 1
@@ -115,12 +129,12 @@ def _ranges(codes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         further = length + (1 << k)
         length = torch.where(_below(differ(i + further * d), limit), further, length)
     end = i + length * d
-    whole = differ(end)
-    s = torch.zeros_like(i)
+    of_all = differ(end)
+    offset = torch.zeros_like(i)
     for k in reversed(range(steps)):
-        further = s + (1 << k)
-        s = torch.where((further < length) & _below(differ(i + further * d), whole), further, s)
-    split = i + s * d + torch.minimum(d, torch.zeros_like(d))
+        further = offset + (1 << k)
+        offset = torch.where((further < length) & _below(differ(i + further * d), of_all), further, offset)
+    split = i + offset * d + torch.minimum(d, torch.zeros_like(d))
     return torch.minimum(i, end), torch.maximum(i, end), split
 
 
@@ -129,11 +143,11 @@ def _range_boxes(low: Tensor, high: Tensor, first: Tensor, last: Tensor) -> tupl
     count = last - first + 1
     out_low, out_high = torch.empty_like(low[:, : len(first)]), torch.empty_like(high[:, : len(first)])
     width = 1
-    while True:
-        mine = torch.nonzero((count >= width) & (count < 2 * width))[:, 0]
-        a, b = first[mine], last[mine] - (width - 1)
-        out_low[:, mine] = torch.minimum(low[:, a], low[:, b])
-        out_high[:, mine] = torch.maximum(high[:, a], high[:, b])
+    while True:  # low, high: boxes of `width` leaves from each leaf on
+        nodes = torch.nonzero((count >= width) & (count < 2 * width))[:, 0]
+        a, b = first[nodes], last[nodes] - (width - 1)
+        out_low[:, nodes] = torch.minimum(low[:, a], low[:, b])
+        out_high[:, nodes] = torch.maximum(high[:, a], high[:, b])
         if 2 * width > low.shape[1] + width:
             return out_low, out_high
         low = torch.minimum(low[:, :-width], low[:, width:])
@@ -142,7 +156,7 @@ def _range_boxes(low: Tensor, high: Tensor, first: Tensor, last: Tensor) -> tupl
 
 
 def _depth(parent: Tensor) -> int:
-    """Return the length of the longest chain of parents, by pointer jumping."""
+    """Return the number of nodes on the longest chain of parents, by pointer jumping; the root is its own parent."""
     steps = (parent != torch.arange(len(parent), device=parent.device)).long()
     steps[0] = 0
     while bool((parent != 0).any()):
@@ -159,8 +173,9 @@ def _depth(parent: Tensor) -> int:
 
 #: Lanes that are traversed together; bounds memory to about 100 MB.
 CHUNK = 1 << 18
-#: Steps of a round that descend before each of its steps that test leaves.
+#: Steps of a round that descend before each of its steps that test leaves: eight steps a round.
 DESCENTS = (3, 3)
+#: Node of a lane that is finished, beyond all others.
 _DONE = 1 << 30
 #: Boxes are enlarged by 16 ulps of the distance; the slab test errs by 3 (Ize, "Robust BVH Ray Traversal", 2013).
 _SLACK = 1.0 + 2.0**-20
@@ -169,7 +184,17 @@ _SLACK = 1.0 + 2.0**-20
 def intersect(
     o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the nearest hits; ``tensors``, ``counts`` and ``depth`` are those of :class:`Lbvh`."""
+    """Return the nearest hits.
+
+    Args:
+        o: origins ``(3, N)``.
+        d: directions ``(3, N)``.
+        t_max: ends of the rays ``(N,)``.
+        tensors: ``corners`` and ``rows`` of the primitives and ``quadrics``, as :func:`torchpt.search.leaf.distances` takes
+            them; children, boxes and order of the :class:`RadixTree`.
+        counts: numbers of primitives of each kind.
+        depth: of the tree.
+    """
     chunks = [_Chunk(*rays, tensors, counts, depth).run(any_hit=False) for rays in _chunks(o, d, t_max)]
     t, prim, u, v = (torch.cat(x) for x in zip(*chunks, strict=True)) if len(chunks) > 1 else chunks[0]
     missed = prim < 0
@@ -183,6 +208,7 @@ def occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts:
 
 
 def _chunks(o: Tensor, d: Tensor, t_max: Tensor) -> Iterable[tuple[Tensor, Tensor, Tensor]]:
+    """Yield the rays in chunks."""
     return zip(o.split(CHUNK, 1), d.split(CHUNK, 1), t_max.split(CHUNK), strict=True)
 
 
@@ -198,20 +224,20 @@ class _Chunk:
         self.t = t_max.clone()
         self.prim = torch.full_like(t_max, -1, dtype=torch.int64)
         self.u, self.v = torch.zeros_like(t_max), torch.zeros_like(t_max)
-        good = (t_max > 0) & torch.isfinite(o).all(0) & torch.isfinite(d).all(0) & (d != 0).any(0)
-        self.node = torch.where(good, 0, _DONE)
-        self.top = torch.zeros_like(self.node)  # entries on the stack
+        valid = (t_max > 0) & torch.isfinite(o).all(0) & torch.isfinite(d).all(0) & (d != 0).any(0)
+        self.node = torch.where(valid, 0, _DONE)
+        self.top = torch.zeros_like(self.node)  # number of entries on the stack
         # Row 0 holds `_DONE`; a lane that waits at the deepest leaf writes a row above its `depth` entries.
         self.stack = torch.full((depth + 2, len(t_max)), _DONE, dtype=torch.int32, device=o.device)
-        self.lanes: Tensor | None = None  # numbers of the lanes in the chunk; None: all
-        self.found: tuple[Tensor, ...] = ()  # hits of all rays
+        self.lanes: Tensor | None = None  # (n,) indices of the lanes in the chunk; None: all
+        self.hits_of_all: tuple[Tensor, ...] = ()  # t, prim, u, v of all rays of the chunk, once stored
 
     def _hits(self) -> tuple[Tensor, ...]:
         return self.t, self.prim, self.u, self.v
 
     def run(self, any_hit: bool) -> tuple[Tensor, ...]:
         """Traverse to the end; return ``t, prim, u, v`` of all rays, where a miss has prim -1."""
-        while self.children.shape[1]:
+        while self.children.shape[1]:  # 0 in a tree without primitives
             for descents in DESCENTS:
                 for _ in range(descents):
                     self._descend()
@@ -219,17 +245,17 @@ class _Chunk:
             live = torch.nonzero(self.node < _DONE)[:, 0]
             if not len(live):
                 break
-            if 8 * len(live) < 7 * len(self.node):
+            if 8 * len(live) < 7 * len(self.node):  # fewer than 7/8 are left
                 self._compact(live)
         self._store()
-        return self.found
+        return self.hits_of_all
 
     def _store(self) -> None:
         """Store the hits of the lanes in those of all rays."""
         if self.lanes is None:
-            self.found = self._hits()
+            self.hits_of_all = self._hits()
         else:
-            for all_rays, value in zip(self.found, self._hits(), strict=True):
+            for all_rays, value in zip(self.hits_of_all, self._hits(), strict=True):
                 all_rays[self.lanes] = value
 
     def _compact(self, live: Tensor) -> None:
@@ -297,13 +323,15 @@ class Lbvh(Accel):
         self.corners = torch.cat([geometry.p0, geometry.p1, geometry.p2]).float()
         self.rows = tables.rows.T.contiguous()
         quadrics = quadric_rows(geometry)
+        # the last row, h, is left out if it is 0 in all quadrics, which saves its operations
         self.quadrics = quadrics if bool(quadrics[-1].any()) else quadrics[:-1]
-        keep = torch.nonzero(tables.area)[:, 0]
+        with_area = torch.nonzero(tables.area)[:, 0]
         low, high = primitive_bounds(geometry)
-        self.tree = build_tree(low[:, keep], high[:, keep], keep)
+        self.tree = build_tree(low[:, with_area], high[:, with_area], with_area)
         self.build_seconds = time.perf_counter() - start
 
     def _tensors(self) -> list[Tensor]:
+        """Return the tensors that :func:`intersect` takes."""
         return [self.corners, self.rows, self.quadrics, self.tree.children, self.tree.boxes, self.tree.order]
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
