@@ -11,6 +11,8 @@ from simulated_driver import PtxDriver, SimulatedCuda, shuffled_lanes, simulated
 
 from torchpt.compiler.ptx import ptx_target
 from torchpt.engines.kernels.device import DeviceForward, device_forward
+from torchpt.engines.kernels.device_backward import device_backward
+from torchpt.gradients import replay
 from torchpt.paths.wave import Wave
 from torchpt.rendering import run
 from torchpt.scene.prepare import own_models
@@ -26,15 +28,21 @@ def device(monkeypatch) -> Iterator[Callable[..., SimulatedCuda]]:
 
     def use(lanes: int = 2048, order: int | None = None, packets: bool = True, ptx: bool = False) -> SimulatedCuda:
         cuda = SimulatedCuda(PtxDriver() if ptx else None)
+        target = ptx_target if ptx else partial(simulated_target, order=order)
 
         def engine(scene: Any, wave: Wave, eager: list[str], threads: int | None = None) -> DeviceForward:
             own = own_models(scene, wave)
-            target = ptx_target if ptx else partial(simulated_target, order=order)
             made = device_forward(wave, own, packets, None, cuda, target, lanes)
             eager += [f"{number}: {reason}" for number, reason in made.kernels.eager.items()]
             return made
 
+        def backward(kernels: Any, tape: Any, settings: Any, cotangent: Any, sums: Any) -> str:
+            on_device = device_backward(tape, [], kernels.cotangent, packets, cuda, target)
+            cuda.fallback = replay._replay_on_device(on_device, tape, settings, cotangent, sums)
+            return cuda.fallback
+
         monkeypatch.setattr(run, "kernel_engine", engine)
+        monkeypatch.setattr(replay, "_replay_on_threads", backward)
         return cuda
 
     with shuffled_lanes():

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 import torch
 from few import few
-from gradient_rooms import room
+from gradient_rooms import several, sums_of
 from mirrored import Mirrored, lights
 
-import torchpt
 from torchpt.compiler.graph import Unsupported
 from torchpt.engines import tensors
 from torchpt.engines.kernels import engine
 from torchpt.engines.kernels.backward import KernelsBackward, VjpKernels
 from torchpt.gradients import replay
-from torchpt.gradients.parameters import SceneTape
 from torchpt.math import sums
 from torchpt.math.sum_kernels import COLUMNS, add_at, add_by_columns, sort_by_sample
 from torchpt.paths.integrators.path import partition
@@ -109,17 +107,7 @@ def test_terms_of_other_entries_may_lie_between():
 
 # -- gradients
 
-PLATE = {"type": "roughconductor", "alpha": 0.3, "eta": [0.2, 0.4, 1.4], "k": [3, 2, 1.7]}
-GLASS = {"type": "sphere", "center": [0.2, 0.1, 0.6], "radius": 0.3, "material": "glass"}
-SKY = {"type": "constant", "radiance": [0.3, 0.2, 0.1]}
 NAMES = ["materials.grey.reflectance", "lights.sky.radiance", "shapes.plate.to_world", "shapes.lamp.emission"]
-
-
-def several(opacity: float = 1.0) -> torchpt.Scene:
-    """Three models, so that places of lanes are not in the order of their samples."""
-    described = room({**PLATE, "opacity": opacity}, {"ball": GLASS}, lights={"sky": SKY})
-    described["materials"]["glass"] = {"type": "dielectric", "int_ior": 1.4}
-    return torchpt.load(described, "cpu")
 
 
 @pytest.fixture(params=["few", "dense", "stream"])
@@ -127,30 +115,6 @@ def table(request, monkeypatch) -> None:
     """How the tables of a scene are summed, which have few numbers."""
     monkeypatch.setattr(sums, "MAX_BY_COLUMNS", sums.MAX_BY_COLUMNS if request.param == "few" else 0)
     monkeypatch.setattr(sums, "MAX_DENSE", 0 if request.param == "stream" else sums.MAX_DENSE)
-
-
-def sums_of(scene: torchpt.Scene, name: str, **wish: Any) -> torch.Tensor:
-    """The sums of a gradient before they are rounded to float32, which would hide their order.
-
-    So would terms of one size, which float64 adds exactly: those of pixels differ by up to 12 orders of magnitude.
-    """
-    found: list[torch.Tensor] = []
-    gradients = SceneTape.gradients
-
-    def noted(self: SceneTape, whole: sums.GradientSums) -> Any:
-        found.extend(whole.total(number).flatten() for number in range(len(self.leaves)))
-        return gradients(self, whole)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SceneTape, "gradients", noted)
-        leaf = scene.params[name].clone().requires_grad_()
-        wish = {"spp": 16, "seed": 3, "threads": 1, "edges": False, **wish}
-        picture = torchpt.render(scene, params={name: leaf}, **wish)
-        weight = 10.0 ** (-12 * torch.rand(picture.shape, generator=torch.Generator().manual_seed(1)))
-        torch.autograd.grad((picture * weight).sum(), leaf)
-    total = torch.cat(found)
-    assert total.dtype == torch.float64 and float(total.norm()) > 0
-    return total
 
 
 def shuffled(monkeypatch: pytest.MonkeyPatch) -> list[int]:

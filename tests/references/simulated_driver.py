@@ -154,10 +154,15 @@ class _Copied:
 
 
 class SimulatedCuda(Cuda):
-    """A device of the simulated driver, whose memory is that of CPU tensors."""
+    """A device of the simulated driver, whose memory is that of CPU tensors.
+
+    Attributes:
+        fallback: why the last gradient was not taken by kernels; "" if it was.
+    """
 
     def __init__(self, driver: SimulatedDriver | None = None) -> None:
         super().__init__(torch.device("cpu"), driver or SimulatedDriver())
+        self.fallback = "no gradient was asked for"
 
     def _index(self) -> int:
         return 0

@@ -353,6 +353,13 @@ def _slot(block: Block, ty: str, place: str, extra: int) -> str:
     return _from_memory(block, ty, block.gather(element, start, place, mask="%mask"))
 
 
+def _segment(block: Block, ty: str, first: str, end: str, start: str, extra: int) -> str:
+    """Add a segment of row ``extra`` of the slots to ``start``, see :mod:`torchpt.compiler.segments`."""
+    row = block.at("%slots", "float", block.op(f"mul i64 %stride, {extra}"))
+    real = ELEMENTS[ty]
+    return block.op(f"call {real} @segment_{ty}(ptr {row}, ptr %uniform0, i32 {first}, i32 {end}, {real} {start})")
+
+
 def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
     """Load row ``k`` of input tensor ``slot`` at the lane's number; ``%in0s`` is the length of the rows of ``%in0``."""
     slot, k = extra
@@ -368,7 +375,8 @@ def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
 
 
 #: The handler of each operation. `extra` of those that have it: gather (table, numbers an entry, component), element (table,
-#: index), uniform (uniform, index), search (table, its type, right), part (index), arena and slot (row), tensor (tensor, row).
+#: index), uniform (uniform, index), search (table, its type, right), part (index), arena, slot and segment (row), tensor
+#: (tensor, row).
 _HANDLERS: dict[str, Callable[..., str]] = {
     "bitreverse": lambda block, ty, a: block.call("llvm.bitreverse", ty, a),
     "add": _arithmetic("add"),
@@ -407,4 +415,5 @@ _HANDLERS: dict[str, Callable[..., str]] = {
     "arena": _arena,
     "slot": _slot,
     "tensor": _tensor,
+    "segment": _segment,
 }

@@ -21,6 +21,7 @@ from torchpt.compiler.graph import Graph, Unsupported
 from torchpt.compiler.packet import binary_searches
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.remainder import float_remainders
+from torchpt.compiler.segments import segment_functions
 from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 
 __all__ = ["HEAD", "SinkWriter", "argument_words", "kernel_ir", "sink_writer"]
@@ -354,7 +355,11 @@ def kernel_ir(stage: TracedStage, form: Form) -> str:
             names[node] = generate_node(body, graph, node, names)
     writer = sink_writer(body, graph, names, sinks)
     writer.write()
-    functions = [binary_searches(graph, needed, form), float_remainders(graph, needed, form)]
+    functions = [
+        binary_searches(graph, needed, form),
+        float_remainders(graph, needed, form),
+        segment_functions(graph, needed, form),
+    ]
     if stage.search is not None:
         functions.append(stage.search(form))
     declarations = set().union(*(block.declarations for block in (body, *functions)))

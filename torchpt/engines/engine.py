@@ -27,6 +27,7 @@ __all__ = [
     "LANES_OF_KERNELS",
     "TASKS",
     "Backward",
+    "BackwardDevice",
     "BackwardKernels",
     "Block",
     "Forward",
@@ -38,6 +39,7 @@ __all__ = [
     "backward_kernels",
     "backward_tensors",
     "describe_kernels",
+    "device_backward",
     "forward_device",
     "forward_kernels",
     "forward_tensors",
@@ -285,3 +287,38 @@ def backward_kernels(tape: Tape, own: Sequence[int], cotangent: Tensor | None) -
     kernels = VjpKernels(tape, uses_packets(tape.wave), None if cotangent is None else cotangent.float().contiguous())
     kernels.eager = kernels.probe(own)
     return kernels
+
+
+class BackwardDevice(Protocol):
+    """The kernels of a backward pass on a device.
+
+    Attributes:
+        eager_vjps: stages that cannot be compiled, with the reasons.
+    """
+
+    eager_vjps: dict[tuple[Any, ...], str]
+
+    def engine(self) -> Backward[Any, Any, Any]:
+        """Return an engine."""
+        ...
+
+    def chunk_sums(self, whole: GradientSums) -> Any:
+        """Return sums of a chunk; their ``merge_into_whole`` adds them to those of the pass."""
+        ...
+
+
+def device_backward(tape: Tape, own: Sequence[int], cotangent: Tensor | None, packets: bool) -> BackwardDevice:
+    """Return the kernels of a backward pass on a CUDA device.
+
+    Args:
+        tape: as for :func:`backward_tensors`.
+        own: as for :func:`backward_kernels`.
+        cotangent: as for :func:`backward_tensors`.
+        packets: as for :func:`forward_device`.
+
+    Raises:
+        RenderError: kernels cannot run on the device.
+    """
+    from torchpt.engines.kernels.device_backward import device_backward
+
+    return device_backward(tape, own, cotangent, packets)

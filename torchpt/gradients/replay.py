@@ -24,14 +24,23 @@ from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import warn_once
 from torchpt.core.memory import Budget, Span, is_out_of_memory
 from torchpt.core.threads import map_in_order
-from torchpt.engines.engine import LANES_OF_KERNELS, Backward, BackwardKernels, backward_kernels, backward_tensors
+from torchpt.engines.engine import (
+    LANES_OF_KERNELS,
+    Backward,
+    BackwardDevice,
+    BackwardKernels,
+    backward_kernels,
+    backward_tensors,
+    device_backward,
+)
 from torchpt.gradients.parameters import SceneTape
 from torchpt.gradients.tape import budget_of_chunks, sample_cotangents
 from torchpt.math.sums import ChunkGradientSums, GradientSums
 from torchpt.paths.walk import KEPT, Counts, Observer, Population, walk
+from torchpt.paths.wave import Wave
 from torchpt.scene import Scene
 from torchpt.scene.memory_estimate import BYTES_PER_LANE
-from torchpt.scene.prepare import own_models
+from torchpt.scene.prepare import own_models, uses_kernels
 from torchpt.scene.settings import Settings
 
 __all__ = ["replay_paths"]
@@ -89,9 +98,7 @@ class Chunk:
         sums: gradient sums to add to.
     """
 
-    def __init__(
-        self, engine: Backward[Any, Any, Any], settings: Settings, span: Span, sums: GradientSums | ChunkGradientSums
-    ) -> None:
+    def __init__(self, engine: Backward[Any, Any, Any], settings: Settings, span: Span, sums: Any) -> None:
         self.engine, self.settings, self.span, self.sums = engine, settings, span, sums
 
     def run(self, pixels: Tensor) -> None:
@@ -148,14 +155,15 @@ def replay_paths(
     # A splat reaches a pixel by itself: its cotangent is the pixel's over spp.
     splat_cotangent = cotangent / settings.render.spp if wave.integrator.splats else None
     if _uses_kernels(scene_tape, settings):
-        kernels = backward_kernels(scene_tape, own_models(scene, wave), splat_cotangent)
-        reason = _replay_on_threads(kernels, scene_tape, settings, cotangent, sums)
-        models = wave.context.world.materials.models
-        for (stage, *details), why in kernels.eager_vjps.items():
-            model = f" at {models[details[0]]}" if stage == "bounce" else ""
-            warn_once(
-                f"torchpt: {stage}{model} is differentiated by tensor operations, as no kernel can be made of {why}"
-            )
+        own = own_models(scene, wave)
+        if wave.centre.device.type == "cpu":
+            kernels = backward_kernels(scene_tape, own, splat_cotangent)
+            reason = _replay_on_threads(kernels, scene_tape, settings, cotangent, sums)
+            _warn_of_eager_vjps(kernels, wave)
+        else:
+            packets = settings.render.accel == "auto"
+            on_device = device_backward(scene_tape, own, splat_cotangent, packets)
+            reason = _replay_on_device(on_device, scene_tape, settings, cotangent, sums)
         if not reason:
             return
         warn_once(f"torchpt: gradients of this scene are taken by tensor operations, as {reason}")
@@ -185,6 +193,36 @@ def chunk_sums(
     engine = backward_tensors(scene_tape, splat_cotangent)
     Chunk(engine, settings, span, sums).run(cotangent)
     return sums
+
+
+def _warn_of_eager_vjps(kernels: BackwardKernels, wave: Wave) -> None:
+    """Warn of stages whose VJP cannot be compiled."""
+    models = wave.context.world.materials.models
+    for (stage, *details), why in kernels.eager_vjps.items():
+        model = f" at {models[details[0]]}" if stage == "bounce" else ""
+        warn_once(f"torchpt: {stage}{model} is differentiated by tensor operations, as no kernel can be made of {why}")
+
+
+def _replay_on_device(
+    kernels: BackwardDevice, scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums
+) -> str:
+    """Replay all chunks by kernels on a device, in their order; return why that is not possible, or ""."""
+    _, _, width, height = scene_tape.wave.crop
+    blocks = scene_tape.blocks(width * height, settings.render.spp)
+    cotangent = cotangent.float()
+    try:
+        engine = kernels.engine()
+        for span in _spans(blocks, settings.render.spp):
+            chunk = kernels.chunk_sums(sums)
+            Chunk(engine, settings, span, chunk).run(cotangent)
+            chunk.merge_into_whole()
+    except Unsupported as error:
+        return f"no kernel can be made of {error}"
+    except Exception as error:
+        if not is_out_of_memory(error):
+            raise
+        return "memory ran out"
+    return ""
 
 
 def _replay_on_threads(
@@ -263,8 +301,9 @@ def _budget_of_kernels(kernels: BackwardKernels, settings: Settings) -> Budget:
 
 
 def _uses_kernels(scene_tape: SceneTape, settings: Settings) -> bool:
-    """Return True if kernels support this: a CPU, float32, no gradients with respect to weights of modules or opacity."""
+    """Return True if kernels support this: float32, no gradients with respect to weights of modules or opacity."""
     wave = scene_tape.wave
-    if wave.centre.device.type != "cpu" or wave.context.plan.dtype != torch.float32 or settings.render.compile == "off":
+    device, dtype = wave.centre.device, wave.context.plan.dtype
+    if dtype != torch.float32 or not uses_kernels(settings, device, dtype):
         return False
     return not scene_tape.captured and not scene_tape.differentiates_opacity

@@ -37,7 +37,15 @@ from torch import Tensor
 
 from torchpt.ranks import Group
 
-__all__ = ["ChunkGradientSums", "GradientSums", "summed_by_entry"]
+__all__ = [
+    "MAX_BY_COLUMNS",
+    "MAX_DENSE",
+    "ChunkGradientSums",
+    "GradientSums",
+    "TableSums",
+    "entries_and_width",
+    "summed_by_entry",
+]
 
 #: Tables of at most so many numbers are summed in float64, larger ones in the lanes' precision: their entries have few terms.
 MAX_FLOAT64 = 1 << 20
@@ -47,7 +55,7 @@ MAX_DENSE = 1 << 15
 MAX_BY_COLUMNS = 1 << 7
 
 
-class _TableSums(ABC):
+class TableSums(ABC):
     """Base of the sums of a whole pass and of a chunk: gradients as large as their tables, and look-ups that add to them.
 
     Methods name a table by its ``number``, an index into ``tables``. M is the number of entries, R that of components of an
@@ -89,7 +97,7 @@ class _TableSums(ABC):
                 self.add(number, gradient)
 
 
-class GradientSums(_TableSums):
+class GradientSums(TableSums):
     """Sums of the gradients of tables over a whole pass.
 
     Args:
@@ -105,7 +113,7 @@ class GradientSums(_TableSums):
         total = self._totals[number]
         if total is None:
             table = self.tables[number]
-            entries, width = _entries_and_width(table)
+            entries, width = entries_and_width(table)
             dtype = torch.float64 if table.numel() <= MAX_FLOAT64 else table.dtype
             total = self._totals[number] = torch.zeros(entries, width, dtype=dtype, device=table.device)
         return total
@@ -168,7 +176,7 @@ class GradientSums(_TableSums):
         ]
 
 
-class ChunkGradientSums(_TableSums):
+class ChunkGradientSums(TableSums):
     """Sums of one chunk: dense sums of small tables, and the terms of large tables.
 
     Args:
@@ -189,7 +197,7 @@ class ChunkGradientSums(_TableSums):
 
     def add_at(self, number: int, index: Tensor, values: Tensor) -> None:
         """Add ``values (..., n)`` to the entries ``index (n,)`` of a table; a term's number serves as its slot."""
-        _, width = _entries_and_width(self.tables[number])
+        _, width = entries_and_width(self.tables[number])
         term_numbers = np.arange(len(index), dtype=np.int32)
         self.add_rows(number, index.to(torch.int32).numpy(), values.reshape(width, -1).numpy(), term_numbers)
 
@@ -227,11 +235,11 @@ class ChunkGradientSums(_TableSums):
     def total(self, number: int) -> Tensor:
         """Return the dense sum of a table as ``(M, R)``."""
         if number not in self.dense:
-            self.dense[number] = torch.zeros(*_entries_and_width(self.tables[number]), dtype=torch.float64)
+            self.dense[number] = torch.zeros(*entries_and_width(self.tables[number]), dtype=torch.float64)
         return self.dense[number]
 
 
-def _entries_and_width(table: Tensor) -> tuple[int, int]:
+def entries_and_width(table: Tensor) -> tuple[int, int]:
     """Return M and R: the numbers of entries of a table, and of components of an entry. Look-ups index the last axis."""
     return (table.shape[-1], math.prod(table.shape[:-1])) if table.dim() else (1, 1)
 

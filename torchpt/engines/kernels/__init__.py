@@ -3,14 +3,15 @@
 The stages are the tensor functions that also run eagerly; :mod:`torchpt.compiler` compiles them to kernels. Between two kernels
 of a chunk there is neither an operator of torch nor a barrier between threads.
 
-=================  =======================================================================================
-``threads.py``     tasks on threads, and adding samples to the film: start here
-``engine.py``      the engine of one thread: kernel calls, ray searches, and the stages of a walk
-``programs.py``    the kernels of a render, compiled on first use, and shared between renders
-``stages.py``      the functions that trace kernels: camera rays, search, emission, bounce, layers, film
-``layout.py``      rows of the path state in memory; loads, stores and lists that kernels share
-``backward.py``    kernels and engine of path replay
-``device.py``      the same stages on a CUDA device: waves, counts in memory, films
-``driver.py``      the device's driver: loading code and launching kernels
-=================  =======================================================================================
+======================  =====================================================================================
+``threads.py``          tasks on threads, and adding samples to the film: start here
+``engine.py``           the engine of one thread: kernel calls, ray searches, and the stages of a walk
+``programs.py``         the kernels of a render, compiled on first use, and shared between renders
+``stages.py``           the functions that trace kernels: camera rays, search, emission, bounce, layers, film
+``layout.py``           rows of the path state in memory; loads, stores and lists that kernels share
+``backward.py``         kernels and engine of path replay
+``device.py``           the same stages on a CUDA device: waves, counts in memory, films
+``device_backward.py``  path replay on a CUDA device
+``driver.py``           the device's driver: loading code and launching kernels
+======================  =====================================================================================
 """

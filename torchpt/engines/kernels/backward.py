@@ -328,16 +328,17 @@ class KernelsBackward(KernelsEngine):
 
     Args:
         kernels: of the backward pass.
+        calls: see :class:`KernelsEngine`.
     """
 
     keeps_splats = False  # their VJP needs the vertices, not the splats
 
-    def __init__(self, kernels: VjpKernels) -> None:
-        super().__init__(kernels)
+    def __init__(self, kernels: VjpKernels, calls: Any = None) -> None:
+        super().__init__(kernels, calls=calls)
         self.back = kernels
         self._levels: list[Paths] = []
-        self._sample_slots = Memory(kernels.slots.count)
-        self._results = Memory(1)
+        self._sample_slots = self.calls.memory(kernels.slots.count)
+        self._results = self.calls.memory(1)
         self._sorted = (
             Memory(2),
             np.zeros(CAPACITY, np.uint8),
@@ -438,7 +439,7 @@ class KernelsBackward(KernelsEngine):
 
     def _results_of(self, kernel: Kernel) -> Memory:
         rows = max((max(index + 1, first + width) for _, index, first, width in kernel.program.sums), default=1)
-        return self._results if len(self._results.words) >= rows else Memory(rows)
+        return self._results if len(self._results.words) >= rows else self.calls.memory(rows)
 
     def _eagerly(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
         """Pull cotangents back through a stage by tensor operations, if it cannot be compiled."""
@@ -494,6 +495,10 @@ class KernelsBackward(KernelsEngine):
             pairs = [(x, first(name)) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
             if not pairs:
                 return
-            cotangents = [torch.from_numpy(self._sample_slots.floats[row : row + 3, :n].copy()) for _, row in pairs]
+            cotangents = [self._ray_cotangents(row, n) for _, row in pairs]
             found = torch.autograd.grad([x for x, _ in pairs], self._tables(), cotangents, allow_unused=True)
         self.sums.add_each(found)
+
+    def _ray_cotangents(self, row: int, n: int) -> Tensor:
+        """Return a copy of three rows of the slots ``(3, n)``."""
+        return torch.from_numpy(self._sample_slots.floats[row : row + 3, :n].copy())

@@ -16,6 +16,7 @@ for the number of lanes.
 from __future__ import annotations
 
 import ctypes
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -59,8 +60,12 @@ __all__ = [
     "DeviceForward",
     "DeviceKernels",
     "DeviceMemory",
+    "KernelsOnDevice",
+    "SearchWords",
     "device_forward",
     "device_kernels",
+    "on_host",
+    "packets_on_device",
 ]
 
 #: Steps between two checks of a loop without a fixed end for lanes that are left.
@@ -77,63 +82,57 @@ _WORD = {name: k for k, name in enumerate(HEAD)}
 # ---- Kernels and their tables on the device
 
 
-def wave_on_host(wave: Wave) -> Wave:
-    """Return a copy of a wave whose tensors are on the host, to trace stages with; its search is left as it is."""
+def on_host(wave: Wave, known: dict[int, Tensor]) -> Wave:
+    """Return a wave with all tensors on the host, to trace stages with; its search is left as it is.
+
+    ``known``: tensors of the host by the id of the device's, used in place of new copies; new ones are added.
+    """
     host = torch.device("cpu")
-    if wave.centre.device == host:
-        return wave
-    moved = map_leaves(lambda leaf: leaf.to(host), wave)
-    return replace(moved, filter=type(wave.filter)(wave.filter.values, host))
+
+    def moved(tensor: Tensor) -> Tensor:
+        if id(tensor) not in known:
+            known[id(tensor)] = tensor.to(host)
+        return known[id(tensor)]
+
+    return replace(map_leaves(moved, wave), filter=type(wave.filter)(wave.filter.values, host))
 
 
-class DeviceKernels(Kernels):
-    """The kernels of one render on a device.
+class KernelsOnDevice(Kernels, ABC):
+    """Base of kernels that run on a device; it comes before the other base of a class, which says what kernels there are.
 
     Args:
-        wave: the render; its tensors are on the device.
         cuda: the device.
         target: the target that stages are compiled for; its form has the row length of arenas.
-        search: see :func:`packets_on_device`; None: rays are searched outside of kernels.
-        fused: True: the search is part of the stages.
-        before: see :class:`Kernels`.
+        search: from :func:`packets_on_device`; None: rays are searched outside of kernels.
+        arguments: of the other base.
 
     Attributes:
         row: number of lanes of an arena.
     """
 
-    def __init__(
-        self,
-        wave: Wave,
-        cuda: Cuda,
-        target: Target,
-        search: SearchWords | None,
-        fused: bool,
-        before: Kernels | None = None,
-    ) -> None:
-        super().__init__(wave, search is not None, fused, before)
+    def __init__(self, cuda: Cuda, target: Target, search: SearchWords | None, *arguments: Any) -> None:
         self.cuda, self.target, self.row = cuda, target, target.form.row
-        self.search = search
+        self._search = search
         self._host: tuple[Layout, NamedTensors] | None = None
+        super().__init__(*arguments)
+
+    @abstractmethod
+    def _host_inputs(self) -> tuple[Layout, NamedTensors]:
+        """Return layout and leaves on the host, to trace stages with."""
 
     def _search_inputs(self) -> tuple[Any, None]:
-        return None, None
+        return self._search, None
 
     def _program(self, key: tuple[Any, ...], listed: bool, build: Callable[[Any], Sinks]) -> Program:
         """Return the program of a stage, traced on the host if it is new."""
 
-        def traced() -> Any:
-            layout, leaves = self._host_inputs()
+        def trace() -> Any:
+            if self._host is None:
+                self._host = self._host_inputs()
+            layout, leaves = self._host
             return trace_stage(leaves, layout, build, listed)
 
-        return cache.program_of((key, self.structure), self._leaves.tensors, traced, self.target, self.cuda.device)
-
-    def _host_inputs(self) -> tuple[Layout, NamedTensors]:
-        """Return layout and leaves on the host, which stages are traced with."""
-        if self._host is None:
-            wave = wave_on_host(self.wave)
-            layout = Layout(wave, self.packets, self.fused)
-            self._host = layout, NamedTensors(records_of(layout, None))
-        return self._host
+        return cache.program_of((key, self.structure), self._leaves.tensors, trace, self.target, self.cuda.device)
 
     def _bind(self, program: Program) -> Tables:
         return bind_tables(
@@ -146,6 +145,34 @@ class DeviceKernels(Kernels):
             self._results,
             self.cuda.device,
         )
+
+
+class DeviceKernels(KernelsOnDevice):
+    """The kernels of one render on a device.
+
+    Args:
+        wave: the render; its tensors are on the device.
+        cuda: the device.
+        target: see :class:`KernelsOnDevice`.
+        search: see there.
+        fused: True: the search is part of the stages.
+        before: see :class:`Kernels`.
+    """
+
+    def __init__(
+        self,
+        wave: Wave,
+        cuda: Cuda,
+        target: Target,
+        search: SearchWords | None,
+        fused: bool,
+        before: Kernels | None = None,
+    ) -> None:
+        super().__init__(cuda, target, search, wave, search is not None, fused, before)
+
+    def _host_inputs(self) -> tuple[Layout, NamedTensors]:
+        layout = Layout(on_host(self.wave, {}), self.packets, self.fused)
+        return layout, NamedTensors(records_of(layout, None))
 
 
 @dataclass(frozen=True)
@@ -173,8 +200,17 @@ def host_packet_search(accel: Accel) -> Accel | None:
     return brute_if_fastest(Geometry(p0, p1, p2, (triangles, rectangles, disks, spheres, quadrics)))
 
 
-def packets_on_device(brute: Any, device: torch.device) -> SearchWords:
-    """Copy the scene data of packet searches to a device; ``brute``: :class:`torchpt.search.brute.Brute`."""
+def packets_on_device(accel: Accel, wanted: bool, device: torch.device) -> SearchWords | None:
+    """Return the argument of packet searches of a scene on a device; None: rays are searched outside of kernels.
+
+    Args:
+        accel: the scene's acceleration structure.
+        wanted: True: few primitives are searched by packets, also where ``accel`` is a tree.
+        device: where kernels run.
+    """
+    brute: Any = accel if accel.name == "brute" else host_packet_search(accel) if wanted else None
+    if brute is None:
+        return None
     tables = tuple(table.to(device) for table in (brute.table, brute.spheres))
     words = torch.frombuffer(bytearray(brute.words), dtype=torch.int64).clone()
     words[0], words[1] = (table.data_ptr() for table in tables)
@@ -274,7 +310,7 @@ class DeviceCalls:
         blocks: tensors of counters of the wave, :data:`_COUNTER_ROWS` rows each.
     """
 
-    def __init__(self, kernels: DeviceKernels) -> None:
+    def __init__(self, kernels: KernelsOnDevice) -> None:
         self.kernels, self.cuda = kernels, kernels.cuda
         self.device, self._row_length = kernels.cuda.device, kernels.row
         self.width = kernels.models + 6
@@ -482,7 +518,7 @@ class DeviceEngine(KernelsEngine):
         spare: slots of the next wave.
     """
 
-    def __init__(self, kernels: DeviceKernels) -> None:
+    def __init__(self, kernels: KernelsOnDevice) -> None:
         self.device_calls = DeviceCalls(kernels)
         super().__init__(kernels, calls=self.device_calls)
         self.spare = self.device_calls.memory(3)
@@ -501,13 +537,13 @@ class DeviceEngine(KernelsEngine):
     def _count_truncated(self, lanes: Count) -> None:
         self._truncated += [(counter, 1) for counter in lanes.counters]
 
-    def begin(self, chunk: Chunk) -> None:
+    def begin_wave(self, chunk: Chunk) -> None:
         """Begin a wave: a chunk, or its layers first and then the chunk."""
         self._rays, self._truncated, self.tally = [], [], RayCounts()
         self.device_calls.begin(chunk.pixels * chunk.samples)
 
     def launch(self, chunk: Chunk) -> None:
-        """Launch all kernels that fill ``slots`` with the radiance of a chunk's samples, after :meth:`begin`."""
+        """Launch all kernels that fill ``slots`` with the radiance of a chunk's samples, after :meth:`begin_wave`."""
         walk(self, self.spawn(chunk), self.wave.integrator.limits)
         self.mark_lost()
 
@@ -584,7 +620,12 @@ class _Launched:
 
 
 def device_kernels(
-    wave: Wave, own: Sequence[int], cuda: Cuda, target: Target, brute: Any, before: Kernels | None = None
+    wave: Wave,
+    own: Sequence[int],
+    cuda: Cuda,
+    target: Target,
+    search: SearchWords | None,
+    before: Kernels | None = None,
 ) -> DeviceKernels:
     """Return the kernels of a render on a device; its ``eager`` lists models that cannot be compiled, with the reasons.
 
@@ -593,10 +634,9 @@ def device_kernels(
         own: indices of the user's own models, which are compiled at once to find out whether they can be.
         cuda: the device.
         target: see :class:`DeviceKernels`.
-        brute: :class:`torchpt.search.brute.Brute` of the scene, on the host; None: rays are searched outside of kernels.
+        search: see :class:`KernelsOnDevice`.
         before: kernels of another render; its tables are shared where they were made of the same tensors.
     """
-    search = None if brute is None else packets_on_device(brute, cuda.device)
     opaque = wave.context.world.materials.opacity is None and not wave.integrator.has_own_transmit
     fused = search is not None and opaque and wave.first_surface is None and not wave.integrator.splats
     kernels = DeviceKernels(wave, cuda, target, search, fused, before)
@@ -631,14 +671,12 @@ def device_forward(
         RenderError: kernels cannot run on the device.
     """
     device = cuda_of(wave.centre.device) if cuda is None else cuda
-    brute = wave.accel if wave.accel.name == "brute" else None
-    if brute is None and packets:
-        brute = host_packet_search(wave.accel)
+    search = packets_on_device(wave.accel, packets, device.device)
     last = before
 
     def make(row: int) -> DeviceKernels:
         nonlocal last
-        last = device_kernels(wave, own, device, target(row), brute, last)
+        last = device_kernels(wave, own, device, target(row), search, last)
         return last
 
     return DeviceForward(make, device, wave, lanes, wave.integrator.strict)
@@ -723,11 +761,11 @@ class DeviceForward:
         """
         engine, clamp, chunk = self._engine(), self.wave.integrator.clamp, Chunk(*span, pixel_set)
         calls = engine.device_calls
-        engine.begin(chunk)
+        engine.begin_wave(chunk)
         names, rays = tuple(pixel_set.layers), 0
         if names:
             rays = engine.layers(chunk, names)
-            engine.begin(chunk)  # its tally is that of the chunk alone
+            engine.begin_wave(chunk)  # its tally is that of the chunk alone
         light = None
         if self.wave.integrator.light:
             # Slots of the wave before are read until it is finished.
