@@ -269,12 +269,12 @@ def _stores(
         if gradient is None:
             continue
         nodes = np.broadcast_to(tracer.get(gradient).nodes, tuple(kernels.primals[number].shape)).reshape(-1)
-        summands = [summand_of(graph, int(node)) for node in nodes]
-        if any(node is not None for node in summands):
-            if len(summands) > _MOST_ELEMENTS:
+        lane_nodes = [summand_of(graph, int(node)) for node in nodes]
+        if any(node is not None for node in lane_nodes):
+            if len(lane_nodes) > _MOST_ELEMENTS:
                 raise Unsupported("a derivative by all of a table in every lane")
-            first = append_rows([zero if node is None else node for node in summands])
-            trace.sums.append((number, -1, first, len(summands)))
+            first = append_rows([zero if node is None else node for node in lane_nodes])
+            trace.sums.append((number, -1, first, len(lane_nodes)))
     return sinks
 
 
