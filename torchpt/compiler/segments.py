@@ -54,7 +54,7 @@ def segment_functions(graph: Graph, needed: list[int], form: Form) -> Block:
 
 def _text(real: str) -> str:
     """Return the definition of the function for results of an LLVM type."""
-    to_real = "fpext float %term to double" if real == "double" else "bitcast float %term to float"
+    conversion = "fpext float %term to double" if real == "double" else "bitcast float %term to float"
     arguments = f"ptr %row, ptr %order, i32 %first, i32 %end, {real} %start"
     return f"""define internal {real} @segment_{real[0]}({arguments}) alwaysinline #0 {{
 entry:
@@ -67,7 +67,7 @@ loop:
   %place = load i32, ptr %listed
   %element = getelementptr float, ptr %row, i32 %place
   %term = load float, ptr %element
-  %wide = {to_real}
+  %wide = {conversion}
   %after = fadd {real} %before, %wide
   %next = add i32 %k, 1
   %more = icmp slt i32 %next, %end
