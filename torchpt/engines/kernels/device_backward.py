@@ -305,7 +305,7 @@ class DeviceBackward(DeviceEngine, KernelsBackward):
         slots: Any = self._sample_slots
         return slots
 
-    def _one(self, key: tuple, paths: Paths, places: Any, count: Any, added: bool) -> None:
+    def _vjp_of_stage(self, key: tuple, paths: Paths, places: Any, count: Any, *, added: bool) -> None:
         """Pull cotangents back through one stage on the lanes of a list, by its kernel.
 
         Raises:
