@@ -42,12 +42,12 @@ def search_on_machine(
 
     ``per_thread``: how many rays a thread takes.
     """
-    rays = tuple(x.contiguous() for x in rays)
-    lanes = rays[2].shape[0]
+    o, d, t_max = rays = rays[0].contiguous(), rays[1].contiguous(), rays[2].contiguous()
+    lanes = t_max.shape[0]
     stage = search_stage(tree_search(accel), hits=not any_hit, blocked=any_hit)
     machine, memory, results = PtxMachine(ptx_of(stage)), DeviceMemory(), results_of(stage, lanes)
     count = np.array([lanes])
-    for array in (*(x.numpy() for x in rays), *(x for x in accel.tables if x.size), accel.words, count):
+    for array in (*(x.numpy() for x in (o, d, t_max)), *(x for x in accel.tables if x.size), accel.words, count):
         memory.add(array, constant=True)
     for result in results:
         memory.add(result.numpy())
