@@ -63,8 +63,9 @@ def trees(monkeypatch) -> list[Any]:
     plain = device_module.search_on_device
 
     def noted(*given: Any) -> Any:
-        copied.append(plain(*given).tree)
-        return plain(*given)
+        found = plain(*given)
+        copied.append(None if found is None else found.tree)
+        return found
 
     monkeypatch.setattr(device_module, "search_on_device", noted)
     return copied
