@@ -291,6 +291,7 @@ class PtxMachine:
 
     Attributes:
         sizes: bytes of each parameter.
+        local_bytes: bytes of local memory of a thread.
         registers: number of registers that the text declares, by kind.
         instructions: number of instructions in the text, by kind.
         executed: instructions that threads have run, by kind, over all launches.
@@ -311,6 +312,7 @@ class PtxMachine:
             end += self.sizes[-1]
         self._parameter_bytes = end
         self._numbers: dict[str, int] = {}
+        self.local_bytes, self._local_name = 0, ""
         self._dtypes: list[Any] = []
         self.registers: Counter[str] = Counter()
         self.executed: Counter[str] = Counter()
@@ -333,6 +335,14 @@ class PtxMachine:
                     self._numbers[f"{found[2]}{k}"] = len(self._dtypes)
                     self._dtypes.append(dtype)
                 self.registers[found[1]] += int(found[3])
+                continue
+            if found := re.match(r"\.reg\s+\.b64\s+(%SPL?)$", line):  # where a thread's local memory begins
+                self._numbers[found[1]] = len(self._dtypes)
+                self._dtypes.append(np.uint64)
+                continue
+            if found := re.match(r"\.local\s+\.align \d+ \.b8\s+(\w+)\[(\d+)\]$", line):
+                assert not self.local_bytes, line
+                self._local_name, self.local_bytes = found[1], int(found[2])
                 continue
             if not line or line in "{}" or line.startswith((".pragma", ".loc", ".file")):
                 continue
@@ -390,7 +400,7 @@ class PtxMachine:
 
     def _reader(self, text: str, dtype: Any) -> _Read:
         size = np.dtype(dtype).itemsize
-        if _REGISTER.fullmatch(text):
+        if _REGISTER.fullmatch(text) or text in self._numbers:
             k = self._numbers[text]
             own = self._dtypes[k]
             if own is np.bool_ or dtype is np.bool_:
@@ -408,6 +418,8 @@ class PtxMachine:
             value = np.array(int(text, 0) % (1 << 8 * size), _UNSIGNED[size]).view(dtype)[()]
         elif text in self._parameters:
             value = np.array(self._parameters[text], _UNSIGNED[size]).view(dtype)[()]
+        elif text == self._local_name:
+            value = np.dtype(dtype).type(0)  # addresses of local memory are offsets in it
         else:
             raise KeyError(text)
         return lambda R, who: value
@@ -476,27 +488,44 @@ class PtxMachine:
                 writes[0](R, who, m._words[at : at + size].copy().view(dtype)[0])
 
             return load
-        assert op[1] == "global" and {*op[2:-1]} <= {"nc", f"v{len(writes)}"}, op
+        assert op[1] in ("global", "local") and {*op[2:-1]} <= {"nc", f"v{len(writes)}"}, op
+        local = op[1] == "local"
 
-        def load_global(m: PtxMachine, R: list[Array], who: Threads) -> None:
+        def load(m: PtxMachine, R: list[Array], who: Threads) -> None:
             first = address(R, who)
             for k, write in enumerate(writes):
-                write(R, who, m.memory.load(dtype, first + np.int64(k * size)))
+                at = first + np.int64(k * size)
+                if local:
+                    write(R, who, m._local.view(dtype)[m._local_place(at, size, who)])
+                else:
+                    write(R, who, m.memory.load(dtype, at))
 
-        return load_global
+        return load
 
     def _st_(self, op: list[str], given: list[str]) -> _Run:
         dtype, address = _TYPES[op[-1]], self._address(given[0])
         size = np.dtype(dtype).itemsize
         reads = [self._reader(x.strip(), dtype) for x in given[1].strip("{}").split(",")]
-        assert op[1] == "global" and {*op[2:-1]} <= {f"v{len(reads)}"}, op
+        assert op[1] in ("global", "local") and {*op[2:-1]} <= {f"v{len(reads)}"}, op
+        local = op[1] == "local"
 
         def store(m: PtxMachine, R: list[Array], who: Threads) -> None:
             first = address(R, who)
             for k, read in enumerate(reads):
-                m.memory.store(dtype, first + np.int64(k * size), np.broadcast_to(read(R, who), first.shape))
+                at, value = first + np.int64(k * size), np.broadcast_to(read(R, who), first.shape)
+                if local:
+                    m._local.view(dtype)[m._local_place(at, size, who)] = value
+                else:
+                    m.memory.store(dtype, at, value)
 
         return store
+
+    def _local_place(self, address: Array, size: int, who: Threads) -> tuple[Array, Array]:
+        """Return rows and columns of elements in local memory."""
+        if (address < 0).any() or (address + size > self.local_bytes).any() or (address % size).any():
+            raise IndexError(f"an access of {size} B outside of {self.local_bytes} B of local memory, or misaligned")
+        thread = np.arange(len(self._local)) if who is None else who
+        return np.broadcast_to(thread, address.shape), address // size
 
     def _mov_(self, op: list[str], given: list[str]) -> _Run:
         dtype = _TYPES[op[-1]]
@@ -652,6 +681,8 @@ class PtxMachine:
             "%nctaid.x": np.full(n, blocks),
             "%lanemask_lt": (1 << (thread % WARP)) - 1,
         }
+        row = -(-self.local_bytes // 8) * 8
+        self._local = self.rng.integers(0, 256, (n, row), np.uint8)
         R = [self.rng.integers(0, 256, n * np.dtype(x).itemsize, np.uint8).view(x) if x is not np.bool_
              else self.rng.integers(0, 2, n).astype(np.bool_) for x in self._dtypes]  # fmt: skip
         done = len(self._blocks)

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler import cpu
-from torchpt.compiler.block import Block
 from torchpt.compiler.form import VECTORS, Form
 from torchpt.compiler.graph import Graph
 from torchpt.compiler.kernel import HEAD, kernel_ir
 from torchpt.compiler.program import TracedStage
+from torchpt.compiler.searching import RaySearch
 from torchpt.compiler.sinks import Sinks, Store
 
 __all__ = ["Search", "argument_block", "results_of", "search_stage", "searches"]
@@ -24,7 +24,7 @@ Search = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
 _RESULTS = (torch.float32, torch.int32, torch.float32, torch.float32, torch.bool)
 
 
-def search_stage(functions: Callable[[Form], Block], hits: bool = True, blocked: bool = True) -> TracedStage:
+def search_stage(functions: RaySearch, hits: bool = True, blocked: bool = True) -> TracedStage:
     """Return a stage around the nodes ``nearest`` (``hits``) and ``occluded`` (``blocked``); its inputs are ``o, d, t_max``."""
     graph = Graph()
     ray = [graph.node("tensor", "f", extra=at) for at in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0))]
@@ -53,7 +53,7 @@ def argument_block(words: int, tensors: list[Tensor]) -> Any:
     return block
 
 
-def searches(functions: Callable[[Form], Block], words: int, form: Form = VECTORS) -> Search:
+def searches(functions: RaySearch, words: int, form: Form = VECTORS) -> Search:
     """Return a function of rays that gives ``t, prim, u, v, blocked``, by a kernel of this CPU.
 
     Args:

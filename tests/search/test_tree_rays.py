@@ -5,7 +5,8 @@ import pytest
 import torch
 from accel_reference import quadric_table, soup, sphere_mesh, triangles
 from ray_kernels import searches
-from test_bits import KINDS, equal_bits, found, make_rays
+from ray_sets import KINDS, make_rays
+from test_bits import equal_bits, found
 
 import torchpt
 from torchpt.compiler.form import SCALAR

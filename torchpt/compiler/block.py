@@ -34,12 +34,17 @@ class Block:
         label: name of the basic block that lines are appended to.
     """
 
-    def __init__(self, form: Form) -> None:
+    def __init__(self, form: Form, names: int = 0) -> None:
         self.form, self.width = form, form.width
         self.lines: list[str] = []
         self.declarations: set[str] = set()
         self.label = "entry"
-        self._count = 0
+        self._count = names
+
+    @property
+    def names(self) -> int:
+        """The number of names that were given; the next one is behind it."""
+        return self._count
 
     def name(self) -> str:
         """Return a fresh name for a value."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-from torchpt.compiler.block import ELEMENTS
+from torchpt.compiler.block import ELEMENTS, Block
 from torchpt.compiler.codegen import MEMORY, LoopBody, generate_node
 from torchpt.compiler.form import WARP, Form
 from torchpt.compiler.fusing import fused_products
@@ -21,6 +21,7 @@ from torchpt.compiler.graph import Graph, Unsupported
 from torchpt.compiler.packet import binary_searches
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.remainder import float_remainders
+from torchpt.compiler.searching import LoopingSearch, SearchLoop, lone_search
 from torchpt.compiler.segments import segment_functions
 from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 
@@ -350,8 +351,12 @@ def kernel_ir(stage: TracedStage, form: Form) -> str:
     _begin_body(body)
     names: dict[int, str] = {}
     fused = set(products.values())  # computed with their sums
+    lone = lone_search(stage, needed) if form.threads and isinstance(stage.search, LoopingSearch) else None
+    loaded = 0  # lines before the lone search
     for node in needed:
-        if node not in fused:
+        if node == lone:
+            loaded, names[node] = len(body.lines), "%found"
+        elif node not in fused:
             names[node] = generate_node(body, graph, node, names)
     writer = sink_writer(body, graph, names, sinks)
     writer.write()
@@ -360,15 +365,21 @@ def kernel_ir(stage: TracedStage, form: Form) -> str:
         float_remainders(graph, needed, form),
         segment_functions(graph, needed, form),
     ]
-    if stage.search is not None:
+    inner: Block = body
+    if lone is not None and isinstance(stage.search, LoopingSearch):
+        op, _, ray, _ = graph.nodes[lone]
+        load, store = body.lines[:loaded], body.lines[loaded:]
+        own = SearchLoop(form, op == "occluded", load, [names[k] for k in ray], store, body.names)
+        inner = stage.search.lane_loop(own)
+    elif stage.search is not None:
         functions.append(stage.search(form))
-    declarations = set().union(*(block.declarations for block in (body, *functions)))
-    loop = _grid_stride_loop if form.threads else _cpu_loop
+    declarations = set().union(*(block.declarations for block in (body, inner, *functions)))
+    count = len(argument_words(stage))
     lines = [
         *(line for block in functions for line in block.lines),
         *writer.functions,
-        *loop(entry, body, writer, len(argument_words(stage))),
-        *sorted(declarations),
+        *(_gpu_kernel(entry, inner, lone is None, count) if form.threads else _cpu_loop(entry, body, writer)),
+        *sorted(declarations | (_THREAD_NUMBERS if form.threads else set())),
         f"attributes #0 = {{ nounwind{_PREFERRED if form.width > 1 else ''} }}",
         "!0 = !{}",
         "",
@@ -380,14 +391,13 @@ def kernel_ir(stage: TracedStage, form: Form) -> str:
 _PREFERRED = ' "prefer-vector-width"="512" "min-legal-vector-width"="512"'
 
 
-def _cpu_loop(entry: list[str], body: LoopBody, writer: SinkWriter, words: int) -> list[str]:
+def _cpu_loop(entry: list[str], body: LoopBody, writer: SinkWriter) -> list[str]:
     """Return the function of a CPU's kernel: a loop over all lanes.
 
     Args:
         entry: lines before the loop.
         body: the loop's body.
         writer: the writer of the stores in the body.
-        words: number of words of the arguments, which a GPU's kernel takes by value.
     """
     return [
         "define void @kernel(ptr noalias %arguments, i64 %n) #0 {",
@@ -409,25 +419,43 @@ def _cpu_loop(entry: list[str], body: LoopBody, writer: SinkWriter, words: int) 
     ]
 
 
-def _grid_stride_loop(entry: list[str], body: LoopBody, writer: SinkWriter, words: int) -> list[str]:
-    """Return the function of a GPU's kernel: each thread takes the lanes of its number plus multiples of the number of threads.
+#: Numbers of thread and block, and their counts.
+_REGISTERS = ("tid", "ntid", "ctaid", "nctaid")
+_THREAD_NUMBERS = {f"declare i32 @llvm.nvvm.read.ptx.sreg.{name}.x()" for name in _REGISTERS}
 
-    The loop's condition is that of the warp's first thread, so that all threads of a warp meet in the calls of ``take``.
-    Arguments as for :func:`_cpu_loop`.
+
+def _gpu_kernel(entry: list[str], body: Block, strides: bool, words: int) -> list[str]:
+    """Return the function of a GPU's kernel.
+
+    Args:
+        entry: lines before the loop.
+        body: the loop's body, or the loop.
+        strides: True: the body is of a loop that is added here; False: it is the loop.
+        words: number of words of the arguments, which the kernel takes by value.
     """
-    registers = ("tid", "ntid", "ctaid", "nctaid")
-    body.declarations.update(f"declare i32 @llvm.nvvm.read.ptx.sreg.{name}.x()" for name in registers)
     return [
         f"define ptx_kernel void @kernel(ptr byval([{words} x i64]) align 8 %arguments, ptr addrspace(1) %lanes) #0 {{",
         "entry:",
         *entry,
         "  %n = load i64, ptr addrspace(1) %lanes, !invariant.load !0",
-        "  %last_lane = sub i64 %n, 1",
-        *(f"  %{name} = call i32 @llvm.nvvm.read.ptx.sreg.{name}.x()" for name in registers),
-        *(f"  %{name}_wide = zext i32 %{name} to i64" for name in registers),
+        *(f"  %{name} = call i32 @llvm.nvvm.read.ptx.sreg.{name}.x()" for name in _REGISTERS),
+        *(f"  %{name}_wide = zext i32 %{name} to i64" for name in _REGISTERS),
         "  %block_start = mul i64 %ctaid_wide, %ntid_wide",
         "  %thread = add i64 %block_start, %tid_wide",
         "  %threads = mul i64 %nctaid_wide, %ntid_wide",
+        *(_grid_stride_loop(body) if strides else body.lines),
+        "  ret void",
+        "}",
+    ]
+
+
+def _grid_stride_loop(body: Block) -> list[str]:
+    """Return a loop in which each thread takes the lanes of its number plus multiples of the number of threads.
+
+    The loop's condition is that of the warp's first thread, so that all threads of a warp meet in the calls of ``take``.
+    """
+    return [
+        "  %last_lane = sub i64 %n, 1",
         "  br label %head",
         "head:",
         f"  %lane = phi i64 [ %thread, %entry ], [ %next, %{body.label} ]",
@@ -441,8 +469,6 @@ def _grid_stride_loop(entry: list[str], body: LoopBody, writer: SinkWriter, word
         "  %next = add i64 %lane, %threads",
         "  br label %head",
         "exit:",
-        "  ret void",
-        "}",
     ]
 
 

@@ -7,7 +7,7 @@ A stage is traced once (:class:`TracedStage`), compiled (:class:`Program`), and 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,11 +15,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.compiler.block import Block
 from torchpt.compiler.cpu import Function
-from torchpt.compiler.form import Form
 from torchpt.compiler.graph import Graph, Unsupported
 from torchpt.compiler.prologue import Guard, Source, Step, StepKey, Table, run_prologue, step_keys
+from torchpt.compiler.searching import RaySearch
 from torchpt.compiler.sinks import Sinks
 
 __all__ = ["Program", "Tables", "TracedStage", "bind_tables", "guards_hold", "lay_out_table"]
@@ -56,7 +55,7 @@ class TracedStage:
     uniforms: Sequence[str] = ()
     tensors: int = 0
     listed: bool = False
-    search: Callable[[Form], Block] | None = None
+    search: RaySearch | None = None
     sums: Sequence[Sequence[Any]] = ()
 
     def needed(self) -> list[int]:

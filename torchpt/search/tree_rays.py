@@ -4,21 +4,26 @@ The hits have the bits of the CPU's search by packets (:class:`torchpt.search.tr
 operations on boxes and primitives are the same, and hits do not depend on the order of visits
 (:mod:`torchpt.search.tree_layout`).
 
-The threads of a warp take turns together. In a turn the warp either tests the boxes of nodes or one primitive of leaves,
+The threads of a warp take turns together. In a turn the warp either tests the boxes of nodes or two primitives of leaves,
 whichever more of its threads have to do next; the others wait. So threads do not wait for a whole leaf, or a whole descent, of
-their neighbours. The stack has one entry for each node with children left to visit: for nearest hits their numbers in the order
-of their entries, for any hits a mask.
+their neighbours. In kernels that only search, threads whose ray is finished take new ones (Aila and Laine, "Understanding the
+Efficiency of Ray Traversal on GPUs", HPG 2009).
+
+The stack has one entry for each node with children left to visit: for nearest hits their numbers in the order of their entries,
+for any hits a mask.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from torchpt.compiler.block import Block
-from torchpt.compiler.form import Form
+from torchpt.compiler.form import WARP, Form
+from torchpt.compiler.searching import SearchLoop
 from torchpt.compiler.values import LaneBlock, Value, Variable
 from torchpt.physics.shapes.geometry import KINDS
 from torchpt.search.tree import WideBvh
@@ -28,6 +33,11 @@ __all__ = ["TreeSearch", "tree_search"]
 
 _RAY = ("ox", "oy", "oz", "dx", "dy", "dz", "t_max")
 _HIT = "{float, i32, float, float}"
+#: Threads of a warp without a ray at which they take new ones, and the weight of a thread that waits for a turn of nodes beside
+#: that of one that waits for a turn of leaves: of the values tried, those that issue the fewest instructions for bounced rays.
+_REFILL, _NODES_FIRST = 8, 2
+#: Primitives of a leaf that a thread tests in a turn: more save votes, but make the code longer.
+_PRIMITIVES = 2
 #: The address words of :func:`torchpt.search.tree.scene_words`, and the ids behind them.
 _TABLES, _FIRST_IDS = ("tree", "corner", "rows", "quadrics"), ("rectangle", "disk", "sphere", "quadric")
 #: The bits of an entry in a key; the sign bit is cleared, as entries are not negative but may be -0.
@@ -64,6 +74,12 @@ class TreeSearch:
             whole.declarations |= block.declarations
         return whole
 
+    def lane_loop(self, loop: SearchLoop) -> Block:
+        """See :class:`torchpt.compiler.searching.LoopingSearch`."""
+        block = _Traversal(self, loop.any_hit, loop.form, loop.names)
+        block.write_loop(loop)
+        return block
+
 
 def tree_search(tree: WideBvh) -> TreeSearch:
     """Return the functions that search a tree; its words are :attr:`WideBvh.words`."""
@@ -88,8 +104,8 @@ def _dot(a: Sequence[Value], b: Sequence[Value]) -> Value:
 class _Traversal(LaneBlock):
     """The builder of one function: state of the traversal of a ray, and the turns that change it."""
 
-    def __init__(self, search: TreeSearch, any_hit: bool, form: Form) -> None:
-        super().__init__(form)
+    def __init__(self, search: TreeSearch, any_hit: bool, form: Form, names: int = 0) -> None:
+        super().__init__(form, names)
         self.search, self.any_hit = search, any_hit
 
     def write(self) -> None:
@@ -101,9 +117,55 @@ class _Traversal(LaneBlock):
         self._declare()
         self._begin(*(self.given("f", f"%{name}") for name in _RAY))
         with self.loop() as leave:
-            self._turn(leave)
-        self._finish()
+            nodes, leaves = self._ballots()
+            leave((nodes | leaves).eq(0))
+            self._turn(nodes, leaves)
+        self.do(f"ret {result} {self._result()}")
         self.lines.append("}")
+
+    def write_loop(self, loop: SearchLoop) -> None:
+        """Write a loop over lanes, in which threads take new rays once :data:`_REFILL` of their warp have none.
+
+        A warp takes the lanes of its threads' numbers plus multiples of the number of all threads, in this order.
+        """
+        self._declare()
+        self.node.value = self.leaf.value = -1
+        self.open.value, self.top.value = self.none_open, 0
+        lane, taken = Variable(self, "L"), Variable(self, "L")  # -1: no lane; lanes that the warp took
+        more = Variable(self, "b")  # there are lanes behind them
+        lane.value, taken.value, more.value = -1, 0, True
+        n, threads = self.given("L", "%n"), self.given("L", "%threads")
+        first_of_warp = self.given("L", "%thread") & -WARP
+        self.declarations.add("declare i32 @llvm.nvvm.read.ptx.sreg.lanemask.lt()")
+        below = self.given("i", self.op("call i32 @llvm.nvvm.read.ptx.sreg.lanemask.lt()"))
+
+        def lane_at(place: Value) -> Value:
+            return (place >> (WARP.bit_length() - 1)) * threads + first_of_warp + (place & WARP - 1)
+
+        with self.loop() as leave:
+            nodes, leaves = self._ballots()
+            idle = ~(nodes | leaves)
+            waiting = idle.call("llvm.ctpop")
+            with self.either(waiting.eq(WARP) | (waiting.ge(_REFILL) & more.value)) as otherwise:
+                mine = self.node.value.lt(0) & self.leaf.value.lt(0)
+                with self.when((mine & lane.value.ge(0)).name):
+                    self._add(loop.store, i=lane.value.name, mask="true", found=self._result())
+                lane.value = mine.select(self.number("L", -1), lane.value)
+                next_lane = lane_at(taken.value + (idle & below).call("llvm.ctpop").to("zext", "L"))
+                with self.when((mine & next_lane.lt(n)).name):
+                    lane.value = next_lane
+                    self._add(loop.load, i=next_lane.name, mask="true")
+                    self._begin(*(self.given("f", name) for name in loop.ray))
+                taken.value = taken.value + waiting.to("zext", "L")
+                more.value = lane_at(taken.value).lt(n)
+                leave(self._ballot(lane.value.ge(0)).eq(0))
+                otherwise()
+                self._turn(nodes, leaves)
+
+    def _add(self, lines: Sequence[str], **values: str) -> None:
+        """Append lines, with values in place of some of their names."""
+        names = re.compile(rf"%({'|'.join(values)})\b")
+        self.lines += [names.sub(lambda found: values[found[1]], line) for line in lines]
 
     # -- state
 
@@ -118,6 +180,12 @@ class _Traversal(LaneBlock):
         self.parent, self.open, self.top = Variable(self, "i"), Variable(self, "i"), Variable(self, "i")
         self.none_open = 0 if self.any_hit else 1
         self.stack = self.op(f"alloca [{2 * self.search.depth} x i32], align 8")
+        # The ray: origin, direction, origin and shear by turned axes, reciprocals of the direction; offsets of near planes in a
+        # node, and of corners' components by turned axes in a leaf.
+        floats, offsets = ("o", "d", "origin", "shear", "inverse"), ("near", "along")
+        self.ray = {
+            name: [Variable(self, "f" if name in floats else "i") for _ in range(3)] for name in (*floats, *offsets)
+        }
         self.best, self.prim = Variable(self, "f"), Variable(self, "i")
         # u and v are quotients, divided once at the end.
         self.u, self.v, self.over_u, self.over_v = (Variable(self, "f") for _ in range(4))
@@ -132,31 +200,29 @@ class _Traversal(LaneBlock):
         """Begin the traversal of a ray at the root; a ray that is not finite, or ends before it begins, is over at once."""
         zero = ox * 0.0 + oy * 0.0 + oz * 0.0 + dx * 0.0 + dy * 0.0 + dz * 0.0
         valid = t_max.gt(0.0) & zero.eq(0.0)
-        self.o, self.d = (ox, oy, oz), (dx, dy, dz)
+        o, d = (ox, oy, oz), (dx, dy, dz)
         # Axes in the order of Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection" (2013): the longest one last.
-        x, y, z = map(abs, self.d)
+        x, y, z = map(abs, d)
         on_x, on_y = x.ge(y) & x.ge(z), y.ge(z)
 
         def turned(of: tuple[Value, Value, Value]) -> tuple[Value, ...]:
             """Return the components of a vector in this order."""
             return tuple(on_x.select(of[k - 2], on_y.select(of[k - 1], of[k])) for k in range(3))
 
-        d0, d1, d2 = turned(self.d)
-        self.origin, self.shear = turned(self.o), (d0 / d2, d1 / d2, self.number("f", 1.0) / d2)
+        d0, d1, d2 = turned(d)
         starts = turned((self.number("i", 0), self.number("i", WIDTH), self.number("i", 2 * WIDTH)))
-        self.along = [self._from(start) for start in starts]
         # Reciprocals that are never infinite.
         least = _greater(abs(d2) * 1e-20, self.number("f", 1e-37))
-        self.inverse = [
+        inverse = [
             self.number("f", 1.0) / size.ge(least).select(c, least.call("llvm.copysign", c))
-            for size, c in zip((x, y, z), self.d, strict=True)
+            for size, c in zip((x, y, z), d, strict=True)
         ]
-        self.near, self.far = [], []
-        for k, inverse in enumerate(self.inverse):
-            low, high = k * WIDTH, (k + 3) * WIDTH
-            near = inverse.gt(0.0).select(self.number("i", low), high)
-            self.near.append(self._from(near))
-            self.far.append(self._from(self.number("i", low + high) - near))
+        near = [x.gt(0.0).select(self.number("i", k * WIDTH), (k + 3) * WIDTH) for k, x in enumerate(inverse)]
+        shear = (d0 / d2, d1 / d2, self.number("f", 1.0) / d2)
+        given = {"o": o, "d": d, "origin": turned(o), "shear": shear, "inverse": inverse, "near": near, "along": starts}
+        for name, components in given.items():
+            for variable, component in zip(self.ray[name], components, strict=True):
+                variable.value = component
         self.node.value = valid.select(self.number("i", 0), -1)
         self.leaf.value = self.prim.value = -1
         self.open.value = self.none_open
@@ -165,62 +231,72 @@ class _Traversal(LaneBlock):
         self.u.value = self.v.value = 0.0
         self.over_u.value = self.over_v.value = 1.0
 
-    def _from(self, offset: Value) -> str:
-        """Return the address of an offset in the tree's buffer."""
-        return self.at(self.tables["tree"], "float", f"i32 {offset.name}")
+    def _ray(self, name: str) -> list[Value]:
+        """Return three components of the ray, see :meth:`_declare`."""
+        return [variable.value for variable in self.ray[name]]
 
-    def _finish(self) -> None:
-        """Return the result."""
+    def _result(self) -> str:
+        """Return the result: whether anything is hit, or ``t, prim, u, v``."""
         hit = self.prim.value.ge(0)
         if self.any_hit:
-            self.do(f"ret i1 {hit.name}")
-            return
+            return hit.name
         t = hit.select(self.best.value, np.inf)
         parts = (t, self.prim.value, self.u.value / self.over_u.value, self.v.value / self.over_v.value)
         value = "poison"
         for k, part in enumerate(parts):
             value = self.op(f"insertvalue {_HIT} {value}, {self.vector(part.ty)} {part.name}, {k}")
-        self.do(f"ret {_HIT} {value}")
+        return value
 
     # -- turns
 
-    def _turn(self, leave: object) -> None:
-        """Write a turn: of nodes or of leaves, as most of the warp's threads need; ``leave`` ends the loop of turns."""
-        has_node, has_leaf = self.node.value.ge(0), self.leaf.value.ge(0)
+    def _ballots(self) -> tuple[Value, Value]:
+        """Return which threads of the warp have a node to visit, and which a leaf to test, as bits; for a CPU its only one."""
+        conditions = self.node.value.ge(0), self.leaf.value.ge(0)
         if self.form.threads:
-            nodes, leaves = self._threads(has_node), self._threads(has_leaf)
-            leave((nodes | leaves).eq(0))  # type: ignore[operator]
-            nodes_next = nodes.ge(leaves)
+            nodes, leaves = (self._ballot(condition) for condition in conditions)
         else:
-            leave(~(has_node | has_leaf))  # type: ignore[operator]
-            nodes_next = has_node
+            nodes, leaves = (condition.to("zext", "i") for condition in conditions)
+        return nodes, leaves
+
+    def _turn(self, nodes: Value, leaves: Value) -> None:
+        """Write a turn: of nodes or of leaves, as most of the warp's threads need; threads are bits, see :meth:`_ballots`."""
+        nodes, leaves = (threads.call("llvm.ctpop") for threads in (nodes, leaves))
+        nodes_next = (nodes * _NODES_FIRST).ge(leaves)
+        has_node, has_leaf = self.node.value.ge(0), self.leaf.value.ge(0)
         with self.either(nodes_next) as otherwise:
             with self.when(has_node.name):
                 self._visit_node()
             otherwise()
             with self.when(has_leaf.name):
                 self._test_primitive()
+            for _ in range(_PRIMITIVES - 1 if self.form.threads else 0):
+                with self.when(self.leaf.value.ge(0).name):
+                    self._test_primitive()
         with self.loop() as leave_boxes:
             leave_boxes(self.node.value.ge(0) | self.leaf.value.ge(0))
             leave_boxes(self.open.value.eq(self.none_open) & self.top.value.eq(0))
             self._next_box()
 
-    def _threads(self, condition: Value) -> Value:
-        """Return the number of threads of the warp for which a condition holds."""
+    def _ballot(self, condition: Value) -> Value:
+        """Return a bit for each thread of the warp, set where a condition holds."""
         self.declarations.add("declare i32 @llvm.nvvm.vote.ballot.sync(i32, i1)")
-        ballot = self.op(f"call i32 @llvm.nvvm.vote.ballot.sync(i32 -1, i1 {condition.name})")
-        return self.given("i", ballot).call("llvm.ctpop")
+        return self.given("i", self.op(f"call i32 @llvm.nvvm.vote.ballot.sync(i32 -1, i1 {condition.name})"))
 
-    def _entry(self, near: Sequence[Value], o: Sequence[Value]) -> Value:
+    def _distances(self, planes: Sequence[Value]) -> list[Value]:
+        """Return the distances along the ray of three planes of a box."""
+        ray = zip(planes, self._ray("o"), self._ray("inverse"), strict=True)
+        return [(plane - c) * inverse for plane, c, inverse in ray]
+
+    def _entry(self, near: Sequence[Value]) -> Value:
         """Return the distance at which the ray enters a box, from the box's near planes."""
-        x, y, z = ((plane - c) * inverse for plane, c, inverse in zip(near, o, self.inverse, strict=True))
+        x, y, z = self._distances(near)
         return x.call("llvm.maxnum", y).call("llvm.maxnum", z.call("llvm.maxnum", 0.0))
 
-    def _planes(self, starts: Sequence[str], node: Value) -> list[list[Value]]:
+    def _planes(self, offsets: Sequence[Value], node: Value) -> list[list[Value]]:
         """Load three planes of each of a node's eight boxes."""
         found = []
-        for start in starts:
-            address = self.at(start, "float", f"i32 {node.name}")
+        for offset in offsets:
+            address = self.at(self.tables["tree"], "float", f"i32 {(node + offset).name}")
             numbers = []
             for half in range(2):
                 four = self.op(
@@ -236,12 +312,14 @@ class _Traversal(LaneBlock):
         self.node.value = -1
         with self.when(self.open.value.ne(self.none_open).name):
             self._push()
-        near, far, best = self._planes(self.near, node), self._planes(self.far, node), self.best.value
+        offsets, best = self._ray("near"), self.best.value
+        near = self._planes(offsets, node)
+        far = self._planes([self.number("i", (2 * k + 3) * WIDTH) - offset for k, offset in enumerate(offsets)], node)
         hits: list[Value] = []
         entries: list[Value] = []
         for k in range(WIDTH):
-            entry = self._entry([planes[k] for planes in near], self.o)
-            x, y, z = ((planes[k] - c) * inverse for planes, c, inverse in zip(far, self.o, self.inverse, strict=True))
+            entry = self._entry([planes[k] for planes in near])
+            x, y, z = self._distances([planes[k] for planes in far])
             exit_ = x.call("llvm.minnum", y).call("llvm.minnum", z.call("llvm.minnum", best)) * float(SLACK)
             hits.append(entry.le(exit_))
             entries.append(entry)
@@ -291,8 +369,8 @@ class _Traversal(LaneBlock):
             rest = order & (order - 1)
         else:
             child, rest = order & 7, order >> 3
-        near = [self.read("f", start, node + child) for start in self.near]
-        entry = (self._entry(near, self.o).to("bitcast", "i") & _ENTRY_BITS).to("bitcast", "f")
+        near = [self.read("f", self.tables["tree"], node + child + offset) for offset in self._ray("near")]
+        entry = (self._entry(near).to("bitcast", "i") & _ENTRY_BITS).to("bitcast", "f")
         if self.any_hit:
             self.open.value = rest
             self._enter(node, child, entry)
@@ -357,17 +435,20 @@ class _Traversal(LaneBlock):
 
     def _corner(self, place: Value, number: int) -> tuple[Value, Value, Value]:
         """Return a corner relative to the origin in sheared space, the first of whose numbers is at ``place``."""
+        tree, first = self.tables["tree"], place + 3 * WIDTH * number
         x, y, z = (
-            self.read("f", start, place + 3 * WIDTH * number) - c
-            for start, c in zip(self.along, self.origin, strict=True)
+            self.read("f", tree, first + offset) - c
+            for offset, c in zip(self._ray("along"), self._ray("origin"), strict=True)
         )
-        return x - self.shear[0] * z, y - self.shear[1] * z, z
+        shear_x, shear_y, _ = self._ray("shear")
+        return x - shear_x * z, y - shear_y * z, z
 
     def _plane(self, place: Value) -> Value:
         """Return the distance along the ray of a plane whose numbers begin at ``place``."""
         n0, n1, n2, n3 = (self.read("f", self.tables["tree"], place + WIDTH * k) for k in range(4))
-        away = n0 * self.o[0] + n1 * self.o[1] + n2 * self.o[2] + n3
-        return -away / (n0 * self.d[0] + n1 * self.d[1] + n2 * self.d[2])
+        o, d = self._ray("o"), self._ray("d")
+        away = n0 * o[0] + n1 * o[1] + n2 * o[2] + n3
+        return -away / (n0 * d[0] + n1 * d[1] + n2 * d[2])
 
     def _triangle(self, place: Value, id_: Value) -> None:
         """Test a triangle by its edge functions, without any tolerance."""
@@ -379,7 +460,7 @@ class _Traversal(LaneBlock):
         det = e + f + g
         with self.when(((low.ge(0.0) | high.le(0.0)) & det.ne(0.0)).name):
             plane = self._plane(place + PLANES)
-            za, zb, zc = (z * self.shear[2] for z in (za, zb, zc))
+            za, zb, zc = (z * self._ray("shear")[2] for z in (za, zb, zc))
             t = _lesser(_greater(plane, _lesser(_lesser(za, zb), zc)), _greater(_greater(za, zb), zc))
             self._accept(t, id_, plane.eq(plane) & t.gt(0.0), (f, det), (g, det))
 
@@ -387,7 +468,7 @@ class _Traversal(LaneBlock):
         """Test a rectangle, by the operations of :func:`torchpt.search.leaf.distances`."""
         plane = self._plane(place + RULED)
         (ax, ay, az), (bx, by, bz), (cx, cy, cz), (qx, qy, qz) = (self._corner(place, k) for k in range(4))
-        az, bz, cz, qz = (z * self.shear[2] for z in (az, bz, cz, qz))
+        az, bz, cz, qz = (z * self._ray("shear")[2] for z in (az, bz, cz, qz))
         f, g = ax * cy - ay * cx, bx * ay - by * ax
         h, k = qx * by - qy * bx, cx * qy - cy * qx
         low, high = _lesser(_lesser(f, g), _lesser(h, k)), _greater(_greater(f, g), _greater(h, k))
@@ -408,8 +489,8 @@ class _Traversal(LaneBlock):
         """Test a disk, a plane with the rows of its u and v."""
         first = (prim - self.first_id["rectangle"]) * 12
         c0, c1, c2 = (self.read("f", self.tables["rows"], first + k) for k in (3, 7, 11))
-        plane = -(self._row("rows", first, self.o) + c0) / self._row("rows", first, self.d)
-        p = [o + plane * d for o, d in zip(self.o, self.d, strict=True)]
+        plane = -(self._row("rows", first, self._ray("o")) + c0) / self._row("rows", first, self._ray("d"))
+        p = [o + plane * d for o, d in zip(self._ray("o"), self._ray("d"), strict=True)]
         u, v = self._row("rows", first + 4, p) + c1, self._row("rows", first + 8, p) + c2
         met = plane.gt(0.0) & plane.lt(np.inf) & (u * u + v * v).le(1.0)
         one = self.number("f", 1.0)
@@ -422,8 +503,8 @@ class _Traversal(LaneBlock):
         """Test a sphere in float64, see ``sphere_distance`` of ``scripts/kernel_sources/tree_leaf.py``."""
         first = (prim - self.first_id["rectangle"]) * 12
         *centre, radius = self._doubled([self.read("f", self.tables["corner"], first + k) for k in range(4)])
-        f = [o - c for o, c in zip(self._doubled(self.o), centre, strict=True)]
-        e = self._doubled(self.d)
+        f = [o - c for o, c in zip(self._doubled(self._ray("o")), centre, strict=True)]
+        e = self._doubled(self._ray("d"))
         a, b = _dot(e, e), -_dot(f, e)
         s = b / a
         off = [x + s * y for x, y in zip(f, e, strict=True)]
@@ -440,7 +521,7 @@ class _Traversal(LaneBlock):
         """Test a quadric in its own space in float64, by the operations of :func:`torchpt.search.leaf.quadric`."""
         first = (prim - self.first_id["quadric"]) * 19
         numbers = {k: self.read("d", self.tables["quadrics"], first + k) for k in (3, 7, 11, *range(12, 19))}
-        o, d = self._doubled(self.o), self._doubled(self.d)
+        o, d = self._doubled(self._ray("o")), self._doubled(self._ray("d"))
         fx, fy, fz = (self._row("quadrics", first + 4 * k, o) + numbers[4 * k + 3] for k in range(3))
         ex, ey, ez = (self._row("quadrics", first + 4 * k, d) for k in range(3))
         bend, level, shift, low, high, around, half = (numbers[k] for k in range(12, 19))

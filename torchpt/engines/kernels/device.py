@@ -9,8 +9,8 @@ set theirs to 0. Loops without a fixed end (paths without a depth limit, rays th
 Threads count in any order, so the places of lanes in an arena are random. No result depends on them: radiance is written to
 the slot of its sample, and slots are added to the film in the order of samples.
 
-Stages that cannot be compiled, and searches that are not part of kernels, run as tensor operations between kernels; they wait
-for the number of lanes.
+Few primitives are searched inside stages, a tree by kernels between them. Stages that cannot be compiled, and searches that
+kernels do not know (instances), run as tensor operations between kernels; they wait for the number of lanes.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -49,7 +50,10 @@ from torchpt.physics.film.splats import LARGEST, Splats
 from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search import Accel, brute_if_fastest
+from torchpt.search.brute import Brute
 from torchpt.search.lbvh import Lbvh
+from torchpt.search.tree import WideBvh
+from torchpt.search.tree_rays import TreeSearch, tree_search
 
 __all__ = [
     "CHECK_EVERY",
@@ -65,7 +69,7 @@ __all__ = [
     "device_forward",
     "device_kernels",
     "on_host",
-    "packets_on_device",
+    "search_on_device",
 ]
 
 #: Steps between two checks of a loop without a fixed end for lanes that are left.
@@ -103,7 +107,7 @@ class KernelsOnDevice(Kernels, ABC):
     Args:
         cuda: the device.
         target: the target that stages are compiled for; its form has the row length of arenas.
-        search: from :func:`packets_on_device`; None: rays are searched outside of kernels.
+        search: from :func:`search_on_device`; None: rays are searched outside of kernels.
         arguments: of the other base.
 
     Attributes:
@@ -114,6 +118,7 @@ class KernelsOnDevice(Kernels, ABC):
         self.cuda, self.target, self.row = cuda, target, target.form.row
         self._search = search
         self._host: tuple[Layout, NamedTensors] | None = None
+        self.tree = None if search is None else search.tree
         super().__init__(*arguments)
 
     @abstractmethod
@@ -130,6 +135,7 @@ class KernelsOnDevice(Kernels, ABC):
             if self._host is None:
                 self._host = self._host_inputs()
             layout, leaves = self._host
+            layout.tree = self.tree
             return trace_stage(leaves, layout, build, listed)
 
         return cache.program_of((key, self.structure), self._leaves.tensors, trace, self.target, self.cuda.device)
@@ -177,44 +183,64 @@ class DeviceKernels(KernelsOnDevice):
 
 @dataclass(frozen=True)
 class SearchWords:
-    """The argument of packet searches, on a device.
+    """The argument of searches in kernels, on a device.
 
     Attributes:
-        words: int64, see :func:`torchpt.compiler.packet.scene_words`.
-        keep: tensors whose addresses are among the words.
+        words: int64, see :func:`torchpt.compiler.packet.scene_words` and :func:`torchpt.search.tree.scene_words`.
+        tables: tensors whose addresses are the first words.
+        tree: see :class:`~torchpt.engines.kernels.layout.Layout`.
     """
 
     words: Tensor
-    keep: tuple[Tensor, ...]
+    tables: tuple[Tensor, ...]
+    tree: TreeSearch | None
 
 
-def host_packet_search(accel: Accel) -> Accel | None:
-    """Return the packet search, on the host, of the primitives that a device searches by a tree of tensors.
+def host_search(accel: Accel) -> Brute | WideBvh | None:
+    """Return the search, on the host, whose data kernels of a device read; of few primitives, or a tree.
 
-    None if there are too many primitives or other ones than packets know.
+    None for instances, and for quadrics that the device searches by a tree of tensors.
     """
+    if isinstance(accel, Brute | WideBvh):
+        return None if isinstance(accel, Brute) and accel.quadrics else accel
     if not isinstance(accel, Lbvh) or accel.counts[4]:
         return None
     p0, p1, p2 = accel.corners.cpu().split(3)
     triangles, rectangles, disks, spheres, quadrics = accel.counts
-    return brute_if_fastest(Geometry(p0, p1, p2, (triangles, rectangles, disks, spheres, quadrics)))
+    geometry = Geometry(p0, p1, p2, (triangles, rectangles, disks, spheres, quadrics))
+    few = brute_if_fastest(geometry)
+    return few if isinstance(few, Brute) else WideBvh(geometry)
 
 
-def packets_on_device(accel: Accel, wanted: bool, device: torch.device) -> SearchWords | None:
-    """Return the argument of packet searches of a scene on a device; None: rays are searched outside of kernels.
+#: Searches that were copied to devices, by the accel of the scene.
+_ON_DEVICE: WeakKeyDictionary[Accel, dict[torch.device, SearchWords | None]] = WeakKeyDictionary()
+
+
+def search_on_device(accel: Accel, wanted: bool, device: torch.device) -> SearchWords | None:
+    """Return the argument of searches in kernels of a scene, on a device; None: rays are searched outside of kernels.
 
     Args:
         accel: the scene's acceleration structure.
-        wanted: True: few primitives are searched by packets, also where ``accel`` is a tree.
+        wanted: False: only ``accel`` itself is searched by kernels, not a tree of tensors by another one.
         device: where kernels run.
     """
-    brute: Any = accel if accel.name == "brute" else host_packet_search(accel) if wanted else None
-    if brute is None:
+    if not wanted and not isinstance(accel, Brute):
         return None
-    tables = tuple(table.to(device) for table in (brute.table, brute.spheres))
-    words = torch.frombuffer(bytearray(brute.words), dtype=torch.int64).clone()
-    words[0], words[1] = (table.data_ptr() for table in tables)
-    return SearchWords(words.to(device), tables)
+    found = _ON_DEVICE.setdefault(accel, {})
+    if device not in found:
+        host = host_search(accel)
+        found[device] = None if host is None else _copied(host, device)
+    return found[device]
+
+
+def _copied(host: Brute | WideBvh, device: torch.device) -> SearchWords:
+    if isinstance(host, WideBvh):
+        tables, words = [torch.from_numpy(table) for table in host.tables], torch.from_numpy(host.words)
+    else:
+        tables, words = [host.table, host.spheres], torch.frombuffer(bytearray(host.words), dtype=torch.int64)
+    moved, words = tuple(table.to(device) for table in tables), words.clone()
+    words[: len(moved)] = torch.tensor([table.data_ptr() for table in moved])
+    return SearchWords(words.to(device), moved, tree_search(host) if isinstance(host, WideBvh) else None)
 
 
 # ---- Memory, counters and launches
@@ -634,11 +660,12 @@ def device_kernels(
         own: indices of the user's own models, which are compiled at once to find out whether they can be.
         cuda: the device.
         target: see :class:`DeviceKernels`.
-        search: see :class:`KernelsOnDevice`.
+        search: see :class:`KernelsOnDevice`. A tree is searched by kernels of its own, with fewer registers than stages need.
         before: kernels of another render; its tables are shared where they were made of the same tensors.
     """
     opaque = wave.context.world.materials.opacity is None and not wave.integrator.has_own_transmit
-    fused = search is not None and opaque and wave.first_surface is None and not wave.integrator.splats
+    packets = search is not None and search.tree is None
+    fused = packets and opaque and wave.first_surface is None and not wave.integrator.splats
     kernels = DeviceKernels(wave, cuda, target, search, fused, before)
     eager = kernels.probe(own) if wave.integrator.light else {}
     if eager and kernels.fused:  # stages that run as tensor operations need searches between the stages
@@ -661,7 +688,7 @@ def device_forward(
     Args:
         wave: of the render, on the device.
         own: see :func:`device_kernels`.
-        packets: True: few primitives are searched inside of kernels; False: by the wave's acceleration structure.
+        packets: True: rays are searched by kernels where these can; False: by the wave's acceleration structure.
         before: see :func:`device_kernels`.
         cuda: the device; None: that of the wave.
         target: returns the target of a row length.
@@ -671,7 +698,7 @@ def device_forward(
         RenderError: kernels cannot run on the device.
     """
     device = cuda_of(wave.centre.device) if cuda is None else cuda
-    search = packets_on_device(wave.accel, packets, device.device)
+    search = search_on_device(wave.accel, packets, device.device)
     last = before
 
     def make(row: int) -> DeviceKernels:

@@ -32,7 +32,7 @@ from torchpt.engines.kernels.device import (
     LateCheck,
     SearchWords,
     on_host,
-    packets_on_device,
+    search_on_device,
 )
 from torchpt.engines.kernels.driver import Cuda, Function, cuda_of
 from torchpt.engines.kernels.engine import LANES, Chunk, Paths
@@ -235,7 +235,7 @@ def device_backward(
         RenderError: kernels cannot run on the device.
     """
     device = cuda_of(tape.wave.centre.device) if cuda is None else cuda
-    search = packets_on_device(tape.wave.accel, packets, device.device)
+    search = search_on_device(tape.wave.accel, packets, device.device)
     cotangent = None if cotangent is None else cotangent.float().contiguous()
     kernels = DeviceVjpKernels(tape, cotangent, device, target(LANES), search)
     kernels.eager = kernels.probe(own)

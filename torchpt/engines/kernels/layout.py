@@ -24,6 +24,7 @@ from torchpt.paths.state import EXTRA, PathState
 from torchpt.paths.wave import camera_state
 from torchpt.physics.samplers import Dimension
 from torchpt.physics.shapes.geometry import Hit
+from torchpt.search.tree_rays import TreeSearch
 
 if TYPE_CHECKING:
     from torchpt.paths.wave import Wave
@@ -223,7 +224,7 @@ class Layout:
 
     Args:
         wave: the render.
-        packets: True: few primitives, searched by packet kernels. False: the acceleration structure is called.
+        packets: True: rays are searched by kernels. False: the acceleration structure is called.
         fused: True: the search is part of the stages. False: it runs between them.
 
     Attributes:
@@ -236,7 +237,10 @@ class Layout:
         has_transmission: True: rays may pass surfaces, or the integrator has its own ``transmit``.
         listed: True: kernels read lanes by lists. False: all lanes of the arena are on the only model.
         numbers: tensors of the sampler.
+        tree: the search of a tree by kernels; None: they intersect each ray with every primitive.
     """
+
+    tree: TreeSearch | None = None
 
     def __init__(self, wave: Wave, packets: bool, fused: bool) -> None:
         self.wave, self.packets, self.fused = wave, packets, fused

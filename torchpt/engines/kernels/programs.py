@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -183,6 +183,7 @@ def trace_stage(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], S
         sinks = build(trace)
     tables, steps, guards = without_unused_steps(tracer.tables, tracer.steps, tracer.guards)
     searches = any(op in ("nearest", "occluded") for op, *_ in tracer.graph.nodes)
+    functions = PacketSearch(kinds_of(layout.world)) if layout.tree is None else layout.tree
     return TracedStage(
         graph=tracer.graph,
         sinks=sinks,
@@ -193,7 +194,7 @@ def trace_stage(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], S
         uniforms=tuple(trace.uniforms),
         tensors=trace.tensors,
         listed=listed,
-        search=PacketSearch(kinds_of(layout.world)) if searches else None,
+        search=functions if searches else None,
         sums=tuple(trace.sums),
     )
 
@@ -240,7 +241,7 @@ class Kernels(Layout):
         seconds: seconds spent on making kernels.
         structure: key that is equal for renders that can share kernels and memory of threads.
         kernel_cache: shared by renders of the same structure.
-        search: argument of packet searches; None where the acceleration structure is called.
+        search: argument of searches by kernels; None where the acceleration structure is called.
         non_opaque: uint8 for each primitive, 1 where a ray may pass it, for the acceleration structure.
     """
 
@@ -259,7 +260,7 @@ class Kernels(Layout):
         self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
         own = (fingerprint(wave.integrator), wave.context.crop) if wave.integrator.has_own_stages else None
         parts = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first_surface, own, self._leaves.tensors)
-        self.structure = (self._of_world, *map(signature, parts), packets, fused)
+        self.structure = (self._of_world, *map(signature, parts), packets, fused, self.tree and astuple(self.tree))
         alike = before is not None and before.structure == self.structure
         self.kernel_cache = before.kernel_cache if alike else KernelCache()  # pyright: ignore[reportOptionalMemberAccess]
         self._laid_out = self.kernel_cache.tables(self._leaves)
