@@ -363,7 +363,7 @@ CASES = [
         [f for op in (torch.floor, torch.ceil, torch.trunc, torch.round) for f in each(op, "fdilu")],
     ),
     Case("isnan isinf", [f for op in (torch.isnan, torch.isinf, torch.isfinite) for f in each(op, "fdilu")]),
-    Case("isfinite", each(aten.isfinite, "fd"), inference=True),
+    Case("isfinite", each(aten.isfinite, "fdilu"), inference=True),
     *(
         function_of(name, 4)
         for name in "sin cos tan asin acos atan exp exp2 expm1 log log2 log10 log1p sinh cosh tanh sigmoid".split()

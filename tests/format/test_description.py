@@ -153,6 +153,7 @@ BAD: dict[str, tuple[dict[str, Any], str, str]] = {  # name -> scene, key, part 
     "endless": (scene(integrator={"max_depth": -1, "rr_prob": 1}), "integrator.rr_prob", "below 1"),
     "device": (scene(render={"device": "tpu"}), "render.device", "cuda:N"),
     "memory": (scene(render={"max_memory": "much"}), "render.max_memory", "4GB"),
+    "memory beyond float64": (scene(render={"max_memory": "9" * 400}), "render.max_memory", "4GB"),
 }
 
 

@@ -216,7 +216,7 @@ def test_info_names_lights_and_offers_cameras(tmp_path: Path) -> None:
 def test_cameras_of_other_kinds(tmp_path: Path) -> None:
     flat = {"type": "orthographic", "orthographic": {"xmag": 1.5, "ymag": 1}}
     (part,) = load_mesh(write(tmp_path, [BULB, SPOT, SUN], cameras=[flat]))
-    assert [(camera.kind, camera.name, camera.film) for camera in part.cameras] == [
+    assert [(camera.kind, camera.name, camera.film_text) for camera in part.cameras] == [
         ("orthographic", "camera0", "width: 3")
     ]
     for odd in ({"type": "perspective"}, {"type": "perspective", "perspective": {"yfov": 4}}, {"type": "fisheye"}, 3):

@@ -64,6 +64,11 @@ MTL: dict[str, tuple[str, dict[str, Any], tuple[str, ...]]] = {
     ),
     "mirror": ("Kd 0 0 0\nKs .9 .8 .7\nillum 5", {"type": "conductor", "reflectance": [0.9, 0.8, 0.7]}, ()),
     "glass": ("Ni 1.5\nillum 7\nd 0.2", {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, ()),
+    "glass with what it does not use": (
+        "Kd 1 1 1\nKs 1 1 1\nNi 1.5\nillum 7\nPm 1\nPs .5\nPc 0",
+        {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
+        ("Ks", "Pm", "Ps"),
+    ),
     "rough tinted glass": (
         "Ni 1.33\nillum 6\nd 0.5\nTf .5 .6 .7\nPr .3",
         {

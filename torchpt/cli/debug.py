@@ -98,7 +98,7 @@ def lines(path: Path) -> Iterator[str]:
         yield from _vertex_lines(vertex)
     yield f"ended: {path.ended}"
     yield f"radiance {_triple_text(path.radiance, digits=_EXACT_DIGITS)}"
-    if path.value != path.radiance:
+    if path.value != path.radiance:  # weighted by the filter, clamped, or 0 as it is not finite
         yield f"in the picture {_triple_text(path.value, digits=_EXACT_DIGITS)}"
 
 

@@ -82,7 +82,8 @@ def unknown_key_error(key: str, words: Iterable[str] = ()) -> str:
         or did_you_mean(group, SCENE_BLOCKS, lambda block: f"{block}.{name}" if name else block)
     )
     ours = ", ".join(f"{group}.*" for group in GROUPS)
-    return f"{key}: unknown key{hint}; known: scene, out, {ours}, and the scene's own: {', '.join(SCENE_BLOCKS[1:])}"
+    _version, *blocks = SCENE_BLOCKS  # nobody overrides the version of the format
+    return f"{key}: unknown key{hint}; known: scene, out, {ours}, and the scene's own: {', '.join(blocks)}"
 
 
 def scenes_help() -> str:

@@ -1,7 +1,9 @@
 """Traced stages, compiled programs, and the tables of a scene in the layout that kernels read.
 
 A stage is traced once (:class:`TracedStage`), compiled (:class:`Program`), and bound to the tables of each scene
-(:func:`bind_tables`). For leaves, tables, steps and guards see :mod:`torchpt.compiler.prologue`.
+(:func:`bind_tables`). *Leaves* are the tensors of a scene by dotted path; *tables* are tensors that do not depend on lanes:
+leaves, or results of *steps*, torch operators on leaves that are run before the kernel; *guards* are values of leaves on which
+the trace depends (:mod:`torchpt.compiler.prologue`).
 """
 
 from __future__ import annotations
@@ -43,7 +45,8 @@ class TracedStage:
         listed: lanes are read at the indices of a list; False: all lanes in order.
         search: generates the functions that nodes ``nearest`` and ``occluded`` call, such as
             :class:`torchpt.compiler.packet.PacketSearch`; None: no rays are searched.
-        sums: parameters whose derivatives are rows of the results, see :mod:`torchpt.engines.kernels.backward`.
+        sums: for each table with gradients its number, the row of the index (-1: none, every lane adds to the whole table), the
+            first row of the values, and their number; see :mod:`torchpt.engines.kernels.backward`.
     """
 
     graph: Graph
@@ -78,12 +81,13 @@ class Program:
         guards: values that the trace depended on.
         uniforms: names of the inputs that all lanes share.
         lists: number of index lists that the kernel writes.
-        counters: number of counters.
+        counters: number of counters, to which the kernel adds how many lanes it wrote to lists or counted.
         tensors: number of input tensors.
         results: number of result tensors.
         shadows: number of shadow rays a lane.
         nodes: number of nodes that each file of the package created.
-        sums: parameters whose derivatives are rows of the results, see :mod:`torchpt.engines.kernels.backward`.
+        sums: for each table with gradients its number, the row of the index (-1: none, every lane adds to the whole table), the
+            first row of the values, and their number; see :mod:`torchpt.engines.kernels.backward`.
     """
 
     function: Function

@@ -1,7 +1,8 @@
 """Sums of segments of a row, one term after the other, as LLVM IR: functions that kernels of single lanes call.
 
 A *segment* is what lies from one place to another in a list that orders the elements of a row. Its sum is made by one lane, in
-the order of the list, so it has the same bits on any machine.
+the order of the list, so it has the same bits on any machine. The rows are those of the *slots*, memory outside of the arenas
+that several kernels share (:mod:`torchpt.compiler.sinks`).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ def segment_sums(rows: int, ty: str) -> TracedStage:
         ty: node type of the result, ``f`` or ``d``, in which terms are added.
     """
     graph = Graph()
-    first, end = (graph.node("tensor", "i", extra=(slot, 0)) for slot in range(2))
+    first, end = (graph.node("tensor", "i", extra=(number, 0)) for number in range(2))
     starts = [graph.node("tensor", ty, extra=(2, row)) for row in range(rows)]
     sums = [graph.node("segment", ty, first, end, start, extra=row) for row, start in enumerate(starts)]
     return TracedStage(graph, Sinks(store=[Store(tuple(sums), ty)]), uniforms=("order",), tensors=3)

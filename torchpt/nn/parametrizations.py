@@ -17,8 +17,8 @@ In a rigid motion ``w`` is a rotation as axis times angle, ``exp(w)`` its matrix
 A plain sigmoid never reaches 0 or 1, and is flat near them: an albedo of 0 would be ``x`` of minus infinity, and stay there.
 So it is stretched by ``e = 0.05`` at each closed end, which is then reached at a finite ``x`` with a sixth of the slope in
 the middle. Beyond an end the parameter is clamped, and only gradients that lead back pass (a projected gradient). Open ends
-(a radius above 0) are not stretched. ``s`` is the mean magnitude of the initial value (1 if that is 0), so that a step of
-``x`` is relative to the parameter's scale, for a lamp of 0.01 as for one of 1,000.
+(a radius above 0) are not stretched. ``s`` is the mean distance of the initial value from ``low`` (1 if that is 0), so that a
+step of ``x`` is relative to the parameter's scale, for a lamp of 0.01 as for one of 1,000.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ def parametrization_of(spec: Spec, start: Tensor, *, rigid: bool = True, length:
     Args:
         spec: declaration of the parameter.
         start: its initial value.
-        rigid: True: poses move rigidly. False: only those that must keep angles do.
+        rigid: True: poses move rigidly. False: only those whose spec says that they must keep angles or lengths.
         length: size of the scene, the unit of a pose's position.
     """
     if isinstance(spec, Pose):

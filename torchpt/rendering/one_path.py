@@ -1,7 +1,8 @@
 """Trace one path of a render and describe it vertex by vertex; it is the path of the picture's sample, to the bit.
 
-``torchpt debug`` prints the result. An :class:`~torchpt.paths.explain.Explainer` records the events of the path as it is traced
-(camera ray, intersection, emitter hit, scattering), in lanes of one; :class:`_PathBuilder` puts those of one depth together.
+``torchpt render SCENE debug.pixel=[x,y]`` prints the result. An :class:`~torchpt.paths.explain.Explainer` records the events
+of the path as it is traced (camera ray, intersection, emitter hit, scattering), in lanes of one; :class:`_PathBuilder` puts
+those of one depth together.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class LightSampleRecord:
         wi: direction to the light.
         pdf: density per solid angle, times the probability of the light; infinite for a delta light.
         arriving: radiance over pdf, before occlusion.
-        bsdf: BSDF times cosine, with the shadowing of perturbed normals.
+        bsdf: BSDF times cosine, times the factor of the shading normal (``DirectLight.share``): below 1 where perturbed normals
+            shadow, 0 on the back of a one-sided surface.
         mis_weight: MIS weight of the light sample.
         visible: transmittance of the shadow ray, from 0 to 1; None where the contribution is 0 and no ray is traced.
         contribution: radiance added to the sample.
@@ -145,7 +147,7 @@ class Path:
         seed: seed of the render.
         origin: origin of the camera ray.
         direction: direction of the camera ray.
-        vertices: vertices from the camera on.
+        vertices: surfaces that the path met, in order, and the environment where it escaped; the camera is none of them.
         ended: why the path ended: escaped, max_depth, absorbed, roulette or not finite.
         radiance: radiance of the whole path.
         value: value added to the film: weighted by the filter, 0 where it is not finite, clamped.
@@ -186,7 +188,7 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         expected = f"one that follows paths ({names}) beside debug.pixel"
         raise SceneError("integrator.type", settings.integrator.name, expected)
     with torch.no_grad(), limited_threads(settings.render.threads):
-        wave = make_wave(scene, settings, None, torch.float32)
+        wave = make_wave(scene, settings, params=None, dtype=torch.float32)
         explainer = Explainer(wave.context.world)
         x, y, number = (torch.tensor([value], device=scene.device) for value in (*pixel, sample))
         state = wave.rays_of(x, y, number)

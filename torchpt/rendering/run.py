@@ -203,6 +203,7 @@ class Run:
     def sample_all(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, until a stop rule or ``on_progress`` ends the render, and return the rendering."""
         self.on_progress = on_progress
+        # Where nothing looks at the picture between passes, these are as long as possible.
         self.stop_rules.picture_is_watched = (
             on_progress is not None or self.settings.adaptive or self.has_checkpoint or self.distributed is not None
         )
@@ -248,6 +249,7 @@ class Run:
 
     def _finish(self) -> Rendering:
         mark_loaded(self._how())  # code is loaded now: later estimates of memory leave it out
+        # Without a limit the memory of threads is kept for the next render.
         self.engine.release_workers(keeps=self.settings.render.max_memory is None)
         return finished_rendering(self)
 
@@ -291,6 +293,7 @@ class Run:
             return
         self._before_resampling = self._counts_and_light()
         from_first_rank = None if self.distributed is None else self.distributed.from_first_rank
+        # The call sets `probes.resampled` too, which holds the third values of the outliers once their samples are taken.
         if not self._take_samples(self.probes.resample_outliers(self.picture.film, from_first_rank)):
             self.probes.resampled = None
         self._join_films()
@@ -331,6 +334,8 @@ class Run:
         while self.stop_rules.should_continue(mean):  # mean samples a pixel so far
             requested = min(2.0 * mean, float(self.settings.render.spp)) - mean
             more = self.stop_rules.affordable_spp(requested)  # mean samples a pixel of this round
+            # The last round reaches `render.spp` with less than twice the samples; as no round follows, it gives out all that
+            # are left.
             last = more == requested and more < mean and mean + more >= self.settings.render.spp
             spans = allocation.spans(self.picture, self.probes, mean + more, last=last)
             if not spans:  # not enough samples are left for one block
@@ -461,8 +466,9 @@ class Run:
         """Return the upper end of the interval of relMSE after resampling outliers, which takes samples."""
         assert self.probes is not None
         self._resample_outliers()
-        estimate, unknown = error_estimate_of(self, self.probes.picture(self.picture.film))
-        return math.inf if self.stopped_by_caller or unknown else _upper_bound(estimate)
+        # Of the picture with the second samples of the probes merged in; `distrust` says why it cannot be trusted, or is empty.
+        estimate, distrust = error_estimate_of(self, self.probes.picture(self.picture.film))
+        return math.inf if self.stopped_by_caller or distrust else _upper_bound(estimate)
 
     def _undo_resampling(self) -> None:
         """Restore the counts before outliers were resampled: the picture gets more samples, and they will be again."""
@@ -547,7 +553,9 @@ class Run:
             snapshot=self.snapshot,
         )
         stop_requested = bool(self.on_progress(state))
-        if paths or self.sharing_ranks > 1 or self.distributed is None:  # ranks stop together, after a pass
+        # Between two passes that ranks share, not every rank reports, but ranks have to stop together: within a pass.
+        is_between_shared_passes = self.distributed is not None and self.sharing_ranks == 1 and not paths
+        if not is_between_shared_passes:
             self.stopped_by_caller = stop_requested and self.done < self.requested_paths()
         return self.stopped_by_caller
 

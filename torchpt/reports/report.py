@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -18,7 +19,7 @@ from torchpt.reports.runs import Measured, machine, write_whole
 from torchpt.reports.study import Study
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["facts_of", "write_report"]
+__all__ = ["facts_of", "plot_stems", "write_report"]
 
 
 def write_report(study: Study, measured: Sequence[Measured], folder: Path) -> list[SceneReport]:
@@ -47,16 +48,26 @@ def write_report(study: Study, measured: Sequence[Measured], folder: Path) -> li
     text = page(study, scene_reports, sheets, figures, f"torchpt {__version__}, {made}, {where}")
     plots = folder / "plots"
     plots.mkdir(exist_ok=True)
-    for scene_report, found in zip(scene_reports, figures, strict=True):
+    stems = plot_stems([scene_report.name for scene_report in scene_reports])
+    for stem, found in zip(stems, figures, strict=True):
         for name, (png, svg) in found.items():
-            is_path = scene_report.name.endswith((".yaml", ".yml"))
-            # Everything that is no letter, digit or underscore becomes an underscore.
-            stem = re.sub(r"\W+", "_", Path(scene_report.name).stem if is_path else scene_report.name)
             write_whole(plots / f"{stem}_{name}.png", png)
             write_whole(plots / f"{stem}_{name}.svg", svg)
     write_whole(folder / "report.json", facts.encode())
     write_whole(folder / "report.html", text.encode())
     return scene_reports
+
+
+def plot_stems(scenes: Sequence[str]) -> list[str]:
+    """Return the beginnings of the names of plot files, distinct for each scene (a name or a scene file)."""
+    stems: list[str] = []
+    for scene in scenes:
+        is_path = scene.endswith((".yaml", ".yml"))
+        # Everything that is no letter, digit or underscore becomes an underscore.
+        base = re.sub(r"\W+", "_", Path(scene).stem if is_path else scene)
+        candidates = (base if number == 1 else f"{base}_{number}" for number in itertools.count(1))
+        stems.append(next(stem for stem in candidates if stem not in stems))
+    return stems
 
 
 def _figures(scene_report: SceneReport, measures: tuple[str, ...]) -> dict[str, Figure]:

@@ -90,7 +90,7 @@ def description_of(source: Any) -> dict[str, Any]:
     if not shapes:
         raise AssetError(_LABEL, "the scene is empty (no mesh with a face)")
     description: dict[str, Any] = {"shapes": shapes, **_view(source)}
-    lights, _ = lights_of(source, _LABEL)
+    lights, _unsupported = lights_of(source, _LABEL)
     if lights:
         names = unique_labels([light.name for light in lights])
         description["lights"] = {name: _light(light) for name, light in zip(names, lights, strict=True)}
@@ -111,6 +111,7 @@ def _shapes(source: Any) -> tuple[dict[str, Any], bool]:
     for label, (_, name, matrix) in zip(labels, nodes, strict=True):
         if name not in parts:
             parts[name] = checked(parts_of(source.geometry[name], str(name)[:80], converter), Path(_LABEL))
+        # `part.material.material`: the block of a scene file that the file's material becomes.
         emits = any("emission" in part.material.material for part in parts[name] if part.material is not None)
         any_emits |= emits
         # Instances cannot emit, and need a transform that has an inverse.

@@ -85,7 +85,11 @@ class MemoryEstimate:
         return int(SLACK * (held + self.code + self.waves)) + SPARE
 
     def left(self, limit: int, held: int) -> int:
-        """Return the bytes of a limit that are left for waves, where the process holds ``held`` bytes."""
+        """Return the bytes of a limit that are left for waves, where the process holds ``held`` bytes.
+
+        ``picture`` is taken off too, for the pictures of progress that are computed beside a wave. What is left may be less
+        than ``waves``, as :meth:`least` counts the larger of both: the render then has waves of the fewest lanes.
+        """
         return limit - held - self.films - self.code - self.picture
 
 

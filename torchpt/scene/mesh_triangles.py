@@ -119,7 +119,7 @@ def _camera_text(camera: FileCamera, pose: np.ndarray) -> str:
         target, up = (origin + ahead / np.linalg.norm(ahead), up / np.linalg.norm(up))
     places = {"origin": origin, "target": target, "up": up}
     rows = ", ".join(f"{key}: [{', '.join(f'{x + 0.0:.6g}' for x in value)}]" for key, value in places.items())
-    return f"camera {camera.name}: {{type: {camera.kind}, {rows}, {camera.film}}}"
+    return f"camera {camera.name}: {{type: {camera.kind}, {rows}, {camera.film_text}}}"
 
 
 def faces_with_area(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:

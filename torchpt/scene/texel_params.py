@@ -98,7 +98,7 @@ def _copy_params(textured: Scene, scene: Scene, texels: Mapping[str, Tensor]) ->
         # The tensor stays where it is the same memory, so that it does not count as changed.
         if name not in texels or not _same_memory(textured.params[name], new):
             textured.params[name] = new
-    textured.mark_checked(scene)
+    textured.mark_checked(scene)  # tensors that `scene` has checked for their ranges are not checked again
 
 
 def _same_memory(one: Tensor, other: Tensor) -> bool:
@@ -127,6 +127,7 @@ def _build_with_texels(scene: Scene, texels: Mapping[str, Tensor]) -> SceneBuild
     parameters = Parameters()
     parameters |= before.parameters
     parameters.specs |= before.parameters.specs
+    # Names of parameters whose texels are tensors of the scene, not of image files.
     parameters.texels_in_scene |= before.parameters.texels_in_scene | texels.keys()
     texture_loader = TextureLoader({}, scene.description, parameters)
     materials = {

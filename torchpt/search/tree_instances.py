@@ -46,7 +46,8 @@ class InstancedWideBvh(Accel):
         threads: CPU threads; None: torch's number at the time of a search.
     """
 
-    name, refits = "numba", True
+    name = "numba"  # the value of `render.accel` that asks for wide trees, whose kernels were once made by Numba
+    refits = True
 
     def __init__(self, geometry: Geometry, threads: int | None = None) -> None:
         start = time.perf_counter()
@@ -69,6 +70,7 @@ class InstancedWideBvh(Accel):
             start: time at which the build or refit began.
         """
         assert geometry.copies is not None
+        # Rows 12 to 14: of each instance the mesh's first triangle, number of triangles, and the first primitive id.
         self.base, self.threads, self.spans = base, base.threads, geometry.copies[12:]
         not_empty = np.flatnonzero([tables.meshes[k].size > 0 for k in tables.mesh.tolist()]).astype(np.int32)
         boxes = torch.cat((tables.low, tables.high)).T.contiguous().numpy()[not_empty]
@@ -78,7 +80,8 @@ class InstancedWideBvh(Accel):
         upper = aligned_buffer(line_count(top, none.counts) * LINE)
         write_tree(top, none, np.zeros((0, 4), np.float32), NonTriangles(none), line=0, memory=upper)
         self.depth = top.depth + self._lower_depth
-        roots = np.array([4 * state.line for state in self.refit_states], np.int64)  # codes, see tree_layout.py
+        # A code is a reference to a node or leaf, see tree_layout.py: here the root node of each mesh's tree.
+        roots = np.array([4 * state.line for state in self.refit_states], np.int64)
         self.tables = (
             upper, lower, tables.inverse.numpy(), tables.shift.numpy().astype(np.int32), roots[tables.mesh.numpy()]
         )  # fmt: skip
@@ -132,7 +135,7 @@ class InstancedWideBvh(Accel):
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
     ) -> None:
-        """See :meth:`Accel.blocked`; with ``non_opaque`` every ray that hits anything gets 2."""
+        """See :meth:`Accel.blocked`; with ``non_opaque`` every ray with a hit gets 2 (compute its transmittance)."""
         self.base.blocked(o, d, t_max, count, out)
         self._run("occluded", count, 1, o, d, t_max, out)
         mark_non_opaque(out[:count], non_opaque)

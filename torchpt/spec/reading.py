@@ -5,6 +5,7 @@ Numbers are strict: no booleans, no numeric text, nothing that is not finite in 
 
 from __future__ import annotations
 
+import math
 import re
 from itertools import chain
 from typing import Any
@@ -182,7 +183,10 @@ def _refuse_first_bad_row(value: Any, columns: int, expected: str) -> None:
 
 
 def faces(value: Any) -> NDArray[np.int64]:
-    """Return triangles ``(F, 3)`` int64 from lists of three or more indices; polygons are split into fans."""
+    """Return triangles ``(F, 3)`` int64 from lists of three or more indices; polygons are split into fans.
+
+    Indices out of range, negative ones among them, are refused where the number of vertices is known.
+    """
     expected = "a list of faces, each three or more vertex indices (whole numbers >= 0)"
     if isinstance(value, list | tuple):
         all_lists = bool(value) and set(map(type, value)) <= {list, tuple}
@@ -220,7 +224,8 @@ def memory_size(value: Any) -> int | None:
             raise Refused(expected)
         base = 1024 if match[3] else 1000
         digits, prefix, _ = match.groups()
-        value = int(float(digits) * base ** " KMGT".index(prefix.upper() or " "))  # the exponent is the prefix's index
+        size = float(digits) * base ** " KMGT".index(prefix.upper() or " ")  # the exponent is the prefix's index
+        value = int(size) if math.isfinite(size) else None
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 2**60:  # an EiB
         raise Refused(expected)
     return value

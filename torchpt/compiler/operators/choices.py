@@ -1,4 +1,7 @@
-"""Lowerings of comparisons, selection, casts and constants."""
+"""Lowerings of comparisons, selection, casts and constants.
+
+The letters of node types (``b``, ``i``, ``l``, ``L``) are those of :mod:`torchpt.compiler.graph`.
+"""
 
 from __future__ import annotations
 
@@ -45,6 +48,8 @@ def _isnan(tracer: Tracer, out: Tensor, a: Tensor) -> None:
 @register_lowering("isfinite")
 def _isfinite(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     graph, ty = tracer.graph, DTYPES[a.dtype]
+    if ty not in FLOATS:
+        return tracer.put(out, np.array(graph.constant("b", True), object))
     apply(tracer, out, lambda x: graph.node("lt", "b", graph.node("abs", ty, x), graph.constant(ty, math.inf)), a)
 
 

@@ -2,7 +2,8 @@
 
 A *table* is a tensor that does not depend on lanes; a look-up at an index that does is a load from memory (node ``gather``,
 whose ``extra`` is the number of the table, the numbers of an entry, and the one that is loaded). A look-up in a tensor that
-depends on lanes is supported only at the lane's own index, and among a few values of each lane.
+depends on lanes is supported only at the lane's own index, and among a few values of each lane. The letters of node types
+(``i``, ``l``, ``L``) are those of :mod:`torchpt.compiler.graph`.
 """
 
 from __future__ import annotations
@@ -74,7 +75,8 @@ def _index(tracer: Tracer, out: Tensor, table: Tensor, indices: Any) -> None:
             first = graph.binary("mul", "i", first, graph.constant("i", table.shape[axis])) if axis else first
             first = graph.binary("add", "i", first, graph.cast(of_axis[entry], "i"))
         first = graph.binary("mul", "i", first, graph.constant("i", width))
-        for k, component in enumerate(np.ndindex(*entry_shape)):  # each index is clamped by itself
+        # The kernel clamps `flat_index`: beyond the table's end it reads the table's last number, for each component.
+        for k, component in enumerate(np.ndindex(*entry_shape)):
             flat_index = graph.binary("add", "i", first, graph.constant("i", k))
             nodes[(*entry, *component)] = graph.node("gather", ty, flat_index, extra=(number, 1, 0))
     tracer.put(out, nodes)

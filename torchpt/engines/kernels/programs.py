@@ -112,6 +112,7 @@ class KernelCache:
         if entry is None:
             return None
         kernel, states = entry
+        # Constants are tensors without a path, so nothing tells whether they were written to: their tables are laid out anew.
         if kernel.program is not program or program.constants:
             return None
         return kernel if all(leaves.has(path, state) for path, state in states.items()) else None
@@ -177,6 +178,7 @@ def program_of(
 
 def trace_stage(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> TracedStage:
     """Trace a stage; arguments as for :func:`program_of`."""
+    # A number of lanes that divides no axis of a leaf: axes of lanes are told apart from those of tables by their length.
     tracer = Tracer(choose_lane_count(leaves.tensors.values()), leaves.ids)
     trace = Trace(tracer, layout)
     with torch.no_grad():
@@ -210,7 +212,7 @@ def records_of(layout: Layout, cotangent: Tensor | None) -> dict[str, Any]:
         "camera": wave.camera,
         "filter": wave.filter.tensors(),
         "sampler": layout.numbers,
-        "centre": wave.centre,
+        "centre": wave.centre,  # origin of the lanes' coordinates in the scene
         "pixel": wave.context.pixel,
         "first": wave.first_surface,
         "cotangent": cotangent,
@@ -258,6 +260,7 @@ class Kernels(Layout):
         self._leaves = NamedTensors(records_of(self, cotangent), None if before is None else before._leaves)
         same = fixed and before is not None and before.world is self.world
         self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
+        # The crop is None without splats, which only stages of an integrator's own add.
         own = (fingerprint(wave.integrator), wave.context.crop) if wave.integrator.has_own_stages else None
         parts = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first_surface, own, self._leaves.tensors)
         self.structure = (self._of_world, *map(signature, parts), packets, fused, self.tree and astuple(self.tree))
@@ -285,7 +288,7 @@ class Kernels(Layout):
         reasons = {}
         for model in models:
             try:
-                self.bounce(model, roulette=0.0)
+                self.bounce(model, roulette=0.0)  # the upper bound of survival; 0: no roulette
             except Unsupported as error:
                 reasons[model] = str(error)
         return reasons
@@ -302,11 +305,11 @@ class Kernels(Layout):
     # -- vertices of paths
 
     def generate(self, chosen: bool, given: bool) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.generate`."""
+        """See :func:`torchpt.engines.kernels.stages.generate`; ``chosen``: pixels are listed, ``given``: rays are given."""
         return self._get(False, stages.generate, chosen, given)
 
     def sort_lanes(self, shadow: bool) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.sort_lanes`."""
+        """See :func:`torchpt.engines.kernels.stages.sort_lanes`; ``shadow``: shadow rays came before."""
         return self._get(False, stages.sort_lanes, shadow)
 
     def emit(self) -> Kernel:
@@ -328,7 +331,7 @@ class Kernels(Layout):
     # -- the search by packets
 
     def search_nearest(self, passed: bool) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.search_nearest`."""
+        """See :func:`torchpt.engines.kernels.stages.search_nearest`; ``passed``: of rays that pass surfaces, not of paths."""
         return self._get(False, stages.search_nearest, passed)
 
     def search_occluded(self) -> Kernel:

@@ -47,7 +47,7 @@ class Rough(Bsdf, part=True):
 
     @classmethod
     def given(cls, values: Values) -> dict[str, Any]:
-        """Return the values, with the default ``alpha`` if no roughness is set."""
+        """Return the values that are set (not None), and the default ``alpha`` if no roughness is."""
         found = super().given(values)
         return found if found.keys() & {"alpha", "roughness", "alpha_u"} else {**found, "alpha": _DEFAULT_ALPHA}
 
@@ -65,6 +65,7 @@ class Anisotropic(Rough, part=True):
 
     def __post_init__(self) -> None:
         if self.energy_compensation:
+            # Sets these attributes.
             self.has(tabulated=("alpha", "roughness", "alpha_u", "alpha_v", "int_ior", "ext_ior"), reciprocal=False)
 
 

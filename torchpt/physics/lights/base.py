@@ -40,7 +40,7 @@ __all__ = [
     "sort_key",
 ]  # fmt: skip
 
-#: Columns of the table that every row has, fields of :class:`Lights` by name.
+#: Columns of the table that every row has, fields of :class:`Lights` by name; ``flip`` is -1 where a sphere emits inward.
 COLUMNS = ("p0", "e1", "e2", "normal", "flip", "area", "bound", "radiance")
 
 

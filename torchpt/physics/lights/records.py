@@ -57,7 +57,8 @@ class LightSample:
 
     wi: Tensor  # (3, N) unit, toward the light
     target: Tensor  # (3, N) end of the shadow ray, moved off the light's surface; a direction where `distant`
-    distant: Tensor | None  # (N,) bool; None without distant lights
+    #: (N,) bool; None without distant lights. A kind's own samples have None: `torchpt.physics.lights.table` sets the mask.
+    distant: Tensor | None
     radiance: Tensor  # (3, N), zero where sampling failed; for a delta light the intensity or irradiance
     pdf: Tensor  # (N,) per steradian, times the probability of the light, detached; inf for a delta light
     weight: Tensor  # (N,) = 1 / pdf, differentiable in the geometry

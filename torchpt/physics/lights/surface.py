@@ -37,7 +37,7 @@ class Faces:
     """E emissive primitives of one kind."""
 
     e1: Tensor  # (3, E) first edge, as in LaneGeometry
-    face: Tensor  # (3, E) cross product of the edges
+    edge_cross: Tensor  # (3, E) cross product of the edges
     column: Tensor  # (E,) int64 index among the scene's primitives of the kind
     quadrics: Quadrics | None  # all quadrics of the scene
     frame: Tensor | None  # (12, Q) float64: p0 e1 e2 e3 of all quadrics
@@ -79,10 +79,10 @@ class Surface(Emitter):
     def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
         """Return the column ``Lights.area``, differentiable, and the areas in the world, detached; each ``(E,)`` float64."""
         # In float64: the fourth power of a length leaves float32 long before the length is extreme.
-        cross_product = faces.face.double()
+        cross_product = faces.edge_cross.double()
         area = dot(cross_product, cross_product).clamp_min(
             torch.finfo(torch.float64).tiny
-        ).sqrt() * faces.face.new_tensor(cls.area_factor)
+        ).sqrt() * faces.edge_cross.new_tensor(cls.area_factor)
         return area, area.detach()
 
     @classmethod

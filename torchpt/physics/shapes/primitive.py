@@ -205,7 +205,7 @@ class Primitive:
         return nothing, nothing, nothing
 
     @classmethod
-    def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
+    def tangent_columns(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
         """Return the columns of ``LaneGeometry.tangents`` and ``bitangents`` of a part: ``(3, P)`` each.
 
         Args:

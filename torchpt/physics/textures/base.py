@@ -178,7 +178,7 @@ class Opening:
         name: dotted name of the texture, the prefix of its parameters.
         channel: channel for a number, if the slot sets it.
         parameters: parameters of the scene, to which the texture adds its own.
-        resolve: maps a path as written and its dotted key to a file.
+        resolve: maps candidates of a path as written, and the dotted key, to the first file that exists.
         file: the scene file, for errors.
         image_cache: images read for other slots, shared by all openings of a scene; keys are those of the kind.
     """
@@ -337,7 +337,7 @@ def _uv_transform(value: Any) -> UvTransform:
     if not isinstance(value, Mapping):
         raise Refused("a mapping with scale, rotate, translate")
     try:
-        return UvTransform(**read_params(UvTransform, value, "", None, "uv_transform").values)
+        return UvTransform(**read_params(UvTransform, value, key="", file=None, words="uv_transform").values)
     except SceneError as error:
         raise as_refused(error) from None
 

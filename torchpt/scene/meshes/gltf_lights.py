@@ -123,4 +123,4 @@ def camera_at(document: Document, node: dict[str, Any], matrix: NDArray[np.float
         return None
     name = str(block.get("name") or node.get("name") or f"camera{index}")[:80]
     film = f"fov: {math.degrees(size):.6g}, fov_axis: y" if kind == "perspective" else f"width: {2.0 * size:.6g}"
-    return FileCamera(name=name, kind=str(kind), matrix=matrix, film=film)
+    return FileCamera(name=name, kind=str(kind), matrix=matrix, film_text=film)

@@ -112,13 +112,13 @@ class FileCamera:
         name: as in the file.
         kind: ``type`` of a scene file's camera.
         matrix: ``(4, 4)`` from its own space, where it looks along -z with +y up, to the file's.
-        film: its field of view or width, as text of a scene file's camera block.
+        film_text: its field of view or width, as text of a scene file's camera block.
     """
 
     name: str
     kind: str
     matrix: NDArray[np.float64]
-    film: str
+    film_text: str
 
 
 @dataclass(frozen=True)

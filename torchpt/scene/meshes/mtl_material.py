@@ -166,8 +166,10 @@ class _Converter:
         tint = self._unit("tf", _WHITE)
         if tint != _WHITE:
             material["specular_transmittance"] = list(tint)
+        self._ignore_specular()
+        self.ignored += [_NAMES[key] for key in ("pm", "ps", "pc") if self.numbers.get(key, 0.0) > 0.0]
         self.ignored += [
-            found.key for kind, found in self.maps.items() if kind in ("map_kd", "map_ks", "map_pr", "map_pm")
+            found.key for kind, found in self.maps.items() if kind in ("map_kd", "map_pr", "map_pm", "map_ps")
         ]
         self.opacity = 1.0  # the dielectric has its own transmission
         return material

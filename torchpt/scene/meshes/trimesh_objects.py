@@ -367,7 +367,7 @@ def _cameras(scene: Any) -> Iterator[FileCamera]:
         matrix = np.array(scene.camera_transform, np.float64)
         fov = float(scene.camera.fov[0])
         yield FileCamera(
-            name=str(scene.camera.name), kind="perspective", matrix=matrix, film=f"fov: {fov:.6g}, fov_axis: x"
+            name=str(scene.camera.name), kind="perspective", matrix=matrix, film_text=f"fov: {fov:.6g}, fov_axis: x"
         )
 
 

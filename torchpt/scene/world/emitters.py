@@ -57,7 +57,7 @@ class _Rows:
     e2: Tensor
     normal: Tensor  # unit normal or direction
     flip: Tensor  # (rows,) -1 where normals are flipped, else 1
-    area: Tensor  # (rows,)
+    area: Tensor  # (rows,) by which points are sampled, see `Lights.area`
     bound: Tensor  # (rows,) rounding bound
     radiance: Tensor  # without an emission texture
     power: Tensor  # (rows,) float64, detached: the weight of the row for light samplers
@@ -163,11 +163,12 @@ def _surfaces(
     dtype, device = primitives.p0.dtype, primitives.p0.device
     counts = torch.tensor([n for _, n in emitting], dtype=torch.int64, device=device)
     names = [part.kind for part, n in emitting for _ in range(n)]
-    p0, e1, e2, face, normal = (
+    p0, e1, e2, edge_cross, normal = (
         x.index_select(1, prim)
-        for x in (primitives.p0, primitives.e1, primitives.e2, primitives.face, primitives.normal)
+        for x in (primitives.p0, primitives.e1, primitives.e2, primitives.edge_cross, primitives.normal)
     )
-    # world_areas: areas in the world, by which power is estimated, float64; columns: in the table of quadrics
+    # areas: by which points are sampled; of a quadric the area in object space times |det|. world_areas: areas in the world, by
+    # which power is estimated; both float64. columns: in the table of quadrics.
     areas, world_areas, columns, needs_quadrics, start = [], [], [], False, 0
     for number, name in enumerate(KINDS):  # the order of primitives
         stop = start + names.count(name)
@@ -175,7 +176,7 @@ def _surfaces(
             continue
         kind, span = SURFACES[name], slice(start, stop)
         column = prim[span] - sum(primitives.counts[:number])  # primitives of earlier kinds come before
-        faces = Faces(e1[:, span], face[:, span], column, quadrics=primitives.quadrics, frame=primitives.frame)
+        faces = Faces(e1[:, span], edge_cross[:, span], column, quadrics=primitives.quadrics, frame=primitives.frame)
         area, world_area = kind.areas(faces)
         areas.append(area)
         world_areas.append(world_area)

@@ -80,7 +80,7 @@ def vertex_attributes_of(
     found: dict[str, Any] = dict.fromkeys(("tangents", "bitangents", "uvs", "axes", "mirrored", "colors"))
     if needs_tangents:
         derivatives = [  # of each part: of its points by u, and by v
-            kind.moves(part, part_corners, part_uvs, parameters[f"{part.name}.to_world"][:3, :3])
+            kind.tangent_columns(part, part_corners, part_uvs, parameters[f"{part.name}.to_world"][:3, :3])
             for kind, (part, part_corners), part_uvs in zip(kinds, pairs, uvs, strict=True)
         ]
         found["tangents"] = torch.cat([by_u for by_u, _ in derivatives], 1)

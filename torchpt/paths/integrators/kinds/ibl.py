@@ -32,7 +32,7 @@ class Ibl(FirstSurfaceIntegrator):
     """A preview: the first surface under the environment by split sum (unshadowed), and under other lights."""
 
     name = "ibl"
-    parameters: ClassVar = {**LIGHT_CHOICE, **SAMPLES}
+    parameters: ClassVar = {**LIGHT_CHOICE, **SAMPLES}  # SAMPLES: `clamp` and `strict`, which treat each sample
     strategy = "light"
 
     def first(self, world: World) -> Preview:
@@ -77,6 +77,7 @@ class Preview(FirstSurface):
         """Return the paths with split-sum radiance added, and shadow rays to the lights other than the environment."""
         world, state, hit = context.world, vertex.state, vertex.hit
         without_sky = replace(context, world=replace(world, lights=lights.without_environment(world.lights)))
+        # `chance` is 1 with the derivative of the probability that the ray passed the surfaces before.
         throughput = state.throughput if hit.chance is None else state.throughput * hit.chance
         arriving = replace(state, throughput=throughput)
         at = interact(world, state.o, state.d, hit, follow_ray=context.follow_ray)

@@ -61,7 +61,7 @@ class Blend(Bsdf):
 
     def __post_init__(self) -> None:
         a, b = self.a, self.b
-        self.has(
+        self.has(  # sets these attributes
             factors=(*a.factors, *b.factors),  # names of the parameters that scale a lobe
             delta=a.delta or b.delta,  # some lobe is a delta
             smooth=a.smooth and b.smooth,  # all lobes are deltas

@@ -48,7 +48,7 @@ class Dielectric(Glass):
         return sample_smooth_interface(parameters, wo, lobe)
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """Return white, as nothing is absorbed."""
+        """Return white; the tints of reflection and transmission are left out."""
         return torch.ones_like(parameters["eta"]).expand(3, -1)
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:

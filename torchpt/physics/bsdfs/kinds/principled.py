@@ -114,6 +114,7 @@ class Principled(Bsdf):
         return {key: value for key, value in found.items() if key in _ALWAYS_KEPT or value != 0.0}
 
     def __post_init__(self) -> None:
+        # Sets these attributes.
         self.has(transmits=self.transmissive, refracts=self.transmissive)
 
     @classmethod

@@ -64,7 +64,7 @@ class ThinDielectric(Glass):
         return BsdfSample(wi=torch.stack((-wo[0], -wo[1], z)), pdf=pdf, weight=weight)
 
     def albedo(self, parameters: Parameters) -> Tensor:
-        """Return white, as nothing is absorbed."""
+        """Return white; the tints of reflection and transmission are left out."""
         return torch.ones_like(parameters["eta"]).expand(3, -1)
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:

@@ -30,6 +30,7 @@ class ThinLens(Pinhole):
     """
 
     name = "thinlens"
+    # `Moves.SURFACES`: what moves surfaces or the camera, as the lens does.
     parameters: ClassVar = {
         "aperture_radius": Scalar(length=True, moves=Moves.SURFACES, doc="radius of the lens; 0 is a pinhole"),
         "focus_distance": Scalar(

@@ -173,7 +173,7 @@ def _grid(weights: Tensor, floor: Tensor) -> Grid:
 def _cell_of(map: EnvironmentMap, d: Tensor) -> Cell:
     """Return the cells in which unit directions ``(3, N)`` of the world lie."""
     local = [dot(map.turn[k][:, None], d) for k in range(3)]
-    around, down = angles(local, torch.finfo(d.dtype).tiny)
+    around, down = angles(local, min_sin2=torch.finfo(d.dtype).tiny)
     tall, wide = map.size[0].to(d.dtype), map.size[1].to(d.dtype)
     y = down * ((tall - 1.0) * (1.0 / math.pi))
     x = around * (wide * (0.5 / math.pi)) - 0.5
@@ -262,7 +262,8 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
         # The inverse of an orthogonal matrix is its transpose.
         turn = map.turn
         wi = torch.stack([local[0] * turn[0, k] + local[1] * turn[1, k] + local[2] * turn[2, k] for k in range(3)])
-        # The fraction of the cell in theta, in which the look-up is bilinear.
+        # The fraction of the cell in theta, in which the look-up is bilinear; `azimuth` gives theta, the angle from +y, whose
+        # cosine is local[1] and whose sine is `radius`.
         y = (azimuth(local[1], radius) * ((tall - 1.0) * (1.0 / math.pi)) - row).clamp(0.0, 1.0)
     if map.turn.requires_grad:
         return wi, density, radiance(map, wi)  # differentiable in the rotation
@@ -284,7 +285,7 @@ class Envmap(Environment):
         "scale": Scalar(1.0, doc="factor of the radiance"),
         "transform": Pose(
             None,
-            angles=True,
+            angles=True,  # has to keep angles
             moves=Moves.NOTHING,
             doc="rotation, may mirror; translation and scale have no effect",
         ),
@@ -310,7 +311,7 @@ class Envmap(Environment):
     def row(cls, scene: Setting) -> Row:
         """See :meth:`Light.row`; :attr:`Row.environment` is an :class:`EnvironmentMap`."""
         texels, scale = (scene.given(key).to(scene.dtype) for key in ("texels", "scale"))
-        linear = scene["to_world"][:3, :3]
+        linear = scene["to_world"][:3, :3]  # the tensor of the key `transform`
         turn = torch.linalg.inv(linear) * torch.linalg.det(linear).abs() ** (1.0 / 3.0)
         around = build(texels, turn.to(scene.dtype), scale)
         color = (around.mean * around.scale.detach()).expand(3)
@@ -323,6 +324,7 @@ class Envmap(Environment):
         """See :meth:`Light.sample`."""
         wi, density, light = sample(at.environment, u, mis)
         weight = torch.where(density > 0, safe_reciprocal(density), 0.0)
+        # `distant` is set by the light table, for the rows of all kinds at once.
         return LightSample(wi=wi, target=wi, distant=None, radiance=light, pdf=density, weight=weight)
 
     @classmethod

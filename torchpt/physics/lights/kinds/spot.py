@@ -33,6 +33,7 @@ def falloff(wi: Tensor, axis: Tensor, cutoff: Tensor, slope: Tensor) -> Tensor:
     """
     aside = cross(axis.expand_as(wi), wi)
     sine = dot(aside, aside).clamp_min(torch.finfo(wi.dtype).tiny).sqrt()
+    # `azimuth(cosine, sine)` is the angle between the axis and the direction away from the light.
     return ((cutoff - azimuth(-dot(wi, axis), sine)) * slope).clamp(0.0, 1.0)
 
 

@@ -46,6 +46,6 @@ class Rectangle(Primitive):
         return unit_uvs(corners)
 
     @classmethod
-    def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
-        """See :meth:`Primitive.moves`."""
+    def tangent_columns(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
+        """See :meth:`Primitive.tangent_columns`."""
         return corner_tangents(corners, uvs)

@@ -37,12 +37,13 @@ class Sphere(Primitive):
         linear, move = pose.split((3, 1), 1)
         radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)  # the pose scales equally along all axes
         zero = torch.zeros_like(radius)
+        # Of spheres `p1` becomes `e1` as it is, without `p0` subtracted.
         p1 = torch.stack((radius, zero, zero))[:, None]
         return Corners(p0=move.to(dtype), p1=p1.to(dtype), p2=torch.zeros_like(move).to(dtype))
 
     @classmethod
-    def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the vector whose cross product with the normal is the tangent, and ``(pi r, 0, 0)``."""
+    def tangent_columns(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the vector whose cross product with the normal is the tangent, and ``(pi r, 0, 0)`` for the bitangent."""
         linear = linear.to(corners.p0)
         radius, zero = corners.p1[0].abs(), torch.zeros_like(corners.p1[0])
         turned = -1.0 if part.flip else 1.0  # sign of the normal

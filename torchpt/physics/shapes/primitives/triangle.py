@@ -60,6 +60,8 @@ class Triangle(Primitive):
         return first, second, third
 
     @classmethod
-    def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
-        """See :meth:`Primitive.moves`."""
-        return super().moves(part, corners, uvs, linear) if part.uvs is None else corner_tangents(corners, uvs)
+    def tangent_columns(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
+        """See :meth:`Primitive.tangent_columns`."""
+        return (
+            super().tangent_columns(part, corners, uvs, linear) if part.uvs is None else corner_tangents(corners, uvs)
+        )

@@ -93,10 +93,10 @@ class Image(Mapped):
         """See :meth:`Texture.open`."""
         slot, scale = opening.slot, values["scale"]
         label, picture = _read_image(values, opening)
-        channel = opening.channel or values["channel"] or "luminance"
+        channel = opening.channel or values["channel"] or "luminance"  # the slot's choice comes first
         alpha = not slot.coloured and channel == "a"  # alpha is always linear
         space = values["colorspace"]
-        # Files of 8 bits a value hold sRGB, unless the file or the slot says otherwise.
+        # Files of 8 bits a value hold sRGB, unless the file says otherwise or the slot's values are no colours (`slot.linear`).
         decode = picture.eight_bit and (space == "srgb" or (space == "auto" and (alpha or not slot.linear)))
         channels = picture.values.shape[2]
         if alpha and channels in (1, 3):

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.vectors import luminance
-from torchpt.physics.textures.base import CHANNELS, Node, Opening, Table, Texture, TexturePoint
+from torchpt.physics.textures.base import Node, Opening, Table, Texture, TexturePoint
 
 __all__ = ["VertexColor"]
 
@@ -62,4 +62,4 @@ class VertexColor(Texture):
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
         """See :meth:`Texture.open`."""
-        return _Node(channel=opening.channel_index(CHANNELS[:4], "vertices have no alpha"))
+        return _Node(channel=opening.channel_index(("luminance", "r", "g", "b"), reason="vertices have no alpha"))
