@@ -116,7 +116,7 @@ def test_a_file_of_one_layer_needs_no_name(pair: Path, capfd: Captured) -> None:
 def test_a_map_of_numbers(pair: Path, capfd: Captured, metric: str) -> None:
     told = facts(capfd, "a.exr", "b.exr", "map=e.exr", f"metric={metric}")["map"]
     written = read_layers("e.exr")["image"]
-    seen = (DisplayTransform().of(A), DisplayTransform().of(B)) if metric == "ssim" else (A, B)
+    seen = (DisplayTransform().apply(A), DisplayTransform().apply(B)) if metric == "ssim" else (A, B)
     errors = error_map(metric, *seen)
     assert written.shape == (14, 18, 1) and torch.allclose(written[..., 0], errors.float(), rtol=1e-6)
     assert told == {"file": "e.exr", "metric": metric, "largest": pytest.approx(float(errors.max()))}
