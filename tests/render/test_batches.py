@@ -374,7 +374,7 @@ def counted(monkeypatch):
 
     counting(scenes_room, "assemble", "worlds")
     counting(search, "build", "trees")
-    counting(programs, "_traced", "programs")
+    counting(programs, "trace_stage", "programs")
     plain = loop_kernels.Kernels._make
 
     def make(self, key, *rest):
@@ -612,11 +612,11 @@ def test_memory_that_runs_out_in_a_thread(monkeypatch):
     expected = torchpt.render_batch(scenes)
     plain, failed = loop_kernels.Kernels.generate, []
 
-    def once(self, *form):
+    def once(self, **form):
         if not failed:
             failed.append(True)
             raise MemoryError
-        return plain(self, *form)
+        return plain(self, **form)
 
     monkeypatch.setattr(loop_kernels.Kernels, "generate", once)
     assert torch.equal(torchpt.render_batch(scenes, threads=2), expected) and failed
