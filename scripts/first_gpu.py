@@ -67,6 +67,14 @@ class NotMeasurable(Exception):
     """Raised by a check for which hardware or a program is missing."""
 
 
+class Differs(Exception):
+    """Raised by a check whose numbers are not the expected ones; ``figures``: those numbers, by name."""
+
+    def __init__(self, words: str, figures: dict[str, Any]) -> None:
+        super().__init__(words)
+        self.figures = figures
+
+
 @dataclass
 class Outcome:
     """The outcome of a check.
@@ -113,6 +121,8 @@ class Device:
             self._simulated_target = simulated_target
         else:
             self.torch = torch.device(name)
+            if self.torch.index is None:
+                self.torch = torch.device(self.torch.type, torch.cuda.current_device())
             self.cuda = cuda_of(self.torch)
 
     @property
@@ -181,8 +191,16 @@ def _differing(a: Tensor, b: Tensor) -> int:
     return int(((a != b) & ~((a != a) & (b != b))).sum())
 
 
-def _run(device: Device, function: Callable[..., Any], inputs: list[Tensor]) -> list[Tensor]:
-    """Run a function of lanes as one kernel on the device."""
+def _require(holds: bool, words: str, figures: dict[str, Any]) -> None:
+    """Raise :class:`Differs` unless something holds."""
+    if not holds:
+        raise Differs(words, figures)
+
+
+def _prepared(
+    device: Device, function: Callable[..., Any], inputs: list[Tensor]
+) -> tuple[list[Tensor], Callable[[Tensor], None]]:
+    """Make one kernel of a function of lanes; return its results and what launches it for a number of lanes ``(1,)`` int64."""
     stage, like = trace_lanewise(function, inputs)
     program = cache.compile_stage(stage, device.target(1024))
     tables = bind_tables(stage.tables, stage.steps, stage.constants, {}, device=device.torch)
@@ -193,10 +211,19 @@ def _run(device: Device, function: Callable[..., Any], inputs: list[Tensor]) -> 
     words[HEAD.index("tables")] = tables.address
     for k, x in enumerate((*given, *results)):
         words[len(HEAD) + 2 * k], words[len(HEAD) + 2 * k + 1] = x.data_ptr(), count
-    lanes = torch.tensor([count], dtype=torch.int64, device=device.torch)
     code = device.cuda.load(program.function.code, program.function.key)
+
+    def launch(lanes: Tensor, _keep: Any = (given, tables)) -> None:  # tensors whose addresses are among the words
+        device.cuda.launch(code, words, lanes.data_ptr(), count, device.cuda.stream())
+
     device.cuda.enter()
-    device.cuda.launch(code, words, lanes.data_ptr(), count, device.cuda.stream())
+    return results, launch
+
+
+def _run(device: Device, function: Callable[..., Any], inputs: list[Tensor]) -> list[Tensor]:
+    """Run a function of lanes as one kernel on the device."""
+    results, launch = _prepared(device, function, inputs)
+    launch(torch.tensor([inputs[0].shape[-1]], dtype=torch.int64, device=device.torch))
     device.wait()
     return [x.cpu() for x in results]
 
@@ -220,7 +247,7 @@ def first_kernels(device: Device) -> tuple[str, dict[str, Any]]:
     figures["kernels"] = len(functions)
     figures["most_registers"] = max((function.registers for function in functions), default=0)
     figures["most_local_bytes"] = max((function.local_bytes for function in functions), default=0)
-    assert not wrong, f"these scenes differ from the CPU: {', '.join(wrong)}"
+    _require(not wrong, f"these scenes differ from the CPU: {', '.join(wrong)}", figures)
     return f"{len(functions)} kernels of {len(SCENES)} scenes gave the CPU's bits", figures
 
 
@@ -242,7 +269,7 @@ def arithmetic(device: Device) -> tuple[str, dict[str, Any]]:
         for name, a, b in zip(("quotient", "root", "reciprocal", "fused"), found, expected, strict=True):
             figures[f"{name} {str(dtype).removeprefix('torch.')}"] = _differing(a, b)
     wrong = [name for name, count in figures.items() if count and name != "pairs"]
-    assert not wrong, f"these differ from the CPU: {', '.join(wrong)}"
+    _require(not wrong, f"these differ from the CPU: {', '.join(wrong)}", figures)
     return f"{pairs} random pairs gave the CPU's bits in float32 and float64", figures
 
 
@@ -254,7 +281,7 @@ def pictures(device: Device) -> tuple[str, dict[str, Any]]:
         figures[name] = _differing(found.image, expected.image)
         if figures[name] or (found.rays, found.nonfinite_samples) != (expected.rays, expected.nonfinite_samples):
             wrong.append(name)
-    assert not wrong, f"these scenes differ from the CPU: {', '.join(wrong)}"
+    _require(not wrong, f"these scenes differ from the CPU: {', '.join(wrong)}", figures)
     return f"{len(SCENES)} pictures gave the CPU's bits", figures
 
 
@@ -286,7 +313,7 @@ def repeated(device: Device) -> tuple[str, dict[str, Any]]:
         with torch.cuda.stream(torch.cuda.Stream(device.torch)):
             again("another stream")
     wrong = [label for label, count in figures.items() if count]
-    assert not wrong, f"these differ from the first picture: {', '.join(wrong)}"
+    _require(not wrong, f"these differ from the first picture: {', '.join(wrong)}", figures)
     return f"{len(figures)} more pictures had the same bits", figures
 
 
@@ -312,16 +339,15 @@ def times(device: Device) -> tuple[str, dict[str, Any]]:
 
 
 def _launch_seconds(device: Device) -> float:
-    """Return the seconds of a launch without lanes, of a kernel that was loaded before."""
+    """Return the seconds of a launch without lanes."""
     count = 200
-    function = device.cuda.functions()[-1]
-    words = (ctypes.c_int64 * 64)()
+    _, launch = _prepared(device, _arithmetic, [torch.ones(1 << 20) for _ in range(3)])
     lanes = torch.zeros(1, dtype=torch.int64, device=device.torch)
-    device.cuda.enter()
+    launch(lanes)
     device.wait()
     start = time.perf_counter()
     for _ in range(count):
-        device.cuda.launch(function, words, lanes.data_ptr(), 1 << 20, device.cuda.stream())
+        launch(lanes)
     device.wait()
     return (time.perf_counter() - start) / count
 
@@ -363,7 +389,7 @@ def memory(device: Device) -> tuple[str, dict[str, Any]]:
     finally:
         torch.cuda.set_per_process_memory_fraction(1.0, device.torch)
     figures = {"lanes": found.lanes, "differing": _differing(found.image, expected.image)}
-    assert not figures["differing"], "the picture differs after memory ran out"
+    _require(not figures["differing"], "the picture differs after memory ran out", figures)
     return f"waves of {found.lanes} lanes gave the same picture", figures
 
 
@@ -390,8 +416,8 @@ def gradients(device: Device) -> tuple[str, dict[str, Any]]:
     wrong = [name for name in colours if figures[f"{name}, differing from the CPU"]]
     # Gradients of camera rays are tensor operations, whose sums round differently on a GPU.
     wrong += [name for name in moving if figures[f"{name}, of the largest"] > 1e-3]
-    assert not figures["differing in two runs"], "two runs differ"
-    assert not wrong, f"these differ from the CPU: {', '.join(wrong)}"
+    _require(not figures["differing in two runs"], "two runs differ", figures)
+    _require(not wrong, f"these differ from the CPU: {', '.join(wrong)}", figures)
     bits = sum(figures[f"{name}, differing from the CPU"] for name in moving)
     return f"colours gave the CPU's bits; of what moves {bits} numbers differ", figures
 
@@ -464,13 +490,11 @@ def checked(device: Device, numbers: list[int]) -> Iterator[Outcome]:
             outcome = Outcome(number, name, "passed", words, figures)
         except NotMeasurable as error:
             outcome = Outcome(number, name, "not measurable here", str(error))
+        except Differs as error:
+            outcome = Outcome(number, name, "failed", str(error), error.figures)
         except Exception as error:
             place = traceback.extract_tb(error.__traceback__)[-1]
-            where = (
-                ""
-                if isinstance(error, AssertionError | TorchptError)
-                else f" ({Path(place.filename).name}:{place.lineno})"
-            )
+            where = "" if isinstance(error, TorchptError) else f" ({Path(place.filename).name}:{place.lineno})"
             outcome = Outcome(number, name, "failed", f"{error or type(error).__name__}{where}")
         outcome.seconds = round(time.perf_counter() - start, 2)
         yield outcome
