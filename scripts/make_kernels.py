@@ -19,8 +19,9 @@ import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
+from torchpt.native.kernels import FOLDER, read_module
+
 ROOT = Path(__file__).resolve().parents[1]
-FOLDER = ROOT / "torchpt" / "native" / "ir"
 SOURCES = ROOT / "scripts" / "kernel_sources"
 MODULES = ("tree_packet", "tree_instances", "tree_build", "tree_refit", "light_tree", "sums")
 
@@ -33,7 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
     made, changed = make(), []
     for name, text in made.items():
         path = FOLDER / f"{name}.ll.xz"
-        if not path.exists() or lzma.decompress(path.read_bytes()).decode() != text:
+        if not path.exists() or read_module(name) != text:
             changed.append(name)
             if not check:
                 FOLDER.mkdir(exist_ok=True)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler import cache, cpu
-from torchpt.compiler.form import THREADS
+from torchpt.compiler.form import Form
 from torchpt.compiler.function import compile_lanewise
 from torchpt.compiler.graph import Graph, Unsupported
 from torchpt.compiler.kernel import argument_words, kernel_ir
@@ -78,13 +78,13 @@ def test_rows_of_an_arena():
     """The length of rows is the form's."""
     short, long = (kernel_ir(compaction(), ptx_target(row).form) for row in (32, 1 << 20))
     assert "i64 384" in short and "i64 12582912" in long
-    assert ptx_target().form == THREADS
+    assert ptx_target().form == Form(width=1, threads=True)
 
 
 def test_counter_that_shifts_results():
     with pytest.raises(Unsupported, match="a counter that shifts"):
-        kernel_ir(compaction(shift=0), THREADS)
-    kernel_ir(compaction(shift=1), THREADS)
+        kernel_ir(compaction(shift=0), ptx_target().form)
+    kernel_ir(compaction(shift=1), ptx_target().form)
 
 
 def test_cached(monkeypatch, tmp_path, programs):

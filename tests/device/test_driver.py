@@ -42,7 +42,7 @@ def test_code_that_the_driver_refuses_is_one_line():
 
 def test_a_launch_may_fail():
     cuda = SimulatedCuda()
-    function = driver.Function(ctypes.c_void_p(1), None, 1, 0, 0)
+    function = driver.Function(ctypes.c_void_p(1), 1, 0, 0)
     words, lanes = (ctypes.c_int64 * 1)(), ctypes.c_int64(1)
     simulated: SimulatedDriver = cuda.driver
     for code, kind, name in ((2, MemoryError, "OUT_OF_MEMORY"), (700, RenderError, "UNKNOWN")):
@@ -55,7 +55,7 @@ def test_grids_fill_the_device_once():
     cuda = SimulatedCuda()
     grids = []
     cuda.driver.cuLaunchKernel = lambda function, grid, *rest: grids.append(grid) or 0
-    function = driver.Function(ctypes.c_void_p(1), None, 40, 0, 0)
+    function = driver.Function(ctypes.c_void_p(1), 40, 0, 0)
     words, lanes = (ctypes.c_int64 * 1)(), ctypes.c_int64(1)
     for most in (0, 1, 128, 129, 1 << 20):
         cuda.launch(function, words, ctypes.addressof(lanes), most, 0)

@@ -8,7 +8,7 @@ KINDS = ("random", "aimed", "axes")
 
 
 def make_rays(kind, g, n, seed=0, sort=False):
-    """Random rays; aimed at vertices and edges; parallel to axes, with ±0, NaN, infinity and ends. ``o, d, t_max``."""
+    """Make rays ``o, d, t_max``: random, aimed at vertices and edges, or parallel to axes with ±0, NaN, infinity and ends."""
     rng = np.random.default_rng(seed)
     corners = np.concatenate([p.numpy() for p in (g.p0, g.p1, g.p2)], 1)
     low, high = corners.min(1), corners.max(1)

@@ -245,10 +245,6 @@ class Block:
 
     def scatter(self, element: str, value: str, pointer: str, index: str, mask: str) -> None:
         """Store an element for each lane at int32 indices where the mask is set."""
-        if self.width == 1:
-            with self.when(mask):
-                self.do(f"store {element} {value}, ptr {self.at(pointer, element, f'i32 {index}')}")
-            return
         vector, suffix = self.each(element), self.suffix(element)
         name = f"llvm.masked.scatter.{suffix}.v{self.width}p0"
         self.declarations.add(f"declare void @{name}({vector}, {self.each('ptr')}, i32, {self.each('i1')})")
@@ -268,10 +264,6 @@ class Block:
 
     def masked_store(self, element: str, value: str, pointer: str, mask: str) -> None:
         """Store consecutive elements where the mask is set."""
-        if self.width == 1:
-            with self.when(mask):
-                self.do(f"store {element} {value}, ptr {pointer}")
-            return
         vector, suffix = self.each(element), self.suffix(element)
         name = f"llvm.masked.store.{suffix}.p0"
         self.declarations.add(f"declare void @{name}({vector}, ptr, i32, {self.each('i1')})")

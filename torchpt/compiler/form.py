@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["CAPACITY", "SCALAR", "THREADS", "VECTORS", "WARP", "Form"]
+__all__ = ["CAPACITY", "SCALAR", "VECTORS", "WARP", "Form"]
 
 
 #: Elements of a row of a CPU's arenas: at most 2^14 lanes, and one vector of padding, as kernels write whole vectors.
@@ -56,5 +56,3 @@ class Form:
 VECTORS = Form(width=16)
 #: One lane at a time on a CPU.
 SCALAR = Form(width=1)
-#: One lane a GPU thread, here with the row length of CPU arenas; see :class:`Form` for the calling convention.
-THREADS = Form(width=1, threads=True)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchpt.compiler import cache, operators  # noqa: F401  (the operators register how they are lowered)
 from torchpt.compiler.graph import DTYPES, Unsupported
-from torchpt.compiler.kernel import HEAD
+from torchpt.compiler.kernel import HEAD, WORD
 from torchpt.compiler.program import Program, Tables, TracedStage, bind_tables
 from torchpt.compiler.prologue import without_unused_steps
 from torchpt.compiler.sinks import Sinks, Store
@@ -36,7 +36,7 @@ GRAIN = 3_000_000
 #: Most structures of arguments for which kernels of one function are kept.
 _MOST_STRUCTURES = 32
 #: Index of the address of the tables among the words of a kernel's arguments.
-_TABLES = HEAD.index("tables")
+_TABLES = WORD["tables"]
 
 
 class Lanewise:

@@ -25,7 +25,7 @@ from torchpt.compiler.searching import LoopingSearch, SearchLoop, lone_search
 from torchpt.compiler.segments import segment_functions
 from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 
-__all__ = ["HEAD", "SinkWriter", "argument_words", "kernel_ir", "sink_writer"]
+__all__ = ["HEAD", "WORD", "argument_words", "kernel_ir"]
 
 
 # ---- Stores: the LLVM IR at the end of the loop's body that writes the results to the sinks
@@ -151,9 +151,8 @@ class _VectorSinks(SinkWriter):
 
     def __init__(self, block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
         super().__init__(block, graph, names, sinks)
-        self._counters = {
-            k: f"%c{k}" for k in range(sinks.counters())
-        }  # the register of each, as of the last instruction
+        # The register of each, as of the last instruction.
+        self._counters = {k: f"%c{k}" for k in range(sinks.counters())}
 
     def write(self) -> None:
         """See :meth:`SinkWriter.write`; adds the phi nodes of the counters."""
@@ -322,6 +321,8 @@ def sink_writer(block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sin
 #: ``stride``: address of the slots, and elements from one row of them to the next; ``counters``: the counters; ``tables``: for
 #: each table address and number of entries; ``search``: data for ray searches (:func:`torchpt.compiler.packet.scene_words`).
 HEAD = ("src", "dst", "list", "slots", "stride", "counters", "tables", "search")
+#: Index of each of these words.
+WORD = {name: k for k, name in enumerate(HEAD)}
 
 
 def argument_words(stage: TracedStage) -> list[tuple[str, str]]:

@@ -14,8 +14,8 @@ __all__ = ["float_remainders"]
 
 #: Operations of a graph that take a remainder of floats.
 _OPERATIONS = ("fmod", "remainder", "floordiv")
-#: By node type: bits of the fraction, and bits by which a remainder is shifted at once, so that it stays below 2^64.
-_FRACTION, _SHIFT = {"f": 23, "d": 52}, {"f": 40, "d": 11}
+#: Bits of the fraction, by node type. A remainder is shifted by 63 less these at once, so that it stays below 2^64.
+_FRACTION = {"f": 23, "d": 52}
 
 
 def float_remainders(graph: Graph, needed: list[int], form: Form) -> Block:
@@ -90,7 +90,7 @@ loop:
   %more = icmp ne i64 %left, 0
   br i1 %more, label %step, label %normalize
 step:
-  %by = call i64 @llvm.umin.i64(i64 %left, i64 {_SHIFT[ty]})
+  %by = call i64 @llvm.umin.i64(i64 %left, i64 {63 - fraction})
   %shifted = shl i64 %r, %by
   %next = urem i64 %shifted, %k
   %less = sub i64 %left, %by

@@ -70,9 +70,6 @@ class Value:
     def __or__(self, other: Number) -> Value:
         return self._binary("or", other)
 
-    def __xor__(self, other: Number) -> Value:
-        return self._binary("xor", other)
-
     def __lshift__(self, by: int) -> Value:
         return self._binary("shl", by)
 
@@ -141,7 +138,7 @@ class Variable:
 
     @property
     def value(self) -> Value:
-        """The present value."""
+        """Return the present value."""
         return Value(self._block, self._ty, self._block.op(f"load {ELEMENTS[self._ty]}, ptr {self._pointer}"))
 
     @value.setter

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from torchpt.core.memory import Budget, Span
 from torchpt.engines import work
 from torchpt.engines.kernels.engine import LANES as LANES_OF_KERNELS
-from torchpt.engines.kernels.programs import Kernels
+from torchpt.engines.kernels.programs import Kernels, probed_kernels
 from torchpt.engines.kernels.threads import KernelsForward
 from torchpt.engines.tensors import hits, layers, radiance, seen, trace, weighted_radiance
 from torchpt.engines.tensors_forward import TensorsForward
@@ -138,15 +139,7 @@ def kernels_of(wave: Wave, own: Sequence[int], before: Kernels | None = None) ->
         before: kernels of another render; its tables are shared where they were made of the same tensors.
     """
     packets = uses_packets(wave)
-    # the search is part of the stages (fused) if it is by packets, and nothing has to happen between search and stage
-    opaque = wave.context.world.materials.opacity is None and not wave.integrator.has_own_transmit
-    fused = packets and opaque and wave.first_surface is None and not wave.integrator.splats
-    kernels = Kernels(wave, packets, fused, before, fixed=not own)
-    eager = kernels.probe(own) if wave.integrator.light else {}
-    if eager and kernels.fused:  # stages that run as tensor operations need searches between the stages
-        kernels = Kernels(wave, packets, fused=False)
-    kernels.eager = eager
-    return kernels
+    return probed_kernels(wave, own, packets, partial(Kernels, wave, packets, before=before, fixed=not own))
 
 
 def forward_kernels(kernels: Kernels, threads: int | None = None, strict: bool = False) -> Tasks:
@@ -177,7 +170,7 @@ def forward_device(wave: Wave, own: Sequence[int], packets: bool, before: Kernel
     Args:
         wave: of the render, on the device.
         own: see :func:`kernels_of`.
-        packets: True: few primitives are searched inside of kernels; False: by the wave's acceleration structure.
+        packets: True: rays are searched by kernels where these can; False: by the wave's acceleration structure.
         before: kernels of another render; its tables are shared where they were made of the same tensors.
 
     Raises:
@@ -190,9 +183,8 @@ def forward_device(wave: Wave, own: Sequence[int], packets: bool, before: Kernel
 
 def describe_kernels(kernels: Kernels) -> dict[str, Any]:
     """Return a description of the compiled loop, for the summary of a render."""
-    search = (
-        "inside the stages" if kernels.fused else "kernels of packets" if kernels.packets else kernels.wave.accel.name
-    )
+    by_kernels = "kernels of packets" if kernels.tree is None else "kernels of a tree"
+    search = "inside the stages" if kernels.fused else by_kernels if kernels.packets else kernels.wave.accel.name
     names = [str(model) for model in kernels.wave.context.world.materials.models]
     eager = {names[number]: reason for number, reason in kernels.eager.items()}
     return {

@@ -31,7 +31,8 @@ KEY_DIGITS = 40
 _CHECKSUM_BYTES = 32
 #: Prefix of the names of entries that are being written.
 _UNFINISHED = "unfinished-"
-#: Names of files that this module may remove, since the folder may hold other files. Earlier versions wrote ``.nbc``.
+#: Names of files that this module may remove, since the folder may hold other files, such as the results of
+#: device checks, which are few and stay. Earlier versions wrote ``.nbc``.
 _OURS = re.compile(rf"[0-9a-f]{{{KEY_DIGITS}}}\.(o|json|nbc|ptx)|{_UNFINISHED}.*")
 
 

@@ -2,8 +2,8 @@
 
 A *wave* (:class:`~torchpt.paths.wave.Wave`) is all that an engine needs: world, search, camera, integrator, sampler, film
 filter. Its *stage context* is what the stages of an integrator know beside the lanes; the *plan* in it is what does not depend
-on the world. *Kernels* are machine code of stages for a CPU; without them stages run as tensor operations (*eager*). Renders,
-gradients and ``torchpt info`` begin with :func:`make_wave`; only renders call :func:`kernel_engine`.
+on the world. *Kernels* are machine code of stages for a CPU or a GPU; without them stages run as tensor operations (*eager*).
+Renders, gradients and ``torchpt info`` begin with :func:`make_wave`; only renders call :func:`kernel_engine`.
 """
 
 from __future__ import annotations
@@ -319,7 +319,7 @@ def _has_passed(device: torch.device) -> bool:
 
 
 def own_models(scene: Scene, wave: Wave) -> list[int]:
-    """Return the indices, in the world's table of models, of those that the caller wrote; they are not compiled."""
+    """Return the indices, in the world's table of models, of those that the caller wrote."""
     models = wave.context.world.materials.models
     return [index for index, model in enumerate(models) if any(model is own for own in scene.own_models)]
 

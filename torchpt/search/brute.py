@@ -20,7 +20,7 @@ from torch import Tensor
 from torchpt.compiler import cache
 from torchpt.compiler.function import Lanewise
 from torchpt.compiler.graph import Graph
-from torchpt.compiler.kernel import HEAD
+from torchpt.compiler.kernel import HEAD, WORD
 from torchpt.compiler.packet import KINDS, PacketSearch, scene_words
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.sinks import Sinks, Store
@@ -42,7 +42,7 @@ _BLOCK = 64
 #: Rays times primitives that are worth another thread: about 50 microseconds.
 _GRAIN = 100_000
 #: Index of the address of the scene data in the head of a kernel's arguments.
-_SEARCH = HEAD.index("search")
+_SEARCH = WORD["search"]
 
 
 class Rows(NamedTuple):

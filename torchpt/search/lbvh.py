@@ -1,7 +1,7 @@
 """A linear BVH by tensor operations on any device: built from Morton codes, traversed by all rays in lockstep.
 
-It is the search on GPUs, and the reference for the other backends. A *lane* is a ray of those that are traversed together. A
-node is the index of an inner node, ``~k`` for leaf k, or ``_DONE`` for a lane that is finished.
+It is the search of tensors on GPUs, and the reference for the other backends. A *lane* is a ray of those that are traversed
+together. A node is the index of an inner node, ``~k`` for leaf k, or ``_DONE`` for a lane that is finished.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torchpt.search.bounds import half_areas, primitive_bounds
 from torchpt.search.leaf import Rays, distances, prepare_rays
 from torchpt.search.tables import affine_rows, quadric_rows
 
-__all__ = ["Lbvh", "RadixTree", "build_tree", "intersect", "morton_codes", "occluded"]
+__all__ = ["Lbvh"]
 
 
 # ---- Build: a radix tree over Morton codes, by tensor operations without a loop over primitives
@@ -98,8 +98,7 @@ def _below(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
     """Return True where the highest set bit of a is below that of b.
 
     ``a`` and ``b`` are pairs: xor of two leaves' codes, and of their indices, which count where both of the codes' are 0. In
-        the
-    terms of Karras the common prefix of the leaves of ``a`` is longer than that of ``b``.
+    the terms of Karras the common prefix of the leaves of ``a`` is longer than that of ``b``.
     """
     (codes_a, indices_a), (codes_b, indices_b) = a, b
     by_codes = (codes_a < codes_b) & (codes_a < (codes_a ^ codes_b))

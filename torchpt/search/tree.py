@@ -1,7 +1,7 @@
 """The search by a *wide tree*, a BVH with eight children a node, and its refit when primitives move.
 
 The tree lies in one buffer (:mod:`torchpt.search.tree_layout`), which machine code traverses
-(:mod:`torchpt.native.kernels`, module ``tree_nearest`` and ``tree_occluded``).
+(:mod:`torchpt.native.kernels`, modules ``tree_nearest`` and ``tree_occluded``).
 """
 
 from __future__ import annotations
@@ -59,9 +59,8 @@ class RefitState:
 
     def __init__(self, tree: WideTree, geometry: Geometry, line: int = 0) -> None:
         self.nodes, self.line, self.counts = tree.nodes, line, geometry.counts
-        self.without_area = np.zeros(
-            0, np.int32
-        )  # ascending ids of the primitives without area, which are not in the tree
+        # Ascending ids of the primitives without area, which are not in the tree.
+        self.without_area = np.zeros(0, np.int32)
         if (tree.ids >= 0).sum() < geometry.size:
             self.without_area = np.setdiff1d(np.arange(geometry.size, dtype=np.int32), tree.ids)
         self.built_cost: float | None = None  # expected cost as built, computed by the first refit

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler import cache
-from torchpt.compiler.kernel import HEAD
+from torchpt.compiler.kernel import HEAD, WORD
 from torchpt.compiler.program import Program, Tables, bind_tables
 from torchpt.compiler.ptx import ptx_target
 from torchpt.compiler.sinks import Sinks
@@ -39,7 +39,7 @@ from torchpt.core.tree import map_leaves
 from torchpt.engines.kernels.driver import Cuda, Function, HostCopy, cuda_of
 from torchpt.engines.kernels.engine import Chunk, ChunkSearch, KernelsEngine, LaneCount, Paths
 from torchpt.engines.kernels.layout import HIT, Layout, Rows
-from torchpt.engines.kernels.programs import Kernel, Kernels, NamedTensors, records_of, trace_stage
+from torchpt.engines.kernels.programs import Kernel, Kernels, NamedTensors, probed_kernels, records_of, trace_stage
 from torchpt.engines.kernels.stages import CHUNK_FIELDS
 from torchpt.engines.work import SampleRange, TaskResult
 from torchpt.paths.nonfinite import NonFinite
@@ -65,6 +65,7 @@ __all__ = [
     "DeviceKernels",
     "DeviceMemory",
     "KernelsOnDevice",
+    "LateCheck",
     "SearchWords",
     "device_forward",
     "device_kernels",
@@ -80,7 +81,6 @@ MAX_LANES = 1 << 20
 MIN_LANES = 1 << 10
 #: Rows of counters that are allocated, and set to 0, at once.
 _COUNTER_ROWS = 64
-_WORD = {name: k for k, name in enumerate(HEAD)}
 
 
 # ---- Kernels and their tables on the device
@@ -163,6 +163,7 @@ class DeviceKernels(KernelsOnDevice):
         search: see there.
         fused: True: the search is part of the stages.
         before: see :class:`Kernels`.
+        fixed: see there.
     """
 
     def __init__(
@@ -173,8 +174,9 @@ class DeviceKernels(KernelsOnDevice):
         search: SearchWords | None,
         fused: bool,
         before: Kernels | None = None,
+        fixed: bool = False,
     ) -> None:
-        super().__init__(cuda, target, search, wave, search is not None, fused, before)
+        super().__init__(cuda, target, search, wave, search is not None, fused, before, fixed)
 
     def _host_inputs(self) -> tuple[Layout, NamedTensors]:
         layout = Layout(on_host(self.wave, {}), self.packets, self.fused)
@@ -196,7 +198,7 @@ class SearchWords:
     tree: TreeSearch | None
 
 
-def host_search(accel: Accel) -> Brute | WideBvh | None:
+def _host_search(accel: Accel) -> Brute | WideBvh | None:
     """Return the search, on the host, whose data kernels of a device read; of few primitives, or a tree.
 
     None for instances, and for quadrics that the device searches by a tree of tensors.
@@ -228,7 +230,7 @@ def search_on_device(accel: Accel, wanted: bool, device: torch.device) -> Search
         return None
     found = _ON_DEVICE.setdefault(accel, {})
     if device not in found:
-        host = host_search(accel)
+        host = _host_search(accel)
         found[device] = None if host is None else _copied(host, device)
     return found[device]
 
@@ -396,7 +398,7 @@ class DeviceCalls:
         return 0 if self._look.ended(step, count) else count
 
     def running_sums(self, counts: Sequence[Count]) -> tuple[list[Any], Any]:
-        """See :meth:`torchpt.engines.kernels.engine.Calls.running_sums`; with the search in kernels nothing needs them."""
+        """See :meth:`torchpt.engines.kernels.engine.Calls.running_sums`; with the search in the stages nothing needs them."""
         if self.kernels.fused:
             return [None] * len(counts), None
         if len(counts) == 1:
@@ -425,7 +427,7 @@ class DeviceCalls:
         """See :meth:`torchpt.engines.kernels.engine.Calls.set_dimensions`."""
         known = self._salts.get((depth, step))
         if known is None:
-            known = self._salts[depth, step] = salts(depth, self.device, step)
+            known = self._salts[depth, step] = self.cuda.to_device(salts(depth, torch.device("cpu"), step))
         self._uniforms["salts"] = known.data_ptr()
 
     def run(
@@ -447,7 +449,7 @@ class DeviceCalls:
         if places is not None:
             words[2] = places.address
         words[3] = self.slots.address if slots is None else slots.address
-        words[_WORD["counters"]] = self._counters
+        words[WORD["counters"]] = self._counters
         for place, name in uniforms:
             words[place] = self._uniforms[name]
         if lists is not None:
@@ -466,10 +468,10 @@ class DeviceCalls:
         program = kernel.program
         start = len(HEAD) + len(program.uniforms)
         words = (ctypes.c_int64 * (start + program.lists + 2 * (program.tensors + program.results)))()
-        words[_WORD["stride"]] = self._row_length
-        words[_WORD["tables"]] = kernel.tables.address
+        words[WORD["stride"]] = self._row_length
+        words[WORD["tables"]] = kernel.tables.address
         if self.kernels.search is not None:
-            words[_WORD["search"]] = self.kernels.search.words.data_ptr()
+            words[WORD["search"]] = self.kernels.search.words.data_ptr()
         return words, self.cuda.load(program.function.code, program.function.key), start
 
     # -- adding samples to a film
@@ -489,7 +491,7 @@ class DeviceCalls:
         """
         kernel = self.kernels.accumulate(film.channels, clamp is not None)
         words, function, start = self._block(kernel)
-        words[_WORD["counters"]] = lost.address
+        words[WORD["counters"]] = lost.address
         if clamp is not None:
             limit = torch.full((1,), clamp, dtype=torch.float32, device=self.device)
             words[len(HEAD)] = limit.data_ptr()
@@ -663,15 +665,9 @@ def device_kernels(
         search: see :class:`KernelsOnDevice`. A tree is searched by kernels of its own, with fewer registers than stages need.
         before: kernels of another render; its tables are shared where they were made of the same tensors.
     """
-    opaque = wave.context.world.materials.opacity is None and not wave.integrator.has_own_transmit
     packets = search is not None and search.tree is None
-    fused = packets and opaque and wave.first_surface is None and not wave.integrator.splats
-    kernels = DeviceKernels(wave, cuda, target, search, fused, before)
-    eager = kernels.probe(own) if wave.integrator.light else {}
-    if eager and kernels.fused:  # stages that run as tensor operations need searches between the stages
-        kernels = DeviceKernels(wave, cuda, target, search, False)
-    kernels.eager = eager
-    return kernels
+    make = partial(DeviceKernels, wave, cuda, target, search, before=before, fixed=not own)
+    return probed_kernels(wave, own, packets, make)
 
 
 def device_forward(
@@ -730,13 +726,14 @@ class DeviceForward:
             cuda.device, lanes, what="a wave of the fewest lanes", fallback="waves of fewer lanes", min_lanes=MIN_LANES
         )
         self.kernels = make(lanes)
+        self._seconds = 0.0  # of kernels that were replaced
         self._made: DeviceEngine | None = None
         self._clamped: Any = None
 
     @property
     def seconds(self) -> float:
         """Return the seconds spent on making kernels."""
-        return self.kernels.seconds
+        return self._seconds + self.kernels.seconds
 
     def rows(self, layers: Mapping[str, Any]) -> int:
         """Return how many 32-bit numbers a lane takes, for these layers."""
@@ -771,6 +768,7 @@ class DeviceForward:
             self.release_workers(keeps=False)
             self.budget.lanes = row
             if row != self.kernels.row:
+                self._seconds += self.kernels.seconds
                 self.kernels = self._make(row)
             if not fits_in_memory(self._make_engine):
                 self.budget.shrink()

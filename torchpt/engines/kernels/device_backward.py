@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchpt.compiler import cache
 from torchpt.compiler.graph import Unsupported
-from torchpt.compiler.kernel import HEAD
+from torchpt.compiler.kernel import HEAD, WORD
 from torchpt.compiler.ptx import ptx_target
 from torchpt.compiler.segments import segment_sums
 from torchpt.compiler.target import Target
@@ -44,8 +44,6 @@ from torchpt.math.sums import GradientSums, TableSums, entries_and_width
 from torchpt.paths.adjoint import Tape
 
 __all__ = ["DeviceBackward", "DeviceChunkSums", "DeviceVjpKernels", "SegmentSums", "device_backward"]
-
-_WORD = {name: k for k, name in enumerate(HEAD)}
 
 
 # ---- Sums of terms by entry
@@ -109,7 +107,7 @@ class SegmentSums:
             function = self._functions[rows, found.dtype] = self._cuda.load(code.code, code.key)
         uniforms, inputs = [order.data_ptr()], [(x.data_ptr(), n) for x in (first, end, found)]
         words = (ctypes.c_int64 * (len(HEAD) + len(uniforms) + 2 * (len(inputs) + 1)))()
-        words[_WORD["slots"]], words[_WORD["stride"]] = values.data_ptr(), values.stride(0)
+        words[WORD["slots"]], words[WORD["stride"]] = values.data_ptr(), values.stride(0)
         words[len(HEAD) :] = [*uniforms, *(word for pair in (*inputs, inputs[-1]) for word in pair)]
         lanes = torch.full((1,), n, dtype=torch.int64, device=found.device)
         self._cuda.enter()
@@ -227,7 +225,7 @@ def device_backward(
         tape: see :class:`DeviceVjpKernels`.
         own: indices of the user's own models, which are compiled at once to find out whether they can be.
         cotangent: see :class:`DeviceVjpKernels`.
-        packets: True: few primitives are searched by packets; False: by the wave's acceleration structure.
+        packets: True: rays are searched by kernels where these can; False: by the wave's acceleration structure.
         cuda: the device; None: that of the wave.
         target: returns the target of a row length.
 

@@ -62,7 +62,6 @@ def library() -> Any | None:
         found.cuDevicePrimaryCtxRetain.argtypes = [pointer, number]
         found.cuCtxSetCurrent.argtypes = [pointer]
         found.cuModuleLoadDataEx.argtypes = [pointer, ctypes.c_char_p, unsigned, pointer, pointer]
-        found.cuModuleUnload.argtypes = [pointer]
         found.cuModuleGetFunction.argtypes = [pointer, pointer, ctypes.c_char_p]
         found.cuFuncGetAttribute.argtypes = [pointer, number, pointer]
         found.cuOccupancyMaxActiveBlocksPerMultiprocessor.argtypes = [pointer, pointer, number, ctypes.c_size_t]
@@ -117,17 +116,14 @@ class Function:
 
     Attributes:
         handle: of the driver.
-        module: handle of the module that holds it.
-        blocks: number of blocks of :data:`THREADS` threads that fill the device once.
+        blocks: number of blocks of :attr:`Cuda.threads` threads, as of its load, that fill the device once.
         registers: of a thread.
         local_bytes: local memory of a thread: spilled registers and arrays.
         seconds: in which the driver has compiled it.
     """
 
-    def __init__(
-        self, handle: Any, module: Any, blocks: int, registers: int, local_bytes: int, seconds: float = 0.0
-    ) -> None:
-        self.handle, self.module, self.blocks = handle, module, blocks
+    def __init__(self, handle: Any, blocks: int, registers: int, local_bytes: int, seconds: float = 0.0) -> None:
+        self.handle, self.blocks = handle, blocks
         self.registers, self.local_bytes, self.seconds = registers, local_bytes, seconds
 
 
@@ -159,7 +155,7 @@ class Cuda:
         code = self.driver.cuDeviceGetAttribute(ctypes.byref(value), _MULTIPROCESSORS, number)
         self._check(code, "the number of multiprocessors")
         self.multiprocessors = value.value
-        self._functions: dict[str, Function] = {}
+        self._functions: dict[tuple[str, int], Function] = {}
         self._lanes = ctypes.c_int64()
 
     # -- what torch has
@@ -198,15 +194,15 @@ class Cuda:
         self._check(self.driver.cuCtxSetCurrent(self._context), "the device's context")
 
     def load(self, code: bytes, key: str) -> Function:
-        """Return the kernel of a module, loaded once.
+        """Return the kernel of a module, loaded once for each number of threads, on which its number of blocks depends.
 
         Args:
             code: PTX, which the driver compiles and keeps in a cache of its own.
             key: identifies the code.
         """
-        function = self._functions.get(key)
+        function = self._functions.get((key, self.threads))
         if function is None:
-            function = self._functions[key] = self._loaded(code)
+            function = self._functions[key, self.threads] = self._loaded(code)
         return function
 
     def functions(self) -> list[Function]:
@@ -229,7 +225,7 @@ class Cuda:
         for value, attribute in ((registers, _ATTRIBUTE_REGISTERS), (local, _ATTRIBUTE_LOCAL_BYTES)):
             self._check(driver.cuFuncGetAttribute(ctypes.byref(value), attribute, handle), "a kernel's attributes")
         fill = max(blocks.value, 1) * self.multiprocessors
-        return Function(handle, module, fill, registers.value, local.value, time.perf_counter() - start)
+        return Function(handle, fill, registers.value, local.value, time.perf_counter() - start)
 
     def launch(self, function: Function, words: Any, lanes: int, most: int, stream: int) -> None:
         """Launch a kernel.

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler.form import CAPACITY, VECTORS
-from torchpt.compiler.kernel import HEAD
+from torchpt.compiler.kernel import HEAD, WORD
 from torchpt.engines.kernels.layout import HIT, Memory, Rows, path_state, state_values
 from torchpt.engines.kernels.programs import Kernel, Kernels
 from torchpt.engines.kernels.stages import CHUNK_FIELDS
@@ -49,7 +49,6 @@ __all__ = ["LANES", "Calls", "Chunk", "ChunkSearch", "Halted", "KernelsEngine", 
 
 
 #: Index of each word at the head of a kernel's arguments.
-_WORD = {name: k for k, name in enumerate(HEAD)}
 #: A number of lanes: an int, or on a device a :class:`torchpt.engines.kernels.device.Count`, which is always true.
 LaneCount = Any
 
@@ -199,11 +198,11 @@ class Calls:
         program = kernel.program
         start = len(HEAD) + len(program.uniforms)
         words = (ctypes.c_int64 * (start + program.lists))()
-        words[_WORD["stride"]] = CAPACITY
-        words[_WORD["counters"]] = self.counters.ctypes.data
-        words[_WORD["tables"]] = kernel.tables.address
+        words[WORD["stride"]] = CAPACITY
+        words[WORD["counters"]] = self.counters.ctypes.data
+        words[WORD["tables"]] = kernel.tables.address
         if self.kernels.search is not None:
-            words[_WORD["search"]] = ctypes.addressof(self.kernels.search)
+            words[WORD["search"]] = ctypes.addressof(self.kernels.search)
         uniforms = tuple((len(HEAD) + k, name) for k, name in enumerate(program.uniforms))
         self._keep.append(kernel)
         lists = range(start, start + program.lists)

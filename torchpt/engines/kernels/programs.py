@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -40,6 +40,7 @@ __all__ = [
     "Kernels",
     "NamedTensors",
     "TensorVersion",
+    "probed_kernels",
     "program_of",
     "records_of",
     "trace_stage",
@@ -232,7 +233,7 @@ class Kernels(Layout):
 
     Args:
         wave: the render.
-        packets: True: few primitives, searched by packet kernels. False: the acceleration structure is called.
+        packets: True: rays are searched by kernels. False: the acceleration structure is called.
         fused: True: the search is part of the stages. False: it runs between them.
         before: kernels of another render; its tables are shared where they were made of the same tensors.
         fixed: True: the structure of a world object never changes. False with models of a user's own, whose code may change.
@@ -407,3 +408,25 @@ class Kernels(Layout):
         return bind_tables(
             program.tables, program.steps, program.constants, leaves, self._laid_out, program.names, self._results
         )
+
+
+K = TypeVar("K", bound=Kernels)
+
+
+def probed_kernels(wave: Wave, own: Sequence[int], packets: bool, make: Callable[[bool], K]) -> K:
+    """Return the kernels of a render; its ``eager`` lists models that cannot be compiled, with the reasons.
+
+    Args:
+        wave: of the render.
+        own: indices of the user's own models, which are compiled at once to find out whether they can be.
+        packets: True: rays are searched by packets. This is part of the stages (fused) where nothing has to happen between
+            search and stage.
+        make: makes the kernels; True: fused.
+    """
+    opaque = wave.context.world.materials.opacity is None and not wave.integrator.has_own_transmit
+    kernels = make(packets and opaque and wave.first_surface is None and not wave.integrator.splats)
+    eager = kernels.probe(own) if wave.integrator.light else {}
+    if eager and kernels.fused:  # stages that run as tensor operations need searches between the stages
+        kernels = make(False)
+    kernels.eager = eager
+    return kernels

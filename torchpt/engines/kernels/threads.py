@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from torchpt.compiler.form import CAPACITY, VECTORS
-from torchpt.compiler.kernel import HEAD
+from torchpt.compiler.kernel import HEAD, WORD
 from torchpt.core.memory import Budget, explain_out_of_memory, is_out_of_memory, on_low_memory
 from torchpt.core.threads import map_in_order
 from torchpt.engines.kernels.engine import LANES, Chunk, Halted, KernelsEngine
@@ -328,8 +328,8 @@ class KernelsForward:
         counters = np.zeros(1, np.int64)  # of samples that are not finite
         limit = np.array([clamp or 0.0], np.float32)
         words = (ctypes.c_int64 * (len(HEAD) + len(program.uniforms) + 2 * (program.tensors + program.results)))()
-        words[HEAD.index("counters")] = counters.ctypes.data
-        words[HEAD.index("tables")] = kernel.tables.address
+        words[WORD["counters"]] = counters.ctypes.data
+        words[WORD["tables"]] = kernel.tables.address
         if program.uniforms:
             words[len(HEAD)] = limit.ctypes.data
         # Then address and row length of each tensor: samples and sums in, sums and, with a clamp, samples out.
