@@ -101,5 +101,5 @@ def test_waits_and_transfers_of_a_wave(log: Log):
     assert found[1] == found[2]  # whatever the number of lanes
     waits, transfers, size = found[1]
     # To the host: at each vertex the number of lanes by model; for a picture whether all samples are finite, and counts of
-    # samples. To the device: the camera's film size, and the sampler's seeds.
-    assert transfers == depth + 3 and waits == transfers + 2 and size <= 256
+    # samples. To the device: three tensors of the camera, and the sampler's seeds.
+    assert transfers == depth + 3 and waits == transfers + 4 and size <= 256

@@ -14,7 +14,10 @@ To C++ the wrappers are CPU tensors. Zeros that its autograd makes (for absent g
 therefore host tensors, which on a real device they are not. They are told from the package's tensors by their memory: tensors
 of the package are arguments of the call that Python made, zeros of C++ are not (:func:`_made_by_autograd`).
 
-Not simulated: speed, the rounding of CUDA's own kernels, streams, memory, ``torch.compile``.
+With ``rounds=True`` operators round differently from the CPU's where CUDA's kernels may: sums, products of matrices,
+elementary functions, fused products, division by a number of the host.
+
+Not simulated: speed, streams, memory, ``torch.compile``.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch.utils._pytree import tree_iter
+from torch.utils._pytree import tree_iter, tree_map
 
 __all__ = ["Log", "SimulatedTensor", "simulated_cuda", "without_compiled_functions"]
 
@@ -50,6 +53,13 @@ _WAITING = frozenset(
 )  # fmt: skip
 #: Operators whose result is a number on the host.
 _READING = frozenset({"_local_scalar_dense"})
+#: Operators that CUDA's kernels round in another way than the CPU's.
+_ROUNDS = frozenset(
+    {"sum", "mean", "cumsum", "prod", "cumprod", "logsumexp", "_softmax", "norm", "linalg_vector_norm", "var", "std", "mm", "bmm",
+     "mv", "dot", "addmm", "addmv", "baddbmm", "addcmul", "addcdiv", "lerp", "rsqrt", "pow", "exp", "exp2", "expm1", "log",
+     "log2", "log10", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "hypot", "sigmoid",
+     "erf", "erfinv", "index_add", "scatter_add", "_linalg_det", "_linalg_solve_ex", "linalg_inv_ex"}
+)  # fmt: skip
 #: Functions of torch that make tensors, and methods of tensors that do.
 _FACTORIES = (
     "arange", "empty", "empty_like", "eye", "full", "full_like", "linspace", "logspace", "ones", "ones_like", "rand",
@@ -258,10 +268,27 @@ def _run(func: Any, args: Any, kwargs: Any) -> Any:
         found = func(*map(_inner, args), **{key: _inner(value) for key, value in kwargs.items() if key != "pin_memory"})
     else:
         found = func(*map(_inner, args))
+    if _machine["rounds"] and _rounds(operator.name, args):
+        found = tree_map(_rounded_up, found)
     if operator.written:
         own = [args[key] if isinstance(key, int) else kwargs[key] for key in operator.written]
         return own[0] if len(own) == 1 else tuple(own)
     return _wrap(found, on)
+
+
+def _rounds(name: str, args: Any) -> bool:
+    """Return True if CUDA's kernel rounds in another way than the CPU's."""
+    name = name.removesuffix("_")
+    by_number = name == "div" and not isinstance(args[1], SimulatedTensor)
+    return name in _ROUNDS or by_number or (name == "index_put" and len(args) > 3 and args[3])
+
+
+def _rounded_up(x: Any) -> Any:
+    """Return a tensor whose finite numbers other than 0 are the next larger ones, in place."""
+    if isinstance(x, torch.Tensor) and x.is_floating_point():
+        up = torch.nextafter(x, torch.full_like(x, torch.inf))
+        return x.copy_(torch.where(torch.isfinite(up) & (x != 0), up, x))
+    return x
 
 
 def _count_wait(name: str, args: Any, kwargs: Any) -> None:
@@ -394,7 +421,7 @@ class _Cards(threading.local):
 
 
 _cards = _Cards()
-_machine: dict[str, Any] = {"count": 1, "name": "Simulated GPU"}
+_machine: dict[str, Any] = {"count": 1, "name": "Simulated GPU", "rounds": False}
 
 
 def _cuda_device(device: Any = None) -> torch.device:
@@ -541,14 +568,15 @@ def _cuda() -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def simulated_cuda(cards: int = 1, name: str = "Simulated GPU") -> Iterator[Log]:
+def simulated_cuda(cards: int = 1, name: str = "Simulated GPU", rounds: bool = False) -> Iterator[Log]:
     """Make ``device="cuda"`` work within the context, on all threads; yield the counts, which start at zero.
 
     Args:
         cards: number of devices.
         name: name of each.
+        rounds: True: operators round as CUDA's may.
     """
-    _machine.update(count=cards, name=name)
+    _machine.update(count=cards, name=name, rounds=rounds)
     _cards.current = 0
     _log.clear()
     nothing: Callable[..., bool] = lambda *args: False  # noqa: E731

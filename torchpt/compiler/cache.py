@@ -185,16 +185,14 @@ def program_of(
     tensors: Mapping[str, Tensor],
     trace: Callable[[], TracedStage],
     target: Target | None = None,
-    device: torch.device | None = None,
 ) -> Program:
     """Return the program of a structure: from memory, from disk, or traced and compiled now.
 
     Args:
         structure: all that a trace depends on, except for the values of tensors; hashable.
-        tensors: the leaves by path; a trace may depend on their values, and then has guards.
+        tensors: the leaves by path, on the host; a trace may depend on their values, and then has guards.
         trace: traces the stage.
         target: machine to compile for; None: this one.
-        device: of the leaves; None: the host.
 
     Raises:
         Unsupported: the stage does something that the lane compiler cannot compile.
@@ -205,7 +203,7 @@ def program_of(
         disk_key = cache_key(structure, target) if program is None else None
         if program is None and disk_key is not None:
             program = load(disk_key, target)
-        if program is None or not guards_hold(program, tensors, device):
+        if program is None or not guards_hold(program, tensors):
             program = compile_stage(trace(), target)
             if disk_key is not None:
                 store(disk_key, program)

@@ -208,6 +208,7 @@ def bind_tables(
     names: Sequence[StepKey | None] = (),
     results: dict[StepKey, Tensor] | None = None,
     device: torch.device | None = None,
+    placed: Mapping[str, Tensor] | None = None,
 ) -> Tables:
     """Compute and lay out the tables of a kernel for one scene.
 
@@ -215,22 +216,24 @@ def bind_tables(
         tables: tables of the trace.
         steps: prologue of the trace.
         constants: constant tensors of the trace.
-        leaves: the scene's tensors by path.
+        leaves: the scene's tensors by path, on the host; the prologue runs there.
         known: leaves that were laid out before, by path and axis; those laid out now are added.
         names: keys of the steps, :attr:`Program.names`.
         results: results of steps of other kernels, see :func:`torchpt.compiler.prologue.run_prologue`; filled.
-        device: of the leaves, if kernels read tables on a device; None: on the host.
+        device: where kernels read tables; None: the host.
+        placed: the leaves on the device by path.
     """
     known = {} if known is None else known
-    tensor = run_prologue(steps, constants, leaves, names, results, device)
+    tensor = run_prologue(steps, constants, leaves, names, results)
     words: list[int] = []
     keep: list[Tensor] = []
     for table in tables:
         key = (table.source.name, table.axis) if table.source.kind == "leaf" else None
         laid_out = known.get(key) if key is not None else None
-        original = tensor(table.source)
+        original = tensor(table.source) if key is None or placed is None else placed[str(table.source.name)]
         if laid_out is None:
             laid_out = lay_out_table(original, table.axis)
+            laid_out = laid_out if device is None else laid_out.to(device)
             if key is not None:
                 known[key] = laid_out
         keep.append(laid_out)
@@ -243,11 +246,11 @@ def bind_tables(
     return Tables(ctypes.addressof(block), (block, keep))
 
 
-def guards_hold(program: Program, leaves: Mapping[str, Tensor], device: torch.device | None = None) -> bool:
-    """Return True if the guards of a program hold for these leaves, which are on a device (None: the host)."""
+def guards_hold(program: Program, leaves: Mapping[str, Tensor]) -> bool:
+    """Return True if the guards of a program hold for these leaves, which are on the host."""
     if not program.guards:
         return True
-    tensor = run_prologue(program.steps, program.constants, leaves, device=device)
+    tensor = run_prologue(program.steps, program.constants, leaves)
 
     def number(value: Any) -> Any:
         return value.item() if isinstance(value, Tensor) else value

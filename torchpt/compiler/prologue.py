@@ -178,17 +178,15 @@ def run_prologue(
     leaves: Mapping[str, Tensor],
     names: Sequence[StepKey | None] = (),
     known: dict[StepKey, Tensor] | None = None,
-    device: torch.device | None = None,
 ) -> Any:
     """Run a prologue and return a function that returns the tensor of a :class:`Source`.
 
     Args:
         steps: the prologue.
         constants: the program's constant tensors.
-        leaves: the scene's tensors by path.
+        leaves: the scene's tensors by path, on the host.
         names: keys of the steps, see :func:`step_keys`.
         known: results of steps of other prologues on the same leaves, by key; small results are added.
-        device: of the leaves; constants are moved there, and steps that create tensors create them there. None: the host.
     """
     results: list[Any] = []
 
@@ -196,8 +194,7 @@ def run_prologue(
         if source.kind == "leaf":
             return leaves[str(source.name)]
         if source.kind == "constants":
-            constant = constants[int(source.name)]
-            return constant if device is None else constant.to(device)
+            return constants[int(source.name)].cpu()  # weights of a user's module may be on a device
         result = results[int(source.name)]
         return result if source.item < 0 else result[source.item]
 
@@ -205,8 +202,6 @@ def run_prologue(
         """Return an argument with tensors in place of sources."""
         if isinstance(value, Source):
             return tensor(value)
-        if device is not None and isinstance(value, torch.device):
-            return device
         return type(value)(filled(x) for x in value) if isinstance(value, list | tuple) else value
 
     with torch.no_grad():

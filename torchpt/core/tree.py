@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["NOT_FINGERPRINTED", "fingerprint", "leaves", "map_leaves", "named_leaves", "rebuild", "signature"]
+__all__ = ["NOT_FINGERPRINTED", "fingerprint", "leaves", "map_leaves", "moved", "named_leaves", "rebuild", "signature"]
 
 T = TypeVar("T")
 
@@ -134,6 +134,25 @@ def map_leaves(function: Callable[..., Any], record: T, *others: T) -> T:
         unchanged = unchanged and new is value
         values[name] = new
     return record if unchanged else kind(**values)
+
+
+def moved(record: T, device: torch.device, known: dict[int, Tensor] | None = None) -> T:
+    """Return a record whose leaves are on a device; a tensor that occurs twice is copied once. Gradients flow back.
+
+    Args:
+        record: the record; its own leaves live as long as it does.
+        device: the device.
+        known: tensors of the device by the id of a leaf, used in place of new copies; new ones are added.
+    """
+    copies = {} if known is None else known
+
+    def copy_of(tensor: Tensor) -> Tensor:
+        found = copies.get(id(tensor))
+        if found is None:
+            found = copies[id(tensor)] = tensor.to(device)
+        return found
+
+    return map_leaves(copy_of, record)
 
 
 def rebuild(record: T, tensors: Sequence[Tensor]) -> T:

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError, warn_once
+from torchpt.core.tree import moved
 from torchpt.engines import engine
 from torchpt.engines.engine import ForwardDevice, Kernels, Tasks
 from torchpt.images.denoiser import GUIDES
@@ -230,7 +231,7 @@ def rebuild_with_tape(wave: Wave, scene: Scene, settings: Settings, params: Mapp
         camera=camera,
         first_surface=None
         if wave.first_surface is None
-        else wave.first_surface.again(world),  # the same for another world
+        else moved(wave.first_surface.again(moved(world, torch.device("cpu"))), scene.device),  # for another world
     )
 
 
@@ -250,14 +251,21 @@ def surface_layers(settings: Settings) -> dict[str, type[SurfaceLayer]]:
 
 def _first_surface(scene: Scene, integrator: Integrator, world: World, *, own: bool) -> FirstSurface | None:
     """Return the integrator's ``FirstSurface``, cached with the scene where the world is the scene's ``own``."""
+
+    def first_on_host(world: World) -> FirstSurface | None:
+        """Return the shading, computed on the host as the world was; None where the integrator has none of its own."""
+        if type(integrator).first is Integrator.first:
+            return None
+        return moved(integrator.first(moved(world, torch.device("cpu"))), scene.device)
+
     if not own or torch.is_grad_enabled():
-        return integrator.first(world)  # None where the integrator has no shading of first surfaces alone
+        return first_on_host(world)
     cache = scene_cache(scene)
     if cache.first_surface is not None:
         cached_integrator, cached_world, first_surface = cache.first_surface
         if cached_integrator == integrator and cached_world is world:
             return first_surface
-    first_surface = integrator.first(world)
+    first_surface = first_on_host(world)
     if first_surface is not None:
         cache.first_surface = integrator, world, first_surface
     return first_surface
@@ -287,7 +295,10 @@ def _context(
 
 def _pixel_of(world: World, camera: Camera) -> Tensor | None:
     """Return the camera's footprint for filtered textures; None where no texture is filtered."""
-    return camera.pixel() if world.textures.filtered else None
+    if not world.textures.filtered:
+        return None
+    pixel = moved(camera, torch.device("cpu")).pixel()  # on the host, as the camera was
+    return moved(pixel, world.geometry.p0.device)
 
 
 def uses_kernels(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool:

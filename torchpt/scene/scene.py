@@ -26,6 +26,7 @@ from torchpt.core.autograd import outside_transforms
 from torchpt.core.errors import SceneError, example_names
 from torchpt.core.memory import MemoryMeter, mb, retry_out_of_memory
 from torchpt.core.threads import outside_inference_mode, warm_up
+from torchpt.core.tree import moved
 from torchpt.physics.bsdfs import Bsdf
 from torchpt.physics.cameras import Camera
 from torchpt.physics.cameras.opencv import PinholeMatrices, extrinsics
@@ -34,6 +35,7 @@ from torchpt.physics.world import World
 from torchpt.scene.build import SceneBuild, build_parts
 from torchpt.scene.devices import device_of
 from torchpt.scene.formats.description import Description, settings
+from torchpt.scene.host_copies import HostCopies
 from torchpt.scene.info import describe
 from torchpt.scene.settings import Film, Settings
 from torchpt.scene.sources import check_light_params
@@ -112,7 +114,9 @@ class Scene:
 
     def _reset_caches(self) -> None:
         """Reset all caches."""
-        self._space = Space(torch.from_numpy(self._built.centre).to(self.device), self._built.unit)
+        self._host_space = Space(torch.from_numpy(self._built.centre), self._built.unit)
+        self._space = moved(self._host_space, self.device)
+        self._host_copies = HostCopies()
         self._lock = threading.RLock()
         # By dtype, whether texture coordinates were asked for, and light sampler.
         self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
@@ -358,15 +362,17 @@ class Scene:
         return made
 
     def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
-        """Return the camera on a film, in the coordinates of lanes."""
+        """Return the camera on a film, in the coordinates of lanes. It is computed on the host, see :meth:`_assemble`."""
         camera, values = self.description.camera, dict(self.description.camera.values)
+        params = {name: value for name, value in params.items() if name.startswith("camera.")}
+        params = self._host_copies.of(params, self.params)
         for key, spec in parameters_of(camera.kind).items():
             value = params.get(f"camera.{key}")
             if spec.differentiable and value is not None:
                 values[key] = (value.double() / self._space.unit if spec.length else value).to(dtype)
         pose = params["camera.to_world"]
-        pose = torch.cat((self._space.pose(pose), pose[3:].double())).to(dtype)  # (3, 4), and the last row 0 0 0 1
-        return camera.kind.on(pose, (film.width, film.height), values)
+        pose = torch.cat((self._host_space.pose(pose), pose[3:].double())).to(dtype)  # (3, 4), and the last row 0 0 0 1
+        return moved(camera.kind.on(pose, (film.width, film.height), values), self.device)
 
     def film_size(self, film: Mapping[str, Any] | None = None) -> tuple[int, int]:
         """Return width and height of the whole film in pixels; ``film``: settings that override the scene's."""
@@ -408,8 +414,15 @@ class Scene:
     def _assemble(
         self, params: Mapping[str, Tensor], dtype: torch.dtype, *, uv: bool, choice: str
     ) -> tuple[World, Geometry]:
-        built = self._built
-        return assemble(built.parts, params, built.sources, self._space, dtype, built.copies, uv=uv, choice=choice)
+        """Assemble the world on the host, and copy it to the device.
+
+        torch's operators round differently on a GPU, and a ray that then takes another way changes the picture. Tensors that
+        are a parameter as it is, such as texels, are not copied.
+        """
+        host = self._host_copies.of(params, self.params)
+        built, space = self._built, self._host_space
+        made = assemble(built.parts, host, built.sources, space, dtype, built.copies, uv=uv, choice=choice)
+        return moved(made, self.device, {id(host[name]): value for name, value in params.items()})
 
     def _refresh(self) -> None:
         """Clear the caches where a parameter other than the camera's was replaced or changed in place."""

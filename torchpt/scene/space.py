@@ -66,7 +66,7 @@ class Space:
     @property
     def shift(self) -> Tensor:
         """Return :attr:`centre` in units of these coordinates ``(3,)``."""
-        return self.centre / self.unit
+        return self.centre * (1.0 / self.unit)  # exact, as the unit is a power of two
 
 
 def centre_and_unit(

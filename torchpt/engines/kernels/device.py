@@ -18,7 +18,7 @@ from __future__ import annotations
 import ctypes
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -35,7 +35,7 @@ from torchpt.compiler.ptx import ptx_target
 from torchpt.compiler.sinks import Sinks
 from torchpt.compiler.target import Target
 from torchpt.core.memory import Budget, Span, explain_out_of_memory, fits_in_memory
-from torchpt.core.tree import map_leaves
+from torchpt.core.tree import moved
 from torchpt.engines.kernels.driver import Cuda, Function, HostCopy, cuda_of
 from torchpt.engines.kernels.engine import Chunk, ChunkSearch, KernelsEngine, LaneCount, Paths
 from torchpt.engines.kernels.layout import HIT, Layout, Rows
@@ -92,13 +92,30 @@ def on_host(wave: Wave, known: dict[int, Tensor]) -> Wave:
     ``known``: tensors of the host by the id of the device's, used in place of new copies; new ones are added.
     """
     host = torch.device("cpu")
+    return replace(moved(wave, host, known), filter=type(wave.filter)(wave.filter.values, host))
 
-    def moved(tensor: Tensor) -> Tensor:
-        if id(tensor) not in known:
-            known[id(tensor)] = tensor.to(host)
-        return known[id(tensor)]
 
-    return replace(map_leaves(moved, wave), filter=type(wave.filter)(wave.filter.values, host))
+class _HostLeaves(Mapping[str, Tensor]):
+    """Copies of a render's tensors on the host, made when they are first read.
+
+    Args:
+        leaves: the tensors on the device by path.
+    """
+
+    def __init__(self, leaves: Mapping[str, Tensor]) -> None:
+        self._leaves = leaves
+        self._copies: dict[str, Tensor] = {}
+
+    def __getitem__(self, path: str) -> Tensor:
+        if path not in self._copies:
+            self._copies[path] = self._leaves[path].detach().cpu()
+        return self._copies[path]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._leaves)
+
+    def __len__(self) -> int:
+        return len(self._leaves)
 
 
 class KernelsOnDevice(Kernels, ABC):
@@ -120,6 +137,8 @@ class KernelsOnDevice(Kernels, ABC):
         self._host: tuple[Layout, NamedTensors] | None = None
         self.tree = None if search is None else search.tree
         super().__init__(*arguments)
+        #: What prologues read: torch's operators round differently on a GPU.
+        self._host_leaves = _HostLeaves(self._leaves.tensors)
 
     @abstractmethod
     def _host_inputs(self) -> tuple[Layout, NamedTensors]:
@@ -138,18 +157,19 @@ class KernelsOnDevice(Kernels, ABC):
             layout.tree = self.tree
             return trace_stage(leaves, layout, build, listed)
 
-        return cache.program_of((key, self.structure), self._leaves.tensors, trace, self.target, self.cuda.device)
+        return cache.program_of((key, self.structure), self._host_leaves, trace, self.target)
 
     def _bind(self, program: Program) -> Tables:
         return bind_tables(
             program.tables,
             program.steps,
             program.constants,
-            self._leaves.tensors,
+            self._host_leaves,
             self._laid_out,
             program.names,
             self._results,
             self.cuda.device,
+            self._leaves.tensors,
         )
 
 

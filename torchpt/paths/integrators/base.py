@@ -185,7 +185,10 @@ class Integrator(FrozenConfig):
         return overrides or bool(self.fields) or self.splats
 
     def first(self, world: World) -> FirstSurface | None:
-        """Return the shading of first surfaces, made once a scene and differentiable in its tensors; None: paths go on."""
+        """Return the shading of first surfaces, made once a scene and differentiable in its tensors; None: paths go on.
+
+        The world's tensors are on the host; results are copied to the device of the render.
+        """
         return None
 
 

@@ -134,10 +134,13 @@ class Film:
 
     def _mean(self) -> Tensor:
         """Return means of the pixels ``(C, pixels)``."""
-        mean = self._sums.sum(0) / self._counts.sum(0).clamp_min(1)
+        total = self._sums[0].clone()
+        for sums in self._sums[1:]:  # in order: torch's own order differs between devices
+            total += sums
+        mean = total / self._counts.sum(0).clamp_min(1)
         if self.splats is not None:
-            total = sum(self.splats.values(k) for k in range(self.randomizations))
-            mean += total / _samples_a_pixel(self._counts.sum(0))
+            splats = sum(self.splats.values(k) for k in range(self.randomizations))
+            mean += splats / _samples_a_pixel(self._counts.sum(0))
         return mean
 
     def _mean_of(self, k: int) -> Tensor:
@@ -220,5 +223,6 @@ class Film:
 
 def _samples_a_pixel(counts: Tensor) -> Tensor:
     """Return the mean ``()`` of the numbers of samples of all pixels ``(pixels,)``; 1 without samples."""
-    mean = counts.double().mean()
+    total = counts.sum().double()
+    mean = total / torch.full_like(total, len(counts))  # by a tensor: GPUs multiply by the reciprocal of a number
     return torch.where(mean > 0, mean, 1.0)
