@@ -55,10 +55,11 @@ _WAITING = frozenset(
 _READING = frozenset({"_local_scalar_dense"})
 #: Operators that CUDA's kernels round in another way than the CPU's.
 _ROUNDS = frozenset(
-    {"sum", "mean", "cumsum", "prod", "cumprod", "logsumexp", "_softmax", "norm", "linalg_vector_norm", "var", "std", "mm", "bmm",
-     "mv", "dot", "addmm", "addmv", "baddbmm", "addcmul", "addcdiv", "lerp", "rsqrt", "pow", "exp", "exp2", "expm1", "log",
-     "log2", "log10", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "hypot", "sigmoid",
-     "erf", "erfinv", "index_add", "scatter_add", "_linalg_det", "_linalg_solve_ex", "linalg_inv_ex"}
+    {"sum", "mean", "cumsum", "prod", "cumprod", "logsumexp", "_softmax", "norm", "linalg_vector_norm", "var", "std",
+     "mm", "bmm", "mv", "dot", "addmm", "addmv", "baddbmm", "addcmul", "addcdiv", "lerp", "rsqrt", "pow", "exp", "exp2",
+     "expm1", "log", "log2", "log10", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh",
+     "tanh", "hypot", "sigmoid", "erf", "erfinv", "index_add", "scatter_add", "_linalg_det", "_linalg_solve_ex",
+     "linalg_inv_ex"}
 )  # fmt: skip
 #: Functions of torch that make tensors, and methods of tensors that do.
 _FACTORIES = (
