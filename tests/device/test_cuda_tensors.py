@@ -76,7 +76,7 @@ def gradients(where: str) -> list[Tensor]:
     scene = torchpt.load("cornell_box", where)
     values = {name: scene.params[name].clone().requires_grad_() for name in NAMES}
     image = torchpt.render(scene, params=values, spp=2, seed=1, film=FILM, compile="on", edges=False)
-    weights = torch.arange(image.numel()).view(image.shape).to(image.device) / image.numel()
+    weights = (torch.arange(image.numel()).view(image.shape) / image.numel()).to(image.device)
     return [x.cpu() for x in torch.autograd.grad(image, list(values.values()), weights)]
 
 

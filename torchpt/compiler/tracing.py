@@ -39,6 +39,11 @@ LANES = (97, 89, 101, 83, 103, 79, 107, 109, 113, 127)
 #: Most elements of a table that become a node each, where a stage computes with a whole table in every lane.
 _MOST_ELEMENTS = 4096
 
+#: Operators that fill a new tensor with one number.
+_FILLED = frozenset(
+    {"full", "full_like", "new_full", "ones", "ones_like", "scalar_tensor", "zeros", "zeros_like", "new_zeros"}
+)
+
 #: A function that lowers an operator, see :func:`register_lowering`.
 Handler = Callable[..., None]
 #: Lowering of each torch operator, by its name without overload.
@@ -130,6 +135,7 @@ class Tracer(TorchDispatchMode):
         self._sources = {key: Source("leaf", path) for key, (path, _) in leaves.items()}
         self._numbers: dict[Table, int] = {}
         self._reads = _Reads(self)
+        self._filled: dict[int, Tensor] = {}  # tables that are one number throughout, by id
         self._keep: list[Any] = [leaves]  # ids stay those of the same tensors as long as these live
 
     def __enter__(self) -> Tracer:
@@ -221,7 +227,11 @@ class Tracer(TorchDispatchMode):
             return self._expanded_table(tensor, lane)
         if tensor.numel() > _MOST_ELEMENTS:
             raise Unsupported(f"a table of shape {tuple(tensor.shape)} read whole in every lane")
-        table, ty = self.table(tensor, axis=None), DTYPES[tensor.dtype]
+        ty = DTYPES[tensor.dtype]
+        if id(tensor) in self._filled:
+            constant = self.graph.constant(ty, tensor.reshape(-1)[0].item())
+            return Value(np.full(tuple(tensor.shape), constant, object), None)
+        table = self.table(tensor, axis=None)
         nodes = np.empty(tuple(tensor.shape), object)
         for k, entry in enumerate(np.ndindex(*tensor.shape)):
             nodes[entry] = self.graph.node("element", ty, extra=(table, k))
@@ -312,6 +322,12 @@ class Tracer(TorchDispatchMode):
                 return self.source(x)
             return type(x)(with_sources(y) for y in x) if isinstance(x, list | tuple) else x
 
+        if func.overloadpacket.__name__ in _FILLED and out.numel():
+            self._filled[id(out)] = out
+        if func._schema.is_mutable:
+            written = {x.untyped_storage().data_ptr() for x in _flattened((args, kwargs)) if isinstance(x, Tensor)}
+            kept = self._filled.items()
+            self._filled = {k: x for k, x in kept if x.untyped_storage().data_ptr() not in written}
         number = len(self.steps)
         self.steps.append(Step(func, tuple(map(with_sources, args)), {k: with_sources(v) for k, v in kwargs.items()}))
         self._keep.append(out)

@@ -158,7 +158,10 @@ def replay_paths(
     """
     wave = scene_tape.wave
     # A splat reaches a pixel by itself: its cotangent is the pixel's over spp.
-    splat_cotangent = cotangent / settings.render.spp if wave.integrator.splats else None
+    samples = torch.full(
+        (), settings.render.spp, device=cotangent.device
+    )  # a tensor: GPUs multiply by a number's reciprocal
+    splat_cotangent = cotangent / samples if wave.integrator.splats else None
     if _uses_kernels(scene_tape, settings):
         own = own_models(scene, wave)
         if wave.centre.device.type == "cpu":

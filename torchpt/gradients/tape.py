@@ -40,7 +40,9 @@ def sample_cotangents(settings: Settings, radiance: Tensor, pixels: Tensor) -> T
         pixels: cotangents of the pixels ``(3, n)``.
     """
     finite = torch.isfinite(radiance).all(0)
-    cotangent = pixels[:, None] * (finite.to(radiance.dtype) / settings.render.spp)
+    # Divided on the host: a GPU multiplies by the reciprocal of a number.
+    weight = torch.ones((), dtype=radiance.dtype) / settings.render.spp
+    cotangent = pixels[:, None] * (finite.to(radiance.dtype) * weight.to(radiance.device))
     clamp = settings.integrator.clamp
     if clamp is None:
         return cotangent

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,7 +21,15 @@ from torchpt.paths.wave import Bounce, Wave, clamp_scale
 from torchpt.physics.film.splats import LARGEST
 from torchpt.physics.shapes.geometry import Hit
 
-__all__ = ["InputCotangents", "Tape", "VertexCotangents", "bounce_vjp", "emission_vjp", "splat_contributions"]
+__all__ = [
+    "InputCotangents",
+    "Tape",
+    "VertexCotangents",
+    "bounce_vjp",
+    "emission_vjp",
+    "rays_vjp",
+    "splat_contributions",
+]
 
 
 @dataclass
@@ -185,6 +192,22 @@ def emission_vjp(
         return _vjp([(contribution, radiance)], input_leaves, extra_leaves)
 
 
+def rays_vjp(
+    rays: Callable[[], PathState], o: Tensor, d: Tensor, extra_leaves: LeafSource
+) -> tuple[Tensor | None, ...]:
+    """Return the VJP of camera rays: cotangents of the extra leaves, in their order; None where rays do not depend on one.
+
+    Args:
+        rays: returns the rays, differentiable.
+        o: cotangent of their origins ``(3, n)``.
+        d: of their directions.
+        extra_leaves: as for :func:`bounce_vjp`.
+    """
+    with torch.enable_grad():
+        state = rays()
+        return _gradients([(state.o, o), (state.d, d)], list(extra_leaves()))
+
+
 def splat_contributions(
     clamp: float | None, cotangent: Tensor, splat: Splat, transmittance: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -236,14 +259,19 @@ def _with_leaves(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _InputLe
     return VertexInput(state, replace(hit, chance=chance)), input_leaves
 
 
+def _gradients(pairs: Sequence[tuple[Tensor, Tensor]], inputs: Sequence[Tensor]) -> tuple[Tensor | None, ...]:
+    """Differentiate (output, cotangent) pairs with respect to inputs; None for one that no output depends on."""
+    pairs = [(output, cotangent) for output, cotangent in pairs if output.requires_grad]
+    if not pairs:
+        return (None,) * len(inputs)
+    outputs, cotangents = [output for output, _ in pairs], [cotangent for _, cotangent in pairs]
+    return torch.autograd.grad(outputs, inputs, cotangents, allow_unused=True)
+
+
 def _vjp(pairs: list[tuple[Tensor, Tensor]], input_leaves: _InputLeaves, extra_leaves: LeafSource) -> InputCotangents:
     """Differentiate (output, cotangent) pairs with respect to the inputs of a vertex and the extra leaves."""
-    pairs = [(output, cotangent) for output, cotangent in pairs if output.requires_grad]
-    inputs, extra_inputs = leaves(input_leaves), list(extra_leaves())
-    grads: Sequence[Any] = [None] * (len(inputs) + len(extra_inputs))
-    if pairs:
-        outputs, cotangents = [output for output, _ in pairs], [cotangent for _, cotangent in pairs]
-        grads = torch.autograd.grad(outputs, [*inputs, *extra_inputs], cotangents, allow_unused=True)
+    inputs = leaves(input_leaves)
+    grads = _gradients(pairs, [*inputs, *extra_leaves()])
     # Those of the inputs come first; the extra leaves follow.
     gradients = {id(leaf): gradient for leaf, gradient in zip(inputs, grads, strict=False)}
 
@@ -255,6 +283,6 @@ def _vjp(pairs: list[tuple[Tensor, Tensor]], input_leaves: _InputLeaves, extra_l
         o=gradient_of(input_leaves.o),
         d=gradient_of(input_leaves.d),
         chance=gradient_of(input_leaves.chance),
-        extra_leaves=tuple(grads[len(inputs) :]),
+        extra_leaves=grads[len(inputs) :],
         extra={name: gradient_of(leaf) for name, leaf in input_leaves.extra.items()},
     )

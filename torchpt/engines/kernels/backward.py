@@ -25,6 +25,7 @@ from torchpt.compiler.operators.derivatives import summand_of
 from torchpt.compiler.sinks import Scatter, Sinks
 from torchpt.compiler.tracing import Tracer
 from torchpt.core.memory import Span
+from torchpt.engines.kernels import stages
 from torchpt.engines.kernels.engine import Chunk, KernelsEngine, Paths
 from torchpt.engines.kernels.layout import HIT, Fields, Layout, Memory, Rows, Trace, path_state
 from torchpt.engines.kernels.programs import Kernel, Kernels
@@ -34,6 +35,7 @@ from torchpt.paths import adjoint
 from torchpt.paths.adjoint import InputCotangents, Tape, VertexCotangents
 from torchpt.paths.integrators.path import follows_ray
 from torchpt.paths.state import EXTRA, PathState, Shadow, Splat, VertexInput
+from torchpt.paths.vertex import generate
 from torchpt.paths.walk import KEPT
 from torchpt.paths.wave import with_detached_geometry
 from torchpt.physics.samplers import salts
@@ -168,6 +170,26 @@ def escape_vjp(trace: Trace) -> Sinks:
     return _stores(trace, gathers, state, input_cotangents, added=rows)
 
 
+def rays_vjp(trace: Trace) -> Sinks:
+    """Pull the cotangents of a chunk's camera rays back to the camera, see :func:`torchpt.paths.adjoint.rays_vjp`."""
+    kernels, tracer = _begin_vjp(trace)
+    salts = trace.salts()
+    x, y, key = stages.samples_of_lanes(trace)
+    with tracer:
+        lane = torch.arange(tracer.lanes, dtype=torch.int32)  # the slot of its sample
+    rows = Rows(slots_of(trace.layout)).read(tracer, "o", "d", place=trace.node(lane))
+    taped, gathers = kernels.tape.taped, _RecordedGathers(tracer, kernels)
+
+    def rays() -> PathState:
+        return generate(taped.context.plan, taped.camera, taped.filter, x, y, key, salts)
+
+    sinks = Sinks()
+    with tracer, recording_gathers(gathers):
+        gradients = adjoint.rays_vjp(rays, rows["o"], rows["d"], gathers.leaves)
+    _store_sums(trace, sinks, gathers, gradients)
+    return sinks
+
+
 def store_hits(trace: Trace) -> Sinks:
     """Write hits of rays and transmittance of shadow rays from an arena to the slots, for the VJP of the vertex before."""
     layout, tracer = trace.layout, trace.tracer
@@ -223,7 +245,7 @@ def _stores(
             have.
     """
     kernels: Any = trace.layout
-    tracer, graph = trace.tracer, trace.tracer.graph
+    tracer = trace.tracer
     fields: dict[str, Tensor] = {}
     with tracer:
         for name, cotangent, like in input_cotangents.of_rays(state, attached=kernels.taped.plan.attached):
@@ -235,10 +257,25 @@ def _stores(
     if fields:
         rows = tuple(Rows(slots_of(trace.layout)).nodes(tracer, **fields))
         sinks.scatter.append(Scatter(_ALL_LANES, trace.node(state.lane), rows, slots=True))
+    _store_sums(trace, sinks, gathers, input_cotangents.extra_leaves)
+    return sinks
+
+
+def _store_sums(trace: Trace, sinks: Sinks, gathers: _RecordedGathers, gradients: Sequence[Tensor | None]) -> None:
+    """Store the gradients of look-ups, then of whole tables, in rows, and append to ``trace.sums`` what they are.
+
+    Args:
+        trace: the trace.
+        sinks: gets the stores.
+        gathers: look-ups in differentiated tables.
+        gradients: of :meth:`_RecordedGathers.leaves`.
+    """
+    kernels: Any = trace.layout
+    tracer, graph = trace.tracer, trace.tracer.graph
     # Gradients of look-ups: by number of the table and node of the index the nodes of an entry's gradient. Look-ups at the same
     # index are added up in the lane.
     entries: dict[tuple[int, int], list[int]] = {}
-    for (number, index, _), gradient in zip(gathers.taken, input_cotangents.extra_leaves, strict=False):
+    for (number, index, _), gradient in zip(gathers.taken, gradients, strict=False):
         if gradient is None:
             continue
         index_nodes = tracer.get(index).nodes.reshape(-1)
@@ -265,7 +302,7 @@ def _stores(
             row_of_index[index_node] = append_rows([index_node])
         trace.sums.append((number, row_of_index[index_node], append_rows(nodes), len(nodes)))
     # Gradients of whole tables are sums over lanes; a lane outputs its summand.
-    for number, gradient in enumerate(input_cotangents.extra_leaves[len(gathers.taken) :]):
+    for number, gradient in enumerate(gradients[len(gathers.taken) :]):
         if gradient is None:
             continue
         nodes = np.broadcast_to(tracer.get(gradient).nodes, tuple(kernels.primals[number].shape)).reshape(-1)
@@ -275,13 +312,12 @@ def _stores(
                 raise Unsupported("a derivative by all of a table in every lane")
             first = append_rows([zero if node is None else node for node in lane_nodes])
             trace.sums.append((number, -1, first, len(lane_nodes)))
-    return sinks
 
 
 # ---- The kernels of a backward pass: those that trace paths again, and those of VJPs
 
 
-_STAGES = {"bounce": bounce_vjp, "emit": emit_vjp, "escape": escape_vjp}
+_STAGES = {"bounce": bounce_vjp, "emit": emit_vjp, "escape": escape_vjp, "rays": rays_vjp}
 
 
 class VjpKernels(Kernels):
@@ -318,12 +354,12 @@ class VjpKernels(Kernels):
     def vjp_kernel(self, key: tuple[Any, ...]) -> Kernel | None:
         """Return the kernel of a stage's VJP; None if it cannot be compiled, see :attr:`eager_vjps`.
 
-        ``key``: ``("bounce", model, roulette, follow_ray)``, ``("emit", follow_ray)`` or ``("escape",)``.
+        ``key``: ``("bounce", model, roulette, follow_ray)``, ``("emit", follow_ray)``, ``("escape",)`` or ``("rays",)``.
         """
         if key in self.eager_vjps:
             return None
         try:
-            return self._get(True, _STAGES[key[0]], *key[1:])
+            return self._get(key[0] != "rays", _STAGES[key[0]], *key[1:])  # all lanes of a chunk have a ray
         except Unsupported as error:
             self.eager_vjps[key] = str(error)
             return None
@@ -456,15 +492,8 @@ class KernelsBackward(KernelsEngine):
             return
         self._results = self._results_of(kernel)
         self.calls.run(kernel, count, paths.arena, self._results, places, slots=self._sample_slots)
-        if slots is None:
-            return
-        floats, words = self._results.floats, self._results.words
-        for number, index_row, first, width in kernel.program.sums:
-            values = floats[first : first + width, :count]
-            if index_row < 0:
-                self.sums.add_all(number, values, slots)
-            else:
-                self.sums.add_rows(number, words[index_row, :count], values, slots)
+        if slots is not None:
+            self._add_sums(kernel, count, slots)
 
     def _sort_by_sample(self, paths: Paths, places: Memory, count: int) -> np.ndarray:
         """Sort the lanes of a list by sample, in place; return their slots in ascending order."""
@@ -534,8 +563,12 @@ class KernelsBackward(KernelsEngine):
         return self.back.tape.tables
 
     def vjp_rays(self) -> None:
-        """See :class:`torchpt.engines.engine.Backward`. Runs tensor operations."""
+        """See :class:`torchpt.engines.engine.Backward`. Runs tensor operations for rays of a user's, which are tables."""
         if not self.back.taped.plan.attached:
+            return
+        kernel = self.back.vjp_kernel(("rays",)) if self.wave.start_rays is None else None
+        if kernel is not None:
+            self._vjp_of_camera(kernel)
             return
         chunk, first, n = self._chunk, self.back.slots.first, self._chunk.pixels * self._chunk.samples
         with torch.enable_grad(), recording_gathers(self.sums):
@@ -546,6 +579,26 @@ class KernelsBackward(KernelsEngine):
             cotangents = [self._ray_cotangents(row, n) for _, row in pairs]
             gradients = torch.autograd.grad([x for x, _ in pairs], self._tables(), cotangents, allow_unused=True)
         self.sums.add_each(gradients)
+
+    def _vjp_of_camera(self, kernel: Kernel) -> None:
+        """Add the gradients of the camera from the chunk's rays."""
+        if not kernel.program.sums:
+            return
+        n = self._chunk.pixels * self._chunk.samples
+        self._results = self._results_of(kernel)
+        self.calls.set_dimensions(depth=0)
+        self.calls.run(kernel, self.calls.lanes(n), self._results, self._results, slots=self._sample_slots)
+        self._add_sums(kernel, n, np.arange(n, dtype=np.int32))
+
+    def _add_sums(self, kernel: Kernel, count: int, slots: np.ndarray) -> None:
+        """Add the rows that a VJP's kernel wrote for lanes of rising ``slots`` to the sums."""
+        floats, words = self._results.floats, self._results.words
+        for number, index_row, first, width in kernel.program.sums:
+            values = floats[first : first + width, :count]
+            if index_row < 0:
+                self.sums.add_all(number, values, slots)
+            else:
+                self.sums.add_rows(number, words[index_row, :count], values, slots)
 
     def _ray_cotangents(self, row: int, n: int) -> Tensor:
         """Return a copy of three rows of the slots ``(3, n)``."""

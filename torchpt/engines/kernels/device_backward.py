@@ -37,7 +37,7 @@ from torchpt.engines.kernels.device import (
 from torchpt.engines.kernels.driver import Cuda, Function, cuda_of
 from torchpt.engines.kernels.engine import LANES, Chunk, Paths
 from torchpt.engines.kernels.layout import Layout
-from torchpt.engines.kernels.programs import NamedTensors
+from torchpt.engines.kernels.programs import Kernel, NamedTensors
 from torchpt.math import sums
 from torchpt.math.sum_kernels import COLUMNS
 from torchpt.math.sums import GradientSums, TableSums, entries_and_width
@@ -317,10 +317,24 @@ class DeviceBackward(DeviceEngine, KernelsBackward):
         if not kernel.program.sums:
             return
         arena: Any = paths.arena
-        results: Any = self._results
         lanes = places.words[0].long()
         exists = torch.arange(len(lanes), device=lanes.device) < count.value
         slots = arena.words[self.back.state.first("lane")].index_select(0, lanes).long()
+        self._add_sums(kernel, exists, slots)
+
+    def _add_sums(self, kernel: Kernel, count: Any, slots: Any) -> None:
+        """Add the rows that a VJP's kernel wrote.
+
+        Args:
+            kernel: the kernel.
+            count: ``(row,)`` bool, True for the lanes that exist; or their number, the first ones.
+            slots: ``(row,)`` of the lanes, distinct where they exist; or an array of the first ones.
+        """
+        results: Any = self._results
+        if isinstance(count, int):
+            slots = torch.arange(results.words.shape[1], device=results.words.device)
+            count = slots < count
+        exists = count
         for number, index, first, width in kernel.program.sums:
             values = results.floats[first : first + width]
             if index < 0:

@@ -43,6 +43,7 @@ __all__ = [
     "list_transmitting",
     "nearest",
     "occluded",
+    "samples_of_lanes",
     "search_nearest",
     "search_occluded",
     "search_words",
@@ -140,28 +141,12 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
     True: its rows ``o`` and ``d`` have the rays; False: they are camera rays.
     """
     layout, tracer, wave = trace.layout, trace.tracer, trace.layout.wave
-    chunk_fields = trace.uniform(
-        "place", torch.ones(len(CHUNK_FIELDS), dtype=torch.int32)
-    )  # ones: they divide in the trace
-    salts = trace.salts()
-    pixels = layout.state.read(tracer, "prim")["prim"] if chosen else torch.empty(0)
+    pixels = layout.state.read(tracer, "prim")["prim"] if chosen else None
     rays = layout.state.read(tracer, "o", "d") if given else {}
+    salts = trace.salts()
+    x, y, key = samples_of_lanes(trace, pixels)
     passthrough: dict[str, Tensor] = {}
     with tracer:
-        chunk = dict(zip(CHUNK_FIELDS, chunk_fields.to(torch.int64).unbind(), strict=True))
-        # Lanes run over the chunk's pixels, then over its samples.
-        lane = torch.arange(tracer.lanes)
-        sample = torch.div(lane, chunk["pixels"], rounding_mode="floor")
-        pixel = pixels if chosen else lane - sample * chunk["pixels"] + chunk["first"]
-        row = torch.div(pixel, chunk["crop"], rounding_mode="floor")
-        x, y = pixel - row * chunk["crop"] + chunk["x"], row + chunk["y"]
-        film_pixel = y * chunk["film"] + x
-        # The same randomization and point as in Sampler.key, without the index of the sample, which may exceed 32 bits.
-        turn = sample + chunk["turn"]
-        group = turn % chunk["streams"] + chunk["stream"]
-        point = torch.div(turn, chunk["streams"], rounding_mode="floor") + chunk["point"]
-        key = wave.sampler.points.key(layout.numbers, film_pixel, group, point)
-        x, y = x.to(layout.plan.dtype), y.to(layout.plan.dtype)
         if given:
             state = camera_state(rays["o"], rays["d"], key)
         else:
@@ -175,6 +160,30 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
     else:
         sinks.write += trace.kept(state, passthrough)
     return sinks
+
+
+def samples_of_lanes(trace: Trace, pixels: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """Return column and row of the pixel ``(N,)``, and the random key, of the sample of each lane of a chunk.
+
+    ``pixels``: ``(N,)`` index of the lane's pixel; None: lanes run over the chunk's pixels, then over its samples.
+    """
+    layout, tracer = trace.layout, trace.tracer
+    ones = torch.ones(len(CHUNK_FIELDS), dtype=torch.int32)  # ones: they divide in the trace
+    chunk_fields = trace.uniform("place", ones)
+    with tracer:
+        chunk = dict(zip(CHUNK_FIELDS, chunk_fields.to(torch.int64).unbind(), strict=True))
+        lane = torch.arange(tracer.lanes)
+        sample = torch.div(lane, chunk["pixels"], rounding_mode="floor")
+        pixel = lane - sample * chunk["pixels"] + chunk["first"] if pixels is None else pixels
+        row = torch.div(pixel, chunk["crop"], rounding_mode="floor")
+        x, y = pixel - row * chunk["crop"] + chunk["x"], row + chunk["y"]
+        film_pixel = y * chunk["film"] + x
+        # The same randomization and point as in Sampler.key, without the index of the sample, which may exceed 32 bits.
+        turn = sample + chunk["turn"]
+        group = turn % chunk["streams"] + chunk["stream"]
+        point = torch.div(turn, chunk["streams"], rounding_mode="floor") + chunk["point"]
+        key = layout.wave.sampler.points.key(layout.numbers, film_pixel, group, point)
+        return x.to(layout.plan.dtype), y.to(layout.plan.dtype), key
 
 
 def sort_lanes(trace: Trace, shadow: bool) -> Sinks:
