@@ -14,8 +14,8 @@ max_depth it traces less in such scenes, and less light arrives: 0.3 % in ``mate
 ``--error`` compares errors at equal time, see ``bench_error.py``.
 
 ``--busy`` compares an idle machine with one where two other processes are busy, ``--scaling`` one thread with two (or
-``--threads``), both on the Cornell box. Needs the extra ``bench``; the bunny and the teapot need ``$TORCHPT_ASSETS``, else
-their stand-ins are rendered.
+``--threads``), both on the Cornell box. ``--cuda`` compares on a GPU. Needs the extra ``bench``; the bunny and the teapot
+need ``$TORCHPT_ASSETS``, else their stand-ins are rendered.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from typing import Any
 import bench_error
 import bench_files
 from bench_figures import GROUPS, SCENES, geometric_means
-from bench_workers import DEPTH, LLVM, OURS, SCALAR, Contender, Turn, Workers, ask, replaced, started
+from bench_workers import CUDA, DEPTH, LLVM, OURS, SCALAR, Contender, Turn, Workers, ask, replaced, started
 
 #: Number of busy processes.
 BUSY = 2
@@ -78,6 +78,9 @@ def main() -> None:
     parser.add_argument("--sampler", help="ours, by default the program's own; Mitsuba's is independent")
     parser.add_argument("--compile", default="auto", choices=("auto", "on", "off"), help="off: eager")
     parser.add_argument("--scalar", action="store_true", help=f"{SCALAR} too")
+    parser.add_argument(
+        "--cuda", action="store_true", help=f"both on a GPU, ours by kernels: {CUDA}; take a --size of 1024"
+    )
     parser.add_argument("--quick", action="store_true", help="one round of small pictures: that it works, no more")
     parser.add_argument("--busy", action="store_true", help=f"the same with {BUSY} other processes busy")
     parser.add_argument("--scaling", action="store_true", help="one thread beside two, or --threads")
@@ -88,6 +91,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.quick:
         arguments.rounds, arguments.size, arguments.spp = 1, 64, 4
+    if arguments.cuda:
+        arguments.compile = "on"
     if arguments.error:
         bench_error.contest(arguments)
     elif arguments.busy:
@@ -100,7 +105,7 @@ def main() -> None:
 
 def race(arguments: argparse.Namespace) -> None:
     """Time all scenes, torchpt beside Mitsuba."""
-    rivals = (LLVM, SCALAR) if arguments.scalar else (LLVM,)
+    rivals = (CUDA,) if arguments.cuda else (LLVM, SCALAR) if arguments.scalar else (LLVM,)
     contenders = entered((OURS, *rivals), arguments)
     found: dict[str, Any] = {}
     overall: dict[str, dict[str, float]] = {}
@@ -115,7 +120,7 @@ def race(arguments: argparse.Namespace) -> None:
             "replaced": replaced(scene),
         }
         cells = "".join(f"{found[scene][r]['rate']:13.3f}{found[scene][r]['ratio']:8.3f}" for r in rivals)
-        z = found[scene][LLVM]["z"]
+        z = found[scene][rivals[0]]["z"]
         means = f"{ours.mean:.5f} {others[0].mean:.5f}" + ("" if z is None else f" {z:5.1f}")
         print(f"{scene:22s}{ours.rate:9.3f}{cells}    {means}", flush=True)
         for name, instead in found[scene]["replaced"].items():

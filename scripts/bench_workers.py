@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from torchpt.scene.settings import Settings
 
 DEPTH = 8
-OURS, LLVM, SCALAR = "torchpt", "llvm_ad_rgb", "scalar_rgb"
+OURS, LLVM, SCALAR, CUDA = "torchpt", "llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"
 
 #: Renders a picture ``(H, W, 3)`` from samples a pixel and seed; also returns the number of samples taken.
 Shoot = Callable[[int, int], tuple[Any, int]]
@@ -73,6 +73,7 @@ def started(scene: str, contenders: Iterable[Contender], arguments: argparse.Nam
         for contender in contenders:
             wishes = {"size": arguments.size, "spp": arguments.spp, "sampler": contender.sampler}
             wishes |= {"compile": arguments.compile, "threads": contender.threads}
+            wishes["device"] = "cuda" if arguments.cuda else "cpu"
             given = [f"--{key}={value}" for key, value in wishes.items() if value is not None]
             command = [sys.executable, __file__, scene, contender.engine, *given]
             worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -109,12 +110,13 @@ def main() -> None:
     """Run a worker: warm up, then answer each line on stdin with the JSON of a turn."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene")
-    parser.add_argument("engine", choices=(OURS, LLVM, SCALAR))
+    parser.add_argument("engine", choices=(OURS, LLVM, SCALAR, CUDA))
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--spp", type=int, default=64, help="of the warm-up")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--sampler")
     parser.add_argument("--compile", default="auto")
+    parser.add_argument("--device", default="cpu", help="ours")
     arguments = parser.parse_args()
     shoot = (torchpt if arguments.engine == OURS else mitsuba)(arguments)
     shoot(arguments.spp, 0)
@@ -189,12 +191,12 @@ def torchpt(arguments: argparse.Namespace) -> Shoot:
 
     from torchpt.rendering.api import render_scene
 
-    scene = nearest(arguments.scene)
+    scene = nearest(arguments.scene).to(arguments.device)
     given = wishes(scene, arguments)
 
     def shoot(spp: int, seed: int) -> tuple[Any, int]:
         found = render_scene(scene, replace(given, render=given.render.but(spp=spp, seed=seed)))
-        return found.image.numpy(), found.spp
+        return found.image.cpu().numpy(), found.spp
 
     return shoot
 

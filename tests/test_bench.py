@@ -150,7 +150,7 @@ def test_both_render_the_same(scripts, name):
 ])  # fmt: skip
 def test_a_turn_of_the_benchmark(engine, sampler, taken, tmp_path):
     given = argparse.Namespace(
-        scene="cornell_box", engine=engine, sampler=sampler, size=16, spp=2, compile="off", threads=1
+        scene="cornell_box", engine=engine, sampler=sampler, size=16, spp=2, compile="off", threads=1, device="cpu"
     )
     shoot = (bench_workers.torchpt if engine == "torchpt" else bench_workers.mitsuba)(given)
     turn = bench_workers.timed(shoot, 16, 7, 1, str(tmp_path / "picture.npy"))
