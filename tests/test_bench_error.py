@@ -203,7 +203,8 @@ def row(ratio: float, multijitter: float = 0.02) -> dict[str, Any]:
 def given(file: Path | None = None, **more: Any) -> argparse.Namespace:
     wishes = {
         "scenes": [], "rounds": 7, "size": 256, "spp": 64, "threads": None, "sampler": None, "compile": "auto",
-        "budgets": bench_error.BUDGETS, "again": False, "plot": None, "json": file, "markdown": False, "quick": False, "cuda": False,
+        "budgets": bench_error.BUDGETS, "again": False, "plot": None, "json": file, "markdown": False, "quick": False,
+        "cuda": False,
     }  # fmt: skip
     return argparse.Namespace(**(wishes | more))
 
