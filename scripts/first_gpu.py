@@ -151,17 +151,19 @@ class Device:
     def gradients(self, *names: str) -> list[Tensor]:
         """Return gradients of the Cornell box by kernels on the device, see :func:`_gradients`."""
 
-        def backward(kernels: Any, tape: Any, *rest: Any) -> str:
-            on_device = device_backward(tape, [], kernels.cotangent, True, self.cuda, self.target)
-            return replay._replay_on_device(on_device, tape, *rest)
+        def backward(kernels: Any, tape: Any, settings: Any, cotangent: Tensor, sums: Any) -> str:
+            return replay._replay_on_device([], tape, settings, cotangent, kernels.cotangent, sums)
 
-        kept = replay._replay_on_threads
+        def made(tape: Any, own: Any, cotangent: Any, packets: bool, lanes: int) -> Any:
+            return device_backward(tape, own, cotangent, packets, lanes, self.cuda, self.target)
+
+        kept = replay._replay_on_threads, replay.device_backward
         if self.simulated:
-            replay._replay_on_threads = backward
+            replay._replay_on_threads, replay.device_backward = backward, made
         try:
             return _gradients(self.pixels, self.torch, *names)
         finally:
-            replay._replay_on_threads = kept
+            replay._replay_on_threads, replay.device_backward = kept
 
     def wait(self) -> None:
         """Wait for the device."""

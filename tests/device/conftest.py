@@ -37,12 +37,15 @@ def device(monkeypatch) -> Iterator[Callable[..., SimulatedCuda]]:
             return made
 
         def backward(kernels: Any, tape: Any, settings: Any, cotangent: Any, sums: Any) -> str:
-            on_device = device_backward(tape, [], kernels.cotangent, packets, cuda, target)
-            cuda.fallback = replay._replay_on_device(on_device, tape, settings, cotangent, sums)
+            cuda.fallback = replay._replay_on_device([], tape, settings, cotangent, kernels.cotangent, sums)
             return cuda.fallback
+
+        def made(tape: Any, own: Any, cotangent: Any, _: bool, lanes: int) -> Any:
+            return device_backward(tape, own, cotangent, packets, lanes, cuda, target)
 
         monkeypatch.setattr(run, "kernel_engine", engine)
         monkeypatch.setattr(replay, "_replay_on_threads", backward)
+        monkeypatch.setattr(replay, "device_backward", made)
         return cuda
 
     with shuffled_lanes():

@@ -62,7 +62,7 @@ def card(monkeypatch) -> Iterator[_Card]:
     for module in (device_module, backward_module):
         monkeypatch.setattr(module, "cuda_of", lambda device: card)
     monkeypatch.setattr(device_module.device_forward, "__defaults__", (None, None, simulated_target, 2048))
-    monkeypatch.setattr(backward_module.device_backward, "__defaults__", (None, simulated_target))
+    monkeypatch.setattr(backward_module.device_backward, "__defaults__", (2048, None, simulated_target))
     with simulated_cuda(rounds=True):  # no number of a picture may come from an operator of torch on the device
         yield card
 

@@ -19,9 +19,10 @@ from torchpt.compiler.graph import Unsupported
 from torchpt.compiler.ptx import ptx_target
 from torchpt.engines.kernels import engine
 from torchpt.engines.kernels.backward import VjpKernels
-from torchpt.engines.kernels.device_backward import SegmentSums
+from torchpt.engines.kernels.device_sums import Places, SegmentSums, WaveSums
 from torchpt.gradients import replay
-from torchpt.math import sum_kernels, sums
+from torchpt.math import sums
+from torchpt.math.sums import ChunkGradientSums, GradientSums
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
 
@@ -38,39 +39,62 @@ NAMES = [
 
 
 def terms(entries: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Entries, numbers and slots of terms in random order; some are of no entry."""
+    """Entries, numbers and samples of terms in random order; some are of no entry."""
     random = np.random.default_rng(entries)
-    slots = random.permutation(1500)[:1200]
+    samples = random.permutation(1500)[:1200]
     size = np.exp(8 * random.standard_normal((width, 1200))) * random.standard_normal((width, 1200))
     index = random.integers(-1, entries + 1, 1200)
-    return torch.from_numpy(index), torch.from_numpy(size.astype(np.float32)), torch.from_numpy(slots)
+    return torch.from_numpy(index), torch.from_numpy(size.astype(np.float32)), torch.from_numpy(samples)
 
 
-@pytest.mark.parametrize("ptx", [False, True])
-@pytest.mark.parametrize(("entries", "width", "dtype"), [(1, 3, "f8"), (40, 2, "f8"), (900, 1, "f4")])
-def test_terms_are_added_in_the_order_of_slots(entries, width, dtype, ptx):
-    index, values, slots = terms(entries, width)
-    order = np.argsort(slots.numpy())
-    given = [index.numpy()[order].astype(np.int32), values.numpy()[:, order], slots.numpy()[order].astype(np.int32)]
-    start = np.random.default_rng(1).standard_normal((entries, width)).astype(dtype)
+def wave_sums(table: Tensor, whole: GradientSums, ptx: bool = False) -> tuple[WaveSums, Places]:
+    """Sums of a wave of 250 pixels of 6 samples, in chunks of 500 samples but for the last one: 83, 83, 83 and 1 pixels."""
     cuda, target = (SimulatedCuda(PtxDriver()), ptx_target()) if ptx else (SimulatedCuda(), simulated_target(1024))
-    segments = SegmentSums(cuda, target)
-    expected, found = start.copy(), torch.from_numpy(start.copy())
-    sum_kernels.add_at(expected, *given[:2])
-    segments.add(found, index, values, slots)
-    assert np.array_equal(found.numpy(), expected)
-    if dtype == "f8":
-        sum_kernels.add_by_columns(expected, *given)
-        segments.add_by_columns(found, index, values, slots)
-        assert np.array_equal(found.numpy(), expected)
+    made = WaveSums([table], whole, SegmentSums(cuda, target), 500)
+    return made, made.begin(250, 6, torch.device("cpu"))
+
+
+@pytest.mark.parametrize(("entries", "width", "dense", "ptx"), [
+    (1, 3, None, False), (40, 2, None, False), (400, 3, None, False), (400, 3, 0, False), (1, 3, None, True), (40, 2, 0, True),
+])  # fmt: skip
+def test_terms_are_added_in_the_order_of_chunks_and_slots(entries, width, dense, ptx, monkeypatch):
+    monkeypatch.setattr(sums, "MAX_DENSE", sums.MAX_DENSE if dense is None else dense)
+    index, values, samples = terms(entries, width)
+    table = torch.zeros(width, entries)
+    expected, found = (GradientSums([table]) for _ in range(2))
+    wave, places = wave_sums(table, found, ptx)
+    exists = torch.rand(1200, generator=torch.Generator().manual_seed(3)) < 0.9
+    for _ in range(2):  # two look-ups
+        wave.add_terms(0, None, index.int(), values, places.terms(samples, exists))
+    wave.add_all(
+        0, values[:1].expand(table.numel(), -1).contiguous(), places.terms(samples, exists)
+    ) if dense is None else None
+    wave.merge_into_whole()
+    first = 0
+    for pixels in (83, 83, 83, 1):
+        chunk = ChunkGradientSums([table])
+        # sample s of pixel p is number 250 s + p of the wave, and slot pixels s + p - first of the chunk
+        slot = samples // 250 * pixels + samples % 250 - first
+        mine = (exists & (samples % 250 >= first) & (samples % 250 < first + pixels)).nonzero()[:, 0]
+        mine = mine[slot[mine].argsort()]
+        of_chunk = values[:, mine].numpy(), slot[mine].int().numpy()
+        for _ in range(2):
+            chunk.add_rows(0, index[mine].int().numpy(), *of_chunk)
+        if dense is None:
+            chunk.add_all(0, np.repeat(of_chunk[0][:1], table.numel(), 0), of_chunk[1])
+        expected.merge(chunk)
+        first += pixels
+    assert found.total(0).any() and torch.equal(found.total(0), expected.total(0))
 
 
 def test_terms_of_no_entry_change_nothing():
-    segments = SegmentSums(SimulatedCuda(), simulated_target(1024))
-    total = torch.arange(6.0, dtype=torch.float64).view(3, 2)
-    for add in (segments.add, segments.add_by_columns):
-        add(total, torch.tensor([-1, 3]), torch.ones(2, 2), torch.tensor([1, 0]))
-        assert torch.equal(total, torch.arange(6.0, dtype=torch.float64).view(3, 2))
+    table = torch.zeros(2, 3)
+    whole = GradientSums([table])
+    wave, places = wave_sums(table, whole)
+    found = places.terms(torch.tensor([1, 0]), torch.tensor([True, True]))
+    wave.add_terms(0, None, torch.tensor([-1, 3], dtype=torch.int32), torch.ones(2, 2), found)
+    wave.merge_into_whole()
+    assert not whole.total(0).any()
 
 
 # -- gradients

@@ -294,16 +294,30 @@ class BackwardDevice(Protocol):
 
     eager_vjps: dict[tuple[Any, ...], str]
 
+    @property
+    def lanes(self) -> int:
+        """Return the number of lanes of a wave."""
+        ...
+
     def engine(self) -> Backward[Any, Any, Any]:
         """Return an engine."""
         ...
 
-    def chunk_sums(self, whole: GradientSums) -> Any:
-        """Return sums of a chunk; their ``merge_into_whole`` adds them to those of the pass."""
+    def bytes_per_lane(self, levels: int) -> int:
+        """Return the bytes that a lane takes if ``levels`` vertices are kept."""
+        ...
+
+    def wave_sums(self, whole: GradientSums, size: int) -> Any:
+        """Return sums of a wave of chunks of at most ``size`` samples.
+
+        Their ``merge_into_whole`` adds them to those of the pass.
+        """
         ...
 
 
-def device_backward(tape: Tape, own: Sequence[int], cotangent: Tensor | None, packets: bool) -> BackwardDevice:
+def device_backward(
+    tape: Tape, own: Sequence[int], cotangent: Tensor | None, packets: bool, lanes: int
+) -> BackwardDevice:
     """Return the kernels of a backward pass on a CUDA device.
 
     Args:
@@ -311,10 +325,11 @@ def device_backward(tape: Tape, own: Sequence[int], cotangent: Tensor | None, pa
         own: as for :func:`backward_kernels`.
         cotangent: as for :func:`backward_tensors`.
         packets: as for :func:`forward_device`.
+        lanes: of a wave.
 
     Raises:
         RenderError: kernels cannot run on the device.
     """
     from torchpt.engines.kernels.device_backward import device_backward
 
-    return device_backward(tape, own, cotangent, packets)
+    return device_backward(tape, own, cotangent, packets, lanes)

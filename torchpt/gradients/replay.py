@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import warn_once
-from torchpt.core.memory import Budget, Span, is_out_of_memory
+from torchpt.core.memory import Budget, Span, free_memory, is_out_of_memory, release_memory
 from torchpt.core.threads import map_in_order
 from torchpt.engines.engine import (
     LANES_OF_KERNELS,
@@ -50,6 +50,10 @@ __all__ = ["replay_paths"]
 LANES = {"cpu": 1 << 16, "cuda": 1 << 20}
 #: Bytes of a lane at a vertex that is kept: path state, hit, and its lists of lanes by model.
 BYTES_PER_VERTEX = 240
+#: Numbers of chunks that kernels of a device trace at once.
+CHUNKS_OF_WAVE = (1, 8, 64)
+#: A wave may have this many times the lanes that there are samples.
+CHUNKS_GROWTH = 8
 #: Greatest number of marks of a walk; where there are more, every other one is dropped.
 MARKS = 8
 
@@ -169,9 +173,7 @@ def replay_paths(
             reason = _replay_on_threads(kernels, scene_tape, settings, cotangent, sums)
             _warn_of_eager_vjps(kernels, wave)
         else:
-            packets = settings.render.accel == "auto"
-            on_device = device_backward(scene_tape, own, splat_cotangent, packets)
-            reason = _replay_on_device(on_device, scene_tape, settings, cotangent, sums)
+            reason = _replay_on_device(own, scene_tape, settings, cotangent, splat_cotangent, sums)
         if not reason:
             return
         warn_once(f"torchpt: gradients of this scene are taken by tensor operations, as {reason}")
@@ -212,25 +214,51 @@ def _warn_of_eager_vjps(kernels: BackwardKernels, wave: Wave) -> None:
 
 
 def _replay_on_device(
-    kernels: BackwardDevice, scene_tape: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums
+    own: Sequence[int],
+    scene_tape: SceneTape,
+    settings: Settings,
+    cotangent: Tensor,
+    splat_cotangent: Tensor | None,
+    sums: GradientSums,
 ) -> str:
-    """Replay all chunks by kernels on a device, in their order; return why that is not possible, or ""."""
-    _, _, width, height = scene_tape.wave.crop
-    blocks = scene_tape.blocks(width * height, settings.render.spp)
-    cotangent = cotangent.float()
-    try:
-        engine = kernels.engine()
-        for span in _spans(blocks, settings.render.spp):
-            chunk = kernels.chunk_sums(sums)
-            Chunk(engine, settings, span, chunk).run(cotangent)
-            chunk.merge_into_whole()
-    except Unsupported as error:
-        return f"no kernel can be made of {error}"
-    except Exception as error:
-        if not is_out_of_memory(error):
-            raise
-        return "memory ran out"
-    return ""
+    """Replay all chunks by kernels on a device, many at once; return why that is not possible, or "".
+
+    Sums are those of chunks whatever the number of lanes, so that waves of fewer lanes, where memory is short, change no bit.
+    """
+    wave, spp, cotangent = scene_tape.wave, settings.render.spp, cotangent.float()
+    _, _, width, height = wave.crop
+    blocks = scene_tape.blocks(width * height, spp)
+    samples = spp * sum(pixels for _, pixels in blocks)
+    numbers = [
+        chunks for chunks in CHUNKS_OF_WAVE if chunks == 1 or chunks * LANES_OF_KERNELS < CHUNKS_GROWTH * samples
+    ]
+    packets = settings.render.accel == "auto"
+    while numbers:
+        lanes = numbers.pop() * LANES_OF_KERNELS
+        try:
+            kernels = device_backward(scene_tape, own, splat_cotangent, packets, lanes)
+            if numbers and not _fits(kernels, wave.centre.device, settings):
+                continue
+            engine = kernels.engine()
+            for span in _spans(blocks, spp, lanes // LANES_OF_KERNELS):
+                wave_sums = kernels.wave_sums(sums, LANES_OF_KERNELS)
+                Chunk(engine, settings, span, wave_sums).run(cotangent)
+                wave_sums.merge_into_whole()
+            return ""
+        except Unsupported as error:
+            return f"no kernel can be made of {error}"
+        except Exception as error:
+            if not is_out_of_memory(error):
+                raise
+        sums.clear()
+        release_memory()
+    return "memory ran out"
+
+
+def _fits(kernels: BackwardDevice, device: torch.device, settings: Settings) -> bool:
+    """Return True if a wave takes at most half of the device's memory, and of ``render.max_memory``."""
+    bounds = [bound for bound in (free_memory(device), settings.render.max_memory) if bound is not None]
+    return kernels.lanes * kernels.bytes_per_lane(_kept_vertices(settings)) <= min(bounds) // 2
 
 
 def _replay_on_threads(
@@ -288,11 +316,14 @@ def _kept_vertices(settings: Settings) -> int:
     return min(depth, KEPT) if depth >= 0 else KEPT
 
 
-def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
-    """Yield the chunks of blocks of pixels, given by first pixel and number; they do not depend on threads."""
+def _spans(blocks: Sequence[tuple[int, int]], samples: int, chunks: int = 1) -> Iterator[Span]:
+    """Yield the chunks of blocks of pixels, given by first pixel and number; they do not depend on threads.
+
+    ``chunks``: number of consecutive chunks that make one span.
+    """
     for sample in range(0, samples, LANES_OF_KERNELS):
         count = min(LANES_OF_KERNELS, samples - sample)
-        step = max(LANES_OF_KERNELS // count, 1)
+        step = chunks * max(LANES_OF_KERNELS // count, 1)
         for start, pixels in blocks:
             for pixel in range(start, start + pixels, step):
                 yield pixel, min(step, start + pixels - pixel), sample, count

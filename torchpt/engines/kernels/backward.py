@@ -588,7 +588,11 @@ class KernelsBackward(KernelsEngine):
         self._results = self._results_of(kernel)
         self.calls.set_dimensions(depth=0)
         self.calls.run(kernel, self.calls.lanes(n), self._results, self._results, slots=self._sample_slots)
-        self._add_sums(kernel, n, np.arange(n, dtype=np.int32))
+        self._add_all_lanes(kernel, n)
+
+    def _add_all_lanes(self, kernel: Kernel, count: int) -> None:
+        """Add the rows that a VJP's kernel wrote for the chunk's samples, one lane each in their order, to the sums."""
+        self._add_sums(kernel, count, np.arange(count, dtype=np.int32))
 
     def _add_sums(self, kernel: Kernel, count: int, slots: np.ndarray) -> None:
         """Add the rows that a VJP's kernel wrote for lanes of rising ``slots`` to the sums."""
