@@ -358,7 +358,7 @@ def _segment(block: Block, ty: str, first: str, end: str, start: str, extra: int
     """Add a segment of row ``extra`` of the slots to ``start``, see :mod:`torchpt.compiler.segments`."""
     row = block.at("%slots", "float", block.op(f"mul i64 %stride, {extra}"))
     real = ELEMENTS[ty]
-    return block.op(f"call {real} @segment_{ty}(ptr {row}, ptr %uniform0, i32 {first}, i32 {end}, {real} {start})")
+    return block.op(f"call {real} @segment_{ty}(ptr {row}, i32 {first}, i32 {end}, {real} {start})")
 
 
 def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:

@@ -1,8 +1,8 @@
 """Sums of segments of a row, one term after the other, as LLVM IR: functions that kernels of single lanes call.
 
-A *segment* is what lies from one place to another in a list that orders the elements of a row. Its sum is made by one lane, in
-the order of the list, so it has the same bits on any machine. The rows are those of the *slots*, memory outside of the arenas
-that several kernels share (:mod:`torchpt.compiler.sinks`).
+A *segment* is what lies from one element of a row to another. Its sum is made by one lane, from left to right, so it has the
+same bits on any machine. The rows are those of the *slots*, memory outside of the arenas that several kernels share
+(:mod:`torchpt.compiler.sinks`).
 """
 
 from __future__ import annotations
@@ -15,13 +15,16 @@ from torchpt.compiler.sinks import Sinks, Store
 
 __all__ = ["segment_functions", "segment_sums"]
 
+#: Terms whose loads overlap.
+UNROLLED = 8
+
 
 def segment_sums(rows: int, ty: str) -> TracedStage:
     """Return the stage that adds segments of rows of the slots, the same segment of each row in a lane.
 
-    Its inputs are the tensors first ``(n,)`` and end ``(n,)``, int32, and start ``(rows, n)`` of the result's type. The uniform
-    ``order`` is the list, int32. Its result ``(rows, n)`` is ``start[r] + slots[r, order[first]] + ... +
-    slots[r, order[end - 1]]``, added from left to right; for an empty segment, ``end <= first``, it is ``start[r]``.
+    Its inputs are the tensors first ``(n,)`` and end ``(n,)``, int32, and start ``(rows, n)`` of the result's type. Its result
+    ``(rows, n)`` is ``start[r] + slots[r, first] + ... + slots[r, end - 1]``, added from left to right; for an empty segment,
+    ``end <= first``, it is ``start[r]``.
 
     Args:
         rows: number of rows, of float32.
@@ -31,7 +34,7 @@ def segment_sums(rows: int, ty: str) -> TracedStage:
     first, end = (graph.node("tensor", "i", extra=(number, 0)) for number in range(2))
     starts = [graph.node("tensor", ty, extra=(2, row)) for row in range(rows)]
     sums = [graph.node("segment", ty, first, end, start, extra=row) for row, start in enumerate(starts)]
-    return TracedStage(graph, Sinks(store=[Store(tuple(sums), ty)]), uniforms=("order",), tensors=3)
+    return TracedStage(graph, Sinks(store=[Store(tuple(sums), ty)]), tensors=3)
 
 
 def segment_functions(graph: Graph, needed: list[int], form: Form) -> Block:
@@ -55,25 +58,44 @@ def segment_functions(graph: Graph, needed: list[int], form: Form) -> Block:
 
 def _text(real: str) -> str:
     """Return the definition of the function for results of an LLVM type."""
-    conversion = "fpext float %term to double" if real == "double" else "bitcast float %term to float"
-    arguments = f"ptr %row, ptr %order, i32 %first, i32 %end, {real} %start"
-    return f"""define internal {real} @segment_{real[0]}({arguments}) alwaysinline #0 {{
+
+    def added(terms: int, start: str, place: str, name: str) -> str:
+        """Return code that adds consecutive terms from ``place`` on to ``start``; all loads come first, as they can overlap."""
+        loads, adds = [], []
+        for n in range(terms):
+            loads += [
+                f"%{name}at{n} = add i32 {place}, {n}",
+                f"%{name}p{n} = getelementptr float, ptr %row, i32 %{name}at{n}",
+            ]
+            loads += [f"%{name}t{n} = load float, ptr %{name}p{n}"]
+            wide = f"%{name}t{n}"
+            if real == "double":
+                wide = f"%{name}w{n}"
+                loads.append(f"{wide} = fpext float %{name}t{n} to double")
+            adds.append(f"%{name}s{n} = fadd {real} {f'%{name}s{n - 1}' if n else start}, {wide}")
+        return "\n  ".join(loads + adds)
+
+    return f"""define internal {real} @segment_{real[0]}(ptr %row, i32 %first, i32 %end, {real} %start) alwaysinline #0 {{
 entry:
-  %some = icmp slt i32 %first, %end
-  br i1 %some, label %loop, label %exit
-loop:
-  %k = phi i32 [ %first, %entry ], [ %next, %loop ]
-  %before = phi {real} [ %start, %entry ], [ %after, %loop ]
-  %listed = getelementptr i32, ptr %order, i32 %k
-  %place = load i32, ptr %listed
-  %element = getelementptr float, ptr %row, i32 %place
-  %term = load float, ptr %element
-  %wide = {conversion}
-  %after = fadd {real} %before, %wide
-  %next = add i32 %k, 1
-  %more = icmp slt i32 %next, %end
-  br i1 %more, label %loop, label %exit
+  br label %head
+head:
+  %k = phi i32 [ %first, %entry ], [ %later, %many ]
+  %before = phi {real} [ %start, %entry ], [ %ms{UNROLLED - 1}, %many ]
+  %later = add i32 %k, {UNROLLED}
+  %fits = icmp sle i32 %later, %end
+  br i1 %fits, label %many, label %rest
+many:
+  {added(UNROLLED, "%before", "%k", "m")}
+  br label %head
+rest:
+  %j = phi i32 [ %k, %head ], [ %next, %one ]
+  %sum = phi {real} [ %before, %head ], [ %os0, %one ]
+  %more = icmp slt i32 %j, %end
+  br i1 %more, label %one, label %exit
+one:
+  {added(1, "%sum", "%j", "o")}
+  %next = add i32 %j, 1
+  br label %rest
 exit:
-  %sum = phi {real} [ %start, %entry ], [ %after, %loop ]
   ret {real} %sum
 }}"""

@@ -51,9 +51,9 @@ LANES = {"cpu": 1 << 16, "cuda": 1 << 20}
 #: Bytes of a lane at a vertex that is kept: path state, hit, and its lists of lanes by model.
 BYTES_PER_VERTEX = 240
 #: Numbers of chunks that kernels of a device trace at once.
-CHUNKS_OF_WAVE = (1, 8, 64)
-#: A wave may have this many times the lanes that there are samples.
-CHUNKS_GROWTH = 8
+CHUNKS_OF_WAVE = (1, 4, 16, 64, 256)
+#: A wave has less than this many times the lanes that there are samples.
+CHUNKS_GROWTH = 4
 #: Greatest number of marks of a walk; where there are more, every other one is dropped.
 MARKS = 8
 

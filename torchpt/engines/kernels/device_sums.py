@@ -36,7 +36,7 @@ class Order:
     """Terms sorted by entry.
 
     Attributes:
-        terms: ``(n,)`` int32, the terms; those of an entry in the order in which they are added.
+        terms: ``(n,)`` int64, the terms; those of an entry in the order in which they are added.
         first: ``(M,)`` int32, where the terms of each entry begin.
         end: ``(M,)`` int32, where they end.
     """
@@ -47,10 +47,11 @@ class Order:
 
     @staticmethod
     def of(entry: Tensor, entries: int) -> Order:
-        """Sort terms ``(n,)`` by entry, stably; those of the entry ``entries`` are left out."""
-        found, order = torch.sort(entry.int(), stable=True)
-        bounds = torch.searchsorted(found, torch.arange(entries + 1, dtype=torch.int32, device=entry.device)).int()
-        return Order(order.int(), bounds[:-1], bounds[1:])
+        """Sort terms by entry ``(n,)`` int32, stably; those of the entry ``entries`` are left out."""
+        found, terms = torch.sort(entry, stable=True)
+        numbers = torch.arange(entries + 1, dtype=torch.int32, device=entry.device)
+        bounds = torch.searchsorted(found, numbers, out_int32=True)
+        return Order(terms, bounds[:-1], bounds[1:])
 
 
 @dataclass(frozen=True)
@@ -61,11 +62,15 @@ class Places:
         of_sample: ``(samples,)`` int64, by the number of the sample in the wave.
         chunks: number of chunks.
         size: places of a chunk.
+        chunk: ``(places,)`` int32, the chunk of each place.
+        column: ``(places,)`` int32, the column of its slot.
     """
 
     of_sample: Tensor
     chunks: int
     size: int
+    chunk: Tensor
+    column: Tensor
 
     @staticmethod
     def of(pixels: int, samples: int, size: int, device: torch.device) -> Places:
@@ -77,7 +82,10 @@ class Places:
         pixel = number - sample * pixels
         chunk = torch.div(pixel, in_chunk, rounding_mode="floor")
         width = (pixels - chunk * in_chunk).clamp_max(in_chunk)  # pixels of the sample's own chunk
-        return Places(chunk * size + sample * width + pixel - chunk * in_chunk, chunks, size)
+        place = torch.arange(chunks * size, dtype=torch.int32, device=device)
+        of_place = torch.div(place, size, rounding_mode="floor")
+        of_sample = chunk * size + sample * width + pixel - chunk * in_chunk
+        return Places(of_sample, chunks, size, of_place, (place - of_place * size) % COLUMNS)
 
     @property
     def count(self) -> int:
@@ -116,12 +124,12 @@ class Terms:
         self._orders: dict[Any, Order] = {}
 
     def entry(self, index: Tensor | None, entries: int) -> Tensor:
-        """Return the entry ``(places,)`` of the term at each place; ``entries``: none, or out of range.
+        """Return the entry ``(places,)`` int32 of the term at each place; ``entries``: none, or out of range.
 
-        ``index``: ``(n,)`` entries by term; None: all terms are of entry 0.
+        ``index``: ``(n,)`` int32 entries by term; None: all terms are of entry 0.
         """
         if index is None:
-            return torch.where(self._exists, 0, entries)
+            return torch.where(self._exists, 0, entries).int()
         found = index.index_select(0, self._at)
         return torch.where(self._exists & (found >= 0) & (found < entries), found, entries)
 
@@ -134,12 +142,11 @@ class Terms:
         known = key, entries, by_columns
         if key is None or known not in self._orders:
             entry, places = self.entry(index, entries), self._places
-            place = torch.arange(places.count, device=entry.device)
-            row, rows = torch.div(place, places.size, rounding_mode="floor") * entries + entry, places.chunks * entries
+            row, rows = places.chunk * entries + entry, places.chunks * entries
             if by_columns:
-                row, rows = row * COLUMNS + place % COLUMNS, rows * COLUMNS
+                row, rows = row * COLUMNS + places.column, rows * COLUMNS
             found = Order.of(torch.where(entry < entries, row, rows), rows)
-            self._orders[known] = Order(self._at.int().index_select(0, found.terms), found.first, found.end)
+            self._orders[known] = Order(self._at.index_select(0, found.terms), found.first, found.end)
         return self._orders[known]
 
 
@@ -157,6 +164,7 @@ class SegmentSums:
     def __init__(self, cuda: Cuda, target: Target) -> None:
         self._cuda, self._target = cuda, target
         self._functions: dict[tuple[int, torch.dtype], Function] = {}  # by number of rows and type of the sums
+        self._lanes: dict[int, Tensor] = {}  # numbers of lanes, on the device
 
     def add(self, total: Tensor, order: Order, values: Tensor) -> None:
         """Add terms to a table.
@@ -164,9 +172,14 @@ class SegmentSums:
         Args:
             total: ``(M, R)`` float64 or float32, in which terms are added.
             order: of the terms, for M entries.
-            values: ``(R, n)`` float32; rows may lie apart.
+            values: ``(R, n)`` float32.
         """
         found = total.T.contiguous()
+        self._launch(found, order, values)
+        total.copy_(found.T)
+
+    def _launch(self, found: Tensor, order: Order, values: Tensor) -> None:
+        """Add terms to sums ``found (R, M)``, which are contiguous."""
         rows, entries = found.shape
         function = self._functions.get((rows, found.dtype))
         if function is None:
@@ -174,26 +187,27 @@ class SegmentSums:
             code = cache.compile_stage(stage, self._target).function
             function = self._functions[rows, found.dtype] = self._cuda.load(code.code, code.key)
         tensors = [(x.data_ptr(), entries) for x in (order.first, order.end, found)]
-        words = (ctypes.c_int64 * (len(HEAD) + 1 + 2 * (len(tensors) + 1)))()
-        words[WORD["slots"]], words[WORD["stride"]] = values.data_ptr(), values.stride(0)
-        words[len(HEAD) :] = [order.terms.data_ptr(), *(word for pair in (*tensors, tensors[-1]) for word in pair)]
-        lanes = torch.full((1,), entries, dtype=torch.int64, device=found.device)
+        sorted_values = values.index_select(1, order.terms)
+        words = (ctypes.c_int64 * (len(HEAD) + 2 * (len(tensors) + 1)))()
+        words[WORD["slots"]], words[WORD["stride"]] = sorted_values.data_ptr(), sorted_values.shape[1]
+        words[len(HEAD) :] = [word for pair in (*tensors, tensors[-1]) for word in pair]
+        if entries not in self._lanes:
+            self._lanes[entries] = torch.full((1,), entries, dtype=torch.int64, device=found.device)
         self._cuda.enter()
-        self._cuda.launch(function, words, lanes.data_ptr(), entries, self._cuda.stream())
-        total.copy_(found.T)
+        self._cuda.launch(function, words, self._lanes[entries].data_ptr(), entries, self._cuda.stream())
 
     def by_columns(self, order: Order, values: Tensor) -> Tensor:
         """Return the sums ``(M, R)`` float64 of terms, added by column first, see :mod:`torchpt.math.sums`.
 
         ``order``: for M * :data:`~torchpt.math.sum_kernels.COLUMNS` entries.
         """
-        total = torch.zeros(len(order.first), len(values), dtype=torch.float64, device=values.device)
-        self.add(total, order, values)
-        columns, half = total.view(-1, COLUMNS, len(values)), COLUMNS // 2
-        while half:
-            columns[:, :half] += columns[:, half : 2 * half]
-            half //= 2
-        return columns[:, 0]
+        found = torch.zeros(len(values), len(order.first), dtype=torch.float64, device=values.device)
+        self._launch(found, order, values)
+        columns = found.view(len(values), -1, COLUMNS)
+        while columns.shape[2] > 1:
+            first, second = columns.chunk(2, 2)
+            columns = first + second
+        return columns[..., 0].T
 
 
 class WaveSums(TableSums):
@@ -233,7 +247,7 @@ class WaveSums(TableSums):
     def add_at(self, number: int, index: Tensor, values: Tensor) -> None:
         """Add ``values (..., n)`` to the entries ``index (n,)`` of a table, one for each sample of the wave, in their order."""
         _, width = entries_and_width(self.tables[number])
-        self.add_terms(number, None, index, values.reshape(width, -1).contiguous(), self._places.all_terms())
+        self.add_terms(number, None, index.int(), values.reshape(width, -1).contiguous(), self._places.all_terms())
 
     def add_terms(self, number: int, key: Any, index: Tensor, values: Tensor, terms: Terms) -> None:
         """Add terms to entries of a table.
@@ -241,7 +255,7 @@ class WaveSums(TableSums):
         Args:
             number: of the table.
             key: the same for the same ``index`` of ``terms``; None: this ``index`` is used once.
-            index: ``(n,)`` the entry of each term; terms out of range are skipped.
+            index: ``(n,)`` int32, the entry of each term; terms out of range are skipped.
             values: ``(R, n)`` float32.
             terms: the order of terms.
         """
@@ -253,7 +267,7 @@ class WaveSums(TableSums):
         by_columns = table.numel() <= sums.MAX_BY_COLUMNS
         order, total = terms.order(key, index, entries, by_columns=by_columns), self._of_chunks(number)
         if by_columns:
-            total += self._segments.by_columns(order, values).view(total.shape)
+            total += self._segments.by_columns(order, values).reshape(total.shape)
         else:
             self._segments.add(total.view(-1, width), order, values)
 
@@ -261,7 +275,7 @@ class WaveSums(TableSums):
         """Add derivatives by a whole table: the sums of ``values (table.numel(), n)`` over the terms of each chunk."""
         total = self._of_chunks(number)  # (chunks, M, R)
         found = self._segments.by_columns(terms.order("all", None, 1, by_columns=True), values)
-        total += found.view(len(total), total.shape[2], total.shape[1]).transpose(1, 2)
+        total += found.reshape(len(total), total.shape[2], total.shape[1]).transpose(1, 2)
 
     def merge_into_whole(self) -> None:
         """Add the sums of chunks to those of the pass, in the order of chunks."""
