@@ -354,11 +354,10 @@ def _slot(block: Block, ty: str, place: str, extra: int) -> str:
     return _from_memory(block, ty, block.gather(element, start, place, mask="%mask"))
 
 
-def _segment(block: Block, ty: str, first: str, end: str, start: str, extra: int) -> str:
-    """Add a segment of row ``extra`` of the slots to ``start``, see :mod:`torchpt.compiler.segments`."""
-    row = block.at("%slots", "float", block.op(f"mul i64 %stride, {extra}"))
+def _segment(block: Block, ty: str, first: str, end: str, start: str) -> str:
+    """Add a segment of the slots to ``start``, see :mod:`torchpt.compiler.segments`."""
     real = ELEMENTS[ty]
-    return block.op(f"call {real} @segment_{ty}(ptr {row}, i32 {first}, i32 {end}, {real} {start})")
+    return block.op(f"call {real} @segment_{ty}(ptr %slots, i32 {first}, i32 {end}, {real} {start})")
 
 
 def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:

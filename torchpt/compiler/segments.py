@@ -1,8 +1,8 @@
 """Sums of segments of a row, one term after the other, as LLVM IR: functions that kernels of single lanes call.
 
 A *segment* is what lies from one element of a row to another. Its sum is made by one lane, from left to right, so it has the
-same bits on any machine. The rows are those of the *slots*, memory outside of the arenas that several kernels share
-(:mod:`torchpt.compiler.sinks`).
+same bits on any machine. The row is the first of the *slots*, memory outside of the arenas that several kernels
+share (:mod:`torchpt.compiler.sinks`).
 """
 
 from __future__ import annotations
@@ -16,25 +16,23 @@ from torchpt.compiler.sinks import Sinks, Store
 __all__ = ["segment_functions", "segment_sums"]
 
 #: Terms whose loads overlap.
-UNROLLED = 8
+UNROLLED = 16
 
 
-def segment_sums(rows: int, ty: str) -> TracedStage:
-    """Return the stage that adds segments of rows of the slots, the same segment of each row in a lane.
+def segment_sums(ty: str) -> TracedStage:
+    """Return the stage that adds segments of the first row of the slots, one in a lane.
 
-    Its inputs are the tensors first ``(n,)`` and end ``(n,)``, int32, and start ``(rows, n)`` of the result's type. Its result
-    ``(rows, n)`` is ``start[r] + slots[r, first] + ... + slots[r, end - 1]``, added from left to right; for an empty segment,
-    ``end <= first``, it is ``start[r]``.
+    Its inputs are the tensors first and end, int32, and start of the result's type, ``(n,)`` each. Its result ``(n,)`` is
+    ``start + slots[first] + ... + slots[end - 1]``, added from left to right; for an empty segment, ``end <= first``, it is
+    ``start``.
 
     Args:
-        rows: number of rows, of float32.
-        ty: node type of the result, ``f`` or ``d``, in which terms are added.
+        ty: node type of the result, ``f`` or ``d``, in which terms are added; the slots are float32.
     """
     graph = Graph()
     first, end = (graph.node("tensor", "i", extra=(number, 0)) for number in range(2))
-    starts = [graph.node("tensor", ty, extra=(2, row)) for row in range(rows)]
-    sums = [graph.node("segment", ty, first, end, start, extra=row) for row, start in enumerate(starts)]
-    return TracedStage(graph, Sinks(store=[Store(tuple(sums), ty)]), tensors=3)
+    total = graph.node("segment", ty, first, end, graph.node("tensor", ty, extra=(2, 0)))
+    return TracedStage(graph, Sinks(store=[Store((total,), ty)]), tensors=3)
 
 
 def segment_functions(graph: Graph, needed: list[int], form: Form) -> Block:

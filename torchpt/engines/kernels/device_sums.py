@@ -153,6 +153,10 @@ class Terms:
 # ---- Sums
 
 
+#: Most terms that a launch adds: indices are 32-bit.
+_MOST_TERMS = (1 << 31) - 1
+
+
 class SegmentSums:
     """Adds terms to the rows of a table on a device.
 
@@ -163,7 +167,7 @@ class SegmentSums:
 
     def __init__(self, cuda: Cuda, target: Target) -> None:
         self._cuda, self._target = cuda, target
-        self._functions: dict[tuple[int, torch.dtype], Function] = {}  # by number of rows and type of the sums
+        self._functions: dict[torch.dtype, Function] = {}  # by type of the sums
         self._lanes: dict[int, Tensor] = {}  # numbers of lanes, on the device
 
     def add(self, total: Tensor, order: Order, values: Tensor) -> None:
@@ -179,22 +183,25 @@ class SegmentSums:
         total.copy_(found.T)
 
     def _launch(self, found: Tensor, order: Order, values: Tensor) -> None:
-        """Add terms to sums ``found (R, M)``, which are contiguous."""
-        rows, entries = found.shape
-        function = self._functions.get((rows, found.dtype))
+        """Add terms to sums ``found (R, M)``, which are contiguous; a thread adds one number."""
+        function = self._functions.get(found.dtype)
         if function is None:
-            stage = segment_sums(rows, "d" if found.dtype == torch.float64 else "f")
+            stage = segment_sums("d" if found.dtype == torch.float64 else "f")
             code = cache.compile_stage(stage, self._target).function
-            function = self._functions[rows, found.dtype] = self._cuda.load(code.code, code.key)
-        tensors = [(x.data_ptr(), entries) for x in (order.first, order.end, found)]
-        sorted_values = values.index_select(1, order.terms)
-        words = (ctypes.c_int64 * (len(HEAD) + 2 * (len(tensors) + 1)))()
-        words[WORD["slots"]], words[WORD["stride"]] = sorted_values.data_ptr(), sorted_values.shape[1]
-        words[len(HEAD) :] = [word for pair in (*tensors, tensors[-1]) for word in pair]
-        if entries not in self._lanes:
-            self._lanes[entries] = torch.full((1,), entries, dtype=torch.int64, device=found.device)
-        self._cuda.enter()
-        self._cuda.launch(function, words, self._lanes[entries].data_ptr(), entries, self._cuda.stream())
+            function = self._functions[found.dtype] = self._cuda.load(code.code, code.key)
+        terms = values.index_select(1, order.terms)
+        rows = min(len(found), _MOST_TERMS // terms.shape[1])
+        starts = torch.arange(rows, dtype=torch.int32, device=found.device)[:, None] * terms.shape[1]
+        first, end = starts + order.first, starts + order.end
+        for row in range(0, len(found), rows):
+            part, count = found[row : row + rows], found[row : row + rows].numel()
+            words = (ctypes.c_int64 * (len(HEAD) + 2 * 4))()
+            words[WORD["slots"]] = terms[row:].data_ptr()
+            words[len(HEAD) :] = [word for x in (first, end, part, part) for word in (x.data_ptr(), count)]
+            if count not in self._lanes:
+                self._lanes[count] = torch.full((1,), count, dtype=torch.int64, device=found.device)
+            self._cuda.enter()
+            self._cuda.launch(function, words, self._lanes[count].data_ptr(), count, self._cuda.stream())
 
     def by_columns(self, order: Order, values: Tensor) -> Tensor:
         """Return the sums ``(M, R)`` float64 of terms, added by column first, see :mod:`torchpt.math.sums`.
