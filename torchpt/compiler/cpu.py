@@ -6,7 +6,6 @@ Code is cached in memory and on disk; its key is a hash of the IR, the target an
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import threading
 from dataclasses import dataclass
 from typing import Any
@@ -65,7 +64,7 @@ def compile_ir(ir: str, target: Target | None = None) -> Function:
     """Return the function ``kernel`` of an LLVM module from memory, from disk, or compiled now for the target."""
     with _lock:
         target = target or host()
-        key = _key(ir, target)
+        key = cache.digest(_identity(target), ir)
         function = _functions.get(key)
         if function is None:
             code = cache.read(_entry(key, target))
@@ -100,17 +99,13 @@ def identity(target: Target | None = None) -> str:
 
 def _entry(key: str, target: Target) -> str:
     """Return the name of the entry on disk."""
-    return f"{key[: cache.KEY_DIGITS]}.{'ptx' if target.form.threads else 'o'}"
+    return f"{key}.{'ptx' if target.form.threads else 'o'}"
 
 
 def _identity(target: Target) -> str:
     import llvmlite
 
     return "\n".join((_VERSION, llvmlite.__version__, repr(target)))
-
-
-def _key(ir: str, target: Target) -> str:
-    return hashlib.sha256(f"{_identity(target)}\n{ir}".encode()).hexdigest()
 
 
 def _machine(target: Target) -> Any:
