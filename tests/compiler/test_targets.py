@@ -14,6 +14,7 @@ from torch import Tensor
 from torchpt.compiler import cpu as engine
 from torchpt.compiler.function import compile_lanewise
 from torchpt.compiler.target import Target
+from torchpt.native import machine
 
 X86 = platform.machine().lower() in ("x86_64", "amd64")
 N = 333
@@ -94,7 +95,7 @@ def test_older_machines_have_no_newer_vectors():
     ir += "  %y = fadd <16 x float> %x, %x\n  store <16 x float> %y, ptr %a, align 4\n  ret void\n}\n"
     module = llvm.parse_assembly(ir)
     for cpu, registers in (("nehalem", "xmm"), ("haswell", "ymm"), ("skylake-avx512", None)):
-        text = engine._new_machine(Target(cpu, "")).emit_assembly(module)
+        text = machine.new_machine(cpu).emit_assembly(module)
         assert ("zmm" in text) == (cpu == "skylake-avx512")
         assert registers is None or registers in text
         assert ("ymm" in text) == (cpu == "haswell")

@@ -10,6 +10,7 @@ import pytest
 import torch
 from few import few
 from mirrored import Mirrored
+from scene_makers import lit_floor, turned
 from torch import Tensor
 
 import torchpt
@@ -56,29 +57,10 @@ def assert_same(a: Rendering, b: Rendering) -> None:
 
 def box(**more: Any) -> dict[str, Any]:
     """A floor, a ball and a lamp."""
-    down = {"rotate": {"axis": [1, 0, 0], "angle": 90}}
-    up = {"rotate": {"axis": [1, 0, 0], "angle": -90}}
-    return {
-        "camera": {"type": "perspective", "origin": [0, 1.2, 4], "target": [0, 0.6, 0], "fov": 40},
-        "materials": {
-            "grey": {"type": "diffuse", "reflectance": 0.6},
-            "film": {"type": "diffuse", "reflectance": [0.7, 0.4, 0.3], "opacity": 0.4},
-            "lamp": {"type": "diffuse", "reflectance": 0.0, "emission": 9.0},
-        },
-        "shapes": {
-            "floor": {"type": "rectangle", "material": "grey", "transform": [{"scale": 2}, up]},
-            "ball": {"type": "sphere", "material": "grey", "center": [0, 0.4, 0], "radius": 0.4},
-            "light": {
-                "type": "rectangle",
-                "material": "lamp",
-                "transform": [{"scale": 0.4}, down, {"translate": [0, 2, 0]}],
-            },
-            **more,
-        },
-    }
+    return lit_floor(ball={"type": "sphere", "material": "grey", "center": [0, 0.4, 0], "radius": 0.4}, **more)
 
 
-PANE = {"pane": {"type": "rectangle", "material": "film", "transform": [{"scale": 0.7}, {"translate": [0, 0.6, 1]}]}}
+PANE = {"pane": turned("film", 0.0, 0.7, [0, 0.6, 1])}
 
 
 @pytest.mark.parametrize("name", few(SCENES, 1))

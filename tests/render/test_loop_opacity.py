@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from few import few
+from scene_makers import lit_floor, turned
 from trials import film_of
 
 import torchpt
@@ -17,44 +18,19 @@ from torchpt.scene.formats.description import settings
 MESH = str(Path(__file__).parents[2] / "scenes" / "standin.ply")
 
 
-def flat(material: str, angle: float, size: float, at: list[float]) -> dict[str, Any]:
-    """A square turned about x."""
-    turn = {"rotate": {"axis": [1, 0, 0], "angle": angle}}
-    return {"type": "rectangle", "material": material, "transform": [{"scale": size}, turn, {"translate": at}]}
-
-
 def description(copies: bool) -> dict[str, Any]:
     shapes: dict[str, Any] = {
-        "floor": flat("grey", -90.0, 2.0, [0, 0, 0]),
-        "lamp": flat("lamp", 90.0, 0.4, [0, 2, 0]),
-        "pane": flat("film", 90.0, 0.7, [0, 0.9, 0]),
+        "pane": turned("film", 90.0, 0.7, [0, 0.9, 0]),
         "tube": {"type": "cylinder", "material": "film", "center": [0.5, 0.4, 0.3], "radius": 0.2, "height": 0.6},
         "ball": {"type": "sphere", "material": "grey", "center": [-0.5, 0.3, 0.2], "radius": 0.3},
     }
     if copies:
+        at, there = [{"scale": 3}, {"translate": [-0.3, 0, -0.4]}], [{"translate": [0.2, 0.5, -0.5]}]
         shapes |= {
-            "block": {
-                "type": "mesh",
-                "path": MESH,
-                "material": "film",
-                "transform": [{"scale": 3}, {"translate": [-0.3, 0, -0.4]}],
-            },
-            "there": {
-                "type": "instance",
-                "of": "block",
-                "material": "film",
-                "transform": [{"translate": [0.2, 0.5, -0.5]}],
-            },
+            "block": {"type": "mesh", "path": MESH, "material": "film", "transform": at},
+            "there": {"type": "instance", "of": "block", "material": "film", "transform": there},
         }
-    return {
-        "camera": {"type": "perspective", "origin": [0, 1.2, 4], "target": [0, 0.6, 0], "fov": 40},
-        "materials": {
-            "grey": {"type": "diffuse", "reflectance": 0.6},
-            "film": {"type": "diffuse", "reflectance": [0.7, 0.4, 0.3], "opacity": 0.4},
-            "lamp": {"type": "diffuse", "reflectance": 0.0, "emission": 9.0},
-        },
-        "shapes": shapes,
-    }
+    return lit_floor(**shapes)
 
 
 @pytest.mark.parametrize(

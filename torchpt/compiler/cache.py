@@ -7,7 +7,6 @@ values that are not tensors.
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 import threading
 from collections.abc import Callable, Mapping
@@ -53,10 +52,9 @@ def cache_key(structure: Any, target: Target | None = None) -> str | None:
     None if the structure holds objects that exist in this process alone.
     """
     try:
-        content = "\n".join((code_of_folder(), torch.__version__, cpu.identity(target), _canonical(structure)))
+        return cache.digest(code_of_folder(), torch.__version__, cpu.identity(target), _canonical(structure))
     except _NotStorable:
         return None
-    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def _canonical(value: Any) -> str:
@@ -74,7 +72,7 @@ def _canonical(value: Any) -> str:
 
 def load(key: str, target: Target | None = None) -> Program | None:
     """Load a program for a target (None: this machine) from disk; None if there is no usable entry."""
-    content = cache.read(f"{key[: cache.KEY_DIGITS]}.json")
+    content = cache.read(f"{key}.json")
     if content is None:
         return None
     entry = json.loads(content)
@@ -104,7 +102,7 @@ def store(key: str, program: Program) -> None:
         }
     except _NotStorable:
         return
-    cache.write(f"{key[: cache.KEY_DIGITS]}.json", json.dumps(entry).encode())
+    cache.write(f"{key}.json", json.dumps(entry).encode())
 
 
 def _tuple_if_list(value: Any) -> Any:

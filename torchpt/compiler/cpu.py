@@ -6,12 +6,10 @@ Code is cached in memory and on disk; its key is a hash of the IR, the target an
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import threading
 from dataclasses import dataclass
 from typing import Any
 
-from torchpt.compiler.ptx import emit_ptx
 from torchpt.compiler.target import Target
 from torchpt.core.memory import check_address_space
 from torchpt.native import cache, machine
@@ -66,13 +64,13 @@ def compile_ir(ir: str, target: Target | None = None) -> Function:
     """Return the function ``kernel`` of an LLVM module from memory, from disk, or compiled now for the target."""
     with _lock:
         target = target or host()
-        key = _key(ir, target)
+        key = cache.digest(_identity(target), ir)
         function = _functions.get(key)
         if function is None:
             code = cache.read(_entry(key, target))
             check_address_space()  # LLVM ends the process if it gets no memory
             if code is None:
-                code = emit_ptx(machine.llvm(), ir, target) if target.form.threads else _object(ir, target)
+                code = _code(ir, target)
                 _state["compiled"] += 1
                 cache.write(_entry(key, target), code)
             else:
@@ -101,7 +99,7 @@ def identity(target: Target | None = None) -> str:
 
 def _entry(key: str, target: Target) -> str:
     """Return the name of the entry on disk."""
-    return f"{key[: cache.KEY_DIGITS]}.{'ptx' if target.form.threads else 'o'}"
+    return f"{key}.{'ptx' if target.form.threads else 'o'}"
 
 
 def _identity(target: Target) -> str:
@@ -110,43 +108,31 @@ def _identity(target: Target) -> str:
     return "\n".join((_VERSION, llvmlite.__version__, repr(target)))
 
 
-def _key(ir: str, target: Target) -> str:
-    return hashlib.sha256(f"{_identity(target)}\n{ir}".encode()).hexdigest()
-
-
 def _machine(target: Target) -> Any:
     if target not in _machines:
-        _machines[target] = _new_machine(target)
+        opt = 3 if target.form.threads else 2
+        _machines[target] = machine.new_machine(target.cpu, target.features, target.triple, opt)
     return _machines[target]
 
 
-def _new_machine(target: Target) -> Any:
-    """Return LLVM's target machine; ``jit`` suits code that is loaded into this process, so it is for this machine only."""
-    llvm = machine.llvm()
-    if target.triple is not None:
-        llvm.initialize_all_targets()
-        llvm.initialize_all_asmprinters()
-    kind = llvm.Target.from_default_triple() if target.triple is None else llvm.Target.from_triple(target.triple)
-    options = {"jit": True} if target.triple is None else {}
-    return kind.create_target_machine(cpu=target.cpu, features=target.features, opt=2, **options)
-
-
-def _object(ir: str, target: Target) -> bytes:
-    """Compile IR to an object file."""
-    llvm, target_machine = machine.llvm(), _machine(target)
-    module = llvm.parse_assembly(ir)
-    module.triple = target.triple or llvm.get_default_triple()
-    module.data_layout = str(target_machine.target_data)
-    module.verify()
+def _code(ir: str, target: Target) -> bytes:
+    """Compile IR to an object file, or for threads to the text of PTX."""
+    llvm, target_machine, threads = machine.llvm(), _machine(target), target.form.threads
+    module = machine.parse(ir, target_machine)
     # The IR is already vectorized and its constants are folded: LLVM's standard pipelines take three times as long as these
-    # passes, and the code is no faster.
+    # passes, and the code is no faster; kernels of GPUs then need more registers.
     passes = llvm.create_new_module_pass_manager()
+    if threads:
+        passes.add_always_inliner_pass()
+        passes.add_sroa_pass()
     passes.add_simplify_cfg_pass()
     passes.add_instruction_combine_pass()
     passes.add_new_gvn_pass()
     passes.add_aggressive_dce_pass()
+    if threads:  # definitions of functions that were inlined
+        passes.add_global_dead_code_eliminate_pass()
     passes.run(module, llvm.create_pass_builder(target_machine, llvm.create_pipeline_tuning_options()))
-    return target_machine.emit_object(module)
+    return target_machine.emit_assembly(module).encode() if threads else target_machine.emit_object(module)
 
 
 def _loaded(code: bytes, target: Target, key: str) -> Function:

@@ -108,10 +108,6 @@ class SinkWriter(ABC):
         """Return the address of a row of the target arena."""
         return self.block.at("%dst", "i8", 4 * self.block.form.row * row) if row else "%dst"
 
-    def _row(self, row: int, element: str, place: str) -> str:
-        """Return the address of index ``place`` in a row of the target arena."""
-        return self.block.at(self._start(row), element, place)
-
     def _scatter(self, scatter: Scatter) -> None:
         block = self.block
         mask = "%mask" if scatter.mask < 0 else self._masked(scatter.mask)
@@ -175,6 +171,10 @@ class _VectorSinks(SinkWriter):
         for row, node in self.sinks.write:
             element, value = self._stored_value(node)
             self._put(element, value, self._row(row, element, place))
+
+    def _row(self, row: int, element: str, place: str) -> str:
+        """Return the address of index ``place`` in a row of the target arena."""
+        return self.block.at(self._start(row), element, place)
 
     def _put(self, element: str, value: str, pointer: str) -> None:
         self.block.do(f"store {self.block.each(element)} {value}, ptr {pointer}, align 4")
@@ -276,36 +276,34 @@ class _LaneSinks(SinkWriter):
         return self.block.op(f"call i64 @take(ptr {self.block.at('%counters', 'i64', counter)}, i1 {mask})")
 
     def _write(self, place: str) -> None:
-        self._put(self.sinks.write, place, "%mask")
+        self._put(self._rows(self.sinks.write), place, "%mask")
 
-    def _put(self, rows: Sequence[tuple[int, int]], place: str, mask: str) -> None:
-        stored = [(row, *self._stored_value(node)) for row, node in rows]
+    def _rows(self, rows: Sequence[tuple[int, int]]) -> list[tuple[str, str, str]]:
+        """Return the stores to rows of the target arena, as for :meth:`_put_scattered`."""
+        return [(*self._stored_value(node), self._start(row)) for row, node in rows]
+
+    def _put(self, stores: Sequence[tuple[str, str, str]], place: str, mask: str) -> None:
+        """Store at index ``place`` (an i64, or an i32 with its type) where the mask is set."""
         with self.block.when(mask):
-            for row, element, value in stored:
-                self.block.do(f"store {element} {value}, ptr {self._row(row, element, place)}")
+            for element, value, start in stores:
+                self.block.do(f"store {element} {value}, ptr {self.block.at(start, element, place)}")
 
     def _put_scattered(self, stores: Sequence[tuple[str, str, str]], place: str, mask: str) -> None:
-        with self.block.when(mask):
-            for element, value, start in stores:
-                self.block.do(f"store {element} {value}, ptr {self.block.at(start, element, f'i32 {place}')}")
+        self._put(stores, f"i32 {place}", mask)
 
     def _put_lanes(self, stores: Sequence[tuple[str, str, str]]) -> None:
-        with self.block.when("%mask"):
-            for element, value, start in stores:
-                self.block.do(f"store {element} {value}, ptr {self.block.at(start, element, '%i')}")
+        self._put(stores, "%i", "%mask")
 
     def _compact(self, compact: Compact) -> None:
         mask = self._masked(compact.mask)
         place = self._take(compact.counter, mask)
-        self._put(compact.rows, place, mask)
+        self._put(self._rows(compact.rows), place, mask)
         for append in compact.appends:
             both = self.block.op(f"and i1 {self.names[append.mask]}, {mask}")
             self._append_index(append, both, self.block.places(place))
 
     def _append_index(self, append: AppendIndex, mask: str, places: str) -> None:
-        end = self._take(append.counter, mask)
-        with self.block.when(mask):
-            self.block.do(f"store i32 {places}, ptr {self.block.at(f'%list{append.list}', 'i32', end)}")
+        self._put([("i32", places, f"%list{append.list}")], self._take(append.counter, mask), mask)
 
 
 def sink_writer(block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> SinkWriter:

@@ -19,21 +19,26 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-__all__ = ["KEY_DIGITS", "cache_folder", "read", "write"]
+__all__ = ["cache_folder", "digest", "read", "write"]
 
 #: Largest size of the folder in bytes (512 MiB). Beyond it the least recently used entries are removed until half is left.
 MOST = 1 << 29
 #: Seconds after which the time of use of an entry is updated, and an unfinished entry counts as abandoned.
 DAY = 86_400.0
 #: Hexadecimal digits of a SHA-256 that name an entry.
-KEY_DIGITS = 40
+_KEY_DIGITS = 40
 #: Bytes of the checksum before the content of an entry: a SHA-256.
 _CHECKSUM_BYTES = 32
 #: Prefix of the names of entries that are being written.
 _UNFINISHED = "unfinished-"
 #: Names of files that this module may remove, since the folder may hold other files, such as the results of
 #: device checks, which are few and stay. Earlier versions wrote ``.nbc``.
-_OURS = re.compile(rf"[0-9a-f]{{{KEY_DIGITS}}}\.(o|json|nbc|ptx)|{_UNFINISHED}.*")
+_OURS = re.compile(rf"[0-9a-f]{{{_KEY_DIGITS}}}\.(o|json|nbc|ptx)|{_UNFINISHED}.*")
+
+
+def digest(*texts: str) -> str:
+    """Return the digest of some texts that names an entry."""
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:_KEY_DIGITS]
 
 
 def cache_folder() -> Path | None:

@@ -7,7 +7,6 @@ package makes them stale, an edit of text does not.
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 import os
 from collections.abc import Iterator
@@ -22,17 +21,13 @@ __all__ = ["code_of_folder"]
 _PACKAGE = Path(__file__).parent.parent
 
 
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 @functools.cache
 def code_of_folder(folder: Path = _PACKAGE) -> str:
     """Return a digest of the code of all modules below a folder, by default of the whole package.
 
     The digest of each file is kept on disk. A file is read again only if its size or time has changed.
     """
-    name = _digest(str(folder))[: cache.KEY_DIGITS] + ".json"
+    name = cache.digest(str(folder)) + ".json"
     # by path relative to the folder: [size in bytes, time of change in nanoseconds, digest]
     on_disk: dict[str, list[Any]] = json.loads(cache.read(name) or b"{}")
     present: dict[str, list[Any]] = {}
@@ -42,7 +37,7 @@ def code_of_folder(folder: Path = _PACKAGE) -> str:
         present[key] = entry if entry is not None and entry[:2] == state else [*state, _digest_of_file(path)]
     if present != on_disk:
         cache.write(name, json.dumps(present).encode())
-    return _digest(repr(sorted((key, digest) for key, (_, _, digest) in present.items())))
+    return cache.digest(repr(sorted((key, digest) for key, (_, _, digest) in present.items())))
 
 
 def _modules(folder: str) -> Iterator[tuple[str, os.stat_result]]:
@@ -57,7 +52,7 @@ def _modules(folder: str) -> Iterator[tuple[str, os.stat_result]]:
 
 def _digest_of_file(path: str) -> str:
     # optimize=2 removes docstrings and asserts
-    return _digest(repr(_content(compile(Path(path).read_bytes(), "", "exec", dont_inherit=True, optimize=2))))
+    return cache.digest(repr(_content(compile(Path(path).read_bytes(), "", "exec", dont_inherit=True, optimize=2))))
 
 
 def _content(code: CodeType) -> tuple[Any, ...]:

@@ -8,12 +8,12 @@ card and driver: a new driver compiles kernels anew, so the card is checked anew
 from __future__ import annotations
 
 import ctypes
-import hashlib
+import functools
 import json
 import sys
 import warnings
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -21,9 +21,11 @@ from torchpt.core.version import __version__
 from torchpt.native import cache
 
 __all__ = [
+    "DRIVER_FILES",
     "CheckResult",
     "card_name",
     "cuda_of_driver",
+    "driver_library",
     "driver_too_old",
     "driver_version",
     "last_check",
@@ -32,6 +34,8 @@ __all__ = [
     "why_unavailable",
 ]
 
+#: File names of the driver's library, by platform.
+DRIVER_FILES = {"linux": ("libcuda.so.1", "libcuda.so"), "win32": ("nvcuda.dll",)}
 #: Bytes of NVML's version text; NVML writes at most 80 (NVML_SYSTEM_DRIVER_VERSION_BUFFER_SIZE).
 _VERSION_BYTES = 96
 
@@ -76,14 +80,21 @@ def driver_version() -> str:
     return f"CUDA {version[0]}.{version[1]}" if version else ""
 
 
+@functools.cache
+def driver_library() -> Any | None:
+    """Return the library of the CUDA driver; None if there is none."""
+    for name in DRIVER_FILES.get(sys.platform, ()):
+        with suppress(OSError):
+            return ctypes.CDLL(name)
+    return None
+
+
 def cuda_of_driver() -> tuple[int, int] | None:
     """Return the newest version of CUDA that the driver supports, such as ``(12, 4)``; None if there is no driver."""
-    number = ctypes.c_int(0)  # 1000 major + 10 minor
-    with suppress(OSError, AttributeError):
-        driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-        if driver.cuDriverGetVersion(ctypes.byref(number)) == 0 and number.value:
-            return number.value // 1000, number.value % 1000 // 10
-    return None
+    driver, number = driver_library(), ctypes.c_int(0)  # 1000 major + 10 minor
+    if driver is None or driver.cuDriverGetVersion(ctypes.byref(number)) or not number.value:
+        return None
+    return number.value // 1000, number.value % 1000 // 10
 
 
 def why_unavailable() -> str | None:
@@ -118,7 +129,7 @@ def driver_too_old() -> bool:
 
 def _entry(card: str, driver: str) -> str:
     """Return the name of the cache entry that holds the result for a card and a driver."""
-    return f"cuda-check-{hashlib.sha256(json.dumps([card, driver]).encode()).hexdigest()[:32]}.json"
+    return f"cuda-check-{cache.digest(json.dumps([card, driver]))}.json"
 
 
 def record(result: CheckResult) -> None:

@@ -11,7 +11,6 @@ Kernels run without the GIL. They allocate no memory and raise nothing.
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import lzma
 import os
 import re
@@ -152,11 +151,11 @@ def read_module(module: str) -> str:
 
 def _load(module: str) -> dict[str, Kernel]:
     ir = read_module(module)
-    key = hashlib.sha256(f"{machine.identity()}\n{ir}".encode()).hexdigest()[: cache.KEY_DIGITS]
-    code = cache.read(f"{key}.o")
+    entry = f"{cache.digest(machine.identity(), ir)}.o"
+    code = cache.read(entry)
     if code is None:
         code = machine.object_code(ir)
-        cache.write(f"{key}.o", code)
+        cache.write(entry, code)
     engine, address_of_function = machine.load_object(code)
     head = ir.partition("\ndefine ")[0]  # all before the first function
     return {

@@ -39,13 +39,22 @@ def identity() -> str:
     return "\n".join((llvmlite.__version__, *host()))
 
 
-def new_machine() -> Any:
-    """Return a target machine of LLVM for this CPU, for code that is loaded into this process (``jit``).
+def new_machine(cpu: str = "", features: str = "", triple: str | None = None, opt: int = 2) -> Any:
+    """Return a target machine of LLVM.
 
-    ``opt=2`` is LLVM's default level of code generation: it selects instructions and registers, and runs no passes on the IR.
+    Args:
+        cpu: LLVM's name of the processor; empty: that and the features of this CPU.
+        features: LLVM's list of processor features.
+        triple: of another machine; None: this one, for code that is loaded into this process (``jit``).
+        opt: level of code generation, by default LLVM's: it selects instructions and registers, and runs no passes on the IR.
     """
-    cpu, features = host()
-    return llvm().Target.from_default_triple().create_target_machine(cpu=cpu, features=features, opt=2, jit=True)
+    if triple is not None:
+        llvm().initialize_all_targets()
+        llvm().initialize_all_asmprinters()
+    if not cpu:
+        cpu, features = host()
+    kind = llvm().Target.from_default_triple() if triple is None else llvm().Target.from_triple(triple)
+    return kind.create_target_machine(cpu=cpu, features=features, opt=opt, jit=triple is None)
 
 
 def object_code(ir: str) -> bytes:
@@ -61,9 +70,9 @@ def object_code(ir: str) -> bytes:
 
 def parse(ir: str, machine: Any) -> Any:
     """Parse IR as :func:`object_code` takes it; return the verified module, with triple and data layout of a target machine."""
-    module = llvm().parse_assembly(ir)
-    module.triple = llvm().get_default_triple()
-    module.data_layout = str(machine.target_data)
+    # The layout comes before the instructions: LLVM gives loads and stores their alignment as it reads them.
+    head = f'target datalayout = "{machine.target_data}"\ntarget triple = "{machine.triple}"\n'
+    module = llvm().parse_assembly(head + ir)
     module.verify()
     return module
 

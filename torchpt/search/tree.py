@@ -163,40 +163,30 @@ class WideBvh(Accel):
         t, u, v = torch.empty_like(t_max), torch.empty_like(t_max), torch.empty_like(t_max)
         prim = torch.empty_like(t_max, dtype=torch.int32)
         rays = (x.contiguous().numpy() for x in (o, d, t_max))
-        threads = thread_count(self.threads)
-        self._nearest(t_max.shape[0], threads, *rays, *(x.numpy() for x in (t, prim, u, v)))
+        self._run("nearest", t_max.shape[0], thread_count(self.threads), *rays, *(x.numpy() for x in (t, prim, u, v)))
         return t, prim, u, v
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
         out = torch.empty_like(t_max, dtype=torch.int32)
-        origins, directions, ends = (x.contiguous().numpy() for x in (o, d, t_max))
-        threads = thread_count(self.threads)
-        self._blocked(t_max.shape[0], threads, origins, directions, ends, _ALL_OPAQUE, out.numpy())
+        rays, results = (x.contiguous().numpy() for x in (o, d, t_max)), (_ALL_OPAQUE, 0, out.numpy())
+        self._run("occluded", t_max.shape[0], thread_count(self.threads), *rays, *results)
         return out != 0
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
-        self._nearest(count, 1, o, d, t_max, t, prim, u, v)
+        self._run("nearest", count, 1, o, d, t_max, t, prim, u, v)
 
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
     ) -> None:
         """See :meth:`Accel.blocked`."""
-        self._blocked(count, 1, o, d, t_max, _ALL_OPAQUE if non_opaque is None else non_opaque, out)
+        flags = _ALL_OPAQUE if non_opaque is None else non_opaque
+        self._run("occluded", count, 1, o, d, t_max, flags, len(flags), out)
 
-    def _nearest(self, count: int, threads: int, o: Array, d: Array, t_max: Array, *hits: Array) -> None:
-        capacity = d.shape[1]  # the arrays may be longer than the number of rays
-        args = (o, d, t_max, capacity, self.words, *hits)
-        run_parallel(kernel("tree_nearest", "nearest"), count, threads, _GRAIN, packet_memory(self.stack_length), args)
-
-    def _blocked(
-        self, count: int, threads: int, o: Array, d: Array, t_max: Array, non_opaque: Array, out: Array
-    ) -> None:
-        capacity = d.shape[1]
-        args = (o, d, t_max, capacity, self.words, non_opaque, len(non_opaque), out)
-        run_parallel(
-            kernel("tree_occluded", "occluded"), count, threads, _GRAIN, packet_memory(self.stack_length), args
-        )
+    def _run(self, name: str, count: int, threads: int, o: Array, d: Array, t_max: Array, *results: Any) -> None:
+        """Search with the kernel ``name``; the arrays may be longer than the number of rays."""
+        args = (o, d, t_max, d.shape[1], self.words, *results)
+        run_parallel(kernel(f"tree_{name}", name), count, threads, _GRAIN, packet_memory(self.stack_length), args)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`.

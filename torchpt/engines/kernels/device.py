@@ -15,13 +15,12 @@ kernels do not know (instances), run as tensor operations between kernels; they 
 
 from __future__ import annotations
 
-import ctypes
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -36,8 +35,17 @@ from torchpt.compiler.sinks import Sinks
 from torchpt.compiler.target import Target
 from torchpt.core.memory import Budget, Span, explain_out_of_memory, fits_in_memory
 from torchpt.core.tree import moved
-from torchpt.engines.kernels.driver import Cuda, Function, HostCopy, cuda_of
-from torchpt.engines.kernels.engine import Chunk, ChunkSearch, KernelsEngine, LaneCount, Paths
+from torchpt.engines.kernels.driver import Cuda, HostCopy, cuda_of
+from torchpt.engines.kernels.engine import (
+    Arguments,
+    Chunk,
+    ChunkSearch,
+    KernelsEngine,
+    LaneCount,
+    Paths,
+    count_samples,
+    film_words,
+)
 from torchpt.engines.kernels.layout import HIT, Layout, Rows
 from torchpt.engines.kernels.programs import Kernel, Kernels, NamedTensors, probed_kernels, records_of, trace_stage
 from torchpt.engines.kernels.stages import CHUNK_FIELDS
@@ -46,7 +54,6 @@ from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.walk import Counts, walk
 from torchpt.paths.wave import PixelSet, RayCounts, Wave, clamp_scale
 from torchpt.physics.film import Film
-from torchpt.physics.film.splats import LARGEST, Splats
 from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search import Accel, brute_if_fastest
@@ -331,22 +338,6 @@ class LateCheck:
         return False
 
 
-class _Arguments(NamedTuple):
-    """The arguments of a kernel.
-
-    Attributes:
-        words: the argument block, a ctypes array of int64.
-        function: the kernel on the device.
-        uniforms: index of the word of each uniform, and its name.
-        lists: indices of the words of the lists.
-    """
-
-    words: Any
-    function: Function
-    uniforms: tuple[tuple[int, str], ...]
-    lists: range
-
-
 class DeviceCalls:
     """Launches kernels on a device; as :class:`torchpt.engines.kernels.engine.Calls`.
 
@@ -371,8 +362,7 @@ class DeviceCalls:
         self._max_lanes = 0  # lanes of the wave
         self._stream = 0
         self._look = LateCheck(self.cuda)
-        #: By id of a kernel: the kernel, which keeps the id from being reused, and what :meth:`_arguments` returns.
-        self._prepared: dict[int, tuple[Kernel, _Arguments]] = {}
+        self._prepared: dict[int, Arguments] = {}  # by id of the kernel, which they refer to
         self._salts: dict[tuple[int, int], Tensor] = {}
         self._uniforms = {"place": self.place.data_ptr()}
 
@@ -461,38 +451,19 @@ class DeviceCalls:
         slots: Any = None,
     ) -> None:
         """Launch a kernel, see :meth:`torchpt.engines.kernels.engine.Calls.run`."""
-        known = self._prepared.get(id(kernel))
-        if known is None:
-            known = self._prepared[id(kernel)] = kernel, self._arguments(kernel)
-        words, function, uniforms, list_words = known[1]
-        words[0], words[1] = source.address, target.address
-        if places is not None:
-            words[2] = places.address
-        words[3] = self.slots.address if slots is None else slots.address
-        words[WORD["counters"]] = self._counters
-        for place, name in uniforms:
-            words[place] = self._uniforms[name]
-        if lists is not None:
-            for place, memory in zip(list_words, lists, strict=False):
-                words[place] = memory.address
-        self.cuda.launch(function, words, count.address, self._max_lanes, self._stream)
+        arguments = self._prepared.get(id(kernel))
+        if arguments is None:
+            arguments = self._prepared[id(kernel)] = self._arguments(kernel)
+        arguments.set(source, target, places, slots or self.slots, self._uniforms, lists)
+        arguments.words[WORD["counters"]] = self._counters
+        self.cuda.launch(arguments.function, arguments.words, count.address, self._max_lanes, self._stream)
 
-    def _arguments(self, kernel: Kernel) -> _Arguments:
-        """Return the arguments of a kernel, with constant words filled in."""
-        words, function, start = self._block(kernel)
-        uniforms = tuple((len(HEAD) + k, name) for k, name in enumerate(kernel.program.uniforms))
-        return _Arguments(words, function, uniforms, range(start, start + kernel.program.lists))
-
-    def _block(self, kernel: Kernel) -> tuple[Any, Function, int]:
-        """Return a new argument block of a kernel, its code on the device, and the index of the word after the uniforms."""
-        program = kernel.program
-        start = len(HEAD) + len(program.uniforms)
-        words = (ctypes.c_int64 * (start + program.lists + 2 * (program.tensors + program.results)))()
-        words[WORD["stride"]] = self._row_length
-        words[WORD["tables"]] = kernel.tables.address
-        if self.kernels.search is not None:
-            words[WORD["search"]] = self.kernels.search.words.data_ptr()
-        return words, self.cuda.load(program.function.code, program.function.key), start
+    def _arguments(self, kernel: Kernel) -> Arguments:
+        """Return new arguments of a kernel, whose code is loaded on the device."""
+        search, code = self.kernels.search, kernel.program.function
+        arguments = Arguments(kernel, self._row_length, 0 if search is None else search.words.data_ptr())
+        arguments.function = self.cuda.load(code.code, code.key)
+        return arguments
 
     # -- adding samples to a film
 
@@ -509,22 +480,16 @@ class DeviceCalls:
             clamped: memory for the clamped samples.
             lost: is increased by the number of samples that are not finite.
         """
-        kernel = self.kernels.accumulate(film.channels, clamp is not None)
-        words, function, start = self._block(kernel)
+        arguments = self._arguments(self.kernels.accumulate(film.channels, clamp is not None))
+        words, first = arguments.words, arguments.tensors
         words[WORD["counters"]] = lost.address
         if clamp is not None:
             limit = torch.full((1,), clamp, dtype=torch.float32, device=self.device)
             words[len(HEAD)] = limit.data_ptr()
-        sums, n, pixels = film.sums, chunk.pixels, film.sums.shape[2]
-        lanes = self.lanes(n)
-        for k in range(chunk.samples):
-            group = (chunk.first_sample + k) % film.randomizations
-            offset = 4 * k * n
-            total = sums.data_ptr() + 8 * (group * film.channels * pixels + chunk.first_pixel)
-            words[start : start + 6] = (address + offset, self._row_length, total, pixels, total, pixels)
-            if clamp is not None:
-                words[start + 6], words[start + 7] = clamped.address + offset, self._row_length
-            self.cuda.launch(function, words, lanes.address, n, self._stream)
+        lanes, written = self.lanes(chunk.pixels), None if clamp is None else clamped.address
+        for tensors in film_words(film, chunk, address, self._row_length, written):
+            words[first:] = tensors
+            self.cuda.launch(arguments.function, words, lanes.address, chunk.pixels, self._stream)
 
 
 # ---- Searches outside of kernels
@@ -617,28 +582,6 @@ class DeviceEngine(KernelsEngine):
             return RayCounts(known.rays + total(rays), known.truncated + total(truncated))
 
         return counted
-
-    def _splat(self, paths: Paths) -> None:
-        """Record splats that arrive, as the engine of threads does; waits for the number of lanes."""
-        arena: Any = paths.arena
-        rows, n = self.kernels.state, self.calls.known(paths.count)
-        splat, shadow = (slice(rows.first(f"{name}_o"), rows.first(f"{name}_radiance")) for name in ("splat", "shadow"))
-        own = arena.words[shadow, :n].clone()  # saved: the search reads the rows of shadow rays
-        arena.words[shadow, :n] = arena.words[splat, :n]
-        self.search.light(arena, paths.count)
-        arena.words[shadow, :n] = own
-        if "transmittance" in rows:
-            transmittance = arena.floats[rows.first("transmittance"), :n]
-        else:
-            transmittance = (arena.words[rows.first("blocked"), :n] == 0).to(torch.float32)
-        arena.floats[rows.first("splat_transmittance"), :n] = transmittance
-        pixel, first = arena.words[rows.first("splat_pixel"), :n].long(), rows.first("splat_radiance")
-        value = arena.floats[first : first + 3, :n] * transmittance
-        comes, finite = (pixel >= 0) & (transmittance != 0), (value.abs() < LARGEST).all(0)
-        lane, on = arena.words[rows.first("lane"), :n].long(), comes & finite
-        self.splats.append(Splats(lane[on], pixel[on], value[:, on]))
-        lost: Any = lane[comes & ~finite]
-        self._lost.append(lost)
 
 
 # ---- The forward engine
@@ -826,7 +769,7 @@ class DeviceForward:
             for film in pixel_set.layers.values():
                 address = shown.address + 4 * self.kernels.row * first
                 calls.accumulate(film, chunk, address, None, None, calls.lanes(0))
-                _count_samples(film, chunk, shown.floats[first : first + film.channels])
+                count_samples(film, chunk, shown.floats[first : first + film.channels])
                 first += film.channels
             copied = self.cuda.to_host(lost.value)
             behind.append(_Launched(chunk, pixel_set, engine.tallies(), copied, calls.slots, light, rays))
@@ -838,7 +781,7 @@ class DeviceForward:
             self._clamped = calls.memory(3)
         calls.accumulate(film, chunk, calls.slots.address, clamp, self._clamped, lost)
         values = calls.slots.floats if clamp is None else self._clamped.floats
-        _count_samples(film, chunk, values)
+        count_samples(film, chunk, values)
         light = None
         if clamp is not None:
             plain = calls.slots.floats[:, :used]
@@ -873,10 +816,3 @@ class DeviceForward:
             radiance = wave.slots.floats[:, :used].view(3, chunk.samples, chunk.pixels)
             result.lost = NonFinite.of(radiance, chunk.first_pixel, chunk.first_sample, self.wave.crop, wave.pixel_set)
         return result
-
-
-def _count_samples(film: Film, chunk: Chunk, values: Tensor) -> None:
-    """Count a chunk's samples in a film, and keep the first sample of each pixel."""
-    film.count_samples(chunk.first_pixel, chunk.pixels, chunk.first_sample, chunk.samples)
-    if chunk.first_sample == 0:
-        film.set_first_samples(values[:, : chunk.pixels], chunk.first_pixel)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import RenderError
+from torchpt.native.device_checks import DRIVER_FILES, driver_library
 
 __all__ = [
     "OLDEST_CAPABILITY",
@@ -29,8 +30,6 @@ __all__ = [
     "missing",
 ]
 
-#: File names of the driver's library, by platform.
-_FILES = {"linux": ("libcuda.so.1", "libcuda.so"), "win32": ("nvcuda.dll",)}
 #: Oldest version of the driver's interface that compiles PTX 7.0, as ``1000 major + 10 minor`` of CUDA: 11.0.
 OLDEST_DRIVER = 11000
 #: Oldest compute capability that the PTX is for (``torchpt.compiler.ptx``).
@@ -47,27 +46,24 @@ _OUT_OF_MEMORY = 2  # CUresult
 
 @functools.cache
 def library() -> Any | None:
-    """Return the driver's library; None if there is none."""
-    for name in _FILES.get(sys.platform, ()):
-        try:
-            found = ctypes.CDLL(name)
-        except OSError:
-            continue
-        pointer, number, unsigned = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint
-        found.cuInit.argtypes = [unsigned]
-        found.cuDriverGetVersion.argtypes = [pointer]
-        found.cuGetErrorName.argtypes = [number, pointer]
-        found.cuDeviceGet.argtypes = [pointer, number]
-        found.cuDeviceGetAttribute.argtypes = [pointer, number, number]
-        found.cuDevicePrimaryCtxRetain.argtypes = [pointer, number]
-        found.cuCtxSetCurrent.argtypes = [pointer]
-        found.cuModuleLoadDataEx.argtypes = [pointer, ctypes.c_char_p, unsigned, pointer, pointer]
-        found.cuModuleGetFunction.argtypes = [pointer, pointer, ctypes.c_char_p]
-        found.cuFuncGetAttribute.argtypes = [pointer, number, pointer]
-        found.cuOccupancyMaxActiveBlocksPerMultiprocessor.argtypes = [pointer, pointer, number, ctypes.c_size_t]
-        found.cuLaunchKernel.argtypes = [pointer, *([unsigned] * 7), pointer, pointer, pointer]
-        return found
-    return None
+    """Return the driver's library with the types of arguments; None if there is none."""
+    found = driver_library()
+    if found is None:
+        return None
+    pointer, number, unsigned = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint
+    found.cuInit.argtypes = [unsigned]
+    found.cuDriverGetVersion.argtypes = [pointer]
+    found.cuGetErrorName.argtypes = [number, pointer]
+    found.cuDeviceGet.argtypes = [pointer, number]
+    found.cuDeviceGetAttribute.argtypes = [pointer, number, number]
+    found.cuDevicePrimaryCtxRetain.argtypes = [pointer, number]
+    found.cuCtxSetCurrent.argtypes = [pointer]
+    found.cuModuleLoadDataEx.argtypes = [pointer, ctypes.c_char_p, unsigned, pointer, pointer]
+    found.cuModuleGetFunction.argtypes = [pointer, pointer, ctypes.c_char_p]
+    found.cuFuncGetAttribute.argtypes = [pointer, number, pointer]
+    found.cuOccupancyMaxActiveBlocksPerMultiprocessor.argtypes = [pointer, pointer, number, ctypes.c_size_t]
+    found.cuLaunchKernel.argtypes = [pointer, *([unsigned] * 7), pointer, pointer, pointer]
+    return found
 
 
 def missing(index: int, driver: Any = None) -> str:
@@ -79,7 +75,7 @@ def missing(index: int, driver: Any = None) -> str:
     """
     driver = library() if driver is None else driver
     if driver is None:
-        return f"there is no CUDA driver ({' or '.join(_FILES.get(sys.platform, ('libcuda',)))})"
+        return f"there is no CUDA driver ({' or '.join(DRIVER_FILES.get(sys.platform, ('libcuda',)))})"
     version, device = ctypes.c_int(), ctypes.c_int()
     capability = ctypes.c_int(), ctypes.c_int()
     if code := (

@@ -18,10 +18,11 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import accumulate
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -37,18 +38,31 @@ from torchpt.paths.layers import LAYERS
 from torchpt.paths.state import Shadow, Splat, VertexInput, no_shadow
 from torchpt.paths.walk import Counts, Observer, walk
 from torchpt.paths.wave import PixelSet, RayCounts
+from torchpt.physics.film import Film
 from torchpt.physics.film.splats import LARGEST, Splats
 from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.search import Accel
 
-__all__ = ["LANES", "Calls", "Chunk", "ChunkSearch", "Halted", "KernelsEngine", "Paths", "bounce_eagerly"]
+__all__ = [
+    "LANES",
+    "Arguments",
+    "Calls",
+    "Chunk",
+    "ChunkSearch",
+    "Halted",
+    "KernelsEngine",
+    "LaneCount",
+    "Paths",
+    "bounce_eagerly",
+    "count_samples",
+    "film_words",
+]
 
 
 # ---- Kernel calls of one thread: counters, and arguments that are prepared once
 
 
-#: Index of each word at the head of a kernel's arguments.
 #: A number of lanes: an int, or on a device a :class:`torchpt.engines.kernels.device.Count`, which is always true.
 LaneCount = Any
 
@@ -57,22 +71,46 @@ class Halted(Exception):
     """Raised where a kernel is called after the render was cancelled."""
 
 
-class _PreparedCall(NamedTuple):
-    """A kernel with its argument words.
+class Arguments:
+    """The argument block of a kernel, with the words that stay the same filled in.
+
+    Args:
+        kernel: the kernel.
+        row: elements of a row of the arenas.
+        search: address of the argument of searches; 0: none.
 
     Attributes:
-        words: the words, of which those that differ from call to call are set anew each time.
-        call: machine code.
-        address: of the words.
-        uniforms: index of the word and name of each uniform.
-        lists: indices of the words of the lists that it appends to.
+        words: a ctypes array of int64, see :func:`torchpt.compiler.kernel.argument_words`.
+        tensors: index of the first word of the tensors.
+        function: what runs the kernel, for the caller to set.
     """
 
-    words: Any
-    call: Any
-    address: int
-    uniforms: tuple[tuple[int, str], ...]
-    lists: range
+    __slots__ = ("_lists", "_uniforms", "function", "kernel", "tensors", "words")
+
+    def __init__(self, kernel: Kernel, row: int, search: int = 0) -> None:
+        program, first_list = kernel.program, len(HEAD) + len(kernel.program.uniforms)
+        self.kernel = kernel
+        self.function: Any = None
+        self._uniforms = tuple((len(HEAD) + k, name) for k, name in enumerate(program.uniforms))
+        self.tensors = first_list + program.lists
+        self._lists = range(first_list, self.tensors)
+        self.words: Any = (ctypes.c_int64 * (self.tensors + 2 * (program.tensors + program.results)))()
+        self.words[WORD["stride"]], self.words[WORD["tables"]] = row, kernel.tables.address
+        self.words[WORD["search"]] = search
+
+    def set(
+        self, source: Any, target: Any, places: Any, slots: Any, uniforms: Mapping[str, int], lists: list[Any] | None
+    ) -> None:
+        """Set the words that differ from call to call: addresses of memory, and of each uniform by name."""
+        words = self.words
+        words[0], words[1], words[3] = source.address, target.address, slots.address  # of HEAD: src, dst, slots
+        if places is not None:
+            words[2] = places.address
+        for word, name in self._uniforms:
+            words[word] = uniforms[name]
+        if lists is not None:
+            for word, memory in zip(self._lists, lists, strict=False):
+                words[word] = memory.address
 
 
 class Calls:
@@ -93,8 +131,7 @@ class Calls:
         self.counters = np.zeros(kernels.models + 6, np.int64)
         self.place = np.zeros(len(CHUNK_FIELDS), np.int32)
         self.slots = Memory(3)
-        self._prepared: dict[int, _PreparedCall] = {}  # by id of the kernel
-        self._keep: list[Kernel] = []  # the kernels of `_prepared`, so that their ids are not reused
+        self._prepared: dict[int, Arguments] = {}  # by id of the kernel, which they refer to
         self._salts: dict[tuple[int, int], Any] = {}  # by depth and step
         self._uniforms = {"place": self.place.ctypes.data}  # address of each uniform
 
@@ -102,7 +139,6 @@ class Calls:
         """Drop all references to the render and its kernels."""
         del self.kernels, self._halt
         self._prepared.clear()
-        self._keep.clear()
 
     def rebind(self, kernels: Kernels, halt: threading.Event) -> None:
         """Use the kernels of another render of the same structure, which has the same memory layout."""
@@ -178,35 +214,18 @@ class Calls:
         """
         if self._halt.is_set():
             raise Halted
-        prepared = self._prepared.get(id(kernel))
-        if prepared is None:
-            prepared = self._prepared[id(kernel)] = self._prepare(kernel)
-        words, call, address, uniforms, list_words = prepared
-        words[0], words[1] = source.address, target.address  # the first words of HEAD: src, dst, list, slots
-        if places is not None:
-            words[2] = places.address
-        words[3] = self.slots.address if slots is None else slots.address
-        for word, name in uniforms:
-            words[word] = self._uniforms[name]
-        if lists is not None:
-            for word, memory in zip(list_words, lists, strict=False):
-                words[word] = memory.address
-        call(address, count)
+        arguments = self._prepared.get(id(kernel))
+        if arguments is None:
+            arguments = self._prepared[id(kernel)] = self._prepare(kernel)
+        arguments.set(source, target, places, slots or self.slots, self._uniforms, lists)
+        arguments.function(count)
 
-    def _prepare(self, kernel: Kernel) -> _PreparedCall:
-        """Return a kernel with the argument words that stay the same filled in."""
-        program = kernel.program
-        start = len(HEAD) + len(program.uniforms)
-        words = (ctypes.c_int64 * (start + program.lists))()
-        words[WORD["stride"]] = CAPACITY
-        words[WORD["counters"]] = self.counters.ctypes.data
-        words[WORD["tables"]] = kernel.tables.address
-        if self.kernels.search is not None:
-            words[WORD["search"]] = ctypes.addressof(self.kernels.search)
-        uniforms = tuple((len(HEAD) + k, name) for k, name in enumerate(program.uniforms))
-        self._keep.append(kernel)
-        lists = range(start, start + program.lists)
-        return _PreparedCall(words, program.call, ctypes.addressof(words), uniforms, lists)
+    def _prepare(self, kernel: Kernel) -> Arguments:
+        search = self.kernels.search
+        arguments = Arguments(kernel, CAPACITY, 0 if search is None else ctypes.addressof(search))
+        arguments.words[WORD["counters"]] = self.counters.ctypes.data
+        arguments.function = partial(kernel.program.call, ctypes.addressof(arguments.words))
+        return arguments
 
 
 # ---- A vertex by tensor operations on lanes of an arena, for models that cannot be compiled
@@ -396,6 +415,36 @@ class Chunk:
     pixel_set: PixelSet | None = None
 
 
+# Chunks are added to films by the kernels :func:`torchpt.engines.kernels.stages.accumulate`, a sample at a time.
+
+
+def film_words(film: Film, chunk: Chunk, samples: int, row: int, clamped: int | None) -> Iterator[tuple[int, ...]]:
+    """Yield for each sample of a chunk the words of the kernel's tensors: address and row length of each.
+
+    They are samples and sums in, sums and, with a clamp, samples out.
+
+    Args:
+        film: the film.
+        chunk: pixels and samples.
+        samples: address of the samples ``(channels, samples * pixels)``, those of the first sample of all pixels first.
+        row: elements of a row of them.
+        clamped: address of the clamped samples, in rows like these; None: no clamp.
+    """
+    _, channels, pixels = film.sums.shape  # float64, by randomization
+    for k in range(chunk.samples):
+        group, offset = (chunk.first_sample + k) % film.randomizations, 4 * k * chunk.pixels
+        total = film.sums.data_ptr() + 8 * (group * channels * pixels + chunk.first_pixel)
+        words = (samples + offset, row, total, pixels, total, pixels)
+        yield words if clamped is None else (*words, clamped + offset, row)
+
+
+def count_samples(film: Film, chunk: Chunk, values: np.ndarray | Tensor) -> None:
+    """Count a chunk's samples ``values (channels, samples * pixels)`` in a film, and keep the first one of each pixel."""
+    film.count_samples(chunk.first_pixel, chunk.pixels, chunk.first_sample, chunk.samples)
+    if chunk.first_sample == 0:
+        film.set_first_samples(values[:, : chunk.pixels], chunk.first_pixel)
+
+
 @dataclass
 class Paths:
     """The population of this engine: paths of a chunk at a vertex.
@@ -452,7 +501,7 @@ class KernelsEngine:
         self.shown: Memory | None = None
         self.tally = RayCounts()
         self.splats: list[Splats] = []
-        self._lost: list[np.ndarray] = []  # samples with splats that are not finite
+        self._lost: list[Any] = []  # samples with splats that are not finite
         self._rooms = [self._room() for _ in range(2)]  # memory of even and of odd vertices
 
     def _make_search(self) -> ChunkSearch:
@@ -664,30 +713,32 @@ class KernelsEngine:
             self.search.light(paths.arena, paths.count)
 
     def _splat(self, paths: Paths) -> None:
-        """Record splats that reach the film. One that is not finite is left out and makes its sample NaN."""
-        rows, floats, words, n = self.kernels.state, paths.arena.floats, paths.arena.words, paths.count
+        """Record splats that reach the film. One that is not finite is left out and makes its sample NaN.
+
+        Memory is arrays of numpy, or on a device tensors; there the number of lanes is waited for.
+        """
+        rows, arena, n = self.kernels.state, paths.arena, self.calls.known(paths.count)
+        floats, words = cast(Any, arena.floats), cast(Any, arena.words)
         # the rows o, d and t of the splats' shadow rays, and of those to lights
-        splat, shadow = (slice(rows.first(f"{name}_o"), rows.first(f"{name}_radiance")) for name in ("splat", "shadow"))
-        saved = words[shadow, :n].copy()  # the search reads the rows of shadow rays
-        words[shadow, :n] = words[splat, :n]
-        self.search.light(paths.arena, n)
-        words[shadow, :n] = saved
-        transmittance = (
-            floats[rows.first("transmittance"), :n]
-            if "transmittance" in rows
-            else words[rows.first("blocked"), :n] == 0
+        splat, shadow = (
+            [*range(rows.first(f"{name}_o"), rows.first(f"{name}_radiance"))] for name in ("splat", "shadow")
         )
-        floats[rows.first("splat_transmittance"), :n] = transmittance
-        pixel, first = words[rows.first("splat_pixel"), :n], rows.first("splat_radiance")
-        value = floats[first : first + 3, :n] * floats[rows.first("splat_transmittance"), :n]
-        arrives, finite = (pixel >= 0) & (transmittance != 0), (np.abs(value) < LARGEST).all(0)
-        lane, counts = words[rows.first("lane"), :n].astype(np.int64), arrives & finite
+        saved = words[shadow, :n]  # a copy, as rows are given by a list; the search reads the rows of shadow rays
+        words[shadow, :n] = words[splat, :n]
+        self.search.light(arena, paths.count)
+        words[shadow, :n] = saved
+        if "transmittance" in rows:
+            floats[rows.first("splat_transmittance"), :n] = floats[rows.first("transmittance"), :n]
+        else:
+            floats[rows.first("splat_transmittance"), :n] = words[rows.first("blocked"), :n] == 0
+        transmittance, first = floats[rows.first("splat_transmittance"), :n], rows.first("splat_radiance")
+        pixel, value = words[rows.first("splat_pixel"), :n], floats[first : first + 3, :n] * transmittance
+        arrives, finite = (pixel >= 0) & (transmittance != 0), (abs(value) < LARGEST).all(0)
+        lane, counts = words[rows.first("lane"), :n], arrives & finite
         if self.keeps_splats:
-            arrays = lane[counts], pixel[counts].astype(np.int64), value[:, counts]
-            self.splats.append(Splats(*(torch.from_numpy(array) for array in arrays)))
-        lost = arrives & ~finite
-        if lost.any():
-            self._lost.append(lane[lost])
+            senders, pixels, light = map(torch.as_tensor, (lane[counts], pixel[counts], value[:, counts]))
+            self.splats.append(Splats(senders.long(), pixels.long(), light))
+        self._lost.append(lane[arrives & ~finite])
 
 
 class _Layers(Observer[Paths]):

@@ -20,7 +20,15 @@ from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD, WORD
 from torchpt.core.memory import Budget, explain_out_of_memory, is_out_of_memory, on_low_memory
 from torchpt.core.threads import map_in_order
-from torchpt.engines.kernels.engine import LANES, Chunk, Halted, KernelsEngine
+from torchpt.engines.kernels.engine import (
+    LANES,
+    Arguments,
+    Chunk,
+    Halted,
+    KernelsEngine,
+    count_samples,
+    film_words,
+)
 from torchpt.engines.kernels.programs import Kernels
 from torchpt.engines.work import TASKS, Block, TaskResult
 from torchpt.paths.nonfinite import NonFinite
@@ -273,14 +281,14 @@ class KernelsForward:
         values = worker.slots.floats
         samples = values[:, : chunk.pixels * chunk.samples]
         if self.clamp is None:
-            if self._accumulate(values, chunk, pixel_set.film, channels=3, clamp=None):
+            if self._accumulate(values, chunk, pixel_set.film, clamp=None):
                 result.lost.add(self._lost(samples, chunk))
             return
         finite = np.isfinite(samples).all(0)
         if not finite.all():
             result.lost.add(self._lost(samples, chunk))  # before the clamp writes over them
         before = float(np.where(finite, samples, 0.0).sum(dtype=np.float64))
-        self._accumulate(values, chunk, pixel_set.film, channels=3, clamp=self.clamp)
+        self._accumulate(values, chunk, pixel_set.film, clamp=self.clamp)
         after = float(np.ascontiguousarray(samples).sum(dtype=np.float64))
         self._count_light(result, before, after)
 
@@ -310,43 +318,30 @@ class KernelsForward:
         first = 0
         for film in pixel_set.layers.values():
             values = worker.shown.floats[first : first + film.channels]
-            self._accumulate(values, chunk, film, film.channels, clamp=None)
+            self._accumulate(values, chunk, film, clamp=None)
             first += film.channels
 
-    def _accumulate(self, values: np.ndarray, chunk: Chunk, film: Film, channels: int, clamp: float | None) -> int:
+    def _accumulate(self, values: np.ndarray, chunk: Chunk, film: Film, clamp: float | None) -> int:
         """Add samples to a film in their order; return how many were not finite.
 
         Args:
             values: ``(channels, CAPACITY)`` float32: the chunk's samples, those of the first sample of all pixels first.
             chunk: pixels and samples.
             film: the film.
-            channels: its channels.
             clamp: largest component of a sample, and clamped samples are written back to ``values``; None: no clamp.
         """
-        kernel = self.kernels.accumulate(channels, clamp=clamp is not None)
-        program = kernel.program
+        arguments = Arguments(self.kernels.accumulate(film.channels, clamp=clamp is not None), CAPACITY)
+        call, words, first = arguments.kernel.program.call, arguments.words, arguments.tensors
         counters = np.zeros(1, np.int64)  # of samples that are not finite
         limit = np.array([clamp or 0.0], np.float32)
-        words = (ctypes.c_int64 * (len(HEAD) + len(program.uniforms) + 2 * (program.tensors + program.results)))()
         words[WORD["counters"]] = counters.ctypes.data
-        words[WORD["tables"]] = kernel.tables.address
-        if program.uniforms:
+        if clamp is not None:
             words[len(HEAD)] = limit.ctypes.data
-        # Then address and row length of each tensor: samples and sums in, sums and, with a clamp, samples out.
-        first_tensor = len(HEAD) + len(program.uniforms)
-        sums, n = film.sums, chunk.pixels  # sums: (randomizations, channels, pixels) float64
-        pixels = sums.shape[2]
-        for k in range(chunk.samples):
-            group = (chunk.first_sample + k) % film.randomizations
-            source = values.ctypes.data + 4 * k * n
-            total = sums.data_ptr() + 8 * (group * channels * pixels + chunk.first_pixel)
-            words[first_tensor : first_tensor + 6] = (source, CAPACITY, total, pixels, total, pixels)
-            if clamp is not None:
-                words[first_tensor + 6 : first_tensor + 8] = (source, CAPACITY)
-            program.call(ctypes.addressof(words), n)
-        film.count_samples(chunk.first_pixel, n, chunk.first_sample, chunk.samples)
-        if chunk.first_sample == 0:
-            film.set_first_samples(values[:, :n], chunk.first_pixel)
+        samples = values.ctypes.data
+        for tensors in film_words(film, chunk, samples, CAPACITY, None if clamp is None else samples):
+            words[first:] = tensors
+            call(ctypes.addressof(words), chunk.pixels)
+        count_samples(film, chunk, values)
         return int(counters[0])
 
     def _lost(self, samples: np.ndarray, chunk: Chunk) -> NonFinite:
