@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,12 +18,40 @@ from torchpt.compiler.kernel import HEAD, kernel_ir
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.searching import RaySearch
 from torchpt.compiler.sinks import Sinks, Store
+from torchpt.search.instance_rays import instance_search, instance_tables
+from torchpt.search.tree import WideBvh
+from torchpt.search.tree_instances import InstancedWideBvh
+from torchpt.search.tree_rays import TreeSearch, tree_search, tree_tables
 
-__all__ = ["Search", "argument_block", "results_of", "search_stage", "searches"]
+__all__ = ["Search", "SearchedTrees", "argument_block", "results_of", "search_stage", "searched_trees", "searches"]
 
 #: A function of rays ``o, d, t_max``.
 Search = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
 _RESULTS = (torch.float32, torch.int32, torch.float32, torch.float32, torch.bool)
+
+
+@dataclass(frozen=True)
+class SearchedTrees:
+    """What kernels on this CPU search.
+
+    Attributes:
+        functions: generates ``nearest`` and ``occluded``.
+        tables: arrays that kernels read.
+        words: of the scene, with the tables' addresses.
+    """
+
+    functions: TreeSearch
+    tables: Sequence[np.ndarray]
+    words: np.ndarray
+
+
+def searched_trees(accel: WideBvh | InstancedWideBvh) -> SearchedTrees:
+    """Return what kernels search for an acceleration structure."""
+    if isinstance(accel, WideBvh):
+        functions, (tables, numbers) = tree_search(accel), tree_tables(accel)
+    else:
+        functions, (tables, numbers) = instance_search(accel), instance_tables(accel)
+    return SearchedTrees(functions, tables, np.array([*(x.ctypes.data for x in tables), *numbers], np.int64))
 
 
 def search_stage(functions: RaySearch, hits: bool = True, blocked: bool = True) -> TracedStage:

@@ -1,4 +1,4 @@
-"""The search of a tree by kernels as PTX on the machine of the tests, beside the CPU's search by packets."""
+"""The search of trees by kernels as PTX on the machine of the tests, beside the CPU's search by packets."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import torch
 from forms import differing
 from ptx_calls import ptx_of
 from ptx_machine import WARP, DeviceMemory, PtxMachine
-from ray_kernels import argument_block, results_of, search_stage
+from ray_kernels import argument_block, results_of, search_stage, searched_trees
 from torch import Tensor
 
 from torchpt.search.tree import WideBvh
-from torchpt.search.tree_rays import tree_search
+from torchpt.search.tree_instances import InstancedWideBvh
 
 __all__ = ["Found", "search_on_machine"]
 
@@ -36,7 +36,11 @@ class Found:
 
 
 def search_on_machine(
-    accel: WideBvh, rays: tuple[Tensor, Tensor, Tensor], any_hit: bool, per_thread: int = 1, seed: int = 0
+    accel: WideBvh | InstancedWideBvh,
+    rays: tuple[Tensor, Tensor, Tensor],
+    any_hit: bool,
+    per_thread: int = 1,
+    seed: int = 0,
 ) -> Found:
     """Search rays ``o, d, t_max``: their nearest hits, or (``any_hit``) whether they are blocked.
 
@@ -44,14 +48,15 @@ def search_on_machine(
     """
     o, d, t_max = rays = rays[0].contiguous(), rays[1].contiguous(), rays[2].contiguous()
     lanes = t_max.shape[0]
-    stage = search_stage(tree_search(accel), hits=not any_hit, blocked=any_hit)
+    trees = searched_trees(accel)
+    stage = search_stage(trees.functions, hits=not any_hit, blocked=any_hit)
     machine, memory, results = PtxMachine(ptx_of(stage)), DeviceMemory(), results_of(stage, lanes)
     count = np.array([lanes])
-    for array in (*(x.numpy() for x in (o, d, t_max)), *(x for x in accel.tables if x.size), accel.words, count):
+    for array in (*(x.numpy() for x in (o, d, t_max)), *(x for x in trees.tables if x.size), trees.words, count):
         memory.add(array, constant=True)
     for result in results:
         memory.add(result.numpy())
-    block = argument_block(accel.words.ctypes.data, [*rays, *results])
+    block = argument_block(trees.words.ctypes.data, [*rays, *results])
     threads = -(-lanes // per_thread // WARP) * WARP
     arguments = bytes(block), np.int64(count.ctypes.data).tobytes()
     machine.launch(memory, arguments, threads // WARP, WARP, seed=seed)

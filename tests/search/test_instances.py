@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from accel_reference import rays, soup, sphere_mesh, triangles
+from accel_reference import rays, sphere_mesh, triangles
+from search_scenes import with_instances
 
 from torchpt.core.errors import SceneError
 from torchpt.physics.shapes.geometry import Geometry
@@ -13,39 +14,6 @@ from torchpt.search import build
 from torchpt.search.base import Accel
 
 BACKENDS = ("torch", "numba")
-
-
-def maps(seed: int, count: int) -> np.ndarray:
-    """Affine maps ``(I, 3, 4)``: turned, stretched, every third one mirrored."""
-    rng = np.random.default_rng(seed)
-    linear = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0] * rng.uniform(0.2, 0.8, (count, 1, 3))
-    linear[::3] *= -1
-    return np.concatenate([linear, rng.uniform(-1.5, 1.5, (count, 3, 1))], 2)
-
-
-def scene(count: int, seed: int = 0) -> tuple[Geometry, Geometry]:
-    """Two meshes and some planes with copies of either mesh, and the same with explicit triangles."""
-    v, f = sphere_mesh(8)
-    small, g = triangles(v[:, ::-1] * 0.4, f[:60]), soup(seed, (30, 4, 3, 2))
-    first = [triangles(v * 0.3, f), small]
-    parts = [torch.cat([*(getattr(mesh, p) for mesh in first), getattr(g, p)], 1) for p in ("p0", "p1", "p2")]
-    sizes = [mesh.size for mesh in first]
-    counts = (sum(sizes) + g.counts[0], *g.counts[1:])
-    maps_ = maps(seed, count)
-    columns, explicit, at = [], [[], [], []], sum(counts)
-    for k, m in enumerate(maps_):
-        which = k % 2
-        start = which * sizes[0]
-        columns.append([*m.reshape(-1), start, sizes[which], at])
-        at += sizes[which]
-        for corner, p in zip(explicit, parts, strict=True):
-            q = m[:, :3] @ p[:, start : start + sizes[which]].double().numpy() + m[:, 3:]
-            corner.append(torch.from_numpy(q).float())
-    copied = Geometry(parts[0], parts[1], parts[2], counts, None, torch.tensor(np.array(columns).T))
-    n = counts[0]
-    whole = [torch.cat([p[:, :n], *more, p[:, n:]], 1) for p, more in zip(parts, explicit, strict=True)]
-    extra = at - sum(counts)
-    return copied, Geometry(whole[0], whole[1], whole[2], (n + extra, *counts[1:]))
 
 
 def as_explicit(prim: torch.Tensor, geometry: Geometry) -> torch.Tensor:
@@ -58,7 +26,7 @@ def as_explicit(prim: torch.Tensor, geometry: Geometry) -> torch.Tensor:
 
 @pytest.mark.parametrize("kind", BACKENDS)
 def test_copies_are_hit_as_explicit_meshes_are(kind):
-    copied, explicit = scene(23)
+    copied, explicit = with_instances(23)
     o, d, t_max = rays(1, 15_000)
     t_max[::3] = 1.0
     accel, plain = build(copied, kind), build(explicit, kind)
@@ -79,7 +47,7 @@ def test_copies_are_hit_as_explicit_meshes_are(kind):
 
 
 def test_backends_agree_to_the_bit():
-    copied, _ = scene(40, 3)
+    copied, _ = with_instances(40, 3)
     o, d, t_max = rays(2, 20_000)
     found = [build(copied, kind).intersect(o, d, t_max) for kind in BACKENDS]
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
@@ -102,7 +70,7 @@ def test_equal_distances_go_to_the_lowest_id(kind):
 
 @pytest.mark.parametrize("kind", BACKENDS)
 def test_dead_rays_and_the_open_interval(kind):
-    copied, _ = scene(5)
+    copied, _ = with_instances(5)
     accel = build(copied, kind)
     o, d, t_max = rays(6, 4000)
     t, prim, _, _ = accel.intersect(o, d, t_max)
@@ -120,12 +88,12 @@ def test_dead_rays_and_the_open_interval(kind):
 
 
 def test_what_is_built_and_what_is_refused():
-    copied, _ = scene(9)
+    copied, _ = with_instances(9)
 
     def nodes(accel: Accel) -> int:
         return accel.describe()["nodes"]
 
-    more, _ = scene(9, 1)
+    more, _ = with_instances(9, 1)
     few = build(copied, "numba").describe()
     assert few["instances"] == 9 and few["primitives"] > 9 * 60
     assert abs(nodes(build(more, "numba")) - few["nodes"]) < 20

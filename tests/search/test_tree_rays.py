@@ -1,42 +1,22 @@
-"""The search of a tree inside kernels: one ray at a time it gives the bits of the CPU's search by packets."""
+"""The search of trees inside kernels: one ray at a time it gives the bits of the CPU's search by packets."""
 
 import numpy as np
 import pytest
 import torch
-from accel_reference import quadric_table, soup, sphere_mesh, triangles
-from ray_kernels import searches
+from accel_reference import soup, sphere_mesh, triangles
+from few import few
+from ray_kernels import searched_trees, searches
 from ray_sets import KINDS, make_rays
+from search_scenes import copied, maps, with_instances, with_quadrics
 from test_bits import equal_bits, found
 
 import torchpt
 from torchpt.compiler.form import SCALAR
 from torchpt.physics.shapes.geometry import Geometry
-from torchpt.physics.shapes.kinds.cone import Cone
-from torchpt.physics.shapes.kinds.cylinder import Cylinder
-from torchpt.physics.shapes.kinds.sphere import Ellipsoid
-from torchpt.physics.shapes.quadrics import Form
+from torchpt.search import build
 from torchpt.search.tree import WideBvh
-from torchpt.search.tree_rays import TreeSearch, tree_search
-
-
-class Bowl(Cylinder):
-    """A paraboloid, ``x^2 + y^2 = z``."""
-
-    name, form = "bowl", Form(bend=0.0, level=0.0, half=-0.5)
-
-
-QUADRICS = (Ellipsoid, Cylinder, Cone, Bowl)
-
-
-def with_quadrics():
-    """Twenty quadrics of each shape at random places, and primitives of all other kinds."""
-    rng = np.random.default_rng(3)
-    g = soup(2, (60, 12, 12, 12))
-    kinds = QUADRICS * 20
-    frame = torch.from_numpy(rng.normal(size=(12, len(kinds))) * 0.3)
-    p = [torch.cat([a, frame[k : k + 3].float()], 1) for a, k in ((g.p0, 0), (g.p1, 3), (g.p2, 6))]
-    return Geometry(p[0], p[1], p[2], (*g.counts[:4], len(kinds)), quadric_table(kinds, frame))
-
+from torchpt.search.tree_instances import InstancedWideBvh
+from torchpt.search.tree_rays import TreeSearch
 
 SCENES = {
     "mesh": lambda: triangles(*sphere_mesh(40)),
@@ -51,8 +31,10 @@ SCENES = {
 
 def search_of(accel, functions=None):
     """Return ``t, prim, u, v`` and ``blocked`` of rays, arrays of numpy, by a kernel of single lanes."""
-    run = searches(functions or tree_search(accel), accel.words.ctypes.data, SCALAR)
-    return lambda *rays: [x.numpy() for x in run(*map(torch.from_numpy, rays))]
+    trees = searched_trees(accel)
+    run = searches(functions or trees.functions, trees.words.ctypes.data, SCALAR)
+    # `trees`: their tables live as long as the function
+    return lambda *rays, trees=trees: [x.numpy() for x in run(*map(torch.from_numpy, rays))]
 
 
 def check(accel, search, rays):
@@ -116,12 +98,66 @@ def test_refit():
     check(accel, search_of(accel), make_rays("aimed", moved, 5000, 3))
 
 
+def with_two_at_a_place():
+    """A mesh, an instance of it at the same place, and two at another one."""
+    same, moved = np.eye(3, 4), np.eye(3, 4)
+    moved[0, 3] = 1.5
+    g = triangles(*sphere_mesh(10))
+    return copied(g, [(0, g.size)], [same, moved, moved])
+
+
+def with_flat_meshes():
+    """Instances of a mesh, of triangles without area, and of no triangle."""
+    g = soup(9, (40, 0, 3, 0))
+    p = [torch.cat([a[:, :20], b[:, :20], a[:, 20:]], 1) for a, b in zip((g.p0, g.p1, g.p2), [g.p0] * 3, strict=True)]
+    flat = Geometry(p[0], p[1], p[2], (60, *g.counts[1:]))
+    return copied(flat, [(0, 20), (20, 20), (40, 0)], maps(2, 9))
+
+
+#: Geometries with instances, and what rays are aimed at.
+INSTANCES = {
+    "two at a place": lambda: (with_two_at_a_place(),) * 2,
+    "two meshes": lambda: with_instances(23),
+    "quadrics and all others": lambda: (copied(with_quadrics(), [(0, 40), (40, 20)], maps(4, 30)),) * 2,
+    "a hundred": lambda: with_instances(100, 5),
+    "flat": lambda: (with_flat_meshes(),) * 2,
+    "only flat": lambda: (copied(soup(4, (9, 2, 0, 0)), [(0, 0)], maps(1, 2)),) * 2,
+}
+
+
+@pytest.mark.parametrize("name", few(INSTANCES, 3))
+def test_bits_of_instances(name):
+    """Random rays; rays at vertices and edges of instances; rays along axes, not finite, or that end early."""
+    g, aim = INSTANCES[name]()
+    accel = InstancedWideBvh(g, 1)
+    search = search_of(accel)
+    for kind in KINDS:
+        rays = make_rays(kind, aim, 4000, 1)
+        assert check(accel, search, rays) > 0.01
+        t, prim, *_ = found(accel, *rays)
+        assert (prim >= g.size).any() == (name != "only flat")
+        for end in (t, np.nextafter(t, np.float32(np.inf))):  # rays that end where they would hit
+            check(accel, search, (*rays[:2], end))
+
+
+def test_instances_that_moved():
+    g, _ = with_instances(23)
+    before = build(g, "numba", 1)
+    assert g.copies is not None
+    copies = g.copies.clone()
+    copies[3] += 0.2
+    moved = Geometry(g.p0, g.p1, g.p2, g.counts, None, copies)
+    accel = before.refit(moved)
+    assert isinstance(accel, InstancedWideBvh)
+    check(accel, search_of(accel), make_rays("aimed", moved, 5000, 3))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cornell_bunny", "env_teapot", "shapes_and_maps"])
+@pytest.mark.parametrize("name", ["cornell_bunny", "env_teapot", "shapes_and_maps", "instances", "clutter"])
 def test_shipped_scenes(name):
     _, g = torchpt.load(name, "cpu").world(torch.float32)
-    assert g.copies is None
-    accel = WideBvh(g, 1)
+    assert (g.copies is not None) == (name == "instances")
+    accel = build(g, "numba", 1)
     search = search_of(accel)
     for kind in KINDS:
         for seed in range(5):

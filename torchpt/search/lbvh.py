@@ -311,6 +311,9 @@ class Lbvh(Accel):
 
     Args:
         geometry: the primitives, on any device.
+
+    Attributes:
+        geometry: the same, in the memory of this search.
     """
 
     name = "torch"
@@ -320,6 +323,8 @@ class Lbvh(Accel):
         tables = affine_rows(geometry)
         self.counts = list(geometry.counts)
         self.corners = torch.cat([geometry.p0, geometry.p1, geometry.p2]).float()
+        p0, p1, p2 = self.corners.split(3)
+        self.geometry = Geometry(p0, p1, p2, geometry.counts, geometry.quadrics, geometry.copies)
         self.rows = tables.rows.T.contiguous()
         quadrics = quadric_rows(geometry)
         # the last row, h, is left out if it is 0 in all quadrics, which saves its operations

@@ -18,6 +18,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 
 import numpy as np
 
@@ -29,7 +31,7 @@ from torchpt.physics.shapes.geometry import KINDS
 from torchpt.search.tree import WideBvh
 from torchpt.search.tree_layout import CHILDREN, FLOOR, IDS, LINE, PLANES, RECTANGLES, RULED, SLACK, WIDTH
 
-__all__ = ["TreeSearch", "tree_search"]
+__all__ = ["Traversal", "TreeSearch", "tree_search", "tree_tables"]
 
 _RAY = ("ox", "oy", "oz", "dx", "dy", "dz", "t_max")
 _HIT = "{float, i32, float, float}"
@@ -38,8 +40,8 @@ _HIT = "{float, i32, float, float}"
 _REFILL, _NODES_FIRST = 8, 2
 #: Primitives of a leaf that a thread tests in a turn: more save votes, but make the code longer.
 _PRIMITIVES = 2
-#: The address words of :func:`torchpt.search.tree.scene_words`, and the ids behind them.
-_TABLES, _FIRST_IDS = ("tree", "corner", "rows", "quadrics"), ("rectangle", "disk", "sphere", "quadric")
+#: Kinds whose first ids are the words behind the addresses.
+_FIRST_IDS = ("rectangle", "disk", "sphere", "quadric")
 #: The bits of an entry in a key; the sign bit is cleared, as entries are not negative but may be -0.
 _ENTRY_BITS = 0x7FFFFFF8
 #: Batcher's odd-even merge sort of eight.
@@ -68,7 +70,7 @@ class TreeSearch:
         assert form.width == 1
         whole = Block(form)
         for any_hit in (False, True):
-            block = _Traversal(self, any_hit, form)
+            block = self._traversal(any_hit, form)
             block.write()
             whole.lines += block.lines
             whole.declarations |= block.declarations
@@ -76,15 +78,24 @@ class TreeSearch:
 
     def lane_loop(self, loop: SearchLoop) -> Block:
         """See :class:`torchpt.compiler.searching.LoopingSearch`."""
-        block = _Traversal(self, loop.any_hit, loop.form, loop.names)
+        block = self._traversal(loop.any_hit, loop.form, loop.names)
         block.write_loop(loop)
         return block
+
+    def _traversal(self, any_hit: bool, form: Form, names: int = 0) -> Traversal:
+        """Return a builder of one of the functions; ``names`` as in :class:`SearchLoop`."""
+        return Traversal(self, any_hit, form, names)
 
 
 def tree_search(tree: WideBvh) -> TreeSearch:
     """Return the functions that search a tree; its words are :attr:`WideBvh.words`."""
     kinds = tuple(kind for kind, count in zip(KINDS, tree.counts, strict=True) if count)
     return TreeSearch(kinds, tree.depth)
+
+
+def tree_tables(tree: WideBvh) -> tuple[Sequence[np.ndarray], np.ndarray]:
+    """Return the tables whose addresses are the first words of the scene, and the words behind them."""
+    return tree.tables, tree.words[len(tree.tables) :]
 
 
 def _lesser(a: Value, b: Value) -> Value:
@@ -101,8 +112,18 @@ def _dot(a: Sequence[Value], b: Sequence[Value]) -> Value:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-class _Traversal(LaneBlock):
-    """The builder of one function: state of the traversal of a ray, and the turns that change it."""
+class Traversal(LaneBlock):
+    """The builder of one function: state of the traversal of a ray, and the turns that change it.
+
+    Args:
+        search: what the scene has.
+        any_hit: True: the function is ``occluded``, else ``nearest``.
+        form: of the kernel.
+        names: see :class:`torchpt.compiler.searching.SearchLoop`.
+    """
+
+    #: Tables whose addresses are the first words of the scene.
+    table_names: tuple[str, ...] = ("tree", "corner", "rows", "quadrics")
 
     def __init__(self, search: TreeSearch, any_hit: bool, form: Form, names: int = 0) -> None:
         super().__init__(form, names)
@@ -117,9 +138,9 @@ class _Traversal(LaneBlock):
         self._declare()
         self._begin(*(self.given("f", f"%{name}") for name in _RAY))
         with self.loop() as leave:
-            nodes, leaves = self._ballots()
-            leave((nodes | leaves).eq(0))
-            self._turn(nodes, leaves)
+            ballots = self._ballots()
+            leave(reduce(or_, ballots).eq(0))
+            self._turn(*ballots)
         self.do(f"ret {result} {self._result()}")
         self.lines.append("}")
 
@@ -130,7 +151,7 @@ class _Traversal(LaneBlock):
         """
         self._declare()
         self.node.value = self.leaf.value = -1
-        self.open.value, self.top.value = self.none_open, 0
+        self._end()
         lane, taken = Variable(self, "L"), Variable(self, "L")  # -1: no lane; lanes that the warp took
         more = Variable(self, "b")  # there are lanes behind them
         lane.value, taken.value, more.value = -1, 0, True
@@ -143,11 +164,11 @@ class _Traversal(LaneBlock):
             return (place >> (WARP.bit_length() - 1)) * threads + first_of_warp + (place & WARP - 1)
 
         with self.loop() as leave:
-            nodes, leaves = self._ballots()
-            idle = ~(nodes | leaves)
+            ballots = self._ballots()
+            idle = ~reduce(or_, ballots)
             waiting = idle.call("llvm.ctpop")
             with self.either(waiting.eq(WARP) | (waiting.ge(_REFILL) & more.value)) as otherwise:
-                mine = self.node.value.lt(0) & self.leaf.value.lt(0)
+                mine = self._is_over()
                 with self.when((mine & lane.value.ge(0)).name):
                     self._add(loop.store, i=lane.value.name, mask="true", found=self._result())
                 lane.value = mine.select(self.number("L", -1), lane.value)
@@ -160,7 +181,7 @@ class _Traversal(LaneBlock):
                 more.value = lane_at(taken.value).lt(n)
                 leave(self._ballot(lane.value.ge(0)).eq(0))
                 otherwise()
-                self._turn(nodes, leaves)
+                self._turn(*ballots)
 
     def _add(self, lines: Sequence[str], **values: str) -> None:
         """Append lines, with values in place of some of their names."""
@@ -190,22 +211,35 @@ class _Traversal(LaneBlock):
         # u and v are quotients, divided once at the end.
         self.u, self.v, self.over_u, self.over_v = (Variable(self, "f") for _ in range(4))
         self.tables = {
-            name: self.load_pointer(self.at("%search", "i64", k), invariant=True) for k, name in enumerate(_TABLES)
+            name: self.load_pointer(self.at("%search", "i64", k), invariant=True)
+            for k, name in enumerate(self.table_names)
         }
-        self.first_id = {
-            name: self.read("L", "%search", len(_TABLES) + k).to("trunc", "i") for k, name in enumerate(_FIRST_IDS)
-        }
+        self.first_id = {name: self._word(k) for k, name in enumerate(_FIRST_IDS)}
+
+    def _word(self, k: int) -> Value:
+        """Load word ``k`` of those behind the addresses of tables, to an int32."""
+        return self.read("L", "%search", len(self.table_names) + k).to("trunc", "i")
 
     def _begin(self, ox: Value, oy: Value, oz: Value, dx: Value, dy: Value, dz: Value, t_max: Value) -> None:
         """Begin the traversal of a ray at the root; a ray that is not finite, or ends before it begins, is over at once."""
         zero = ox * 0.0 + oy * 0.0 + oz * 0.0 + dx * 0.0 + dy * 0.0 + dz * 0.0
         valid = t_max.gt(0.0) & zero.eq(0.0)
-        o, d = (ox, oy, oz), (dx, dy, dz)
+        self._set_ray((ox, oy, oz), (dx, dy, dz))
+        self.node.value = valid.select(self.number("i", 0), -1)
+        self.leaf.value = self.prim.value = -1
+        self.open.value = self.none_open
+        self.parent.value = self.top.value = 0
+        self.best.value = t_max
+        self.u.value = self.v.value = 0.0
+        self.over_u.value = self.over_v.value = 1.0
+
+    def _set_ray(self, o: Sequence[Value], d: Sequence[Value]) -> None:
+        """Set the ray, and what tests of boxes and primitives use of it."""
         # Axes in the order of Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection" (2013): the longest one last.
         x, y, z = map(abs, d)
         on_x, on_y = x.ge(y) & x.ge(z), y.ge(z)
 
-        def turned(of: tuple[Value, Value, Value]) -> tuple[Value, ...]:
+        def turned(of: Sequence[Value]) -> tuple[Value, ...]:
             """Return the components of a vector in this order."""
             return tuple(on_x.select(of[k - 2], on_y.select(of[k - 1], of[k])) for k in range(3))
 
@@ -217,19 +251,24 @@ class _Traversal(LaneBlock):
             self.number("f", 1.0) / size.ge(least).select(c, least.call("llvm.copysign", c))
             for size, c in zip((x, y, z), d, strict=True)
         ]
-        near = [x.gt(0.0).select(self.number("i", k * WIDTH), (k + 3) * WIDTH) for k, x in enumerate(inverse)]
+        near = self._near(inverse)
         shear = (d0 / d2, d1 / d2, self.number("f", 1.0) / d2)
         given = {"o": o, "d": d, "origin": turned(o), "shear": shear, "inverse": inverse, "near": near, "along": starts}
         for name, components in given.items():
             for variable, component in zip(self.ray[name], components, strict=True):
                 variable.value = component
-        self.node.value = valid.select(self.number("i", 0), -1)
-        self.leaf.value = self.prim.value = -1
-        self.open.value = self.none_open
-        self.parent.value = self.top.value = 0
-        self.best.value = t_max
-        self.u.value = self.v.value = 0.0
-        self.over_u.value = self.over_v.value = 1.0
+
+    def _near(self, inverse: Sequence[Value]) -> list[Value]:
+        """Return the offsets of near planes in a node, from the reciprocals of the direction."""
+        return [x.gt(0.0).select(self.number("i", k * WIDTH), (k + 3) * WIDTH) for k, x in enumerate(inverse)]
+
+    def _is_over(self) -> Value:
+        """Return whether the traversal is over, or has not begun."""
+        return self.node.value.lt(0) & self.leaf.value.lt(0)
+
+    def _end(self) -> None:
+        """End a traversal whose node and leaf are done."""
+        self.open.value, self.top.value = self.none_open, 0
 
     def _ray(self, name: str) -> list[Value]:
         """Return three components of the ray, see :meth:`_declare`."""
@@ -249,17 +288,26 @@ class _Traversal(LaneBlock):
 
     # -- turns
 
-    def _ballots(self) -> tuple[Value, Value]:
-        """Return which threads of the warp have a node to visit, and which a leaf to test, as bits; for a CPU its only one."""
-        conditions = self.node.value.ge(0), self.leaf.value.ge(0)
-        if self.form.threads:
-            nodes, leaves = (self._ballot(condition) for condition in conditions)
-        else:
-            nodes, leaves = (condition.to("zext", "i") for condition in conditions)
-        return nodes, leaves
+    def _needs(self) -> tuple[Value, ...]:
+        """Return what the ray may need next, as conditions: a node is to be visited, a leaf to be tested."""
+        return self.node.value.ge(0), self.leaf.value.ge(0)
 
-    def _turn(self, nodes: Value, leaves: Value) -> None:
-        """Write a turn: of nodes or of leaves, as most of the warp's threads need; threads are bits, see :meth:`_ballots`."""
+    def _ballots(self) -> list[Value]:
+        """Return for each of :meth:`_needs` which threads of the warp have it, as bits; for a CPU its only one."""
+        if self.form.threads:
+            return [self._ballot(need) for need in self._needs()]
+        return [need.to("zext", "i") for need in self._needs()]
+
+    def _turn(self, *ballots: Value) -> None:
+        """Write a turn: for the need that most of the warp's threads have; see :meth:`_ballots`."""
+        self._visit_or_test(*ballots)
+        with self.loop() as leave_boxes:
+            leave_boxes(self.node.value.ge(0) | self.leaf.value.ge(0))
+            leave_boxes(self.open.value.eq(self.none_open) & self.top.value.eq(0))
+            self._next_box()
+
+    def _visit_or_test(self, nodes: Value, leaves: Value) -> None:
+        """Visit nodes, or test leaves."""
         nodes, leaves = (threads.call("llvm.ctpop") for threads in (nodes, leaves))
         nodes_next = (nodes * _NODES_FIRST).ge(leaves)
         has_node, has_leaf = self.node.value.ge(0), self.leaf.value.ge(0)
@@ -272,10 +320,6 @@ class _Traversal(LaneBlock):
             for _ in range(_PRIMITIVES - 1 if self.form.threads else 0):
                 with self.when(self.leaf.value.ge(0).name):
                     self._test_primitive()
-        with self.loop() as leave_boxes:
-            leave_boxes(self.node.value.ge(0) | self.leaf.value.ge(0))
-            leave_boxes(self.open.value.eq(self.none_open) & self.top.value.eq(0))
-            self._next_box()
 
     def _ballot(self, condition: Value) -> Value:
         """Return a bit for each thread of the warp, set where a condition holds."""
@@ -386,12 +430,19 @@ class _Traversal(LaneBlock):
         code = self.read("i", self.tables["tree"], node + child + CHILDREN)
         # A code counts quarters of lines.
         with self.either(code.ge(0)) as otherwise:
-            self.node.value = code * (LINE // 4)
+            self.node.value = self._placed(code * (LINE // 4))
             otherwise()
-            leaf = (~code & ~3) * (LINE // 4)
-            self.leaf.value, self.slot.value = leaf, 0
-            self.id.value = self.read("i", self.tables["tree"], leaf + IDS)
-            self.floor.value = entry * float(FLOOR)
+            self._enter_leaf(self._placed((~code & ~3) * (LINE // 4)), entry)
+
+    def _placed(self, offset: Value) -> Value:
+        """Return the offset in the buffer of a block, from its offset in the tree."""
+        return offset
+
+    def _enter_leaf(self, leaf: Value, entry: Value) -> None:
+        """Make a leaf the next one to test."""
+        self.leaf.value, self.slot.value = leaf, 0
+        self.id.value = self.read("i", self.tables["tree"], leaf + IDS)
+        self.floor.value = entry * float(FLOOR)
 
     # -- primitives
 
@@ -408,7 +459,7 @@ class _Traversal(LaneBlock):
         self.leaf.value = done.select(self.number("i", -1), leaf)
         if self.any_hit:
             with self.when(self.prim.value.ge(0).name):
-                self.open.value, self.top.value = self.none_open, 0
+                self._end()
 
     def _intersect(self, place: Value, id_: Value) -> None:
         """Intersect the primitive at a place of a leaf; there is code only for the kinds that the scene has."""
@@ -462,7 +513,11 @@ class _Traversal(LaneBlock):
             plane = self._plane(place + PLANES)
             za, zb, zc = (z * self._ray("shear")[2] for z in (za, zb, zc))
             t = _lesser(_greater(plane, _lesser(_lesser(za, zb), zc)), _greater(_greater(za, zb), zc))
-            self._accept(t, id_, plane.eq(plane) & t.gt(0.0), (f, det), (g, det))
+            self._accept(t, self._triangle_id(id_), plane.eq(plane) & t.gt(0.0), (f, det), (g, det))
+
+    def _triangle_id(self, id_: Value) -> Value:
+        """Return the id of a primitive, from a triangle's id in its leaf."""
+        return id_
 
     def _rectangle(self, place: Value, prim: Value) -> None:
         """Test a rectangle, by the operations of :func:`torchpt.search.leaf.distances`."""

@@ -9,8 +9,8 @@ set theirs to 0. Loops without a fixed end (paths without a depth limit, rays th
 Threads count in any order, so the places of lanes in an arena are random. No result depends on them: radiance is written to
 the slot of its sample, and slots are added to the film in the order of samples.
 
-Few primitives are searched inside stages, a tree by kernels between them. Stages that cannot be compiled, and searches that
-kernels do not know (instances), run as tensor operations between kernels; they wait for the number of lanes.
+Few primitives are searched inside stages, trees by kernels between them. Stages that cannot be compiled, and the search by a
+tree of tensors where it is asked for, run as tensor operations between kernels; they wait for the number of lanes.
 """
 
 from __future__ import annotations
@@ -55,12 +55,14 @@ from torchpt.paths.walk import Counts, walk
 from torchpt.paths.wave import PixelSet, RayCounts, Wave, clamp_scale
 from torchpt.physics.film import Film
 from torchpt.physics.samplers import salts
-from torchpt.physics.shapes.geometry import Geometry
-from torchpt.search import Accel, brute_if_fastest
+from torchpt.search import Accel, build
 from torchpt.search.brute import Brute
+from torchpt.search.instance_rays import instance_search, instance_tables
+from torchpt.search.instances import Instanced
 from torchpt.search.lbvh import Lbvh
 from torchpt.search.tree import WideBvh
-from torchpt.search.tree_rays import TreeSearch, tree_search
+from torchpt.search.tree_instances import InstancedWideBvh
+from torchpt.search.tree_rays import TreeSearch, tree_search, tree_tables
 
 __all__ = [
     "CHECK_EVERY",
@@ -215,7 +217,8 @@ class SearchWords:
     """The argument of searches in kernels, on a device.
 
     Attributes:
-        words: int64, see :func:`torchpt.compiler.packet.scene_words` and :func:`torchpt.search.tree.scene_words`.
+        words: int64, see :func:`torchpt.compiler.packet.scene_words`, :func:`torchpt.search.tree.scene_words` and
+            :func:`torchpt.search.instance_rays.instance_tables`.
         tables: tensors whose addresses are the first words.
         tree: see :class:`~torchpt.engines.kernels.layout.Layout`.
     """
@@ -225,20 +228,13 @@ class SearchWords:
     tree: TreeSearch | None
 
 
-def _host_search(accel: Accel) -> Brute | WideBvh | None:
-    """Return the search, on the host, whose data kernels of a device read; of few primitives, or a tree.
-
-    None for instances, and for quadrics that the device searches by a tree of tensors.
-    """
-    if isinstance(accel, Brute | WideBvh):
-        return None if isinstance(accel, Brute) and accel.quadrics else accel
-    if not isinstance(accel, Lbvh) or accel.counts[4]:
-        return None
-    p0, p1, p2 = accel.corners.cpu().split(3)
-    triangles, rectangles, disks, spheres, quadrics = accel.counts
-    geometry = Geometry(p0, p1, p2, (triangles, rectangles, disks, spheres, quadrics))
-    few = brute_if_fastest(geometry)
-    return few if isinstance(few, Brute) else WideBvh(geometry)
+def _host_search(accel: Accel) -> Accel | None:
+    """Return the search, on the host, whose data kernels of a device read; None if they know none for this one."""
+    if isinstance(accel, Instanced):
+        accel = accel.base
+    if isinstance(accel, Lbvh):
+        return build(moved(accel.geometry, torch.device("cpu")))
+    return None if isinstance(accel, Brute) and accel.quadrics else accel
 
 
 #: Searches that were copied to devices, by the accel of the scene.
@@ -262,14 +258,21 @@ def search_on_device(accel: Accel, wanted: bool, device: torch.device) -> Search
     return found[device]
 
 
-def _copied(host: Brute | WideBvh, device: torch.device) -> SearchWords:
-    if isinstance(host, WideBvh):
-        tables, words = [torch.from_numpy(table) for table in host.tables], torch.from_numpy(host.words)
+def _copied(host: Accel, device: torch.device) -> SearchWords | None:
+    """Return a search of the host on a device; None if kernels do not know it."""
+    tree: TreeSearch | None = None
+    if isinstance(host, Brute):
+        tables = host.table.numpy(), host.spheres.numpy()
+        numbers = np.frombuffer(host.words, np.int64)[len(tables) :]
+    elif isinstance(host, WideBvh):
+        (tables, numbers), tree = tree_tables(host), tree_search(host)
+    elif isinstance(host, InstancedWideBvh):
+        (tables, numbers), tree = instance_tables(host), instance_search(host)
     else:
-        tables, words = [host.table, host.spheres], torch.frombuffer(bytearray(host.words), dtype=torch.int64)
-    moved, words = tuple(table.to(device) for table in tables), words.clone()
-    words[: len(moved)] = torch.tensor([table.data_ptr() for table in moved])
-    return SearchWords(words.to(device), moved, tree_search(host) if isinstance(host, WideBvh) else None)
+        return None
+    copies = tuple(torch.from_numpy(table).to(device) for table in tables)
+    addresses = np.array([table.data_ptr() for table in copies])
+    return SearchWords(torch.from_numpy(np.concatenate([addresses, numbers])).to(device), copies, tree)
 
 
 # ---- Memory, counters and launches

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -264,7 +264,7 @@ class Kernels(Layout):
         # The crop is None without splats, which only stages of an integrator's own add.
         own = (fingerprint(wave.integrator), wave.context.crop) if wave.integrator.has_own_stages else None
         parts = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first_surface, own, self._leaves.tensors)
-        self.structure = (self._of_world, *map(signature, parts), packets, fused, self.tree and astuple(self.tree))
+        self.structure = (self._of_world, *map(signature, parts), packets, fused, signature(self.tree))
         alike = before is not None and before.structure == self.structure
         self.kernel_cache = before.kernel_cache if alike else KernelCache()  # pyright: ignore[reportOptionalMemberAccess]
         self._laid_out = self.kernel_cache.tables(self._leaves)
