@@ -32,17 +32,17 @@ def test_camera_by_kernels(name: str):
     scene = torchpt.load(description, device="cpu")
     names = [key for key in scene.params if key.startswith("camera.")]
 
-    def gradients(**options: str) -> list[torch.Tensor]:
+    def gradients(compile: str) -> list[torch.Tensor]:
         values = {key: scene.params[key].clone().requires_grad_() for key in names}
         film = {"width": 24, "height": 16, "filter": "box"}
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # a stage without a kernel is a warning
             warnings.simplefilter("ignore", EdgeWarning)
-            image = torchpt.render(scene, params=values, spp=16, seed=1, film=film, edges=False, **options)
+            image = torchpt.render(scene, params=values, spp=16, seed=1, film=film, edges=False, compile=compile)
         weights = torch.linspace(0, 1, image.numel()).view(image.shape)
         return list(torch.autograd.grad(image, list(values.values()), weights))
 
-    found, expected = gradients(compile="on"), gradients(compile="off")
+    found, expected = gradients("on"), gradients("off")
     for key, a, b in zip(names, found, expected, strict=True):
         assert (a - b).abs().max() <= 2e-4 * b.abs().max(), key
         assert b.abs().max() > 0

@@ -163,7 +163,7 @@ def test_samples_enter_the_film_as_eagerly(clamp):
             part = values[:, first : first + 3, start : start + count].reshape(3, -1)
             worker.slots.floats[:, : part.shape[1]] = part.numpy()
             chunk = Chunk(start, count, first, 3)
-            bad = loop._accumulate(worker.slots.floats, chunk, films[0], 3, clamp)
+            bad = loop._accumulate(worker.slots.floats, chunk, films[0], clamp)
             there = slice(start, start + count)
             assert bad == int((~finite[first : first + 3, there]).sum())
             films[1].add(eager[:, first : first + 3, there], start, first)
