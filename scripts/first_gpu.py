@@ -50,7 +50,6 @@ from torchpt.scene.prepare import own_models
 SCENES = (
     "cornell_box",
     "veach_mis",
-    "cornell_spheres",
     "cornell_transmissive",
     "cornell_specular",
     "thin_lens",
@@ -58,6 +57,7 @@ SCENES = (
     "ibl_row",
     "cornell_bunny",
     "shapes_and_maps",
+    "instances",
 )
 #: Checks that have to pass before ``device=auto`` takes the card.
 DECISIVE = (1, 2, 3, 4)

@@ -24,6 +24,7 @@ from torchpt.engines.kernels import device_backward as backward_module
 from torchpt.engines.kernels import driver as driver_module
 from torchpt.native import device_checks
 from torchpt.native.device_checks import CheckResult
+from torchpt.search.tree import WideBvh
 
 FILM = {"width": 16, "height": 12}
 NAMES = ("materials.white.reflectance", "shapes.lamp.emission", "shapes.short_box.vertices", "camera.to_world")
@@ -104,3 +105,23 @@ def test_on_is_refused_with_an_old_driver(card, monkeypatch):
     monkeypatch.setattr(driver_module, "library", lambda: SimulatedDriver(version=10020))
     with pytest.raises(SceneError, match=r"render.compile: .*the CUDA driver is too old: 10.2, and 11.0 is needed"):
         picture("cornell_box", "cuda", compile="on")
+
+
+@pytest.mark.slow
+def test_a_mesh_that_moves_refits_the_tree(card, monkeypatch):
+    built: list[int] = []
+    made = WideBvh.__init__
+    monkeypatch.setattr(WideBvh, "__init__", lambda self, *given: (built.append(1), made(self, *given))[1])
+
+    def pictures(where: str) -> list[Tensor]:
+        scene = torchpt.load("cornell_bunny", where)
+        vertices, found = scene.params["shapes.bunny.vertices"], []
+        for step in range(3):
+            options: dict[str, Any] = {"film": {"width": 8, "height": 8}, "integrator": {"max_depth": 2}}
+            params = {"shapes.bunny.vertices": vertices + 0.02 * step}
+            found.append(torchpt.render(scene, params=params, spp=1, compile="on", **options).cpu())
+        return found
+
+    found = pictures("cuda")
+    assert len(built) == 1 and all(map(torch.equal, found, pictures("cpu")))
+    assert not torch.equal(found[0], found[2])

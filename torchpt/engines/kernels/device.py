@@ -221,19 +221,24 @@ class SearchWords:
             :func:`torchpt.search.instance_rays.instance_tables`.
         tables: tensors whose addresses are the first words.
         tree: see :class:`~torchpt.engines.kernels.layout.Layout`.
+        host: the search of the host that the tables were copied from.
     """
 
     words: Tensor
     tables: tuple[Tensor, ...]
     tree: TreeSearch | None
+    host: Accel
 
 
-def _host_search(accel: Accel) -> Accel | None:
-    """Return the search, on the host, whose data kernels of a device read; None if they know none for this one."""
+def _host_search(accel: Accel, before: SearchWords | None = None) -> Accel | None:
+    """Return the search, on the host, whose data kernels of a device read; None if they know none for this one.
+
+    ``before``: of an earlier render. Its tree is refitted to primitives that have moved, where that is good enough.
+    """
     if isinstance(accel, Instanced):
         accel = accel.base
     if isinstance(accel, Lbvh):
-        return build(moved(accel.geometry, torch.device("cpu")))
+        return build(moved(accel.geometry, torch.device("cpu")), before=None if before is None else before.host)
     return None if isinstance(accel, Brute) and accel.quadrics else accel
 
 
@@ -241,19 +246,22 @@ def _host_search(accel: Accel) -> Accel | None:
 _ON_DEVICE: WeakKeyDictionary[Accel, dict[torch.device, SearchWords | None]] = WeakKeyDictionary()
 
 
-def search_on_device(accel: Accel, wanted: bool, device: torch.device) -> SearchWords | None:
+def search_on_device(
+    accel: Accel, wanted: bool, device: torch.device, before: Kernels | None = None
+) -> SearchWords | None:
     """Return the argument of searches in kernels of a scene, on a device; None: rays are searched outside of kernels.
 
     Args:
         accel: the scene's acceleration structure.
         wanted: False: only ``accel`` itself is searched by kernels, not a tree of tensors by another one.
         device: where kernels run.
+        before: kernels of an earlier render, whose tree may be refitted.
     """
     if not wanted and not isinstance(accel, Brute):
         return None
     found = _ON_DEVICE.setdefault(accel, {})
     if device not in found:
-        host = _host_search(accel)
+        host = _host_search(accel, before.search if isinstance(before, KernelsOnDevice) else None)
         found[device] = None if host is None else _copied(host, device)
     return found[device]
 
@@ -272,7 +280,7 @@ def _copied(host: Accel, device: torch.device) -> SearchWords | None:
         return None
     copies = tuple(torch.from_numpy(table).to(device) for table in tables)
     addresses = np.array([table.data_ptr() for table in copies])
-    return SearchWords(torch.from_numpy(np.concatenate([addresses, numbers])).to(device), copies, tree)
+    return SearchWords(torch.from_numpy(np.concatenate([addresses, numbers])).to(device), copies, tree, host)
 
 
 # ---- Memory, counters and launches
@@ -660,7 +668,7 @@ def device_forward(
         RenderError: kernels cannot run on the device.
     """
     device = cuda_of(wave.centre.device) if cuda is None else cuda
-    search = search_on_device(wave.accel, packets, device.device)
+    search = search_on_device(wave.accel, packets, device.device, before)
     last = before
 
     def make(row: int) -> DeviceKernels:

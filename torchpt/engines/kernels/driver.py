@@ -36,9 +36,11 @@ OLDEST_DRIVER = 11000
 OLDEST_CAPABILITY = (7, 5)
 #: Threads of a block: a multiple of a warp's 32. Four warps: few registers are wasted where a kernel needs many.
 THREADS = 128
+#: Most registers of a thread. Fewer than kernels ask for: more warps hide the latency of memory better than spills cost.
+REGISTERS = 96
 
 # Values of the driver's enumerations, from cuda.h.
-_JIT_ERROR_LOG, _JIT_ERROR_LOG_SIZE = 5, 6  # CUjit_option
+_JIT_MAX_REGISTERS, _JIT_ERROR_LOG, _JIT_ERROR_LOG_SIZE = 0, 5, 6  # CUjit_option
 _ATTRIBUTE_REGISTERS, _ATTRIBUTE_LOCAL_BYTES = 4, 3  # CUfunction_attribute
 _CAPABILITY_MAJOR, _CAPABILITY_MINOR, _MULTIPROCESSORS = 75, 76, 16  # CUdevice_attribute
 _OUT_OF_MEMORY = 2  # CUresult
@@ -132,13 +134,14 @@ class Cuda:
 
     Attributes:
         threads: threads of a block.
+        registers: most registers of a thread; others are spilled to local memory. 255 is the hardware's bound.
 
     Raises:
         RenderError: there is no such device, or its driver cannot run kernels.
     """
 
     def __init__(self, device: torch.device, driver: Any = None) -> None:
-        self.device, self.threads = device, THREADS
+        self.device, self.threads, self.registers = device, THREADS, REGISTERS
         reason = missing(self._index(), driver)
         if reason:
             raise RenderError(f"kernels cannot run on {device}: {reason}")
@@ -151,7 +154,7 @@ class Cuda:
         code = self.driver.cuDeviceGetAttribute(ctypes.byref(value), _MULTIPROCESSORS, number)
         self._check(code, "the number of multiprocessors")
         self.multiprocessors = value.value
-        self._functions: dict[tuple[str, int], Function] = {}
+        self._functions: dict[tuple[str, int, int], Function] = {}
         self._lanes = ctypes.c_int64()
 
     # -- what torch has
@@ -190,16 +193,16 @@ class Cuda:
         self._check(self.driver.cuCtxSetCurrent(self._context), "the device's context")
 
     def load(self, code: bytes, key: str) -> Function:
-        """Return the kernel of a module, loaded once for each number of threads, on which its number of blocks depends.
+        """Return the kernel of a module, loaded once for each :attr:`threads` and :attr:`registers`.
 
         Args:
             code: PTX, which the driver compiles and keeps in a cache of its own.
             key: identifies the code.
         """
-        function = self._functions.get((key, self.threads))
-        if function is None:
-            function = self._functions[key, self.threads] = self._loaded(code)
-        return function
+        known = key, self.threads, self.registers
+        if known not in self._functions:
+            self._functions[known] = self._loaded(code)
+        return self._functions[known]
 
     def functions(self) -> list[Function]:
         """Return the kernels loaded so far."""
@@ -210,8 +213,8 @@ class Cuda:
         start = time.perf_counter()
         driver, module, handle = self.driver, ctypes.c_void_p(), ctypes.c_void_p()
         log = ctypes.create_string_buffer(1 << 12)
-        options = (ctypes.c_int * 2)(_JIT_ERROR_LOG, _JIT_ERROR_LOG_SIZE)
-        values = (ctypes.c_void_p * 2)(ctypes.addressof(log), len(log))
+        options = (ctypes.c_int * 3)(_JIT_ERROR_LOG, _JIT_ERROR_LOG_SIZE, _JIT_MAX_REGISTERS)
+        values = (ctypes.c_void_p * 3)(ctypes.addressof(log), len(log), self.registers)
         found = driver.cuModuleLoadDataEx(ctypes.byref(module), code + b"\0", len(options), options, values)
         self._check(found, "the code of a kernel", log.value)
         self._check(driver.cuModuleGetFunction(ctypes.byref(handle), module, b"kernel"), "the code of a kernel")
