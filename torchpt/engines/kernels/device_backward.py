@@ -74,7 +74,7 @@ class DeviceVjpKernels(KernelsOnDevice, VjpKernels):
         leaves = [primal.detach().requires_grad_() for primal in primals]
         known |= {id(leaf): copy for leaf, copy in zip(self.tape.leaves, leaves, strict=True)}
         tape = Tape(wave, on_host(self.tape.taped, known), leaves, primals, captured=())
-        kernels = _HostVjpKernels(tape, self.packets, None if self.cotangent is None else self.cotangent.cpu())
+        kernels = _HostVjpKernels(tape, self.by_kernels, None if self.cotangent is None else self.cotangent.cpu())
         return kernels, kernels._leaves
 
     def engine(self) -> DeviceBackward:
