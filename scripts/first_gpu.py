@@ -138,8 +138,8 @@ class Device:
         """Render a scene by kernels on the device."""
 
         def engine(scene: Any, wave: Any, *rest: Any) -> DeviceForward:
-            packets = rest[0].render.accel == "auto" if not self.simulated else True
-            return device_forward(wave, own_models(scene, wave), packets, None, self.cuda, self.target, self.lanes)
+            by_kernels = self.simulated or rest[0].render.search_by_kernels
+            return device_forward(wave, own_models(scene, wave), by_kernels, None, self.cuda, self.target, self.lanes)
 
         kept = renders.kernel_engine, renders.device_engine
         renders.kernel_engine = renders.device_engine = engine  # type: ignore[assignment]
@@ -154,8 +154,8 @@ class Device:
         def backward(kernels: Any, tape: Any, settings: Any, cotangent: Tensor, sums: Any) -> str:
             return replay._replay_on_device([], tape, settings, cotangent, kernels.cotangent, sums)
 
-        def made(tape: Any, own: Any, cotangent: Any, packets: bool, lanes: int) -> Any:
-            return device_backward(tape, own, cotangent, packets, lanes, self.cuda, self.target)
+        def made(tape: Any, own: Any, cotangent: Any, by_kernels: bool, lanes: int) -> Any:
+            return device_backward(tape, own, cotangent, by_kernels, lanes, self.cuda, self.target)
 
         kept = replay._replay_on_threads, replay.device_backward
         if self.simulated:

@@ -26,13 +26,13 @@ def device(monkeypatch) -> Iterator[Callable[..., SimulatedCuda]]:
     and whether the kernels are PTX, which takes warps in a random order.
     """
 
-    def use(lanes: int = 2048, order: int | None = None, packets: bool = True, ptx: bool = False) -> SimulatedCuda:
+    def use(lanes: int = 2048, order: int | None = None, by_kernels: bool = True, ptx: bool = False) -> SimulatedCuda:
         cuda = SimulatedCuda(PtxDriver() if ptx else None)
         target = ptx_target if ptx else partial(simulated_target, order=order)
 
         def engine(scene: Any, wave: Wave, eager: list[str], threads: int | None = None) -> DeviceForward:
             own = own_models(scene, wave)
-            made = device_forward(wave, own, packets, None, cuda, target, lanes)
+            made = device_forward(wave, own, by_kernels, None, cuda, target, lanes)
             eager += [f"{number}: {reason}" for number, reason in made.kernels.eager.items()]
             return made
 
@@ -41,7 +41,7 @@ def device(monkeypatch) -> Iterator[Callable[..., SimulatedCuda]]:
             return cuda.fallback
 
         def made(tape: Any, own: Any, cotangent: Any, _: bool, lanes: int) -> Any:
-            return device_backward(tape, own, cotangent, packets, lanes, cuda, target)
+            return device_backward(tape, own, cotangent, by_kernels, lanes, cuda, target)
 
         monkeypatch.setattr(run, "kernel_engine", engine)
         monkeypatch.setattr(replay, "_replay_on_threads", backward)

@@ -119,7 +119,7 @@ def test_settings_have_the_bits_of_the_cpu(keys, device):
 def test_opacity_has_the_bits_of_the_cpu(accel, device):
     scene = torchpt.load(box(**PANE), device="cpu")
     of_cpu = rendered(scene, render={"accel": accel})
-    device(2048, 0, packets=False)
+    device(2048, 0, by_kernels=False)
     assert_same(rendered(scene, render={"accel": accel}), of_cpu)
 
 

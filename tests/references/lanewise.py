@@ -136,10 +136,10 @@ def compare(scene: torchpt.Scene, wishes: Mapping[str, Any], pixels: int, sample
             _first_hits(found, wave, chosen, pixels, samples)
             return found
         recorder = waves(wave, pixels, samples)
-        _generate(found, wave, Kernels(wave, chosen.packets, False), pixels, samples)
-        for kernels in [chosen] + ([Kernels(wave, chosen.packets, False)] if chosen.fused else []):
+        _generate(found, wave, Kernels(wave, chosen.by_kernels, False), pixels, samples)
+        for kernels in [chosen] + ([Kernels(wave, chosen.by_kernels, False)] if chosen.fused else []):
             _vertices(found, wave, kernels, recorder)
-        _search(found, wave, Kernels(wave, chosen.packets, False), recorder)
+        _search(found, wave, Kernels(wave, chosen.by_kernels, False), recorder)
     return found
 
 

@@ -379,7 +379,7 @@ def test_searches_do_not_depend_on_the_packet(name):
     wave, _ = prepared(scene, {"film": film_of(32), "render": {"spp": 4}})
     with torch.no_grad():
         kernels = kernels_of(scene, wave)
-        kernels = type(kernels)(wave, kernels.packets, False)
+        kernels = type(kernels)(wave, kernels.by_kernels, False)
         worker, states = KernelsEngine(kernels), waves(wave, 1024, 4).states
         state = states[1]
         n = len(state.lane)

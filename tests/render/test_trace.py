@@ -62,7 +62,9 @@ def camera_rays(scene: torchpt.Scene, film: dict[str, Any], seed: int = 0, **wis
         state = wave.rays(0, count, 0, 1)
         vectors = {"o": state.o, "d": state.d}
     else:
-        kernels = Kernels(wave, kernels_of(scene, wave).packets, False)  # whose paths are all kept, whatever they met
+        kernels = Kernels(
+            wave, kernels_of(scene, wave).by_kernels, False
+        )  # whose paths are all kept, whatever they met
         paths = KernelsEngine(kernels).spawn(Chunk(0, count, 0, 1))
         vectors = kernels.state.take(paths.arena, np.arange(count), ("o", "d"))
     space = scene.space

@@ -164,13 +164,13 @@ def why_no_kernels(device: torch.device) -> str:
     return missing(torch.cuda.current_device() if device.index is None else device.index)
 
 
-def forward_device(wave: Wave, own: Sequence[int], packets: bool, before: Kernels | None = None) -> ForwardDevice:
+def forward_device(wave: Wave, own: Sequence[int], by_kernels: bool, before: Kernels | None = None) -> ForwardDevice:
     """Return a forward engine of kernels on a CUDA device.
 
     Args:
         wave: of the render, on the device.
         own: see :func:`kernels_of`.
-        packets: True: rays are searched by kernels where these can; False: by the wave's acceleration structure.
+        by_kernels: True: rays are searched by kernels where these can; False: by the wave's acceleration structure.
         before: kernels of another render; its tables are shared where they were made of the same tensors.
 
     Raises:
@@ -178,13 +178,13 @@ def forward_device(wave: Wave, own: Sequence[int], packets: bool, before: Kernel
     """
     from torchpt.engines.kernels.device import device_forward
 
-    return device_forward(wave, own, packets, before)
+    return device_forward(wave, own, by_kernels, before)
 
 
 def describe_kernels(kernels: Kernels) -> dict[str, Any]:
     """Return a description of the compiled loop, for the summary of a render."""
-    by_kernels = "kernels of packets" if kernels.tree is None else "kernels of a tree"
-    search = "inside the stages" if kernels.fused else by_kernels if kernels.packets else kernels.wave.accel.name
+    of_kernels = "kernels of packets" if kernels.tree is None else "kernels of a tree"
+    search = "inside the stages" if kernels.fused else of_kernels if kernels.by_kernels else kernels.wave.accel.name
     names = [str(model) for model in kernels.wave.context.world.materials.models]
     eager = {names[number]: reason for number, reason in kernels.eager.items()}
     return {
@@ -316,7 +316,7 @@ class BackwardDevice(Protocol):
 
 
 def device_backward(
-    tape: Tape, own: Sequence[int], cotangent: Tensor | None, packets: bool, lanes: int
+    tape: Tape, own: Sequence[int], cotangent: Tensor | None, by_kernels: bool, lanes: int
 ) -> BackwardDevice:
     """Return the kernels of a backward pass on a CUDA device.
 
@@ -324,7 +324,7 @@ def device_backward(
         tape: as for :func:`backward_tensors`.
         own: as for :func:`backward_kernels`.
         cotangent: as for :func:`backward_tensors`.
-        packets: as for :func:`forward_device`.
+        by_kernels: as for :func:`forward_device`.
         lanes: of a wave.
 
     Raises:
@@ -332,4 +332,4 @@ def device_backward(
     """
     from torchpt.engines.kernels.device_backward import device_backward
 
-    return device_backward(tape, own, cotangent, packets, lanes)
+    return device_backward(tape, own, cotangent, by_kernels, lanes)

@@ -232,11 +232,10 @@ def _replay_on_device(
     numbers = [
         chunks for chunks in CHUNKS_OF_WAVE if chunks == 1 or chunks * LANES_OF_KERNELS < CHUNKS_GROWTH * samples
     ]
-    packets = settings.render.accel == "auto"
     while numbers:
         lanes = numbers.pop() * LANES_OF_KERNELS
         try:
-            kernels = device_backward(scene_tape, own, splat_cotangent, packets, lanes)
+            kernels = device_backward(scene_tape, own, splat_cotangent, settings.render.search_by_kernels, lanes)
             if numbers and not _fits(kernels, wave.centre.device, settings):
                 continue
             engine = kernels.engine()

@@ -98,7 +98,7 @@ def make_wave(
     attached: bool = False,
     like: Wave | None = None,
     rays: tuple[Tensor, Tensor] | None = None,
-    packets: bool = True,
+    tree: bool = False,
 ) -> Wave:
     """Build the wave of a render.
 
@@ -111,7 +111,7 @@ def make_wave(
         attached: True where the geometry is differentiated.
         like: a wave that differs in the camera's parameters only; its world and search are used again.
         rays: origins and directions ``(..., 3)`` in the scene's coordinates, in place of the camera's.
-        packets: False to search a tree even where packets would be faster.
+        tree: True to search a tree even where packets would be faster.
 
     Raises:
         SceneError: a direction that is zero, or a ray that is not finite.
@@ -127,9 +127,7 @@ def make_wave(
         threads = None if settings.render.threads == "auto" else int(settings.render.threads)
         moved = any(name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in world_params)
         accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
-        if (
-            accel.name == "brute" and not packets
-        ):  # `brute` tests packets of rays against all primitives; `numba` is a tree
+        if tree and accel.name == "brute":  # it tests packets of rays against all primitives; `numba` is a tree
             accel = scene.accel("numba", threads, geometry if moved else None)
         if not integrator.lit:  # an integrator that does not use lights
             world = _without_lights(scene, world, own=own)
@@ -376,8 +374,8 @@ def device_engine(scene: Scene, wave: Wave, settings: Settings, eager: list[str]
         eager: gets the names of models that cannot be compiled, each with the reason.
     """
     cache = scene_cache(scene)
-    packets = settings.render.accel == "auto"
-    forward = engine.forward_device(wave, own_models(scene, wave), packets, cache.kernels)
+    by_kernels = settings.render.search_by_kernels
+    forward = engine.forward_device(wave, own_models(scene, wave), by_kernels, cache.kernels)
     cache.kernels = forward.kernels
     _warn_of_eager_models(wave, forward.kernels, eager)
     return forward

@@ -401,6 +401,11 @@ class Render(FrozenConfig):
     }
 
     @property
+    def search_by_kernels(self) -> bool:
+        """Return True if kernels of a device search rays where they can, instead of the structure that ``accel`` names."""
+        return self.accel == "auto"
+
+    @property
     def stops(self) -> dict[str, Any]:
         """Return the stop rules that are set, other than ``spp``, by name."""
         rules = {name: getattr(self, name) for name in settings_with(Role.ENDS)["render"]}

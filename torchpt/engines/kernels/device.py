@@ -208,7 +208,7 @@ class DeviceKernels(KernelsOnDevice):
         super().__init__(cuda, target, search, wave, search is not None, fused, before, fixed)
 
     def _host_inputs(self) -> tuple[Layout, NamedTensors]:
-        layout = Layout(on_host(self.wave, {}), self.packets, self.fused)
+        layout = Layout(on_host(self.wave, {}), self.by_kernels, self.fused)
         return layout, NamedTensors(records_of(layout, None))
 
 
@@ -647,7 +647,7 @@ def device_kernels(
 def device_forward(
     wave: Wave,
     own: Sequence[int],
-    packets: bool,
+    by_kernels: bool,
     before: Kernels | None = None,
     cuda: Cuda | None = None,
     target: Callable[[int], Target] = ptx_target,
@@ -658,7 +658,7 @@ def device_forward(
     Args:
         wave: of the render, on the device.
         own: see :func:`device_kernels`.
-        packets: True: rays are searched by kernels where these can; False: by the wave's acceleration structure.
+        by_kernels: True: rays are searched by kernels where these can; False: by the wave's acceleration structure.
         before: see :func:`device_kernels`.
         cuda: the device; None: that of the wave.
         target: returns the target of a row length.
@@ -668,7 +668,7 @@ def device_forward(
         RenderError: kernels cannot run on the device.
     """
     device = cuda_of(wave.centre.device) if cuda is None else cuda
-    search = search_on_device(wave.accel, packets, device.device, before)
+    search = search_on_device(wave.accel, by_kernels, device.device, before)
     last = before
 
     def make(row: int) -> DeviceKernels:

@@ -74,7 +74,7 @@ class DeviceVjpKernels(KernelsOnDevice, VjpKernels):
         leaves = [primal.detach().requires_grad_() for primal in primals]
         known |= {id(leaf): copy for leaf, copy in zip(self.tape.leaves, leaves, strict=True)}
         tape = Tape(wave, on_host(self.tape.taped, known), leaves, primals, captured=())
-        kernels = _HostVjpKernels(tape, self.packets, None if self.cotangent is None else self.cotangent.cpu())
+        kernels = _HostVjpKernels(tape, self.by_kernels, None if self.cotangent is None else self.cotangent.cpu())
         return kernels, kernels._leaves
 
     def engine(self) -> DeviceBackward:
@@ -95,7 +95,7 @@ def device_backward(
     tape: Tape,
     own: Sequence[int],
     cotangent: Tensor | None,
-    packets: bool,
+    by_kernels: bool,
     lanes: int = LANES,
     cuda: Cuda | None = None,
     target: Callable[[int], Target] = ptx_target,
@@ -106,7 +106,7 @@ def device_backward(
         tape: see :class:`DeviceVjpKernels`.
         own: indices of the user's own models, which are compiled at once to find out whether they can be.
         cotangent: see :class:`DeviceVjpKernels`.
-        packets: True: rays are searched by kernels where these can; False: by the wave's acceleration structure.
+        by_kernels: True: rays are searched by kernels where these can; False: by the wave's acceleration structure.
         lanes: of a wave.
         cuda: the device; None: that of the wave.
         target: returns the target of a row length.
@@ -115,7 +115,7 @@ def device_backward(
         RenderError: kernels cannot run on the device.
     """
     device = cuda_of(tape.wave.centre.device) if cuda is None else cuda
-    search = search_on_device(tape.wave.accel, packets, device.device)
+    search = search_on_device(tape.wave.accel, by_kernels, device.device)
     cotangent = None if cotangent is None else cotangent.float().contiguous()
     kernels = DeviceVjpKernels(tape, cotangent, device, target(lanes), search)
     kernels.eager = kernels.probe(own)

@@ -343,7 +343,7 @@ class ChunkSearch:
     def light(self, arena: Memory, count: LaneCount) -> None:
         """Trace the arena's shadow rays, and write to it whether they are blocked, or their transmittance."""
         kernels, calls = self.kernels, self.calls
-        if not kernels.packets:
+        if not kernels.by_kernels:
             self._occluded_outside(arena, count)
         elif not kernels.has_opacity:
             calls.run(kernels.search_occluded(), count, arena, arena)
@@ -362,7 +362,7 @@ class ChunkSearch:
 
     def _trace(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: LaneCount) -> None:
         """Find the nearest hit, opaque or not, of each ray in the rows ``o, d, t_max``."""
-        if self.kernels.packets:
+        if self.kernels.by_kernels:
             kernel = self.kernels.search_nearest(passed=rows is self.kernels.passed)
             self.calls.run(kernel, count, memory, memory)
         else:

@@ -224,7 +224,7 @@ class Layout:
 
     Args:
         wave: the render.
-        packets: True: rays are searched by kernels. False: the acceleration structure is called.
+        by_kernels: True: rays are searched by kernels. False: the acceleration structure is called.
         fused: True: the search is part of the stages. False: it runs between them.
 
     Attributes:
@@ -242,8 +242,8 @@ class Layout:
 
     tree: TreeSearch | None = None
 
-    def __init__(self, wave: Wave, packets: bool, fused: bool) -> None:
-        self.wave, self.packets, self.fused = wave, packets, fused
+    def __init__(self, wave: Wave, by_kernels: bool, fused: bool) -> None:
+        self.wave, self.by_kernels, self.fused = wave, by_kernels, fused
         self.plan, self.world = wave.context.plan, wave.context.world
         self.numbers = wave.sampler.tensors(wave.centre.device)
         table = self.world.lights
@@ -291,7 +291,7 @@ def _path_fields(layout: Layout) -> Fields:
         fields |= SHADOW
         if layout.has_opacity:
             fields["transmittance"] = ((), "f")
-        if not (layout.has_opacity and layout.packets):
+        if not (layout.has_opacity and layout.by_kernels):
             fields["blocked"] = ((), "i")
     return fields
 

@@ -233,7 +233,7 @@ class Kernels(Layout):
 
     Args:
         wave: the render.
-        packets: True: rays are searched by kernels. False: the acceleration structure is called.
+        by_kernels: True: rays are searched by kernels. False: the acceleration structure is called.
         fused: True: the search is part of the stages. False: it runs between them.
         before: kernels of another render; its tables are shared where they were made of the same tensors.
         fixed: True: the structure of a world object never changes. False with models of a user's own, whose code may change.
@@ -251,20 +251,20 @@ class Kernels(Layout):
     def __init__(
         self,
         wave: Wave,
-        packets: bool,
+        by_kernels: bool,
         fused: bool,
         before: Kernels | None = None,
         fixed: bool = False,
         cotangent: Tensor | None = None,
     ) -> None:
-        super().__init__(wave, packets, fused)
+        super().__init__(wave, by_kernels, fused)
         self._leaves = NamedTensors(records_of(self, cotangent), None if before is None else before._leaves)
         same = fixed and before is not None and before.world is self.world
         self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
         # The crop is None without splats, which only stages of an integrator's own add.
         own = (fingerprint(wave.integrator), wave.context.crop) if wave.integrator.has_own_stages else None
         parts = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first_surface, own, self._leaves.tensors)
-        self.structure = (self._of_world, *map(signature, parts), packets, fused, signature(self.tree))
+        self.structure = (self._of_world, *map(signature, parts), by_kernels, fused, signature(self.tree))
         alike = before is not None and before.structure == self.structure
         self.kernel_cache = before.kernel_cache if alike else KernelCache()  # pyright: ignore[reportOptionalMemberAccess]
         self._laid_out = self.kernel_cache.tables(self._leaves)
@@ -277,7 +277,7 @@ class Kernels(Layout):
 
     def _search_inputs(self) -> tuple[Any, np.ndarray | None]:
         """Return :attr:`search` and :attr:`non_opaque`."""
-        if self.packets:
+        if self.by_kernels:
             return stages.search_words(self.wave), None
         if not self.has_opacity:
             return None, None
