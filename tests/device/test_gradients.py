@@ -19,6 +19,7 @@ from torchpt.compiler.graph import Unsupported
 from torchpt.compiler.ptx import ptx_target
 from torchpt.engines.kernels import engine
 from torchpt.engines.kernels.backward import VjpKernels
+from torchpt.engines.kernels.device_backward import DeviceBackward, DeviceVjpKernels
 from torchpt.engines.kernels.device_sums import Places, SegmentSums, WaveSums
 from torchpt.gradients import replay
 from torchpt.math import sums
@@ -121,6 +122,26 @@ def assert_same(device: Any, scene: torchpt.Scene, *names: str, ptx: bool = Fals
 def test_gradients_have_the_bits_of_the_cpu(monkeypatch, names, device):
     monkeypatch.setattr(replay, "LANES_OF_KERNELS", engine.LANES // 16)  # so that there are some chunks
     assert_same(device, several(), *names)
+
+
+@pytest.mark.parametrize("short", ["fails", "known"])
+def test_waves_of_fewer_lanes_where_memory_is_short(monkeypatch, device, short):
+    """An allocation that fails, and memory that is known to be short: the same gradient from smaller waves."""
+    monkeypatch.setattr(replay, "LANES_OF_KERNELS", engine.LANES // 16)
+    lanes: list[int] = []
+    made, fewest = DeviceVjpKernels.engine, engine.LANES // 16
+
+    def small(self: DeviceVjpKernels) -> DeviceBackward:
+        lanes.append(self.lanes)
+        if short == "fails" and self.lanes > fewest:
+            raise MemoryError
+        return made(self)
+
+    monkeypatch.setattr(DeviceVjpKernels, "engine", small)
+    if short == "known":
+        monkeypatch.setattr(replay, "free_memory", lambda device: 0)
+    assert_same(device, several(), *NAMES[3])
+    assert lanes[-1] == fewest and (len(lanes) > 1) == (short == "fails")
 
 
 @pytest.mark.slow

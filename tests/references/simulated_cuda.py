@@ -560,6 +560,7 @@ def _cuda() -> dict[str, Any]:
         "empty_cache": lambda: None,
         "reset_peak_memory_stats": lambda device=None: None,
         "memory_allocated": lambda device=None: 0,
+        "memory_reserved": lambda device=None: 0,
         "max_memory_allocated": lambda device=None: 0,
         "mem_get_info": lambda device=None: (16 << 30, 16 << 30),
         "current_stream": lambda device=None: _Stream(),

@@ -229,21 +229,28 @@ def _replay_on_device(
     _, _, width, height = wave.crop
     blocks = scene_tape.blocks(width * height, spp)
     samples = spp * sum(pixels for _, pixels in blocks)
-    numbers = [
-        chunks for chunks in CHUNKS_OF_WAVE if chunks == 1 or chunks * LANES_OF_KERNELS < CHUNKS_GROWTH * samples
-    ]
-    while numbers:
-        lanes = numbers.pop() * LANES_OF_KERNELS
+    lanes = [LANES_OF_KERNELS * chunks for chunks in CHUNKS_OF_WAVE]
+    lanes = [number for number in lanes if number == lanes[0] or number < CHUNKS_GROWTH * samples]
+
+    def replay(number: int, last: bool) -> bool:
+        """Replay all chunks in waves of so many lanes; return False, and do nothing, if memory is too short for them."""
+        by_kernels = settings.render.search_by_kernels
+        kernels = device_backward(scene_tape, own, splat_cotangent, by_kernels, number)
+        if not last and not _fits(kernels, wave.centre.device, settings):
+            return False
+        engine = kernels.engine()
+        for span in _spans(blocks, spp, number // LANES_OF_KERNELS):
+            wave_sums = kernels.wave_sums(sums, LANES_OF_KERNELS)
+            Chunk(engine, settings, span, wave_sums).run(cotangent)
+            wave_sums.merge_into_whole()
+        return True
+
+    while lanes:
+        number = lanes.pop()
         try:
-            kernels = device_backward(scene_tape, own, splat_cotangent, settings.render.search_by_kernels, lanes)
-            if numbers and not _fits(kernels, wave.centre.device, settings):
-                continue
-            engine = kernels.engine()
-            for span in _spans(blocks, spp, lanes // LANES_OF_KERNELS):
-                wave_sums = kernels.wave_sums(sums, LANES_OF_KERNELS)
-                Chunk(engine, settings, span, wave_sums).run(cotangent)
-                wave_sums.merge_into_whole()
-            return ""
+            if replay(number, last=not lanes):
+                return ""
+            continue
         except Unsupported as error:
             return f"no kernel can be made of {error}"
         except Exception as error:
