@@ -18,6 +18,7 @@ __all__ = [
     "intersect_others",
     "intersect_primitive",
     "quadric_hit",
+    "rectangle_hits",
     "setup_ray",
     "sphere_distance",
 ]
@@ -50,6 +51,21 @@ def sphere_distance(ox, oy, oz, dx, dy, dz, cx, cy, cz, radius):
     return np.float32(low if low > 0.0 else high)
 
 
+# ---- Rows of affine transforms
+
+
+@inner(forceinline=True)
+def _linear(table, at, x, y, z):
+    """Return a vector times the three numbers of a table from ``at`` on."""
+    return item(table, at) * x + item(table, at + 1) * y + item(table, at + 2) * z
+
+
+@inner(forceinline=True)
+def _affine(table, at, x, y, z):
+    """Return a point times the three numbers of a table from ``at`` on, plus the fourth."""
+    return _linear(table, at, x, y, z) + item(table, at + 3)
+
+
 # ---- Quadrics, in their own space: the operations of ``leaf.quadric``, in the same order
 
 
@@ -78,27 +94,16 @@ def quadric_hit(table, k, ox, oy, oz, dx, dy, dz):
     """
     px, py, pz = np.float64(ox), np.float64(oy), np.float64(oz)
     rx, ry, rz = np.float64(dx), np.float64(dy), np.float64(dz)
-    fx = (
-        item(table, 19 * k + 0) * px
-        + item(table, 19 * k + 1) * py
-        + item(table, 19 * k + 2) * pz
-        + item(table, 19 * k + 3)
+    fx, fy, fz = (
+        _affine(table, 19 * k + 0, px, py, pz),
+        _affine(table, 19 * k + 4, px, py, pz),
+        _affine(table, 19 * k + 8, px, py, pz),
     )
-    fy = (
-        item(table, 19 * k + 4) * px
-        + item(table, 19 * k + 5) * py
-        + item(table, 19 * k + 6) * pz
-        + item(table, 19 * k + 7)
+    ex, ey, ez = (
+        _linear(table, 19 * k + 0, rx, ry, rz),
+        _linear(table, 19 * k + 4, rx, ry, rz),
+        _linear(table, 19 * k + 8, rx, ry, rz),
     )
-    fz = (
-        item(table, 19 * k + 8) * px
-        + item(table, 19 * k + 9) * py
-        + item(table, 19 * k + 10) * pz
-        + item(table, 19 * k + 11)
-    )
-    ex = item(table, 19 * k + 0) * rx + item(table, 19 * k + 1) * ry + item(table, 19 * k + 2) * rz
-    ey = item(table, 19 * k + 4) * rx + item(table, 19 * k + 5) * ry + item(table, 19 * k + 6) * rz
-    ez = item(table, 19 * k + 8) * rx + item(table, 19 * k + 9) * ry + item(table, 19 * k + 10) * rz
     bend, level, shift = item(table, 19 * k + 12), item(table, 19 * k + 13), item(table, 19 * k + 14)
     low, high = item(table, 19 * k + 15), item(table, 19 * k + 16)
     around, half = item(table, 19 * k + 17), item(table, 19 * k + 18)
@@ -171,29 +176,12 @@ def intersect_primitive(prim, corner, rows, quadrics, n2, n3, n4, o, d):
         radius = np.float64(item(corner, 12 * prim + 3))
         t = sphere_distance(o[0], o[1], o[2], d[0], d[1], d[2], x, y, z, radius)
         return t, _ZERO, _ZERO
-    away = (
-        item(rows, 12 * prim + 0) * o[0]
-        + item(rows, 12 * prim + 1) * o[1]
-        + item(rows, 12 * prim + 2) * o[2]
-        + item(rows, 12 * prim + 3)
-    )
-    along = item(rows, 12 * prim + 0) * d[0] + item(rows, 12 * prim + 1) * d[1] + item(rows, 12 * prim + 2) * d[2]
+    away, along = _affine(rows, 12 * prim, o[0], o[1], o[2]), _linear(rows, 12 * prim, d[0], d[1], d[2])
     plane = -away / along
     if not (plane > _ZERO and plane < _INF):
         return _NAN, _ZERO, _ZERO
     x, y, z = o[0] + plane * d[0], o[1] + plane * d[1], o[2] + plane * d[2]
-    u = (
-        item(rows, 12 * prim + 4) * x
-        + item(rows, 12 * prim + 5) * y
-        + item(rows, 12 * prim + 6) * z
-        + item(rows, 12 * prim + 7)
-    )
-    v = (
-        item(rows, 12 * prim + 8) * x
-        + item(rows, 12 * prim + 9) * y
-        + item(rows, 12 * prim + 10) * z
-        + item(rows, 12 * prim + 11)
-    )
+    u, v = _affine(rows, 12 * prim + 4, x, y, z), _affine(rows, 12 * prim + 8, x, y, z)
     return (plane if u * u + v * v <= _ONE else _NAN), u, v
 
 
@@ -212,29 +200,34 @@ def _corner(tree, at, axes, p, s):
 
 
 @inner(forceinline=True)
+def rectangle_hits(plane, a, b, c, q, zero):
+    """Return mask of hits, ``t``, u and v of rays at rectangles, by the operations of :func:`torchpt.search.leaf.distances`.
+
+    ``plane`` are distances of the planes; then the corners in sheared space, with depths in units of ``t``; a splat of 0.
+    """
+    f, g = a[0] * c[1] - a[1] * c[0], b[0] * a[1] - b[1] * a[0]
+    h, k = q[0] * b[1] - q[1] * b[0], c[0] * q[1] - c[1] * q[0]
+    low, high = minimum(minimum(f, g), minimum(h, k)), maximum(maximum(f, g), maximum(h, k))
+    det = minimum(absolute(f + h), absolute(g + k))  # a product would be the fourth power of a length
+    met = ((low >= zero) | (high <= zero)) & (det != zero) & (plane == plane)
+    near, far = minimum(minimum(minimum(a[2], b[2]), c[2]), q[2]), maximum(maximum(maximum(a[2], b[2]), c[2]), q[2])
+    t = minimum(maximum(plane, near), far)
+    return met & (t > zero), t, f / (f + h), g / (g + k)
+
+
+@inner(forceinline=True)
 def _rectangles(tree, at, axes, o, d, p, s):
-    """Intersect eight rectangles, by the operations of :func:`torchpt.search.leaf.distances`: mask of hits, ``t``, u and v.
+    """Intersect eight rectangles, see :func:`rectangle_hits`.
 
     ``at`` is the offset of the rectangles in the tree; ``o``, ``d`` are tuples; ``p`` and ``s`` splats, see :func:`_corner`.
     """
-    zero = splat(_ZERO, 8)
     n0, n1 = load(tree, at + RULED, 8), load(tree, at + RULED + 8, 8)
     n2, n3 = load(tree, at + RULED + 16, 8), load(tree, at + RULED + 24, 8)
     away = n0 * splat(o[0], 8) + n1 * splat(o[1], 8) + n2 * splat(o[2], 8) + n3
     along = n0 * splat(d[0], 8) + n1 * splat(d[1], 8) + n2 * splat(d[2], 8)
-    plane = -away / along
-    ax, ay, az = _corner(tree, at, axes, p, s)
-    bx, by, bz = _corner(tree, at + 24, axes, p, s)
-    cx, cy, cz = _corner(tree, at + 48, axes, p, s)
-    qx, qy, qz = _corner(tree, at + FOURTH, axes, p, s)
-    f, g = ax * cy - ay * cx, bx * ay - by * ax
-    h, k = qx * by - qy * bx, cx * qy - cy * qx
-    low, high = minimum(minimum(f, g), minimum(h, k)), maximum(maximum(f, g), maximum(h, k))
-    det = minimum(absolute(f + h), absolute(g + k))  # a product would be the fourth power of a length
-    met = ((low >= zero) | (high <= zero)) & (det != zero) & (plane == plane)
-    near, far = minimum(minimum(minimum(az, bz), cz), qz), maximum(maximum(maximum(az, bz), cz), qz)
-    t = minimum(maximum(plane, near), far)
-    return met & (t > zero), t, f / (f + h), g / (g + k)
+    a, b = _corner(tree, at, axes, p, s), _corner(tree, at + 24, axes, p, s)
+    c, q = _corner(tree, at + 48, axes, p, s), _corner(tree, at + FOURTH, axes, p, s)
+    return rectangle_hits(-away / along, a, b, c, q, splat(_ZERO, 8))
 
 
 @inner()

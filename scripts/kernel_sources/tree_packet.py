@@ -31,7 +31,7 @@ from kernel_sources.simd import (
     store,
     trailing_zeros,
 )
-from kernel_sources.tree_leaf import intersect_others
+from kernel_sources.tree_leaf import intersect_others, rectangle_hits
 from kernel_sources.tree_nodes import (
     block_offset,
     blocking,
@@ -389,7 +389,6 @@ def _triangle(tree, at, axes, s, o, d, floor):
 @inner(forceinline=True)
 def _rectangle(tree, at, axes, s, o, d):
     """Intersect 16 rays with one rectangle: mask, ``t``, u, v; see :func:`kernel_sources.tree_leaf.intersect_others`."""
-    zero = splat(_ZERO, 16)
     n0, n1 = splat(item(tree, at + RULED), 16), splat(item(tree, at + RULED + 8), 16)
     n2, n3 = splat(item(tree, at + RULED + 16), 16), splat(item(tree, at + RULED + 24), 16)
     plane = -(n0 * o[0] + n1 * o[1] + n2 * o[2] + n3) / (n0 * d[0] + n1 * d[1] + n2 * d[2])
@@ -397,15 +396,8 @@ def _rectangle(tree, at, axes, s, o, d):
     bx, by, bz = _corner(tree, at + 24, axes, o, s)
     cx, cy, cz = _corner(tree, at + 48, axes, o, s)
     qx, qy, qz = _corner(tree, at + FOURTH, axes, o, s)
-    az, bz, cz, qz = az * s[2], bz * s[2], cz * s[2], qz * s[2]
-    f, g = ax * cy - ay * cx, bx * ay - by * ax
-    h, k = qx * by - qy * bx, cx * qy - cy * qx
-    low, high = minimum(minimum(f, g), minimum(h, k)), maximum(maximum(f, g), maximum(h, k))
-    det = minimum(absolute(f + h), absolute(g + k))  # a product would be the fourth power of a length
-    m = ((low >= zero) | (high <= zero)) & (det != zero) & (plane == plane)
-    near, far = minimum(minimum(minimum(az, bz), cz), qz), maximum(maximum(maximum(az, bz), cz), qz)
-    t = minimum(maximum(plane, near), far)
-    return m & (t > zero), t, f / (f + h), g / (g + k)
+    a, b, c, q = (ax, ay, az * s[2]), (bx, by, bz * s[2]), (cx, cy, cz * s[2]), (qx, qy, qz * s[2])
+    return rectangle_hits(plane, a, b, c, q, splat(_ZERO, 16))
 
 
 @inner(forceinline=True)

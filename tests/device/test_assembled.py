@@ -36,8 +36,11 @@ def passes(scene: torchpt.Scene, gradient: bool) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:the gradient leaves out")
-@pytest.mark.parametrize("name", [x if x == FAST else pytest.param(x, marks=pytest.mark.slow) for x in TABLE])
-def test_registers_and_spills(name):
+@pytest.mark.parametrize(
+    ("name", "every"), [(FAST, False), *(pytest.param(name, True, marks=pytest.mark.slow) for name in TABLE)]
+)
+def test_registers_and_spills(name, every):
+    """Of every kernel for every architecture, or of the two shortest kernels for one."""
     ptxas = find_ptxas()
     if ptxas is None:
         pytest.skip("ptxas is not installed (extra `cuda-dev`)")
@@ -45,9 +48,9 @@ def test_registers_and_spills(name):
     stages = named_stages(scene, lambda loaded: passes(loaded, which == "backward"))
     common = stages.keys() & TABLE[name].keys()
     assert len(common) >= len(TABLE[name]) // 2  # the others are called by few paths, or for layers
-    for kernel in sorted(common):
+    for kernel in sorted(common, key=lambda kernel: TABLE[name][kernel]["ptx"])[: None if every else 2]:
         known, ptx = TABLE[name][kernel], ptx_of(stages[kernel])
-        for architecture in ("sm_90",) if name == FAST else ARCHITECTURES:
+        for architecture in ARCHITECTURES if every else ("sm_90",):
             figures = assemble(ptxas, ptx, architecture)
             what = f"{kernel} on {architecture}: {figures}"
             assert figures.registers <= known["registers"][architecture] + SLACK, what

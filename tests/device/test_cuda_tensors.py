@@ -26,7 +26,7 @@ from torchpt.native import device_checks
 from torchpt.native.device_checks import CheckResult
 from torchpt.search.tree import WideBvh
 
-FILM = {"width": 16, "height": 12}
+FILM = {"width": 8, "height": 6}
 NAMES = ("materials.white.reflectance", "shapes.lamp.emission", "shapes.short_box.vertices", "camera.to_world")
 
 

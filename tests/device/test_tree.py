@@ -33,14 +33,13 @@ def tensors(rays: Any) -> Any:
     return tuple(map(torch.from_numpy, rays))
 
 
-@pytest.mark.parametrize("any_hit", [False, True])
-def test_hits_of_a_mesh(any_hit):
+@pytest.mark.parametrize(("kind", "any_hit"), few(product(KINDS, (False, True)), 4))
+def test_hits_of_a_mesh(kind, any_hit):
     g = triangles(*sphere_mesh(10))
     accel = WideBvh(g, 1)
-    for kind in KINDS:
-        found = search_on_machine(accel, tensors(make_rays(kind, g, 250, 1)), any_hit, per_thread=2)
-        assert found.differing == 0
-        assert found.machine.local_bytes == 8 * accel.depth
+    found = search_on_machine(accel, tensors(make_rays(kind, g, 250, 1)), any_hit, per_thread=2)
+    assert found.differing == 0
+    assert found.machine.local_bytes == 8 * accel.depth
 
 
 def test_hits_of_other_primitives():

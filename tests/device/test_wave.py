@@ -163,10 +163,11 @@ def test_models_that_cannot_be_compiled_run_between_kernels(device):
     described = box()
     described["materials"]["grey"] = {"type": "own", "level": 0.4}
     scene = torchpt.load(described, device="cpu", bsdfs={"own": Own()})
-    of_cpu = rendered(scene)
+    keys = {"film": {"width": 12, "height": 8}, "render": {"spp": 2}}
+    of_cpu = rendered(scene, **keys)
     assert of_cpu.eager
     device(2048)
-    found = rendered(scene)
+    found = rendered(scene, **keys)
     assert found.eager
     assert_same(found, of_cpu)
 
