@@ -325,7 +325,7 @@ class VjpKernels(Kernels):
 
     Args:
         tape: the wave and its differentiated tensors.
-        packets: see :class:`~torchpt.engines.kernels.layout.Layout`.
+        by_kernels: see :class:`~torchpt.engines.kernels.layout.Layout`.
         cotangent: ``(3, H W)`` float32 of the picture, divided by the samples a pixel, for the VJP of splats.
 
     Attributes:
@@ -336,8 +336,8 @@ class VjpKernels(Kernels):
         slots: rows of :func:`torchpt.engines.kernels.backward.slots_of`.
     """
 
-    def __init__(self, tape: Tape, packets: bool, cotangent: Tensor | None = None) -> None:
-        super().__init__(with_detached_geometry(tape.wave), packets, fused=False, cotangent=cotangent)
+    def __init__(self, tape: Tape, by_kernels: bool, cotangent: Tensor | None = None) -> None:
+        super().__init__(with_detached_geometry(tape.wave), by_kernels, fused=False, cotangent=cotangent)
         self.tape, self.cotangent = tape, cotangent
         self.taped = tape.taped.context
         self.primals = tape.primals
