@@ -92,6 +92,8 @@ def main() -> None:
     if arguments.quick:
         arguments.rounds, arguments.size, arguments.spp = 1, 64, 4
     if arguments.cuda:
+        if arguments.error or arguments.busy or arguments.scaling or arguments.scalar:
+            parser.error("--cuda compares throughput with cuda_ad_rgb alone")
         arguments.compile = "on"
     if arguments.error:
         bench_error.contest(arguments)

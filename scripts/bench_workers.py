@@ -116,7 +116,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int)
     parser.add_argument("--sampler")
     parser.add_argument("--compile", default="auto")
-    parser.add_argument("--device", default="cpu", help="ours")
+    parser.add_argument("--device", default="cpu", help="device of torchpt")
     arguments = parser.parse_args()
     shoot = (torchpt if arguments.engine == OURS else mitsuba)(arguments)
     shoot(arguments.spp, 0)

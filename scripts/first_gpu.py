@@ -152,10 +152,10 @@ class Device:
         """Return gradients of the Cornell box by kernels on the device, see :func:`_gradients`."""
 
         def backward(kernels: Any, tape: Any, settings: Any, cotangent: Tensor, sums: Any) -> str:
-            return replay._replay_on_device([], tape, settings, cotangent, kernels.cotangent, sums)
+            return replay._replay_on_device([], tape, settings, cotangent, kernels.cotangent, sums, None)
 
-        def made(tape: Any, own: Any, cotangent: Any, by_kernels: bool, lanes: int) -> Any:
-            return device_backward(tape, own, cotangent, by_kernels, lanes, self.cuda, self.target)
+        def made(tape: Any, own: Any, cotangent: Any, by_kernels: bool, lanes: int, before: Any) -> Any:
+            return device_backward(tape, own, cotangent, by_kernels, lanes, before, self.cuda, self.target)
 
         kept = replay._replay_on_threads, replay.device_backward
         if self.simulated:

@@ -37,11 +37,11 @@ def device(monkeypatch) -> Iterator[Callable[..., SimulatedCuda]]:
             return made
 
         def backward(kernels: Any, tape: Any, settings: Any, cotangent: Any, sums: Any) -> str:
-            cuda.fallback = replay._replay_on_device([], tape, settings, cotangent, kernels.cotangent, sums)
+            cuda.fallback = replay._replay_on_device([], tape, settings, cotangent, kernels.cotangent, sums, None)
             return cuda.fallback
 
-        def made(tape: Any, own: Any, cotangent: Any, _: bool, lanes: int) -> Any:
-            return device_backward(tape, own, cotangent, by_kernels, lanes, cuda, target)
+        def made(tape: Any, own: Any, cotangent: Any, _: bool, lanes: int, before: Any) -> Any:
+            return device_backward(tape, own, cotangent, by_kernels, lanes, before, cuda, target)
 
         monkeypatch.setattr(run, "kernel_engine", engine)
         monkeypatch.setattr(replay, "_replay_on_threads", backward)

@@ -59,7 +59,7 @@ _ROUNDS = frozenset(
      "mm", "bmm", "mv", "dot", "addmm", "addmv", "baddbmm", "addcmul", "addcdiv", "lerp", "rsqrt", "pow", "exp", "exp2",
      "expm1", "log", "log2", "log10", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh",
      "tanh", "hypot", "sigmoid", "erf", "erfinv", "index_add", "scatter_add", "_linalg_det", "_linalg_solve_ex",
-     "linalg_inv_ex"}
+     "linalg_inv_ex", "linalg_cross"}
 )  # fmt: skip
 #: Functions of torch that make tensors, and methods of tensors that do.
 _FACTORIES = (

@@ -375,7 +375,7 @@ def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
 
 
 #: The handler of each operation. `extra` of those that have it: gather (table, numbers an entry, component), element (table,
-#: index), uniform (uniform, index), search (table, its type, right), part (index), arena, slot and segment (row), tensor
+#: index), uniform (uniform, index), search (table, its type, right), part (index), arena and slot (row), tensor
 #: (tensor, row).
 _HANDLERS: dict[str, Callable[..., str]] = {
     "bitreverse": lambda block, ty, a: block.call("llvm.bitreverse", ty, a),

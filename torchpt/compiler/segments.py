@@ -13,7 +13,7 @@ from torchpt.compiler.graph import Graph, Unsupported
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.sinks import Sinks, Store
 
-__all__ = ["segment_functions", "segment_sums"]
+__all__ = ["UNROLLED", "segment_functions", "segment_sums"]
 
 #: Terms whose loads overlap.
 UNROLLED = 16

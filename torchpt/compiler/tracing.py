@@ -228,8 +228,8 @@ class Tracer(TorchDispatchMode):
         if tensor.numel() > _MOST_ELEMENTS:
             raise Unsupported(f"a table of shape {tuple(tensor.shape)} read whole in every lane")
         ty = DTYPES[tensor.dtype]
-        # Zeros that autograd makes are constants, so that sums over lanes are found (:mod:`.operators.derivatives`). Stages keep
-        # their tables: with constants other products would be fused.
+        # Zeros that autograd makes are constants, so that sums over lanes are found (:mod:`.operators.derivatives`). Stages
+        # keep their tables: with constants other products would be fused.
         if self.graph.derivatives and id(tensor) in self._filled:
             constant = self.graph.constant(ty, tensor.reshape(-1)[0].item())
             return Value(np.full(tuple(tensor.shape), constant, object), None)

@@ -149,9 +149,8 @@ def free_memory(device: torch.device) -> int | None:
     """Return the free memory in bytes, on a CPU the lesser of machine and container; None if unknown."""
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
-        return (
-            free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        )  # torch keeps freed memory
+        # torch's allocator keeps freed memory for itself.
+        return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     sizes = [size for size in (_free_in_machine(), _free_in_control_group()) if size is not None]
     return min(sizes, default=None)
 

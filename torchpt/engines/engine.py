@@ -316,7 +316,7 @@ class BackwardDevice(Protocol):
 
 
 def device_backward(
-    tape: Tape, own: Sequence[int], cotangent: Tensor | None, by_kernels: bool, lanes: int
+    tape: Tape, own: Sequence[int], cotangent: Tensor | None, by_kernels: bool, lanes: int, before: Kernels | None
 ) -> BackwardDevice:
     """Return the kernels of a backward pass on a CUDA device.
 
@@ -326,10 +326,11 @@ def device_backward(
         cotangent: as for :func:`backward_tensors`.
         by_kernels: as for :func:`forward_device`.
         lanes: of a wave.
+        before: kernels of an earlier render, whose tree is refitted where primitives have moved.
 
     Raises:
         RenderError: kernels cannot run on the device.
     """
     from torchpt.engines.kernels.device_backward import device_backward
 
-    return device_backward(tape, own, cotangent, by_kernels, lanes)
+    return device_backward(tape, own, cotangent, by_kernels, lanes, before)

@@ -93,7 +93,8 @@ class SceneTape(Tape):
             rays = o, d
             self._inputs += [o, d] if differentiates_rays else []
         # The inputs may end with the rays, which have no name.
-        given = {name: value.detach() for name, value in params.items()} | dict(zip(wanted, self._inputs, strict=False))
+        given = {name: value.detach() if value.requires_grad else value for name, value in params.items()}
+        given |= dict(zip(wanted, self._inputs, strict=False))
         with torch.enable_grad():
             taped_wave = make_wave(scene, settings, given, dtype, tape=True, attached=attached, rays=rays)
         self._outputs: list[Tensor] = []

@@ -14,6 +14,7 @@ Vicini, Speierer, Jakob 2021, *Path Replay Backpropagation*; for the marks Griew
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -30,6 +31,7 @@ from torchpt.engines.engine import (
     Backward,
     BackwardDevice,
     BackwardKernels,
+    Kernels,
     backward_kernels,
     backward_tensors,
     device_backward,
@@ -41,7 +43,7 @@ from torchpt.paths.walk import KEPT, Counts, Observer, Population, walk
 from torchpt.paths.wave import Wave
 from torchpt.scene import Scene
 from torchpt.scene.memory_estimate import BYTES_PER_LANE
-from torchpt.scene.prepare import own_models, uses_kernels
+from torchpt.scene.prepare import own_models, scene_cache, uses_kernels
 from torchpt.scene.settings import Settings
 
 __all__ = ["replay_paths"]
@@ -52,8 +54,8 @@ LANES = {"cpu": 1 << 16, "cuda": 1 << 20}
 BYTES_PER_VERTEX = 240
 #: Numbers of chunks that kernels of a device trace at once.
 CHUNKS_OF_WAVE = (1, 4, 16, 64, 256)
-#: A wave has less than this many times the lanes that there are samples.
-CHUNKS_GROWTH = 4
+#: Waves of several chunks have fewer lanes than this many times the number of samples.
+MAX_LANES_PER_SAMPLE = 4
 #: Greatest number of marks of a walk; where there are more, every other one is dropped.
 MARKS = 8
 
@@ -162,9 +164,8 @@ def replay_paths(
     """
     wave = scene_tape.wave
     # A splat reaches a pixel by itself: its cotangent is the pixel's over spp.
-    samples = torch.full(
-        (), settings.render.spp, device=cotangent.device
-    )  # a tensor: GPUs multiply by a number's reciprocal
+    # A tensor: a GPU multiplies by the reciprocal of a number.
+    samples = torch.full((), settings.render.spp, device=cotangent.device)
     splat_cotangent = cotangent / samples if wave.integrator.splats else None
     if _uses_kernels(scene_tape, settings):
         own = own_models(scene, wave)
@@ -173,7 +174,8 @@ def replay_paths(
             reason = _replay_on_threads(kernels, scene_tape, settings, cotangent, sums)
             _warn_of_eager_vjps(kernels, wave)
         else:
-            reason = _replay_on_device(own, scene_tape, settings, cotangent, splat_cotangent, sums)
+            before = scene_cache(scene).kernels
+            reason = _replay_on_device(own, scene_tape, settings, cotangent, splat_cotangent, sums, before)
         if not reason:
             return
         warn_once(f"torchpt: gradients of this scene are taken by tensor operations, as {reason}")
@@ -205,7 +207,7 @@ def chunk_sums(
     return sums
 
 
-def _warn_of_eager_vjps(kernels: BackwardKernels, wave: Wave) -> None:
+def _warn_of_eager_vjps(kernels: BackwardKernels | BackwardDevice, wave: Wave) -> None:
     """Warn of stages whose VJP cannot be compiled."""
     models = wave.context.world.materials.models
     for (stage, *details), why in kernels.eager_vjps.items():
@@ -220,6 +222,7 @@ def _replay_on_device(
     cotangent: Tensor,
     splat_cotangent: Tensor | None,
     sums: GradientSums,
+    before: Kernels | None,
 ) -> str:
     """Replay all chunks by kernels on a device, many at once; return why that is not possible, or "".
 
@@ -229,26 +232,27 @@ def _replay_on_device(
     _, _, width, height = wave.crop
     blocks = scene_tape.blocks(width * height, spp)
     samples = spp * sum(pixels for _, pixels in blocks)
-    lanes = [LANES_OF_KERNELS * chunks for chunks in CHUNKS_OF_WAVE]
-    lanes = [number for number in lanes if number == lanes[0] or number < CHUNKS_GROWTH * samples]
+    fewest, *larger = (LANES_OF_KERNELS * chunks for chunks in CHUNKS_OF_WAVE)
+    sizes = [fewest, *(size for size in larger if size < MAX_LANES_PER_SAMPLE * samples)]
 
-    def replay(number: int, last: bool) -> bool:
+    def replay(lanes: int, last: bool) -> bool:
         """Replay all chunks in waves of so many lanes; return False, and do nothing, if memory is too short for them."""
         by_kernels = settings.render.search_by_kernels
-        kernels = device_backward(scene_tape, own, splat_cotangent, by_kernels, number)
+        kernels = device_backward(scene_tape, own, splat_cotangent, by_kernels, lanes, before)
         if not last and not _fits(kernels, wave.centre.device, settings):
             return False
         engine = kernels.engine()
-        for span in _spans(blocks, spp, number // LANES_OF_KERNELS):
+        for span in _spans(blocks, spp, lanes // LANES_OF_KERNELS):
             wave_sums = kernels.wave_sums(sums, LANES_OF_KERNELS)
             Chunk(engine, settings, span, wave_sums).run(cotangent)
             wave_sums.merge_into_whole()
+        _warn_of_eager_vjps(kernels, wave)
         return True
 
-    while lanes:
-        number = lanes.pop()
+    while sizes:
+        lanes = sizes.pop()
         try:
-            if replay(number, last=not lanes):
+            if replay(lanes, last=not sizes):
                 return ""
             continue
         except Unsupported as error:
@@ -262,9 +266,9 @@ def _replay_on_device(
 
 
 def _fits(kernels: BackwardDevice, device: torch.device, settings: Settings) -> bool:
-    """Return True if a wave takes at most half of the device's memory, and of ``render.max_memory``."""
+    """Return True if the paths of a wave take at most half of the free memory, and of ``render.max_memory``."""
     bounds = [bound for bound in (free_memory(device), settings.render.max_memory) if bound is not None]
-    return kernels.lanes * kernels.bytes_per_lane(_kept_vertices(settings)) <= min(bounds) // 2
+    return kernels.lanes * kernels.bytes_per_lane(_kept_vertices(settings)) <= min(bounds, default=sys.maxsize) // 2
 
 
 def _replay_on_threads(

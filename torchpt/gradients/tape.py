@@ -40,9 +40,9 @@ def sample_cotangents(settings: Settings, radiance: Tensor, pixels: Tensor) -> T
         pixels: cotangents of the pixels ``(3, n)``.
     """
     finite = torch.isfinite(radiance).all(0)
-    # Divided on the host: a GPU multiplies by the reciprocal of a number.
-    weight = torch.ones((), dtype=radiance.dtype) / settings.render.spp
-    cotangent = pixels[:, None] * (finite.to(radiance.dtype) * weight.to(radiance.device))
+    # A tensor: a GPU multiplies by the reciprocal of a number.
+    count = torch.full((), settings.render.spp, dtype=radiance.dtype, device=radiance.device)
+    cotangent = pixels[:, None] * (finite.to(radiance.dtype) / count)
     clamp = settings.integrator.clamp
     if clamp is None:
         return cotangent

@@ -1,7 +1,7 @@
 """Copies of parameters on the host, where worlds are assembled.
 
-A render on a GPU reads a world that was computed on the CPU. Parameters that do not change between renders, such as texels and
-the vertices of a scene whose lights are optimized, are copied once.
+A render on a GPU reads a world that was computed on the CPU. Parameters of the scene that do not change between renders, such
+as texels and the vertices of a scene whose lights are optimized, are copied once.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from torchpt.core.threads import outside_inference_mode
+
 __all__ = ["HostCopies"]
 
 
@@ -18,9 +20,8 @@ class HostCopies:
     """Copies of a scene's tensors, kept until these change."""
 
     def __init__(self) -> None:
-        self._kept: dict[
-            str, tuple[Tensor, int, Tensor]
-        ] = {}  # by name: the tensor, its version by torch, and the copy
+        #: By name: the tensor, its version by torch, and the copy.
+        self._kept: dict[str, tuple[Tensor, int, Tensor]] = {}
 
     def of(self, params: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return parameters on the host, themselves where they are there; gradients flow back to the originals.
@@ -38,6 +39,7 @@ class HostCopies:
             return value.cpu()
         tensor, version, copy = self._kept.get(name, (None, 0, value))
         if tensor is not value or version != value._version:
-            copy = value.detach().cpu()
+            with outside_inference_mode():
+                copy = value.detach().cpu()
             self._kept[name] = value, value._version, copy
         return copy

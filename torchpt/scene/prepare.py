@@ -125,10 +125,12 @@ def make_wave(
         uv = any(layer.uv for layer in surface_layers(settings).values())  # an AOV shows texture coordinates
         world, geometry = scene.world(dtype, world_params, uv=uv, choice=settings.light_choice)
         threads = None if settings.render.threads == "auto" else int(settings.render.threads)
-        moved = any(name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in world_params)
-        accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
+        surfaces_move = any(
+            name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in world_params
+        )
+        accel = scene.accel(settings.render.accel, threads, geometry if surfaces_move else None)
         if tree and accel.name == "brute":  # it tests packets of rays against all primitives; `numba` is a tree
-            accel = scene.accel("numba", threads, geometry if moved else None)
+            accel = scene.accel("numba", threads, geometry if surfaces_move else None)
         if not integrator.lit:  # an integrator that does not use lights
             world = _without_lights(scene, world, own=own)
     else:

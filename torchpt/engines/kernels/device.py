@@ -247,17 +247,17 @@ _ON_DEVICE: WeakKeyDictionary[Accel, dict[torch.device, SearchWords | None]] = W
 
 
 def search_on_device(
-    accel: Accel, wanted: bool, device: torch.device, before: Kernels | None = None
+    accel: Accel, by_kernels: bool, device: torch.device, before: Kernels | None = None
 ) -> SearchWords | None:
     """Return the argument of searches in kernels of a scene, on a device; None: rays are searched outside of kernels.
 
     Args:
         accel: the scene's acceleration structure.
-        wanted: False: only ``accel`` itself is searched by kernels, not a tree of tensors by another one.
+        by_kernels: False: only ``accel`` itself is searched by kernels, not a tree of tensors by another one.
         device: where kernels run.
         before: kernels of an earlier render, whose tree may be refitted.
     """
-    if not wanted and not isinstance(accel, Brute):
+    if not by_kernels and not isinstance(accel, Brute):
         return None
     found = _ON_DEVICE.setdefault(accel, {})
     if device not in found:

@@ -31,9 +31,9 @@ from torchpt.engines.kernels.device import (
 )
 from torchpt.engines.kernels.device_sums import SegmentSums, Terms, WaveSums
 from torchpt.engines.kernels.driver import Cuda, cuda_of
-from torchpt.engines.kernels.engine import LANES, Chunk, Paths
+from torchpt.engines.kernels.engine import Chunk, Paths
 from torchpt.engines.kernels.layout import Layout
-from torchpt.engines.kernels.programs import Kernel, NamedTensors
+from torchpt.engines.kernels.programs import Kernel, Kernels, NamedTensors
 from torchpt.math.sums import GradientSums
 from torchpt.paths.adjoint import Tape
 
@@ -96,7 +96,8 @@ def device_backward(
     own: Sequence[int],
     cotangent: Tensor | None,
     by_kernels: bool,
-    lanes: int = LANES,
+    lanes: int,
+    before: Kernels | None = None,
     cuda: Cuda | None = None,
     target: Callable[[int], Target] = ptx_target,
 ) -> DeviceVjpKernels:
@@ -108,6 +109,7 @@ def device_backward(
         cotangent: see :class:`DeviceVjpKernels`.
         by_kernels: True: rays are searched by kernels where these can; False: by the wave's acceleration structure.
         lanes: of a wave.
+        before: see :func:`~torchpt.engines.kernels.device.search_on_device`.
         cuda: the device; None: that of the wave.
         target: returns the target of a row length.
 
@@ -115,7 +117,7 @@ def device_backward(
         RenderError: kernels cannot run on the device.
     """
     device = cuda_of(tape.wave.centre.device) if cuda is None else cuda
-    search = search_on_device(tape.wave.accel, by_kernels, device.device)
+    search = search_on_device(tape.wave.accel, by_kernels, device.device, before)
     cotangent = None if cotangent is None else cotangent.float().contiguous()
     kernels = DeviceVjpKernels(tape, cotangent, device, target(lanes), search)
     kernels.eager = kernels.probe(own)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchpt.compiler import cache
 from torchpt.compiler.kernel import HEAD, WORD
-from torchpt.compiler.segments import segment_sums
+from torchpt.compiler.segments import UNROLLED, segment_sums
 from torchpt.compiler.target import Target
 from torchpt.engines.kernels.driver import Cuda, Function
 from torchpt.math import sums
@@ -153,8 +153,8 @@ class Terms:
 # ---- Sums
 
 
-#: Most terms that a launch adds: indices are 32-bit.
-_MOST_TERMS = (1 << 31) - 1
+#: Most terms that a launch adds: indices are 32-bit, also those that are found to be past the end.
+_MOST_TERMS = (1 << 31) - 1 - UNROLLED
 
 
 class SegmentSums:
@@ -235,7 +235,7 @@ class WaveSums(TableSums):
         self._large: dict[int, list[tuple[Tensor, Tensor]]] = {}
 
     def begin(self, pixels: int, samples: int, device: torch.device) -> Places:
-        """Return the places of the wave's samples."""
+        """Begin a wave of ``samples`` samples of ``pixels`` pixels each; keep and return their places."""
         self._places = Places.of(pixels, samples, self._size, device)
         return self._places
 

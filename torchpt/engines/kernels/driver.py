@@ -155,7 +155,6 @@ class Cuda:
         self._check(code, "the number of multiprocessors")
         self.multiprocessors = value.value
         self._functions: dict[tuple[str, int, int], Function] = {}
-        self._lanes = ctypes.c_int64()
 
     # -- what torch has
 
@@ -236,8 +235,8 @@ class Cuda:
             most: largest number of lanes that may stand there.
             stream: handle of the stream.
         """
-        self._lanes.value = lanes
-        pointers = (ctypes.c_void_p * 2)(ctypes.addressof(words), ctypes.addressof(self._lanes))
+        address = ctypes.c_int64(lanes)
+        pointers = (ctypes.c_void_p * 2)(ctypes.addressof(words), ctypes.addressof(address))
         grid = max(min(-(-most // self.threads), function.blocks), 1)
         code = self.driver.cuLaunchKernel(function.handle, grid, 1, 1, self.threads, 1, 1, 0, stream, pointers, None)
         self._check(code, "the launch of a kernel")
