@@ -12,6 +12,7 @@ of a chunk there is neither an operator of torch nor a barrier between threads.
 ``backward.py``         kernels and engine of path replay
 ``device.py``           the same stages on a CUDA device: waves, counts in memory, films
 ``device_backward.py``  path replay on a CUDA device
+``device_sums.py``      its sums of gradients, in the order of a CPU
 ``driver.py``           the device's driver: loading code and launching kernels
 ======================  =====================================================================================
 """

@@ -469,7 +469,11 @@ class Shadows:
         prim = torch.where(first, spots[0].hit.prim, spots[1].hit.prim)
         y = torch.where(first, spots[0].p, spots[1].p).double()
         numbers = [torch.where(first, getattr(spots[0].hit, k), getattr(spots[1].hit, k)) for k in ("u", "v")]
-        some = (prim >= 0).nonzero().squeeze(1)
+        # A ray through a straight edge meets none of the edge's own flat faces again: where rounding says so, a step beside the
+        # edge, the point does not lie in the direction that its density is for, and its light has no bound.
+        own = (prim == passed.held.prim) | (prim == passed.mate)
+        flat = (prim < self.bodies.first_sphere) | (prim >= sum(self.bodies.counts))  # instances are of triangles
+        some = ((prim >= 0) & ~(own & flat)).nonzero().squeeze(1)
         prim, y = take(prim, some), take(y, some)
         held = self._held(prim, take(torch.stack(numbers), some), y)
         passed = rows(passed, some)
