@@ -20,13 +20,14 @@ from torchpt.core.tree import map_leaves
 from torchpt.math.sums import GradientSums
 from torchpt.paths.adjoint import Tape
 from torchpt.paths.wave import Wave
+from torchpt.physics.shapes.geometry import LaneGeometry
 from torchpt.ranks import Group, blocks
 from torchpt.scene import Scene
 from torchpt.scene.prepare import make_wave
 from torchpt.scene.settings import Settings
 from torchpt.spec import Moves
 
-__all__ = ["SceneTape", "attached"]
+__all__ = ["SceneTape", "attached", "near_of"]
 
 
 # ---- Which parameters move geometry, by their specs: gradients of colours then need no derivatives of geometry
@@ -48,6 +49,43 @@ def attached(scene: Scene, names: Iterable[str]) -> bool:
         return moves is Moves.SURFACES
 
     return any(map(is_attached, names))
+
+
+# ---- The length over which points slide along their rays
+
+
+#: Share of the scene's size where what moves has none of its own: the camera, instances.
+_NEAR = 0.25
+
+
+@torch.no_grad()
+def near_of(scene: Scene, geometry: LaneGeometry, wanted: Iterable[str]) -> Tensor:
+    """Return the length ``(1,)`` float64 over which points slide along their rays in place of being held.
+
+    It is about half the diagonal of the box around all that moves. It changes no gradient's mean, but its variance: see
+    :func:`torchpt.physics.shapes.interaction.reattach`.
+
+    Args:
+        scene: the scene.
+        geometry: its primitives.
+        wanted: names of the parameters that are differentiated.
+    """
+    p0, e1, e2 = (corner.double() for corner in (geometry.p0, geometry.e1, geometry.e2))
+    corners = torch.stack((p0, p0 + e1, p0 + e2, p0 + e1 + e2))
+    low, high = corners.amin(0), corners.amax(0)
+    round_ = slice(sum(geometry.counts[:2]), None)  # disks, spheres and quadrics are about p0
+    radius = torch.maximum(e1.norm(dim=0), e2.norm(dim=0))[round_]
+    low[:, round_], high[:, round_] = p0[:, round_] - radius, p0[:, round_] + radius
+    moving, first = torch.zeros_like(low[0], dtype=torch.bool), 0
+    for part in scene.built.parts:
+        end = first + (1 if part.faces is None else len(part.faces))
+        moving[first:end] = any(name.startswith(f"{part.name}.") for name in wanted)
+        first = end
+    whole = 0.5 * (high.amax(1) - low.amin(1)).norm()
+    if not bool(moving.any()):
+        return (_NEAR * whole)[None]
+    box = high[:, moving].amax(1) - low[:, moving].amin(1)
+    return torch.minimum(0.5 * box.norm(), whole)[None]
 
 
 # ---- From parameters to the tensors of waves, and back once a backward pass
@@ -97,6 +135,9 @@ class SceneTape(Tape):
         given |= dict(zip(wanted, self._inputs, strict=False))
         with torch.enable_grad():
             taped_wave = make_wave(scene, settings, given, dtype, tape=True, attached=attached, rays=rays)
+        if attached:
+            near = near_of(scene, taped_wave.context.world.geometry, wanted).to(dtype)
+            taped_wave = replace(taped_wave, context=replace(taped_wave.context, near=near))
         self._outputs: list[Tensor] = []
         primals: dict[int, Tensor] = {}  # by id of the tensor on the tape
         leaves: dict[int, Tensor] = {}  # by id of the primal

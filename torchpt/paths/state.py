@@ -162,6 +162,8 @@ class StageContext:
         world: the scene's tensors.
         pixel: ``(5,)`` footprint of a pixel, as :meth:`torchpt.physics.cameras.base.Camera.pixel` returns it; None: textures
             are not filtered.
+        near: ``(1,)`` length over which points slide along their rays in place of being held, see
+            :func:`torchpt.physics.shapes.interaction.reattach`; None where geometry is not differentiated.
         salts: ``(len(Dimension),)`` int32, the hashed random dimensions of this vertex: with a path's key they give its random
             numbers, see :func:`torchpt.physics.samplers.salts`.
         follow_ray: True: hit points are intersected anew along their rays, see :func:`torchpt.physics.shapes.interact`.
@@ -174,6 +176,7 @@ class StageContext:
     plan: Plan
     world: World
     pixel: Tensor | None = None
+    near: Tensor | None = None
     salts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int32))
     follow_ray: bool = False
     roulette: float = 0.0

@@ -280,12 +280,13 @@ def attach(
     plan, world = context.plan, context.world
     kind, frame = world.materials.models[model], surface.frame
     d, weight, pdf, sharp = drawn.d, drawn.weight, drawn.pdf, drawn.sharp
-    # attached_d: the same direction, differentiable in both ends of the ray. measure: 1, with the derivative of the change of
-    # measure from solid angle to the area at the next hit, see `reattach`.
+    # attached_d: the same direction, differentiable in both ends of the ray. measure: 1, with the derivative of the measure of
+    # directions, see `reattach`.
     hit, attached_d, measure, alive = None, d, 1.0, drawn.least > 0
     if plan.attached:
         hit = context.search(replace(state, o=drawn.o, d=d, t_max=alive.to(plan.dtype) * T_MAX))
-        attached_d, measure = reattach(world, at.p, hit, d)
+        assert context.near is not None
+        attached_d, measure = reattach(world, at.p, hit, d, context.near)
     if not kind.smooth:
         value = kind.eval(surface.parameters, surface.wo, frame.to_local(attached_d))
         attached_weight = value * (measure / torch.where(alive & ~torch.isinf(pdf), pdf, 1.0))

@@ -36,6 +36,7 @@ __all__ = [
     "mesh_edges",
     "own_view",
     "plain_of",
+    "primitive_count",
     "rims",
     "round_outline",
     "rounds_of",
@@ -296,12 +297,17 @@ def known(form: Form) -> bool:
     return form.around or (form.half == 0 and (form.bend == 0 or (form.bend < 0 and form.level == 0)))
 
 
+def primitive_count(part: Part) -> int:
+    """Return the number of primitives of a part."""
+    return 1 if part.faces is None else len(part.faces)
+
+
 def _starts(parts: tuple[Part, ...], bodies: Bodies) -> list[int]:
     """The id of the first primitive of each part."""
     starts, at = [], 0
     for part in parts:
         starts.append(at)
-        at += len(part.faces) if part.faces is not None else 1
+        at += primitive_count(part)
     assert at == sum(bodies.counts)
     return starts
 

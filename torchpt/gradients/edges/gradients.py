@@ -12,10 +12,14 @@ from torch import Tensor
 
 from torchpt.core.threads import limited_threads
 from torchpt.gradients.edges.bodies import Bodies, bodies_of
+from torchpt.gradients.edges.curves import primitive_count
 from torchpt.gradients.edges.film import Worth
 from torchpt.gradients.edges.primary import Look, pieces_of, primary_of
+from torchpt.gradients.edges.receivers import Frame
+from torchpt.gradients.edges.segments import Segments, segments_of
 from torchpt.gradients.edges.shadows import Shadows, occluders_of, sources_of
 from torchpt.gradients.edges.traced import Traced, traced_of
+from torchpt.gradients.parameters import near_of
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.ranks import Group, share
 from torchpt.scene import Scene
@@ -41,6 +45,18 @@ class Samples(Protocol):
 def concerns(scene: Scene, names: Iterable[str]) -> bool:
     """Return True where any of the parameters moves edges."""
     return any(scene.spec(name).moves in (Moves.SURFACES, Moves.SHADOWS) for name in names)
+
+
+def moving_primitives(scene: Scene, bodies: Bodies, names: Iterable[str]) -> Tensor:
+    """Return a mask ``(P,)`` of the primitives, by ids of the search, that any of the parameters moves."""
+    names = [name for name in names if scene.spec(name).moves is Moves.SURFACES]
+    def move(name: str) -> bool:
+        return any(wanted.startswith(f"{name}.") for wanted in names)
+
+    of_part = {part.name: [move(part.name)] * primitive_count(part) for part in scene.built.parts}
+    marks = list(of_part.values())
+    marks += [[move(copy.name) or moved for moved in of_part[copy.of]] for copy in scene.built.copies]
+    return torch.tensor(list(chain.from_iterable(marks)), dtype=torch.bool, device=scene.device)
 
 
 @dataclass(frozen=True)
@@ -107,36 +123,45 @@ class Boundary:
         for first, count in self._chunks(total):
             yield primary.samples(first, count, total, self.worth, look, held)
 
-    def shadows(self, spp: int) -> Iterator[Samples]:
-        """Samples of the edges of shadows: of lights, then of what surfaces reflect."""
-        total = spp * self.pixels
-        for shadows in self._shadows():
-            for first, count in self._chunks(total):
-                cast = shadows.samples(first, count, total, self.worth)
-                if cast is not None:
-                    yield cast
+    def shadows(self, spp: int, holds_first: bool = False) -> Iterator[Samples]:
+        """Samples of the edges of shadows: of lights, then of what surfaces reflect.
 
-    def _shadows(self) -> Iterator[Shadows]:
+        ``holds_first``: the interior holds in place what the camera sees.
+        """
+        total = spp * self.pixels
+        for estimator in self._estimators(holds_first):
+            for first, count in self._chunks(total):
+                found = estimator.samples(first, count, total)
+                if found is not None:
+                    yield found
+
+    def _estimators(self, holds_first: bool) -> Iterator[Shadows | Segments]:
         still, integrator = self.still, self.traced.wave.integrator
         depth = integrator.limits.max_depth
         if not isinstance(integrator, PathIntegrator) or 0 <= depth < 2:
             return
         with torch.no_grad():
-            occluders = occluders_of(self.scene, still, self.scene.merged(self.params))
-            if occluders is None:
-                return
+            poses = self.scene.merged(self.params)
+            world = self.traced.wave.context.world
             _, geometry = self.scene.world(torch.float32, self.params)
+            near = near_of(self.scene, world.geometry, self.leaves)
+            moves = moving_primitives(self.scene, still, self.leaves)
+            camera_moves = any(name.startswith("camera.") for name in self.leaves)
+            frame = Frame(still, self.traced, self.worth, near, moves, holds_first, camera_moves)
             low, high = primitive_bounds(geometry)
             reach = float((high.double().amax(1) - low.double().amin(1)).norm()) * 0.5
             met = integrator.strategy in ("bsdf", "uniform")
-            sources = sources_of(still, self.traced.wave.context.world, reach, met)
+            occluders = occluders_of(self.scene, still, poses)
+            sources = sources_of(still, world, reach, met)
         if sources is None:
             return
-        # Where nothing but the camera moves, what it does not see itself stays as it is.
-        onward = any(not name.startswith("camera.") for name in self.leaves)
-        for light in (sources, None):
-            if light is not None or (not 0 <= depth < 3 and self.moving.keys() - {"lights"}):
-                yield Shadows(still, occluders, light, self.traced, reach, depth, onward)
+        if occluders is not None:
+            yield Shadows(frame, occluders, sources, reach, depth)
+        if self.moving.keys() - {"lights"}:
+            with torch.no_grad():
+                segments = segments_of(self.scene, frame, poses, depth)
+            if segments is not None:
+                yield segments
 
     def _chunks(self, total: int) -> Iterator[tuple[int, int]]:
         """First samples and how many."""
@@ -219,10 +244,10 @@ def add_gradients(
         if not held:
             return every.gradients(chain(every.primary(samples, every.traced.radiance), every.shadows(samples)), wanted)
         found = every.gradients(every.primary(samples, every.traced.radiance, held=True), wanted)
-        # Shadows move with what they fall on, which is held: only lights move them.
+        # What the camera sees is held: only lights move shadows.
         lights = [name for name in wanted if not name.startswith("camera.")]
         thrown = boundary_of(scene, settings, params, lights, dtype, cotangent, ranks)
         if thrown is None:
             return found
-        more = thrown.gradients(thrown.shadows(samples), wanted)
+        more = thrown.gradients(thrown.shadows(samples, holds_first=True), wanted)
         return [b if a is None else a if b is None else a + b for a, b in zip(found, more, strict=True)]

@@ -1,9 +1,8 @@
-"""Edges of shadows and of what is seen by way of further surfaces: occluders, lit points, and their share of the gradient."""
+"""Edges of shadows of lights: what throws them, where they fall, and their share of the gradient."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import torch
@@ -22,12 +21,11 @@ from torchpt.gradients.edges.curves import (
     rounds_of,
     straight,
 )
-from torchpt.gradients.edges.film import Worth, film_places, slopes
-from torchpt.gradients.edges.traced import Traced, Use
+from torchpt.gradients.edges.receivers import LONGEST, Frame, Prefix, held_at, prefixes_of
+from torchpt.gradients.edges.traced import Use
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.sampling import Distribution1D, concentric_disk, uniform_sphere, uniform_triangle
-from torchpt.math.vectors import cross, dot, largest, luminance, rows, take
-from torchpt.paths.roulette import russian_roulette, survival_probability
+from torchpt.math.vectors import cross, dot, luminance, rows, take
 from torchpt.paths.vertex import light_radiance
 from torchpt.physics.lights import KINDS, SURFACES, from_digits
 from torchpt.physics.lights.base import Environment, lane_rows
@@ -52,9 +50,9 @@ class Beam:
     Attributes:
         view: from where it comes.
         held: the point that it leaves; where ``row`` says that it is on a surface.
-        row: ``(N,)`` of the table of lights; -1: light that a surface reflects.
+        row: ``(N,)`` of the table of lights.
         u: ``(2, N)`` of the direction, of environments.
-        chance: ``(N,)`` density of the row and, on surfaces, of the place by area; of reflected light of the direction.
+        chance: ``(N,)`` density of the row and, on surfaces, of the place by area.
     """
 
     view: View
@@ -349,12 +347,10 @@ def _round_weight(bodies: Bodies, rounds: Rounds) -> Tensor:
 
 # ---- Edges of shadows: curves on surfaces along which light from one point begins to pass an edge
 #
-# For a point y that light comes from, held on its surface, and a place p on an outline as y sees it, the ray from y past p
-# meets a receiver at x: there, for this y, light begins. Seen by the camera the curve lies on the film, ``s = camera(x)``, and
-# moves as y, p, the receiver and the camera do: see :mod:`torchpt.gradients.edges.primary`. Seen by way of further surfaces it
-# lies on the receiver, ``x`` against the point that is held there (the material form of Zhang, Miller, Yan, Gkioulekas, Zhao,
-# *Path-Space Differentiable Rendering*, 2020, whose boundary segments these are): from x light is followed on toward the
-# camera.
+# For a point y of a light, held on its surface, and a place p on an outline as y sees it, the ray from y past p meets a
+# receiver at x: there, for this y, light begins. The curve of such x moves over the receiver as y, p and the receiver do,
+# against the point that the interior has there (:mod:`torchpt.gradients.edges.receivers`). From x light is followed on toward
+# the camera (boundary segments of Zhang, Miller, Yan, Gkioulekas, Zhao, *Path-Space Differentiable Rendering*, 2020).
 
 
 #: Rays past an edge go so far beside it, against the way to it.
@@ -365,13 +361,6 @@ _NEAR = 2.0**-10
 _OWN = 2.0**-6
 #: Where a ray from a light begins, against the way to the edge.
 _BEGIN = 2.0**-12
-#: Vertices after which light that reaches no camera is given up where paths have no limit of their own.
-_MOST = 32
-#: From this vertex on roulette plays.
-_ROULETTE = 3
-
-#: Light ``(3, n)`` that arrives in lanes ``(n,)``, for paths of ``k`` vertices from there to the camera.
-Brought = Callable[[int, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -384,8 +373,7 @@ class Cast:
         edge: the places past which it goes.
         receiver: the points where it arrives.
         normal: of the receiver ``(3, N)``.
-        film: weights ``(2, N)`` of places on the film.
-        surface: weights ``(3, N)`` of places against the receiver's own points; None where nobody asks.
+        seen: prefixes of the receivers, each with weights ``(3, M)`` of their motion over the receiver.
     """
 
     beam: Beam
@@ -393,17 +381,18 @@ class Cast:
     edge: Held
     receiver: Held
     normal: Tensor
-    film: Tensor
-    surface: Tensor | None
+    seen: list[tuple[Prefix, Tensor]]
 
     def sum(self, bodies: Bodies) -> Tensor:
-        """Differentiable in ``bodies``; of no meaning but for its derivative."""
+        """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
         e, w = self._from(bodies), self.beam.view.w
         p, held = bodies.points(self.edge), bodies.points(self.receiver)
         toward = e - p * w
         x = p - toward * (dot(self.normal, p - held) / dot(self.normal, toward))
-        value = (film_places(bodies.camera, x) * self.film).sum()
-        return value if self.surface is None else value + ((x - held) * self.surface).sum()
+        value = torch.zeros((), dtype=x.dtype, device=x.device)
+        for prefix, weight in self.seen:
+            value = value + ((take(x, prefix.lane) - prefix.receivers(bodies)) * weight).sum()
+        return value
 
     def _from(self, bodies: Bodies) -> Tensor:
         e = torch.where(self.source == -1, bodies.points(self.beam.held), self.beam.view.e)
@@ -419,72 +408,37 @@ class Shadows:
     """The estimator of one render.
 
     Attributes:
-        bodies: detached.
+        frame: of the interior.
         occluders: what throws shadows.
-        sources: the lights; None: what surfaces reflect.
-        traced: what sees, and draws.
+        sources: the lights.
         reach: radius of the scene.
         depth: vertices of paths at most; -1: any number.
-        onward: whether light that reaches the camera by way of further surfaces counts too.
     """
 
-    bodies: Bodies
+    frame: Frame
     occluders: Occluders
-    sources: Sources | None
-    traced: Traced
+    sources: Sources
     reach: float
     depth: int
-    onward: bool
 
     @torch.no_grad()
-    def samples(self, first: int, count: int, total: int, worth: Worth) -> Cast | None:
-        """Samples ``first .. first + count`` of ``total``; None where none of them counts."""
-        number = torch.arange(first, first + count, device=self.bodies.p0.device)
-        key = self.traced.key(number, Use.REFLECTED if self.sources is None else Use.LIGHTS)
-        u, coin = self.traced.edge(number, key, total)
+    def samples(self, first: int, count: int, total: int) -> Cast | None:
+        """Return samples ``first .. first + count`` of ``total``; None where none of them counts."""
+        traced, bodies = self.frame.traced, self.frame.bodies
+        number = torch.arange(first, first + count, device=bodies.p0.device)
+        key = traced.key(number, Use.LIGHTS)
+        u, coin = traced.edge(number, key, total)
         index, rest, chance = self.occluders.draw(u)
-        if self.sources is not None:
-            beam = self.sources.draw(self.traced.draws(key))
-            passed = self.occluders.place(index, rest, chance, coin, beam.view)
-            beam = rows(beam, passed.lane)
-        else:
-            beam, passed = self._reflected(key, index, rest, chance, coin)
-        beam, passed, spot, outward = self._past(beam, passed)
+        beam = self.sources.draw(traced.draws(key))
+        passed = self.occluders.place(index, rest, chance, coin, beam.view)
+        beam, passed, spot, outward = self._past(rows(beam, passed.lane), passed)
         if not len(passed.lane):
             return None
-        return self._cast(take(number, passed.lane), take(key, passed.lane), beam, passed, spot, outward, worth, total)
-
-    def _reflected(self, key: Tensor, index: Tensor, rest: Tensor, chance: Tensor, coin: Tensor) -> tuple[Beam, Passed]:
-        """Points of surfaces, by a direction from the edge; of edges that are the same from everywhere."""
-        away = uniform_sphere(self.traced.draws(key).two(Dimension.BSDF).double())
-        known = (take(self.occluders.form, index) < 0).nonzero().squeeze(1)
-        index, rest, chance, coin, away = (take(x, known) for x in (index, rest, chance, coin, away))
-        passed = self.occluders.place(index, rest, chance, coin, View(away, 0.0))
-        away = take(away, passed.lane)
-        aside = cross(passed.along, away)
-        aside = aside / dot(aside, aside).sqrt() * (_STEP * self.reach)
-        spots = [met(self.traced, passed.p + aside * side, away) for side in (1.0, -1.0)]
-        far = [torch.where(spot.hit.prim >= 0, spot.hit.t, -1.0) for spot in spots]
-        first = far[0] >= far[1]
-        prim = torch.where(first, spots[0].hit.prim, spots[1].hit.prim)
-        y = torch.where(first, spots[0].p, spots[1].p).double()
-        numbers = [torch.where(first, getattr(spots[0].hit, k), getattr(spots[1].hit, k)) for k in ("u", "v")]
-        # A ray through a straight edge meets none of the edge's own flat faces again: where rounding says so, a step beside the
-        # edge, the point does not lie in the direction that its density is for, and its light has no bound.
-        own = (prim == passed.held.prim) | (prim == passed.mate)
-        flat = (prim < self.bodies.first_sphere) | (prim >= sum(self.bodies.counts))  # instances are of triangles
-        some = ((prim >= 0) & ~(own & flat)).nonzero().squeeze(1)
-        prim, y = take(prim, some), take(y, some)
-        held = self._held(prim, take(torch.stack(numbers), some), y)
-        passed = rows(passed, some)
-        row = torch.full_like(prim, -1)
-        one = torch.ones_like(y[0])
-        beam = Beam(View(y, one), held, row, torch.zeros_like(y[:2]), one / (4.0 * math.pi))
-        lane = take(known, passed.lane)
-        return beam, Passed(lane, passed.held, passed.mate, passed.p, passed.along, passed.density)
+        return self._cast(take(key, passed.lane), beam, passed, spot, outward, total)
 
     def _past(self, beam: Beam, passed: Passed) -> tuple[Beam, Passed, Spot, Tensor]:
         """Rays past edges: what they meet, and unit vectors ``(3, N)`` across the edge to the side that is lit."""
+        traced = self.frame.traced
         toward = beam.view.toward(passed.p)
         w = torch.as_tensor(beam.view.w, device=toward.device).expand(toward.shape[1])
         length = dot(toward, toward).sqrt()
@@ -494,7 +448,7 @@ class Shadows:
         aside = aside / dot(aside, aside).sqrt()
         step = aside * (dot(way, way).sqrt() * _STEP)
         n = len(passed.lane)
-        t, prim = self.traced.nearest(torch.cat((o, o), 1), torch.cat((way + step, way - step), 1))
+        t, prim = traced.nearest(torch.cat((o, o), 1), torch.cat((way + step, way - step), 1))
         t, prim = t.view(2, n), prim.view(2, n)
         own = (prim == passed.held.prim) | ((prim == passed.mate) & (passed.mate >= 0))
         hidden = t < torch.where(own, 1.0 - _OWN, 1.0 - _NEAR)
@@ -504,22 +458,12 @@ class Shadows:
         index = good.nonzero().squeeze(1)
         side = torch.where(take(far[0], index), 1.0, -1.0)
         outward = take(aside, index) * side
-        spot = met(self.traced, take(o, index), take(way, index) + take(step, index) * side)
+        spot = met(traced, take(o, index), take(way, index) + take(step, index) * side)
         some = (spot.hit.prim >= 0).nonzero().squeeze(1)
         index = take(index, some)
         return rows(beam, index), rows(passed, index), spot.taken(some), take(outward, some)
 
-    def _cast(
-        self,
-        number: Tensor,
-        key: Tensor,
-        beam: Beam,
-        passed: Passed,
-        spot: Spot,
-        outward: Tensor,
-        worth: Worth,
-        total: int,
-    ) -> Cast:
+    def _cast(self, key: Tensor, beam: Beam, passed: Passed, spot: Spot, outward: Tensor, total: int) -> Cast | None:
         x, n = spot.p.double(), spot.n.double()
         toward = beam.view.toward(x)
         wi = toward / dot(toward, toward).sqrt()
@@ -531,130 +475,23 @@ class Shadows:
             return (v - leaving * (dot(n, v) / slope)) * stretch
 
         along, across = follow(passed.along), follow(outward)
-        light = dot(n, wi).abs() / (passed.density * total)
-        if self.sources is not None:
-            brought = self._shone(self.sources.brought(beam, x) * light)
-        else:
-            brought = self._bounced(number, beam, passed, x, wi, light)
-        direct = self._seen(spot, wi, brought, worth)
-        _, jacobian = slopes(self.bodies.camera, x)
-        ds = (jacobian * along).sum(1)
-        normal = torch.stack((ds[1], -ds[0]))
-        sign = torch.sign((normal * (jacobian * across).sum(1)).sum(0))
-        film = torch.where(direct != 0, -normal * (sign * direct), 0.0)
-        surface = None
-        if self.onward:
-            edge = cross(n, along)
-            sign = torch.sign(dot(edge, across))
-            surface = -edge * (sign * self._followed(key, spot, wi, brought, worth))
-        receiver = self._held(spot.hit.prim, torch.stack((spot.hit.u, spot.hit.v)), x)
-        return Cast(beam, self._source(beam), passed.held, receiver, n, film, surface)
+        brought = self.sources.brought(beam, x) * (dot(n, wi).abs() / (passed.density * total))
+        edge = cross(n, along)
+        edge = edge * -torch.sign(dot(edge, across))
+        longest = (self.depth if self.depth >= 0 else LONGEST) - 1
+        seen = []
+        for prefix in prefixes_of(self.frame, spot, wi, key, longest):
+            value = (prefix.weight * take(brought, prefix.lane)).sum(0)
+            seen.append((prefix, take(edge, prefix.lane) * value))
+        if not seen:
+            return None
+        receiver = held_at(self.frame.bodies, spot.hit.prim, torch.stack((spot.hit.u, spot.hit.v)), x)
+        return Cast(beam, self._source(beam), passed.held, receiver, n, seen)
 
     def _source(self, beam: Beam) -> Tensor:
         """Columns of ``Bodies.lights``; see :class:`Cast`."""
-        if self.sources is None:
-            return beam.row
         column = beam.row - self.sources.surfaces
         around = self.sources.world.lights
         assert around is not None
         still = -1 if around.environment is None else len(around.area) - 1
         return torch.where(column < 0, -1, torch.where(beam.row == still, -2, column))
-
-    @staticmethod
-    def _shone(light: Tensor) -> Brought:
-        """Of lights, the same for all paths."""
-        return lambda _, lane: take(light, lane)
-
-    def _bounced(self, number: Tensor, beam: Beam, passed: Passed, x: Tensor, wi: Tensor, light: Tensor) -> Brought:
-        """What surfaces reflect from y to x; paths of more vertices on the way to the camera have fewer before."""
-        to = beam.view.e - passed.p
-        whole = beam.view.e - x
-        factor = light * dot(to, to) / (dot(whole, whole) * beam.chance)
-        o, most = x + whole * _BEGIN, self.traced.wave.integrator.limits.max_depth
-
-        def brought(k: int, lane: Tensor) -> Tensor:
-            rays = (take(o, lane), take(wi, lane), take(number, lane), Use.BEHIND)
-            depth = most if most < 0 else most - k
-            if not len(lane) or 0 <= depth < 2:  # nothing but light of sources themselves
-                return torch.zeros_like(rays[1])
-            return (self.traced.radiance(*rays, depth) - self.traced.radiance(*rays, 1)) * take(factor, lane)
-
-        return brought
-
-    def _camera(self, spot: Spot) -> tuple[Tensor, Tensor, Tensor]:
-        """Which points the camera sees ``(n,)``, their places on the film, and directions to the camera."""
-        camera, x = self.bodies.camera, spot.p.double()
-        seen = camera.film_of(x)
-        assert seen is not None
-        s = film_places(camera, x)
-        width, height = camera.resolution
-        margin = 16.0  # pixels, for wide filters
-        good = (seen[2] > 0) & (seen[3] > 0) & (s > -margin).all(0) & (s[0] < width + margin) & (s[1] < height + margin)
-        index = good.nonzero().squeeze(1)
-        s, x = take(s, index), take(x, index)
-        o, d = camera.rays(s[0], s[1], None)
-        o = o.expand_as(d)
-        away = x - o
-        t, prim = self.traced.nearest(o, d)
-        reach = dot(away, d)
-        off = (t - reach).abs() / reach
-        visible = ((prim == take(spot.hit.prim, index)) & (off < _NEAR)) | (off < 2.0**-14)
-        some = visible.nonzero().squeeze(1)
-        return take(index, some), take(s, some), -take(d, some)
-
-    def _seen(self, spot: Spot, wi: Tensor, brought: Brought, worth: Worth) -> Tensor:
-        """What light that arrives from ``wi`` is worth where the camera sees it ``(N,)``, by area of the film."""
-        found = torch.zeros_like(wi[0])
-        index, s, wo = self._camera(spot)
-        if len(index):
-            sent = spot.taken(index).sent(wo.to(spot.p), take(wi, index).to(spot.p)).double()
-            found[index] = (worth.at(s) * sent * brought(1, index)).sum(0)
-        return found
-
-    def _followed(self, key: Tensor, spot: Spot, wi: Tensor, brought: Brought, worth: Worth) -> Tensor:
-        """What it is worth by way of further surfaces ``(N,)``, by area of the receiver."""
-        found = torch.zeros_like(wi[0])
-        lane = torch.arange(len(found), device=found.device)
-        carried = torch.ones_like(wi)
-        limit = self.depth if self.depth >= 0 else _MOST
-        first = 1 if self.sources is not None else 2
-        for k in range(2, limit - first + 1):
-            o, d, weight = spot.scattered(wi.to(spot.p), take(key, lane), k)
-            carried = carried * weight.double()
-            alive = largest(carried) > 0
-            if k > _ROULETTE:
-                draws = self.traced.draws(take(key, lane), k)
-                alive, carried = russian_roulette(
-                    survival_probability(None, 1.0, largest(carried), None), draws, alive, carried
-                )
-            on = alive.nonzero().squeeze(1)
-            lane, carried = take(lane, on), take(carried, on)
-            spot = met(self.traced, take(o, on), take(d, on))
-            some = (spot.hit.prim >= 0).nonzero().squeeze(1)
-            lane, carried, spot = take(lane, some), take(carried, some), spot.taken(some)
-            if not len(lane):
-                break
-            wi = -spot.d.double()
-            index, s, wo = self._camera(spot)
-            if not len(index):
-                continue
-            part = spot.taken(index)
-            sent = part.sent(wo.to(spot.p), take(wi, index).to(spot.p)).double()
-            _, jacobian = slopes(self.bodies.camera, part.p.double())
-            grown = dot(cross(jacobian[0], jacobian[1]), part.n.double()).abs()
-            back = take(lane, index)
-            value = (worth.at(s) * sent * take(carried, index) * brought(k, back)).sum(0) * grown
-            found.index_add_(0, back, value)
-        return found
-
-    def _held(self, prim: Tensor, uv: Tensor, x: Tensor) -> Held:
-        """Points of surfaces, held there."""
-        a = torch.cat((uv.double(), torch.zeros_like(x[:1])))
-        bodies = self.bodies
-        if bodies.counts[3] or bodies.counts[4]:
-            bent = ((prim >= bodies.first_sphere) & (prim < sum(bodies.counts))).nonzero().squeeze(1)
-            p0, *axes = bodies.place(take(prim, bent))
-            faces = [cross(axes[1], axes[2]), cross(axes[2], axes[0]), cross(axes[0], axes[1])]
-            away, det = take(x, bent) - p0, dot(axes[0], faces[0])
-            a[:, bent] = torch.stack([dot(face, away) / det for face in faces])
-        return Held(prim, a)

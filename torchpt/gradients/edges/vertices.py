@@ -57,30 +57,44 @@ class Spot:
             for into, value in zip(found, make(model, index, at), strict=True):
                 into.index_copy_(into.dim() - 1, index, value.to(into.dtype))
 
-    def sent(self, wo: Tensor, wi: Tensor) -> Tensor:
-        """``f cos_s(wi) / cos_g(wi)`` ``(3, N)`` of light from ``wi`` that leaves along ``wo``; deltas give nothing."""
+    def sent(self, wo: Tensor, wi: Tensor, along_surface: bool = False) -> Tensor:
+        """Return ``f cos_s(wi) / cos_g(wi)`` ``(3, N)`` of light from ``wi`` that leaves along ``wo``; deltas give nothing.
+
+        ``along_surface``: True: ``wi`` lies in the plane of the geometric normal. Then it is ``f cos_s(wi)``, negative where
+        the light that counts comes from behind that plane.
+        """
         out = torch.zeros_like(wo)
 
         def make(model: int, index: Tensor, at: Interaction) -> list[Tensor]:
-            return [self._weighed(model, at, take(wo, index), take(wi, index))]
+            return [self._weighed(model, at, take(wo, index), take(wi, index), along_surface)]
 
         self._each([out], make)
         return out
 
-    def _weighed(self, model: int, at: Interaction, wo: Tensor, wi: Tensor) -> Tensor:
+    def _weighed(self, model: int, at: Interaction, wo: Tensor, wi: Tensor, along_surface: bool) -> Tensor:
         world = self.traced.wave.context.world
         kind = world.materials.models[model]
         if kind.smooth:
             return torch.zeros_like(wo)
         surface = surface_at(world, model, -wo, at, self.traced.wave.context.pixel)
         local = surface.frame.to_local(wi)
+        if along_surface:
+            side = torch.sign(local[2]) if surface.side is None else torch.sign(local[2]) * surface.side
+            value = kind.eval(surface.parameters, surface.wo, local) * side
+            value = value if surface.front_mask is None else value * surface.front_mask
+            return value if surface.perturbed_normal is None else value * surface.perturbed_normal.shadowing(wi)
         cosine = dot(wi, at.ng).abs()
         weight, share = 1.0 / cosine.clamp_min(1e-6), shading_weight(world, model, at, surface, wi, local)
         weight = weight if share is None else weight * share
         return kind.eval(surface.parameters, surface.wo, local) * weight
 
-    def scattered(self, wi: Tensor, key: Tensor, depth: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return rays by which light from ``wi`` goes on: origins, unit directions, ``f cos_s / cos_g |cos_g(wo)| / pdf``."""
+    def scattered(
+        self, wi: Tensor, key: Tensor, depth: int, along_surface: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return rays by which light from ``wi`` goes on: origins, unit directions, ``f cos_s / cos_g |cos_g(wo)| / pdf``.
+
+        ``along_surface``: as for :meth:`sent`.
+        """
         o, d, weight = torch.zeros_like(wi), wi.clone(), torch.zeros_like(wi)
         context = self.traced.wave.context
         world = context.world
@@ -93,7 +107,7 @@ class Spot:
             drawn = sample_bsdf(context, model, at, surface, self.traced.draws(take(key, index), depth))
             usable = (drawn.pdf > 0) & torch.isfinite(drawn.pdf)
             factor = dot(drawn.d, at.ng).abs() / torch.where(usable, drawn.pdf, 1.0)
-            value = self._weighed(model, at, drawn.d, back) * factor
+            value = self._weighed(model, at, drawn.d, back, along_surface) * factor
             return [drawn.o, drawn.d, torch.where(usable, value, 0.0)]
 
         self._each([o, d, weight], make)

@@ -27,17 +27,17 @@ class PathIntegrator(Integrator):
 def follows_ray(plan: Plan, world: World, depth: int) -> bool:
     """Return True where hit points are intersected anew along their rays; see :func:`torchpt.physics.shapes.interact`.
 
-    Where geometry is differentiated, the first hit follows the camera ray, and so do hits behind delta lobes, so all of a scene
-    with such lobes; all others keep their ``u``, ``v`` on the primitive. In float64 hits are intersected anew too, since the
-    search rounds to float32.
+    Where geometry is differentiated all hits follow their rays, whose directions have the derivatives. In float64 hits that
+    need no derivative are intersected anew too, since the search rounds to float32: the first, and those behind delta lobes.
 
     Args:
         plan: static configuration of the render.
         world: the scene's tensors.
         depth: number of the vertex; 1 is the first hit.
     """
-    intersects_anew = plan.attached or plan.dtype == torch.float64
-    return intersects_anew and (depth == 1 or any(model.delta for model in world.materials.models))
+    if plan.attached:
+        return True
+    return plan.dtype == torch.float64 and (depth == 1 or any(model.delta for model in world.materials.models))
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,13 @@
 The search has no gradients. Computing the point from the corners of its primitive is more accurate than ``o + t d`` and
 makes any search differentiable. The derivative can be taken in two parametrizations, with the same values:
 
-- a camera ray stays fixed in its pixel and the point slides along it: ``follow_ray``;
-- at later vertices the point stays fixed on its surface and the direction follows it: :func:`reattach` (the material form of
-  Zhang, Miller, Yan, Gkioulekas, Zhao, *Path-Space Differentiable Rendering*, 2020; its interior term).
+- the ray stays fixed and the point slides along it: ``follow_ray``;
+- the point stays fixed on its surface and the direction follows it (the material form of Zhang, Miller, Yan, Gkioulekas, Zhao,
+  *Path-Space Differentiable Rendering*, 2020; its interior term).
+
+Camera rays take the first. Behind a surface :func:`reattach` blends the two by the length of the ray: near points slide, since
+the geometry term of points that are held has a derivative of the order of one over their distance, which has no variance; far
+points are held, since each point that slides hands its motion, over the cosine, to the next.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ from torchpt.physics.shapes.geometry import Hit, Interaction
 from torchpt.physics.shapes.primitive import LanePrimitives, Primitive, Rays, lane_primitives
 from torchpt.physics.world import World
 
-__all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
+__all__ = ["OFFSET", "interact", "offset_origin", "reattach", "slide_share"]
 
 #: Rays leave a surface ``OFFSET * world.geometry.bound`` off its plane. Re-deriving a point and evaluating its plane in the
 #: search each round by less than ``4 * 2^-24 * 2 bound``; this is twice their sum, and scales with the scene.
@@ -61,7 +65,11 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_ray: bool = Fa
     prim, p0, e1, e2, u, v = primitives.prim, primitives.p0, primitives.e1, primitives.e2, hit.u, hit.v
     not_flat = _not_flat(world, prim)
     if follow_ray:
-        u, v = _plane_uv(o, d, p0, e1, e2)
+        along_u, along_v = _plane_uv(o, d, p0, e1, e2)
+        if o.dtype == torch.float64:  # more accurate than the float32 of the search
+            u, v = along_u, along_v
+        else:  # the search is more accurate where a ray grazes the plane
+            u, v = u + (along_u - along_u.detach()), v + (along_v - along_v.detach())
     # In lanes of kinds that are not flat u and v are no affine coordinates: at 0 the sum below stays finite until
     # ``hit_points`` replaces it.
     for _, is_kind in not_flat:
@@ -121,19 +129,32 @@ def _framed(world: World, primitives: LanePrimitives, at: Interaction) -> Intera
     return replace(at, tangent=tangent, bitangent=bitangent)
 
 
-def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Tensor]:
+def slide_share(r: Tensor, near: Tensor) -> Tensor:
+    """Return the share ``(N,)`` by which a point at distance ``r (N,)`` slides along its ray in place of being held.
+
+    ``near (1,)``: the length over which points slide. The share is ``exp(-(r / near)^2)``.
+    """
+    return torch.exp(-(r / near).square())
+
+
+def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
     """Make a traced direction differentiable in both of its end points.
+
+    With the share ``a`` of :func:`slide_share` the motion of the direction is ``D = (1 - a) dw``, where ``dw`` turns with the
+    points if both are held. A ray with this motion meets the moving surface at the point that is held by ``1 - a`` and slides
+    by ``a``. The derivative of the measure is the divergence of ``D``: ``1 - a`` times that of ``|cos| dA / r^2``, less the
+    slope of ``a`` along ``dw``; the distance changes by ``-r (n dw) / (n w)`` with the direction, ``n`` the normal.
 
     Args:
         world: the scene's tensors, with gradients.
         x: origins, differentiable ``(3, N)``.
-        hit: hits of the rays. The points stay fixed at ``u, v`` of their primitives (on a sphere at their normal, on a quadric
-            at their position in object space).
+        hit: hits of the rays. Points that are held stay at ``u, v`` of their primitives (on a sphere at their normal, on a
+            quadric at their position in object space). Those of emitters are all held, as are points that light sampling draws.
         wi: traced directions ``(3, N)``; unchanged for misses.
+        near: ``(1,)`` length over which points slide.
 
     Returns:
-        The direction ``(3, N)``, and a factor ``(N,)`` of value 1 with the relative derivative of ``|cos| dA / r^2``, the
-        change of measure from solid angle to area.
+        The direction ``(3, N)``, and a factor ``(N,)`` of value 1 with the relative derivative of the measure.
     """
     missed = hit.prim < 0
     primitives = lane_primitives(world, hit.prim.clamp_min(0))
@@ -148,18 +169,28 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
             y, area = torch.where(is_kind, fixed.p, y), torch.where(is_kind, fixed.area, area)
     offset = torch.where(missed, wi, y - x)
     square = dot(offset, offset)
-    # Where two surfaces touch, the derivative grows as one over the distance. Points within rounding of each other count as
-    # one: a ray that leaves beside an edge may hit the other face of that edge.
+    # Points within rounding of each other count as one: a ray that leaves beside an edge may hit the other face of that edge.
     least = largest(torch.maximum(x.detach().abs(), y.detach().abs())) * NEAR
     apart = missed | (square.detach() > least * least)
     square = torch.where(apart, square, 1.0)
     direction = offset / square.sqrt()
-    measure = dot(direction, torch.where(missed, wi, area)).abs() / torch.where(missed, 1.0, square)
-    value = measure.detach()
+    slides = slide_share(square.detach().sqrt(), near)
+    if world.lights is not None and world.lights.row_of_prim is not None:
+        emits = take(world.lights.row_of_prim, world.geometry.slot(hit.prim.clamp_min(0))) >= 0
+        slides = torch.where(emits, 0.0, slides)
+    held = 1.0 - slides
+    area = torch.where(missed, wi, area)
+    projected = dot(direction, area)  # the cosine times the area
+    measure = projected.abs() / torch.where(missed, 1.0, square)
+    value, cosine = measure.detach(), projected.detach()
     usable = apart & ~missed & (value > 0)
-    ratio = torch.where(usable, measure / torch.where(usable, value, 1.0), 1.0)
+    turn = direction - direction.detach()
+    slope = -2.0 * (square.detach() / near.square()) * slides  # of the share by the logarithm of the distance
+    along = dot(turn, area.detach()) / torch.where(usable, cosine, 1.0)
+    change = held * (measure / torch.where(usable, value, 1.0) - 1.0) + slope * along
+    ratio = torch.where(usable, 1.0 + change, 1.0)
     # The value stays the traced direction; only the derivative is added.
-    return torch.where(apart, wi + (direction - direction.detach()), wi), ratio
+    return torch.where(apart & ~missed, wi + held * turn, wi), ratio
 
 
 def offset_origin(world: World, at: Interaction, w: Tensor) -> Tensor:

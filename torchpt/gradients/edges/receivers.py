@@ -1,0 +1,242 @@
+"""Receivers of light that passes edges: paths by which the camera sees them, and how they move in the interior's frame.
+
+Light that arrives at a receiver x is worth ``W(x)`` to the loss, by area of x. Where the camera sees x, that is the worth of
+its place on the film times the film's area for one of the surface; else light is followed on by the BSDF of x, and the camera
+connected with each vertex behind. The surfaces from the camera to x are the *prefix* of the path.
+
+The interior differentiates paths in a frame of its own (:mod:`torchpt.physics.shapes.interaction`), in which points partly
+slide along the rays that reach them. So x moves with all surfaces of its prefix::
+
+    V(x_1) = S(camera's ray, x_1)
+    V(x_k+1) = (1 - a) v(x_k+1) + a S(V(x_k), x_k+1)
+
+with ``v`` the velocity of the surface's own point, ``S`` that of the point that slides along a ray whose origin moves, and
+``a`` the share of :func:`torchpt.physics.shapes.interaction.slide_share`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.film import Worth, film_places, slopes
+from torchpt.gradients.edges.traced import Traced
+from torchpt.gradients.edges.vertices import Spot, met
+from torchpt.math.vectors import cross, dot, largest, rows, take
+from torchpt.paths.roulette import russian_roulette, survival_probability
+from torchpt.physics.shapes.interaction import slide_share
+
+__all__ = ["LONGEST", "Frame", "Prefix", "Stop", "held_at", "prefixes_of"]
+
+#: Vertices after which light that reaches no camera is given up where paths have no limit of their own.
+LONGEST = 32
+#: From this vertex on roulette plays.
+_ROULETTE = 3
+#: What ends so close to a point, against the way to it, ends at it: of the point's own primitive, and of others.
+_NEAR, _NEAREST = 2.0**-10, 2.0**-14
+#: Pixels beside the film that are looked at, for wide filters.
+_MARGIN = 16.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The frame of the interior, and what is seen in it.
+
+    Attributes:
+        bodies: detached.
+        traced: what sees.
+        worth: of places on the film.
+        near: ``(1,)`` length over which points slide along their rays.
+        moves: ``(P,)`` bool by ids of the search: primitives that move.
+        holds_first: True: what the camera sees is held in place (:mod:`torchpt.gradients.camera`).
+        camera_moves: True: the camera moves.
+    """
+
+    bodies: Bodies
+    traced: Traced
+    worth: Worth
+    near: Tensor
+    moves: Tensor
+    holds_first: bool
+    camera_moves: bool
+
+    def share(self, prim: Tensor, r: Tensor) -> Tensor:
+        """Return the share ``(N,)`` by which points of primitives slide at the ends of rays of length ``r (N,)``."""
+        world = self.traced.wave.context.world
+        share = slide_share(r, self.near)
+        if world.lights is None or world.lights.row_of_prim is None:
+            return share
+        emits = take(world.lights.row_of_prim, world.geometry.slot(prim.clamp_min(0))) >= 0
+        return torch.where(emits, 0.0, share)
+
+    def moving(self, prim: Tensor) -> Tensor:
+        """Return a mask ``(N,)`` of primitives that move; False where ``prim`` is -1."""
+        return take(self.moves, prim.clamp_min(0)) & (prim >= 0)
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Points of surfaces on paths from the camera, M lanes.
+
+    Attributes:
+        held: the points, held on their surfaces.
+        p: where they are ``(3, M)``.
+        n: geometric normals ``(3, M)``.
+    """
+
+    held: Held
+    p: Tensor
+    n: Tensor
+
+
+@dataclass(frozen=True)
+class Prefix:
+    """Paths from the camera to M receivers, with as many surfaces each.
+
+    Attributes:
+        frame: of the interior.
+        lane: ``(M,)`` the receivers.
+        weight: ``(3, M)`` worth of the light that arrives at them, by area.
+        place: ``(2, M)`` of the paths on the film.
+        stops: the surfaces, first that which the camera sees; the last is the receiver.
+    """
+
+    frame: Frame
+    lane: Tensor
+    weight: Tensor
+    place: Tensor
+    stops: tuple[Stop, ...]
+
+    @property
+    def count(self) -> int:
+        """Return the number of surfaces."""
+        return len(self.stops)
+
+    def taken(self, index: Tensor) -> Prefix:
+        """Return some of the lanes."""
+        return Prefix(self.frame, *rows((self.lane, self.weight, self.place, self.stops), index))
+
+    def moves(self) -> Tensor:
+        """Return a mask ``(M,)`` of the paths that move."""
+        if self.frame.camera_moves and not self.frame.holds_first:
+            return torch.ones_like(self.lane, dtype=torch.bool)
+        moving = torch.zeros_like(self.lane, dtype=torch.bool)
+        for stop in self.stops:
+            moving = moving | self.frame.moving(stop.held.prim)
+        return moving
+
+    def receivers(self, bodies: Bodies) -> Tensor:
+        """Return where the receivers are in the interior's frame ``(3, M)``, differentiable in ``bodies``."""
+        first, *others = self.stops
+        x = bodies.points(first.held)
+        if not self.frame.holds_first:
+            o, d = bodies.camera.rays(self.place[0], self.place[1], None)
+            x = o + d * (dot(first.n, x - o) / dot(first.n, d))
+        before = first.p
+        for stop in others:
+            away = stop.p - before
+            r = dot(away, away).sqrt()
+            at = bodies.points(stop.held)
+            slid = x + away * (dot(stop.n, at - x) / dot(stop.n, away))
+            x, before = at + (slid - at) * self.frame.share(stop.held.prim, r), stop.p
+        return x
+
+
+def prefixes_of(
+    frame: Frame, spot: Spot, wi: Tensor, key: Tensor, longest: int, *, along_surface: bool = False
+) -> list[Prefix]:
+    """Return paths from the camera to receivers, by the number of surfaces; those with the same number in one.
+
+    Args:
+        frame: of the interior.
+        spot: the receivers.
+        wi: ``(3, N)`` unit directions from which light arrives at them.
+        key: the sampler's keys ``(rows, N)`` of the samples.
+        longest: the greatest number of surfaces.
+        along_surface: True: light arrives in the plane of the receiver's geometric normal, see :meth:`Spot.sent`.
+    """
+    found: list[Prefix] = []
+    lane = torch.arange(wi.shape[1], device=wi.device)
+    carried = torch.ones_like(wi)
+    stops = [_stop(frame, spot)]
+    for k in range(1, longest + 1):
+        index, place, wo = _seen(frame, spot)
+        if len(index):
+            seen = spot.taken(index)
+            back = take(wi, index).to(spot.p)
+            sent = seen.sent(wo.to(spot.p), back, along_surface=along_surface and k == 1).double()
+            _, jacobian = slopes(frame.bodies.camera, seen.p.double())
+            area = dot(cross(jacobian[0], jacobian[1]), seen.n.double()).abs()
+            weight = frame.worth.at(place) * sent * take(carried, index) * area
+            some = (weight != 0).any(0).nonzero().squeeze(1)
+            if len(some):
+                chosen = take(index, some)
+                chain = tuple(rows(stop, chosen) for stop in reversed(stops))
+                found.append(Prefix(frame, take(lane, chosen), take(weight, some), take(place, some), chain))
+        if k == longest:
+            break
+        o, d, weight = spot.scattered(wi.to(spot.p), take(key, lane), k + 1, along_surface=along_surface and k == 1)
+        carried = carried * weight.double()
+        alive = (carried != 0).any(0)
+        if k >= _ROULETTE:
+            draws = frame.traced.draws(take(key, lane), k + 1)
+            chance = survival_probability(None, 1.0, largest(carried.abs()), None)
+            alive, carried = russian_roulette(chance, draws, alive, carried)
+        on = alive.nonzero().squeeze(1)
+        spot = met(frame.traced, take(o, on), take(d, on))
+        some = (spot.hit.prim >= 0).nonzero().squeeze(1)
+        kept = take(on, some)
+        if not len(kept):
+            break
+        lane, carried, spot = take(lane, kept), take(carried, kept), spot.taken(some)
+        stops = [*(rows(stop, kept) for stop in stops), _stop(frame, spot)]
+        wi = -spot.d.double()
+    return found
+
+
+def _stop(frame: Frame, spot: Spot) -> Stop:
+    p = spot.p.double()
+    return Stop(held_at(frame.bodies, spot.hit.prim, torch.stack((spot.hit.u, spot.hit.v)), p), p, spot.n.double())
+
+
+def _seen(frame: Frame, spot: Spot) -> tuple[Tensor, Tensor, Tensor]:
+    """Return which points the camera sees ``(n,)``, their places on the film, and directions to the camera."""
+    camera, x = frame.bodies.camera, spot.p.double()
+    seen = camera.film_of(x)
+    assert seen is not None
+    s = film_places(camera, x)
+    width, height = camera.resolution
+    good = (seen[2] > 0) & (seen[3] > 0) & (s > -_MARGIN).all(0) & (s[0] < width + _MARGIN) & (s[1] < height + _MARGIN)
+    index = good.nonzero().squeeze(1)
+    s, x = take(s, index), take(x, index)
+    o, d = camera.rays(s[0], s[1], None)
+    o = o.expand_as(d)
+    away = x - o
+    t, prim = frame.traced.nearest(o, d)
+    reach = dot(away, d)
+    off = (t - reach).abs() / reach
+    visible = ((prim == take(spot.hit.prim, index)) & (off < _NEAR)) | (off < _NEAREST)
+    some = visible.nonzero().squeeze(1)
+    return take(index, some), take(s, some), -take(d, some)
+
+
+def held_at(bodies: Bodies, prim: Tensor, uv: Tensor, x: Tensor) -> Held:
+    """Return points of surfaces, held there.
+
+    Args:
+        bodies: detached.
+        prim: their primitives ``(N,)``.
+        uv: ``(2, N)`` as the search gives them.
+        x: the points ``(3, N)``.
+    """
+    a = torch.cat((uv.double(), torch.zeros_like(x[:1])))
+    if bodies.counts[3] or bodies.counts[4]:
+        bent = ((prim >= bodies.first_sphere) & (prim < sum(bodies.counts))).nonzero().squeeze(1)
+        p0, *axes = bodies.place(take(prim, bent))
+        faces = [cross(axes[1], axes[2]), cross(axes[2], axes[0]), cross(axes[0], axes[1])]
+        away, det = take(x, bent) - p0, dot(axes[0], faces[0])
+        a[:, bent] = torch.stack([dot(face, away) / det for face in faces])
+    return Held(prim, a)
