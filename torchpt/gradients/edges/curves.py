@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from torchpt.core.tree import map_leaves
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.math.vectors import cross, dot, take
 from torchpt.paths.integrators.path import PathIntegrator
-from torchpt.physics.parts import Part
+from torchpt.physics.parts import Copy, Part
 from torchpt.physics.shapes.geometry import KINDS
 from torchpt.physics.shapes.quadrics import Form
 from torchpt.scene import Scene
@@ -33,10 +34,10 @@ __all__ = [
     "joined",
     "known",
     "left_out",
+    "marked_primitives",
     "mesh_edges",
     "own_view",
     "plain_of",
-    "primitive_count",
     "rims",
     "round_outline",
     "rounds_of",
@@ -300,6 +301,25 @@ def known(form: Form) -> bool:
 def primitive_count(part: Part) -> int:
     """Return the number of primitives of a part."""
     return 1 if part.faces is None else len(part.faces)
+
+
+def marked_primitives(
+    scene: Scene, of_part: Callable[[Part], bool], of_copy: Callable[[Copy, bool], bool] = lambda _, marked: marked
+) -> Tensor:
+    """Return a mask ``(P,)`` of primitives by ids of the search.
+
+    Args:
+        scene: the scene.
+        of_part: whether the primitives of a part are marked.
+        of_copy: whether those of a copy are, given whether those of its mesh are.
+    """
+    parts = [(part, of_part(part)) for part in scene.built.parts]
+    marks = [[marked] * primitive_count(part) for part, marked in parts]
+    meshes = {part.name: (marked, primitive_count(part)) for part, marked in parts}
+    for copy in scene.built.copies:
+        marked, count = meshes[copy.of]
+        marks.append([of_copy(copy, marked)] * count)
+    return torch.tensor(list(chain.from_iterable(marks)), dtype=torch.bool, device=scene.device)
 
 
 def _starts(parts: tuple[Part, ...], bodies: Bodies) -> list[int]:

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from torchpt.core.threads import limited_threads
 from torchpt.gradients.edges.bodies import Bodies, bodies_of
-from torchpt.gradients.edges.curves import primitive_count
+from torchpt.gradients.edges.curves import marked_primitives
 from torchpt.gradients.edges.film import Worth
+from torchpt.gradients.edges.horizons import Horizons, horizons_of
 from torchpt.gradients.edges.primary import Look, pieces_of, primary_of
 from torchpt.gradients.edges.receivers import Frame
 from torchpt.gradients.edges.segments import Segments, segments_of
@@ -53,10 +54,7 @@ def moving_primitives(scene: Scene, bodies: Bodies, names: Iterable[str]) -> Ten
     def move(name: str) -> bool:
         return any(wanted.startswith(f"{name}.") for wanted in names)
 
-    of_part = {part.name: [move(part.name)] * primitive_count(part) for part in scene.built.parts}
-    marks = list(of_part.values())
-    marks += [[move(copy.name) or moved for moved in of_part[copy.of]] for copy in scene.built.copies]
-    return torch.tensor(list(chain.from_iterable(marks)), dtype=torch.bool, device=scene.device)
+    return marked_primitives(scene, lambda part: move(part.name), lambda copy, marked: move(copy.name) or marked)
 
 
 @dataclass(frozen=True)
@@ -135,7 +133,7 @@ class Boundary:
                 if found is not None:
                     yield found
 
-    def _estimators(self, holds_first: bool) -> Iterator[Shadows | Segments]:
+    def _estimators(self, holds_first: bool) -> Iterator[Shadows | Segments | Horizons]:
         still, integrator = self.still, self.traced.wave.integrator
         depth = integrator.limits.max_depth
         if not isinstance(integrator, PathIntegrator) or 0 <= depth < 2:
@@ -160,8 +158,11 @@ class Boundary:
         if self.moving.keys() - {"lights"}:
             with torch.no_grad():
                 segments = segments_of(self.scene, frame, poses, depth)
+                horizons = horizons_of(self.scene, frame, depth)
             if segments is not None:
                 yield segments
+            if horizons is not None:
+                yield horizons
 
     def _chunks(self, total: int) -> Iterator[tuple[int, int]]:
         """First samples and how many."""

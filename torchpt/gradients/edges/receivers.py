@@ -29,8 +29,10 @@ from torchpt.math.vectors import cross, dot, largest, rows, take
 from torchpt.paths.roulette import russian_roulette, survival_probability
 from torchpt.physics.shapes.interaction import slide_share
 
-__all__ = ["LONGEST", "Frame", "Prefix", "Stop", "held_at", "prefixes_of"]
+__all__ = ["LONGEST", "ROUNDING", "Frame", "Prefix", "Stop", "held_at", "prefixes_of"]
 
+#: Rounding of a point that the search finds, against its coordinates and its distance.
+ROUNDING = 2.0**-18
 #: Vertices after which light that reaches no camera is given up where paths have no limit of their own.
 LONGEST = 32
 #: From this vertex on roulette plays.
@@ -146,7 +148,7 @@ class Prefix:
 
 
 def prefixes_of(
-    frame: Frame, spot: Spot, wi: Tensor, key: Tensor, longest: int, *, along_surface: bool = False
+    frame: Frame, spot: Spot, wi: Tensor, key: Tensor, longest: int, side: Tensor | None = None
 ) -> list[Prefix]:
     """Return paths from the camera to receivers, by the number of surfaces; those with the same number in one.
 
@@ -156,7 +158,7 @@ def prefixes_of(
         wi: ``(3, N)`` unit directions from which light arrives at them.
         key: the sampler's keys ``(rows, N)`` of the samples.
         longest: the greatest number of surfaces.
-        along_surface: True: light arrives in the plane of the receiver's geometric normal, see :meth:`Spot.sent`.
+        side: ``(N,)`` where light arrives in the plane of the receivers' geometric normals, see :meth:`Spot.sent`.
     """
     found: list[Prefix] = []
     lane = torch.arange(wi.shape[1], device=wi.device)
@@ -167,7 +169,8 @@ def prefixes_of(
         if len(index):
             seen = spot.taken(index)
             back = take(wi, index).to(spot.p)
-            sent = seen.sent(wo.to(spot.p), back, along_surface=along_surface and k == 1).double()
+            own = None if side is None else take(side, index)
+            sent = seen.sent(wo.to(spot.p), back, own).double()
             _, jacobian = slopes(frame.bodies.camera, seen.p.double())
             area = dot(cross(jacobian[0], jacobian[1]), seen.n.double()).abs()
             weight = frame.worth.at(place) * sent * take(carried, index) * area
@@ -178,7 +181,8 @@ def prefixes_of(
                 found.append(Prefix(frame, take(lane, chosen), take(weight, some), take(place, some), chain))
         if k == longest:
             break
-        o, d, weight = spot.scattered(wi.to(spot.p), take(key, lane), k + 1, along_surface=along_surface and k == 1)
+        o, d, weight = spot.scattered(wi.to(spot.p), take(key, lane), k + 1, side)
+        side = None
         carried = carried * weight.double()
         alive = (carried != 0).any(0)
         if k >= _ROULETTE:

@@ -23,16 +23,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
-from torchpt.gradients.edges.curves import Curves, Rounds, folds_of, joined, plain_of, primitive_count, rounds_of
+from torchpt.gradients.edges.curves import Curves, Rounds, folds_of, joined, marked_primitives, plain_of, rounds_of
 from torchpt.gradients.edges.primary import is_flat
-from torchpt.gradients.edges.receivers import LONGEST, Frame, Prefix, held_at, prefixes_of
+from torchpt.gradients.edges.receivers import LONGEST, ROUNDING, Frame, Prefix, held_at, prefixes_of
 from torchpt.gradients.edges.traced import Use
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.sampling import Distribution1D, uniform_sphere, uniform_triangle
@@ -43,8 +42,6 @@ from torchpt.scene import Scene
 
 __all__ = ["Segments", "SegmentSamples", "segments_of"]
 
-#: Rounding of a point that the search finds, against its coordinates and its distance.
-_ROUNDING = 2.0**-18
 #: Rays go so far beside an edge, against the way to it, beyond the rounding.
 _STEP = 2.0**-16
 #: What ends so close to an edge, against the way to it, ends at it.
@@ -314,9 +311,7 @@ def brinks_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Ten
 
 def smooth_of(scene: Scene, bodies: Bodies) -> Smooth | None:
     """Return the faces that are shaded smooth, those of copies too; None where there are none."""
-    of_part = {part.name: [part.kind == "triangle" and part.smooth] * primitive_count(part) for part in scene.built.parts}
-    marks = [*of_part.values(), *(of_part[copy.of] for copy in scene.built.copies)]
-    mask = torch.tensor(list(chain.from_iterable(marks)), dtype=torch.bool, device=scene.device)
+    mask = marked_primitives(scene, lambda part: part.kind == "triangle" and part.smooth)
     if not bool(mask.any()):
         return None
     prim = mask.nonzero().squeeze(1)
@@ -412,7 +407,7 @@ class Segments:
     def _rounding(self, *points: Tensor) -> Tensor:
         """Return the rounding of points that the search finds ``(N,)``."""
         largest_of = torch.stack([largest(p.abs()) for p in points]).amax(0)
-        return largest_of * _ROUNDING
+        return largest_of * ROUNDING
 
     def _size(self, prim: Tensor) -> Tensor:
         """Return the largest coordinates of primitives ``(3, N)``."""

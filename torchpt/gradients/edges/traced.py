@@ -77,6 +77,7 @@ class Use(IntEnum):
     LIGHTS = 1  # edges of shadows of lights, and the way on to the camera
     REFLECTED = 2  # the same of light that surfaces reflect
     BEHIND = 3  # the paths by which such light came
+    HORIZONS = 4  # planes of faces that are shaded smooth
 
 
 @dataclass(frozen=True)

@@ -57,30 +57,31 @@ class Spot:
             for into, value in zip(found, make(model, index, at), strict=True):
                 into.index_copy_(into.dim() - 1, index, value.to(into.dtype))
 
-    def sent(self, wo: Tensor, wi: Tensor, along_surface: bool = False) -> Tensor:
+    def sent(self, wo: Tensor, wi: Tensor, side: Tensor | None = None) -> Tensor:
         """Return ``f cos_s(wi) / cos_g(wi)`` ``(3, N)`` of light from ``wi`` that leaves along ``wo``; deltas give nothing.
 
-        ``along_surface``: True: ``wi`` lies in the plane of the geometric normal. Then it is ``f cos_s(wi)``, negative where
-        the light that counts comes from behind that plane.
+        ``side``: ``(N,)`` of 1 and -1: ``wi`` lies in the plane of the geometric normal. Then it is ``f cos_s(wi)``, and 0
+        where light that leaves along ``wo`` comes from the other side of that plane. None: ``wi`` lies beside the plane.
         """
         out = torch.zeros_like(wo)
 
         def make(model: int, index: Tensor, at: Interaction) -> list[Tensor]:
-            return [self._weighed(model, at, take(wo, index), take(wi, index), along_surface)]
+            own = None if side is None else take(side, index)
+            return [self._weighed(model, at, take(wo, index), take(wi, index), own)]
 
         self._each([out], make)
         return out
 
-    def _weighed(self, model: int, at: Interaction, wo: Tensor, wi: Tensor, along_surface: bool) -> Tensor:
+    def _weighed(self, model: int, at: Interaction, wo: Tensor, wi: Tensor, side: Tensor | None) -> Tensor:
         world = self.traced.wave.context.world
         kind = world.materials.models[model]
         if kind.smooth:
             return torch.zeros_like(wo)
         surface = surface_at(world, model, -wo, at, self.traced.wave.context.pixel)
         local = surface.frame.to_local(wi)
-        if along_surface:
-            side = torch.sign(local[2]) if surface.side is None else torch.sign(local[2]) * surface.side
-            value = kind.eval(surface.parameters, surface.wo, local) * side
+        if side is not None:
+            counts = torch.sign(local[2]) * (side if surface.side is None else side * surface.side) > 0
+            value = kind.eval(surface.parameters, surface.wo, local) * counts
             value = value if surface.front_mask is None else value * surface.front_mask
             return value if surface.perturbed_normal is None else value * surface.perturbed_normal.shadowing(wi)
         cosine = dot(wi, at.ng).abs()
@@ -89,11 +90,11 @@ class Spot:
         return kind.eval(surface.parameters, surface.wo, local) * weight
 
     def scattered(
-        self, wi: Tensor, key: Tensor, depth: int, along_surface: bool = False
+        self, wi: Tensor, key: Tensor, depth: int, side: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return rays by which light from ``wi`` goes on: origins, unit directions, ``f cos_s / cos_g |cos_g(wo)| / pdf``.
 
-        ``along_surface``: as for :meth:`sent`.
+        ``side``: as for :meth:`sent`.
         """
         o, d, weight = torch.zeros_like(wi), wi.clone(), torch.zeros_like(wi)
         context = self.traced.wave.context
@@ -107,7 +108,8 @@ class Spot:
             drawn = sample_bsdf(context, model, at, surface, self.traced.draws(take(key, index), depth))
             usable = (drawn.pdf > 0) & torch.isfinite(drawn.pdf)
             factor = dot(drawn.d, at.ng).abs() / torch.where(usable, drawn.pdf, 1.0)
-            value = self._weighed(model, at, drawn.d, back, along_surface) * factor
+            own = None if side is None else take(side, index)
+            value = self._weighed(model, at, drawn.d, back, own) * factor
             return [drawn.o, drawn.d, torch.where(usable, value, 0.0)]
 
         self._each([o, d, weight], make)

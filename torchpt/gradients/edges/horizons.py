@@ -1,0 +1,171 @@
+"""Faces that are shaded smooth end light at their own plane, which turns with the face.
+
+Light from below the plane of a face does not count where the shading normal differs from the geometric one
+(:func:`torchpt.paths.vertex.same_hemisphere`). There the integrand ``f cos_s`` jumps from a value to 0, so the plane's horizon is a
+boundary. With ``n`` the geometric normal on the side that counts, ``ω`` on the horizon and ``y`` what is seen there at distance r,
+the derivative of the loss is the integral over the surface and over the angle ``φ`` of ``ω`` of::
+
+    W(x) f cos_s L(ω) [dn·ω + (1 - a) n·(V(y) - V(x)) / r]
+
+in the frame of :mod:`torchpt.gradients.edges.receivers`; ``a`` is 1 for the sky. On flat shading ``f cos_s`` is 0 there.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.curves import marked_primitives
+from torchpt.gradients.edges.receivers import LONGEST, ROUNDING, Frame, Prefix, held_at, prefixes_of
+from torchpt.gradients.edges.traced import Use
+from torchpt.gradients.edges.vertices import Spot, met
+from torchpt.math.sampling import Distribution1D, uniform_triangle
+from torchpt.math.vectors import cross, dot, normalize, take
+from torchpt.physics.samplers import Dimension
+from torchpt.physics.shapes import interact
+from torchpt.physics.shapes.geometry import Hit
+from torchpt.scene import Scene
+
+__all__ = ["HorizonSamples", "Horizons", "horizons_of"]
+
+#: Rays along a plane are tilted by so much to the side that counts.
+_TILT = 1e-5
+
+
+@dataclass(frozen=True)
+class HorizonSamples:
+    """Samples of horizons; the derivative of the loss is that of :meth:`sum`.
+
+    Attributes:
+        face: the points on faces.
+        n: geometric normals on the side that counts ``(3, N)``.
+        omega: directions in their planes ``(3, N)``.
+        seen: what is seen there.
+        r: ``(N,)`` how far it is.
+        share: ``(N,)`` by which it slides.
+        prefixes: of the faces' points, each with the light ``(M,)``.
+    """
+
+    face: Held
+    n: Tensor
+    omega: Tensor
+    seen: Held
+    r: Tensor
+    share: Tensor
+    prefixes: list[tuple[Prefix, Tensor]]
+
+    def sum(self, bodies: Bodies) -> Tensor:
+        """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
+        _, x, y, _ = bodies.place(self.face.prim)
+        n = normalize(cross(x, y))
+        opens = dot(n * torch.sign(dot(n.detach(), self.n)), self.omega)
+        end = dot(self.n, bodies.points(self.seen))
+        value = torch.zeros((), dtype=n.dtype, device=n.device)
+        for prefix, light in self.prefixes:
+            lane = prefix.lane
+            turns = (take(end, lane) - dot(take(self.n, lane), prefix.receivers(bodies))) / take(self.r, lane)
+            value = value + ((take(opens, lane) + (1.0 - take(self.share, lane)) * turns) * light).sum()
+        return value
+
+
+@dataclass(frozen=True)
+class Horizons:
+    """The estimator of one render.
+
+    Attributes:
+        frame: of the interior.
+        prim: faces that are shaded smooth ``(F,)``.
+        choice: of a face, by area and by how far its normals are from the geometric one.
+        area: of each ``(F,)``.
+        depth: vertices of paths at most; -1: any number.
+    """
+
+    frame: Frame
+    prim: Tensor
+    choice: Distribution1D
+    area: Tensor
+    depth: int
+
+    @torch.no_grad()
+    def samples(self, first: int, count: int, total: int) -> HorizonSamples | None:
+        """Return samples ``first .. first + count`` of ``total``; None where none of them counts."""
+        traced, bodies = self.frame.traced, self.frame.bodies
+        number = torch.arange(first, first + count, device=bodies.p0.device)
+        key = traced.key(number, Use.HORIZONS)
+        u, coin = traced.edge(number, key, total)
+        draws = traced.draws(key)
+        place, angle = draws.two(Dimension.LIGHT).double(), 2.0 * math.pi * draws.two(Dimension.BSDF)[0].double()
+        index, _ = self.choice.draw(u)
+        weight = take(self.area, index) * (2.0 * 2.0 * math.pi) / (take(self.choice.pmf, index) * total)
+        prim, uv = take(self.prim, index), uniform_triangle(place)
+        face = Held(prim, torch.cat((uv, torch.zeros_like(uv[:1]))))
+        x = bodies.points(face)
+        _, e1, e2, _ = bodies.place(prim)
+        side = torch.where(coin < 0.5, 1.0, -1.0).double()
+        across, along = normalize(cross(e1, e2)), normalize(e1)
+        omega = along * torch.cos(angle) + cross(across, along) * torch.sin(angle)
+        spot = self._spot(prim, uv, x, omega)
+        n = spot.n.double() * side
+        tiny = x.abs().amax(0).clamp_min(1e-300) * ROUNDING
+        size = torch.stack([axis.abs().amax(0) for axis in (e1, e2)]).amax(0)
+        o, d = x + n * torch.maximum(tiny, size * ROUNDING), normalize(omega + n * _TILT)
+        y = met(traced, o, d)
+        found = y.hit.prim
+        r = torch.where(found >= 0, y.hit.t.double(), 1.0)
+        share = torch.where(found >= 0, self.frame.share(found, r), 1.0)
+        seen = held_at(bodies, found.clamp_min(0), torch.stack((y.hit.u, y.hit.v)), y.p.double())
+        moves = self.frame.moving(prim) | self.frame.moving(found)
+        longest = (self.depth if self.depth >= 0 else LONGEST) - 1
+        prefixes = []
+        for prefix in prefixes_of(self.frame, spot, omega, key, longest, side.to(spot.p)):
+            some = (prefix.moves() | take(moves, prefix.lane)).nonzero().squeeze(1)
+            if not len(some):
+                continue
+            prefix = prefix.taken(some)
+            lane = prefix.lane
+            depth = self.depth if self.depth < 0 else self.depth - prefix.count
+            rays = take(o, lane), take(d, lane), take(number, lane), Use.BEHIND
+            light = traced.radiance(*rays, depth) * prefix.weight
+            prefixes.append((prefix, light.sum(0) * take(weight, lane)))
+        return HorizonSamples(face, n, omega, seen, r, share, prefixes) if prefixes else None
+
+    def _spot(self, prim: Tensor, uv: Tensor, x: Tensor, omega: Tensor) -> Spot:
+        """Return the points of faces as what rays met."""
+        dtype, world = self.frame.traced.dtype, self.frame.traced.wave.context.world
+        hit = Hit(torch.zeros_like(x[0]).to(dtype), prim, uv[0].to(dtype), uv[1].to(dtype))
+        at = interact(world, x.to(dtype), omega.to(dtype), hit)
+        return Spot(self.frame.traced, x.to(dtype), omega.to(dtype), hit, at.p, at.ng)
+
+
+def horizons_of(scene: Scene, frame: Frame, depth: int) -> Horizons | None:
+    """Return the estimator; None where no face is shaded smooth.
+
+    Args:
+        scene: the scene.
+        frame: of the interior.
+        depth: vertices of paths at most; -1: any number.
+    """
+    geometry = frame.traced.wave.context.world.geometry
+    if geometry.normals is None or 0 <= depth < 2:
+        return None
+    prim = marked_primitives(scene, lambda part: part.kind == "triangle" and part.smooth).nonzero().squeeze(1)
+    if not len(prim):
+        return None
+    _, e1, e2, _ = frame.bodies.place(prim)
+    n = cross(e1, e2)
+    area = 0.5 * dot(n, n).sqrt()
+    dtype, apart = geometry.p0.dtype, torch.zeros_like(area)
+    for u, v in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
+        uv = torch.tensor([[u], [v]], dtype=dtype, device=prim.device).expand(2, len(prim))
+        hit = Hit(torch.zeros_like(uv[0]), prim, uv[0], uv[1])
+        at = interact(frame.traced.wave.context.world, uv.new_zeros(3, len(prim)), uv.new_ones(3, len(prim)), hit)
+        off = at.ns.double() - at.ng.double()
+        apart = torch.maximum(apart, dot(off, off).sqrt())
+    weight = area * apart
+    if not bool((weight > 0).any()):
+        return None
+    return Horizons(frame, prim, Distribution1D.of(weight, torch.float64, even=0.0), area, depth)
