@@ -221,7 +221,7 @@ def test_points_that_touch_have_no_derivative_by_their_distance():
     middle = world.geometry.p0[:, :1] + 0.5 * world.geometry.e1[:, :1] + 0.5 * world.geometry.e2[:, :1]
     away = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 1e-7, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
     x = (middle + away).requires_grad_()
-    direction, ratio = reattach(world, x, hit, d)
+    direction, ratio = reattach(world, x, hit, d, torch.tensor([1e-3], dtype=torch.float64))
     (gradient,) = torch.autograd.grad(direction.sum() + ratio.sum(), x)
     assert torch.isfinite(gradient).all()
     assert (gradient[:, :2] == 0).all()

@@ -268,6 +268,45 @@ TILTED = [{"scale": 0.6}, turned([1, 0, 0], -65), moved(0.1, 0.8, 0)]
 #: A lamp that is never occluded and never in view.
 FREE = {**DARK, "shapes": {"floor": FLOOR, "lamp": {**OVERHEAD, "transform": [{"scale": 0.3}, DOWN, moved(0.8, 3, 1)]}}}
 
+#: A corner of a room, whose walls reflect light: what stands on its floor touches it.
+CORNER: dict[str, Any] = {
+    "camera": {"origin": [0.8, 1.6, 4.2], "target": [0.0, 0.6, 0], "fov": 40},
+    "shapes": {
+        "floor": FLOOR,
+        "wall": quad([-1.2, 0, 3], [-1.2, 0, -3], [-1.2, 3, -3], [-1.2, 3, 3], material=WHITE),
+        "back": quad([-1.2, 0, -1.5], [6, 0, -1.5], [6, 3, -1.5], [-1.2, 3, -1.5], material=WHITE),
+        "lamp": {
+            "type": "rectangle",
+            "emission": [30, 28, 25],
+            "transform": [{"scale": 0.4}, DOWN, turned([0, 0, 1], -20), moved(-0.2, 3, 0.8)],
+        },
+    },
+}
+ON_FLOOR = {"type": "sphere", "center": [0.1, 0.5, 0], "radius": 0.5, "material": ORANGE}
+IN_CORNER = [{"scale": 0.4}, turned([0, 1, 0], 25), moved(-0.4, 0.4, -0.7)]
+CONE = {"type": "cone", "apex": [0, 1.0, -0.2], "height": -1, "slope": 0.5, "material": ORANGE}
+BOWL = {"type": "cube", "material": ORANGE, "transform": [{"scale": 0.3}, turned([0, 1, 0], 25), moved(-0.3, 0.6, -0.5)]}
+SHINY = {"type": "roughconductor", "eta": [0.3, 0.6, 1.2], "k": [3, 2.5, 2], "alpha": 0.35}
+FROSTED = {"type": "roughdielectric", "int_ior": 1.4, "ext_ior": 1.0, "alpha": 0.4}
+PANE = {"type": "rectangle", "material": FROSTED, "transform": [{"scale": 0.7}, turned([1, 0, 0], -20), moved(0.1, 0.8, 0.9)]}
+
+
+def field(**more: Any) -> dict[str, Any]:
+    """Return a mesh of hills and valleys, 4 x 4 vertices."""
+    draw = torch.Generator().manual_seed(0)
+    side = torch.linspace(-1, 1, 4)
+    x, z = torch.meshgrid(side, side, indexing="xy")
+    vertices = torch.stack([x.flatten(), 0.2 * torch.randn(16, generator=draw), z.flatten()], 1)
+    grid = torch.arange(16).reshape(4, 4)
+    a, b, c, d = (part.flatten() for part in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
+    faces = torch.cat([torch.stack([a, c, b], 1), torch.stack([a, d, c], 1)])
+    return {"type": "mesh", "vertices": vertices.tolist(), "faces": faces.tolist(), "material": WHITE, **more}
+
+
+#: The field seen from above.
+ABOVE: dict[str, Any] = {"camera": {"origin": [0, 3, 0.01], "target": [0, 0, 0], "up": [0, 0, -1], "fov": 45}}
+OPEN_SKY = {"sky": {"type": "constant"}}
+
 PAIRS: dict[str, Pair] = {
     # Nothing becomes visible or hidden.
     "albedo_room": Pair(ROOM, "materials.red.reflectance", {(0,): 1.0, (1,): 0.5}, 0.05, depth=4),
@@ -387,4 +426,42 @@ PAIRS: dict[str, Pair] = {
     ),
     "point_position": Pair({**with_shapes(DARK, ball=BALL), "lights": BULB}, "lights.bulb.position", {(0,): 1.0}, 0.03),
     "sun_direction": Pair({**with_shapes(DARK, box=BOX), "lights": SUN}, "lights.sun.direction", {(0,): 1.0}, 0.02),
+    # Light that surfaces reflect passes moving edges.
+    "ball_on_floor_radius": Pair(with_shapes(CORNER, ball=ON_FLOOR), "shapes.ball.to_world", grown, 0.01, depth=3),
+    "block_in_corner": Pair(
+        with_shapes(CORNER, block={"type": "cube", "material": ORANGE, "transform": IN_CORNER}),
+        "shapes.block.to_world",
+        X,
+        0.02,
+        depth=3,
+    ),
+    "cone_on_floor": Pair(with_shapes(CORNER, it=CONE), "shapes.it.to_world", X, 0.02, depth=3),
+    "field_vertex": Pair(
+        {**ABOVE, "shapes": {"field": field()}, "lights": OPEN_SKY},
+        "shapes.field.vertices",
+        {(5, 1): 1.0},
+        0.02,
+        depth=3,
+    ),
+    "flat_field_vertex": Pair(
+        {**ABOVE, "shapes": {"field": field(face_normals=True)}, "lights": OPEN_SKY},
+        "shapes.field.vertices",
+        {(5, 1): 1.0, (10, 0): 0.5},
+        0.02,
+        depth=4,
+    ),
+    "block_over_metal": Pair(
+        with_shapes(CORNER, floor={**FLOOR, "material": SHINY}, block=BOWL), "shapes.block.to_world", Y, 0.02, depth=3
+    ),
+    "block_behind_frosted_glass": Pair(
+        with_shapes(CORNER, pane=PANE, block=BOWL), "shapes.block.to_world", X, 0.02, depth=4
+    ),
+    "ball_on_floor_under_sky": Pair(
+        {**without(CORNER, "lamp", ball=ON_FLOOR), "lights": SKY},
+        "shapes.ball.to_world",
+        Y,
+        0.02,
+        depth=3,
+        files={"sky.exr": sky},
+    ),
 }

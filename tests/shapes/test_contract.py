@@ -335,7 +335,8 @@ def test_held_points_move_with_the_shape(name: str):
         return away / distance, ((away * turned).sum(0).abs() / distance**3).log()
 
     def held(step: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return reattach(scene.world(torch.float64, {key: pose + step * shift})[0], o, hit, d)
+        near = torch.tensor([1e-3], dtype=torch.float64)  # all points are farther, and held
+        return reattach(scene.world(torch.float64, {key: pose + step * shift})[0], o, hit, d, near)
 
     h = 1e-5
     wanted = [(a - b) / (2 * h) for a, b in zip(exact(h), exact(-h), strict=True)]

@@ -54,7 +54,7 @@ def attached(scene: Scene, names: Iterable[str]) -> bool:
 # ---- The length over which points slide along their rays
 
 
-#: Share of the scene's size where what moves has none of its own: the camera, instances.
+#: Share of the scene's size where nothing but the camera moves.
 _NEAR = 0.25
 
 
@@ -70,22 +70,44 @@ def near_of(scene: Scene, geometry: LaneGeometry, wanted: Iterable[str]) -> Tens
         geometry: its primitives.
         wanted: names of the parameters that are differentiated.
     """
+    names = list(wanted)
+
+    def moves(owner: str) -> bool:
+        return any(name.startswith(f"{owner}.") for name in names)
+
     p0, e1, e2 = (corner.double() for corner in (geometry.p0, geometry.e1, geometry.e2))
-    corners = torch.stack((p0, p0 + e1, p0 + e2, p0 + e1 + e2))
+    fourth = p0 + e1 + e2
+    triangles = slice(0, geometry.counts[0])
+    fourth[:, triangles] = p0[:, triangles]
+    corners = torch.stack((p0, p0 + e1, p0 + e2, fourth))
     low, high = corners.amin(0), corners.amax(0)
     round_ = slice(sum(geometry.counts[:2]), None)  # disks, spheres and quadrics are about p0
     radius = torch.maximum(e1.norm(dim=0), e2.norm(dim=0))[round_]
     low[:, round_], high[:, round_] = p0[:, round_] - radius, p0[:, round_] + radius
-    moving, first = torch.zeros_like(low[0], dtype=torch.bool), 0
+    all_boxes, moving_boxes, of_mesh = [], [], {}
+    first = 0
     for part in scene.built.parts:
         end = first + (1 if part.faces is None else len(part.faces))
-        moving[first:end] = any(name.startswith(f"{part.name}.") for name in wanted)
+        of_mesh[part.name] = box = torch.stack((low[:, first:end].amin(1), high[:, first:end].amax(1)))
+        all_boxes.append(box)
+        if moves(part.name):
+            moving_boxes.append(box)
         first = end
-    whole = 0.5 * (high.amax(1) - low.amin(1)).norm()
-    if not bool(moving.any()):
-        return (_NEAR * whole)[None]
-    box = high[:, moving].amax(1) - low[:, moving].amin(1)
-    return torch.minimum(0.5 * box.norm(), whole)[None]
+    for k, copy in enumerate(scene.built.copies, 1):
+        assert geometry.copies is not None
+        map_ = [getattr(geometry.copies, name)[:, k].double() for name in ("x", "y", "z", "move")]
+        ends = torch.cartesian_prod(*of_mesh[copy.of].T)  # the corners of the mesh's box
+        placed = ends @ torch.stack(map_[:3]) + map_[3]
+        all_boxes.append(torch.stack((placed.amin(0), placed.amax(0))))
+        if moves(copy.name) or moves(copy.of):
+            moving_boxes.append(all_boxes[-1])
+
+    def half_diagonal(boxes: list[Tensor]) -> Tensor:
+        both = torch.stack(boxes)
+        return 0.5 * (both[:, 1].amax(0) - both[:, 0].amin(0)).norm()
+
+    whole = half_diagonal(all_boxes)
+    return (torch.minimum(half_diagonal(moving_boxes), whole) if moving_boxes else _NEAR * whole)[None]
 
 
 # ---- From parameters to the tensors of waves, and back once a backward pass

@@ -86,6 +86,12 @@ class Bodies:
             p0, x, y = _moved(table, p0) + table.move, _moved(table, x), _moved(table, y)
         return p0, x, y, z
 
+    def corners(self, prim: Tensor) -> list[Tensor]:
+        """Return the four corners ``(3, N)`` of triangles and parallelograms; the last of a triangle is its first."""
+        four = (prim >= self.counts[0]) & (prim < sum(self.counts[:2]))
+        p0, x, y, _ = self.place(prim)
+        return [p0, p0 + x, torch.where(four, p0 + x + y, p0 + y), torch.where(four, p0 + y, p0)]
+
     def points(self, held: Held) -> Tensor:
         """Where points are ``(3, N)``."""
         p0, x, y, z = self.place(held.prim)

@@ -21,6 +21,7 @@ from torchpt.gradients.edges.segments import Segments, segments_of
 from torchpt.gradients.edges.shadows import Shadows, occluders_of, sources_of
 from torchpt.gradients.edges.traced import Traced, traced_of
 from torchpt.gradients.parameters import near_of
+from torchpt.math.vectors import take
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.ranks import Group, share
 from torchpt.scene import Scene
@@ -51,6 +52,7 @@ def concerns(scene: Scene, names: Iterable[str]) -> bool:
 def moving_primitives(scene: Scene, bodies: Bodies, names: Iterable[str]) -> Tensor:
     """Return a mask ``(P,)`` of the primitives, by ids of the search, that any of the parameters moves."""
     names = [name for name in names if scene.spec(name).moves is Moves.SURFACES]
+
     def move(name: str) -> bool:
         return any(wanted.startswith(f"{name}.") for wanted in names)
 
@@ -149,7 +151,8 @@ class Boundary:
             low, high = primitive_bounds(geometry)
             reach = float((high.double().amax(1) - low.double().amin(1)).norm()) * 0.5
             met = integrator.strategy in ("bsdf", "uniform")
-            occluders = occluders_of(self.scene, still, poses)
+            lights_move = "lights" in self.moving or bool((moves & self._emits(len(moves))).any())
+            occluders = occluders_of(self.scene, still, poses, moves | lights_move)
             sources = sources_of(still, world, reach, met)
         if sources is None:
             return
@@ -163,6 +166,14 @@ class Boundary:
                 yield segments
             if horizons is not None:
                 yield horizons
+
+    def _emits(self, count: int) -> Tensor:
+        """Return a mask ``(P,)`` of primitives that emit light, by ids of the search."""
+        world = self.traced.wave.context.world
+        every = torch.arange(count, device=self.scene.device)
+        if world.lights is None or world.lights.row_of_prim is None:
+            return every < 0
+        return take(world.lights.row_of_prim, world.geometry.slot(every)) >= 0
 
     def _chunks(self, total: int) -> Iterator[tuple[int, int]]:
         """First samples and how many."""

@@ -1,9 +1,9 @@
 """Faces that are shaded smooth end light at their own plane, which turns with the face.
 
 Light from below the plane of a face does not count where the shading normal differs from the geometric one
-(:func:`torchpt.paths.vertex.same_hemisphere`). There the integrand ``f cos_s`` jumps from a value to 0, so the plane's horizon is a
-boundary. With ``n`` the geometric normal on the side that counts, ``ω`` on the horizon and ``y`` what is seen there at distance r,
-the derivative of the loss is the integral over the surface and over the angle ``φ`` of ``ω`` of::
+(:func:`torchpt.paths.vertex.same_hemisphere`). There the integrand ``f cos_s`` jumps from a value to 0, so the plane's horizon
+is a boundary. With ``n`` the geometric normal on the side that counts, ``ω`` on the horizon and ``y`` what is seen there at
+distance r, the derivative of the loss is the integral over the surface and over the angle ``φ`` of ``ω`` of::
 
     W(x) f cos_s L(ω) [dn·ω + (1 - a) n·(V(y) - V(x)) / r]
 

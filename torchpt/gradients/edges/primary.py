@@ -82,11 +82,7 @@ def steps_at(bodies: Bodies, faces: tuple[Tensor, Tensor], s: Tensor) -> Tensor:
 
 def outline_of(bodies: Bodies, prim: Tensor) -> list[tuple[Tensor, Tensor]]:
     """The four sides of parallelograms ``(N,)`` on the film, from ``(2, N)`` to ``(2, N)``; a triangle's last has no length."""
-    triangles, rectangles = bodies.counts[0], sum(bodies.counts[:2])
-    four = (prim >= triangles) & (prim < rectangles)
-    p0, x, y, _ = bodies.place(prim)
-    corners = [p0, p0 + x, torch.where(four, p0 + x + y, p0 + y), torch.where(four, p0 + y, p0)]
-    places = [film_places(bodies.camera, corner) for corner in corners]
+    places = [film_places(bodies.camera, corner) for corner in bodies.corners(prim)]
     return list(zip(places, [*places[1:], places[0]], strict=True))
 
 

@@ -1,21 +1,23 @@
 """Edges in light that surfaces reflect: boundary segments, sampled from the edge.
 
-Seen from a receiver x, the light that surfaces reflect jumps along curves of directions. With e on a curve of tangent ``τ``, ``ω``
-the direction from e to x, ``m`` the unit vector across ``ω`` and ``τ`` and ``r = |e - x|``, the measure of receivers and of angles
-along the curve is one of places on the edge and directions there::
+Seen from a receiver x, the light that surfaces reflect jumps along curves of directions. With e on a curve of tangent ``τ``,
+``ω`` the direction from e to x, ``m`` the unit vector across ``ω`` and ``τ``, and ``r = |e - x|``, the measure of receivers
+and of angles along the curve is one of places on the edge and of directions there::
 
     cos_x dA_x dψ / r  =  |τ × ω| dl dω       edges; l is the length
-                       =  κ(ω) dA_p dφ        outlines of round surfaces: any point p, any direction ω of its tangent plane at angle φ
+                       =  κ(ω) dA_p dφ        outlines of round surfaces: any point p, any tangent ω at angle φ
 
-with ``κ`` the normal curvature along ``ω``, and ``m`` the normal. So the weight has no bound-less factor, and no receiver is chosen:
+with ``κ`` the normal curvature along ``ω``; there ``m`` is the normal. So the weight is bounded, and no receiver is chosen:
 it is what the ray from e along ``ω`` meets. The derivative of the loss is the integral of::
 
     W(x) cos_s/cos_g Σ_± -(±) [c - (1 - a_±) d_±] L_±,     c = m·(V(e) - V(x)),  d_± = m·(V(y_±) - V(x)) r / r_±
 
-where ``y_±`` is what the ray from x beside e meets at ``r_±``, ``L_±`` the light that it reflects, and ``a_±`` the share by which it
-slides (:mod:`torchpt.gradients.edges.receivers`). On the edge's own surface ``d = c``, so that a part ``a`` of it counts: creases,
-borders, contacts and silhouettes are one formula, without a test for silhouettes. Light of lights themselves, all of whose
-points are held, and of the sky are in :mod:`torchpt.gradients.edges.shadows`: there lights can be aimed at.
+where ``y_±`` is what the ray from x beside e meets at ``r_±``, ``L_±`` the light that it reflects, and ``a_±`` the share by
+which it slides (:mod:`torchpt.gradients.edges.receivers`). On the edge's own surface ``d = c``, and a part ``a`` of it
+counts: creases, borders, contacts and silhouettes are one formula, without a test for silhouettes.
+
+Light of lights themselves, whose points are all held, and light of the sky are in :mod:`torchpt.gradients.edges.shadows`,
+which aims at lights.
 """
 
 from __future__ import annotations
@@ -30,24 +32,24 @@ from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import Curves, Rounds, folds_of, joined, marked_primitives, plain_of, rounds_of
-from torchpt.gradients.edges.primary import is_flat
+from torchpt.gradients.edges.primary import distance_to, is_flat
 from torchpt.gradients.edges.receivers import LONGEST, ROUNDING, Frame, Prefix, held_at, prefixes_of
+from torchpt.gradients.edges.shadows import STILL
 from torchpt.gradients.edges.traced import Use
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.sampling import Distribution1D, uniform_sphere, uniform_triangle
+from torchpt.math.vectors import Frame as Basis
 from torchpt.math.vectors import concatenate_lanes, cross, dot, largest, normalize, rows, take
 from torchpt.physics.samplers import Dimension
 from torchpt.physics.shapes.quadrics import Form
 from torchpt.scene import Scene
 
-__all__ = ["Segments", "SegmentSamples", "segments_of"]
+__all__ = ["SegmentSamples", "Segments", "segments_of"]
 
 #: Rays go so far beside an edge, against the way to it, beyond the rounding.
 _STEP = 2.0**-16
 #: What ends so close to an edge, against the way to it, ends at it.
 _NEAR = 2.0**-10
-#: Weight of edges that do not move: only what is behind them does.
-_STILL = 0.3
 #: Least weight of a crease against a border of the same length.
 _CREASE = 0.1
 #: Faces at an angle below this make no edge.
@@ -154,7 +156,11 @@ class Brinks:
             if len(lane):
                 lanes.append(lane)
                 parts.append(
-                    make(take(index, lane) - first, *given, *(take(x, lane) for x in (rest, chance, direction, aim, coins)))
+                    make(
+                        take(index, lane) - first,
+                        *given,
+                        *(take(x, lane) for x in (rest, chance, direction, aim, coins)),
+                    )
                 )
 
         add(0, count, self._edges)
@@ -211,7 +217,7 @@ class Brinks:
         away = self.bodies.points(face) - e
         away = away - tangent * dot(tangent, away)
         length = dot(away, away).sqrt()
-        return torch.where(length > 0, away / torch.where(length > 0, length, 1.0), _perpendicular(tangent))
+        return torch.where(length > 0, away / torch.where(length > 0, length, 1.0), Basis.about(tangent).s)
 
     def _rounds(
         self, index: Tensor, rounds: Rounds, rest: Tensor, chance: Tensor, direction: Tensor, aim: Tensor, coins: Tensor
@@ -227,27 +233,19 @@ class Brinks:
         steep = dot(normal, normal).sqrt()  # the slope of the surface's equation in the world
         normal = normal / steep
         area = size * det.abs() * steep / dot(gradient, gradient).sqrt()
-        first = _perpendicular(normal)
-        angle = 2.0 * math.pi * direction[1]
-        omega = first * torch.cos(angle) + cross(normal, first) * torch.sin(angle)
+        basis, angle = Basis.about(normal), 2.0 * math.pi * direction[1]
+        omega = basis.s * torch.cos(angle) + basis.t * torch.sin(angle)
         own = torch.stack([dot(face, omega) / det for face in faces]).square()
         curvature = (own[0] + own[1] + (1.0 if form is None else form.bend) * own[2]).abs() / steep
         weight = curvature * area * (2.0 * math.pi) / chance
         none, one = torch.full_like(prim, -1), torch.ones_like(weight)
-        return Starts(Held(prim, a), none, e, first, normal, curvature, omega, one, e, none >= 0, weight)
-
-
-def _perpendicular(w: Tensor) -> Tensor:
-    """Return any unit vectors ``(3, N)`` across unit vectors."""
-    x, y = torch.zeros_like(w), torch.zeros_like(w)
-    x[0], y[1] = 1.0, 1.0
-    return normalize(cross(w, torch.where(w[:1].abs() < 0.6, x, y)))
+        return Starts(Held(prim, a), none, e, basis.s, normal, curvature, omega, one, e, none >= 0, weight)
 
 
 def _place(form: Form | None, u: Tensor) -> tuple[Tensor, Tensor, float]:
-    """Return places in the own space of round surfaces, half the gradient of their equation ``(3, N)`` each, and the area there.
+    """Return places on round surfaces, half the gradient of their equation, and their area, in their own space.
 
-    Places are even by that area; of a cone also by the distance from its tip.
+    Places and gradients are ``(3, N)``. Places are even by area.
     """
     if form is None:
         q = uniform_sphere(u)
@@ -277,7 +275,7 @@ def brinks_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Ten
         curves.append(part)
         others.append(faces)
         folded.append(folds)
-        weights.append(length * torch.where(moving, 1.0, _STILL) * share)
+        weights.append(length * torch.where(moving, 1.0, STILL) * share)
 
     for folds in folds_of(scene, bodies, poses):
         apart = folds.normals[0] - folds.normals[1]
@@ -292,7 +290,7 @@ def brinks_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Ten
     for some in rounds:
         _, *axes = bodies.place(some.prim)
         size = sum((dot(axis, axis).sqrt() for axis in axes), torch.zeros_like(axes[0][0]))
-        weights.append(2.0 * size * torch.where(take(moves, some.prim), 1.0, _STILL))
+        weights.append(2.0 * size * torch.where(take(moves, some.prim), 1.0, STILL))
     if not weights or not bool((torch.cat(weights) > 0).any()):
         return None
     empty = torch.zeros(0, dtype=torch.bool, device=scene.device)
@@ -510,22 +508,11 @@ class Segments:
             if not len(some):
                 continue
             mine, e = take(prim, some), take(starts.e, some)
-            p0, x, y, _ = bodies.place(mine)
-            four = (mine >= bodies.counts[0]) & (mine < sum(bodies.counts[:2]))
-            corners = [p0, p0 + x, torch.where(four, p0 + x + y, p0 + y), torch.where(four, p0 + y, p0)]
-            away = [_distance(e, a, b) for a, b in zip(corners, [*corners[1:], corners[0]], strict=True)]
+            corners = bodies.corners(mine)
+            away = [distance_to(e, a, b) for a, b in zip(corners, [*corners[1:], corners[0]], strict=True)]
             near = torch.stack(away).amin(0) < 4.0 * take(step, some)
             part[some] = torch.where(near, 0.5, take(part, some))
         return part
-
-
-def _distance(p: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Return the distances ``(N,)`` of points from segments."""
-    along = b - a
-    square = dot(along, along)
-    share = (dot(p - a, along) / torch.where(square > 0, square, 1.0)).clamp(0.0, 1.0)
-    away = p - a - along * share
-    return dot(away, away).sqrt()
 
 
 def segments_of(scene: Scene, frame: Frame, poses: dict[str, Tensor], depth: int) -> Segments | None:

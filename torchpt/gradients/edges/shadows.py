@@ -37,7 +37,7 @@ from torchpt.physics.shapes.quadrics import Form
 from torchpt.physics.world import World
 from torchpt.scene import Scene
 
-__all__ = ["Beam", "Cast", "Occluders", "Passed", "Shadows", "Sources", "occluders_of", "sources_of"]
+__all__ = ["STILL", "Beam", "Cast", "Occluders", "Passed", "Shadows", "Sources", "occluders_of", "sources_of"]
 
 
 # ---- Points on lights, drawn for all edges alike: by power, and evenly over a light's surface
@@ -295,8 +295,19 @@ class Occluders:
         return rows(passed, some.nonzero().squeeze(1))
 
 
-def occluders_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Occluders | None:
-    """All curves, by their length and the chance to be an outline; None where there are none."""
+#: Weight of edges that do not move: only what is behind and before them does.
+STILL = 0.3
+
+
+def occluders_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Tensor) -> Occluders | None:
+    """Return all curves, by their length and the chance to be an outline; None where there are none.
+
+    Args:
+        scene: the scene.
+        bodies: detached.
+        poses: the parameters.
+        moves: ``(P,)`` bool: primitives that move, or all where lights do.
+    """
     curves, firsts, seconds, folded, weights, forms = [], [], [], [], [], []
     for folds in folds_of(scene, bodies, poses):
         _, _, along = folds.curves.moving(bodies, torch.zeros_like(folds.curves.low))
@@ -334,8 +345,10 @@ def occluders_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Occl
     if not curves or not bool((torch.cat(weights) > 0).any()):
         return None
     others = [Held(torch.cat([h.prim for h in x]), torch.cat([h.a for h in x], 1)) for x in (firsts, seconds)]
-    choice = Distribution1D.of(torch.cat(weights), torch.float64, even=0.0)
-    return Occluders(bodies, joined(curves), (others[0], others[1]), torch.cat(folded), torch.cat(forms), kinds, choice)
+    every = joined(curves)
+    moving = take(moves, every.prim) | ((every.mate >= 0) & take(moves, every.mate.clamp_min(0)))
+    choice = Distribution1D.of(torch.cat(weights) * torch.where(moving, 1.0, STILL), torch.float64, even=0.0)
+    return Occluders(bodies, every, (others[0], others[1]), torch.cat(folded), torch.cat(forms), kinds, choice)
 
 
 def _round_weight(bodies: Bodies, rounds: Rounds) -> Tensor:
