@@ -70,7 +70,7 @@ def near_of(scene: Scene, geometry: LaneGeometry, wanted: Iterable[str]) -> Tens
         geometry: its primitives.
         wanted: names of the parameters that are differentiated.
     """
-    names = list(wanted)
+    names = [name for name in wanted if scene.spec(name).moves is Moves.SURFACES]
 
     def moves(owner: str) -> bool:
         return any(name.startswith(f"{owner}.") for name in names)
