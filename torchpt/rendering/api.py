@@ -13,7 +13,7 @@ from torchpt.rendering import Progress, Rendering, render_scene
 from torchpt.rendering.graphs import as_custom_op, with_graph_break
 from torchpt.rendering.requests import execute_request, prepare_request, prepare_trace_request
 from torchpt.scene import Scene
-from torchpt.scene.settings import FILTERS, CommonOptions, Settings, TraceOptions
+from torchpt.scene.settings import FILTERS, CommonOptions, SeedOfCall, Settings, TraceOptions
 from torchpt.spec.arguments import check_names, expand_signature
 from torchpt.spec.schema import ParsedParams
 
@@ -57,7 +57,7 @@ def trace(
     d: Tensor,
     *,
     spp: int | None = 1,
-    seed: int | None = 0,
+    seed: SeedOfCall = 0,
     params: Mapping[str, Tensor] | None = None,
     **options: Unpack[TraceOptions],
 ) -> Tensor:
@@ -73,7 +73,7 @@ def trace(
         o: origins ``(..., 3)``, float32 or float64, in the scene's world, on its device.
         d: directions ``(..., 3)``, of any length; ``o`` and ``d`` are broadcast. Gradients are those of ``d / |d|``.
         spp: samples a ray, which are averaged.
-        seed: any integer from 0; the same seed gives the same numbers.
+        seed: any integer from 0; the same seed gives the same numbers. None: a new one, from torch's default generator.
         params: tensors in place of ``scene.params`` by dotted name; parameters of the camera are refused.
         options: further options of :func:`render`, as :class:`torchpt.scene.settings.TraceOptions` declares them. The scene
             file's film and stop rules are not used.

@@ -28,7 +28,15 @@ from torchpt.rendering.result import denoise_rendering
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
 from torchpt.scene.formats.description import settings as complete_settings
-from torchpt.scene.settings import SAMPLERS, CallArguments, CommonOptions, Settings, settings_of_call
+from torchpt.scene.settings import (
+    SAMPLERS,
+    CallArguments,
+    CommonOptions,
+    Settings,
+    film_keys,
+    seed_number,
+    settings_of_call,
+)
 from torchpt.scene.texel_params import update_texels, with_texel_params
 from torchpt.scene.versions import AFTER, check_unchanged
 from torchpt.spec import Role
@@ -102,9 +110,11 @@ def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) 
     scene = as_scene(scene)
     call = CallArguments.of({**options, "full": full})
     _check_call(scene, call, options.get("device"))
+    if "seed" in options:
+        options["seed"] = seed_number(options["seed"])
     settings = complete_settings(scene.description, settings_of_call(options))
     if not full:
-        settings = _without_aovs(settings, options.get("film"))
+        settings = _without_aovs(settings, film_keys(options.get("film")))
     elif settings.film.denoise:
         check_denoiser()
     params = _parameters(scene, call.params, full)

@@ -37,7 +37,7 @@ from torchpt.scene.devices import device_of
 from torchpt.scene.formats.description import Description, settings
 from torchpt.scene.host_copies import HostCopies
 from torchpt.scene.info import describe
-from torchpt.scene.settings import Film, Settings
+from torchpt.scene.settings import Film, FilmSettings, Settings
 from torchpt.scene.sources import check_light_params
 from torchpt.scene.space import MAX_COORDINATE, Space, bounds_center, bounds_extent
 from torchpt.scene.validation import check_tensor, inherited_checks, validate_changes
@@ -145,12 +145,13 @@ class Scene:
         """Return the scene that this is a view of (:meth:`seen_by`), else itself; caches belong to it."""
         return self if self._origin is None else self._origin
 
-    def seen_by(self, camera: Mapping[str, Any], film: Mapping[str, Any] | None = None) -> Scene:
+    def seen_by(self, camera: Mapping[str, Any], film: FilmSettings | None = None) -> Scene:
         """Return a view of this scene through another camera. It shares all other parameters, worlds and search structures.
 
         Args:
             camera: camera block, as in a scene file.
-            film: film settings that override the scene's. A ``K`` without ``size`` is in pixels of the film.
+            film: film settings that override the scene's, or ``(width, height)``. A ``K`` without ``size`` is in pixels of the
+                film.
 
         Raises:
             SceneError: a wrong camera block or film.
@@ -374,7 +375,7 @@ class Scene:
         pose = torch.cat((self._host_space.pose(pose), pose[3:].double())).to(dtype)  # (3, 4), and the last row 0 0 0 1
         return moved(camera.kind.on(pose, (film.width, film.height), values), self.device)
 
-    def film_size(self, film: Mapping[str, Any] | None = None) -> tuple[int, int]:
+    def film_size(self, film: FilmSettings | None = None) -> tuple[int, int]:
         """Return width and height of the whole film in pixels; ``film``: settings that override the scene's."""
         film_settings = settings(self.description, {"film": film or {}}).film
         return film_settings.width, film_settings.height
@@ -382,14 +383,14 @@ class Scene:
     def pinhole(
         self,
         params: Mapping[str, Tensor] | None = None,
-        film: Mapping[str, Any] | None = None,
+        film: FilmSettings | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> PinholeMatrices:
         """Return the camera as OpenCV's matrices ``K`` in pixels, ``R`` and ``t``; see :mod:`torchpt.physics.cameras.opencv`.
 
         Args:
             params: tensors in place of the scene's, by name; gradients flow to the camera's.
-            film: film settings that override the scene's, e.g. ``{"width": 640, "height": 480}``; a crop has no effect.
+            film: film settings that override the scene's, e.g. ``(640, 480)``; a crop has no effect.
             dtype: dtype of the matrices.
 
         Raises:

@@ -13,13 +13,15 @@ from torch import Tensor
 from torchpt.core.errors import AssetError, NotBuiltError, RenderError, SceneError
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
+from torchpt.scene.settings import SeedOfCall
+from torchpt.spec.arguments import SceneValue
 
 __all__ = ["Cameras", "Seeds", "cameras_of", "naming_errors", "params_of", "scenes_of", "seeds_of"]
 
 #: Camera blocks as in scene files, poses ``(4, 4)`` (also as lists), or a tensor of poses ``(C, 4, 4)``.
 Cameras = Tensor | Sequence[Mapping[str, Any] | Tensor] | None
-#: One seed for all pictures, one for each scene, or one for each scene and camera.
-Seeds = int | Sequence[int] | Sequence[Sequence[int]] | None
+#: One seed for all pictures, one for each scene, or one for each scene and camera; None: a new one for each picture.
+Seeds = SeedOfCall | Sequence[int] | Sequence[Sequence[int]]
 
 #: Keys of a camera block that position it: at least one must be given.
 _POSE_KEYS = frozenset({"origin", "target", "to_world", "R", "t"})
@@ -123,7 +125,7 @@ def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[
 
 
 def seeds_of(seed: Seeds, scenes: int | None, cameras: int) -> Callable[[int, int], Any]:
-    """Return a function of scene ``s`` and camera ``c`` that gives the seed (None: the scene's own).
+    """Return a function of scene ``s`` and camera ``c`` that gives the seed as ``render`` takes it.
 
     Args:
         seed: the caller's argument.
@@ -133,9 +135,9 @@ def seeds_of(seed: Seeds, scenes: int | None, cameras: int) -> Callable[[int, in
     Raises:
         SceneError: too few or too many seeds.
     """
-    if seed is None or isinstance(seed, int):
-        return lambda s, c: seed
     nested = seed.tolist() if isinstance(seed, Tensor | np.ndarray) else seed
+    if nested is None or isinstance(nested, int | SceneValue):
+        return lambda s, c: nested
     expected = f"a whole number, a sequence of {scenes or 'as many as there are scenes'}, or of sequences of {cameras}"
     if not isinstance(nested, Sequence) or isinstance(nested, str) or (scenes is not None and len(nested) != scenes):
         raise SceneError("seed", nested, expected)
