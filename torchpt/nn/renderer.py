@@ -15,7 +15,8 @@ from torchpt.rendering.api import render
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import BatchOptions, RenderOptions, base_seed
+from torchpt.scene.settings import BatchOptions, Params, RenderOptions, base_seed
+from torchpt.scene.validation import params_as_tensors
 from torchpt.spec.arguments import check_names, expand_signature
 
 __all__ = ["Renderer"]
@@ -92,7 +93,7 @@ class Renderer(nn.Module):
     @expand_signature
     def forward(
         self,
-        params: Mapping[str, Tensor] | None = None,
+        params: Params | None = None,
         *,
         seed: int | Tensor | None = None,
         full: bool | None = None,
@@ -101,7 +102,7 @@ class Renderer(nn.Module):
         """Render the scene with the current parameters.
 
         Args:
-            params: tensors in place of parameters of the scene or of this module, by dotted name, such as those of the camera.
+            params: values in place of parameters of the scene or of this module, by dotted name, such as those of the camera.
             seed: seed in place of the counted one.
             full: in place of the constructor's ``full``.
             options: arguments of ``torchpt.render``, in place of the constructor's.
@@ -124,8 +125,8 @@ class Renderer(nn.Module):
             }
 
     @torch.no_grad()
-    def assign(self, values: Mapping[str, Tensor]) -> None:
-        """Set parameters to values by dotted name: all of them, or none if one is refused.
+    def assign(self, values: Params) -> None:
+        """Set parameters to values by dotted name, tensors or as in scene files: all of them, or none if one is refused.
 
         Raises:
             SceneError: a name is no parameter of this module, or the scene does not accept the values.
@@ -133,9 +134,10 @@ class Renderer(nn.Module):
         for name in values:
             if name not in self.names:
                 raise SceneError(f"params.{name}", name, f"one of {', '.join(self.names)}")
-        self.scene.check({**self.values(), **values})
+        tensors = params_as_tensors(self.scene, values)
+        self.scene.check({**self.values(), **tensors})
         numbers: dict[str, Tensor] = {}  # the unconstrained numbers of each value
-        for name, value in values.items():
+        for name, value in tensors.items():
             try:
                 numbers[name] = self.ranges[self.names.index(name)].inverse(value.to(self.free[_key(name)]))  # pyright: ignore[reportCallIssue]
             except ValueError:

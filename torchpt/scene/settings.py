@@ -9,11 +9,12 @@ of that type; the blocks ``film`` and ``render`` are records here. A *role* says
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, TypedDict
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,6 +51,7 @@ __all__ = [
     "CommonOptions",
     "Film",
     "FilmSettings",
+    "Params",
     "Render",
     "RenderOptions",
     "SeedOfCall",
@@ -191,6 +193,8 @@ def _file(value: Any) -> str:
 
 #: A seed of a call: a whole number, or a tensor of one; None: a new one; by default the scene's.
 SeedOfCall = int | Tensor | SceneValue | None
+#: Values in place of a scene's parameters: tensors, or numbers, lists and arrays as in scene files.
+Params = Mapping[str, Tensor | float | str | Sequence[Any] | np.ndarray]
 #: Film settings of a call: a mapping, or width and height.
 FilmSettings = Mapping[str, Any] | tuple[int, int] | list[int]
 #: Methods for gradients, the default first.
@@ -383,12 +387,12 @@ class CommonOptions(BatchOptions, total=False):
         ),
     ]
     params: Annotated[
-        Mapping[str, Tensor] | None,
+        Params | None,
         Argument(
             None,
             fits=lambda value: isinstance(value, Mapping),
-            words="a mapping from names of scene.params to tensors",
-            doc="tensors in place of the scene's, where a material has a number or colour also texels (H, W, C); where one"
+            words="a mapping from names of scene.params to tensors, or numbers and lists as in scene files",
+            doc="values in place of the scene's, where a material has a number or colour also texels (H, W, C); where a tensor"
             " requires gradients, so does the picture",
         ),
     ]

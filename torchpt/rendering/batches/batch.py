@@ -27,7 +27,7 @@ from torchpt.rendering.batches.inputs import Cameras, Seeds, cameras_of, naming_
 from torchpt.rendering.requests import RenderRequest, execute_request, prepare_request
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import BatchOptions, RenderOptions
+from torchpt.scene.settings import BatchOptions, Params, RenderOptions
 from torchpt.scene.versions import check_unchanged
 from torchpt.spec.arguments import SCENE_VALUE, check_names, expand_signature
 
@@ -72,7 +72,7 @@ class _Picture:
 
 
 #: Tensors with a leading dimension for scenes, by name; or a mapping for each scene.
-BatchParams = Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]] | None
+BatchParams = Params | Sequence[Params] | None
 
 
 @overload
@@ -109,8 +109,8 @@ def render_batch(
         cameras: shared by all scenes: a sequence of blocks ``camera`` as in scene files (with ``K``, ``R``, ``t`` too), of
             poses ``camera.to_world (4, 4)`` for the scenes' own cameras, or a tensor of poses ``(C, 4, 4)``; None: each
             scene's own camera, C = 1.
-        params: tensors in place of the scenes', by dotted name: a mapping to tensors with a leading dimension S, or a sequence
-            of S mappings.
+        params: values in place of the scenes', by dotted name: a mapping to tensors (or lists) with a leading dimension S, or a
+            sequence of S mappings as :func:`torchpt.render` takes them.
         seed: one seed for all pictures (by default the scenes' own), a sequence of S, or S sequences of C; None: a new one for
             each picture, from torch's default generator.
         on_progress: called after each picture with the number of finished and of all pictures (None: an iterator of scenes).
@@ -190,7 +190,7 @@ def _with_gradients(found: tuple[RenderRequest | None, Rendering]) -> Rendering:
 def _pictures(
     scenes: Iterable[Scene],
     cameras: Sequence[Mapping[str, Any] | Tensor | None],
-    param_sets: Sequence[Mapping[str, Tensor]] | None,
+    param_sets: Sequence[Params] | None,
     seeds: Callable[[int, int], Any],
     options: BatchOptions,
     *,
@@ -239,7 +239,7 @@ def _pictures(
 def _request(
     scene: Scene,
     camera: Mapping[str, Any] | Tensor | None,
-    params: Mapping[str, Tensor],
+    params: Params,
     seed: Any,
     options: BatchOptions,
     *,

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import AssetError, NotBuiltError, RenderError, SceneError
+from torchpt.math.transforms import tensor_of
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import SeedOfCall
+from torchpt.scene.settings import Params, SeedOfCall
 from torchpt.spec.arguments import SceneValue
 
 __all__ = ["Cameras", "Seeds", "cameras_of", "naming_errors", "params_of", "scenes_of", "seeds_of"]
@@ -84,7 +85,17 @@ def _pose(key: str, value: Any, expected: str) -> Tensor:
         raise SceneError(key, value, expected) from None
 
 
-def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[str, Tensor]] | None:
+def _stacked(value: Any) -> Any:
+    """Return numbers and nested lists as a tensor; other values unchanged."""
+    if not isinstance(value, list | tuple | np.ndarray):
+        return value
+    try:
+        return tensor_of(value, torch.device("cpu"))
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return value
+
+
+def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Params] | None:
     """Return the parameters of each scene of a batch; None without parameters.
 
     Raises:
@@ -94,6 +105,7 @@ def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[
         return None
     if isinstance(params, Mapping):
         size: int | None = None
+        params = {name: _stacked(value) for name, value in params.items()}
         for name, value in params.items():
             if not isinstance(value, Tensor) or value.dim() < 1 or not len(value):
                 found = tuple(value.shape) if isinstance(value, Tensor) else value
@@ -117,7 +129,7 @@ def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[
     if isinstance(params, Sequence) and not isinstance(params, str) and params:
         for s, own in enumerate(params):
             if not isinstance(own, Mapping):
-                raise SceneError(f"params[{s}]", own, "a mapping from names to tensors")
+                raise SceneError(f"params[{s}]", own, "a mapping from names to values")
         if isinstance(scenes, Sequence) and len(params) != len(scenes):
             raise SceneError("params", len(params), f"as many as there are scenes, {len(scenes)}")
         return params
