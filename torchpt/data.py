@@ -18,7 +18,7 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 from torchpt.core.errors import SceneError
 from torchpt.rendering.api import render
 from torchpt.scene import Scene, load
-from torchpt.scene.settings import RenderOptions
+from torchpt.scene.settings import RenderOptions, base_seed, film_keys
 from torchpt.spec.arguments import check_names
 
 __all__ = ["Made", "RenderDataset", "RenderStream"]
@@ -41,7 +41,7 @@ class _ItemRenderer:
         cameras: Sequence[Any],
         spp: int | None,
         layers: Sequence[str],
-        seed: int,
+        seed: int | Tensor,
         device: str | torch.device,
         options: Mapping[str, Any],
     ) -> None:
@@ -52,8 +52,7 @@ class _ItemRenderer:
             if key in options:
                 raise SceneError(key, options[key], "an argument of the data set, of `make` or none")
         _check_options(options)
-        if type(seed) is not int or seed < 0:
-            raise SceneError("seed", seed, "a whole number >= 0")
+        seed = base_seed(seed)
         if isinstance(layers, str) or not isinstance(layers, Iterable):
             raise SceneError("layers", layers, "a sequence of names of layers")
         self.make, self.layers, self.seed, self.device, self.options = make, tuple(layers), seed, device, dict(options)
@@ -67,8 +66,8 @@ class _ItemRenderer:
         scene, scene_options = self._scene(scene_index)
         options: dict[str, Any] = {**self.options, **scene_options}
         film = {
-            **(self.options.get("film") or {}),
-            **(scene_options.get("film") or {}),
+            **(film_keys(self.options.get("film")) or {}),
+            **(film_keys(scene_options.get("film")) or {}),
             "aovs": list(self.layers),
             "denoise": False,
         }
@@ -132,7 +131,7 @@ class RenderDataset(Dataset):
             ``i`` is scene ``i // len(cameras)`` by camera ``i % len(cameras)``. Without cameras, each scene has its own.
         spp: samples a pixel; None: the scene's own.
         layers: names of AOVs (``film.aovs``).
-        seed: seed of item 0; any integer from 0.
+        seed: seed of item 0; any integer from 0, also as a tensor.
         device: device on which mappings are loaded.
         options: further arguments of ``torchpt.render``.
 
@@ -150,7 +149,7 @@ class RenderDataset(Dataset):
         cameras: Sequence[Any] = (),
         spp: int | None = None,
         layers: Sequence[str] = (),
-        seed: int = 0,
+        seed: int | Tensor = 0,
         device: str | torch.device = "cpu",
         **options: Any,
     ) -> None:
@@ -203,7 +202,7 @@ class RenderStream(IterableDataset):
         cameras: Sequence[Any] = (),
         spp: int | None = None,
         layers: Sequence[str] = (),
-        seed: int = 0,
+        seed: int | Tensor = 0,
         device: str | torch.device = "cpu",
         **options: Any,
     ) -> None:
@@ -242,11 +241,11 @@ class RenderStream(IterableDataset):
 
 def _check_options(options: Mapping[str, Any], where: str = "") -> None:
     """Raise SceneError for arguments of ``render`` that have no effect here; ``where`` begins their keys."""
-    film, params = options.get("film"), options.get("params")
+    film, params = film_keys(options.get("film")), options.get("params")
     if "full" in options:
         raise SceneError(f"{where}full", options["full"], "none: an item holds the picture and its layers")
     if film is not None and not isinstance(film, Mapping):
-        raise SceneError(f"{where}film", film, "a mapping of film settings such as width")
+        raise SceneError(f"{where}film", film, "(width, height), or a mapping of film settings")
     if params is not None and not isinstance(params, Mapping):
         raise SceneError(f"{where}params", params, "a mapping from names of scene.params to tensors")
     film = film or {}

@@ -121,7 +121,7 @@ REFUSED: dict[str, tuple[Callable[[torchpt.Scene], Any], str]] = {
     ),
     "layers a word": (lambda s: items(s, layers="depth"), "layers: expected a sequence"),
     "layers none": (lambda s: items(s, layers=None), "layers: expected a sequence"),
-    "film a word": (lambda s: items(s, film="x"), "film: expected a mapping of film settings"),
+    "film a word": (lambda s: items(s, film="x"), r"film: expected \(width, height\), or a mapping of film settings"),
     "layers in the film": (lambda s: items(s, film={"aovs": ["depth"]}), "film.aovs: expected none: use layers"),
     "denoised items": (lambda s: items(s, film={"denoise": True}), "film.denoise: expected false"),
     "a stream of them": (
@@ -130,7 +130,7 @@ REFUSED: dict[str, tuple[Callable[[torchpt.Scene], Any], str]] = {
     ),
     "made layers": (lambda s: made(s, film={"aovs": ["depth"]}), r"make\(0\).film.aovs: expected none: use layers"),
     "made denoised": (lambda s: made(s, film={"denoise": True}), r"make\(0\).film.denoise: expected false"),
-    "made film a word": (lambda s: made(s, film="x"), r"make\(0\).film: expected a mapping"),
+    "made film a word": (lambda s: made(s, film="x"), r"make\(0\).film: expected \(width, height\), or a mapping"),
     "made full": (lambda s: made(s, full=True), r"make\(0\).full: expected none"),
     "made params a list": (lambda s: made(s, params=[1]), r"make\(0\).params: expected a mapping from names"),
     "made params a word": (lambda s: made(s, params={PAINT: "red"}), f"params.{PAINT}: expected numbers"),

@@ -140,7 +140,9 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"spp": 0}, "render.spp: expected a whole number 1..2147483647, got 0"),
     ({"time_limit": 0}, "render.time_limit: expected null or seconds > 0, got 0"),
     ({"resume": True}, "render.resume: expected false without render.checkpoint, the file to go on from, got True"),
-    ({"film": 3}, "film: expected a mapping of settings, got 3"),
+    ({"film": 3}, "film: expected (width, height), or a mapping of settings, got 3"),
+    ({"film": (8, 0)}, "film.height: expected a whole number 1..65536, got 0"),
+    ({"film": (8, 8, 3)}, "film: expected (width, height), or a mapping of settings, got"),
 ]
 
 
@@ -283,3 +285,83 @@ def test_type_checkers_see_every_argument(tmp_path: Path) -> None:
     found = json.loads(done.stdout)["generalDiagnostics"]
     wrong = {number for number, line in enumerate(CALLS.splitlines()) if line.endswith("# wrong")}
     assert {each["range"]["start"]["line"] for each in found} == wrong, found
+
+
+def test_a_film_may_be_its_width_and_height(scene: torchpt.Scene) -> None:
+    whole = {"width": 6, "height": 3}
+    assert torch.equal(torchpt.render(scene, spp=2, film=(6, 3)), torchpt.render(scene, spp=2, film=whole))
+    assert torchpt.render(scene, spp=1, film=[6, 3], full=True).image.shape == (3, 6, 3)
+    assert torchpt.render_batch(scene, spp=1, film=(6, 3)).shape == (1, 1, 3, 6, 3)
+    assert torchpt.nn.Renderer(scene, spp=1, film=(6, 3))().shape == (3, 6, 3)
+    assert scene.film_size((6, 3)) == (6, 3) and torch.equal(scene.pinhole(film=(6, 3)).K, scene.pinhole(film=whole).K)
+    camera = {"to_world": torch.eye(4), "K": [[4.0, 0.0, 3.0], [0.0, 4.0, 1.5], [0.0, 0.0, 1.0]]}
+    assert scene.seen_by(camera, (6, 3)).params["camera.fov"] == scene.seen_by(camera, whole).params["camera.fov"]
+    made = torchpt.data.RenderDataset(lambda _: (scene, {"film": (6, 3)}), 1, spp=1, film=(2, 2))
+    assert made[0]["image"].shape == (3, 6, 3)
+
+
+def test_a_seed_may_be_a_tensor_or_drawn_anew(scene: torchpt.Scene) -> None:
+    def seed_of(**wishes: Any) -> int:
+        made = torchpt.render(scene, spp=1, full=True, **wishes)
+        assert made.settings is not None
+        return made.settings.render.seed
+
+    assert seed_of() == 0 and seed_of(seed=torch.tensor(7)) == seed_of(seed=torch.tensor([7], dtype=torch.uint8)) == 7
+    torch.manual_seed(5)
+    drawn = [seed_of(seed=None) for _ in range(3)]
+    torch.manual_seed(5)
+    assert [seed_of(seed=None) for _ in range(3)] == drawn and len({*drawn}) == 3
+
+
+def test_a_render_with_a_seed_draws_nothing_even_where_it_compiles(
+    scene: torchpt.Scene, tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.setenv("TORCHPT_CACHE", str(tmp_path))  # so that kernels are traced
+    before = torch.get_rng_state()
+    torchpt.render(torchpt.load({**BALL, "film": {"width": 3, "height": 3, "filter": "tent"}}, "cpu"), spp=1, seed=3)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_drawn_seed_in_every_entry(scene: torchpt.Scene) -> None:
+    name = "shapes.ball.material.reflectance"
+
+    def twice(make: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        torch.manual_seed(2)
+        first = make(), make()
+        torch.manual_seed(2)
+        again = make(), make()
+        assert all(map(torch.equal, first, again)) and not torch.equal(*first)
+        return first
+
+    alone = twice(lambda: torchpt.render(scene, spp=1, seed=None))
+    o, d = torch.tensor([0.0, 0.0, 4.0]), torch.tensor([[0.1, 0.0, -1.0]]).expand(9, 3)
+    twice(lambda: torchpt.trace(scene, o, d, seed=None))
+    torch.manual_seed(2)
+    batch = torchpt.render_batch([scene, scene], spp=1, seed=None)[:, 0]
+    assert torch.equal(batch[0], alone[0]) and torch.equal(batch[1], alone[1])
+    module = torchpt.nn.Renderer(scene, name, seed=None, spp=1)
+    with torch.no_grad():
+        twice(module)
+        twice(module.eval())
+    assert torch.equal(
+        torchpt.render_batch(scene, spp=1, seed=torch.tensor(3)), torchpt.render_batch(scene, spp=1, seed=3)
+    )
+
+
+def test_the_backward_pass_of_a_drawn_seed_is_of_that_seed(scene: torchpt.Scene) -> None:
+    name, grads = "shapes.ball.material.reflectance", []
+    for seed in (None, None):
+        torch.manual_seed(4)
+        leaf = torch.full((3,), 0.5, requires_grad=True)
+        torchpt.render(scene, spp=2, seed=seed, params={name: leaf}).square().sum().backward()
+        grads.append(leaf.grad)
+    assert torch.equal(*grads)
+
+
+@pytest.mark.parametrize("seed", [torch.tensor(1.0), torch.tensor([1, 2]), torch.tensor(True)])
+def test_seeds_that_are_refused(scene: torchpt.Scene, seed: torch.Tensor) -> None:
+    for call in (torchpt.render, torchpt.nn.Renderer):
+        with pytest.raises(SceneError, match="^seed: expected a whole number, also as a tensor with one element"):
+            call(scene, spp=1, seed=seed)
+    with pytest.raises(SceneError, match="seed: expected a whole number 0"):
+        torchpt.render(scene, spp=1, seed=torch.tensor(-1))

@@ -461,7 +461,7 @@ def test_poses_as_nested_lists():
         ({"params": [{}]}, "^params: expected as many"),
         ({"params": [{}, {}, {}]}, "^params: expected as many"),
         ({"on_progress": 3}, "^on_progress: expected a function"),
-        ({"cameras": [BLOCKS[0]], "film": "x"}, r"film: expected a mapping"),
+        ({"cameras": [BLOCKS[0]], "film": "x"}, r"film: expected \(width, height\), or a mapping"),
         ({"params": [{}, {"materials.gray.reflectance": torch.ones(3)}]}, r"^scenes\[1\]\.params\.materials\.gray"),
         ({"params": {"a": torch.ones(2), "b": torch.ones(3)}}, "^params.b: .*first dimension of 2"),
         ({"params": {"a": 1.0}}, "^params.a: "),

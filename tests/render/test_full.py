@@ -261,3 +261,24 @@ def test_large_pictures_are_shown_smaller() -> None:
     with Image.open(BytesIO(torchpt.Rendering(image)._repr_png_())) as shown:
         assert shown.size == (768, 192) and shown.format == "PNG"
         assert np.asarray(shown)[100, [10, 700], 0].tolist() == [255, 0]
+
+
+def test_the_depth_of_the_background_is_zero_and_over_alpha_it_is_the_surfaces_own():
+    """A wall 3 before an orthographic camera whose edge crosses pixels: they hold its distance times their coverage."""
+    scene = torchpt.load(
+        {
+            "camera": {"type": "orthographic", "origin": [0, 0, 3], "target": [0, 0, 0], "width": 4.0},
+            "shapes": {"wall": {"type": "rectangle", "transform": [{"scale": 0.83}]}},
+            "lights": {"sky": {"type": "constant", "radiance": 1.0}},
+        },
+        "cpu",
+    )
+    film = {"width": 8, "height": 8, "filter": "box", "aovs": ["depth", "alpha"]}
+    full = torchpt.render(scene, film=film, spp=64, full=True)
+    depth, alpha = full["depth"], full["alpha"]
+    assert set(depth[alpha == 0].tolist()) == {0.0}
+    part = (alpha > 0.1) & (alpha < 0.9)
+    assert int(part.sum()) >= 8 and int((alpha == 1).sum()) >= 4
+    torch.testing.assert_close((depth / alpha)[alpha > 0], torch.full_like(depth[alpha > 0], 3.0))
+    far = torch.where(alpha > 0, depth / alpha, torch.inf)  # what the docs say for an infinite background
+    assert torch.isinf(far[alpha == 0]).all()

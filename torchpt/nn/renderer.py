@@ -15,7 +15,8 @@ from torchpt.rendering.api import render
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import BatchOptions, RenderOptions
+from torchpt.scene.settings import BatchOptions, Params, RenderOptions, base_seed
+from torchpt.scene.validation import params_as_tensors
 from torchpt.spec.arguments import check_names, expand_signature
 
 __all__ = ["Renderer"]
@@ -33,7 +34,7 @@ class Renderer(nn.Module):
     The seed is ``seed + steps``, where the buffer ``steps`` counts calls in training mode; with ``torch.distributed``
     initialized it is ``seed + steps * world + rank``, so that ranks render different samples of one picture (with ``ranks=``
     they share it). In ``eval()`` mode it is always ``seed``. A seed passed to ``forward`` takes precedence, and does not
-    count as a step.
+    count as a step. With ``seed=None`` every call draws a new one from torch's default generator, in both modes.
 
     The scene is shared, not copied, and not changed: only :meth:`write` changes ``scene.params``. Weights of your own BSDF
     models are not among ``parameters()``: pass them to the optimizer too.
@@ -41,7 +42,7 @@ class Renderer(nn.Module):
     Args:
         scene: a scene from ``torchpt.load``.
         names: dotted names of ``scene.params``, or patterns such as ``materials.*.reflectance``; None: no parameters.
-        seed: any integer from 0.
+        seed: any integer from 0, also as a tensor; None: a new one for each call.
         rigid: True: poses move rigidly (six numbers each); False: their 16 numbers are optimized, except for poses that must
             keep angles, as those of spheres and cameras.
         full: True makes calls return a :class:`torchpt.Rendering`.
@@ -60,7 +61,7 @@ class Renderer(nn.Module):
         scene: Scene,
         names: str | Sequence[str] | None = None,
         *,
-        seed: int = 0,
+        seed: int | Tensor | None = 0,
         rigid: bool = True,
         full: bool = False,
         **options: Unpack[BatchOptions],
@@ -71,8 +72,8 @@ class Renderer(nn.Module):
             raise SceneError("rigid", rigid, "True or False")
         if "params" in options:
             raise SceneError("params", options["params"], "an argument of Renderer.forward")
-        if type(seed) is not int or seed < 0:
-            raise SceneError("seed", seed, "a whole number >= 0")
+        if seed is not None:
+            seed = base_seed(seed)
         self.scene, self.seed, self.full, self.options = as_scene(scene), seed, full, options
         self.names = () if names is None else _matching_names(scene, (names,) if isinstance(names, str) else names)
         with torch.no_grad():
@@ -92,16 +93,16 @@ class Renderer(nn.Module):
     @expand_signature
     def forward(
         self,
-        params: Mapping[str, Tensor] | None = None,
+        params: Params | None = None,
         *,
-        seed: int | None = None,
+        seed: int | Tensor | None = None,
         full: bool | None = None,
         **options: Unpack[BatchOptions],
     ) -> Any:
         """Render the scene with the current parameters.
 
         Args:
-            params: tensors in place of parameters of the scene or of this module, by dotted name, such as those of the camera.
+            params: values in place of parameters of the scene or of this module, by dotted name, such as those of the camera.
             seed: seed in place of the counted one.
             full: in place of the constructor's ``full``.
             options: arguments of ``torchpt.render``, in place of the constructor's.
@@ -124,8 +125,8 @@ class Renderer(nn.Module):
             }
 
     @torch.no_grad()
-    def assign(self, values: Mapping[str, Tensor]) -> None:
-        """Set parameters to values by dotted name: all of them, or none if one is refused.
+    def assign(self, values: Params) -> None:
+        """Set parameters to values by dotted name, tensors or as in scene files: all of them, or none if one is refused.
 
         Raises:
             SceneError: a name is no parameter of this module, or the scene does not accept the values.
@@ -133,9 +134,10 @@ class Renderer(nn.Module):
         for name in values:
             if name not in self.names:
                 raise SceneError(f"params.{name}", name, f"one of {', '.join(self.names)}")
-        self.scene.check({**self.values(), **values})
+        tensors = params_as_tensors(self.scene, values)
+        self.scene.check({**self.values(), **tensors})
         numbers: dict[str, Tensor] = {}  # the unconstrained numbers of each value
-        for name, value in values.items():
+        for name, value in tensors.items():
             try:
                 numbers[name] = self.ranges[self.names.index(name)].inverse(value.to(self.free[_key(name)]))  # pyright: ignore[reportCallIssue]
             except ValueError:
@@ -150,9 +152,9 @@ class Renderer(nn.Module):
         for name, value in self.values().items():
             self.scene.params[name] = value.detach().clone()
 
-    def _next_seed(self, *, shares_picture: bool) -> int:
+    def _next_seed(self, *, shares_picture: bool) -> int | None:
         """Return the seed of a call, and count it in training mode; ``shares_picture``: ranks render one picture together."""
-        if not self.training:
+        if self.seed is None or not self.training:
             return self.seed
         rank, world = 0, 1
         if not shares_picture and torch.distributed.is_available() and torch.distributed.is_initialized():

@@ -68,7 +68,7 @@ class Layer:
 
 
 class SurfaceLayer(Layer):
-    """A quantity of the first surface; 0 where a camera ray hits nothing.
+    """A quantity of the first surface; 0 where a camera ray hits nothing, which counts in the mean of a pixel.
 
     Attributes:
         averaged: True: a pixel is the mean of its samples. False: its first sample, for identifiers, which have no mean.
@@ -134,7 +134,7 @@ class Normal(SurfaceLayer):
 
 
 class Depth(SurfaceLayer):
-    """The distance along the camera ray."""
+    """The distance along the camera ray, 0 where it hits nothing; over `alpha` it is the mean over what surfaces cover."""
 
     name = "depth"
     channels = ("Z",)

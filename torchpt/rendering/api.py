@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, Unpack, overload
 
@@ -13,7 +12,7 @@ from torchpt.rendering import Progress, Rendering, render_scene
 from torchpt.rendering.graphs import as_custom_op, with_graph_break
 from torchpt.rendering.requests import execute_request, prepare_request, prepare_trace_request
 from torchpt.scene import Scene
-from torchpt.scene.settings import FILTERS, CommonOptions, Settings, TraceOptions
+from torchpt.scene.settings import FILTERS, CommonOptions, Params, SeedOfCall, Settings, TraceOptions
 from torchpt.spec.arguments import check_names, expand_signature
 from torchpt.spec.schema import ParsedParams
 
@@ -35,7 +34,7 @@ def render(scene: Scene, *, full: bool = False, **options: Unpack[CommonOptions]
         scene: from :func:`torchpt.load`.
         full: True returns a :class:`torchpt.Rendering`: picture, AOVs, error, counts and seconds in one object.
         options: settings, which win over the scene file's (None keeps the file's value), and options of this call: ``spp``,
-            ``seed``, ``params`` (tensors in place of those of ``scene.params``; if one requires gradients, so does the
+            ``seed``, ``params`` (values in place of those of ``scene.params``; if a tensor requires gradients, so does the
             picture), ``film``, ``integrator``... :class:`torchpt.scene.settings.CommonOptions` declares them, ``help`` lists
             them, and docs/guides/ml.md has them as a table.
 
@@ -57,8 +56,8 @@ def trace(
     d: Tensor,
     *,
     spp: int | None = 1,
-    seed: int | None = 0,
-    params: Mapping[str, Tensor] | None = None,
+    seed: SeedOfCall = 0,
+    params: Params | None = None,
     **options: Unpack[TraceOptions],
 ) -> Tensor:
     """Return the radiance that arrives at ``o`` from ``d``, linear RGB ``(..., 3)``; differentiable in both and in ``params``.
@@ -73,8 +72,8 @@ def trace(
         o: origins ``(..., 3)``, float32 or float64, in the scene's world, on its device.
         d: directions ``(..., 3)``, of any length; ``o`` and ``d`` are broadcast. Gradients are those of ``d / |d|``.
         spp: samples a ray, which are averaged.
-        seed: any integer from 0; the same seed gives the same numbers.
-        params: tensors in place of ``scene.params`` by dotted name; parameters of the camera are refused.
+        seed: any integer from 0; the same seed gives the same numbers. None: a new one, from torch's default generator.
+        params: values in place of ``scene.params`` by dotted name; parameters of the camera are refused.
         options: further options of :func:`render`, as :class:`torchpt.scene.settings.TraceOptions` declares them. The scene
             file's film and stop rules are not used.
 

@@ -28,8 +28,9 @@ from torchpt.rendering import Rendering
 from torchpt.scene import Scene
 from torchpt.scene.formats.description import settings
 from torchpt.scene.scene import scene_by_number
-from torchpt.scene.settings import BLOCKS
+from torchpt.scene.settings import BLOCKS, SeedOfCall
 from torchpt.scene.versions import AFTER, check_unchanged
+from torchpt.spec.arguments import SCENE_VALUE
 
 __all__ = ["as_custom_op", "reuse_rendering", "with_graph_break"]
 
@@ -85,7 +86,7 @@ def _in_graph(
     scene: Scene,
     params: Mapping[str, Tensor] | None = None,
     full: bool = False,
-    seed: int | None = None,
+    seed: SeedOfCall = SCENE_VALUE,
     dtype: torch.dtype = torch.float32,
     **options: Any,
 ) -> Any:
@@ -100,8 +101,7 @@ def _in_graph(
                 given[name] = value
     differentiated = [name for name in given if given[name].requires_grad]
     text = _to_text([options, list(given), differentiated, dtype is torch.float64])  # read by _OperatorCall.read
-    seed_number = -1 if seed is None else seed
-    picture, _ = torch.ops.torchpt.render(scene.number, text, seed_number, list(given.values()))
+    picture, _ = torch.ops.torchpt.render(scene.number, text, -1 if seed is SCENE_VALUE else seed, list(given.values()))
     return picture
 
 
@@ -113,7 +113,7 @@ def _fits_graph(params: Any, seed: Any, dtype: Any, options: Mapping[str, Any]) 
         isinstance(params, Mapping) and all([isinstance(value, Tensor) for value in params.values()])
     ):
         return False
-    return is_float and (seed is None or (is_number and 0 <= seed < 1 << 63)) and _is_plain(options)
+    return is_float and (seed is SCENE_VALUE or (is_number and 0 <= seed < 1 << 63)) and _is_plain(options)
 
 
 def _is_plain(value: Any) -> bool:
@@ -167,7 +167,10 @@ class _OperatorCall(NamedTuple):
         if scene is None:
             raise RenderError("the scene that this compiled graph renders is gone: keep a reference to it")
         options, names, differentiated, is_double = ast.literal_eval(text)
-        options |= {"dtype": torch.float64 if is_double else torch.float32, "seed": None if seed < 0 else int(seed)}
+        options |= {
+            "dtype": torch.float64 if is_double else torch.float32,
+            "seed": SCENE_VALUE if seed < 0 else int(seed),
+        }
         return cls(scene, options, names, differentiated)
 
     def versions(self) -> dict[str, int]:

@@ -28,8 +28,18 @@ from torchpt.rendering.result import denoise_rendering
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
 from torchpt.scene.formats.description import settings as complete_settings
-from torchpt.scene.settings import SAMPLERS, CallArguments, CommonOptions, Settings, settings_of_call
+from torchpt.scene.settings import (
+    SAMPLERS,
+    CallArguments,
+    CommonOptions,
+    Params,
+    Settings,
+    film_keys,
+    seed_number,
+    settings_of_call,
+)
 from torchpt.scene.texel_params import update_texels, with_texel_params
+from torchpt.scene.validation import params_as_tensors
 from torchpt.scene.versions import AFTER, check_unchanged
 from torchpt.spec import Role
 
@@ -102,9 +112,11 @@ def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) 
     scene = as_scene(scene)
     call = CallArguments.of({**options, "full": full})
     _check_call(scene, call, options.get("device"))
+    if "seed" in options:
+        options["seed"] = seed_number(options["seed"])
     settings = complete_settings(scene.description, settings_of_call(options))
     if not full:
-        settings = _without_aovs(settings, options.get("film"))
+        settings = _without_aovs(settings, film_keys(options.get("film")))
     elif settings.film.denoise:
         check_denoiser()
     params = _parameters(scene, call.params, full)
@@ -172,14 +184,14 @@ def _broadcast_rays(scene: Scene, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]
     return o, d
 
 
-def _parameters(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
+def _parameters(scene: Scene, params: Params | None, full: bool) -> dict[str, Tensor]:
     """Return tensors in place of the scene's parameters, and those of its own that require gradients.
 
     Raises:
         SceneError: an unknown name, or a value that is no tensor with data. Values are checked later, outside of transforms
             of ``torch.func`` (:mod:`torchpt.core.autograd`).
     """
-    given = dict(params or {})
+    given = params_as_tensors(scene, params or {})
     if any(name not in scene.params or not isinstance(value, Tensor) or value.is_meta for name, value in given.items()):
         scene.check(given)
     if full and any(is_batched(value) for value in given.values()):

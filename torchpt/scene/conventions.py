@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
     from torchpt.scene.scene import Scene
+    from torchpt.scene.settings import FilmSettings, Params
 
 __all__ = [
     "OpenGLCamera", "from_kornia", "from_opencv", "from_opengl", "from_pytorch3d", "to_kornia", "to_opencv", "to_opengl",
@@ -83,8 +83,8 @@ def from_opencv(K: Any, R: Any, t: Any, size: Size, first_pixel: float = 0.5) ->
 
 def to_opencv(
     scene: Scene,
-    params: Mapping[str, Tensor] | None = None,
-    film: Mapping[str, Any] | None = None,
+    params: Params | None = None,
+    film: FilmSettings | None = None,
     dtype: torch.dtype = torch.float32,
     first_pixel: float = 0.5,
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -153,8 +153,8 @@ def from_opengl(
 
 def to_opengl(
     scene: Scene,
-    params: Mapping[str, Tensor] | None = None,
-    film: Mapping[str, Any] | None = None,
+    params: Params | None = None,
+    film: FilmSettings | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> OpenGLCamera:
     """Return a scene's camera with OpenGL's axes. Arguments and errors as :func:`to_opencv`."""
@@ -191,8 +191,8 @@ def from_kornia(camera: PinholeCamera, index: int = 0) -> Block:
 
 def to_kornia(
     scene: Scene,
-    params: Mapping[str, Tensor] | None = None,
-    film: Mapping[str, Any] | None = None,
+    params: Params | None = None,
+    film: FilmSettings | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> PinholeCamera:
     """Return a scene's camera as kornia's ``PinholeCamera``, a batch of one. Arguments and errors as :func:`to_opencv`.
@@ -245,8 +245,8 @@ def from_pytorch3d(
 
 def to_pytorch3d(
     scene: Scene,
-    params: Mapping[str, Tensor] | None = None,
-    film: Mapping[str, Any] | None = None,
+    params: Params | None = None,
+    film: FilmSettings | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> dict[str, Any]:
     """Return PyTorch3D's arguments of ``PerspectiveCameras`` for a batch of one. Arguments and errors as :func:`to_opencv`."""
@@ -264,9 +264,7 @@ def to_pytorch3d(
     return {**found, "image_size": torch.tensor([[tall, wide]], device=rotation.device), "in_ndc": True}
 
 
-def _pinhole(
-    scene: Any, params: Mapping[str, Tensor] | None, film: Mapping[str, Any] | None, dtype: Any
-) -> PinholeMatrices:
+def _pinhole(scene: Any, params: Params | None, film: FilmSettings | None, dtype: Any) -> PinholeMatrices:
     """Return a scene's pinhole matrices in float64, after checking ``dtype``, to which callers convert."""
     if not hasattr(scene, "pinhole"):
         raise SceneError("scene", scene, "a scene from torchpt.load")

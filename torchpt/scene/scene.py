@@ -37,10 +37,10 @@ from torchpt.scene.devices import device_of
 from torchpt.scene.formats.description import Description, settings
 from torchpt.scene.host_copies import HostCopies
 from torchpt.scene.info import describe
-from torchpt.scene.settings import Film, Settings
+from torchpt.scene.settings import Film, FilmSettings, Params, Settings
 from torchpt.scene.sources import check_light_params
 from torchpt.scene.space import MAX_COORDINATE, Space, bounds_center, bounds_extent
-from torchpt.scene.validation import check_tensor, inherited_checks, validate_changes
+from torchpt.scene.validation import check_tensor, inherited_checks, params_as_tensors, validate_changes
 from torchpt.scene.versions import VersionCounter, changed_versions
 from torchpt.scene.view import view_attributes
 from torchpt.scene.world import assemble
@@ -145,12 +145,13 @@ class Scene:
         """Return the scene that this is a view of (:meth:`seen_by`), else itself; caches belong to it."""
         return self if self._origin is None else self._origin
 
-    def seen_by(self, camera: Mapping[str, Any], film: Mapping[str, Any] | None = None) -> Scene:
+    def seen_by(self, camera: Mapping[str, Any], film: FilmSettings | None = None) -> Scene:
         """Return a view of this scene through another camera. It shares all other parameters, worlds and search structures.
 
         Args:
             camera: camera block, as in a scene file.
-            film: film settings that override the scene's. A ``K`` without ``size`` is in pixels of the film.
+            film: film settings that override the scene's, or ``(width, height)``. A ``K`` without ``size`` is in pixels of the
+                film.
 
         Raises:
             SceneError: a wrong camera block or film.
@@ -251,7 +252,7 @@ class Scene:
         extent = bounds_extent(self._built.parts, self._built.copies)
         return 2.0 ** round(math.log2(max(extent, 2.0**-100)))  # a single point has a logarithm too
 
-    def check(self, params: Mapping[str, Tensor] | None) -> None:
+    def check(self, params: Params | None) -> None:
         """Check parameters that are to replace the scene's in a render.
 
         Raises:
@@ -374,27 +375,30 @@ class Scene:
         pose = torch.cat((self._host_space.pose(pose), pose[3:].double())).to(dtype)  # (3, 4), and the last row 0 0 0 1
         return moved(camera.kind.on(pose, (film.width, film.height), values), self.device)
 
-    def film_size(self, film: Mapping[str, Any] | None = None) -> tuple[int, int]:
+    def film_size(self, film: FilmSettings | None = None) -> tuple[int, int]:
         """Return width and height of the whole film in pixels; ``film``: settings that override the scene's."""
         film_settings = settings(self.description, {"film": film or {}}).film
         return film_settings.width, film_settings.height
 
     def pinhole(
         self,
-        params: Mapping[str, Tensor] | None = None,
-        film: Mapping[str, Any] | None = None,
+        params: Params | None = None,
+        film: FilmSettings | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> PinholeMatrices:
         """Return the camera as OpenCV's matrices ``K`` in pixels, ``R`` and ``t``; see :mod:`torchpt.physics.cameras.opencv`.
 
         Args:
-            params: tensors in place of the scene's, by name; gradients flow to the camera's.
-            film: film settings that override the scene's, e.g. ``{"width": 640, "height": 480}``; a crop has no effect.
+            params: values in place of the scene's, by name, as :func:`torchpt.render` takes them; gradients flow to the
+                camera's.
+            film: film settings that override the scene's, e.g. ``(640, 480)``; a crop has no effect.
             dtype: dtype of the matrices.
 
         Raises:
             SceneError: wrong parameters or film settings, or a camera other than a pinhole.
         """
+        if isinstance(params, Mapping):
+            params = params_as_tensors(self, params)
         self.check(params)
         merged, film_settings = self.merged(params), settings(self.description, {"film": film or {}}).film
         matrix = self.camera(film_settings, merged, torch.float64).intrinsics()

@@ -9,14 +9,16 @@ of that type; the blocks ``film`` and ``render`` are records here. A *role* says
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, TypedDict
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.core.autograd import is_transformed, outside_transforms
 from torchpt.core.errors import SceneError
 from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.paths.integrators.base import Integrator
@@ -25,7 +27,7 @@ from torchpt.physics.film import FILTERS
 from torchpt.physics.samplers import KINDS as SAMPLERS
 from torchpt.ranks import Group
 from torchpt.spec import Choice, Custom, Flag, FrozenConfig, Integer, Refused, Role, Scalar, parameters_of, reading
-from torchpt.spec.arguments import Argument, arguments_of
+from torchpt.spec.arguments import SCENE_VALUE, Argument, InPython, SceneValue, arguments_of
 from torchpt.spec.schema import (
     ParsedParams,
     ResultCache,
@@ -48,12 +50,18 @@ __all__ = [
     "CallArguments",
     "CommonOptions",
     "Film",
+    "FilmSettings",
+    "Params",
     "Render",
     "RenderOptions",
+    "SeedOfCall",
     "Settings",
     "TraceOptions",
+    "base_seed",
+    "film_keys",
     "keep_aspect",
     "merge",
+    "seed_number",
     "settings_of_call",
     "settings_with",
 ]
@@ -183,6 +191,12 @@ def _file(value: Any) -> str:
     raise Refused("null or a file path")
 
 
+#: A seed of a call: a whole number, or a tensor of one; None: a new one; by default the scene's.
+SeedOfCall = int | Tensor | SceneValue | None
+#: Values in place of a scene's parameters: tensors, or numbers, lists and arrays as in scene files.
+Params = Mapping[str, Tensor | float | str | Sequence[Any] | np.ndarray]
+#: Film settings of a call: a mapping, or width and height.
+FilmSettings = Mapping[str, Any] | tuple[int, int] | list[int]
 #: Methods for gradients, the default first.
 ADJOINTS = ("replay", "autograd")
 #: Phrases of what is accepted.
@@ -293,8 +307,12 @@ class BatchOptions(_SampleOptions, TraceOptions, total=False):
     """Arguments of :func:`torchpt.render` that are the same for all pictures of a batch."""
 
     film: Annotated[
-        Mapping[str, Any] | None,
-        Custom(None, words=f"a mapping of {', '.join(Film.parameters)}", doc="the picture: its size, its layers"),
+        FilmSettings | None,
+        Custom(
+            None,
+            words=f"(width, height), or a mapping of {', '.join(Film.parameters)}",
+            doc="the picture: its size, its layers",
+        ),
     ]
     pilots: Annotated[
         bool | str | None,
@@ -360,14 +378,21 @@ class BatchOptions(_SampleOptions, TraceOptions, total=False):
 class CommonOptions(BatchOptions, total=False):
     """Arguments of :func:`torchpt.render` beside the scene and ``full``."""
 
-    seed: Annotated[int | None, Integer(0, high=MAX_SEED, doc="the same seed gives the same picture")]
+    seed: Annotated[
+        SeedOfCall,
+        Integer(0, high=MAX_SEED, doc="the same seed gives the same picture"),
+        InPython(
+            SCENE_VALUE,
+            accepted=f"a whole number 0..{MAX_SEED}, a tensor of one, or None: a new one a call, drawn from torch's generator",
+        ),
+    ]
     params: Annotated[
-        Mapping[str, Tensor] | None,
+        Params | None,
         Argument(
             None,
             fits=lambda value: isinstance(value, Mapping),
-            words="a mapping from names of scene.params to tensors",
-            doc="tensors in place of the scene's, where a material has a number or colour also texels (H, W, C); where one"
+            words="a mapping from names of scene.params to tensors, or numbers and lists as in scene files",
+            doc="values in place of the scene's, where a material has a number or colour also texels (H, W, C); where a tensor"
             " requires gradients, so does the picture",
         ),
     ]
@@ -445,9 +470,50 @@ class CallArguments(FrozenConfig):
         return cls(**values)
 
 
+def seed_number(seed: SeedOfCall) -> Any:
+    """Return the seed of a call as a number; None draws a new one from torch's default generator of the CPU.
+
+    Other values, :data:`~torchpt.spec.arguments.SCENE_VALUE` among them, are returned unchanged.
+
+    Raises:
+        SceneError: a tensor that is not a single whole number.
+    """
+    if seed is None:
+        with outside_transforms():
+            return int(torch.randint(MAX_SEED, (), device="cpu"))
+    if not isinstance(seed, Tensor):
+        return seed
+    shown = (tuple(seed.shape), seed.dtype)
+    whole = not (seed.is_floating_point() or seed.is_complex() or seed.dtype == torch.bool or seed.is_meta)
+    if not whole or seed.numel() != 1 or is_transformed(seed):
+        shown = "a tensor under a transform of torch.func" if is_transformed(seed) else shown
+        raise SceneError("seed", shown, "a whole number, also as a tensor with one element, or None for a new one")
+    return int(seed)
+
+
+def base_seed(seed: Any) -> int:
+    """Return the first of the seeds that are counted on from it, a whole number or a tensor of one.
+
+    Raises:
+        SceneError: something else.
+    """
+    number = seed_number(seed) if isinstance(seed, Tensor) else seed
+    if type(number) is not int or number < 0:
+        raise SceneError("seed", number, "a whole number >= 0")
+    return number
+
+
+def film_keys(film: Any) -> Any:
+    """Return the mapping of film settings that a pair ``(width, height)`` stands for; other values unchanged."""
+    if isinstance(film, tuple | list) and len(film) == 2:
+        return {"width": film[0], "height": film[1]}
+    return film
+
+
 def settings_of_call(options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings among the arguments of a call, by block, without the device, which belongs to the scene."""
     render = {name: options.get(name) for name in Render.parameters if name in _ARGUMENTS and name != "device"}
+    render = {name: None if value is SCENE_VALUE else value for name, value in render.items()}
     return {**{name: options.get(name) for name in BLOCKS}, "render": render}
 
 
@@ -531,7 +597,8 @@ def _keys_that_are_set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
     if isinstance(raw, str) and key.rpartition(".")[2] in TYPED_BLOCKS:
         return {"type": raw}
     if not isinstance(raw, Mapping):
-        raise SceneError(key, raw, "a mapping of settings", file)
+        pair = "(width, height), or " if key == "film" and file is None else ""
+        raise SceneError(key, raw, f"{pair}a mapping of settings", file)
     return {str(name): value for name, value in raw.items() if value is not None}
 
 
@@ -573,6 +640,8 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
         SceneError: an unknown block or key, a key that the chosen type does not have, a bad value.
         NotBuiltError: a setting that this version does not support.
     """
+    if isinstance(overrides.get("film"), tuple | list):
+        overrides = {**overrides, "film": film_keys(overrides["film"])}
     instance = overrides.get("integrator")
     if isinstance(instance, Integrator):  # made in Python, complete: nothing to merge
         return _merge({**scene, "integrator": None}, {**overrides, "integrator": None}, file, instance)

@@ -27,6 +27,7 @@ from torchpt.spec.schema import read_typed
 
 if TYPE_CHECKING:
     from torchpt.scene.scene import Scene
+    from torchpt.scene.settings import FilmSettings, Params
 
 __all__ = ["Frame", "frame_of", "read_transforms", "write_transforms"]
 
@@ -64,8 +65,8 @@ class Frame(NamedTuple):
 def frame_of(
     scene: Scene,
     image: str | os.PathLike[str],
-    params: Mapping[str, Tensor] | None = None,
-    film: Mapping[str, Any] | None = None,
+    params: Params | None = None,
+    film: FilmSettings | None = None,
 ) -> Frame:
     """Return a scene's camera as a frame of plain numbers, without gradients.
 

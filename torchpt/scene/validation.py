@@ -1,4 +1,4 @@
-"""Check parameters of a scene that were replaced or changed in place, once for each change.
+"""Read and check parameters of a scene: those of a call, and once for each change those replaced or changed in place.
 
 A *version* (:class:`~torchpt.scene.versions.VersionCounter`) counts the changes of a parameter; a version that was checked once
 is not checked again.
@@ -6,19 +6,23 @@ is not checked again.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError
+from torchpt.math.transforms import tensor_of
 from torchpt.scene.sources import check_light_params
 from torchpt.scene.versions import changed_versions
+from torchpt.spec import Color, Index, Refused
 
 if TYPE_CHECKING:
     from torchpt.scene.scene import Scene
 
-__all__ = ["check_tensor", "inherited_checks", "validate_changes"]
+__all__ = ["check_tensor", "inherited_checks", "params_as_tensors", "validate_changes"]
 
 
 def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], *, texels: bool = False) -> None:
@@ -44,6 +48,42 @@ def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], 
         or_texels = "" if floats and value.dim() == 3 else or_texels
     kind = "floating tensor" if dense else "dense floating tensor"  # says dense only where that is what is wrong
     raise SceneError(f"params.{name}", shown, f"a {kind} of shape {tuple(shape)}{or_texels}")
+
+
+def params_as_tensors(scene: Scene, params: Mapping[str, Any]) -> dict[str, Any]:
+    """Return parameters in the shapes that the scene has; numbers and lists become tensors as in a scene file.
+
+    A number stands for three equal channels of a colour, a tensor without dimensions too: gradients flow to it. Values that
+    are neither, and names that the scene has not, are returned unchanged: :meth:`Scene.check` refuses them.
+    """
+    return {name: _as_tensor(scene, name, value) if name in scene.params else value for name, value in params.items()}
+
+
+def _as_tensor(scene: Scene, name: str, value: Any) -> Any:
+    own, spec = scene.params[name], scene.spec(name)
+    if not isinstance(value, Tensor):
+        if isinstance(value, str) and isinstance(spec, Index):  # the name of a medium
+            value = _number_of(spec, name, value)
+        if not isinstance(value, int | float | list | tuple | np.ndarray | np.number) or isinstance(value, bool):
+            return value
+        try:
+            value = tensor_of(value, own.device).to(own.dtype)
+        except (TypeError, ValueError, RuntimeError, OverflowError):
+            return value
+    colour = isinstance(spec, Color) and own.dim() == 1
+    return value.expand(own.shape) if colour and value.dim() == 0 and value.is_floating_point() else value
+
+
+def _number_of(spec: Index, name: str, medium: str) -> float:
+    """Return the index of refraction of a medium.
+
+    Raises:
+        SceneError: an unknown medium.
+    """
+    try:
+        return spec.read(medium)
+    except Refused as error:
+        raise SceneError(f"params.{name}", medium, error.expected) from None
 
 
 def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:

@@ -17,6 +17,7 @@ from torchpt.scene.formats.cameras import read_camera
 from torchpt.scene.formats.description import Description
 from torchpt.scene.formats.tensors import DictTensors
 from torchpt.scene.formats.yaml import plain
+from torchpt.scene.settings import film_keys
 
 __all__ = ["view_attributes"]
 
@@ -26,7 +27,7 @@ def view_attributes(
     built: SceneBuild,
     params: Mapping[str, Tensor],
     camera: Mapping[str, Any],
-    film: Mapping[str, Any],
+    film: Any,
 ) -> dict[str, Any]:
     """Return the attributes of a scene that another camera changes: description, build and parameters.
 
@@ -35,16 +36,17 @@ def view_attributes(
         built: the scene's.
         params: the scene's parameters.
         camera: block of the other camera, as in a scene file.
-        film: film settings that override the scene's.
+        film: film settings that override the scene's, a mapping or ``(width, height)``.
 
     Raises:
         SceneError: a wrong camera block or film.
     """
+    film = film_keys(film)
     if not isinstance(film, Mapping):
-        raise SceneError("film", film, "a mapping")
-    film_keys = description.film | {name: value for name, value in film.items() if value is not None}
+        raise SceneError("film", film, "(width, height), or a mapping of settings")
+    merged_film = description.film | {name: value for name, value in film.items() if value is not None}
     tensors = DictTensors()  # tensors of the block that require gradients; readers get plain numbers
-    new_camera = read_camera(tensors.extract(plain({"camera": camera}))["camera"], film=film_keys, file=None)
+    new_camera = read_camera(tensors.extract(plain({"camera": camera}))["camera"], film=merged_film, file=None)
     description = with_all_intrinsics(replace(description, camera=new_camera), tensors)
     new_camera, parameters = description.camera, Parameters()
     for name, value in built.parameters.items():

@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from enum import Enum
 from functools import cache
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -17,7 +18,16 @@ from torchpt.core.errors import closest_names
 from torchpt.spec.parameters import Spec
 from torchpt.spec.reading import Refused
 
-__all__ = ["Argument", "DeclaredArgument", "arguments_of", "check_names", "expand_signature"]
+__all__ = [
+    "SCENE_VALUE",
+    "Argument",
+    "DeclaredArgument",
+    "InPython",
+    "SceneValue",
+    "arguments_of",
+    "check_names",
+    "expand_signature",
+]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -44,6 +54,32 @@ class Argument(Spec):
         return value
 
 
+class SceneValue(Enum):
+    """Default of an argument where None has a meaning of its own: the value that the scene says, or the spec's default."""
+
+    OWN = "the scene's"
+
+    def __repr__(self) -> str:
+        return self.value
+
+
+#: Default of arguments for which None is a value.
+SCENE_VALUE = SceneValue.OWN
+
+
+@dataclass(frozen=True)
+class InPython:
+    """What differs from the spec in calls of Python, as further metadata of an argument.
+
+    Attributes:
+        default: default of the argument.
+        accepted: phrase of what is accepted.
+    """
+
+    default: Any
+    accepted: str
+
+
 @dataclass(frozen=True)
 class DeclaredArgument:
     """A keyword argument as its ``TypedDict`` declares it.
@@ -51,25 +87,33 @@ class DeclaredArgument:
     Attributes:
         type: its annotation, without the spec.
         spec: says what is accepted and which value None stands for.
+        in_python: what differs in Python; None: nothing.
     """
 
     type: Any
     spec: Spec
+    in_python: InPython | None = None
 
     @property
     def default(self) -> Any:
         """Return the default in Python: None where the type allows it (the scene file may set the value), else the spec's."""
+        if self.in_python is not None:
+            return self.in_python.default
         return None if type(None) in get_args(self.type) else self.spec.default
 
     @property
     def accepted(self) -> str:
         """Return a phrase of what is accepted besides None."""
+        if self.in_python is not None:
+            return self.in_python.accepted
         return self.spec.expected.removeprefix("null or ").removeprefix("null, ")
 
     @property
     def stands_for(self) -> str:
-        """Return a phrase of the value that None, as the default, stands for; "" where there is none."""
-        return "" if self.default is not None or self.spec.default is None else f"None: {self.spec.default}"
+        """Return a phrase of the value that the default stands for; "" where that is the default itself."""
+        if self.spec.default is None or self.default not in (None, SCENE_VALUE):
+            return ""
+        return f"{self.default!r}: {self.spec.default}"
 
     def read(self, value: Any) -> Any:
         """Check a value and return it; the spec's default for None.
@@ -92,7 +136,8 @@ def arguments_of(form: Any) -> dict[str, DeclaredArgument]:
         spec = next((item for item in getattr(hint, "__metadata__", ()) if isinstance(item, Spec)), None)
         if spec is None:
             raise TypeError(f"{form.__name__}.{name} has no spec: Annotated[TYPE, SPEC] declares one")
-        found[name] = DeclaredArgument(hint.__origin__, spec)
+        in_python = next((item for item in hint.__metadata__ if isinstance(item, InPython)), None)
+        found[name] = DeclaredArgument(hint.__origin__, spec, in_python)
     return found
 
 

@@ -172,8 +172,10 @@ class Rows:
             shape, ty = self._fields[name]
             first, size = self._first[name], (*shape, tracer.lanes)
             dtype = _DTYPES[ty]
-            # Any values do: a trace records operations, not results.
-            like = torch.rand(size) + 0.25 if dtype.is_floating_point else torch.zeros(size, dtype=dtype)
+            # Any values do: a trace records operations, not results. torch's default generator is the caller's.
+            numbers = torch.Generator().manual_seed(first)
+            floats = dtype.is_floating_point
+            like = torch.rand(size, generator=numbers) + 0.25 if floats else torch.zeros(size, dtype=dtype)
 
             def node(k: int, first: int = first, ty: str = ty) -> int:
                 if place is not None:

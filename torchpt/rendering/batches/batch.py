@@ -27,9 +27,9 @@ from torchpt.rendering.batches.inputs import Cameras, Seeds, cameras_of, naming_
 from torchpt.rendering.requests import RenderRequest, execute_request, prepare_request
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import BatchOptions, RenderOptions
+from torchpt.scene.settings import BatchOptions, Params, RenderOptions
 from torchpt.scene.versions import check_unchanged
-from torchpt.spec.arguments import check_names, expand_signature
+from torchpt.spec.arguments import SCENE_VALUE, check_names, expand_signature
 
 __all__ = ["Renderings", "render_batch"]
 
@@ -72,17 +72,17 @@ class _Picture:
 
 
 #: Tensors with a leading dimension for scenes, by name; or a mapping for each scene.
-BatchParams = Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]] | None
+BatchParams = Params | Sequence[Params] | None
 
 
 @overload
 def render_batch(
-    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: BatchParams = None, *, seed: Seeds = None,
+    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: BatchParams = None, *, seed: Seeds = SCENE_VALUE,
     on_progress: Callable[[int, int | None], None] | None = None, full: Literal[False] = False, **options: Unpack[BatchOptions],
 ) -> Tensor: ...  # fmt: skip
 @overload
 def render_batch(
-    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: BatchParams = None, *, seed: Seeds = None,
+    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: BatchParams = None, *, seed: Seeds = SCENE_VALUE,
     on_progress: Callable[[int, int | None], None] | None = None, full: Literal[True], **options: Unpack[BatchOptions],
 ) -> Renderings: ...  # fmt: skip
 @expand_signature
@@ -91,7 +91,7 @@ def render_batch(
     cameras: Cameras = None,
     params: BatchParams = None,
     *,
-    seed: Seeds = None,
+    seed: Seeds = SCENE_VALUE,
     on_progress: Callable[[int, int | None], None] | None = None,
     full: bool = False,
     **options: Unpack[BatchOptions],
@@ -109,9 +109,10 @@ def render_batch(
         cameras: shared by all scenes: a sequence of blocks ``camera`` as in scene files (with ``K``, ``R``, ``t`` too), of
             poses ``camera.to_world (4, 4)`` for the scenes' own cameras, or a tensor of poses ``(C, 4, 4)``; None: each
             scene's own camera, C = 1.
-        params: tensors in place of the scenes', by dotted name: a mapping to tensors with a leading dimension S, or a sequence
-            of S mappings.
-        seed: one seed for all pictures (by default the scenes' own), a sequence of S, or S sequences of C.
+        params: values in place of the scenes', by dotted name: a mapping to tensors (or lists) with a leading dimension S, or a
+            sequence of S mappings as :func:`torchpt.render` takes them.
+        seed: one seed for all pictures (by default the scenes' own), a sequence of S, or S sequences of C; None: a new one for
+            each picture, from torch's default generator.
         on_progress: called after each picture with the number of finished and of all pictures (None: an iterator of scenes).
         full: True returns :class:`Renderings`: pictures, AOVs, and the facts of each picture.
         options: other arguments of :func:`torchpt.render`, the same for all pictures. ``checkpoint`` is refused;
@@ -160,7 +161,8 @@ def render_batch(
         _check_memory(first.request, total)
         render_many(_queued_renders(chain([first], pictures), found, on_progress, total), tasks)
     count = 1 + max(s for s, _ in found)
-    for key, given in (("params", param_sets), ("seed", seed)):
+    seeds = None if isinstance(seed, Tensor) and not seed.dim() else seed  # one for all
+    for key, given in (("params", param_sets), ("seed", seeds)):
         if isinstance(given, Sequence | Tensor | np.ndarray) and len(given) != count:
             raise SceneError(key, len(given), f"as many as there are scenes, {count}")
     # Gradients last: autograd wraps pictures that are rendered already.
@@ -188,7 +190,7 @@ def _with_gradients(found: tuple[RenderRequest | None, Rendering]) -> Rendering:
 def _pictures(
     scenes: Iterable[Scene],
     cameras: Sequence[Mapping[str, Any] | Tensor | None],
-    param_sets: Sequence[Mapping[str, Tensor]] | None,
+    param_sets: Sequence[Params] | None,
     seeds: Callable[[int, int], Any],
     options: BatchOptions,
     *,
@@ -237,8 +239,8 @@ def _pictures(
 def _request(
     scene: Scene,
     camera: Mapping[str, Any] | Tensor | None,
-    params: Mapping[str, Tensor],
-    seed: int | None,
+    params: Params,
+    seed: Any,
     options: BatchOptions,
     *,
     full: bool,

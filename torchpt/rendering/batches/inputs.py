@@ -11,15 +11,18 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import AssetError, NotBuiltError, RenderError, SceneError
+from torchpt.math.transforms import tensor_of
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
+from torchpt.scene.settings import Params, SeedOfCall
+from torchpt.spec.arguments import SceneValue
 
 __all__ = ["Cameras", "Seeds", "cameras_of", "naming_errors", "params_of", "scenes_of", "seeds_of"]
 
 #: Camera blocks as in scene files, poses ``(4, 4)`` (also as lists), or a tensor of poses ``(C, 4, 4)``.
 Cameras = Tensor | Sequence[Mapping[str, Any] | Tensor] | None
-#: One seed for all pictures, one for each scene, or one for each scene and camera.
-Seeds = int | Sequence[int] | Sequence[Sequence[int]] | None
+#: One seed for all pictures, one for each scene, or one for each scene and camera; None: a new one for each picture.
+Seeds = SeedOfCall | Sequence[int] | Sequence[Sequence[int]]
 
 #: Keys of a camera block that position it: at least one must be given.
 _POSE_KEYS = frozenset({"origin", "target", "to_world", "R", "t"})
@@ -82,7 +85,17 @@ def _pose(key: str, value: Any, expected: str) -> Tensor:
         raise SceneError(key, value, expected) from None
 
 
-def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[str, Tensor]] | None:
+def _stacked(value: Any) -> Any:
+    """Return numbers and nested lists as a tensor; other values unchanged."""
+    if not isinstance(value, list | tuple | np.ndarray):
+        return value
+    try:
+        return tensor_of(value, torch.device("cpu"))
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return value
+
+
+def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Params] | None:
     """Return the parameters of each scene of a batch; None without parameters.
 
     Raises:
@@ -92,6 +105,7 @@ def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[
         return None
     if isinstance(params, Mapping):
         size: int | None = None
+        params = {name: _stacked(value) for name, value in params.items()}
         for name, value in params.items():
             if not isinstance(value, Tensor) or value.dim() < 1 or not len(value):
                 found = tuple(value.shape) if isinstance(value, Tensor) else value
@@ -115,7 +129,7 @@ def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[
     if isinstance(params, Sequence) and not isinstance(params, str) and params:
         for s, own in enumerate(params):
             if not isinstance(own, Mapping):
-                raise SceneError(f"params[{s}]", own, "a mapping from names to tensors")
+                raise SceneError(f"params[{s}]", own, "a mapping from names to values")
         if isinstance(scenes, Sequence) and len(params) != len(scenes):
             raise SceneError("params", len(params), f"as many as there are scenes, {len(scenes)}")
         return params
@@ -123,7 +137,7 @@ def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[
 
 
 def seeds_of(seed: Seeds, scenes: int | None, cameras: int) -> Callable[[int, int], Any]:
-    """Return a function of scene ``s`` and camera ``c`` that gives the seed (None: the scene's own).
+    """Return a function of scene ``s`` and camera ``c`` that gives the seed as ``render`` takes it.
 
     Args:
         seed: the caller's argument.
@@ -133,9 +147,9 @@ def seeds_of(seed: Seeds, scenes: int | None, cameras: int) -> Callable[[int, in
     Raises:
         SceneError: too few or too many seeds.
     """
-    if seed is None or isinstance(seed, int):
-        return lambda s, c: seed
     nested = seed.tolist() if isinstance(seed, Tensor | np.ndarray) else seed
+    if nested is None or isinstance(nested, int | SceneValue):
+        return lambda s, c: nested
     expected = f"a whole number, a sequence of {scenes or 'as many as there are scenes'}, or of sequences of {cameras}"
     if not isinstance(nested, Sequence) or isinstance(nested, str) or (scenes is not None and len(nested) != scenes):
         raise SceneError("seed", nested, expected)
