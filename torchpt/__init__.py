@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from torchpt.rendering import Rendering
     from torchpt.rendering.api import render, trace
     from torchpt.rendering.batches import Renderings, render_batch
+    from torchpt.rendering.estimates import GradientEstimate, gradient
     from torchpt.scene import Scene, load
     from torchpt.scene.from_trimesh import from_trimesh
 
@@ -39,6 +40,7 @@ __all__ = [
     "Bsdf",
     "EdgeWarning",
     "EnergyWarning",
+    "GradientEstimate",
     "LostRankError",
     "NoLightWarning",
     "NotBuiltError",
@@ -55,6 +57,7 @@ __all__ = [
     "denoise",
     "extend",
     "from_trimesh",
+    "gradient",
     "ibl",
     "load",
     "losses",
@@ -73,11 +76,13 @@ __all__ = [
 # public name -> module that defines it
 _LAZY_NAMES = {
     "Bsdf": "torchpt.physics.bsdfs",
+    "GradientEstimate": "torchpt.rendering.estimates",
     "Rendering": "torchpt.rendering",
     "Renderings": "torchpt.rendering.batches",
     "Scene": "torchpt.scene",
     "denoise": "torchpt.images.denoiser",
     "from_trimesh": "torchpt.scene.from_trimesh",
+    "gradient": "torchpt.rendering.estimates",
     "load": "torchpt.scene",
     "read_header": "torchpt.images",
     "read_image": "torchpt.images",

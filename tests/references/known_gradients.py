@@ -285,10 +285,18 @@ CORNER: dict[str, Any] = {
 ON_FLOOR = {"type": "sphere", "center": [0.1, 0.5, 0], "radius": 0.5, "material": ORANGE}
 IN_CORNER = [{"scale": 0.4}, turned([0, 1, 0], 25), moved(-0.4, 0.4, -0.7)]
 CONE = {"type": "cone", "apex": [0, 1.0, -0.2], "height": -1, "slope": 0.5, "material": ORANGE}
-BOWL = {"type": "cube", "material": ORANGE, "transform": [{"scale": 0.3}, turned([0, 1, 0], 25), moved(-0.3, 0.6, -0.5)]}
+BOWL = {
+    "type": "cube",
+    "material": ORANGE,
+    "transform": [{"scale": 0.3}, turned([0, 1, 0], 25), moved(-0.3, 0.6, -0.5)],
+}
 SHINY = {"type": "roughconductor", "eta": [0.3, 0.6, 1.2], "k": [3, 2.5, 2], "alpha": 0.35}
 FROSTED = {"type": "roughdielectric", "int_ior": 1.4, "ext_ior": 1.0, "alpha": 0.4}
-PANE = {"type": "rectangle", "material": FROSTED, "transform": [{"scale": 0.7}, turned([1, 0, 0], -20), moved(0.1, 0.8, 0.9)]}
+PANE = {
+    "type": "rectangle",
+    "material": FROSTED,
+    "transform": [{"scale": 0.7}, turned([1, 0, 0], -20), moved(0.1, 0.8, 0.9)],
+}
 
 
 def field(**more: Any) -> dict[str, Any]:

@@ -1,0 +1,187 @@
+"""``torchpt.gradient``: a gradient by independent passes, with its standard errors and counts."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt.core.errors import SceneError
+from torchpt.rendering.api import render
+from torchpt.scene import Scene
+from torchpt.scene.settings import SeedOfCall, base_seed, seed_number
+
+__all__ = ["GradientEstimate", "gradient"]
+
+#: Ways to combine passes.
+COMBINE = ("mean", "median")
+#: Options that passes set by themselves.
+_OWN = ("params", "spp", "seed", "spp_grad", "seed_grad")
+#: Odd multiplier that gives passes seeds of their own, any constant.
+_STRIDE = 0x9E3779B1
+
+
+@dataclass(frozen=True, eq=False)
+class GradientEstimate:
+    """A gradient, and how exact it is.
+
+    Attributes:
+        loss: value of the loss; None where a cotangent was given.
+        gradients: by name of the parameter, in the shape of its value.
+        standard_errors: of each number of the gradients; those of the mean, also where ``combine`` is ``median``.
+        passes: number of independent passes.
+        spp: samples a pixel of each pass.
+        clipped: number of gradients, of a parameter in a pass, that ``grad_clip`` made shorter.
+        not_finite: number of gradients, likewise, that were not finite and were left out.
+    """
+
+    loss: float | None
+    gradients: dict[str, Tensor]
+    standard_errors: dict[str, Tensor]
+    passes: int
+    spp: int
+    clipped: int
+    not_finite: int
+
+    def relative_error(self) -> float:
+        """Return the norm of all standard errors over the norm of all gradients; inf where the gradient is 0."""
+        error, size = (
+            torch.cat([x.double().flatten() for x in values.values()]).norm()
+            for values in (self.standard_errors, self.gradients)
+        )
+        return float(error / size) if size > 0 else float("inf")
+
+
+def gradient(
+    scene: Scene,
+    loss: Callable[[Tensor], Tensor] | Tensor,
+    params: Mapping[str, Any] | Iterable[str],
+    *,
+    spp: int = 64,
+    passes: int = 8,
+    seed: SeedOfCall = 0,
+    combine: str = "mean",
+    grad_clip: float | None = None,
+    **options: Any,
+) -> GradientEstimate:
+    """Return the gradient of a loss of the picture, with its standard errors, by independent passes.
+
+    The mean over passes has no bias. Outliers move it as much as they are large; two ways to combine passes are moved less,
+    and are biased toward what most passes say, the more so the more skew their distribution is: ``combine="median"`` takes
+    the median of the passes, number by number (each of which is a mean over its samples: a median of means), and ``grad_clip``
+    shortens gradients that are long beside those of the other passes. Both errors fall as passes get more samples.
+
+    Args:
+        scene: from :func:`torchpt.load`.
+        loss: function of the picture ``(H, W, 3)`` that returns a number, evaluated once, on a picture of ``spp`` samples a
+            pixel; or the cotangent of the picture, ``(H, W, 3)``.
+        params: values in place of ``scene.params`` by name, or names of these; all are differentiated.
+        spp: samples a pixel of the picture, and of all passes together.
+        passes: number of independent passes, at least 2. Each takes ``spp / passes`` samples a pixel, rounded up.
+        seed: see :func:`torchpt.render`.
+        combine: ``mean`` or ``median``.
+        grad_clip: longest gradient of a parameter in a pass, in units of the median length over passes; None: any.
+        options: further options of :func:`torchpt.render`.
+
+    Raises:
+        SceneError: a setting or parameter is not accepted, or all passes of a parameter have gradients that are not finite.
+        TypeError: an option that passes set by themselves, or an unknown one.
+    """
+    for name in _OWN:
+        if name in options:
+            raise TypeError(f"gradient takes no {name} among its options: it has arguments of its own for that")
+    for name, value, low in (("spp", spp, 1), ("passes", passes, 2)):
+        if not isinstance(value, int) or value < low:
+            raise SceneError(name, value, f"a whole number >= {low}")
+    if combine not in COMBINE:
+        raise SceneError("combine", combine, " or ".join(COMBINE))
+    if grad_clip is not None and not grad_clip > 0:
+        raise SceneError("grad_clip", grad_clip, "a number above 0, or None")
+    first = base_seed(seed_number(seed))
+    values = {name: _leaf(value) for name, value in _named(scene, params).items()}
+    if not values:
+        raise SceneError("params", params, "at least one name of scene.params")
+    share, found = -(-spp // passes), None
+    if not isinstance(loss, Tensor):
+        with torch.no_grad():
+            picture = render(scene, params=values, spp=spp, seed=first, **options)
+        found, loss = _cotangent(loss, picture)
+    each: dict[str, list[Tensor]] = {name: [] for name in values}
+    not_finite = 0
+    for number in range(passes):
+        leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+        own = (first + (number + 1) * _STRIDE) % (1 << 32)
+        picture = render(scene, params=leaves, spp=1, seed=first, spp_grad=share, seed_grad=own, **options)
+        if loss.shape != picture.shape:
+            raise SceneError(
+                "loss", f"a tensor of shape {tuple(loss.shape)}", f"one of the picture's, {tuple(picture.shape)}"
+            )
+        grads = torch.autograd.grad(picture, list(leaves.values()), loss.to(picture), allow_unused=True)
+        for name, grad in zip(leaves, grads, strict=True):
+            grad = torch.zeros_like(leaves[name]) if grad is None else grad
+            if bool(torch.isfinite(grad).all()):
+                each[name].append(grad.double())
+            else:
+                not_finite += 1
+    for name, grads in each.items():
+        if len(grads) < 2:
+            raise SceneError(name, "gradients that are not finite", "at least two passes with finite ones")
+    gradients, errors, clipped = {}, {}, 0
+    for name, grads in each.items():
+        shorter, count = _clipped(grads, grad_clip)
+        stack = torch.stack(shorter)
+        whole = stack.mean(0) if combine == "mean" else _median(stack)
+        gradients[name] = whole.to(values[name])
+        errors[name] = (stack.std(0) / len(shorter) ** 0.5).to(values[name])
+        clipped += count
+    return GradientEstimate(found, gradients, errors, passes, share, clipped, not_finite)
+
+
+def _named(scene: Scene, params: Mapping[str, Any] | Iterable[str]) -> Mapping[str, Any]:
+    """Return values by name; names alone stand for the scene's own values."""
+    if isinstance(params, Mapping):
+        return params
+    if isinstance(params, str):
+        raise SceneError("params", params, "values by name, or a list of names")
+    names = list(params)
+    for name in names:
+        if name not in scene.params:
+            raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.params))}")
+    return {name: scene.params[name] for name in names}
+
+
+def _leaf(value: Any) -> Tensor:
+    """Return a value as a tensor without history."""
+    tensor = value.detach() if isinstance(value, Tensor) else torch.as_tensor(value)
+    return tensor if tensor.is_floating_point() else tensor.float()
+
+
+def _cotangent(loss: Callable[[Tensor], Tensor], picture: Tensor) -> tuple[float, Tensor]:
+    """Return the value of a loss, and its derivative by the picture."""
+    picture = picture.detach().requires_grad_()
+    with torch.enable_grad():
+        value = loss(picture)
+    if not isinstance(value, Tensor) or value.numel() != 1:
+        raise SceneError("loss", type(value).__name__, "a function that returns a single number as a tensor")
+    (cotangent,) = torch.autograd.grad(value, picture)
+    return float(value.detach()), cotangent
+
+
+def _clipped(grads: list[Tensor], most: float | None) -> tuple[list[Tensor], int]:
+    """Return gradients none of which is longer than ``most`` times the median length, and how many were."""
+    if most is None:
+        return grads, 0
+    lengths = [float(grad.norm()) for grad in grads]
+    limit = most * statistics.median(lengths)
+    shorter = [grad * (limit / length) if length > limit else grad for grad, length in zip(grads, lengths, strict=True)]
+    return shorter, sum(length > limit for length in lengths)
+
+
+def _median(values: Tensor) -> Tensor:
+    """Return the median over the first axis; of an even number the mean of the two in the middle."""
+    ordered, half = values.sort(0).values, len(values) // 2
+    return ordered[half] if len(values) % 2 else 0.5 * (ordered[half - 1] + ordered[half])
