@@ -357,8 +357,8 @@ FAULTS = (
         "physics/shapes/interaction.py",
         "shapes render gradients",
         "reattach",
-        "torch.where(usable, measure / torch.where(usable, value, 1.0), 1.0)",
-        "torch.ones_like(measure)",
+        "held * (measure / torch.where(usable, value, 1.0) - 1.0) + slope * along",
+        "slope * along",
         "dropped term of a gradient: indirect light does not know that surfaces which move apart see less of each other",
     ),
     Fault(
@@ -369,6 +369,24 @@ FAULTS = (
         "torch.copysign(step, dot(w, at.ng))",
         "step",
         "rays that go through a surface begin before it and meet it again: glass is opaque or black",
+    ),
+    Fault(
+        "share_has_no_slope",
+        "physics/shapes/interaction.py",
+        "gradients shapes",
+        "reattach",
+        "+ slope * along",
+        "+ 0.0 * slope",
+        "dropped term of a gradient: where points slide in part, the measure of directions does not change as they spread",
+    ),
+    Fault(
+        "receivers_stand_still",
+        "gradients/edges/receivers.py",
+        "edges render",
+        "Prefix.receivers",
+        "at + (slid - at) * self.frame.share(stop.held.prim, r)",
+        "at",
+        "edges in indirect light count as if all points were held, against an interior in which near ones slide",
     ),
     # -- search
     Fault(

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 import torchpt
+from torchpt.gradients import parameters
 from torchpt.gradients.parameters import near_of
 from torchpt.math.vectors import cross, dot, normalize
 from torchpt.physics.shapes import interact, reattach
@@ -73,3 +74,31 @@ def test_near_is_half_the_box_of_what_moves():
     assert float(near_of(scene, geometry, [KEY])) == pytest.approx(float(box.norm()) / 2)
     alone = float(near_of(scene, geometry, ["camera.to_world"]))
     assert 0 < alone < float(near_of(scene, geometry, [KEY, "shapes.far.to_world"]))
+
+
+def test_kernels_take_the_length_of_each_pass(monkeypatch: pytest.MonkeyPatch):
+    """Scenes of one structure share kernels, and differ in the length over which points slide."""
+    quads = {
+        "floor": {"type": "rectangle", "transform": [{"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"scale": 2}]},
+        "block": {"type": "cube", "transform": [{"scale": 0.4}, {"translate": [0.1, 0.5, 0]}]},
+        "lamp": {"type": "rectangle", "emission": [9, 8, 7], "transform": [{"translate": [0, 1, -3]}]},
+    }
+    described = {
+        "camera": {"origin": [0, 1.5, 4], "target": [0, 0.4, 0], "fov": 40},
+        "film": {"width": 12, "height": 12, "filter": "box"},
+        "integrator": {"type": "path", "max_depth": 4},
+        "shapes": quads,
+    }
+    scene, key = torchpt.load(described, "cpu"), "shapes.block.to_world"
+    found: dict[tuple[float, str], Tensor] = {}
+    for near in (0.3, 1.5):
+        monkeypatch.setattr(parameters, "near_of", lambda *_, near=near: torch.tensor([near], dtype=torch.float64))
+        for compile in ("on", "off"):
+            leaf = scene.params[key].clone().requires_grad_()
+            wish = {"spp": 8, "seed": 2, "seed_grad": 2, "threads": 1, "edges": False, "compile": compile}
+            with pytest.warns(torchpt.EdgeWarning):
+                picture = torchpt.render(scene, params={key: leaf}, **wish)
+            found[near, compile] = torch.autograd.grad(picture.sum(), leaf)[0]
+        torch.testing.assert_close(found[near, "on"], found[near, "off"], rtol=1e-3, atol=2e-3)
+    apart = (found[0.3, "on"] - found[1.5, "on"]).abs().max()
+    assert float(apart) > 0.1

@@ -215,6 +215,7 @@ def records_of(layout: Layout, cotangent: Tensor | None) -> dict[str, Any]:
         "sampler": layout.numbers,
         "centre": wave.centre,  # origin of the lanes' coordinates in the scene
         "pixel": wave.context.pixel,
+        "near": wave.context.near,
         "first": wave.first_surface,
         "cotangent": cotangent,
     }
