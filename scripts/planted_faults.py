@@ -1,4 +1,4 @@
-"""Plant sixty faults in copies of the package, one at a time, and report which test catches each.
+"""Plant some sixty faults in copies of the package, one at a time, and report which test catches each.
 
     python scripts/planted_faults.py --check                        # all faults still apply; a few seconds
     python scripts/planted_faults.py --list                         # what they are

@@ -375,8 +375,8 @@ FAULTS = (
         "physics/shapes/interaction.py",
         "gradients shapes",
         "reattach",
-        "+ slope * along",
-        "+ 0.0 * slope",
+        "slope * along",
+        "0.0 * along",
         "dropped term of a gradient: where points slide in part, the measure of directions does not change as they spread",
     ),
     Fault(
