@@ -19,7 +19,10 @@ COUNT = 40_000
 
 def drawn(shape: dict[str, Any]) -> tuple[Brinks, Starts, float]:
     """Draw places and directions on the brinks of a shape; return them, and a unit of length of the lanes."""
-    described = {"camera": {"origin": [0, 0, 5], "target": [0, 0, 0]}, "shapes": {"it": shape}}
+    described = {
+        "camera": {"origin": [0, 0, 5], "target": [0, 0, 0]},
+        "shapes": {"it": shape} if "type" in shape else shape,
+    }
     scene = torchpt.load(described, "cpu")
     bodies = bodies_of(scene, settings(scene.description, {}).film, {})
     moves = torch.ones(sum(bodies.counts), dtype=torch.bool)
@@ -35,7 +38,7 @@ SHAPES: dict[str, tuple[dict[str, Any], float]] = {
     "cube": ({"type": "cube", "transform": [{"scale": [0.5, 1.0, 1.5]}]}, 4 * (1 + 2 + 3)),
     "rectangle": ({"type": "rectangle"}, 8.0),
     "disk": ({"type": "disk", "transform": [{"scale": 0.5}]}, math.pi),
-    # two triangles that meet at an angle
+    # two triangles that meet at an angle, in one mesh, and apart
     "roof": (
         {
             "type": "mesh",
@@ -44,6 +47,16 @@ SHAPES: dict[str, tuple[dict[str, Any], float]] = {
             "face_normals": True,
         },
         1 + math.sqrt(1.16) + math.sqrt(2.16) + math.sqrt(1.04) + math.sqrt(2.04),
+    ),
+    "box of rectangles": (
+        {
+            "a": {"type": "rectangle", "transform": [{"translate": [0, 0, 1]}]},
+            "b": {
+                "type": "rectangle",
+                "transform": [{"rotate": {"axis": [0, 1, 0], "angle": 90}}, {"translate": [1, 0, 0]}],
+            },
+        },
+        14.0,
     ),
 }
 

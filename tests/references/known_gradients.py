@@ -284,8 +284,7 @@ CORNER: dict[str, Any] = {
 }
 ON_FLOOR = {"type": "sphere", "center": [0.1, 0.5, 0], "radius": 0.5, "material": ORANGE}
 IN_CORNER = [{"scale": 0.4}, turned([0, 1, 0], 25), moved(-0.4, 0.4, -0.7)]
-CONE = {"type": "cone", "apex": [0, 1.0, -0.2], "height": -1, "slope": 0.5, "material": ORANGE}
-BOWL = {
+HANGING = {
     "type": "cube",
     "material": ORANGE,
     "transform": [{"scale": 0.3}, turned([0, 1, 0], 25), moved(-0.3, 0.6, -0.5)],
@@ -443,7 +442,6 @@ PAIRS: dict[str, Pair] = {
         0.02,
         depth=3,
     ),
-    "cone_on_floor": Pair(with_shapes(CORNER, it=CONE), "shapes.it.to_world", X, 0.02, depth=3),
     "field_vertex": Pair(
         {**ABOVE, "shapes": {"field": field()}, "lights": OPEN_SKY},
         "shapes.field.vertices",
@@ -459,10 +457,14 @@ PAIRS: dict[str, Pair] = {
         depth=4,
     ),
     "block_over_metal": Pair(
-        with_shapes(CORNER, floor={**FLOOR, "material": SHINY}, block=BOWL), "shapes.block.to_world", Y, 0.02, depth=3
+        with_shapes(CORNER, floor={**FLOOR, "material": SHINY}, block=HANGING),
+        "shapes.block.to_world",
+        Y,
+        0.02,
+        depth=3,
     ),
     "block_behind_frosted_glass": Pair(
-        with_shapes(CORNER, pane=PANE, block=BOWL), "shapes.block.to_world", X, 0.02, depth=4
+        with_shapes(CORNER, pane=PANE, block=HANGING), "shapes.block.to_world", X, 0.02, depth=4
     ),
     "ball_on_floor_under_sky": Pair(
         {**without(CORNER, "lamp", ball=ON_FLOOR), "lights": SKY},

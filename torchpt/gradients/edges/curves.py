@@ -37,6 +37,7 @@ __all__ = [
     "marked_primitives",
     "mesh_edges",
     "own_view",
+    "parts_of",
     "plain_of",
     "rims",
     "round_outline",
@@ -272,6 +273,10 @@ def generator(bodies: Bodies, prim: Tensor, form: Form, view: View, side: Tensor
 
 #: Faces whose unit normals differ by less make no crease.
 _FLAT = 1e-6
+#: Points that are closer, against the size of all, are one.
+_SAME = 1e-6
+#: Odd multipliers that make one number of three, any constants.
+_MIX = 0x9E3779B97F4A7C1, 0x5851F42D4C957F2D, 0x2545F4914F6CDD1D
 
 
 @dataclass(frozen=True)
@@ -371,6 +376,22 @@ def _normal(bodies: Bodies, prim: Tensor) -> Tensor:
     _, x, y, _ = bodies.place(prim)
     n = cross(x, y)
     return n / dot(n, n).clamp_min(torch.finfo(n.dtype).tiny).sqrt()
+
+
+def parts_of(bodies: Bodies, curves: Curves) -> Tensor:
+    """Return the parts ``(N,)`` with which curves count: 1 over the number of straight ones between the same two points."""
+    ends = torch.stack([bodies.points(curves.at(t)[0]) for t in (curves.low, curves.high)])  # (2, 3, N)
+    size = float((ends.amax((0, 2)) - ends.amin((0, 2))).max())
+    grid = max(size * _SAME, torch.finfo(ends.dtype).tiny)
+    parts = torch.ones_like(curves.low)
+    for shift in (0.0, 0.5):  # points on the border of two cells of one grid lie within a cell of the other
+        cells = torch.floor(ends / grid + shift).long()
+        code = (
+            cells[:, 0] * _MIX[0] + cells[:, 1] * _MIX[1] + cells[:, 2] * _MIX[2]
+        )  # (2, N), a point each; it may overflow
+        _, group, count = torch.unique(code.sort(0).values, dim=1, return_inverse=True, return_counts=True)
+        parts = torch.minimum(parts, 1.0 / take(count.double(), group))
+    return torch.where(curves.round, 1.0, parts)
 
 
 def plain_of(scene: Scene, bodies: Bodies) -> Curves | None:

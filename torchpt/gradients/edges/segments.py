@@ -31,8 +31,16 @@ import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
-from torchpt.gradients.edges.curves import Curves, Rounds, folds_of, joined, marked_primitives, plain_of, rounds_of
-from torchpt.gradients.edges.primary import distance_to, is_flat
+from torchpt.gradients.edges.curves import (
+    Curves,
+    Rounds,
+    folds_of,
+    joined,
+    marked_primitives,
+    parts_of,
+    plain_of,
+    rounds_of,
+)
 from torchpt.gradients.edges.receivers import LONGEST, ROUNDING, Frame, Prefix, held_at, prefixes_of
 from torchpt.gradients.edges.shadows import STILL
 from torchpt.gradients.edges.traced import Use
@@ -124,6 +132,7 @@ class Brinks:
         curves: E edges that are known; None: there are none.
         others: corners off the edges, of both faces.
         folded: ``(E,)`` bool: edges of two faces.
+        part: ``(E,)`` with which edges count where others lie on them.
         rounds: R round surfaces by kind.
         choice: of the E edges, then of the R surfaces.
         smooth: faces that are shaded smooth; None: there are none.
@@ -133,6 +142,7 @@ class Brinks:
     curves: Curves | None
     others: tuple[Held, Held]
     folded: Tensor
+    part: Tensor
     rounds: list[Rounds]
     choice: Distribution1D
     smooth: Smooth | None
@@ -209,7 +219,7 @@ class Brinks:
         even = torch.where(folded, 0.25, 0.5) / math.pi
         density = 0.5 * (even + torch.where(folded & (angle >= beta), 0.25 / wedge, 0.0))
         zero = torch.zeros_like(e)
-        weight = length * span / chance
+        weight = length * span * take(self.part, index) / chance
         return Starts(held, part.mate, e, tangent, zero, zero[0], omega, density, target, aimed, weight)
 
     def _across(self, face: Held, e: Tensor, tangent: Tensor) -> Tensor:
@@ -293,14 +303,19 @@ def brinks_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Ten
         weights.append(2.0 * size * torch.where(take(moves, some.prim), 1.0, STILL))
     if not weights or not bool((torch.cat(weights) > 0).any()):
         return None
-    empty = torch.zeros(0, dtype=torch.bool, device=scene.device)
+    every = joined(curves) if curves else None
+    part = torch.zeros(0, dtype=torch.float64, device=scene.device)
+    if every is not None:  # of those that are drawn at all
+        drawn = (torch.cat(weights[: len(curves)]) > 0).nonzero().squeeze(1)
+        part = torch.ones_like(every.low).index_copy(0, drawn, parts_of(bodies, rows(every, drawn)))
     firsts, seconds = ([pair[k] for pair in others] for k in range(2))
     zero = Held(torch.zeros(0, dtype=torch.int64), torch.zeros(3, 0, dtype=torch.float64))
     return Brinks(
         bodies,
-        joined(curves) if curves else None,
+        every,
         (concatenate_lanes(firsts), concatenate_lanes(seconds)) if others else (zero, zero),
-        torch.cat(folded) if folded else empty,
+        torch.cat(folded) if folded else part > 0,
+        part,
         rounds,
         Distribution1D.of(torch.cat(weights), torch.float64, even=0.0),
         smooth_of(scene, bodies),
@@ -463,7 +478,6 @@ class Segments:
             held = held_at(self.frame.bodies, prim.clamp_min(0), torch.stack((y.hit.u, y.hit.v)), y.p.double())
             spots.append(y)
             sides.append(Side(sign, held, reach, torch.where(prim >= 0, self.frame.share(prim, r=reach), 1.0)))
-        weight = weight * self._part(starts, [y.hit.prim for y in spots], r, [side.r for side in sides], step)
         lane = ok.nonzero().squeeze(1)
         if not len(lane):
             return None
@@ -497,22 +511,6 @@ class Segments:
         radiance = self.frame.traced.radiance
         found[:, some] = radiance(*rays, depth) - radiance(*rays, 1)  # without light of sources themselves
         return found
-
-    def _part(self, starts: Starts, prims: list[Tensor], r: Tensor, reach: list[Tensor], step: Tensor) -> Tensor:
-        """Return the parts ``(N,)`` with which places count: half where a border of another surface lies on them."""
-        bodies, part = self.frame.bodies, torch.ones_like(r)
-        for prim, t in zip(prims, reach, strict=True):
-            other = is_flat(bodies, prim) & (prim != starts.held.prim) & (prim != starts.mate) & (starts.mate < 0)
-            other &= (starts.curvature == 0) & ((t - r).abs() < r * _NEAR + 4.0 * step)
-            some = other.nonzero().squeeze(1)
-            if not len(some):
-                continue
-            mine, e = take(prim, some), take(starts.e, some)
-            corners = bodies.corners(mine)
-            away = [distance_to(e, a, b) for a, b in zip(corners, [*corners[1:], corners[0]], strict=True)]
-            near = torch.stack(away).amin(0) < 4.0 * take(step, some)
-            part[some] = torch.where(near, 0.5, take(part, some))
-        return part
 
 
 def segments_of(scene: Scene, frame: Frame, poses: dict[str, Tensor], depth: int) -> Segments | None:

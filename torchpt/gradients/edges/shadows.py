@@ -16,6 +16,7 @@ from torchpt.gradients.edges.curves import (
     folds_of,
     generator,
     joined,
+    parts_of,
     plain_of,
     round_outline,
     rounds_of,
@@ -221,7 +222,7 @@ class Passed:
         mate: the other face at each, -1 where there is none.
         p: where they are ``(3, N)``.
         along: how ``p`` changes with the curve's parameter.
-        density: of the draw in that parameter.
+        density: of the draw in that parameter, over the part with which the curve counts.
     """
 
     lane: Tensor
@@ -241,6 +242,7 @@ class Occluders:
         curves: what is not known before the light is (an outline) has its primitive alone.
         others: corners off the edges, of both faces.
         folded: ``(K,)`` bool: edges of two faces, which throw a shadow only where both lie to one side of it.
+        part: ``(K,)`` with which curves count where others lie on them.
         form: ``(K,)`` -1 where the curve is known, 0 for outlines of spheres, from 1 on of ``forms``.
         forms: of cylinders and cones.
         choice: among them.
@@ -250,6 +252,7 @@ class Occluders:
     curves: Curves
     others: tuple[Held, Held]
     folded: Tensor
+    part: Tensor
     form: Tensor
     forms: list[Form]
     choice: Distribution1D
@@ -291,7 +294,14 @@ class Occluders:
         one, two = (dot(across, self.bodies.points(rows(other, index)) - p) for other in self.others)
         some &= ~take(self.folded, index) | (one * two >= 0)
         some &= dot(across, across) > 0
-        passed = Passed(torch.arange(len(index), device=index.device), held, curves.mate, p, along, chance / span)
+        passed = Passed(
+            torch.arange(len(index), device=index.device),
+            held,
+            curves.mate,
+            p,
+            along,
+            chance / (span * take(self.part, index)),
+        )
         return rows(passed, some.nonzero().squeeze(1))
 
 
@@ -348,7 +358,10 @@ def occluders_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: 
     every = joined(curves)
     moving = take(moves, every.prim) | ((every.mate >= 0) & take(moves, every.mate.clamp_min(0)))
     choice = Distribution1D.of(torch.cat(weights) * torch.where(moving, 1.0, STILL), torch.float64, even=0.0)
-    return Occluders(bodies, every, (others[0], others[1]), torch.cat(folded), torch.cat(forms), kinds, choice)
+    form = torch.cat(forms)
+    drawn = ((form < 0) & (torch.cat(weights) > 0)).nonzero().squeeze(1)
+    part = torch.ones_like(every.low).index_copy(0, drawn, parts_of(bodies, rows(every, drawn)))
+    return Occluders(bodies, every, (others[0], others[1]), torch.cat(folded), part, form, kinds, choice)
 
 
 def _round_weight(bodies: Bodies, rounds: Rounds) -> Tensor:
