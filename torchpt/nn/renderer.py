@@ -16,6 +16,7 @@ from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
 from torchpt.scene.settings import BatchOptions, Params, RenderOptions, base_seed
+from torchpt.scene.sizes import is_size
 from torchpt.scene.validation import params_as_tensors
 from torchpt.spec.arguments import check_names, expand_signature
 
@@ -179,6 +180,12 @@ def _key(name: str) -> str:
     return name.replace(".", "/")
 
 
+def _matches(scene: Scene, parameter: str, pattern: str) -> bool:
+    """Return True if a pattern matches a parameter. Sizes of shapes, which poses hold too, match by their own name alone."""
+    own_name = pattern.rpartition(".")[2] == parameter.rpartition(".")[2]
+    return fnmatchcase(parameter, pattern) and (own_name or not is_size(scene.spec(parameter)))
+
+
 def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
     """Return the parameters that match names and patterns, in the scene's order."""
     if not isinstance(names, Iterable) or isinstance(names, Mapping):
@@ -190,7 +197,7 @@ def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if not isinstance(name, str):
             raise SceneError("names", name, "a name of scene.params or a pattern of some, as text")
-        matches = [parameter for parameter in scene.params if parameter == name or fnmatchcase(parameter, name)]
+        matches = [parameter for parameter in scene.params if parameter == name or _matches(scene, parameter, name)]
         if not matches:
             examples = example_names(name, list(scene.params))
             raise SceneError("names", name, f"a parameter of this scene or a pattern of some, such as {examples}")
