@@ -119,6 +119,7 @@ class Scene:
         self._space = moved(self._host_space, self.device)
         self._host_copies = HostCopies()
         self._sized_shapes = sized_shapes(self.description, self.params)
+        self._size_names = frozenset(name for shape in self._sized_shapes for name in shape.names)
         self._unchanged_sizes = unchanged_sizes(self._sized_shapes, self.params)
         self._lock = threading.RLock()
         # By dtype, whether texture coordinates were asked for, and light sampler.
@@ -329,6 +330,8 @@ class Scene:
         Raises:
             SceneError: sizes that a scene file could not hold, or with which a shape has no pose.
         """
+        if self._size_names.isdisjoint(names):
+            return
         for shape in self._sized_shapes:
             given = [name for name in shape.names if name in names]
             changed = next((name for name in given if not shape.is_loaded(name, merged[name])), None)
@@ -406,6 +409,28 @@ class Scene:
         pose = params["camera.to_world"]
         pose = torch.cat((self._host_space.pose(pose), pose[3:].double())).to(dtype)  # (3, 4), and the last row 0 0 0 1
         return moved(camera.kind.on(pose, (film.width, film.height), values), self.device)
+
+    def faces(self, name: str) -> Tensor:
+        """Return the triangles of a mesh: ``(F, 3)`` int64 indices of its vertices, on the scene's device.
+
+        Vertices that a file splits, such as at seams of texture coordinates, are different ones.
+
+        Args:
+            name: its parameter ``shapes.NAME.vertices``, or ``shapes.NAME``.
+
+        Raises:
+            SceneError: no mesh of this scene.
+        """
+        meshes = {part.name: part.faces for part in self._built.parts if part.faces is not None}
+        faces = meshes.get(str(name).removesuffix(".vertices"))
+        if faces is None:
+            found = (
+                f"one of {', '.join([*meshes][:8])}{', ...' if len(meshes) > 8 else ''}"
+                if meshes
+                else "a mesh (there is none)"
+            )
+            raise SceneError("name", name, found)
+        return torch.from_numpy(faces).to(self.device, torch.int64)
 
     def film_size(self, film: FilmSettings | None = None) -> tuple[int, int]:
         """Return width and height of the whole film in pixels; ``film``: settings that override the scene's."""
