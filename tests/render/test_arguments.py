@@ -49,7 +49,7 @@ def scene() -> torchpt.Scene:
         (torchpt.render, ("scene", "full"), CommonOptions),
         (torchpt.trace, ("scene", "o", "d", "spp", "seed", "params"), TraceOptions),
         (torchpt.render_batch, ("scenes", "cameras", "params", "seed", "on_progress", "full"), BatchOptions),
-        (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "full"), BatchOptions),
+        (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "parametrizations", "full"), BatchOptions),
         (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), BatchOptions),
     ],
 )

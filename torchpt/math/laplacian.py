@@ -6,6 +6,7 @@ vertices with a common edge, the diagonal matrix D their numbers.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import torch
@@ -86,6 +87,30 @@ def _edge_numbers(edges: Tensor, pairs: Tensor) -> Tensor:
     return torch.searchsorted(edges[:, 0] * size + edges[:, 1], low * size + high)
 
 
+def _sparse_system(edges: Tensor, degrees: Tensor, weight: float) -> Tensor | None:
+    """Return ``I + λ L`` as a sparse matrix; None where this build of torch cannot multiply by one."""
+    count = len(degrees)
+    diagonal = torch.arange(count, device=edges.device)
+    rows, columns = torch.cat((diagonal, edges[:, 0], edges[:, 1])), torch.cat((diagonal, edges[:, 1], edges[:, 0]))
+    values = torch.cat((1.0 + weight * degrees, degrees.new_full((2 * len(edges),), -weight)))
+    order = torch.argsort(rows * count + columns)
+    ends = torch.bincount(rows, minlength=count).cumsum(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch calls its CSR matrices beta
+        try:
+            matrix = torch.sparse_csr_tensor(
+                torch.cat((ends.new_zeros(1), ends)),
+                columns[order],
+                values[order],
+                (count, count),
+                check_invariants=False,
+            )
+            matrix @ values.new_zeros(count, 3)
+        except RuntimeError:
+            return None
+    return matrix
+
+
 @dataclass(frozen=True)
 class LaplacianSystem:
     """The matrix ``I + λ L`` of a mesh, with the combinatorial Laplacian L.
@@ -97,18 +122,19 @@ class LaplacianSystem:
         edges: ``(E, 2)`` int64.
         degrees: number of neighbours ``(V,)`` float64.
         weight: λ.
+        matrix: the matrix ``(V, V)``, sparse (CSR) and float64; None where this build of torch multiplies none.
     """
 
     edges: Tensor
     degrees: Tensor
     weight: float
+    matrix: Tensor | None
 
     @classmethod
-    def of(cls, faces: Tensor, vertices: int, weight: float) -> LaplacianSystem:
-        """Return the system of a mesh with a number of vertices."""
-        edges = mesh_edges(faces)
+    def of(cls, edges: Tensor, vertices: int, weight: float) -> LaplacianSystem:
+        """Return the system of a mesh by its edges, number of vertices and λ."""
         degrees = torch.bincount(edges.reshape(-1), minlength=vertices).double()
-        return cls(edges, degrees, weight)
+        return cls(edges, degrees, weight, _sparse_system(edges, degrees, weight))
 
     def apply(self, x: Tensor) -> Tensor:
         """Return ``(I + λ L) x`` of ``x (V, C)``."""
@@ -135,7 +161,7 @@ class LaplacianSystem:
         direction, rz = z, (residual * z).sum(0)
         threshold = TOLERANCE * torch.linalg.vector_norm(b64, dim=0)
         for iteration in range(1, 10 * len(b) + CHECK_EVERY + 1):
-            image = self.apply(direction)
+            image = self.apply(direction) if self.matrix is None else self.matrix @ direction
             curvature = (direction * image).sum(0)
             step = torch.where(curvature > 0, rz / curvature, 0.0)  # 0 once a column is solved exactly
             x = x + step * direction
