@@ -105,7 +105,7 @@ def _sparse_system(edges: Tensor, degrees: Tensor, weight: float) -> Tensor | No
                 (count, count),
                 check_invariants=False,
             )
-            matrix @ values.new_zeros(count, 3)
+            _ = matrix @ values.new_zeros(count, 3)
         except RuntimeError:
             return None
     return matrix

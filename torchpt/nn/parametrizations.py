@@ -177,12 +177,12 @@ class _RelativePose(PoseParametrization):
         self.register_buffer("frame", start.detach()[:3, :3].clone())  # rotation, scale and shear of the initial pose
 
     @staticmethod
-    def matrix(rotation: Tensor) -> Tensor:
+    def matrix(rotation: Tensor, /) -> Tensor:
         """Return the rotation ``(3, 3)`` float64 of its numbers."""
         raise NotImplementedError
 
     @staticmethod
-    def numbers(matrix: Tensor) -> Tensor:
+    def numbers(matrix: Tensor, /) -> Tensor:
         """Return the numbers of a rotation ``(1, 3, 3)``, with a first dimension of 1."""
         raise NotImplementedError
 
@@ -209,7 +209,7 @@ class AxisAnglePose(_RelativePose):
     matrix = staticmethod(axis_angle_matrix)
 
     @staticmethod
-    def numbers(matrix: Tensor) -> Tensor:
+    def numbers(matrix: Tensor, /) -> Tensor:
         """Return the rotation vector of a rotation."""
         from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
@@ -225,7 +225,7 @@ class QuaternionPose(_RelativePose):
     matrix = staticmethod(quaternion_matrix)
 
     @staticmethod
-    def numbers(matrix: Tensor) -> Tensor:
+    def numbers(matrix: Tensor, /) -> Tensor:
         """Return the unit quaternion of a rotation."""
         from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
