@@ -14,6 +14,7 @@ import torchpt
 from torchpt.core.errors import SceneError
 from torchpt.math.transforms import compose, look_at
 from torchpt.nn import (
+    AdamUniform,
     AxisAnglePose,
     LargeSteps,
     LookAtPose,
@@ -271,3 +272,52 @@ def test_large_steps_that_are_refused(faces: Any, weight: float, error: type[Exc
 def test_numbers_that_are_not_finite_are_an_error() -> None:
     with pytest.raises(RuntimeError, match="did not converge: expected finite numbers"):
         LargeSteps(STRIP)(torch.full((6, 3), torch.nan))
+
+
+# ---- Adam with one scale
+
+
+def test_first_steps_are_the_gradient_over_its_largest_number() -> None:
+    x = torch.zeros(4, 3, dtype=torch.float64, requires_grad=True)
+    gradient = drawn(4, 3)
+    optimizer = AdamUniform([x], lr=0.1)
+    for steps in (1, 2, 3):  # a constant gradient has both moments at once
+        x.grad = gradient.clone()
+        optimizer.step()
+        torch.testing.assert_close(x.detach(), -0.1 * steps * gradient / gradient.abs().max())
+
+
+def test_moments_are_those_of_adam() -> None:
+    """Of one number it is torch's own Adam."""
+    ours, theirs = (torch.tensor([2.0], dtype=torch.float64, requires_grad=True) for _ in range(2))
+    for optimizer, x in ((AdamUniform([ours], lr=0.05), ours), (torch.optim.Adam([theirs], lr=0.05), theirs)):
+        for _ in range(30):
+            optimizer.zero_grad()
+            (x**4).sum().backward()
+            optimizer.step()
+    torch.testing.assert_close(ours, theirs)
+
+
+def test_its_state_is_saved() -> None:
+    def run(x: Tensor, optimizer: AdamUniform, steps: int) -> None:
+        for _ in range(steps):
+            optimizer.zero_grad()
+            (x - 1.0).square().sum().backward()
+            optimizer.step()
+
+    whole = torch.zeros(5, 3, requires_grad=True)
+    run(whole, AdamUniform([whole]), 8)
+    first = torch.zeros(5, 3, requires_grad=True)
+    before = AdamUniform([first])
+    run(first, before, 5)
+    later = first.detach().clone().requires_grad_()
+    after = AdamUniform([later])
+    after.load_state_dict(copy.deepcopy(before.state_dict()))
+    run(later, after, 3)
+    assert torch.equal(later, whole)
+
+
+@pytest.mark.parametrize("wrong", [{"lr": -1.0}, {"betas": (0.9, 1.0)}, {"eps": -1.0}])
+def test_settings_of_the_optimizer_that_are_refused(wrong: Any) -> None:
+    with pytest.raises(ValueError, match=f"expected {next(iter(wrong))}"):
+        AdamUniform([torch.zeros(1, requires_grad=True)], **wrong)
