@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 import torchpt
@@ -321,3 +322,50 @@ def test_its_state_is_saved() -> None:
 def test_settings_of_the_optimizer_that_are_refused(wrong: Any) -> None:
     with pytest.raises(ValueError, match=f"expected {next(iter(wrong))}"):
         AdamUniform([torch.zeros(1, requires_grad=True)], **wrong)
+
+
+# ---- A shape from pictures
+
+
+@pytest.mark.slow
+def test_large_steps_find_a_smooth_shape() -> None:
+    """A ball becomes a waved ellipsoid, from three views: nearer to it than by Adam on vertices, and without its tangles."""
+    ball = trimesh.creation.icosphere(2)
+    points, faces = torch.from_numpy(ball.vertices.copy()).float(), torch.from_numpy(ball.faces.copy())
+    wanted = points * torch.tensor([1.0, 1.25, 0.8]) * (1.0 + 0.15 * torch.sin(3.0 * points[:, :1]))
+    own = torchpt.load(
+        {
+            "camera": {"origin": [0, 1, 4], "target": [0, 0, 0], "fov": 40.0},
+            "film": {"width": 32, "height": 32},
+            "integrator": {"type": "path", "max_depth": 2},
+            "shapes": {"ball": {"type": "mesh", "vertices": points.numpy(), "faces": faces.numpy()}},
+            "lights": {
+                "lamp": {"type": "point", "position": [2, 3, 4], "intensity": 40.0},
+                "sky": {"type": "constant", "radiance": 0.2},
+            },
+        },
+        "cpu",
+    )
+    name, seen_from = "shapes.ball.vertices", torch.tensor([[0.0, 1.0, 4.0], [4.0, 1.0, 0.0], [-3.0, 1.0, -3.0]])
+    poses = [{"camera.to_world": pose} for pose in look_at_pose(seen_from, torch.zeros(3))]
+    targets = [torchpt.render(own, params={name: wanted, **pose}, spp=64, seed=5) for pose in poses]
+
+    def fitted(optimizer: Any, rate: float, **wishes: Any) -> tuple[float, float, float]:
+        """Return the last loss, the distance from the vertices wanted, and the consistency of normals."""
+        renderer = Renderer(own, name, spp=8, **wishes)
+        steps, total = optimizer(renderer.parameters(), lr=rate), 0.0
+        for _ in range(30):
+            steps.zero_grad()
+            losses = [torchpt.losses.l2(renderer(pose), target) for pose, target in zip(poses, targets, strict=True)]
+            sum(losses, torch.zeros(())).backward()
+            steps.step()
+            total = float(sum(loss.detach() for loss in losses))
+        found = renderer.values()[name].detach()
+        distance = (found - wanted).square().sum(1).mean().sqrt()
+        return total, float(distance), float(torchpt.losses.mesh_normal_consistency(found, faces))
+
+    _, plain_distance, plain_normals = fitted(torch.optim.Adam, 0.01)
+    loss, distance, normals = fitted(AdamUniform, 0.05, parametrizations={name: LargeSteps(faces)})
+    start = float((points - wanted).square().sum(1).mean().sqrt())
+    assert loss < 0.6 * 3.0 * 1.36e-3 and distance < 0.85 * start and distance < 0.85 * plain_distance
+    assert normals < 1.5 * float(torchpt.losses.mesh_normal_consistency(wanted, faces)) < 0.3 * plain_normals
