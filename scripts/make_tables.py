@@ -109,7 +109,7 @@ def arguments(form: Any) -> str:
     """Return keyword arguments as a table: their Python defaults, and the meaning of None."""
     text = "| argument | what it is | accepted | default |\n|---|---|---|---|\n"
     for name, item in arguments_of(form).items():
-        default = item.stands_for.replace("None", "`None`") or f"`{item.default}`"
+        default = f"`{item.default}`{item.stands_for.removeprefix(str(item.default))}"
         text += f"| `{name}` | {item.spec.doc} | {item.accepted} | {default} |\n"
     return text
 

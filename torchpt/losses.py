@@ -1,18 +1,34 @@
-"""Losses between noisy pictures: differentiable, for any two tensors of one shape, such as ``(H, W, 3)``.
+"""Losses between noisy pictures, for any two tensors of one shape such as ``(H, W, 3)``, and losses of meshes.
 
 ``l1 l2 relmse smape`` compare a picture with its target, ``unbiased_squared_error`` and ``unbiased_relmse`` two independent
 renders of one scene with it. A backward pass of ``torchpt.render`` draws its own samples, so the gradient of a loss that is
 quadratic in the picture is unbiased with one render. Its *value* is biased by the variance of the noise; two renders remove
 that. docs/guides/ml.md has the details.
+
+``mesh_edge_loss mesh_laplacian_smoothing mesh_normal_consistency`` keep meshes smooth; names and values are those of
+PyTorch3D's functions for a single mesh. They take ``vertices (V, 3)`` in any space and ``faces (F, 3)``, indices of vertices
+such as ``Scene.faces`` returns.
 """
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from torchpt.images.metrics import FLOOR, relative, symmetric
+from torchpt.math.laplacian import adjacent_faces, cotangent_weights, mesh_edges, neighbour_sums
 
-__all__ = ["l1", "l2", "relmse", "smape", "unbiased_relmse", "unbiased_squared_error"]
+__all__ = [
+    "l1",
+    "l2",
+    "mesh_edge_loss",
+    "mesh_laplacian_smoothing",
+    "mesh_normal_consistency",
+    "relmse",
+    "smape",
+    "unbiased_relmse",
+    "unbiased_squared_error",
+]
 
 
 def _check_pictures(*pictures: Tensor) -> None:
@@ -86,3 +102,81 @@ def unbiased_relmse(a: Tensor, b: Tensor, target: Tensor, scale: Tensor | None =
     scale = target if scale is None else scale
     _check_pictures(a, b, target, scale)
     return relative((a - target) * (b - target), scale.detach(), floor).mean()
+
+
+def _check_mesh(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Return faces on the device of the vertices.
+
+    Raises:
+        TypeError: vertices are no floating tensor, or faces no tensor of whole numbers.
+        ValueError: a wrong shape, or a face with a vertex that is not there.
+    """
+    if not isinstance(vertices, Tensor) or not vertices.is_floating_point():
+        found = vertices.dtype if isinstance(vertices, Tensor) else type(vertices).__name__
+        raise TypeError(f"expected vertices as a tensor of floating numbers, got {found}")
+    if not isinstance(faces, Tensor) or faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
+        found = faces.dtype if isinstance(faces, Tensor) else type(faces).__name__
+        raise TypeError(f"expected faces as a tensor of whole numbers, got {found}")
+    for name, value in (("vertices", vertices), ("faces", faces)):
+        if value.dim() != 2 or value.shape[1] != 3:
+            raise ValueError(f"expected {name} of shape (N, 3), got {tuple(value.shape)}")
+    if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
+        raise ValueError(
+            f"expected indices of vertices in 0..{len(vertices) - 1}, got {int(faces.min())}..{int(faces.max())}"
+        )
+    return faces.to(vertices.device)
+
+
+def mesh_edge_loss(vertices: Tensor, faces: Tensor, target_length: float = 0.0) -> Tensor:
+    """Return the mean of ``(length - target_length)²`` over the edges of a mesh; 0 without edges.
+
+    Raises:
+        TypeError: vertices are no floating tensor, or faces no tensor of whole numbers (all losses of meshes raise it).
+        ValueError: a wrong shape, or an index that is out of range (all losses of meshes raise it).
+    """
+    faces = _check_mesh(vertices, faces)
+    if not len(faces):
+        return 0.0 * vertices.sum()
+    i, j = mesh_edges(faces).unbind(1)
+    lengths = torch.linalg.vector_norm(vertices[i] - vertices[j], dim=1)
+    return (lengths - target_length).square().mean()
+
+
+def mesh_laplacian_smoothing(vertices: Tensor, faces: Tensor, method: str = "uniform") -> Tensor:
+    """Return the mean distance of vertices from the weighted mean of their neighbours; 0 without faces.
+
+    Args:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+        method: ``uniform``: neighbours count alike (Taubin 1995). ``cot``: by the cotangents of the angles opposite to their
+            edge (Desbrun et al., *Implicit Fairing*, 1999), so that the position of vertices within the surface matters less;
+            the weights have no gradients.
+    """
+    faces = _check_mesh(vertices, faces)
+    if method not in ("uniform", "cot"):
+        raise ValueError(f"expected method uniform or cot, got {method!r}")
+    if not len(faces):
+        return 0.0 * vertices.sum()
+    edges = mesh_edges(faces)
+    weights = cotangent_weights(vertices, faces, edges) if method == "cot" else vertices.new_ones(len(edges))
+    total = vertices.new_zeros(len(vertices)).index_add(0, edges.reshape(-1), weights.repeat_interleave(2))
+    sums, known = neighbour_sums(edges, vertices, weights), total > 0
+    # Vertices without neighbours, and those whose cotangents do not sum to a positive number, count as 0.
+    offsets = torch.where(known[:, None], sums / torch.where(known, total, 1.0)[:, None] - vertices, 0.0)
+    return torch.linalg.vector_norm(offsets, dim=1).mean()
+
+
+def mesh_normal_consistency(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Return the mean of ``1 - cos(angle between normals)`` over pairs of faces with a common edge; 0 without such pairs.
+
+    The normals of a pair are those on one side of it, whatever the order of the faces' vertices. Faces without area count as
+    perpendicular to all others.
+    """
+    faces = _check_mesh(vertices, faces)
+    edges, opposite = adjacent_faces(faces)
+    if not len(edges):
+        return 0.0 * vertices.sum()
+    start, end, a, b = (vertices[index] for index in (*edges.unbind(1), *opposite.unbind(1)))
+    first = torch.linalg.cross(end - start, a - start)
+    second = -torch.linalg.cross(end - start, b - start)
+    return (1.0 - torch.nn.functional.cosine_similarity(first, second, dim=1)).mean()

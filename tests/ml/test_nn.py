@@ -18,7 +18,7 @@ from torchpt.compiler import cpu
 from torchpt.core.errors import SceneError
 from torchpt.core.memory import MemoryMeter, release_memory
 from torchpt.nn import Renderer
-from torchpt.nn.parametrizations import Bounded, LowerBounded, RigidMotion, Unbounded, parametrization_of
+from torchpt.nn.parametrizations import AxisAnglePose, Bounded, LowerBounded, Unbounded, parametrization_of
 from torchpt.spec import Angle, Color, Index, Scalar
 
 WALL = "materials.wall.reflectance"
@@ -80,7 +80,7 @@ def test_an_albedo_at_an_end_can_leave_it_and_is_not_driven_beyond(end, inward):
 
 def test_a_pose_stays_rigid_and_comes_back():
     start = torch.tensor([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
-    found = RigidMotion(start)
+    found = AxisAnglePose(start)
     x = found.inverse(start)
     assert torch.equal(found(x), start)
     moved = found(x + torch.tensor([0.3, -0.2, 2.0, 1.0, 0.0, 0.0]))
@@ -89,13 +89,13 @@ def test_a_pose_stays_rigid_and_comes_back():
     torch.testing.assert_close(found(found.inverse(moved)), moved)
     with pytest.raises(ValueError, match="turned and moved"):
         found.inverse(start * 1.5)
-    torch.autograd.gradcheck(RigidMotion(start.double()), x.double().requires_grad_())
+    torch.autograd.gradcheck(AxisAnglePose(start.double()), x.double().requires_grad_())
 
 
 @pytest.mark.parametrize("name", ["material_row", "env_teapot", "noise", "thin_lens"])
 def test_every_parameter_of_a_scene_comes_back_in_range(name):
     scene = torchpt.load(name, "cpu")
-    found = Renderer(scene, "*")
+    found = Renderer(scene, list(scene.params))
     assert set(found.names) == set(scene.params)
     values = {name: value.detach() for name, value in found.values().items()}
     scene.check(values)

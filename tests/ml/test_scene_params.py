@@ -11,7 +11,7 @@ import torch
 
 import torchpt
 from torchpt.core.errors import SceneError
-from torchpt.nn.parametrizations import RigidMotion
+from torchpt.nn.parametrizations import AxisAnglePose
 
 ALBEDO, BALL, FOV = "materials.paint.reflectance", "shapes.ball.to_world", "camera.fov"
 
@@ -89,7 +89,7 @@ def test_a_renderer_under_autocast_has_the_same_poses() -> None:
 
 
 def test_many_turns_are_a_rotation() -> None:
-    found = RigidMotion(torch.eye(4), 8.0)
+    found = AxisAnglePose(torch.eye(4), 8.0)
     x = torch.cat((3000.0 * torch.randn(3, generator=torch.Generator().manual_seed(1)), torch.tensor([1.0, 0.0, -0.5])))
     pose = found(x)
     assert torch.allclose(pose[:3, :3] @ pose[:3, :3].T, torch.eye(3), atol=1e-5)

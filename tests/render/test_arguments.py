@@ -49,7 +49,7 @@ def scene() -> torchpt.Scene:
         (torchpt.render, ("scene", "full"), CommonOptions),
         (torchpt.trace, ("scene", "o", "d", "spp", "seed", "params"), TraceOptions),
         (torchpt.render_batch, ("scenes", "cameras", "params", "seed", "on_progress", "full"), BatchOptions),
-        (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "full"), BatchOptions),
+        (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "parametrizations", "full"), BatchOptions),
         (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), BatchOptions),
     ],
 )
@@ -134,7 +134,10 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"spp_grad": 2.0}, "spp_grad: expected a whole number >= 1, got 2.0"),
     ({"edge_spp": True}, "edge_spp: expected a whole number >= 1, got True"),
     ({"ranks": 2}, "ranks: expected a torchpt.ranks.Group, got 2"),
-    ({"params": []}, "params: expected a mapping from names of scene.params to tensors, got []"),
+    (
+        {"params": []},
+        "params: expected a mapping from names of scene.params to tensors, or numbers and lists as in scene files, got []",
+    ),
     ({"params": {3: 0}}, "params: expected names of scene.params such as "),
     ({"device": "meta"}, "device: expected the scene's own device cpu; load the scene on the other, got 'meta'"),
     ({"spp": 0}, "render.spp: expected a whole number 1..2147483647, got 0"),

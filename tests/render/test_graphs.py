@@ -213,7 +213,7 @@ def test_a_scene_that_changed_before_its_gradient(scene: torchpt.Scene) -> None:
 def test_what_is_no_tensor_is_refused_as_by_eager_code(scene: torchpt.Scene) -> None:
     compiled = torch.compile(picture, backend="aot_eager")
     with pytest.raises(SceneError, match=f"{WALL}: expected a floating tensor"):
-        compiled(scene, [1.0, 1.0, 1.0])  # type: ignore[arg-type]
+        compiled(scene, [1.0, 1.0])  # type: ignore[arg-type]
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute:UserWarning")

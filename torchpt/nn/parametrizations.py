@@ -3,16 +3,17 @@
 ``renderer.py`` chooses a map for each parameter by its spec, the declaration of its range (:func:`parametrization_of`). ``x``
 are the numbers that are optimized, ``low`` and ``high`` the ends of the range.
 
-================  ======================================  =============================================================
-map               range                                   parameter
-================  ======================================  =============================================================
-``Bounded``       two ends: albedos, roughnesses, angles  ``low + (high - low) ((1 + 2 e) sigmoid(x) - e)``, clamped
-``LowerBounded``  one end: radiances, radii, indices      ``low + s (softplus(x) - e)``, clamped
-``Unbounded``     none: points, directions, vertices      ``x``
-``RigidMotion``   poses                                   ``exp(w)`` times the initial pose, at ``l t``; ``x = (w, t)``
-================  ======================================  =============================================================
+=================  =======================================  =============================================================
+map                range                                   parameter
+=================  =======================================  =============================================================
+``Bounded``        two ends: albedos, roughnesses, angles  ``low + (high - low) ((1 + 2 e) sigmoid(x) - e)``, clamped
+``LowerBounded``   one end: radiances, radii, indices      ``low + s (softplus(x) - e)``, clamped
+``Unbounded``      none: points, directions, vertices      ``x``
+``AxisAnglePose``  poses                                   ``exp(w)`` times the initial pose, at ``l t``; ``x = (w, t)``
+=================  =======================================  =============================================================
 
 In a rigid motion ``w`` is a rotation as axis times angle, ``exp(w)`` its matrix, ``l`` a length of the scene, ``t`` a position.
+Others are chosen by ``Renderer(parametrizations=...)``: ``QuaternionPose``, ``LookAtPose``, and ``LargeSteps`` for vertices.
 
 A plain sigmoid never reaches 0 or 1, and is flat near them: an albedo of 0 would be ``x`` of minus infinity, and stay there.
 So it is stretched by ``e = 0.05`` at each closed end, which is then reached at a finite ``x`` with a sixth of the slope in
@@ -29,9 +30,22 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchpt.math.laplacian import LaplacianSystem, mesh_edges
+from torchpt.nn.poses import axis_angle_matrix, look_at_matrix, pose_of, quaternion_matrix
 from torchpt.spec import Pose, Spec
 
-__all__ = ["Bounded", "LowerBounded", "Parametrization", "RigidMotion", "Unbounded", "parametrization_of"]
+__all__ = [
+    "AxisAnglePose",
+    "Bounded",
+    "LargeSteps",
+    "LookAtPose",
+    "LowerBounded",
+    "Parametrization",
+    "PoseParametrization",
+    "QuaternionPose",
+    "Unbounded",
+    "parametrization_of",
+]
 
 #: Overshoot of a closed end, as a share of the range.
 OVERSHOOT = 0.05
@@ -141,29 +155,41 @@ class LowerBounded(Parametrization):
         return (y + torch.log(-torch.expm1(-y))).to(value)
 
 
-class RigidMotion(Parametrization):
-    """A rigid motion of a pose: rotation about the origin of the pose, and translation; scale and shear are kept.
+class PoseParametrization(Parametrization):
+    """Base class of maps to poses; ``start``: the initial pose, ``length``: the unit of positions, such as ``scene.length``."""
 
-    ``x`` is ``(6,)``: the rotation from the initial pose as axis times angle in radians, and the position of the origin in
-    units of ``length``, so that steps of both change the picture alike.
+    def __init__(self, start: Tensor, length: float = 1.0) -> None:
+        super().__init__()
+        self.length = length
+
+
+class _RelativePose(PoseParametrization):
+    """A pose turned about its own origin from the initial one, and moved; scale and shear are kept.
+
+    ``x`` is a rotation from the initial pose, then the position of the origin in units of ``length``, so that steps of both
+    change the picture alike.
     """
 
     frame: Tensor
 
     def __init__(self, start: Tensor, length: float = 1.0) -> None:
-        super().__init__()
-        self.length = length
+        super().__init__(start, length)
         self.register_buffer("frame", start.detach()[:3, :3].clone())  # rotation, scale and shear of the initial pose
+
+    @staticmethod
+    def matrix(rotation: Tensor, /) -> Tensor:
+        """Return the rotation ``(3, 3)`` float64 of its numbers."""
+        raise NotImplementedError
+
+    @staticmethod
+    def numbers(matrix: Tensor, /) -> Tensor:
+        """Return the numbers of a rotation ``(1, 3, 3)``, with a first dimension of 1."""
+        raise NotImplementedError
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
-        # Rodrigues' rotation: the exponential of the cross-product matrix of axis times angle.
-        a, b, c = x[:3].double().unbind()  # large angles lose their digits in float32
-        zero = torch.zeros_like(a)
-        cross_matrix = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).reshape(3, 3)
-        rotated = (torch.linalg.matrix_exp(cross_matrix) @ self.frame.double()).to(x.dtype)
-        last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=x.dtype, device=x.device)
-        return torch.cat((torch.cat((rotated, self.length * x[3:, None]), 1), last))
+        rotated = (self.matrix(x[:-3]) @ self.frame.double()).to(x.dtype)
+        return pose_of(rotated, self.length * x[-3:])
 
     def inverse(self, value: Tensor) -> Tensor:
         """See :class:`Parametrization`.
@@ -171,15 +197,141 @@ class RigidMotion(Parametrization):
         Raises:
             ValueError: the pose is no rigid motion of the initial one.
         """
+        rotation = value[:3, :3].double() @ torch.linalg.inv(self.frame.double())
+        if not _is_rotation(rotation):
+            raise ValueError("the pose at first, turned and moved (rigid=False takes any)")
+        return torch.cat((self.numbers(rotation[None])[0].to(value), value[:3, 3] / self.length))
+
+
+class AxisAnglePose(_RelativePose):
+    """A rigid motion of a pose: ``x (6,)`` is axis times angle in radians, then the position over ``length``."""
+
+    matrix = staticmethod(axis_angle_matrix)
+
+    @staticmethod
+    def numbers(matrix: Tensor, /) -> Tensor:
+        """Return the rotation vector of a rotation."""
         from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
-        rotation = value[:3, :3].double() @ torch.linalg.inv(self.frame.double())
+        return rotation_matrix_to_axis_angle(matrix)
+
+
+class QuaternionPose(_RelativePose):
+    """A rigid motion of a pose: ``x (7,)`` is a quaternion, real part first, then the position over ``length``.
+
+    The quaternion turns the initial pose, and is ``(1, 0, 0, 0)`` at first; it may have any length but 0.
+    """
+
+    matrix = staticmethod(quaternion_matrix)
+
+    @staticmethod
+    def numbers(matrix: Tensor, /) -> Tensor:
+        """Return the unit quaternion of a rotation."""
+        from kornia.geometry.conversions import rotation_matrix_to_quaternion
+
+        return rotation_matrix_to_quaternion(matrix)
+
+
+class LookAtPose(PoseParametrization):
+    """A pose aimed at a point: ``x (6,)`` is the position of the origin and the point, both over ``length``.
+
+    The +z axis points to it, as a camera's does, and the initial +y axis stays in the upper half: no roll about the axis. At
+    first the point lies at distance ``length``. Scale and shear are kept.
+    """
+
+    up: Tensor
+    frame: Tensor
+
+    def __init__(self, start: Tensor, length: float = 1.0) -> None:
+        super().__init__(start, length)
+        linear = start.detach()[:3, :3].double()
+        axes = look_at_matrix(torch.zeros_like(linear[:, 2]), linear[:, 2], linear[:, 1])
+        self.register_buffer("up", start.detach()[:3, 1].clone())
+        self.register_buffer("frame", (axes.T @ linear).to(start))  # scale and shear of the initial pose
+
+    def forward(self, x: Tensor) -> Tensor:
+        """See :class:`Parametrization`."""
+        axes = look_at_matrix(x[:3], x[3:], self.up)
+        return pose_of((axes @ self.frame.double()).to(x.dtype), self.length * x[:3])
+
+    def inverse(self, value: Tensor) -> Tensor:
+        """See :class:`Parametrization`.
+
+        Raises:
+            ValueError: the pose is not the initial one, aimed elsewhere and moved.
+        """
+        axes = value[:3, :3].double() @ torch.linalg.inv(self.frame.double())
+        aimed = look_at_matrix(torch.zeros_like(axes[:, 2]), axes[:, 2], self.up)
+        if not _is_rotation(axes) or not torch.allclose(axes, aimed, atol=1e-4):
+            raise ValueError("the pose at first, aimed elsewhere and moved, without roll")
+        origin = value[:3, 3].double() / self.length
+        return torch.cat((origin, origin + axes[:, 2])).to(value)
+
+
+def _is_rotation(matrix: Tensor) -> bool:
+    """Return True for a rotation ``(3, 3)``, within tolerance."""
+    orthogonal = torch.allclose(matrix @ matrix.T, torch.eye(3).to(matrix), atol=1e-4)
+    return orthogonal and bool(torch.linalg.det(matrix) > 0)
+
+
+class LargeSteps(Parametrization):
+    """Vertices ``v (V, 3)`` of a mesh as ``(I + λ L)^-1 x``, so that steps of an optimizer move smooth regions together.
+
+    Nicolet, Jacobson and Jakob, *Large Steps in Inverse Rendering of Geometry* (2021): L is the combinatorial Laplacian. A
+    gradient step in ``x`` is one in ``v`` smoothed twice, so meshes stay free of tangles at large learning rates.
+
+    Args:
+        faces: ``(F, 3)`` indices of vertices, such as ``scene.faces("shapes.NAME")``.
+        lambda_: weight λ of smoothness, from 0; the paper takes 19 for most meshes, more for finer ones.
+
+    Raises:
+        TypeError: faces are no tensor of whole numbers.
+        ValueError: a wrong shape, or a λ below 0.
+    """
+
+    edges: Tensor
+
+    def __init__(self, faces: Tensor, lambda_: float = 19.0) -> None:
+        super().__init__()
         if (
-            not torch.allclose(rotation @ rotation.T, torch.eye(3).to(rotation), atol=1e-4)
-            or torch.linalg.det(rotation) < 0
+            not isinstance(faces, Tensor)
+            or faces.is_floating_point()
+            or faces.is_complex()
+            or faces.dtype == torch.bool
         ):
-            raise ValueError("expected the pose at first, turned and moved")
-        return torch.cat((rotation_matrix_to_axis_angle(rotation[None])[0].to(value), value[:3, 3] / self.length))
+            found = faces.dtype if isinstance(faces, Tensor) else type(faces).__name__
+            raise TypeError(f"expected faces as a tensor of whole numbers, got {found}")
+        if faces.dim() != 2 or faces.shape[1] != 3:
+            raise ValueError(f"expected faces of shape (F, 3), got {tuple(faces.shape)}")
+        if not 0.0 <= lambda_ < math.inf:
+            raise ValueError(f"expected lambda_ as a finite number >= 0, got {lambda_}")
+        self.lambda_ = float(lambda_)
+        self.register_buffer("edges", mesh_edges(faces), persistent=False)
+        self._system: LaplacianSystem | None = None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """See :class:`Parametrization`."""
+        return self._system_of(x).solve(x)
+
+    def inverse(self, value: Tensor) -> Tensor:
+        """See :class:`Parametrization`.
+
+        Raises:
+            ValueError: the value is not of vertices of these faces.
+        """
+        count = int(self.edges.max()) + 1 if len(self.edges) else 0
+        if value.dim() != 2 or value.shape[1] != 3 or len(value) < count:
+            raise ValueError(f"vertices (V, 3) of the mesh whose faces LargeSteps was given, V at least {count}")
+        return self._system_of(value).apply(value.double()).to(value)
+
+    def _system_of(self, vertices: Tensor) -> LaplacianSystem:
+        system = self._system
+        if system is None or system.edges is not self.edges or len(system.degrees) != len(vertices):
+            system = self._system = LaplacianSystem.of(self.edges, len(vertices), self.lambda_)
+        return system
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_system": None}  # made again where it is needed
 
 
 def parametrization_of(spec: Spec, start: Tensor, *, rigid: bool = True, length: float = 1.0) -> Parametrization:
@@ -192,7 +344,7 @@ def parametrization_of(spec: Spec, start: Tensor, *, rigid: bool = True, length:
         length: size of the scene, the unit of a pose's position.
     """
     if isinstance(spec, Pose):
-        return RigidMotion(start, length) if rigid or spec.angles or spec.rigid else Unbounded()
+        return AxisAnglePose(start, length) if rigid or spec.angles or spec.rigid else Unbounded()
     low, high = getattr(spec, "low", None), getattr(spec, "high", None)
     above, below = getattr(spec, "above", None), getattr(spec, "below", None)  # open ends
     # Of a closed and an open end, the tighter one counts.

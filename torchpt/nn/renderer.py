@@ -10,16 +10,20 @@ import torch
 from torch import Tensor, nn
 
 from torchpt.core.errors import SceneError, example_names
-from torchpt.nn.parametrizations import parametrization_of
+from torchpt.nn.parametrizations import Parametrization, PoseParametrization, parametrization_of
 from torchpt.rendering.api import render
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
 from torchpt.scene.settings import BatchOptions, Params, RenderOptions, base_seed
+from torchpt.scene.sizes import is_size
 from torchpt.scene.validation import params_as_tensors
 from torchpt.spec.arguments import check_names, expand_signature
 
 __all__ = ["Renderer"]
+
+#: A parametrization, or a function of a parameter's initial value and the scene's length that makes one.
+ParametrizationOf = Parametrization | Callable[[Tensor, float], Parametrization]
 
 
 class Renderer(nn.Module):
@@ -45,6 +49,9 @@ class Renderer(nn.Module):
         seed: any integer from 0, also as a tensor; None: a new one for each call.
         rigid: True: poses move rigidly (six numbers each); False: their 16 numbers are optimized, except for poses that must
             keep angles, as those of spheres and cameras.
+        parametrizations: maps in place of those chosen by the range of parameters, by name or pattern: a
+            :class:`~torchpt.nn.Parametrization` such as ``LargeSteps(faces)``, or a function of the initial value and the
+            scene's length that makes one, such as the classes ``QuaternionPose`` and ``LookAtPose``.
         full: True makes calls return a :class:`torchpt.Rendering`.
         options: further arguments of ``torchpt.render`` for all calls.
 
@@ -63,11 +70,12 @@ class Renderer(nn.Module):
         *,
         seed: int | Tensor | None = 0,
         rigid: bool = True,
+        parametrizations: Mapping[str, ParametrizationOf] | None = None,
         full: bool = False,
         **options: Unpack[BatchOptions],
     ) -> None:
         super().__init__()
-        check_names("Renderer", options, RenderOptions, own=("names", "rigid"))
+        check_names("Renderer", options, RenderOptions, own=("names", "rigid", "parametrizations"))
         if type(rigid) is not bool:
             raise SceneError("rigid", rigid, "True or False")
         if "params" in options:
@@ -78,16 +86,19 @@ class Renderer(nn.Module):
         self.names = () if names is None else _matching_names(scene, (names,) if isinstance(names, str) else names)
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
-            parametrizations = [
+            chosen = _chosen(parametrizations, self.names)
+            maps = [
                 parametrization_of(scene.spec(name), start, rigid=rigid, length=scene.length)
+                if name not in chosen
+                else _made(name, chosen[name], start, scene.length)
                 for name, start in zip(self.names, starts, strict=True)
             ]
             free = {
-                _key(name): nn.Parameter(parametrization.inverse(start).clone())
-                for name, parametrization, start in zip(self.names, parametrizations, starts, strict=True)
+                _key(name): nn.Parameter(_inverse(name, parametrization, start).clone())
+                for name, parametrization, start in zip(self.names, maps, starts, strict=True)
             }
         # `free` has the numbers that are optimized, `ranges` maps them to parameters; both names are in saved state dicts
-        self.ranges, self.free = nn.ModuleList(parametrizations), nn.ParameterDict(free)
+        self.ranges, self.free = nn.ModuleList(maps), nn.ParameterDict(free)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
     @expand_signature
@@ -138,11 +149,8 @@ class Renderer(nn.Module):
         self.scene.check({**self.values(), **tensors})
         numbers: dict[str, Tensor] = {}  # the unconstrained numbers of each value
         for name, value in tensors.items():
-            try:
-                numbers[name] = self.ranges[self.names.index(name)].inverse(value.to(self.free[_key(name)]))  # pyright: ignore[reportCallIssue]
-            except ValueError:
-                expected = "the pose at first, turned and moved (rigid=False takes any)"
-                raise SceneError(f"params.{name}", value.tolist(), expected) from None
+            parametrization: Any = self.ranges[self.names.index(name)]
+            numbers[name] = _inverse(name, parametrization, value.to(self.free[_key(name)]))
         for name, value in numbers.items():
             self.free[_key(name)].copy_(value)
 
@@ -179,6 +187,62 @@ def _key(name: str) -> str:
     return name.replace(".", "/")
 
 
+def _chosen(given: Any, names: Sequence[str]) -> dict[str, ParametrizationOf]:
+    """Return the parametrizations that a caller chose, by name of the parameter; the first that matches counts.
+
+    Raises:
+        SceneError: no mapping, or a pattern that matches no parameter of the module.
+    """
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise SceneError("parametrizations", given, "a mapping from names or patterns to parametrizations")
+    chosen: dict[str, ParametrizationOf] = {}
+    for pattern, parametrization in given.items():
+        matches = [name for name in names if name == pattern or fnmatchcase(name, str(pattern))]
+        if not matches:
+            known = (
+                f"one of {', '.join(names)}, or a pattern of some" if names else "none: the module has no parameters"
+            )
+            raise SceneError("parametrizations", pattern, known)
+        chosen = {name: parametrization for name in matches} | chosen
+    return chosen
+
+
+def _made(name: str, chosen: ParametrizationOf, start: Tensor, length: float) -> Parametrization:
+    """Return the parametrization of a parameter.
+
+    Raises:
+        SceneError: it is none, or not of values such as the initial one.
+    """
+    expected = "a torchpt.nn.Parametrization, or a function of the initial value and a length that makes one"
+    if isinstance(chosen, type) and issubclass(chosen, PoseParametrization) and start.shape != (4, 4):
+        raise SceneError(f"parametrizations.{name}", chosen.__name__, "a parametrization of values that are no poses")
+    made = chosen(start, length) if callable(chosen) and not isinstance(chosen, Parametrization) else chosen
+    if not isinstance(made, Parametrization):
+        raise SceneError(f"parametrizations.{name}", made, expected)
+    return made
+
+
+def _inverse(name: str, parametrization: Parametrization, value: Tensor) -> Tensor:
+    """Return the unconstrained numbers of a parameter's value.
+
+    Raises:
+        SceneError: the parametrization has no such value.
+    """
+    try:
+        return parametrization.inverse(value)
+    except ValueError as error:
+        shown = value.tolist() if value.numel() <= 16 else tuple(value.shape)
+        raise SceneError(f"params.{name}", shown, str(error)) from None
+
+
+def _matches(scene: Scene, parameter: str, pattern: str) -> bool:
+    """Return True if a pattern matches a parameter. Sizes of shapes, which poses hold too, match by their own name alone."""
+    own_name = pattern.rpartition(".")[2] == parameter.rpartition(".")[2]
+    return fnmatchcase(parameter, pattern) and (own_name or not is_size(scene.spec(parameter)))
+
+
 def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
     """Return the parameters that match names and patterns, in the scene's order."""
     if not isinstance(names, Iterable) or isinstance(names, Mapping):
@@ -190,7 +254,7 @@ def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if not isinstance(name, str):
             raise SceneError("names", name, "a name of scene.params or a pattern of some, as text")
-        matches = [parameter for parameter in scene.params if parameter == name or fnmatchcase(parameter, name)]
+        matches = [parameter for parameter in scene.params if parameter == name or _matches(scene, parameter, name)]
         if not matches:
             examples = example_names(name, list(scene.params))
             raise SceneError("names", name, f"a parameter of this scene or a pattern of some, such as {examples}")

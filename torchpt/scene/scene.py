@@ -38,6 +38,7 @@ from torchpt.scene.formats.description import Description, settings
 from torchpt.scene.host_copies import HostCopies
 from torchpt.scene.info import describe
 from torchpt.scene.settings import Film, FilmSettings, Params, Settings
+from torchpt.scene.sizes import sized_shapes, unchanged_sizes, with_poses
 from torchpt.scene.sources import check_light_params
 from torchpt.scene.space import MAX_COORDINATE, Space, bounds_center, bounds_extent
 from torchpt.scene.validation import check_tensor, inherited_checks, params_as_tensors, validate_changes
@@ -117,6 +118,9 @@ class Scene:
         self._host_space = Space(torch.from_numpy(self._built.centre), self._built.unit)
         self._space = moved(self._host_space, self.device)
         self._host_copies = HostCopies()
+        self._sized_shapes = sized_shapes(self.description, self.params)
+        self._size_names = frozenset(name for shape in self._sized_shapes for name in shape.names)
+        self._unchanged_sizes = unchanged_sizes(self._sized_shapes, self.params)
         self._lock = threading.RLock()
         # By dtype, whether texture coordinates were asked for, and light sampler.
         self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
@@ -252,7 +256,7 @@ class Scene:
         extent = bounds_extent(self._built.parts, self._built.copies)
         return 2.0 ** round(math.log2(max(extent, 2.0**-100)))  # a single point has a logarithm too
 
-    def check(self, params: Params | None) -> None:
+    def check(self, params: Mapping[str, Any] | None) -> None:
         """Check parameters that are to replace the scene's in a render.
 
         Raises:
@@ -266,7 +270,9 @@ class Scene:
                 raise SceneError(f"params.{name}", name, f"a parameter of this scene such as {examples}")
             check_tensor(name, value, self.params[name].shape, texels=self.spec(name).texture)
             self.check_number(name, value.detach())
-        check_light_params(self._built.sources, params or {}, self.merged(params))
+        merged = self.merged(params)
+        check_light_params(self._built.sources, params or {}, merged)
+        self.check_sizes(params or {}, merged)
 
     def check_own(self) -> None:
         """Check the tensors of :attr:`params` that were replaced or changed in place since the last check.
@@ -286,10 +292,14 @@ class Scene:
         return self._version_counter.of(self.params)
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
-        """Return all parameters, with those of ``params`` (checked before) in place of the scene's."""
+        """Return all parameters, with those of ``params`` (checked before) in place of the scene's.
+
+        Poses of shapes whose sizes have changed (:mod:`torchpt.scene.sizes`) are those of their primitives.
+        """
         merged = {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
         # Autograd refuses tensors of torch.inference_mode, but not their clones.
-        return {name: value.clone() if value.is_inference() else value for name, value in merged.items()}
+        merged = {name: value.clone() if value.is_inference() else value for name, value in merged.items()}
+        return with_poses(merged, self._sized_shapes, self._unchanged_sizes)
 
     def spec(self, name: str) -> Spec:
         """Return the spec of a parameter."""
@@ -313,6 +323,31 @@ class Scene:
             if not np.abs(position - self._built.centre).max() <= reach:  # True for NaN too
                 expected = f"a place up to {reach:.3g} from the middle of this scene as it was loaded"
                 raise SceneError(f"params.{name}", position.tolist(), expected)
+
+    def check_sizes(self, names: Collection[str], merged: Mapping[str, Tensor]) -> None:
+        """Check the poses of shapes of which sizes are among ``names``; ``merged``: all parameters (:meth:`merged`).
+
+        Raises:
+            SceneError: sizes that a scene file could not hold, or with which a shape has no pose.
+        """
+        if self._size_names.isdisjoint(names):
+            return
+        for shape in self._sized_shapes:
+            given = [name for name in shape.names if name in names]
+            changed = next((name for name in given if not shape.is_loaded(name, merged[name])), None)
+            if changed is None:
+                continue
+            try:
+                shape.kind.check(shape.values(merged), frozenset())
+            except Refused as error:
+                raise SceneError(
+                    ".".join(("params", shape.stem, *map(str, error.at))), error.value, error.expected
+                ) from None
+            try:
+                self.check_number(shape.pose_name, merged[shape.pose_name].detach())
+            except SceneError as error:
+                expected = f"sizes with which its pose is {error.expected}"
+                raise SceneError(f"params.{changed}", merged[changed].tolist(), expected) from None
 
     def world(
         self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None, uv: bool = False, choice: str = "auto"
@@ -374,6 +409,28 @@ class Scene:
         pose = params["camera.to_world"]
         pose = torch.cat((self._host_space.pose(pose), pose[3:].double())).to(dtype)  # (3, 4), and the last row 0 0 0 1
         return moved(camera.kind.on(pose, (film.width, film.height), values), self.device)
+
+    def faces(self, name: str) -> Tensor:
+        """Return the triangles of a mesh: ``(F, 3)`` int64 indices of its vertices, on the scene's device.
+
+        Vertices that a file splits, such as at seams of texture coordinates, are different ones.
+
+        Args:
+            name: its parameter ``shapes.NAME.vertices``, or ``shapes.NAME``.
+
+        Raises:
+            SceneError: no mesh of this scene.
+        """
+        meshes = {part.name: part.faces for part in self._built.parts if part.faces is not None}
+        faces = meshes.get(str(name).removesuffix(".vertices"))
+        if faces is None:
+            found = (
+                f"one of {', '.join([*meshes][:8])}{', ...' if len(meshes) > 8 else ''}"
+                if meshes
+                else "a mesh (there is none)"
+            )
+            raise SceneError("name", name, found)
+        return torch.from_numpy(faces).to(self.device, torch.int64)
 
     def film_size(self, film: FilmSettings | None = None) -> tuple[int, int]:
         """Return width and height of the whole film in pixels; ``film``: settings that override the scene's."""

@@ -25,6 +25,7 @@ from torchpt.scene.formats.materials import check_material, plain_material, read
 from torchpt.scene.materials import declare, resolved
 from torchpt.scene.mesh_triangles import Mesh, faces_with_area, ignored_features, mesh_of
 from torchpt.scene.meshes import FileMaterial, MeshPart
+from torchpt.scene.sizes import size_keys
 from torchpt.scene.sources import build_file_lights, unique_labels
 from torchpt.scene.texture_loader import TextureLoader
 from torchpt.spec import Pose, Vertices, parameters_of
@@ -125,6 +126,8 @@ class ShapeBuilder:
                 raise SceneError(entry.key, pose.tolist(), expected, self.description.file)
         surfaces = shape.kind.surfaces(shape.values, pose)
         self._declare_pose(entry.key, pose, surfaces)
+        for key in size_keys(shape.kind):
+            self.parameters.declare(f"{entry.key}.{key}", shape[key], parameters_of(shape.kind)[key])
         material = self._material(shape["material"], entry.key)
         return [
             self._part(entry, entry.key, material, surface, pose if surface.local is None else pose @ surface.local)

@@ -104,7 +104,9 @@ def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:
         value = scene.params[name]
         check_tensor(name, value, loaded[name].shape)
         scene.check_number(name, value.detach())
-    check_light_params(scene.built.sources, changed, scene.merged(None))  # None: the scene's own parameters
+    merged = scene.merged(None)  # the scene's own parameters
+    check_light_params(scene.built.sources, changed, merged)
+    scene.check_sizes(changed, merged)
     validated_versions |= changed
 
 

@@ -59,8 +59,10 @@ class SceneValue(Enum):
 
     OWN = "the scene's"
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
         return self.value
+
+    __repr__ = __str__
 
 
 #: Default of arguments for which None is a value.

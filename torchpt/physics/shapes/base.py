@@ -8,7 +8,7 @@ the world.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchpt import spec
 from torchpt.math.transforms import affine, constant, tensor_of
-from torchpt.spec import Color, Custom, Flag, Pose, Refused, Spec
+from torchpt.spec import Color, Custom, Flag, Moves, Pose, Refused, Spec
 
 __all__ = ["BOTTOM", "TOP", "UPRIGHT", "Place", "Shape", "Size", "Surface", "Triangles", "placed"]
 
@@ -30,16 +30,16 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Size(spec.Scalar):
-    """Spec of a length before the transform. It is part of ``to_world``, not a parameter tensor."""
+    """Spec of a length before the transform. ``to_world`` is the pose at the lengths that the scene file says."""
 
-    differentiable: ClassVar[bool] = False
+    moves: Moves = field(default=Moves.SURFACES, kw_only=True)
 
 
 @dataclass(frozen=True)
 class Place(spec.Point):
-    """Spec of a point before the transform. It is part of ``to_world``, not a parameter tensor."""
+    """Spec of a point before the transform. ``to_world`` is the pose at the points that the scene file says."""
 
-    differentiable: ClassVar[bool] = False
+    moves: Moves = field(default=Moves.SURFACES, kw_only=True)
 
 
 @dataclass(frozen=True)
