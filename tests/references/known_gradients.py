@@ -298,7 +298,7 @@ PANE = {
 }
 
 
-def field(**more: Any) -> dict[str, Any]:
+def hills(**more: Any) -> dict[str, Any]:
     """Return a mesh of hills and valleys, 4 x 4 vertices."""
     draw = torch.Generator().manual_seed(0)
     side = torch.linspace(-1, 1, 4)
@@ -443,14 +443,14 @@ PAIRS: dict[str, Pair] = {
         depth=3,
     ),
     "field_vertex": Pair(
-        {**ABOVE, "shapes": {"field": field()}, "lights": OPEN_SKY},
+        {**ABOVE, "shapes": {"field": hills()}, "lights": OPEN_SKY},
         "shapes.field.vertices",
         {(5, 1): 1.0},
         0.02,
         depth=3,
     ),
     "flat_field_vertex": Pair(
-        {**ABOVE, "shapes": {"field": field(face_normals=True)}, "lights": OPEN_SKY},
+        {**ABOVE, "shapes": {"field": hills(face_normals=True)}, "lights": OPEN_SKY},
         "shapes.field.vertices",
         {(5, 1): 1.0, (10, 0): 0.5},
         0.02,
