@@ -25,8 +25,12 @@ def forward(scene: torchpt.Scene) -> None:
 
 
 def backward(scene: torchpt.Scene) -> None:
-    """Render a gradient by all parameters."""
-    given = {name: value.clone().requires_grad_() for name, value in scene.params.items()}
+    """Render a gradient by all parameters but those of opacity, which are differentiated by tensor operations."""
+    owners, named = (*scene.built.parts, *scene.built.copies), dict(scene.params)
+    if any(owner.material.opacity != 1.0 for owner in owners):  # a number or a texture, whose table others may share
+        whole = (".vertices", ".to_world")
+        named = {k: v for k, v in named.items() if "opacity" not in k and (v.dim() < 2 or k.endswith(whole))}
+    given = {name: value.clone().requires_grad_() for name, value in named.items()}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # which edges a gradient leaves out does not matter here
         image = torchpt.render(scene, params=given, film={"width": 32, "height": 32}, **WISH)

@@ -3,13 +3,13 @@
 The search has no gradients. Computing the point from the corners of its primitive is more accurate than ``o + t d`` and
 makes any search differentiable. The derivative can be taken in two parametrizations, with the same values:
 
-- the ray stays fixed and the point share along it: ``follow_ray``;
+- the ray stays fixed and the point slides along it: ``follow_ray``;
 - the point stays fixed on its surface and the direction follows it (the material form of Zhang, Miller, Yan, Gkioulekas, Zhao,
   *Path-Space Differentiable Rendering*, 2020; its interior term).
 
 Camera rays take the first. Behind a surface :func:`reattach` blends the two by the length of the ray: near points slide, since
 the geometry term of points that are held has a derivative of the order of one over their distance, which has no variance; far
-points are held, since each point that share hands its motion, over the cosine, to the next.
+points are held, since each point that slides hands its motion, over the cosine, to the next.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _framed(world: World, primitives: LanePrimitives, at: Interaction) -> Intera
 
 
 def slide_share(r: Tensor, near: Tensor) -> Tensor:
-    """Return the share ``(N,)`` by which a point at distance ``r (N,)`` share along its ray in place of being held.
+    """Return the share ``(N,)`` by which a point at distance ``r (N,)`` slides along its ray in place of being held.
 
     ``near (1,)``: the length over which points slide. The share is ``exp(-(r / near)^2)``.
     """
@@ -141,7 +141,7 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor, near: Tensor) -> tup
     """Make a traced direction differentiable in both of its end points.
 
     With the share ``a`` of :func:`slide_share` the motion of the direction is ``D = (1 - a) dw``, where ``dw`` turns with the
-    points if both are held. A ray with this motion meets the moving surface at the point that is held by ``1 - a`` and share
+    points if both are held. A ray with this motion meets the moving surface at the point that is held by ``1 - a`` and slides
     by ``a``. The derivative of the measure is the divergence of ``D``: ``1 - a`` times that of ``|cos| dA / r^2``, less the
     slope of ``a`` along ``dw``; the distance changes by ``-r (n dw) / (n w)`` with the direction, ``n`` the normal.
 
