@@ -380,6 +380,8 @@ def _normal(bodies: Bodies, prim: Tensor) -> Tensor:
 
 def parts_of(bodies: Bodies, curves: Curves) -> Tensor:
     """Return the parts ``(N,)`` with which curves count: 1 over the number of straight ones between the same two points."""
+    if not len(curves.prim):
+        return torch.ones_like(curves.low)
     ends = torch.stack([bodies.points(curves.at(t)[0]) for t in (curves.low, curves.high)])  # (2, 3, N)
     size = float((ends.amax((0, 2)) - ends.amin((0, 2))).max())
     grid = max(size * _SAME, torch.finfo(ends.dtype).tiny)
