@@ -384,7 +384,7 @@ FAULTS = (
         "gradients/edges/receivers.py",
         "edges render",
         "Prefix.receivers",
-        "at + (slid - at) * self.frame.share(stop.held.prim, r)",
+        "at + (slid - at) * self.frame.share(vertex.held.prim, r)",
         "at",
         "edges in indirect light count as if all points were held, against an interior in which near ones slide",
     ),

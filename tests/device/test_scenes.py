@@ -25,11 +25,13 @@ def forward(scene: torchpt.Scene) -> None:
 
 
 def backward(scene: torchpt.Scene) -> None:
-    """Render a gradient by all parameters but those of opacity, which are differentiated by tensor operations."""
+    """Render a gradient by all parameters; of scenes with opacity by vertices and poses alone.
+
+    Opacity is differentiated by tensor operations, and so is a texture whose table it shares.
+    """
     owners, named = (*scene.built.parts, *scene.built.copies), dict(scene.params)
-    if any(owner.material.opacity != 1.0 for owner in owners):  # a number or a texture, whose table others may share
-        whole = (".vertices", ".to_world")
-        named = {k: v for k, v in named.items() if "opacity" not in k and (v.dim() < 2 or k.endswith(whole))}
+    if any(owner.material.opacity != 1.0 for owner in owners):
+        named = {name: value for name, value in named.items() if name.endswith((".vertices", ".to_world"))}
     given = {name: value.clone().requires_grad_() for name, value in named.items()}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # which edges a gradient leaves out does not matter here

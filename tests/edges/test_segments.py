@@ -10,15 +10,16 @@ import torch
 
 import torchpt
 from torchpt.gradients.edges.bodies import bodies_of
-from torchpt.gradients.edges.segments import Brinks, Starts, brinks_of
+from torchpt.gradients.edges.occluders import occluders_of
+from torchpt.gradients.edges.segments import SegmentRays, SegmentSampler, smooth_of
 from torchpt.math.vectors import dot
 from torchpt.scene.formats.description import settings
 
 COUNT = 40_000
 
 
-def drawn(shape: dict[str, Any]) -> tuple[Brinks, Starts, float]:
-    """Draw places and directions on the brinks of a shape; return them, and a unit of length of the lanes."""
+def drawn(shape: dict[str, Any]) -> tuple[SegmentRays, float]:
+    """Draw points and directions on the edges of a shape; return them, and the unit of length of the lanes."""
     described = {
         "camera": {"origin": [0, 0, 5], "target": [0, 0, 0]},
         "shapes": {"it": shape} if "type" in shape else shape,
@@ -26,12 +27,13 @@ def drawn(shape: dict[str, Any]) -> tuple[Brinks, Starts, float]:
     scene = torchpt.load(described, "cpu")
     bodies = bodies_of(scene, settings(scene.description, {}).film, {})
     moves = torch.ones(sum(bodies.counts), dtype=torch.bool)
-    brinks = brinks_of(scene, bodies, scene.merged({}), moves)
-    assert brinks is not None
+    occluders = occluders_of(scene, bodies, scene.merged({}), moves, lights_move=False)
+    assert occluders is not None
+    sampler = SegmentSampler(occluders, smooth_of(scene, bodies))
     g = torch.Generator().manual_seed(4)
     numbers = torch.rand(7, COUNT, generator=g, dtype=torch.float64)
     u = (torch.arange(COUNT) + numbers[0]) / COUNT
-    return brinks, brinks.draw(u, numbers[1:3], numbers[3:5], numbers[5:7]), float(scene.space.unit)
+    return sampler.draw(u, numbers[1:3], numbers[3:5], numbers[5:7]), float(scene.space.unit)
 
 
 SHAPES: dict[str, tuple[dict[str, Any], float]] = {
@@ -64,13 +66,14 @@ SHAPES: dict[str, tuple[dict[str, Any], float]] = {
 @pytest.mark.parametrize("name", SHAPES)
 def test_edges_count_by_length_and_directions_by_solid_angle(name: str):
     shape, length = SHAPES[name]
-    _, starts, unit = drawn(shape)
-    assert float(starts.weight.mean()) * unit == pytest.approx(length, rel=0.02)
-    assert (dot(starts.omega, starts.omega) - 1).abs().max() < 1e-9
+    rays, unit = drawn(shape)
+    # The integral of the sine of the angle with the edge, over all directions, is pi^2.
+    assert float((rays.weight / rays.density).mean()) * unit == pytest.approx(math.pi**2 * length, rel=0.02)
+    assert (dot(rays.omega, rays.omega) - 1).abs().max() < 1e-9
     # Integrals over the sphere of 1 and of components squared, each along and across the edge.
-    assert float((1 / starts.density).mean()) == pytest.approx(4 * math.pi, rel=0.03)
+    assert float((1 / rays.density).mean()) == pytest.approx(4 * math.pi, rel=0.03)
     for k in range(3):
-        part = starts.omega[k].square() / starts.density
+        part = rays.omega[k].square() / rays.density
         assert float(part.mean()) == pytest.approx(4 * math.pi / 3, rel=0.05)
 
 
@@ -86,9 +89,9 @@ ROUND: dict[str, tuple[dict[str, Any], float]] = {
 @pytest.mark.parametrize("name", ROUND)
 def test_outlines_of_round_bodies_count_by_curvature(name: str):
     shape, integral = ROUND[name]
-    _, starts, unit = drawn(shape)
-    bent = starts.curvature > 0
-    total = float(torch.where(bent, starts.weight / starts.density, 0.0).mean()) * unit
+    rays, unit = drawn(shape)
+    bent = rays.curvature > 0
+    total = float(torch.where(bent, rays.weight / rays.density, 0.0).mean()) * unit
     assert total == pytest.approx(integral, rel=0.03)
-    out = starts.out[:, bent]
-    assert dot(out, starts.omega[:, bent]).abs().max() < 1e-9 and (dot(out, out) - 1).abs().max() < 1e-9
+    out = rays.out[:, bent]
+    assert dot(out, rays.omega[:, bent]).abs().max() < 1e-9 and (dot(out, out) - 1).abs().max() < 1e-9

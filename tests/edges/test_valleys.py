@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 
 import torch
+from known_gradients import ABOVE, OPEN_SKY, hills
 
 import torchpt
 
@@ -14,19 +15,14 @@ def test_a_height_field_has_gradients_of_the_right_size():
 
     Central differences along random directions give a gradient of norm .197, and -.0228 and -.0096 for two vertices.
     """
-    draw = torch.Generator().manual_seed(0)
-    side = torch.linspace(-1, 1, 4)
-    x, z = torch.meshgrid(side, side, indexing="xy")
-    vertices = torch.stack([x.flatten(), 0.2 * torch.randn(16, generator=draw), z.flatten()], 1)
-    grid = torch.arange(16).reshape(4, 4)
-    a, b, c, d = (part.flatten() for part in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
-    faces = torch.cat([torch.stack([a, c, b], 1), torch.stack([a, d, c], 1)])
+    field = hills(material={"type": "diffuse"})
+    vertices = torch.tensor(field["vertices"])
     described = {
-        "camera": {"origin": [0, 3, 0.01], "target": [0, 0, 0], "up": [0, 0, -1], "fov": 45},
+        **ABOVE,
         "film": {"width": 32, "height": 32},
         "integrator": {"type": "path", "max_depth": 3},
-        "shapes": {"m": {"type": "mesh", "vertices": vertices, "faces": faces}},
-        "lights": {"sky": {"type": "constant"}},
+        "shapes": {"m": field},
+        "lights": OPEN_SKY,
     }
     scene, norms, grads = torchpt.load(described, device="cpu"), [], []
     for seed in range(8):

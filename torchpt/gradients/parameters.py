@@ -75,6 +75,26 @@ def near_of(scene: Scene, geometry: LaneGeometry, wanted: Iterable[str]) -> Tens
     def moves(owner: str) -> bool:
         return any(name.startswith(f"{owner}.") for name in names)
 
+    boxes = _boxes(scene, geometry)
+    moving = [boxes[part.name] for part in scene.built.parts if moves(part.name)]
+    moving += [boxes[copy.name] for copy in scene.built.copies if moves(copy.name) or moves(copy.of)]
+    return (_half_diagonal(moving) if moving else _NEAR * _half_diagonal(boxes.values()))[None]
+
+
+@torch.no_grad()
+def scene_reach(scene: Scene, geometry: LaneGeometry) -> Tensor:
+    """Return about half the diagonal of the box around all primitives, float64."""
+    return _half_diagonal(_boxes(scene, geometry).values())
+
+
+def _half_diagonal(boxes: Iterable[Tensor]) -> Tensor:
+    """Return half the diagonal of the box around boxes."""
+    low, high = torch.stack(list(boxes)).unbind(1)
+    return 0.5 * (high.amax(0) - low.amin(0)).norm()
+
+
+def _boxes(scene: Scene, geometry: LaneGeometry) -> dict[str, Tensor]:
+    """Return boxes ``(2, 3)`` around the parts and instances by name: least and greatest coordinates, about."""
     p0, e1, e2 = (corner.double() for corner in (geometry.p0, geometry.e1, geometry.e2))
     fourth = p0 + e1 + e2
     triangles = slice(0, geometry.counts[0])
@@ -84,30 +104,21 @@ def near_of(scene: Scene, geometry: LaneGeometry, wanted: Iterable[str]) -> Tens
     round_ = slice(sum(geometry.counts[:2]), None)  # disks, spheres and quadrics are about p0
     radius = torch.maximum(e1.norm(dim=0), e2.norm(dim=0))[round_]
     low[:, round_], high[:, round_] = p0[:, round_] - radius, p0[:, round_] + radius
-    all_boxes, moving_boxes, of_mesh = [], [], {}
+    boxes: dict[str, Tensor] = {}
     first = 0
     for part in scene.built.parts:
-        end = first + (1 if part.faces is None else len(part.faces))
-        of_mesh[part.name] = box = torch.stack((low[:, first:end].amin(1), high[:, first:end].amax(1)))
-        all_boxes.append(box)
-        if moves(part.name):
-            moving_boxes.append(box)
+        end = first + part.primitive_count
+        box = torch.stack((low[:, first:end].amin(1), high[:, first:end].amax(1)))
+        before = boxes.get(part.name, box)  # a shape may have several parts of its name
+        boxes[part.name] = torch.stack((torch.minimum(box[0], before[0]), torch.maximum(box[1], before[1])))
         first = end
     for k, copy in enumerate(scene.built.copies, 1):
         assert geometry.copies is not None
-        map_ = [getattr(geometry.copies, name)[:, k].double() for name in ("x", "y", "z", "move")]
-        ends = torch.cartesian_prod(*of_mesh[copy.of].T)  # the corners of the mesh's box
-        placed = ends @ torch.stack(map_[:3]) + map_[3]
-        all_boxes.append(torch.stack((placed.amin(0), placed.amax(0))))
-        if moves(copy.name) or moves(copy.of):
-            moving_boxes.append(all_boxes[-1])
-
-    def half_diagonal(boxes: list[Tensor]) -> Tensor:
-        both = torch.stack(boxes)
-        return 0.5 * (both[:, 1].amax(0) - both[:, 0].amin(0)).norm()
-
-    whole = half_diagonal(all_boxes)
-    return (torch.minimum(half_diagonal(moving_boxes), whole) if moving_boxes else _NEAR * whole)[None]
+        x, y, z, move = (getattr(geometry.copies, name)[:, k].double() for name in ("x", "y", "z", "move"))
+        ends = torch.cartesian_prod(*boxes[copy.of].T)  # the corners of the mesh's box
+        placed = ends @ torch.stack((x, y, z)) + move
+        boxes[copy.name] = torch.stack((placed.amin(0), placed.amax(0)))
+    return boxes
 
 
 # ---- From parameters to the tensors of waves, and back once a backward pass

@@ -109,6 +109,11 @@ class Part:
     source: str = field(default="", metadata=NOT_FINGERPRINTED)
     ignored: tuple[str, ...] = field(default=(), metadata=NOT_FINGERPRINTED)
 
+    @property
+    def primitive_count(self) -> int:
+        """Return the number of primitives."""
+        return 1 if self.faces is None else len(self.faces)
+
 
 @dataclass(frozen=True)
 class Copy:

@@ -49,7 +49,7 @@ def describe(
         if owner:
             file_lights.setdefault(owner.removeprefix("shapes."), {})[label] = source.kind
     for part in built.parts:
-        count = len(part.faces) if part.faces is not None else 1
+        count = part.primitive_count
         kind = part.kind if part.quadric is None else part.quadric.name
         row: dict[str, Any] = {"kind": kind, "primitives": count, "material": part.material.name}
         if part.emission is not None:

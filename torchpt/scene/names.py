@@ -48,7 +48,7 @@ class Names:
     def __init__(self, built: SceneBuild, world: World) -> None:
         self._parts, self._copies, self._sources = built.parts, built.copies, built.sources
         # First primitive of each part, and the number of all primitives.
-        self._starts = [0, *accumulate(1 if part.faces is None else len(part.faces) for part in built.parts)]
+        self._starts = [0, *accumulate(part.primitive_count for part in built.parts)]
         rows = None if world.lights is None else world.lights.row_of_prim
         # Primitive of each row of the light table that is a surface; these rows come first.
         self._emissive_prims: list[int] = []

@@ -87,7 +87,7 @@ def cases_of(
         changed = read_description(source, change=lambda raw: moved(raw, matrix, camera_pose), overrides=changes)
         return over_noise(harness, lambda: picture(harness, changed))
 
-    num_primitives = sum(len(part.faces) if part.faces is not None else 1 for part in scene.built.parts)
+    num_primitives = sum(part.primitive_count for part in scene.built.parts)
     searches = ("numba", "torch", *(("brute",) if num_primitives <= BRUTE_MAX_PRIMITIVES else ()))
 
     # Figures of cases take a point of the sweep; those of cases without one leave it unused.

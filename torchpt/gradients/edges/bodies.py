@@ -58,16 +58,16 @@ class Bodies:
 
     @cached_property
     def first_sphere(self) -> int:
-        """The id of the first sphere."""
+        """Return the id of the first sphere."""
         return sum(self.counts[:3])
 
     @cached_property
     def first_quadric(self) -> int:
-        """The id of the first quadric."""
+        """Return the id of the first quadric."""
         return sum(self.counts[:4])
 
     def place(self, prim: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Origin and three axes ``(3, N)`` each of primitives ``(N,)``; the third of flat ones is zero."""
+        """Return origin and three axes ``(3, N)`` each of primitives ``(N,)``; the third of flat ones is zero."""
         table = None
         if self.copies is not None:
             column = torch.searchsorted(self.copies.start[1:], prim, right=True)
@@ -93,12 +93,12 @@ class Bodies:
         return [p0, p0 + x, torch.where(four, p0 + x + y, p0 + y), torch.where(four, p0 + y, p0)]
 
     def points(self, held: Held) -> Tensor:
-        """Where points are ``(3, N)``."""
+        """Return where points are ``(3, N)``."""
         p0, x, y, z = self.place(held.prim)
         return affine(p0 + x * held.a[0], y, held.a[1], z, held.a[2])
 
     def tensors(self) -> dict[str, Tensor]:
-        """All that may move, by name."""
+        """Return all that may move, by name."""
         found = {name: getattr(self, name) for name in ("p0", "e1", "e2", "e3", "lights")}
         if self.copies is not None:
             found |= {f"copies.{name}": getattr(self.copies, name) for name in ("x", "y", "z", "move")}
@@ -106,7 +106,7 @@ class Bodies:
         return found | {f"camera.{name}": value for name, value in own if isinstance(value, Tensor)}
 
     def having(self, tensors: Mapping[str, Tensor]) -> Bodies:
-        """The same of other tensors, named as :meth:`tensors` names them."""
+        """Return the same of other tensors, named as :meth:`tensors` names them."""
 
         def of(stem: str) -> dict[str, Tensor]:
             return {name.removeprefix(stem): t for name, t in tensors.items() if name.startswith(stem)}
@@ -121,7 +121,7 @@ def _moved(table: Instances, w: Tensor) -> Tensor:
 
 
 def bodies_of(scene: Scene, film: Film, params: Mapping[str, Tensor]) -> Bodies:
-    """What moves in a scene under ``params``, differentiable in them."""
+    """Return what moves in a scene under ``params``, differentiable in them."""
     built, space, merged = scene.built, scene.space, scene.merged(params)
     wide = torch.float64
     corners = [corners_of(part, merged, space, wide) for part in built.parts]

@@ -42,6 +42,7 @@ __all__ = [
     "rims",
     "round_outline",
     "rounds_of",
+    "smooth_faces",
     "straight",
     "without_gradient",
 ]
@@ -75,7 +76,7 @@ class Edges:
 
 
 def edges_of(part: Part, device: torch.device) -> Edges:
-    """The edges of a mesh, on a device."""
+    """Return the edges of a mesh, on a device."""
     assert part.faces is not None and part.vertices is not None
     faces, vertices = part.faces, part.vertices
     _, welded = np.unique(vertices, axis=0, return_inverse=True)
@@ -124,7 +125,7 @@ class View:
     w: Tensor | float
 
     def toward(self, p: Tensor) -> Tensor:
-        """From points ``(3, N)`` to where they are seen from; of no particular length."""
+        """Return vectors from points ``(3, N)`` to where they are seen from; of no particular length."""
         return self.e - p * self.w
 
 
@@ -142,18 +143,18 @@ class Curves:
     high: Tensor  # (N,) to where
 
     def within(self, low: Tensor, high: Tensor) -> Curves:
-        """The same from ``low`` to ``high``."""
+        """Return the same from ``low`` to ``high``."""
         return replace(self, low=low, high=high)
 
     def at(self, t: Tensor) -> tuple[Held, Tensor]:
-        """Points at ``t (N,)``, and how their numbers change with it ``(3, N)``."""
+        """Return points at ``t (N,)``, and how their numbers change with it ``(3, N)``."""
         cos, sin = torch.cos(t), torch.sin(t)
         bent, slope = self.a + cos * self.b + sin * self.c, cos * self.c - sin * self.b
         a = torch.where(self.round, bent, self.a + t * self.b)
         return Held(self.prim, a), torch.where(self.round, slope, self.b)
 
     def moving(self, bodies: Bodies, t: Tensor) -> tuple[Held, Tensor, Tensor]:
-        """Points at ``t (N,)``: held, where they are ``(3, N)``, and how that changes with ``t`` ``(3, N)``."""
+        """Return points at ``t (N,)``: held, where they are ``(3, N)``, and how that changes with ``t`` ``(3, N)``."""
         held, slope = self.at(t)
         p0, x, y, z = bodies.place(held.prim)
         along = x * slope[0] + y * slope[1] + z * slope[2]
@@ -166,20 +167,20 @@ def joined(parts: list[Curves]) -> Curves:
 
 
 def straight(prim: Tensor, begin: Tensor, end: Tensor, mate: Tensor | None = None) -> Curves:
-    """Segments between numbers ``(3, N)``, ``t`` from 0 to 1."""
+    """Return segments between numbers ``(3, N)``, ``t`` from 0 to 1."""
     zero, one = torch.zeros_like(begin[0]), torch.ones_like(begin[0])
     mate = torch.full_like(prim, -1) if mate is None else mate
     return Curves(prim, mate, begin, end - begin, torch.zeros_like(begin), zero.bool(), zero, one)
 
 
 def circles(prim: Tensor, middle: Tensor, b: Tensor, c: Tensor) -> Curves:
-    """Whole circles, ``t`` from 0 to 2 pi."""
+    """Return whole circles, ``t`` from 0 to 2 pi."""
     zero = torch.zeros_like(middle[0])
     return Curves(prim, torch.full_like(prim, -1), middle, b, c, zero == 0, zero, zero + 2.0 * math.pi)
 
 
 def mesh_edges(edges: Edges, index: Tensor, first: int, turned: bool) -> tuple[Curves, tuple[Held, Held]]:
-    """Some edges of a mesh, and the corners of both faces that lie off them.
+    """Return some edges of a mesh, and the corners of both faces that lie off them.
 
     Args:
         edges: of the mesh.
@@ -200,7 +201,7 @@ def mesh_edges(edges: Edges, index: Tensor, first: int, turned: bool) -> tuple[C
 
 
 def borders(prim: Tensor) -> Curves:
-    """The four borders of parallelograms ``prim (N,)``: ``4 N`` curves."""
+    """Return the four borders of parallelograms ``prim (N,)``: ``4 N`` curves."""
     around = torch.tensor(
         [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)], dtype=torch.float64, device=prim.device
     ).T
@@ -210,7 +211,7 @@ def borders(prim: Tensor) -> Curves:
 
 
 def rims(prim: Tensor, height: float = 0.0, radius: float = 1.0) -> Curves:
-    """Circles about the third axis of disks and quadrics ``prim (N,)``."""
+    """Return circles about the third axis of disks and quadrics ``prim (N,)``."""
     zero = torch.zeros(3, len(prim), dtype=torch.float64, device=prim.device)
     middle, b, c = zero.clone(), zero.clone(), zero.clone()
     middle[2], b[0], c[1] = height, radius, radius
@@ -218,7 +219,7 @@ def rims(prim: Tensor, height: float = 0.0, radius: float = 1.0) -> Curves:
 
 
 def own_view(bodies: Bodies, prim: Tensor, view: View) -> tuple[Tensor, Tensor]:
-    """Where primitives ``(N,)`` are seen from in their own space: ``(3, N)`` and ``(N,)``."""
+    """Return where primitives ``(N,)`` are seen from in their own space: ``(3, N)`` and ``(N,)``."""
     p0, x, y, z = bodies.place(prim)
     faces = cross(y, z), cross(z, x), cross(x, y)
     away = view.toward(p0)
@@ -228,7 +229,7 @@ def own_view(bodies: Bodies, prim: Tensor, view: View) -> tuple[Tensor, Tensor]:
 
 
 def round_outline(bodies: Bodies, prim: Tensor, view: View) -> tuple[Curves, Tensor]:
-    """Outlines of spheres and ellipsoids ``prim (N,)``, and where there is one ``(N,)``: not as seen from within.
+    """Return outlines of spheres and ellipsoids ``prim (N,)``, and where there is one ``(N,)``: not seen from within.
 
     On the unit sphere the normal is the point: ``q . c = w``, a circle.
     """
@@ -251,7 +252,7 @@ def _unit(like: Tensor, k: int) -> Tensor:
 
 
 def generator(bodies: Bodies, prim: Tensor, form: Form, view: View, side: Tensor) -> tuple[Curves, Tensor]:
-    """One of the two lines of a cylinder's or cone's outline, by ``side (N,)`` of 1 or -1; and where there is one.
+    """Return one of the two lines of a cylinder's or cone's outline, by ``side (N,)`` of 1 or -1; and where there is one.
 
     With ``(x, y)`` the radius times ``(cos t, sin t)`` the tangent plane holds the place where ``x c0 + y c1 = w`` on a
     cylinder, ``w - c2`` on a cone whose tip is at 1.
@@ -299,13 +300,8 @@ class Rounds:
 
 
 def known(form: Form) -> bool:
-    """Whether the outline of a quadric is known: ellipsoids, cylinders and cones."""
+    """Return True if the outline of a quadric is known: of ellipsoids, cylinders and cones."""
     return form.around or (form.half == 0 and (form.bend == 0 or (form.bend < 0 and form.level == 0)))
-
-
-def primitive_count(part: Part) -> int:
-    """Return the number of primitives of a part."""
-    return 1 if part.faces is None else len(part.faces)
 
 
 def marked_primitives(
@@ -319,20 +315,28 @@ def marked_primitives(
         of_copy: whether those of a copy are, given whether those of its mesh are.
     """
     parts = [(part, of_part(part)) for part in scene.built.parts]
-    marks = [[marked] * primitive_count(part) for part, marked in parts]
-    meshes = {part.name: (marked, primitive_count(part)) for part, marked in parts}
+    marks = [[marked] * part.primitive_count for part, marked in parts]
+    meshes = {part.name: (marked, part.primitive_count) for part, marked in parts}
     for copy in scene.built.copies:
         marked, count = meshes[copy.of]
         marks.append([of_copy(copy, marked)] * count)
     return torch.tensor(list(chain.from_iterable(marks)), dtype=torch.bool, device=scene.device)
 
 
+def smooth_faces(scene: Scene, bodies: Bodies) -> tuple[Tensor, Tensor]:
+    """Return the faces that are shaded smooth, those of copies too, by ids of the search, and their areas: ``(F,)`` each."""
+    prim = marked_primitives(scene, lambda part: part.kind == "triangle" and part.smooth).nonzero().squeeze(1)
+    _, x, y, _ = bodies.place(prim)
+    n = cross(x, y)
+    return prim, 0.5 * dot(n, n).sqrt()
+
+
 def _starts(parts: tuple[Part, ...], bodies: Bodies) -> list[int]:
-    """The id of the first primitive of each part."""
+    """Return the id of the first primitive of each part."""
     starts, at = [], 0
     for part in parts:
         starts.append(at)
-        at += primitive_count(part)
+        at += part.primitive_count
     assert at == sum(bodies.counts)
     return starts
 
@@ -345,7 +349,7 @@ def _topology(scene: Scene, part: Part) -> Edges:
 
 
 def folds_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Iterator[Folds]:
-    """The edges of each mesh, and of each copy.
+    """Yield the edges of each mesh, and of each copy.
 
     Args:
         scene: whose.
@@ -397,7 +401,7 @@ def parts_of(bodies: Bodies, curves: Curves) -> Tensor:
 
 
 def plain_of(scene: Scene, bodies: Bodies) -> Curves | None:
-    """Borders of rectangles, rims of disks, and the open ends of cylinders and cones; None where there are none.
+    """Return borders of rectangles, rims of disks, and the open ends of cylinders and cones; None where there are none.
 
     The rim of a closed one is that of its disk.
     """
@@ -422,7 +426,7 @@ def plain_of(scene: Scene, bodies: Bodies) -> Curves | None:
 
 
 def rounds_of(scene: Scene, bodies: Bodies) -> list[Rounds]:
-    """The surfaces that have outlines."""
+    """Return the surfaces that have outlines."""
     parts, found = scene.built.parts, []
     forms: dict[Form | None, list[int]] = {}
     for part, start in zip(parts, _starts(parts, bodies), strict=True):
@@ -443,7 +447,7 @@ _RIM = ("cutoff_angle", "beam_width")
 
 
 def left_out(scene: Scene, settings: Settings) -> list[str]:
-    """Edges of the scene that are not differentiated where surfaces, lights or the camera move, each in a few words."""
+    """Return in a few words each the edges that are not differentiated where surfaces, lights or the camera move."""
     return list(_found(scene, settings))
 
 
@@ -470,12 +474,12 @@ def _found(scene: Scene, settings: Settings) -> Iterator[str]:
 
 
 def _point(device: torch.device) -> Tensor:
-    """Any point ``(3, 1)``: whether a camera has a film for points does not depend on it."""
+    """Return any point ``(3, 1)``: whether a camera has a film for points does not depend on it."""
     return torch.zeros(3, 1, dtype=torch.float64, device=device)
 
 
 def without_gradient(scene: Scene, wanted: Iterable[str]) -> list[str]:
-    """Those of the parameters of which pictures depend by jumps alone, so that their gradients are 0."""
+    """Return the parameters on which pictures depend by jumps alone, so that their gradients are 0."""
     owners = [*scene.built.parts, *scene.built.copies]
     cut = {
         material.name

@@ -30,13 +30,13 @@ class Worth:
         self._whole = float(torch.from_numpy(filter.profile(middle.numpy())).mean()) * 2.0 * filter.radius
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """Least and greatest x, then y, of what the picture sees of the film."""
+        """Return least and greatest x, then y, of what the picture sees of the film."""
         x, y, width, height = self._crop
         beyond = max(self._filter.radius - 0.5, 0.0)
         return x - beyond, x + width + beyond, y - beyond, y + height + beyond
 
     def at(self, s: Tensor) -> Tensor:
-        """``(C, N)`` at places ``s (2, N)`` of the film, in pixels."""
+        """Return ``(C, N)`` at places ``s (2, N)`` of the film, in pixels."""
         (x0, wx), (y0, wy) = (self._taps(s[k], self._crop[k], self._crop[k + 2]) for k in range(2))
         width, height = self._crop[2:]
         total = torch.zeros(len(self._values), s.shape[1], dtype=torch.float64, device=s.device)
@@ -47,7 +47,7 @@ class Worth:
         return total
 
     def _taps(self, s: Tensor, low: int, size: int) -> tuple[Tensor, list[Tensor]]:
-        """The first pixel ``(N,)`` that sees a coordinate, and the filter there and at those that follow; 0 off the picture."""
+        """Return the first pixel ``(N,)`` that sees a coordinate, and the filter there and at those behind; 0 off the film."""
         radius = self._filter.radius
         first = torch.ceil(s - 0.5 - radius).long() - low
         weights = []
@@ -62,14 +62,14 @@ class Worth:
 
 
 def film_places(camera: Camera, p: Tensor) -> Tensor:
-    """Places ``(2, N)`` of points ``(3, N)`` on the film; any for those behind the camera."""
+    """Return places ``(2, N)`` of points ``(3, N)`` on the film; any for those behind the camera."""
     seen = camera.film_of(p)
     assert seen is not None
     return seen[:2] / torch.where(seen[2] > 0, seen[2], 1.0)
 
 
 def slopes(camera: Camera, p: Tensor) -> tuple[Tensor, Tensor]:
-    """Places ``(2, N)`` of points on the film and how they change with them ``(2, 3, N)``, detached."""
+    """Return places ``(2, N)`` of points on the film and how they change with them ``(2, 3, N)``, detached."""
     with torch.enable_grad():
         leaf = p.detach().clone().requires_grad_()
         s = film_places(camera, leaf)

@@ -15,18 +15,18 @@ from torchpt.gradients.edges.bodies import Bodies, bodies_of
 from torchpt.gradients.edges.curves import marked_primitives
 from torchpt.gradients.edges.film import Worth
 from torchpt.gradients.edges.horizons import Horizons, horizons_of
+from torchpt.gradients.edges.occluders import occluders_of
 from torchpt.gradients.edges.primary import Look, pieces_of, primary_of
-from torchpt.gradients.edges.receivers import Frame
-from torchpt.gradients.edges.segments import Segments, segments_of
-from torchpt.gradients.edges.shadows import Shadows, occluders_of, sources_of
+from torchpt.gradients.edges.receivers import MovingFrame
+from torchpt.gradients.edges.segments import Segments, SegmentSampler, smooth_of
+from torchpt.gradients.edges.shadows import Shadows, sources_of
 from torchpt.gradients.edges.traced import Traced, traced_of
-from torchpt.gradients.parameters import near_of
+from torchpt.gradients.parameters import near_of, scene_reach
 from torchpt.math.vectors import take
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.ranks import Group, share
 from torchpt.scene import Scene
 from torchpt.scene.settings import Settings
-from torchpt.search.bounds import primitive_bounds
 from torchpt.spec import Moves
 
 __all__ = ["Boundary", "add_gradients", "boundary_of", "concerns"]
@@ -40,7 +40,7 @@ class Samples(Protocol):
     """Samples of edges."""
 
     def sum(self, bodies: Bodies) -> Tensor:
-        """Whose derivative is theirs."""
+        """Return a number, differentiable in ``bodies``, whose derivative is theirs."""
         ...
 
 
@@ -49,7 +49,7 @@ def concerns(scene: Scene, names: Iterable[str]) -> bool:
     return any(scene.spec(name).moves in (Moves.SURFACES, Moves.SHADOWS) for name in names)
 
 
-def moving_primitives(scene: Scene, bodies: Bodies, names: Iterable[str]) -> Tensor:
+def moving_primitives(scene: Scene, names: Iterable[str]) -> Tensor:
     """Return a mask ``(P,)`` of the primitives, by ids of the search, that any of the parameters moves."""
     names = [name for name in names if scene.spec(name).moves is Moves.SURFACES]
 
@@ -108,7 +108,7 @@ class Boundary:
         return [by_name.get(name) for name in wanted]
 
     def primary(self, spp: int, look: Look, held: bool = False) -> Iterator[Samples]:
-        """Samples of the edges that the camera sees, chunk by chunk; ``look``: what rays beside them see.
+        """Yield samples of the edges that the camera sees, chunk by chunk; ``look``: what rays beside them see.
 
         ``held``: they count as they move over what is seen beside them.
         """
@@ -124,7 +124,7 @@ class Boundary:
             yield primary.samples(first, count, total, self.worth, look, held)
 
     def shadows(self, spp: int, holds_first: bool = False) -> Iterator[Samples]:
-        """Samples of the edges of shadows: of lights, then of what surfaces reflect.
+        """Yield samples of the edges of shadows of lights, of edges in reflected light, and of horizons.
 
         ``holds_first``: the interior holds in place what the camera sees.
         """
@@ -140,43 +140,33 @@ class Boundary:
         depth = integrator.limits.max_depth
         if not isinstance(integrator, PathIntegrator) or 0 <= depth < 2:
             return
+        world = self.traced.wave.context.world
         with torch.no_grad():
+            reach = float(scene_reach(self.scene, world.geometry))
+            sources = sources_of(still, world, reach, met=integrator.strategy in ("bsdf", "uniform"))
+            if sources is None:
+                return
+            moves = moving_primitives(self.scene, self.leaves)
+            emitters_move = bool(take(moves, sources.prim[: sources.surfaces]).any())
             poses = self.scene.merged(self.params)
-            world = self.traced.wave.context.world
-            _, geometry = self.scene.world(torch.float32, self.params)
-            near = near_of(self.scene, world.geometry, self.leaves)
-            moves = moving_primitives(self.scene, still, self.leaves)
+            occluders = occluders_of(
+                self.scene, still, poses, moves, lights_move=emitters_move or "lights" in self.moving
+            )
             camera_moves = any(name.startswith("camera.") for name in self.leaves)
-            frame = Frame(still, self.traced, self.worth, near, moves, holds_first, camera_moves)
-            low, high = primitive_bounds(geometry)
-            reach = float((high.double().amax(1) - low.double().amin(1)).norm()) * 0.5
-            met = integrator.strategy in ("bsdf", "uniform")
-            lights_move = "lights" in self.moving or bool((moves & self._emits(len(moves))).any())
-            occluders = occluders_of(self.scene, still, poses, moves | lights_move)
-            sources = sources_of(still, world, reach, met)
-        if sources is None:
-            return
+            near = near_of(self.scene, world.geometry, self.leaves)
+            frame = MovingFrame(still, self.traced, self.worth, near, moves, holds_first, camera_moves)
+            reflects = bool(self.moving.keys() - {"lights"})
+            smooth = smooth_of(self.scene, still) if reflects else None
+            horizons = horizons_of(self.scene, frame, depth) if reflects else None
         if occluders is not None:
             yield Shadows(frame, occluders, sources, reach, depth)
-        if self.moving.keys() - {"lights"}:
-            with torch.no_grad():
-                segments = segments_of(self.scene, frame, poses, depth)
-                horizons = horizons_of(self.scene, frame, depth)
-            if segments is not None:
-                yield segments
-            if horizons is not None:
-                yield horizons
-
-    def _emits(self, count: int) -> Tensor:
-        """Return a mask ``(P,)`` of primitives that emit light, by ids of the search."""
-        world = self.traced.wave.context.world
-        every = torch.arange(count, device=self.scene.device)
-        if world.lights is None or world.lights.row_of_prim is None:
-            return every < 0
-        return take(world.lights.row_of_prim, world.geometry.slot(every)) >= 0
+            if reflects and not 0 <= depth < 3:
+                yield Segments(frame, SegmentSampler(occluders, smooth), depth)
+        if horizons is not None:
+            yield horizons
 
     def _chunks(self, total: int) -> Iterator[tuple[int, int]]:
-        """First samples and how many."""
+        """Yield the first samples of chunks and their numbers."""
         for _, first in share(range(0, total, SAMPLES), self.ranks):
             yield first, min(SAMPLES, total - first)
 

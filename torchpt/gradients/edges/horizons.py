@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
-from torchpt.gradients.edges.curves import marked_primitives
-from torchpt.gradients.edges.receivers import LONGEST, ROUNDING, Frame, Prefix, held_at, prefixes_of
+from torchpt.gradients.edges.curves import smooth_faces
+from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
 from torchpt.gradients.edges.traced import Use
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.sampling import Distribution1D, uniform_triangle
@@ -84,7 +84,7 @@ class Horizons:
         depth: vertices of paths at most; -1: any number.
     """
 
-    frame: Frame
+    frame: MovingFrame
     prim: Tensor
     choice: Distribution1D
     area: Tensor
@@ -94,9 +94,7 @@ class Horizons:
     def samples(self, first: int, count: int, total: int) -> HorizonSamples | None:
         """Return samples ``first .. first + count`` of ``total``; None where none of them counts."""
         traced, bodies = self.frame.traced, self.frame.bodies
-        number = torch.arange(first, first + count, device=bodies.p0.device)
-        key = traced.key(number, Use.HORIZONS)
-        u, coin = traced.edge(number, key, total)
+        number, key, u, coin = traced.edges(first, count, total, Use.HORIZONS)
         draws = traced.draws(key)
         place, angle = draws.two(Dimension.LIGHT).double(), 2.0 * math.pi * draws.two(Dimension.BSDF)[0].double()
         index, _ = self.choice.draw(u)
@@ -110,27 +108,18 @@ class Horizons:
         omega = along * torch.cos(angle) + cross(across, along) * torch.sin(angle)
         spot = self._spot(prim, uv, x, omega)
         n = spot.n.double() * side
-        tiny = x.abs().amax(0).clamp_min(1e-300) * ROUNDING
-        size = torch.stack([axis.abs().amax(0) for axis in (e1, e2)]).amax(0)
-        o, d = x + n * torch.maximum(tiny, size * ROUNDING), normalize(omega + n * _TILT)
+        o, d = x + n * self.frame.rounding(prim, x), normalize(omega + n * _TILT)
         y = met(traced, o, d)
-        found = y.hit.prim
-        r = torch.where(found >= 0, y.hit.t.double(), 1.0)
-        share = torch.where(found >= 0, self.frame.share(found, r), 1.0)
-        seen = held_at(bodies, found.clamp_min(0), torch.stack((y.hit.u, y.hit.v)), y.p.double())
-        moves = self.frame.moving(prim) | self.frame.moving(found)
-        longest = (self.depth if self.depth >= 0 else LONGEST) - 1
+        r = torch.where(y.hit.prim >= 0, y.hit.t.double(), 1.0)
+        moves = self.frame.moving(prim) | self.frame.moving(y.hit.prim)
         prefixes = []
-        for prefix in prefixes_of(self.frame, spot, omega, key, longest, side.to(spot.p)):
-            some = (prefix.moves() | take(moves, prefix.lane)).nonzero().squeeze(1)
-            if not len(some):
-                continue
-            prefix = prefix.taken(some)
-            lane = prefix.lane
-            depth = self.depth if self.depth < 0 else self.depth - prefix.count
-            rays = take(o, lane), take(d, lane), take(number, lane), Use.BEHIND
-            light = traced.radiance(*rays, depth) * prefix.weight
-            prefixes.append((prefix, light.sum(0) * take(weight, lane)))
+        for prefix in prefixes_of(
+            self.frame, spot, omega, key, self.depth, behind=1, moves=moves, side=side.to(spot.p)
+        ):
+            lane, depth = prefix.lane, self.depth if self.depth < 0 else self.depth - prefix.count
+            light = traced.radiance(take(o, lane), take(d, lane), take(number, lane), Use.BEHIND, depth)
+            prefixes.append((prefix, (light * prefix.weight).sum(0) * take(weight, lane)))
+        seen, share = y.held(bodies), self.frame.share(y.hit.prim, r)
         return HorizonSamples(face, n, omega, seen, r, share, prefixes) if prefixes else None
 
     def _spot(self, prim: Tensor, uv: Tensor, x: Tensor, omega: Tensor) -> Spot:
@@ -141,7 +130,7 @@ class Horizons:
         return Spot(self.frame.traced, x.to(dtype), omega.to(dtype), hit, at.p, at.ng)
 
 
-def horizons_of(scene: Scene, frame: Frame, depth: int) -> Horizons | None:
+def horizons_of(scene: Scene, frame: MovingFrame, depth: int) -> Horizons | None:
     """Return the estimator; None where no face is shaded smooth.
 
     Args:
@@ -152,12 +141,9 @@ def horizons_of(scene: Scene, frame: Frame, depth: int) -> Horizons | None:
     geometry = frame.traced.wave.context.world.geometry
     if geometry.normals is None or 0 <= depth < 2:
         return None
-    prim = marked_primitives(scene, lambda part: part.kind == "triangle" and part.smooth).nonzero().squeeze(1)
+    prim, area = smooth_faces(scene, frame.bodies)
     if not len(prim):
         return None
-    _, e1, e2, _ = frame.bodies.place(prim)
-    n = cross(e1, e2)
-    area = 0.5 * dot(n, n).sqrt()
     dtype, apart = geometry.p0.dtype, torch.zeros_like(area)
     for u, v in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
         uv = torch.tensor([[u], [v]], dtype=dtype, device=prim.device).expand(2, len(prim))

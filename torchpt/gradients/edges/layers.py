@@ -44,7 +44,7 @@ class Asked:
 
 
 def followed(settings: Settings) -> tuple[str, ...]:
-    """The layers that have gradients: of first surfaces, and no names of things."""
+    """Return the layers that have gradients: of first surfaces, and no names of things."""
     kinds = {name: LAYERS[name] for name in settings.film.aovs}
     return tuple(name for name, kind in kinds.items() if issubclass(kind, SurfaceLayer) and kind.averaged)
 
@@ -78,7 +78,7 @@ def differentiable(
 def _gradients(
     asked: Asked, names: tuple[str, ...], params: dict[str, Tensor], cotangents: tuple[Tensor, ...]
 ) -> list[Tensor | None]:
-    """The gradients of the parameters that are wanted."""
+    """Return the gradients of the parameters that are wanted."""
     scene, settings, unit = asked.scene, asked.settings, asked.scene.space.unit
     kinds = [surface_layer(name) for name in names]
     worth = torch.cat([c * (unit if kind.length else 1.0) for c, kind in zip(cotangents, kinds, strict=True)], 2)

@@ -53,7 +53,7 @@ _SHARE, _LEAST = 0.25, 2.0**-6
 
 
 def step_of(bodies: Bodies) -> float:
-    """A whole step, in pixels: a few hundred roundings of a ray's direction."""
+    """Return a whole step, in pixels: a few hundred roundings of a ray's direction."""
     width = float(max(bodies.camera.resolution))
     spread = float(bodies.camera.pixel()[4]) * width  # of the film at distance 1
     narrow = max(1.0, 1.0 / spread) if float(bodies.camera.pixel()[3]) else 1.0
@@ -61,7 +61,7 @@ def step_of(bodies: Bodies) -> float:
 
 
 def steps_at(bodies: Bodies, faces: tuple[Tensor, Tensor], s: Tensor) -> Tensor:
-    """Steps ``(N,)`` in pixels: shorter where a ray a whole step beside an edge would pass the whole of a narrow face.
+    """Return steps ``(N,)`` in pixels: shorter where a ray a whole step beside an edge would pass a narrow face.
 
     Args:
         bodies: detached.
@@ -81,18 +81,18 @@ def steps_at(bodies: Bodies, faces: tuple[Tensor, Tensor], s: Tensor) -> Tensor:
 
 
 def outline_of(bodies: Bodies, prim: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """The four sides of parallelograms ``(N,)`` on the film, from ``(2, N)`` to ``(2, N)``; a triangle's last has no length."""
+    """Return the sides of parallelograms ``(N,)`` on the film, from and to ``(2, N)``; a triangle's last has no length."""
     places = [film_places(bodies.camera, corner) for corner in bodies.corners(prim)]
     return list(zip(places, [*places[1:], places[0]], strict=True))
 
 
 def is_flat(bodies: Bodies, prim: Tensor) -> Tensor:
-    """Which primitives ``(N,)`` are triangles or parallelograms; copies are of meshes."""
+    """Return a mask ``(N,)`` of the primitives that are triangles or parallelograms; copies are of meshes."""
     return (prim >= 0) & ((prim < sum(bodies.counts[:2])) | (prim >= sum(bodies.counts)))
 
 
 def distance_to(s: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """From places ``(2, N)`` to segments ``a b``."""
+    """Return distances ``(N,)`` of places ``(2, N)`` from segments ``a b``."""
     along = b - a
     square = (along * along).sum(0)
     share = (((s - a) * along).sum(0) / torch.where(square > 0, square, 1.0)).clamp(0.0, 1.0)
@@ -107,7 +107,7 @@ def distance_to(s: Tensor, a: Tensor, b: Tensor) -> Tensor:
 
 
 def share_of(bodies: Bodies, held: Held, mate: Tensor, s: Tensor, prim: Tensor, near: Tensor, step: Tensor) -> Tensor:
-    """Parts ``(N,)`` with which places of edges count.
+    """Return the parts ``(N,)`` with which places of edges count.
 
     Args:
         bodies: detached.
@@ -156,7 +156,7 @@ class Pieces:
     weight: Tensor
 
     def place(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """``t (N,)`` of places ``u`` in [0, 1) along each piece on the film, and ``du / dt``."""
+        """Return ``t (N,)`` of places ``u`` in [0, 1) along each piece on the film, and ``du / dt``."""
         a, b = self.near
         span = self.curves.high - self.curves.low
         share = u * a / (u * a + (1.0 - u) * b)
@@ -165,13 +165,13 @@ class Pieces:
 
 
 def view_of(bodies: Bodies) -> View:
-    """The camera as a place or a direction."""
+    """Return the camera as a place or a direction."""
     pixel = bodies.camera.pixel().detach()
     return View(pixel[:3, None], float(pixel[3]))
 
 
 def pieces_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bounds) -> Pieces | None:
-    """All that may be seen within ``bounds`` of the film; None where nothing may.
+    """Return all that may be seen within ``bounds`` of the film; None where nothing may.
 
     Args:
         scene: whose.
@@ -202,7 +202,7 @@ def pieces_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bo
 
 
 def _silhouettes(bodies: Bodies, folds: Folds, view: View) -> tuple[Curves, Tensor]:
-    """Edges that are seen as outlines or creases, and their importance."""
+    """Return edges that are seen as outlines or creases, and their importance."""
     _held, p, along = folds.curves.moving(bodies, torch.zeros_like(folds.curves.low))
     across = cross(along, view.toward(p))
     one, two = (dot(across, bodies.points(other) - p) for other in folds.others)
@@ -215,7 +215,7 @@ def _silhouettes(bodies: Bodies, folds: Folds, view: View) -> tuple[Curves, Tens
 
 
 def _lines(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) -> Pieces:
-    """Straight curves clipped to the film; on homogeneous places, since they may run behind the camera."""
+    """Return straight curves clipped to the film; on homogeneous places, since they may run behind the camera."""
     low, high = torch.zeros_like(curves.low), torch.ones_like(curves.low)
     ends = []
     for t in (low, high):
@@ -243,13 +243,13 @@ def _lines(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) -
 
 
 def _apart(first: Tensor, last: Tensor) -> Tensor:
-    """Distances on the film between homogeneous places of it ``(4, N)``."""
+    """Return distances on the film between homogeneous places of it ``(4, N)``."""
     a, b = (s[:2] / torch.where(s[2] > 0, s[2], 1.0) for s in (first, last))
     return ((a - b) * (a - b)).sum(0).sqrt()
 
 
 def _arcs(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) -> Pieces:
-    """Round curves in pieces that may lie on the film; one that comes near the camera weighs as much as the film is wide."""
+    """Return round curves in pieces that may lie on the film; near the camera one weighs as much as the film is wide."""
     some = (importance > 0).nonzero().squeeze(1)
     curves, importance = rows(curves, some), take(importance, some)
     many = torch.arange(len(some), device=some.device).repeat_interleave(_CUTS)
@@ -304,7 +304,7 @@ class Along:
     beside: tuple[Tensor, Tensor, Tensor] | None = None
 
     def sum(self, bodies: Bodies) -> Tensor:
-        """Differentiable in ``bodies``; of no meaning but for its derivative."""
+        """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
         total = (film_places(bodies.camera, bodies.points(self.held)) * self.weight).sum()
         if self.beside is None:
             return total
@@ -332,12 +332,11 @@ class Primary:
 
     @torch.no_grad()
     def samples(self, first: int, count: int, total: int, worth: Worth, look: Look, over: bool = False) -> Along:
-        """Samples ``first .. first + count`` of ``total``: those that are seen.
+        """Return samples ``first .. first + count`` of ``total``: those that are seen.
 
         ``over``: they count as they move over what is seen on both sides, which is held in place.
         """
-        number = torch.arange(first, first + count, device=self.pieces.weight.device)
-        u, _ = self.traced.edge(number, self.traced.key(number, Use.PRIMARY), total)
+        number, _, u, _ = self.traced.edges(first, count, total, Use.PRIMARY)
         index, rest = self.choice.draw(u)
         chance = take(self.choice.pmf, index)
         pieces = rows(self.pieces, index)
@@ -372,7 +371,7 @@ class Primary:
         return Along(rows(held, index), normal * (worthy / chance), beside)
 
     def _beside(self, s: Tensor, unit: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
-        """Rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""
+        """Return rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""
         places = torch.cat((s - unit * step, s + unit * step), 1)
         o, d = self.bodies.camera.rays(places[0], places[1], None)
         return o.expand_as(d), d

@@ -29,12 +29,12 @@ from torchpt.math.vectors import cross, dot, largest, rows, take
 from torchpt.paths.roulette import russian_roulette, survival_probability
 from torchpt.physics.shapes.interaction import slide_share
 
-__all__ = ["LONGEST", "ROUNDING", "Frame", "Prefix", "Stop", "held_at", "prefixes_of"]
+__all__ = ["MovingFrame", "PathVertex", "Prefix", "prefixes_of"]
 
-#: Rounding of a point that the search finds, against its coordinates and its distance.
-ROUNDING = 2.0**-18
+#: Rounding of a point that the search finds, against its coordinates.
+_ROUNDING = 2.0**-18
 #: Vertices after which light that reaches no camera is given up where paths have no limit of their own.
-LONGEST = 32
+_MAX_VERTICES = 32
 #: From this vertex on roulette plays.
 _ROULETTE = 3
 #: What ends so close to a point, against the way to it, ends at it: of the point's own primitive, and of others.
@@ -44,7 +44,7 @@ _MARGIN = 16.0
 
 
 @dataclass(frozen=True)
-class Frame:
+class MovingFrame:
     """The frame of the interior, and what is seen in it.
 
     Attributes:
@@ -66,13 +66,15 @@ class Frame:
     camera_moves: bool
 
     def share(self, prim: Tensor, r: Tensor) -> Tensor:
-        """Return the share ``(N,)`` by which points of primitives slide at the ends of rays of length ``r (N,)``."""
+        """Return the share ``(N,)`` by which points slide at the ends of rays of length ``r (N,)``; 1 where these miss."""
         world = self.traced.wave.context.world
-        share = slide_share(r, self.near)
-        if world.lights is None or world.lights.row_of_prim is None:
-            return share
-        emits = take(world.lights.row_of_prim, world.geometry.slot(prim.clamp_min(0))) >= 0
-        return torch.where(emits, 0.0, share)
+        return torch.where(prim >= 0, slide_share(world, prim.clamp_min(0), r, self.near), 1.0)
+
+    def rounding(self, prim: Tensor, *points: Tensor) -> Tensor:
+        """Return the rounding of points ``(3, N)`` of primitives that the search finds ``(N,)``."""
+        p0, *axes = self.bodies.place(prim)
+        size = p0.abs() + sum((axis.abs() for axis in axes), torch.zeros_like(p0))
+        return torch.stack([largest(p.abs()) for p in (size, *points)]).amax(0) * _ROUNDING
 
     def moving(self, prim: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of primitives that move; False where ``prim`` is -1."""
@@ -80,8 +82,8 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Stop:
-    """Points of surfaces on paths from the camera, M lanes.
+class PathVertex:
+    """Vertices of paths from the camera, M lanes.
 
     Attributes:
         held: the points, held on their surfaces.
@@ -103,67 +105,78 @@ class Prefix:
         lane: ``(M,)`` the receivers.
         weight: ``(3, M)`` worth of the light that arrives at them, by area.
         place: ``(2, M)`` of the paths on the film.
-        stops: the surfaces, first that which the camera sees; the last is the receiver.
+        vertices: those behind the camera, first that which it sees; the last is the receiver.
     """
 
-    frame: Frame
+    frame: MovingFrame
     lane: Tensor
     weight: Tensor
     place: Tensor
-    stops: tuple[Stop, ...]
+    vertices: tuple[PathVertex, ...]
 
     @property
     def count(self) -> int:
-        """Return the number of surfaces."""
-        return len(self.stops)
+        """Return the number of vertices behind the camera."""
+        return len(self.vertices)
 
     def taken(self, index: Tensor) -> Prefix:
         """Return some of the lanes."""
-        return Prefix(self.frame, *rows((self.lane, self.weight, self.place, self.stops), index))
+        return Prefix(self.frame, *rows((self.lane, self.weight, self.place, self.vertices), index))
 
     def moves(self) -> Tensor:
         """Return a mask ``(M,)`` of the paths that move."""
         if self.frame.camera_moves and not self.frame.holds_first:
             return torch.ones_like(self.lane, dtype=torch.bool)
         moving = torch.zeros_like(self.lane, dtype=torch.bool)
-        for stop in self.stops:
-            moving = moving | self.frame.moving(stop.held.prim)
+        for vertex in self.vertices:
+            moving = moving | self.frame.moving(vertex.held.prim)
         return moving
 
     def receivers(self, bodies: Bodies) -> Tensor:
         """Return where the receivers are in the interior's frame ``(3, M)``, differentiable in ``bodies``."""
-        first, *others = self.stops
+        first, *others = self.vertices
         x = bodies.points(first.held)
         if not self.frame.holds_first:
             o, d = bodies.camera.rays(self.place[0], self.place[1], None)
             x = o + d * (dot(first.n, x - o) / dot(first.n, d))
         before = first.p
-        for stop in others:
-            away = stop.p - before
+        for vertex in others:
+            away = vertex.p - before
             r = dot(away, away).sqrt()
-            at = bodies.points(stop.held)
-            slid = x + away * (dot(stop.n, at - x) / dot(stop.n, away))
-            x, before = at + (slid - at) * self.frame.share(stop.held.prim, r), stop.p
+            at = bodies.points(vertex.held)
+            slid = x + away * (dot(vertex.n, at - x) / dot(vertex.n, away))
+            x, before = at + (slid - at) * self.frame.share(vertex.held.prim, r), vertex.p
         return x
 
 
 def prefixes_of(
-    frame: Frame, spot: Spot, wi: Tensor, key: Tensor, longest: int, side: Tensor | None = None
+    frame: MovingFrame,
+    spot: Spot,
+    wi: Tensor,
+    key: Tensor,
+    depth: int,
+    behind: int,
+    *,
+    moves: Tensor | None = None,
+    side: Tensor | None = None,
 ) -> list[Prefix]:
-    """Return paths from the camera to receivers, by the number of surfaces; those with the same number in one.
+    """Return paths from the camera to receivers; those with the same number of vertices in one.
 
     Args:
         frame: of the interior.
         spot: the receivers.
         wi: ``(3, N)`` unit directions from which light arrives at them.
         key: the sampler's keys ``(rows, N)`` of the samples.
-        longest: the greatest number of surfaces.
+        depth: vertices of whole paths at most; -1: any number.
+        behind: the least number of vertices between receiver and light, the light included.
+        moves: ``(N,)`` bool: what the light passes moves; elsewhere only paths that move themselves are returned. None: all.
         side: ``(N,)`` where light arrives in the plane of the receivers' geometric normals, see :meth:`Spot.sent`.
     """
+    longest = (depth if depth >= 0 else _MAX_VERTICES) - behind
     found: list[Prefix] = []
     lane = torch.arange(wi.shape[1], device=wi.device)
     carried = torch.ones_like(wi)
-    stops = [_stop(frame, spot)]
+    vertices = [_vertex(frame, spot)]
     for k in range(1, longest + 1):
         index, place, wo = _seen(frame, spot)
         if len(index):
@@ -174,11 +187,14 @@ def prefixes_of(
             _, jacobian = slopes(frame.bodies.camera, seen.p.double())
             area = dot(cross(jacobian[0], jacobian[1]), seen.n.double()).abs()
             weight = frame.worth.at(place) * sent * take(carried, index) * area
-            some = (weight != 0).any(0).nonzero().squeeze(1)
+            chain = tuple(rows(vertex, index) for vertex in reversed(vertices))
+            prefix = Prefix(frame, take(lane, index), weight, place, chain)
+            counts = (weight != 0).any(0)
+            if moves is not None:
+                counts &= prefix.moves() | take(moves, prefix.lane)
+            some = counts.nonzero().squeeze(1)
             if len(some):
-                chosen = take(index, some)
-                chain = tuple(rows(stop, chosen) for stop in reversed(stops))
-                found.append(Prefix(frame, take(lane, chosen), take(weight, some), take(place, some), chain))
+                found.append(prefix.taken(some))
         if k == longest:
             break
         o, d, weight = spot.scattered(wi.to(spot.p), take(key, lane), k + 1, side)
@@ -196,17 +212,16 @@ def prefixes_of(
         if not len(kept):
             break
         lane, carried, spot = take(lane, kept), take(carried, kept), spot.taken(some)
-        stops = [*(rows(stop, kept) for stop in stops), _stop(frame, spot)]
+        vertices = [*(rows(vertex, kept) for vertex in vertices), _vertex(frame, spot)]
         wi = -spot.d.double()
     return found
 
 
-def _stop(frame: Frame, spot: Spot) -> Stop:
-    p = spot.p.double()
-    return Stop(held_at(frame.bodies, spot.hit.prim, torch.stack((spot.hit.u, spot.hit.v)), p), p, spot.n.double())
+def _vertex(frame: MovingFrame, spot: Spot) -> PathVertex:
+    return PathVertex(spot.held(frame.bodies), spot.p.double(), spot.n.double())
 
 
-def _seen(frame: Frame, spot: Spot) -> tuple[Tensor, Tensor, Tensor]:
+def _seen(frame: MovingFrame, spot: Spot) -> tuple[Tensor, Tensor, Tensor]:
     """Return which points the camera sees ``(n,)``, their places on the film, and directions to the camera."""
     camera, x = frame.bodies.camera, spot.p.double()
     seen = camera.film_of(x)
@@ -225,22 +240,3 @@ def _seen(frame: Frame, spot: Spot) -> tuple[Tensor, Tensor, Tensor]:
     visible = ((prim == take(spot.hit.prim, index)) & (off < _NEAR)) | (off < _NEAREST)
     some = visible.nonzero().squeeze(1)
     return take(index, some), take(s, some), -take(d, some)
-
-
-def held_at(bodies: Bodies, prim: Tensor, uv: Tensor, x: Tensor) -> Held:
-    """Return points of surfaces, held there.
-
-    Args:
-        bodies: detached.
-        prim: their primitives ``(N,)``.
-        uv: ``(2, N)`` as the search gives them.
-        x: the points ``(3, N)``.
-    """
-    a = torch.cat((uv.double(), torch.zeros_like(x[:1])))
-    if bodies.counts[3] or bodies.counts[4]:
-        bent = ((prim >= bodies.first_sphere) & (prim < sum(bodies.counts))).nonzero().squeeze(1)
-        p0, *axes = bodies.place(take(prim, bent))
-        faces = [cross(axes[1], axes[2]), cross(axes[2], axes[0]), cross(axes[0], axes[1])]
-        away, det = take(x, bent) - p0, dot(axes[0], faces[0])
-        a[:, bent] = torch.stack([dot(face, away) / det for face in faces])
-    return Held(prim, a)

@@ -23,80 +23,66 @@ which aims at lights.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
-from torchpt.gradients.edges.curves import (
-    Curves,
-    Rounds,
-    folds_of,
-    joined,
-    marked_primitives,
-    parts_of,
-    plain_of,
-    rounds_of,
-)
-from torchpt.gradients.edges.receivers import LONGEST, ROUNDING, Frame, Prefix, held_at, prefixes_of
-from torchpt.gradients.edges.shadows import STILL
+from torchpt.gradients.edges.curves import smooth_faces
+from torchpt.gradients.edges.occluders import Occluders
+from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
 from torchpt.gradients.edges.traced import Use
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.sampling import Distribution1D, uniform_sphere, uniform_triangle
-from torchpt.math.vectors import Frame as Basis
-from torchpt.math.vectors import concatenate_lanes, cross, dot, largest, normalize, rows, take
+from torchpt.math.vectors import Frame, concatenate_lanes, cross, dot, normalize, rows, take
 from torchpt.physics.samplers import Dimension
 from torchpt.physics.shapes.quadrics import Form
 from torchpt.scene import Scene
 
-__all__ = ["SegmentSamples", "Segments", "segments_of"]
+__all__ = ["SegmentRays", "SegmentSampler", "SegmentSamples", "Segments", "smooth_of"]
 
 #: Rays go so far beside an edge, against the way to it, beyond the rounding.
 _STEP = 2.0**-16
 #: What ends so close to an edge, against the way to it, ends at it.
 _NEAR = 2.0**-10
-#: Least weight of a crease against a border of the same length.
-_CREASE = 0.1
-#: Faces at an angle below this make no edge.
+#: Faces at an angle below this have no directions from which both lie to one side.
 _PLAIN = 1e-6
 #: Part of the directions that are drawn toward points of surfaces shaded smooth, where there are any.
 _TOWARD = 0.5
 
 
-# ---- What segments begin at
+# ---- Rays from edges to receivers
 
 
 @dataclass(frozen=True)
-class Starts:
-    """Places of edges with directions, N lanes.
+class SegmentRays:
+    """Points of edges with directions toward receivers, N lanes.
 
     Attributes:
-        held: the places.
+        held: the points.
         mate: the other face at each; -1: there is none.
         e: where they are ``(3, N)``.
-        tangent: of the edge ``(3, N)``, unit.
         out: normals of round surfaces ``(3, N)``; 0 on edges.
         curvature: ``(N,)`` of round surfaces along ``omega``; 0 on edges.
         omega: unit directions ``(3, N)``.
         density: ``(N,)`` of ``omega`` by solid angle; 1 where ``weight`` has it.
         target: ``(3, N)`` points toward which directions were drawn.
         aimed: ``(N,)`` bool: they were.
-        weight: ``(N,)`` the measure over the density of the place.
+        m: ``(3, N)`` unit vectors across both the edge and ``omega``.
+        weight: ``(N,)`` the measure over the density of the point.
     """
 
     held: Held
     mate: Tensor
     e: Tensor
-    tangent: Tensor
     out: Tensor
     curvature: Tensor
     omega: Tensor
     density: Tensor
     target: Tensor
     aimed: Tensor
+    m: Tensor
     weight: Tensor
 
 
@@ -108,15 +94,13 @@ class Smooth:
         prim: ids ``(S,)``.
         choice: of a face, by area.
         area: of all.
-        mask: ``(P,)`` bool: which of all primitives they are.
     """
 
     prim: Tensor
     choice: Distribution1D
     area: float
-    mask: Tensor
 
-    def draw(self, bodies: Bodies, u: Tensor) -> Held:
+    def draw(self, u: Tensor) -> Held:
         """Return points ``(N,)``, evenly by area; ``u (2, N)``."""
         index, rest = self.choice.draw(u[0])
         place = uniform_triangle(torch.stack((rest, u[1])))
@@ -124,31 +108,40 @@ class Smooth:
 
 
 @dataclass(frozen=True)
-class Brinks:
-    """Edges and round surfaces along whose outlines light jumps.
+class CurveSample:
+    """CurveSample curves and random numbers of N rays.
 
     Attributes:
-        bodies: detached.
-        curves: E edges that are known; None: there are none.
-        others: corners off the edges, of both faces.
-        folded: ``(E,)`` bool: edges of two faces.
-        part: ``(E,)`` with which edges count where others lie on them.
-        rounds: R round surfaces by kind.
-        choice: of the E edges, then of the R surfaces.
+        index: of the curves ``(N,)``.
+        rest: ``(N,)`` where on them, in [0, 1).
+        chance: ``(N,)`` of the curves.
+        direction: ``(2, N)``.
+        aim: ``(2, N)`` of points toward which directions go.
+        coins: ``(2, N)`` how directions are drawn.
+    """
+
+    index: Tensor
+    rest: Tensor
+    chance: Tensor
+    direction: Tensor
+    aim: Tensor
+    coins: Tensor
+
+
+@dataclass(frozen=True)
+class SegmentSampler:
+    """Draws points of edges and of round surfaces, and directions.
+
+    Attributes:
+        occluders: the edges and round surfaces.
         smooth: faces that are shaded smooth; None: there are none.
     """
 
-    bodies: Bodies
-    curves: Curves | None
-    others: tuple[Held, Held]
-    folded: Tensor
-    part: Tensor
-    rounds: list[Rounds]
-    choice: Distribution1D
+    occluders: Occluders
     smooth: Smooth | None
 
-    def draw(self, u: Tensor, direction: Tensor, aim: Tensor, coins: Tensor) -> Starts:
-        """Draw places and directions.
+    def draw(self, u: Tensor, direction: Tensor, aim: Tensor, coins: Tensor) -> SegmentRays:
+        """Draw rays.
 
         Args:
             u: ``(N,)`` where on the edges.
@@ -156,41 +149,32 @@ class Brinks:
             aim: ``(2, N)`` of points toward which directions go.
             coins: ``(2, N)`` how the direction is drawn.
         """
-        index, rest = self.choice.draw(u)
-        chance = take(self.choice.pmf, index)
-        count = 0 if self.curves is None else len(self.curves.prim)
+        index, rest = self.occluders.creases.draw(u)
+        sample = CurveSample(index, rest, take(self.occluders.creases.pmf, index), direction, aim, coins)
+        form = take(self.occluders.form, index)
         lanes, parts = [], []
-
-        def add(first: int, end: int, make: Callable[..., Starts], *given: Any) -> None:
-            lane = ((index >= first) & (index < end)).nonzero().squeeze(1)
-            if len(lane):
-                lanes.append(lane)
-                parts.append(
-                    make(
-                        take(index, lane) - first,
-                        *given,
-                        *(take(x, lane) for x in (rest, chance, direction, aim, coins)),
-                    )
-                )
-
-        add(0, count, self._edges)
-        for rounds in self.rounds:
-            add(count, count + len(rounds.prim), self._rounds, rounds)
-            count += len(rounds.prim)
+        for number in range(-1, len(self.occluders.forms) + 1):
+            lane = (form == number).nonzero().squeeze(1)
+            if not len(lane):
+                continue
+            lanes.append(lane)
+            mine = rows(sample, lane)
+            if number < 0:
+                parts.append(self._edges(mine))
+            else:
+                parts.append(self._rounds(mine, self.occluders.forms[number - 1] if number else None))
         return rows(concatenate_lanes(parts), torch.argsort(torch.cat(lanes)))
 
-    def _edges(
-        self, index: Tensor, rest: Tensor, chance: Tensor, direction: Tensor, aim: Tensor, coins: Tensor
-    ) -> Starts:
-        """Places on edges, and directions: evenly, where both faces lie to one side, and toward smooth faces."""
-        assert self.curves is not None
-        part = rows(self.curves, index)
+    def _edges(self, sample: CurveSample) -> SegmentRays:
+        """Draw points of edges, and directions: evenly, where both faces lie to one side, and toward smooth faces."""
+        index, direction, coins = sample.index, sample.direction, sample.coins
+        bodies, part = self.occluders.bodies, rows(self.occluders.curves, index)
         span = part.high - part.low
-        held, e, along = part.moving(self.bodies, part.low + rest * span)
+        held, e, along = part.moving(bodies, part.low + sample.rest * span)
         length = dot(along, along).sqrt()
         tangent = along / length
         # Axes across the edge, the first in the first face; the second face is at an angle of beta.
-        one, other = (self._across(rows(face, index), e, tangent) for face in self.others)
+        one, other = (self._across(rows(face, index), e, tangent) for face in self.occluders.others)
         cosine = dot(one, other).clamp(-1.0, 1.0)
         bend = other - one * cosine
         plain = dot(bend, bend) < _PLAIN * _PLAIN
@@ -198,7 +182,7 @@ class Brinks:
         beta = torch.acos(cosine)
         # At so many angles, and as many opposite ones, both faces lie to one side.
         wedge = math.pi - beta
-        folded = take(self.folded, index) & ~plain & (wedge > _PLAIN)
+        folded = take(self.occluders.folded, index) & ~plain & (wedge > _PLAIN)
         wedge = torch.where(folded, wedge, 1.0)
         angle = 2.0 * math.pi * direction[1]
         within = folded & (coins[0] < 0.5)
@@ -210,7 +194,7 @@ class Brinks:
         target, aimed = e, torch.zeros_like(folded)
         if self.smooth is not None:
             aimed = coins[1] < _TOWARD
-            target = torch.where(aimed, self.bodies.points(self.smooth.draw(self.bodies, aim)), e)
+            target = torch.where(aimed, bodies.points(self.smooth.draw(sample.aim)), e)
             away = target - e
             size = dot(away, away).sqrt()
             aimed = aimed & (size > 0)
@@ -218,24 +202,24 @@ class Brinks:
         angle = torch.remainder(torch.atan2(dot(omega, two), dot(omega, one)), math.pi)
         even = torch.where(folded, 0.25, 0.5) / math.pi
         density = 0.5 * (even + torch.where(folded & (angle >= beta), 0.25 / wedge, 0.0))
-        zero = torch.zeros_like(e)
-        weight = length * span * take(self.part, index) / chance
-        return Starts(held, part.mate, e, tangent, zero, zero[0], omega, density, target, aimed, weight)
+        side = cross(tangent, omega)
+        sine = dot(side, side).sqrt()
+        m, zero = side / torch.where(sine > 0, sine, 1.0), torch.zeros_like(e)
+        weight = sine * length * span * take(self.occluders.part, index) / sample.chance
+        return SegmentRays(held, part.mate, e, zero, zero[0], omega, density, target, aimed, m, weight)
 
     def _across(self, face: Held, e: Tensor, tangent: Tensor) -> Tensor:
-        """Unit vectors in faces ``(3, N)``, across their edges."""
-        away = self.bodies.points(face) - e
+        """Return unit vectors in faces ``(3, N)``, across their edges."""
+        away = self.occluders.bodies.points(face) - e
         away = away - tangent * dot(tangent, away)
         length = dot(away, away).sqrt()
-        return torch.where(length > 0, away / torch.where(length > 0, length, 1.0), Basis.about(tangent).s)
+        return torch.where(length > 0, away / torch.where(length > 0, length, 1.0), Frame.about(tangent).s)
 
-    def _rounds(
-        self, index: Tensor, rounds: Rounds, rest: Tensor, chance: Tensor, direction: Tensor, aim: Tensor, coins: Tensor
-    ) -> Starts:
-        """Places on round surfaces, evenly in their own space, and directions along them."""
-        prim, form = take(rounds.prim, index), rounds.form
-        a, gradient, size = _place(form, torch.stack((rest, direction[0])))
-        p0, *axes = self.bodies.place(prim)
+    def _rounds(self, sample: CurveSample, form: Form | None) -> SegmentRays:
+        """Draw points of round surfaces, evenly in their own space, and directions along the surfaces."""
+        prim = take(self.occluders.curves.prim, sample.index)
+        a, gradient, size = _place(form, torch.stack((sample.rest, sample.direction[0])))
+        p0, *axes = self.occluders.bodies.place(prim)
         e = p0 + axes[0] * a[0] + axes[1] * a[1] + axes[2] * a[2]
         faces = [cross(axes[1], axes[2]), cross(axes[2], axes[0]), cross(axes[0], axes[1])]
         det = dot(axes[0], faces[0])
@@ -243,13 +227,13 @@ class Brinks:
         steep = dot(normal, normal).sqrt()  # the slope of the surface's equation in the world
         normal = normal / steep
         area = size * det.abs() * steep / dot(gradient, gradient).sqrt()
-        basis, angle = Basis.about(normal), 2.0 * math.pi * direction[1]
+        basis, angle = Frame.about(normal), 2.0 * math.pi * sample.direction[1]
         omega = basis.s * torch.cos(angle) + basis.t * torch.sin(angle)
         own = torch.stack([dot(face, omega) / det for face in faces]).square()
         curvature = (own[0] + own[1] + (1.0 if form is None else form.bend) * own[2]).abs() / steep
-        weight = curvature * area * (2.0 * math.pi) / chance
+        weight = curvature * area * (2.0 * math.pi) / sample.chance
         none, one = torch.full_like(prim, -1), torch.ones_like(weight)
-        return Starts(Held(prim, a), none, e, basis.s, normal, curvature, omega, one, e, none >= 0, weight)
+        return SegmentRays(Held(prim, a), none, e, normal, curvature, omega, one, e, none >= 0, normal, weight)
 
 
 def _place(form: Form | None, u: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -267,74 +251,17 @@ def _place(form: Form | None, u: Tensor) -> tuple[Tensor, Tensor, float]:
     return torch.stack((cos, sin, u[1])), torch.stack((cos, sin, torch.zeros_like(cos))), 2.0 * math.pi
 
 
-def brinks_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Tensor) -> Brinks | None:
-    """Return all edges and round surfaces, by length; None where there are none.
-
-    Args:
-        scene: the scene.
-        bodies: detached.
-        poses: the parameters.
-        moves: ``(P,)`` bool: primitives that move.
-    """
-    curves, others, folded, weights = [], [], [], []
-
-    def add(part: Curves, faces: tuple[Held, Held], folds: Tensor, share: Tensor | float) -> None:
-        _, _, along = part.moving(bodies, 0.5 * (part.low + part.high))
-        moving = take(moves, part.prim) | ((part.mate >= 0) & take(moves, part.mate.clamp_min(0)))
-        length = dot(along, along).sqrt() * (part.high - part.low)
-        curves.append(part)
-        others.append(faces)
-        folded.append(folds)
-        weights.append(length * torch.where(moving, 1.0, STILL) * share)
-
-    for folds in folds_of(scene, bodies, poses):
-        apart = folds.normals[0] - folds.normals[1]
-        bend = dot(apart, apart).sqrt()
-        share = torch.where(folds.border, 1.0, torch.where(bend > _PLAIN, bend.clamp(_CREASE, 1.0), 0.0))
-        add(folds.curves, folds.others, ~folds.border, share)
-    fixed = plain_of(scene, bodies)
-    if fixed is not None:
-        own = Held(fixed.prim, fixed.at(fixed.low)[0].a)
-        add(fixed, (own, own), torch.zeros_like(fixed.round), 1.0)
-    rounds = rounds_of(scene, bodies)
-    for some in rounds:
-        _, *axes = bodies.place(some.prim)
-        size = sum((dot(axis, axis).sqrt() for axis in axes), torch.zeros_like(axes[0][0]))
-        weights.append(2.0 * size * torch.where(take(moves, some.prim), 1.0, STILL))
-    if not weights or not bool((torch.cat(weights) > 0).any()):
-        return None
-    every = joined(curves) if curves else None
-    part = torch.zeros(0, dtype=torch.float64, device=scene.device)
-    if every is not None:  # of those that are drawn at all
-        drawn = (torch.cat(weights[: len(curves)]) > 0).nonzero().squeeze(1)
-        part = torch.ones_like(every.low).index_copy(0, drawn, parts_of(bodies, rows(every, drawn)))
-    firsts, seconds = ([pair[k] for pair in others] for k in range(2))
-    zero = Held(torch.zeros(0, dtype=torch.int64), torch.zeros(3, 0, dtype=torch.float64))
-    return Brinks(
-        bodies,
-        every,
-        (concatenate_lanes(firsts), concatenate_lanes(seconds)) if others else (zero, zero),
-        torch.cat(folded) if folded else part > 0,
-        part,
-        rounds,
-        Distribution1D.of(torch.cat(weights), torch.float64, even=0.0),
-        smooth_of(scene, bodies),
-    )
-
-
 def smooth_of(scene: Scene, bodies: Bodies) -> Smooth | None:
-    """Return the faces that are shaded smooth, those of copies too; None where there are none."""
-    mask = marked_primitives(scene, lambda part: part.kind == "triangle" and part.smooth)
-    if not bool(mask.any()):
-        return None
-    prim = mask.nonzero().squeeze(1)
-    _, x, y, _ = bodies.place(prim)
-    n = cross(x, y)
-    area = 0.5 * dot(n, n).sqrt()
-    return Smooth(prim, Distribution1D.of(area, torch.float64, even=0.0), float(area.sum()), mask)
+    """Return the faces that are shaded smooth; None where there are none."""
+    prim, area = smooth_faces(scene, bodies)
+    return Smooth(prim, Distribution1D.of(area, torch.float64, even=0.0), float(area.sum())) if len(prim) else None
 
 
 # ---- Samples
+
+
+#: The sides of an edge.
+_SIGNS = (1.0, -1.0)
 
 
 @dataclass(frozen=True)
@@ -363,21 +290,21 @@ class SegmentSamples:
         m: unit vectors across them, as receivers see them ``(3, N)``.
         r: ``(N,)`` from the receivers to the edge.
         sides: what is seen on both sides.
-        seen: prefixes of the receivers, each with the light ``(2, M)`` from both sides.
+        prefixes: of the receivers, each with the light ``(2, M)`` from both sides.
     """
 
     edge: Held
     m: Tensor
     r: Tensor
     sides: list[Side]
-    seen: list[tuple[Prefix, Tensor]]
+    prefixes: list[tuple[Prefix, Tensor]]
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
         value = torch.zeros((), dtype=self.r.dtype, device=self.r.device)
         e = dot(self.m, bodies.points(self.edge))
         ends = [dot(self.m, bodies.points(side.held)) for side in self.sides]
-        for prefix, light in self.seen:
+        for prefix, light in self.prefixes:
             lane = prefix.lane
             x = dot(take(self.m, lane), prefix.receivers(bodies))
             c = take(e, lane) - x
@@ -393,112 +320,91 @@ class Segments:
 
     Attributes:
         frame: of the interior.
-        brinks: what segments begin at.
+        sampler: draws rays from edges to receivers.
         depth: vertices of paths at most; -1: any number.
     """
 
-    frame: Frame
-    brinks: Brinks
+    frame: MovingFrame
+    sampler: SegmentSampler
     depth: int
 
     @torch.no_grad()
     def samples(self, first: int, count: int, total: int) -> SegmentSamples | None:
         """Return samples ``first .. first + count`` of ``total``; None where none of them counts."""
-        traced, bodies = self.frame.traced, self.frame.bodies
-        number = torch.arange(first, first + count, device=bodies.p0.device)
-        key = traced.key(number, Use.REFLECTED)
-        u, coin = traced.edge(number, key, total)
+        traced = self.frame.traced
+        number, key, u, coin = traced.edges(first, count, total, Use.REFLECTED)
         draws = traced.draws(key)
         direction, aim = draws.two(Dimension.BSDF).double(), draws.two(Dimension.LIGHT).double()
-        starts = self.brinks.draw(u, direction, aim, torch.stack((coin, draws.one(Dimension.LOBE).double())))
-        starts, spot, lane = self._arrived(starts)
-        if not len(lane):
-            return None
+        coins = torch.stack((coin, draws.one(Dimension.LOBE).double()))
+        rays, spot, lane = self._receivers(self.sampler.draw(u, direction, aim, coins))
         number, key = take(number, lane), take(key, lane)
-        return self._between(starts, spot, number, key, total)
+        return self._samples(rays, spot, number, key, total) if len(lane) else None
 
-    def _rounding(self, *points: Tensor) -> Tensor:
-        """Return the rounding of points that the search finds ``(N,)``."""
-        largest_of = torch.stack([largest(p.abs()) for p in points]).amax(0)
-        return largest_of * ROUNDING
-
-    def _size(self, prim: Tensor) -> Tensor:
-        """Return the largest coordinates of primitives ``(3, N)``."""
-        p0, *axes = self.frame.bodies.place(prim)
-        return p0.abs() + sum((axis.abs() for axis in axes), torch.zeros_like(p0))
-
-    def _arrived(self, starts: Starts) -> tuple[Starts, Spot, Tensor]:
-        """Return the starts whose rays meet a receiver, the receivers, and which lanes these are."""
-        tiny = self._rounding(self._size(starts.held.prim))
-        lift = (starts.omega + starts.out) * (4.0 * tiny)
-        spot = met(self.frame.traced, starts.e + lift, starts.omega)
-        p, n, prim = spot.p.double(), spot.n.double(), spot.hit.prim
-        away = p - starts.e
+    def _receivers(self, rays: SegmentRays) -> tuple[SegmentRays, Spot, Tensor]:
+        """Return the rays that meet a receiver, the receivers, and which lanes these are."""
+        tiny = self.frame.rounding(rays.held.prim)
+        spot = met(self.frame.traced, rays.e + (rays.omega + rays.out) * (4.0 * tiny), rays.omega)
+        p, hits = spot.p.double(), spot.hit.prim >= 0
+        away = p - rays.e
         r = dot(away, away).sqrt()
-        density = starts.density
-        smooth = self.brinks.smooth
-        good = (prim >= 0) & (r > 16.0 * torch.maximum(tiny, self._rounding(p)))
+        hits &= r > 16.0 * self.frame.rounding(rays.held.prim, p)
+        smooth = self.sampler.smooth
         if smooth is not None:
-            mine = take(smooth.mask, prim.clamp_min(0)) & (prim >= 0)
-            toward = r * r / (dot(n, starts.omega).abs().clamp_min(1e-12) * smooth.area)
-            mixed = (1.0 - _TOWARD) * density + torch.where(mine, _TOWARD * toward, 0.0)
-            density = torch.where(starts.curvature > 0, density, mixed)
-            off = p - starts.target
-            hits = dot(off, off).sqrt() < 1e-3 * r + 8.0 * tiny
-            good &= ~starts.aimed | (mine & hits)
-        lane = good.nonzero().squeeze(1)
-        starts = replace(starts, density=density)
-        return rows(starts, lane), spot.taken(lane), lane
+            shaded = torch.isin(spot.hit.prim, smooth.prim)
+            by_area = r * r / (dot(spot.n.double(), rays.omega).abs().clamp_min(1e-12) * smooth.area)
+            density = (1.0 - _TOWARD) * rays.density + torch.where(shaded, _TOWARD * by_area, 0.0)
+            off = p - rays.target
+            # The density is that of what is met first: directions to points behind it count nothing.
+            hits &= ~rays.aimed | (shaded & (dot(off, off).sqrt() < 1e-3 * r + 8.0 * tiny))
+            rays = replace(rays, density=torch.where(rays.curvature > 0, rays.density, density))
+        lane = hits.nonzero().squeeze(1)
+        return rows(rays, lane), spot.taken(lane), lane
 
-    def _between(self, starts: Starts, spot: Spot, number: Tensor, key: Tensor, total: int) -> SegmentSamples | None:
-        """Return the samples of starts and the receivers that they met."""
-        x, n = spot.p.double(), spot.n.double()
-        n = n * -torch.sign(dot(n, starts.omega))
-        round_ = starts.curvature > 0
-        side = cross(starts.tangent, starts.omega)
-        size = dot(side, side).sqrt()
-        m = torch.where(round_, starts.out, side / torch.where(size > 0, size, 1.0))
-        weight = torch.where(round_, 1.0, size) * starts.weight / (starts.density * total)
-        tiny = self._rounding(x, starts.e, self._size(starts.held.prim))
-        o = x + n * tiny
-        way = starts.e - o
+    def _samples(
+        self, rays: SegmentRays, receiver: Spot, number: Tensor, key: Tensor, total: int
+    ) -> SegmentSamples | None:
+        """Return the samples of rays and the receivers that they met; None where none of them counts."""
+        x, n = receiver.p.double(), receiver.n.double()
+        tiny = self.frame.rounding(rays.held.prim, x, rays.e)
+        o = x - n * (torch.sign(dot(n, rays.omega)) * tiny)
+        way = rays.e - o
         r = dot(way, way).sqrt()
         step = r * _STEP + tiny
-        ok = (r > 16.0 * tiny) & (weight > 0) & torch.isfinite(weight)
-        spots, sides = [], []
-        for sign in (1.0, -1.0):
-            y = met(self.frame.traced, o, way + m * (step * sign))
-            prim = y.hit.prim
-            reach = torch.where(prim >= 0, y.hit.t.double(), r)
-            touches = dot(y.n.double(), starts.e - y.p.double()).abs() < 6.0 * step
-            ahead = torch.where(
-                round_ & (prim == starts.held.prim), 12.0 * (step / starts.curvature.clamp_min(1e-3)).sqrt(), r * _NEAR
-            )
-            ok &= (prim < 0) | (reach > r - ahead) | touches
-            held = held_at(self.frame.bodies, prim.clamp_min(0), torch.stack((y.hit.u, y.hit.v)), y.p.double())
-            spots.append(y)
-            sides.append(Side(sign, held, reach, torch.where(prim >= 0, self.frame.share(prim, r=reach), 1.0)))
-        lane = ok.nonzero().squeeze(1)
+        weight = rays.weight / (rays.density * total)
+        counts = (r > 16.0 * tiny) & (weight > 0) & torch.isfinite(weight)
+        seen = [met(self.frame.traced, o, way + rays.m * (step * sign)) for sign in _SIGNS]
+        for y in seen:
+            counts &= self._ends_at(rays, y, r, step)
+        lane = counts.nonzero().squeeze(1)
         if not len(lane):
             return None
-        starts, spot, number, key = rows(starts, lane), spot.taken(lane), take(number, lane), take(key, lane)
-        m, r, weight, o = take(m, lane), take(r, lane), take(weight, lane), take(o, lane)
-        sides, spots = [rows(side, lane) for side in sides], [y.taken(lane) for y in spots]
-        moves = self.frame.moving(starts.held.prim) | self.frame.moving(starts.mate)
-        for y in spots:
+        rays, receiver, number, key = rows(rays, lane), receiver.taken(lane), take(number, lane), take(key, lane)
+        seen, o, r, weight = [y.taken(lane) for y in seen], take(o, lane), take(r, lane), take(weight, lane)
+        moves = self.frame.moving(rays.held.prim) | self.frame.moving(rays.mate)
+        for y in seen:
             moves = moves | self.frame.moving(y.hit.prim)
-        longest = (self.depth if self.depth >= 0 else LONGEST) - 2
-        seen = []
-        for prefix in prefixes_of(self.frame, spot, -starts.omega, key, longest):
-            some = (prefix.moves() | take(moves, prefix.lane)).nonzero().squeeze(1)
-            if not len(some):
-                continue
-            prefix = prefix.taken(some)
+        prefixes = []
+        for prefix in prefixes_of(self.frame, receiver, -rays.omega, key, self.depth, behind=2, moves=moves):
             depth = self.depth if self.depth < 0 else self.depth - prefix.count
-            light = [self._reflected(y, o, number, prefix.lane, depth) for y in spots]
+            light = [self._reflected(y, o, number, prefix.lane, depth) for y in seen]
             scale = prefix.weight * take(weight, prefix.lane)
-            seen.append((prefix, torch.stack([(scale * part).sum(0) for part in light])))
-        return SegmentSamples(starts.held, m, r, sides, seen) if seen else None
+            prefixes.append((prefix, torch.stack([(scale * part).sum(0) for part in light])))
+        if not prefixes:
+            return None
+        sides = [self._side(sign, y, r) for sign, y in zip(_SIGNS, seen, strict=True)]
+        return SegmentSamples(rays.held, rays.m, r, sides, prefixes)
+
+    def _ends_at(self, rays: SegmentRays, y: Spot, r: Tensor, step: Tensor) -> Tensor:
+        """Return a mask ``(N,)`` of rays beside edges that do not end before these, but for what touches there."""
+        own = (rays.curvature > 0) & (y.hit.prim == rays.held.prim)  # a round surface comes forward quickly
+        ahead = torch.where(own, 12.0 * (step / rays.curvature.clamp_min(1e-3)).sqrt(), r * _NEAR)
+        touches = dot(y.n.double(), rays.e - y.p.double()).abs() < 6.0 * step
+        return (y.hit.prim < 0) | (y.hit.t.double() > r - ahead) | touches
+
+    def _side(self, sign: float, y: Spot, r: Tensor) -> Side:
+        """Return what receivers see beside the edge; nothing is as far as the edge."""
+        reach = torch.where(y.hit.prim >= 0, y.hit.t.double(), r)
+        return Side(sign, y.held(self.frame.bodies), reach, self.frame.share(y.hit.prim, reach))
 
     def _reflected(self, spot: Spot, o: Tensor, number: Tensor, lane: Tensor, depth: int) -> Tensor:
         """Return the light ``(3, M)`` that what was met in lanes ``(M,)`` reflects, along paths of so many vertices."""
@@ -511,18 +417,3 @@ class Segments:
         radiance = self.frame.traced.radiance
         found[:, some] = radiance(*rays, depth) - radiance(*rays, 1)  # without light of sources themselves
         return found
-
-
-def segments_of(scene: Scene, frame: Frame, poses: dict[str, Tensor], depth: int) -> Segments | None:
-    """Return the estimator; None where no light is reflected past edges.
-
-    Args:
-        scene: the scene.
-        frame: of the interior.
-        poses: the parameters.
-        depth: vertices of paths at most; -1: any number.
-    """
-    if 0 <= depth < 3:
-        return None
-    brinks = brinks_of(scene, frame.bodies, poses, frame.moves)
-    return None if brinks is None else Segments(frame, brinks, depth)

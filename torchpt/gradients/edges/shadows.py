@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
-from torchpt.gradients.edges.curves import (
-    Curves,
-    Rounds,
-    View,
-    folds_of,
-    generator,
-    joined,
-    parts_of,
-    plain_of,
-    round_outline,
-    rounds_of,
-    straight,
-)
-from torchpt.gradients.edges.receivers import LONGEST, Frame, Prefix, held_at, prefixes_of
+from torchpt.gradients.edges.curves import View
+from torchpt.gradients.edges.occluders import EdgePoints, Occluders
+from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
 from torchpt.gradients.edges.traced import Use
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.sampling import Distribution1D, concentric_disk, uniform_sphere, uniform_triangle
@@ -34,11 +23,9 @@ from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.samplers import Dimension, Draws
 from torchpt.physics.shapes import quadrics
 from torchpt.physics.shapes.geometry import Interaction
-from torchpt.physics.shapes.quadrics import Form
 from torchpt.physics.world import World
-from torchpt.scene import Scene
 
-__all__ = ["STILL", "Beam", "Cast", "Occluders", "Passed", "Shadows", "Sources", "occluders_of", "sources_of"]
+__all__ = ["Beam", "Cast", "Shadows", "Sources", "sources_of"]
 
 
 # ---- Points on lights, drawn for all edges alike: by power, and evenly over a light's surface
@@ -117,7 +104,7 @@ class Sources:
         return torch.ones_like(row, dtype=torch.bool) if lights.kind is None else take(lights.kind, row) == kind
 
     def _place(self, name: str, prim: Tensor, u: Tensor) -> Tensor:
-        """Numbers ``(3, n)`` of places even by area, in a quadric's own space."""
+        """Return numbers ``(3, n)`` of places even by area, in a quadric's own space."""
         if name == "quadric":
             assert self.world.geometry.quadrics is not None
             return quadrics.sample(quadrics.rows(self.world, prim), u)
@@ -128,7 +115,7 @@ class Sources:
         return torch.cat((place, torch.zeros_like(u[:1])))
 
     def brought(self, beam: Beam, x: Tensor) -> Tensor:
-        """What lights bring to points ``x (3, N)`` float64, over the density of the draw: irradiance on what faces them."""
+        """Return what lights bring to points ``x (3, N)`` float64, over the density of the draw: irradiance facing them."""
         lights, found = self.world.lights, torch.zeros(3, x.shape[1], dtype=torch.float64, device=x.device)
         assert lights is not None
         for k, name in enumerate(lights.kinds):
@@ -145,7 +132,7 @@ class Sources:
         return found
 
     def _shone(self, name: str, lights: Lights, at: Lights, beam: Beam, x: Tensor) -> Tensor:
-        """The same of surfaces."""
+        """Return the same of surfaces."""
         y, a = beam.view.e, beam.held.a
         normal = at.normal.double().expand_as(y)
         if name == "sphere":
@@ -170,7 +157,7 @@ class Sources:
 
 
 def sources_of(bodies: Bodies, world: World, reach: float, met: bool) -> Sources | None:
-    """The lights; None where there are none.
+    """Return the lights; None where there are none.
 
     Args:
         bodies: detached.
@@ -205,172 +192,6 @@ def sources_of(bodies: Bodies, world: World, reach: float, met: bool) -> Sources
     return Sources(bodies, world, Distribution1D.of(weight, torch.float64, even=0.05), prim, surfaces)
 
 
-# ---- The curves of a scene that may throw shadows, to be drawn from before it is known where the light comes from
-
-
-#: Least weight of an edge between faces that almost lie in one plane, against a border of the same length.
-_LEAST = 0.01
-
-
-@dataclass(frozen=True)
-class Passed:
-    """Places of curves that light passes, N lanes.
-
-    Attributes:
-        lane: ``(N,)`` of those that were asked for: where there is no outline there is no place.
-        held: the places.
-        mate: the other face at each, -1 where there is none.
-        p: where they are ``(3, N)``.
-        along: how ``p`` changes with the curve's parameter.
-        density: of the draw in that parameter, over the part with which the curve counts.
-    """
-
-    lane: Tensor
-    held: Held
-    mate: Tensor
-    p: Tensor
-    along: Tensor
-    density: Tensor
-
-
-@dataclass(frozen=True)
-class Occluders:
-    """K curves and round surfaces.
-
-    Attributes:
-        bodies: detached.
-        curves: what is not known before the light is (an outline) has its primitive alone.
-        others: corners off the edges, of both faces.
-        folded: ``(K,)`` bool: edges of two faces, which throw a shadow only where both lie to one side of it.
-        part: ``(K,)`` with which curves count where others lie on them.
-        form: ``(K,)`` -1 where the curve is known, 0 for outlines of spheres, from 1 on of ``forms``.
-        forms: of cylinders and cones.
-        choice: among them.
-    """
-
-    bodies: Bodies
-    curves: Curves
-    others: tuple[Held, Held]
-    folded: Tensor
-    part: Tensor
-    form: Tensor
-    forms: list[Form]
-    choice: Distribution1D
-
-    def draw(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return curves ``(N,)``, what is left of ``u``, and their chances."""
-        index, rest = self.choice.draw(u)
-        return index, rest, take(self.choice.pmf, index)
-
-    def place(self, index: Tensor, rest: Tensor, chance: Tensor, coin: Tensor, view: View) -> Passed:
-        """Places on drawn curves as they are seen from ``view``.
-
-        Args:
-            index: curves ``(N,)``.
-            rest: in [0, 1), where on them.
-            chance: of the curves.
-            coin: in [0, 1): which of two lines.
-            view: ``N`` places or directions.
-        """
-        curves, form = rows(self.curves, index), take(self.form, index)
-        some, chance = torch.ones_like(form, dtype=torch.bool), chance.clone()
-        for number in range(len(self.forms) + 1):
-            mine = (form == number).nonzero().squeeze(1)
-            if not len(mine):
-                continue
-            part, prim = rows(view, mine), take(curves.prim, mine)
-            if number == 0:
-                found, there = round_outline(self.bodies, prim, part)
-            else:
-                side = torch.where(take(coin, mine) < 0.5, -1.0, 1.0).double()
-                found, there = generator(self.bodies, prim, self.forms[number - 1], part, side)
-                chance[mine] *= 0.5
-            some[mine] = there
-            for f in fields(Curves):
-                getattr(curves, f.name)[..., mine] = getattr(found, f.name)
-        span = curves.high - curves.low
-        held, p, along = curves.moving(self.bodies, curves.low + rest * span)
-        across = cross(along, view.toward(p))
-        one, two = (dot(across, self.bodies.points(rows(other, index)) - p) for other in self.others)
-        some &= ~take(self.folded, index) | (one * two >= 0)
-        some &= dot(across, across) > 0
-        passed = Passed(
-            torch.arange(len(index), device=index.device),
-            held,
-            curves.mate,
-            p,
-            along,
-            chance / (span * take(self.part, index)),
-        )
-        return rows(passed, some.nonzero().squeeze(1))
-
-
-#: Weight of edges that do not move: only what is behind and before them does.
-STILL = 0.3
-
-
-def occluders_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Tensor) -> Occluders | None:
-    """Return all curves, by their length and the chance to be an outline; None where there are none.
-
-    Args:
-        scene: the scene.
-        bodies: detached.
-        poses: the parameters.
-        moves: ``(P,)`` bool: primitives that move, or all where lights do.
-    """
-    curves, firsts, seconds, folded, weights, forms = [], [], [], [], [], []
-    for folds in folds_of(scene, bodies, poses):
-        _, _, along = folds.curves.moving(bodies, torch.zeros_like(folds.curves.low))
-        cosine = dot(*folds.normals).abs().clamp_max(1.0)
-        # Of directions around an edge this share has both faces on one side, whichever way the normals point.
-        share = torch.where(folds.border, 1.0, (torch.acos(cosine) / math.pi).clamp_min(_LEAST))
-        curves.append(folds.curves)
-        firsts.append(folds.others[0])
-        seconds.append(folds.others[1])
-        folded.append(~folds.border)
-        weights.append(dot(along, along).sqrt() * share)
-        forms.append(torch.full_like(folds.curves.prim, -1))
-    fixed = plain_of(scene, bodies)
-    if fixed is not None:
-        _, _, along = fixed.moving(bodies, fixed.low)
-        curves.append(fixed)
-        weights.append(dot(along, along).sqrt() * (fixed.high - fixed.low))
-        forms.append(torch.full_like(fixed.prim, -1))
-    kinds: list[Form] = []
-    for rounds in rounds_of(scene, bodies):
-        weight, number = _round_weight(bodies, rounds), 0
-        if rounds.form is not None:
-            kinds.append(rounds.form)
-            number = len(kinds)
-        zero = torch.zeros(3, len(rounds.prim), dtype=torch.float64, device=scene.device)
-        curves.append(straight(rounds.prim, zero, zero))
-        weights.append(weight)
-        forms.append(torch.full_like(rounds.prim, number))
-    for k, part in enumerate(curves):
-        if k >= len(firsts):
-            held = Held(part.prim, part.a)
-            firsts.append(held)
-            seconds.append(held)
-            folded.append(torch.zeros_like(part.prim, dtype=torch.bool))
-    if not curves or not bool((torch.cat(weights) > 0).any()):
-        return None
-    others = [Held(torch.cat([h.prim for h in x]), torch.cat([h.a for h in x], 1)) for x in (firsts, seconds)]
-    every = joined(curves)
-    moving = take(moves, every.prim) | ((every.mate >= 0) & take(moves, every.mate.clamp_min(0)))
-    choice = Distribution1D.of(torch.cat(weights) * torch.where(moving, 1.0, STILL), torch.float64, even=0.0)
-    form = torch.cat(forms)
-    drawn = ((form < 0) & (torch.cat(weights) > 0)).nonzero().squeeze(1)
-    part = torch.ones_like(every.low).index_copy(0, drawn, parts_of(bodies, rows(every, drawn)))
-    return Occluders(bodies, every, (others[0], others[1]), torch.cat(folded), part, form, kinds, choice)
-
-
-def _round_weight(bodies: Bodies, rounds: Rounds) -> Tensor:
-    """About the lengths of outlines ``(N,)``."""
-    _, x, y, z = bodies.place(rounds.prim)
-    long = [dot(axis, axis).sqrt() for axis in (x, y, z)]
-    return 2.0 * long[2] if rounds.form is not None else (2.0 * math.pi / 3.0) * (long[0] + long[1] + long[2])
-
-
 # ---- Edges of shadows: curves on surfaces along which light from one point begins to pass an edge
 #
 # For a point y of a light, held on its surface, and a place p on an outline as y sees it, the ray from y past p meets a
@@ -399,7 +220,7 @@ class Cast:
         edge: the places past which it goes.
         receiver: the points where it arrives.
         normal: of the receiver ``(3, N)``.
-        seen: prefixes of the receivers, each with weights ``(3, M)`` of their motion over the receiver.
+        prefixes: of the receivers, each with weights ``(3, M)`` of their motion over the receiver.
     """
 
     beam: Beam
@@ -407,7 +228,7 @@ class Cast:
     edge: Held
     receiver: Held
     normal: Tensor
-    seen: list[tuple[Prefix, Tensor]]
+    prefixes: list[tuple[Prefix, Tensor]]
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
@@ -416,7 +237,7 @@ class Cast:
         toward = e - p * w
         x = p - toward * (dot(self.normal, p - held) / dot(self.normal, toward))
         value = torch.zeros((), dtype=x.dtype, device=x.device)
-        for prefix, weight in self.seen:
+        for prefix, weight in self.prefixes:
             value = value + ((take(x, prefix.lane) - prefix.receivers(bodies)) * weight).sum()
         return value
 
@@ -441,7 +262,7 @@ class Shadows:
         depth: vertices of paths at most; -1: any number.
     """
 
-    frame: Frame
+    frame: MovingFrame
     occluders: Occluders
     sources: Sources
     reach: float
@@ -450,20 +271,17 @@ class Shadows:
     @torch.no_grad()
     def samples(self, first: int, count: int, total: int) -> Cast | None:
         """Return samples ``first .. first + count`` of ``total``; None where none of them counts."""
-        traced, bodies = self.frame.traced, self.frame.bodies
-        number = torch.arange(first, first + count, device=bodies.p0.device)
-        key = traced.key(number, Use.LIGHTS)
-        u, coin = traced.edge(number, key, total)
-        index, rest, chance = self.occluders.draw(u)
+        traced = self.frame.traced
+        _, key, u, coin = traced.edges(first, count, total, Use.LIGHTS)
         beam = self.sources.draw(traced.draws(key))
-        passed = self.occluders.place(index, rest, chance, coin, beam.view)
+        passed = self.occluders.outline_points(u, coin, beam.view)
         beam, passed, spot, outward = self._past(rows(beam, passed.lane), passed)
         if not len(passed.lane):
             return None
         return self._cast(take(key, passed.lane), beam, passed, spot, outward, total)
 
-    def _past(self, beam: Beam, passed: Passed) -> tuple[Beam, Passed, Spot, Tensor]:
-        """Rays past edges: what they meet, and unit vectors ``(3, N)`` across the edge to the side that is lit."""
+    def _past(self, beam: Beam, passed: EdgePoints) -> tuple[Beam, EdgePoints, Spot, Tensor]:
+        """Trace rays past edges: return what they meet, and unit vectors ``(3, N)`` across the edge to the lit side."""
         traced = self.frame.traced
         toward = beam.view.toward(passed.p)
         w = torch.as_tensor(beam.view.w, device=toward.device).expand(toward.shape[1])
@@ -489,7 +307,9 @@ class Shadows:
         index = take(index, some)
         return rows(beam, index), rows(passed, index), spot.taken(some), take(outward, some)
 
-    def _cast(self, key: Tensor, beam: Beam, passed: Passed, spot: Spot, outward: Tensor, total: int) -> Cast | None:
+    def _cast(
+        self, key: Tensor, beam: Beam, passed: EdgePoints, spot: Spot, outward: Tensor, total: int
+    ) -> Cast | None:
         x, n = spot.p.double(), spot.n.double()
         toward = beam.view.toward(x)
         wi = toward / dot(toward, toward).sqrt()
@@ -504,18 +324,16 @@ class Shadows:
         brought = self.sources.brought(beam, x) * (dot(n, wi).abs() / (passed.density * total))
         edge = cross(n, along)
         edge = edge * -torch.sign(dot(edge, across))
-        longest = (self.depth if self.depth >= 0 else LONGEST) - 1
-        seen = []
-        for prefix in prefixes_of(self.frame, spot, wi, key, longest):
+        prefixes = []
+        for prefix in prefixes_of(self.frame, spot, wi, key, self.depth, behind=1):
             value = (prefix.weight * take(brought, prefix.lane)).sum(0)
-            seen.append((prefix, take(edge, prefix.lane) * value))
-        if not seen:
+            prefixes.append((prefix, take(edge, prefix.lane) * value))
+        if not prefixes:
             return None
-        receiver = held_at(self.frame.bodies, spot.hit.prim, torch.stack((spot.hit.u, spot.hit.v)), x)
-        return Cast(beam, self._source(beam), passed.held, receiver, n, seen)
+        return Cast(beam, self._source(beam), passed.held, spot.held(self.frame.bodies), n, prefixes)
 
     def _source(self, beam: Beam) -> Tensor:
-        """Columns of ``Bodies.lights``; see :class:`Cast`."""
+        """Return columns of ``Bodies.lights``; see :class:`Cast`."""
         column = beam.row - self.sources.surfaces
         around = self.sources.world.lights
         assert around is not None

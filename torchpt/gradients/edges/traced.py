@@ -112,6 +112,12 @@ class Traced:
         place, other = self.draws(key).two(Dimension.EDGE).double()
         return (number + place) / total, other
 
+    def edges(self, first: int, count: int, total: int, use: Use) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return numbers and keys of samples ``first .. first + count`` of ``total``, then what :meth:`edge` returns."""
+        number = torch.arange(first, first + count, device=self.wave.centre.device)
+        key = self.key(number, use)
+        return number, key, *self.edge(number, key, total)
+
     def nearest(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """Return how far rays ``(3, N)`` go, in units of ``d``, and the primitives that they meet; -1 for none."""
         t, prim, _, _ = self.wave.accel.intersect(o, d, torch.full_like(d[0], T_MAX, dtype=torch.float32))

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.traced import Traced
-from torchpt.math.vectors import dot, rows, take
+from torchpt.math.vectors import cross, dot, rows, take
 from torchpt.paths.integrators.path import partition
 from torchpt.paths.surface import surface_at
 from torchpt.paths.vertex import sample_bsdf, shading_weight
@@ -44,8 +45,20 @@ class Spot:
     n: Tensor
 
     def taken(self, index: Tensor) -> Spot:
-        """Some of the lanes."""
+        """Return some of the lanes."""
         return Spot(self.traced, *rows((self.o, self.d, self.hit, self.p, self.n), index))
+
+    def held(self, bodies: Bodies) -> Held:
+        """Return the points held on their surfaces; any point in lanes that missed."""
+        prim = self.hit.prim.clamp_min(0)
+        a = torch.stack((self.hit.u, self.hit.v, torch.zeros_like(self.hit.u))).double()
+        if bodies.counts[3] or bodies.counts[4]:
+            bent = ((prim >= bodies.first_sphere) & (prim < sum(bodies.counts))).nonzero().squeeze(1)
+            p0, *axes = bodies.place(take(prim, bent))
+            faces = [cross(axes[1], axes[2]), cross(axes[2], axes[0]), cross(axes[0], axes[1])]
+            away, det = take(self.p, bent).double() - p0, dot(axes[0], faces[0])
+            a[:, bent] = torch.stack([dot(face, away) / det for face in faces])
+        return Held(prim, a)
 
     def _each(self, found: list[Tensor], make: Callable[[int, Tensor, Interaction], list[Tensor]]) -> None:
         """Fill in what each model makes of its lanes."""

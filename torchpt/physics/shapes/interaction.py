@@ -129,12 +129,22 @@ def _framed(world: World, primitives: LanePrimitives, at: Interaction) -> Intera
     return replace(at, tangent=tangent, bitangent=bitangent)
 
 
-def slide_share(r: Tensor, near: Tensor) -> Tensor:
-    """Return the share ``(N,)`` by which a point at distance ``r (N,)`` slides along its ray in place of being held.
+def slide_share(world: World, prim: Tensor, r: Tensor, near: Tensor) -> Tensor:
+    """Return the share ``(N,)`` by which a point slides along the ray that meets it, in place of being held.
 
-    ``near (1,)``: the length over which points slide. The share is ``exp(-(r / near)^2)``.
+    It is ``exp(-(r / near)^2)``, and 0 on emitters, whose points light sampling holds.
+
+    Args:
+        world: the scene's tensors.
+        prim: primitives of the points ``(N,)``, none of them a miss.
+        r: lengths of the rays ``(N,)``.
+        near: ``(1,)`` length over which points slide.
     """
-    return torch.exp(-(r / near).square())
+    share = torch.exp(-(r / near).square())
+    if world.lights is None or world.lights.row_of_prim is None:
+        return share
+    emits = take(world.lights.row_of_prim, world.geometry.slot(prim)) >= 0
+    return torch.where(emits, 0.0, share)
 
 
 def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
@@ -149,7 +159,7 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor, near: Tensor) -> tup
         world: the scene's tensors, with gradients.
         x: origins, differentiable ``(3, N)``.
         hit: hits of the rays. Points that are held stay at ``u, v`` of their primitives (on a sphere at their normal, on a
-            quadric at their position in object space). Those of emitters are all held, as are points that light sampling draws.
+            quadric at their position in object space).
         wi: traced directions ``(3, N)``; unchanged for misses.
         near: ``(1,)`` length over which points slide.
 
@@ -174,10 +184,7 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor, near: Tensor) -> tup
     apart = missed | (square.detach() > least * least)
     square = torch.where(apart, square, 1.0)
     direction = offset / square.sqrt()
-    share = slide_share(square.detach().sqrt(), near)
-    if world.lights is not None and world.lights.row_of_prim is not None:
-        emits = take(world.lights.row_of_prim, world.geometry.slot(hit.prim.clamp_min(0))) >= 0
-        share = torch.where(emits, 0.0, share)
+    share = slide_share(world, hit.prim.clamp_min(0), square.detach().sqrt(), near)
     held = 1.0 - share
     area = torch.where(missed, wi, area)
     projected = dot(direction, area)  # the cosine times the area

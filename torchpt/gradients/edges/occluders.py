@@ -1,0 +1,194 @@
+"""Curves along which light may jump, drawn before the light is known: edges, and outlines of round bodies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.curves import (
+    Curves,
+    Rounds,
+    View,
+    folds_of,
+    generator,
+    joined,
+    parts_of,
+    plain_of,
+    round_outline,
+    rounds_of,
+    straight,
+)
+from torchpt.math.sampling import Distribution1D
+from torchpt.math.vectors import concatenate_lanes, cross, dot, rows, take
+from torchpt.physics.shapes.quadrics import Form
+from torchpt.scene import Scene
+
+__all__ = ["EdgePoints", "Occluders", "occluders_of"]
+
+#: Least weight of an edge between faces that almost lie in one plane, as an outline, against a border of the same length.
+_LEAST_OUTLINE = 0.01
+#: The same as a crease; none between faces at a smaller angle than ``_FLAT``.
+_LEAST_CREASE = 0.1
+_FLAT = 1e-6
+#: Weight of curves that do not move, against those that do: only what is behind and before them moves.
+_STATIC = 0.3
+
+
+@dataclass(frozen=True)
+class EdgePoints:
+    """Points of curves that light passes, N lanes.
+
+    Attributes:
+        lane: ``(N,)`` of those that were asked for: where there is no outline there is no point.
+        held: the points.
+        mate: the other face at each; -1: there is none.
+        p: where they are ``(3, N)``.
+        along: how ``p`` changes with the curve's parameter.
+        density: of the draw in that parameter, over the part with which the curve counts.
+    """
+
+    lane: Tensor
+    held: Held
+    mate: Tensor
+    p: Tensor
+    along: Tensor
+    density: Tensor
+
+
+@dataclass(frozen=True)
+class Occluders:
+    """K curves and round surfaces.
+
+    Attributes:
+        bodies: detached.
+        curves: what is not known before the light is (an outline) has its primitive alone.
+        others: corners off the edges, of both faces.
+        folded: ``(K,)`` bool: edges of two faces.
+        part: ``(K,)`` with which curves count where others lie on them.
+        form: ``(K,)`` -1 where the curve is known, 0 for outlines of spheres and ellipsoids, from 1 on of ``forms``.
+        forms: of cylinders and cones.
+        outlines: choice of a curve, by length and the share of directions from which it is an outline.
+        creases: choice of a curve, by length and the angle between its faces.
+    """
+
+    bodies: Bodies
+    curves: Curves
+    others: tuple[Held, Held]
+    folded: Tensor
+    part: Tensor
+    form: Tensor
+    forms: list[Form]
+    outlines: Distribution1D
+    creases: Distribution1D
+
+    def outline_points(self, u: Tensor, coin: Tensor, view: View) -> EdgePoints:
+        """Return points of outlines as they are seen from ``view``.
+
+        Args:
+            u: ``(N,)`` in [0, 1), which curves and where on them.
+            coin: ``(N,)`` in [0, 1): which of two lines.
+            view: ``N`` places or directions.
+        """
+        index, rest = self.outlines.draw(u)
+        chance = take(self.outlines.pmf, index)
+        curves, form = rows(self.curves, index), take(self.form, index)
+        some = torch.ones_like(form, dtype=torch.bool)
+        for number in range(len(self.forms) + 1):
+            mine = (form == number).nonzero().squeeze(1)
+            if not len(mine):
+                continue
+            part, prim = rows(view, mine), take(curves.prim, mine)
+            if number == 0:
+                found, there = round_outline(self.bodies, prim, part)
+            else:
+                side = torch.where(take(coin, mine) < 0.5, -1.0, 1.0).double()
+                found, there = generator(self.bodies, prim, self.forms[number - 1], part, side)
+                chance[mine] *= 0.5
+            some[mine] = there
+            for f in fields(Curves):
+                getattr(curves, f.name)[..., mine] = getattr(found, f.name)
+        span = curves.high - curves.low
+        held, p, along = curves.moving(self.bodies, curves.low + rest * span)
+        across = cross(along, view.toward(p))
+        one, two = (dot(across, self.bodies.points(rows(other, index)) - p) for other in self.others)
+        some &= ~take(self.folded, index) | (one * two >= 0)
+        some &= dot(across, across) > 0
+        lane, density = torch.arange(len(index), device=index.device), chance / (span * take(self.part, index))
+        return rows(EdgePoints(lane, held, curves.mate, p, along, density), some.nonzero().squeeze(1))
+
+
+def occluders_of(
+    scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Tensor, *, lights_move: bool
+) -> Occluders | None:
+    """Return all curves of a scene that may hide light; None where there are none.
+
+    Args:
+        scene: the scene.
+        bodies: detached.
+        poses: the parameters.
+        moves: ``(P,)`` bool: primitives that move.
+        lights_move: True: lights do.
+    """
+    curves: list[Curves] = []
+    firsts: list[Held] = []
+    seconds: list[Held] = []
+    columns: list[Tensor] = []  # of each part: length, weights as outline and as crease, folded, form
+
+    def add(part: Curves, length: Tensor, others: tuple[Held, Held], *column: Tensor | float) -> None:
+        curves.append(part)
+        firsts.append(others[0])
+        seconds.append(others[1])
+        columns.append(torch.stack([length, *(torch.as_tensor(x).to(length).expand_as(length) for x in column)]))
+
+    for folds in folds_of(scene, bodies, poses):
+        _, _, along = folds.curves.moving(bodies, torch.zeros_like(folds.curves.low))
+        cosine = dot(*folds.normals).abs().clamp_max(1.0)
+        # Of directions around an edge this share has both faces on one side, whichever way the normals point.
+        outline = torch.where(folds.border, 1.0, (torch.acos(cosine) / math.pi).clamp_min(_LEAST_OUTLINE))
+        apart = folds.normals[0] - folds.normals[1]
+        bend = dot(apart, apart).sqrt()
+        crease = torch.where(bend > _FLAT, bend.clamp(_LEAST_CREASE, 1.0), 0.0)
+        crease = torch.where(folds.border, 1.0, crease)
+        add(folds.curves, dot(along, along).sqrt(), folds.others, outline, crease, ~folds.border, -1.0)
+    fixed = plain_of(scene, bodies)
+    if fixed is not None:
+        _, _, along = fixed.moving(bodies, fixed.low)
+        own = Held(fixed.prim, fixed.a)
+        add(fixed, dot(along, along).sqrt() * (fixed.high - fixed.low), (own, own), 1.0, 1.0, 0.0, -1.0)
+    forms: list[Form] = []
+    for rounds in rounds_of(scene, bodies):
+        if rounds.form is not None:
+            forms.append(rounds.form)
+        zero = torch.zeros(3, len(rounds.prim), dtype=torch.float64, device=scene.device)
+        own, number = Held(rounds.prim, zero), 0.0 if rounds.form is None else float(len(forms))
+        add(straight(rounds.prim, zero, zero), _outline_length(bodies, rounds), (own, own), 1.0, 1.0, 0.0, number)
+    if not curves:
+        return None
+    every = joined(curves)
+    length, outline, crease, folded, form = torch.cat(columns, 1)
+    if not bool((length > 0).any()):
+        return None
+    moving = take(moves, every.prim) | ((every.mate >= 0) & take(moves, every.mate.clamp_min(0)))
+    known = ((form < 0) & (crease > 0)).nonzero().squeeze(1)
+    return Occluders(
+        bodies,
+        every,
+        (concatenate_lanes(firsts), concatenate_lanes(seconds)),
+        folded > 0,
+        torch.ones_like(length).index_copy(0, known, parts_of(bodies, rows(every, known))),
+        form.long(),
+        forms,
+        Distribution1D.of(length * outline * torch.where(moving | lights_move, 1.0, _STATIC), torch.float64, even=0.0),
+        Distribution1D.of(length * crease * torch.where(moving, 1.0, _STATIC), torch.float64, even=0.0),
+    )
+
+
+def _outline_length(bodies: Bodies, rounds: Rounds) -> Tensor:
+    """Return about the lengths of outlines ``(N,)``."""
+    _, x, y, z = bodies.place(rounds.prim)
+    long = [dot(axis, axis).sqrt() for axis in (x, y, z)]
+    return 2.0 * long[2] if rounds.form is not None else (2.0 * math.pi / 3.0) * (long[0] + long[1] + long[2])
