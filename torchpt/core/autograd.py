@@ -12,13 +12,25 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._C import _DisableFuncTorch  # pyright: ignore[reportAttributeAccessIssue, reportPrivateUsage]
+from torch._C import (  # pyright: ignore[reportPrivateUsage]
+    _are_functorch_transforms_active,  # pyright: ignore[reportAttributeAccessIssue]
+    _DisableFuncTorch,  # pyright: ignore[reportAttributeAccessIssue]
+)
 from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wrapped_tensor
 
 from torchpt.core.errors import TorchptError
 from torchpt.core.threads import without_autocast
 
-__all__ = ["Backward", "Forward", "custom_vjp", "is_batched", "is_transformed", "outside_transforms", "wants_gradients"]
+__all__ = [
+    "Backward",
+    "Forward",
+    "custom_vjp",
+    "is_batched",
+    "is_transformed",
+    "outside_transforms",
+    "transforms_are_active",
+    "wants_gradients",
+]
 
 Forward = Callable[..., tuple[Tensor, ...]]
 Backward = Callable[..., Sequence[Tensor | None]]
@@ -76,6 +88,11 @@ def is_transformed(value: Tensor) -> bool:
 def outside_transforms() -> AbstractContextManager[Any]:
     """Return a context in which tensors are made outside of all transforms of ``torch.func``."""
     return _DisableFuncTorch()
+
+
+def transforms_are_active() -> bool:
+    """Return True inside of a transform of ``torch.func``."""
+    return _are_functorch_transforms_active()
 
 
 def _levels(value: Tensor) -> Iterator[Tensor]:

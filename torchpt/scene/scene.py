@@ -45,6 +45,7 @@ from torchpt.scene.validation import check_tensor, inherited_checks, params_as_t
 from torchpt.scene.versions import VersionCounter, changed_versions
 from torchpt.scene.view import view_attributes
 from torchpt.scene.world import assemble
+from torchpt.scene.world.pieces import KeptPieces, ParameterReads
 from torchpt.search import Accel
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
@@ -124,6 +125,7 @@ class Scene:
         self._lock = threading.RLock()
         # By dtype, whether texture coordinates were asked for, and light sampler.
         self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
+        self._pieces = KeptPieces()  # of the latest worlds
         # By kind of search and number of threads: those of the scene's own parameters, and the latest of any parameters, to
         # refit or to reuse its topology.
         self._accels: dict[tuple[str, int | None], Accel] = {}
@@ -481,8 +483,22 @@ class Scene:
         are a parameter as it is, such as texels, are not copied.
         """
         host = self._host_copies.of(params, self.params)
+        own = frozenset(name for name, value in params.items() if self.params.get(name) is value)
+        reads = ParameterReads(host, self._pieces, own, variant=(dtype, uv, choice))
         built, space = self._built, self._host_space
-        made = assemble(built.parts, host, built.sources, space, dtype, built.copies, uv=uv, choice=choice)
+        made = assemble(
+            built.parts,
+            reads,
+            built.sources,
+            space,
+            dtype,
+            built.copies,
+            uv=uv,
+            choice=choice,
+            own_models=self.own_models,
+        )
+        if self.device.type == "cpu":
+            return made
         return moved(made, self.device, {id(host[name]): value for name, value in params.items()})
 
     def _refresh(self) -> None:

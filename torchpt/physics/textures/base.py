@@ -158,14 +158,17 @@ class Node:
         raise NotImplementedError
 
     def mean(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Return the mean colour ``(3,)`` over a unit square of texture coordinates, float64, detached; for colours only."""
+        """Return the mean colour ``(3,)`` over a unit square of texture coordinates, float64, detached; for colours only.
+
+        ``parameters``: all parameter tensors of the scene by dotted name, on the host.
+        """
         # Centres of a grid of 64 x 64 cells: the mean decides how often a light is chosen, not what it emits.
         side = (torch.arange(64, dtype=torch.float64) + 0.5) / 64
         uv = torch.stack(torch.meshgrid(side, side, indexing="xy")).reshape(2, -1)
-        detached = {name: value.detach().cpu() for name, value in parameters.items()}
-        table = self.table([self], detached, torch.float64, uv.device)
-        rows = torch.zeros(uv.shape[1], dtype=torch.int64)  # this node is the only one of the table
-        return table.look_up(rows, TexturePoint(uv), coloured=True).mean(1)
+        with torch.no_grad():
+            table = self.table([self], parameters, torch.float64, uv.device)
+            rows = torch.zeros(uv.shape[1], dtype=torch.int64)  # this node is the only one of the table
+            return table.look_up(rows, TexturePoint(uv), coloured=True).mean(1)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Build a :class:`~torchpt.physics.world.World` of parts and parameters: one differentiable function of the parameters.
 
 Read ``assemble.py`` first. ``primitives.py`` makes the geometry, ``materials.py`` the materials, ``emitters.py`` the light
-table. :meth:`torchpt.scene.scene.Scene.world` calls :func:`assemble` and caches its result.
+table; ``pieces.py`` keeps what the next world can use again. :meth:`torchpt.scene.scene.Scene.world` calls :func:`assemble`.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -25,14 +26,16 @@ from torchpt.physics.textures import MaterialTextures, Node, NodeMap, NodePositi
 
 __all__ = [
     "MOST_MODELS",
-    "Groups",
+    "GroupKey",
     "LaneMaterial",
     "OpacityTexture",
-    "groups_of",
     "lane_material",
+    "members_of",
     "node_map_of",
     "opacity_maps_of",
     "opacity_of",
+    "parameters_of_group",
+    "textures_of_group",
     "vertex_attributes_of",
 ]
 
@@ -145,17 +148,25 @@ class LaneMaterial:
     opacity_texture: OpacityTexture | None = None
 
 
-def lane_material(material: ResolvedMaterial, parameters: Mapping[str, Tensor], dtype: torch.dtype) -> LaneMaterial:
-    """Return a material on lanes; ``parameters``: every tensor by dotted name."""
+def lane_material(
+    material: ResolvedMaterial, parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
+) -> LaneMaterial:
+    """Return a material on lanes.
+
+    Args:
+        material: the material.
+        parameters: every tensor by dotted name.
+        dtype: dtype of the lanes.
+        device: device of the lanes.
+    """
     readings = {key: value for key, value in material.values.items() if isinstance(value, Node)}
     values: Parameters = {
         key: parameters[f"{material.name}.{key}"].to(dtype)[..., None] for key in material.values if key not in readings
     }
     if material.inner:
-        a, b = (lane_material(inner, parameters, dtype) for inner in material.inner)
+        a, b = (lane_material(inner, parameters, dtype, device) for inner in material.inner)
         found = _blended(type(material.model), values.get("weight"), readings.get("weight"), a, b)
     else:
-        device = next(iter(parameters.values())).device
         opacity = torch.zeros(1, dtype=dtype, device=device) if material.model.sheer else None
         found = LaneMaterial(material.model, values, opacity=opacity, readings=readings)
     opacity, opacity_texture = found.opacity, found.opacity_texture
@@ -230,42 +241,14 @@ MOST_MODELS = 120
 GroupKey = tuple[Bsdf, Any]
 
 
-@dataclass(frozen=True)
-class Groups:
-    """Materials grouped by BSDF and structure of textures.
-
-    Attributes:
-        group_and_row: index of the group, and row in it, of each material by name.
-        models: BSDF of each group.
-        parameters: stacked parameters of each group.
-        textures: textures of each group; None without.
-        two_sided: ``(rows,)`` bool of each group; None where all materials are two-sided.
-    """
-
-    group_and_row: dict[str, tuple[int, int]]
-    models: tuple[Bsdf, ...]
-    parameters: tuple[Parameters, ...]
-    textures: tuple[MaterialTextures | None, ...]
-    two_sided: tuple[Tensor | None, ...]
-
-
-def groups_of(
-    materials: Mapping[str, ResolvedMaterial],
-    lane_materials: Mapping[str, LaneMaterial],
-    positions: Mapping[Node, NodePosition],
-    parameters: Mapping[str, Tensor],
-    dtype: torch.dtype,
-    device: torch.device,
-) -> Groups:
-    """Group materials.
+def members_of(
+    materials: Mapping[str, ResolvedMaterial], lane_materials: Mapping[str, LaneMaterial]
+) -> dict[GroupKey, list[str]]:
+    """Return the names of the materials of each group, those of BSDF and structure of textures alike.
 
     Args:
         materials: the materials by name.
-        lane_materials: the same materials on lanes, by name.
-        positions: table and row of each node.
-        parameters: every tensor by dotted name.
-        dtype: dtype of the lanes.
-        device: device of the lanes.
+        lane_materials: the same materials on lanes, by name; their values are not read.
 
     Raises:
         SceneError: more than :data:`MOST_MODELS` groups.
@@ -278,32 +261,41 @@ def groups_of(
     if len(members) > MOST_MODELS:
         expected = f"at most {MOST_MODELS} models, blends and textured ones counted by what they are made of"
         raise SceneError("materials", len(members), expected)
-    group_and_row, stacks, textures, two_sided = {}, [], [], []
-    for number, ((model, form), names) in enumerate(members.items()):
-        group_and_row |= {name: (number, row) for row, name in enumerate(names)}
-        if form is None:  # without textures the BSDF computes once what depends on parameters alone
-            stacks.append(stacked([model.prepare(lane_materials[name].values) for name in names], model.factors))
-            textures.append(None)
-        else:
-            stacks.append(stacked([_tabulated(model, lane_materials[name].values) for name in names], model.factors))
-            bindings = _textures(
-                [materials[name] for name in names], [lane_materials[name] for name in names], positions, device
-            )
-            strength_names = [f"{name}.normal_strength" for name in names]
-            if any(name in parameters for name in strength_names):
-                one = torch.ones((), dtype=dtype, device=device)
-                strengths = [parameters[name].to(one) if name in parameters else one for name in strength_names]
-                bindings = replace(bindings, strength=torch.stack(strengths))
-            textures.append(bindings)
-        flags = [materials[name].two_sided for name in names]
-        two_sided.append(None if all(flags) else torch.tensor(flags, device=device))
-    return Groups(
-        group_and_row=group_and_row,
-        models=tuple(model for model, _ in members),
-        parameters=tuple(stacks),
-        textures=tuple(textures),
-        two_sided=tuple(two_sided),
-    )
+    return members
+
+
+def parameters_of_group(model: Bsdf, form: Any, values: Sequence[Parameters]) -> Parameters:
+    """Return the stacked parameters of a group of materials, from those of each; ``form``: of its textures, None without."""
+    # Without textures the BSDF computes once what depends on parameters alone.
+    compute = model.prepare if form is None else partial(_tabulated, model)
+    return stacked([compute(of_material) for of_material in values], model.factors)
+
+
+def textures_of_group(
+    materials: Sequence[ResolvedMaterial],
+    lane_materials: Sequence[LaneMaterial],
+    positions: Mapping[Node, NodePosition],
+    parameters: Mapping[str, Tensor],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> MaterialTextures:
+    """Return the textures of a group of materials.
+
+    Args:
+        materials: the materials.
+        lane_materials: the same materials on lanes.
+        positions: table and row of each node.
+        parameters: every tensor by dotted name.
+        dtype: dtype of the lanes.
+        device: device of the lanes.
+    """
+    bindings = _textures(materials, lane_materials, positions, device)
+    strength_names = [f"{material.name}.normal_strength" for material in materials]
+    if any(name in parameters for name in strength_names):
+        one = torch.ones((), dtype=dtype, device=device)
+        strengths = [parameters[name].to(one) if name in parameters else one for name in strength_names]
+        bindings = replace(bindings, strength=torch.stack(strengths))
+    return bindings
 
 
 def _tabulated(model: Bsdf, values: Parameters) -> Parameters:
