@@ -19,11 +19,22 @@ from torch import Tensor
 
 from torchpt.compiler.cpu import Function
 from torchpt.compiler.graph import Graph, Unsupported
-from torchpt.compiler.prologue import Guard, Source, Step, StepKey, Table, run_prologue, step_keys
+from torchpt.compiler.prologue import (
+    Guard,
+    Source,
+    Step,
+    StepKey,
+    Table,
+    leaves_of,
+    leaves_of_steps,
+    run_prologue,
+    step_keys,
+    write_into_arguments,
+)
 from torchpt.compiler.searching import RaySearch
 from torchpt.compiler.sinks import Sinks
 
-__all__ = ["Program", "Tables", "TracedStage", "bind_tables", "guards_hold", "lay_out_table"]
+__all__ = ["LaidOut", "Program", "Tables", "TracedStage", "bind_tables", "guards_hold", "lay_out_table"]
 
 
 # ---- A traced stage
@@ -147,6 +158,17 @@ class Program:
         return step_keys(self.steps)
 
     @cached_property
+    def in_order(self) -> bool:
+        """Return True if the steps depend on their order."""
+        return write_into_arguments(self.steps)
+
+    @cached_property
+    def table_leaves(self) -> tuple[frozenset[str] | None, ...]:
+        """Return the paths of the leaves that each table depends on; None for tables that depend on more, as on constants."""
+        of_steps = leaves_of_steps(self.steps)
+        return tuple(leaves_of(table.source, of_steps) for table in self.tables)
+
+    @cached_property
     def _leaves(self) -> frozenset[str]:
         paths: set[str] = set()
 
@@ -164,6 +186,10 @@ class Program:
         return frozenset(paths)
 
 
+#: A table in the layout of kernels, and its number of entries.
+LaidOut = tuple[Tensor, int]
+
+
 @dataclass(frozen=True)
 class Tables:
     """Tables in the layout that kernels read.
@@ -171,10 +197,12 @@ class Tables:
     Attributes:
         address: address of an array of pairs (pointer, number of entries).
         keep: objects that own the memory.
+        laid_out: each table, and its number of entries.
     """
 
     address: int
     keep: tuple[Any, ...]
+    laid_out: tuple[LaidOut, ...]
 
 
 def lay_out_table(tensor: Tensor, axis: int | None) -> Tensor:
@@ -209,6 +237,8 @@ def bind_tables(
     results: dict[StepKey, Tensor] | None = None,
     device: torch.device | None = None,
     placed: Mapping[str, Tensor] | None = None,
+    kept: Sequence[LaidOut | None] = (),
+    in_order: bool | None = None,
 ) -> Tables:
     """Compute and lay out the tables of a kernel for one scene.
 
@@ -222,12 +252,16 @@ def bind_tables(
         results: results of steps of other kernels, see :func:`torchpt.compiler.prologue.run_prologue`; filled.
         device: where kernels read tables; None: the host.
         placed: the leaves on the device by path.
+        kept: for each table that of an earlier binding to the same leaves, or None; empty: none.
+        in_order: :attr:`Program.in_order`; None: unknown.
     """
     known = {} if known is None else known
-    tensor = run_prologue(steps, constants, leaves, names, results)
-    words: list[int] = []
-    keep: list[Tensor] = []
-    for table in tables:
+    tensor = run_prologue(steps, constants, leaves, names, results, in_order)
+    found: list[LaidOut] = []
+    for number, table in enumerate(tables):
+        if kept and (earlier := kept[number]) is not None:
+            found.append(earlier)
+            continue
         key = (table.source.name, table.axis) if table.source.kind == "leaf" else None
         laid_out = known.get(key) if key is not None else None
         original = tensor(table.source) if key is None or placed is None else placed[str(table.source.name)]
@@ -236,21 +270,20 @@ def bind_tables(
             laid_out = laid_out if device is None else laid_out.to(device)
             if key is not None:
                 known[key] = laid_out
-        keep.append(laid_out)
-        entries = original.numel() if table.axis is None else original.shape[table.axis]
-        words += [laid_out.data_ptr(), entries]
+        found.append((laid_out, original.numel() if table.axis is None else original.shape[table.axis]))
+    words = [word for laid_out, entries in found for word in (laid_out.data_ptr(), entries)]
     if device is not None:
         pairs = torch.tensor(words or [0], dtype=torch.int64, device=device)
-        return Tables(pairs.data_ptr(), (pairs, keep))
+        return Tables(pairs.data_ptr(), (pairs,), tuple(found))
     block = (ctypes.c_int64 * max(len(words), 1))(*words)
-    return Tables(ctypes.addressof(block), (block, keep))
+    return Tables(ctypes.addressof(block), (block,), tuple(found))
 
 
 def guards_hold(program: Program, leaves: Mapping[str, Tensor]) -> bool:
     """Return True if the guards of a program hold for these leaves, which are on the host."""
     if not program.guards:
         return True
-    tensor = run_prologue(program.steps, program.constants, leaves)
+    tensor = run_prologue(program.steps, program.constants, leaves, in_order=program.in_order)
 
     def number(value: Any) -> Any:
         return value.item() if isinstance(value, Tensor) else value

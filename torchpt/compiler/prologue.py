@@ -15,7 +15,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["Guard", "Source", "Step", "StepKey", "Table", "run_prologue", "step_keys", "without_unused_steps"]
+__all__ = [
+    "Guard",
+    "Source",
+    "Step",
+    "StepKey",
+    "Table",
+    "leaves_of",
+    "leaves_of_steps",
+    "run_prologue",
+    "step_keys",
+    "without_unused_steps",
+    "write_into_arguments",
+]
 
 #: Largest result of a step, in bytes, that is kept for other prologues. Larger ones would hold much memory.
 SMALL = 1 << 16
@@ -178,8 +190,9 @@ def run_prologue(
     leaves: Mapping[str, Tensor],
     names: Sequence[StepKey | None] = (),
     known: dict[StepKey, Tensor] | None = None,
+    in_order: bool | None = None,
 ) -> Any:
-    """Run a prologue and return a function that returns the tensor of a :class:`Source`.
+    """Return a function that returns the tensor of a :class:`Source`; it runs the steps that the tensor depends on, once.
 
     Args:
         steps: the prologue.
@@ -187,15 +200,19 @@ def run_prologue(
         leaves: the scene's tensors by path, on the host.
         names: keys of the steps, see :func:`step_keys`.
         known: results of steps of other prologues on the same leaves, by key; small results are added.
+        in_order: True: all steps are run at once, in their order; None: if :func:`write_into_arguments` says so.
     """
-    results: list[Any] = []
+    results: list[Any] = [None] * len(steps)
 
     def tensor(source: Source) -> Tensor:
         if source.kind == "leaf":
             return leaves[str(source.name)]
         if source.kind == "constants":
             return constants[int(source.name)].cpu()  # weights of a user's module may be on a device
-        result = results[int(source.name)]
+        number = int(source.name)
+        if results[number] is None:
+            run(number)
+        result = results[number]
         return result if source.item < 0 else result[source.item]
 
     def filled(value: Any) -> Any:
@@ -204,13 +221,58 @@ def run_prologue(
             return tensor(value)
         return type(value)(filled(x) for x in value) if isinstance(value, list | tuple) else value
 
-    with torch.no_grad():
-        for number, step in enumerate(steps):
-            key = names[number] if names and known is not None else None
-            result = None if key is None or known is None else known.get(key)
-            if result is None:
+    def run(number: int) -> None:
+        key = names[number] if names and known is not None else None
+        result = None if key is None or known is None else known.get(key)
+        if result is None:
+            step = steps[number]
+            with torch.no_grad():
                 result = step.function(*filled(step.args), **{k: filled(v) for k, v in step.kwargs.items()})
-                if key is not None and known is not None and _small(result):
-                    known[key] = result
-            results.append(result)
+            if key is not None and known is not None and _small(result):
+                known[key] = result
+        results[number] = result
+
+    if write_into_arguments(steps) if in_order is None else in_order:
+        for number in range(len(steps)):
+            if results[number] is None:
+                run(number)
     return tensor
+
+
+def write_into_arguments(steps: Sequence[Step]) -> bool:
+    """Return True if steps may write into their arguments: then results depend on the order of all steps."""
+    return any(map(_writes, steps))
+
+
+def _writes(step: Step) -> bool:
+    """Return True if a step may write into its arguments."""
+    schema = getattr(step.function, "_schema", None)
+    return schema is None or schema.is_mutable
+
+
+def leaves_of_steps(steps: Sequence[Step]) -> tuple[frozenset[str] | None, ...]:
+    """Return the paths of the leaves that each step depends on; None for steps that depend on more, such as constants."""
+    found: list[frozenset[str] | None] = []
+    for step in steps:
+        paths = leaves_of((step.args, tuple(step.kwargs.values())), found)
+        found.append(None if _writes(step) else paths)
+    return tuple(found)
+
+
+def leaves_of(value: Any, of_steps: Sequence[frozenset[str] | None]) -> frozenset[str] | None:
+    """Return the paths of the leaves that a source, or nested arguments with sources, depend on.
+
+    ``of_steps``: as from :func:`leaves_of_steps`, of the steps before.
+    """
+    if isinstance(value, Source):
+        if value.kind == "constants":
+            return None
+        return frozenset({str(value.name)}) if value.kind == "leaf" else of_steps[int(value.name)]
+    paths: frozenset[str] = frozenset()
+    if isinstance(value, list | tuple):
+        for item in value:
+            inner = leaves_of(item, of_steps)
+            if inner is None:
+                return None
+            paths |= inner
+    return paths

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchpt.core.memory import Budget, Span
 from torchpt.engines import work
 from torchpt.engines.kernels.engine import LANES as LANES_OF_KERNELS
-from torchpt.engines.kernels.programs import Kernels, probed_kernels
+from torchpt.engines.kernels.programs import KernelCaches, Kernels, probed_kernels
 from torchpt.engines.kernels.threads import KernelsForward
 from torchpt.engines.tensors import hits, layers, radiance, seen, trace, weighted_radiance
 from torchpt.engines.tensors_forward import TensorsForward
@@ -33,6 +33,7 @@ __all__ = [
     "Block",
     "Forward",
     "ForwardDevice",
+    "KernelCaches",
     "Kernels",
     "SampleRange",
     "TaskResult",
@@ -130,16 +131,20 @@ def forward_tensors(wave: Wave, budget: Budget) -> Forward:
     return TensorsForward(wave, budget)
 
 
-def kernels_of(wave: Wave, own: Sequence[int], before: Kernels | None = None) -> Kernels:
+def kernels_of(
+    wave: Wave, own: Sequence[int], before: Kernels | None = None, caches: KernelCaches | None = None
+) -> Kernels:
     """Return the kernels of a render; its ``eager`` lists models that cannot be compiled, with the reasons.
 
     Args:
         wave: of the render.
         own: indices of the user's own models, which are compiled at once to find out whether they can be.
         before: kernels of another render; its tables are shared where they were made of the same tensors.
+        caches: those of the scene; None: those of ``before``, or new ones.
     """
     packets = uses_packets(wave)
-    return probed_kernels(wave, own, packets, partial(Kernels, wave, packets, before=before, fixed=not own))
+    make = partial(Kernels, wave, packets, before=before, fixed=not own, caches=caches)
+    return probed_kernels(wave, own, packets, make)
 
 
 def forward_kernels(kernels: Kernels, threads: int | None = None, strict: bool = False) -> Tasks:
@@ -251,6 +256,10 @@ class BackwardKernels(Protocol):
         """Return the bytes that a lane takes if ``levels`` vertices are kept."""
         ...
 
+    def release(self, engines: Sequence[Any]) -> None:
+        """Keep engines for the next pass of the same structure, and drop what no other pass can use again."""
+        ...
+
 
 def uses_packets(wave: Wave) -> bool:
     """Return True if packet kernels search the primitives, inside or between the stages; they do not support quadrics."""
@@ -270,17 +279,22 @@ def backward_tensors(tape: Tape, cotangent: Tensor | None) -> Backward[Any, Any,
     return TensorsBackward(tape, None if cotangent is None else cotangent.to(tape.wave.context.plan.dtype))
 
 
-def backward_kernels(tape: Tape, own: Sequence[int], cotangent: Tensor | None) -> BackwardKernels:
+def backward_kernels(
+    tape: Tape, own: Sequence[int], cotangent: Tensor | None, caches: KernelCaches | None = None
+) -> BackwardKernels:
     """Return the kernels of a backward pass, which make a backward engine for each thread.
 
     Args:
         tape: as for :func:`backward_tensors`.
         own: indices of the user's own models, which are compiled at once to find out whether they can be.
         cotangent: as for :func:`backward_tensors`.
+        caches: those of the scene; None: nothing is kept for other passes.
     """
     from torchpt.engines.kernels.backward import VjpKernels
 
-    kernels = VjpKernels(tape, uses_packets(tape.wave), None if cotangent is None else cotangent.float().contiguous())
+    cotangent = None if cotangent is None else cotangent.float().contiguous()
+    # What a user's model compiles to may change from pass to pass.
+    kernels = VjpKernels(tape, uses_packets(tape.wave), cotangent, None if own else caches)
     kernels.eager = kernels.probe(own)
     return kernels
 

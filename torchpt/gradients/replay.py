@@ -170,7 +170,7 @@ def replay_paths(
     if _uses_kernels(scene_tape, settings):
         own = own_models(scene, wave)
         if wave.centre.device.type == "cpu":
-            kernels = backward_kernels(scene_tape, own, splat_cotangent)
+            kernels = backward_kernels(scene_tape, own, splat_cotangent, scene_cache(scene).kernel_caches)
             reason = _replay_on_threads(kernels, scene_tape, settings, cotangent, sums)
             _warn_of_eager_vjps(kernels, wave)
         else:
@@ -296,20 +296,24 @@ def _replay_on_threads(
             sums.merge(chunk)
         return False  # True would stop the threads
 
-    while True:
-        try:
-            map_in_order(_spans(blocks, settings.render.spp), task, budget.threads, merge, ahead=2 * budget.threads)
-            return ""
-        except Unsupported as error:
-            return f"no kernel can be made of {error}"
-        except Exception as error:
-            if not is_out_of_memory(error):
-                raise
-        engines.clear()
-        sums.clear()
-        if budget.threads == 1:
-            return "memory ran out"
-        budget.shrink()
+    try:
+        while True:
+            try:
+                map_in_order(_spans(blocks, settings.render.spp), task, budget.threads, merge, ahead=2 * budget.threads)
+                return ""
+            except Unsupported as error:
+                return f"no kernel can be made of {error}"
+            except Exception as error:
+                if not is_out_of_memory(error):
+                    raise
+            engines.clear()
+            sums.clear()
+            if budget.threads == 1:
+                return "memory ran out"
+            budget.shrink()
+    finally:
+        # Without a limit the memory of threads is kept for the next pass.
+        kernels.release(engines if settings.render.max_memory is None else ())
 
 
 def _budget_of_tensors(device: torch.device, settings: Settings) -> Budget:

@@ -20,7 +20,7 @@ from torch import Tensor
 from torchpt.core.errors import SceneError, warn_once
 from torchpt.core.tree import moved
 from torchpt.engines import engine
-from torchpt.engines.engine import ForwardDevice, Kernels, Tasks
+from torchpt.engines.engine import ForwardDevice, KernelCaches, Kernels, Tasks
 from torchpt.images.denoiser import GUIDES
 from torchpt.math.vectors import dot, normalize
 from torchpt.native import device_checks
@@ -64,6 +64,7 @@ class SceneCache:
 
     Attributes:
         kernels: kernels of the latest render.
+        kernel_caches: machine code bound to tables, of the latest pictures and gradients.
         first_surface: integrator, world, and the ``FirstSurface`` made from them: what shades first surfaces on its own.
         without_lights: a world, and a copy of it without lights.
         camera: of the latest render: key, objects whose ids are in the key, and the camera on its film.
@@ -71,6 +72,7 @@ class SceneCache:
     """
 
     kernels: Kernels | None = None
+    kernel_caches: KernelCaches = field(default_factory=KernelCaches)
     first_surface: tuple[Integrator, World, FirstSurface] | None = None
     without_lights: tuple[World, World] | None = None
     camera: tuple[Any, Any, Camera] | None = None
@@ -186,10 +188,9 @@ def _check_rays(key: str, given: Tensor, good: Tensor, expected: str) -> None:
 def _camera(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
     """Return the camera on the film, from the cache where parameters, film and dtype are the same."""
     merged, film = scene.merged(params), settings.film
-    if torch.is_grad_enabled():
-        return scene.camera(film, merged, dtype)
     tensors = [value for name, value in merged.items() if name.startswith("camera.")]
-    if any(value.is_inference() for value in tensors):  # torch counts no versions of these
+    taped = torch.is_grad_enabled() and any(value.requires_grad for value in tensors)
+    if taped or any(value.is_inference() for value in tensors):  # torch counts no versions of these
         return scene.camera(film, merged, dtype)
     # Keyed by id; the objects are stored too, since an id is unique only while its object lives.
     objects = (scene.description.camera, *tensors)
@@ -337,7 +338,7 @@ def own_models(scene: Scene, wave: Wave) -> list[int]:
 
 def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
     """Return the kernels of a scene's wave; ``before``: those of an earlier wave, used again where they fit."""
-    return engine.kernels_of(wave, own_models(scene, wave), before)
+    return engine.kernels_of(wave, own_models(scene, wave), before, scene_cache(scene).kernel_caches)
 
 
 def describe_engine(scene: Scene, settings: Settings) -> dict[str, Any]:

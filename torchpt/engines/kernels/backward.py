@@ -11,6 +11,7 @@ cotangents of the rays that left the vertex, and writes those of the rays that c
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -28,7 +29,8 @@ from torchpt.core.memory import Span
 from torchpt.engines.kernels import stages
 from torchpt.engines.kernels.engine import Chunk, KernelsEngine, Paths
 from torchpt.engines.kernels.layout import HIT, Fields, Layout, Memory, Rows, Trace, path_state
-from torchpt.engines.kernels.programs import Kernel, Kernels
+from torchpt.engines.kernels.programs import Kernel, KernelCaches, Kernels
+from torchpt.engines.kernels.threads import keep_worker, reuse_worker
 from torchpt.math.gathers import recording_gathers
 from torchpt.math.sums import ChunkGradientSums
 from torchpt.paths import adjoint
@@ -327,6 +329,7 @@ class VjpKernels(Kernels):
         tape: the wave and its differentiated tensors.
         by_kernels: see :class:`~torchpt.engines.kernels.layout.Layout`.
         cotangent: ``(3, H W)`` float32 of the picture, divided by the samples a pixel, for the VJP of splats.
+        caches: those of the scene; None: nothing is kept for other passes.
 
     Attributes:
         taped: stage context whose tables are autograd leaves.
@@ -336,7 +339,9 @@ class VjpKernels(Kernels):
         slots: rows of :func:`torchpt.engines.kernels.backward.slots_of`.
     """
 
-    def __init__(self, tape: Tape, by_kernels: bool, cotangent: Tensor | None = None) -> None:
+    def __init__(
+        self, tape: Tape, by_kernels: bool, cotangent: Tensor | None = None, caches: KernelCaches | None = None
+    ) -> None:
         super().__init__(with_detached_geometry(tape.wave), by_kernels, fused=False, cotangent=cotangent)
         self.tape, self.cotangent = tape, cotangent
         self.taped = tape.taped.context
@@ -348,6 +353,8 @@ class VjpKernels(Kernels):
             if path is not None:
                 self._leaves.ids[id(leaf)] = path, leaf
         self.structure = (*self.structure, self.taped.plan.attached, tuple(paths))
+        self._use(caches or KernelCaches())
+        self._of_this_pass = {"cotangent", *(path for path in paths if path is not None)}
         self.slots = Rows(slots_of(self))
         self.eager_vjps: dict[tuple[Any, ...], str] = {}
 
@@ -364,13 +371,28 @@ class VjpKernels(Kernels):
             self.eager_vjps[key] = str(error)
             return None
 
+    def release(self, engines: Sequence[KernelsBackward]) -> None:
+        """Keep the engines of threads for the next pass of the same structure, and drop what no other pass can use again.
+
+        Tables of differentiated tensors are dropped: every pass makes them anew.
+        """
+        for engine in engines:
+            keep_worker(self.structure, engine)
+        self.kernel_cache.forget(self._of_this_pass)
+        self.kernel_cache.tables.forget(self._of_this_pass)
+
     def store_hits(self) -> Kernel:
         """Return the kernel :func:`torchpt.engines.kernels.backward.store_hits`."""
         return self._get(False, store_hits)
 
     def engine(self) -> KernelsBackward:
-        """Return an engine for one more thread."""
-        return KernelsBackward(self)
+        """Return an engine for one more thread: an idle one of an earlier pass of the same structure, or a new one."""
+        engine = reuse_worker(self.structure)
+        if engine is None:
+            return KernelsBackward(self)
+        assert isinstance(engine, KernelsBackward)
+        engine.rebind(self, threading.Event())
+        return engine
 
     def bytes_per_lane(self, levels: int) -> int:
         """Return the bytes that a lane takes if ``levels`` vertices are kept."""
@@ -410,6 +432,22 @@ class KernelsBackward(KernelsEngine):
         self._sorted_slots = Memory(2)  # slots of a list's lanes, sorted, and scratch memory
         self._slot_is_taken = np.zeros(CAPACITY, np.uint8)  # scratch memory for sorting
         self._first = 1  # depth of the first vertex of the walk
+
+    def memories(self) -> list[Memory]:
+        """See :class:`KernelsEngine`."""
+        kept = [memory for room in self._levels for memory in (room.arena, *room.lists)]
+        return [*super().memories(), *kept, self._sample_slots, self._results, self._sorted_slots]
+
+    def unbind(self) -> int:
+        """See :class:`KernelsEngine`."""
+        del self.back, self.sums
+        self._weight = None
+        return super().unbind()
+
+    def rebind(self, kernels: Any, halt: threading.Event) -> None:
+        """See :class:`KernelsEngine`."""
+        super().rebind(kernels, halt)
+        self.back = kernels
 
     def begin(self, span: Span, sums: ChunkGradientSums) -> Paths:
         """See :class:`torchpt.engines.engine.Backward`."""

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from torchpt.compiler import cache
 from torchpt.compiler.kernel import HEAD, WORD
-from torchpt.compiler.program import Program, Tables, bind_tables
+from torchpt.compiler.program import LaidOut, Program, Tables, bind_tables
 from torchpt.compiler.ptx import ptx_target
 from torchpt.compiler.sinks import Sinks
 from torchpt.compiler.target import Target
@@ -168,7 +168,7 @@ class KernelsOnDevice(Kernels, ABC):
 
         return cache.program_of((key, self.structure), self._host_leaves, trace, self.target)
 
-    def _bind(self, program: Program) -> Tables:
+    def _bind(self, program: Program, kept: Sequence[LaidOut | None]) -> Tables:
         return bind_tables(
             program.tables,
             program.steps,
@@ -179,6 +179,8 @@ class KernelsOnDevice(Kernels, ABC):
             self._results,
             self.cuda.device,
             self._leaves.tensors,
+            kept,
+            program.in_order,
         )
 
 

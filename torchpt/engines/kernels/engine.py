@@ -526,17 +526,17 @@ class KernelsEngine:
 
     def unbind(self) -> int:
         """Drop all references to the render; return the bytes of memory kept for another one of the same structure."""
-        memories = [
-            self.slots,
-            *self.search.passed,
-            self.search.transmitting,
-            *([] if self.shown is None else [self.shown]),
-        ]
-        memories += [memory for room in self._rooms for memory in (room.arena, *room.lists)]
+        size = sum(memory.words.nbytes for memory in self.memories())
         self.calls.unbind()
         self.splats, self._lost = [], []
         del self.kernels, self.wave, self.search.kernels
-        return sum(memory.words.nbytes for memory in memories)
+        return size
+
+    def memories(self) -> list[Memory]:
+        """Return all memory of the engine."""
+        memories = [self.slots, *self.search.passed, self.search.transmitting]
+        memories += [] if self.shown is None else [self.shown]
+        return memories + [memory for room in self._rooms for memory in (room.arena, *room.lists)]
 
     def rebind(self, kernels: Kernels, halt: threading.Event) -> None:
         """Reuse the memory for another render of the same structure, after `unbind`."""

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -20,7 +21,7 @@ from torch import Tensor
 from torchpt.compiler import cache, operators  # noqa: F401  (the operators register how they are lowered)
 from torchpt.compiler.graph import Unsupported
 from torchpt.compiler.packet import PacketSearch
-from torchpt.compiler.program import Program, Tables, TracedStage, bind_tables
+from torchpt.compiler.program import LaidOut, Program, Tables, TracedStage, bind_tables
 from torchpt.compiler.prologue import StepKey, without_unused_steps
 from torchpt.compiler.sinks import Sinks
 from torchpt.compiler.tracing import Tracer, choose_lane_count
@@ -37,8 +38,10 @@ if TYPE_CHECKING:
 __all__ = [
     "Kernel",
     "KernelCache",
+    "KernelCaches",
     "Kernels",
     "NamedTensors",
+    "TableCache",
     "TensorVersion",
     "probed_kernels",
     "program_of",
@@ -90,33 +93,20 @@ class NamedTensors:
         return tensor is kept_tensor and version == kept_version
 
 
-# ---- The cache that renders of one structure share: kernels, and tables of unchanged tensors
+# ---- What the renders of a scene share: tables of unchanged tensors, and by structure the kernels that read them
 
 
-class KernelCache:
-    """Cache of the latest kernel of each stage and the latest table of each tensor.
+class TableCache:
+    """Cache of the latest table of each tensor, and of results of prologues.
 
-    Each is stored with the versions of the tensors that it was made of, and returned only if these are unchanged.
-
-    Renders on several threads may share it at the same time.
+    Each is stored with the versions of the tensors that it was made of, and returned only if these are unchanged. Renders on
+    several threads may share it at the same time.
     """
 
     def __init__(self) -> None:
-        self._kernels: dict[Any, tuple[Kernel, dict[str, TensorVersion]]] = {}
         self._tables: dict[tuple[str, Any], tuple[TensorVersion, Tensor]] = {}
         self._results: dict[frozenset[str], tuple[dict[str, TensorVersion], dict[StepKey, Tensor]]] = {}
         self._lock = threading.Lock()
-
-    def kernel(self, key: Any, program: Program, leaves: NamedTensors) -> Kernel | None:
-        """Return the cached kernel of a stage, if it was made of the same program and tensors; else None."""
-        entry = self._kernels.get(key)
-        if entry is None:
-            return None
-        kernel, states = entry
-        # Constants are tensors without a path, so nothing tells whether they were written to: their tables are laid out anew.
-        if kernel.program is not program or program.constants:
-            return None
-        return kernel if all(leaves.has(path, state) for path, state in states.items()) else None
 
     def tables(self, leaves: NamedTensors) -> dict[Any, Tensor]:
         """Return the cached tables of a render's tensors, by path and axis."""
@@ -135,22 +125,104 @@ class KernelCache:
         return valid
 
     def keep(
-        self,
-        key: Any,
-        kernel: Kernel,
-        tables: dict[Any, Tensor],
-        results: dict[StepKey, Tensor],
-        leaves: NamedTensors,
+        self, tables: Mapping[tuple[str, Any], Tensor], results: Mapping[StepKey, Tensor], leaves: NamedTensors
     ) -> None:
-        """Store a kernel, and all tables and results of prologue steps of its render."""
+        """Store tables and results of prologue steps of a render."""
         groups: dict[frozenset[str], dict[StepKey, Tensor]] = {}  # by the paths that the steps depend on
         for step, result in results.items():
             groups.setdefault(step.leaves, {})[step] = result
         with self._lock:
-            self._kernels[key] = kernel, {path: leaves.states[path] for path in kernel.program.leaves()}
             for paths, group in groups.items():
-                self._results[paths] = {path: leaves.states[path] for path in paths}, group
+                states, before = self._results.get(paths, ({}, {}))
+                same = bool(before) and all(leaves.has(path, state) for path, state in states.items())
+                states = states if same else {path: leaves.states[path] for path in paths}
+                self._results[paths] = states, {**before, **group} if same else group
             self._tables |= {(path, axis): (leaves.states[path], table) for (path, axis), table in tables.items()}
+
+    def forget(self, paths: Collection[str]) -> None:
+        """Drop what was made of tensors at these paths."""
+        with self._lock:
+            self._tables = {key: entry for key, entry in self._tables.items() if key[0] not in paths}
+            self._results = {key: entry for key, entry in self._results.items() if key.isdisjoint(paths)}
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """The latest kernel of a stage: its program, its tables (None for those that were dropped), and versions of tensors."""
+
+    program: Program
+    kernel: Kernel | None  # None where tables were dropped
+    tables: Sequence[LaidOut | None]
+    states: Mapping[str, TensorVersion]
+
+
+class KernelCache:
+    """Cache of the latest kernel of each stage, for renders of one structure.
+
+    Args:
+        tables: tables of the scene.
+    """
+
+    def __init__(self, tables: TableCache) -> None:
+        self.tables = tables
+        self._entries: dict[Any, _Entry] = {}
+
+    def find(self, key: Any, program: Program, leaves: NamedTensors) -> tuple[Kernel | None, Sequence[LaidOut | None]]:
+        """Return the cached kernel of a stage, if it was made of the same program and tensors, and tables to make another of.
+
+        Tables are None where the tensors that they were made of have changed.
+        """
+        entry = self._entries.get(key)
+        if entry is None or entry.program is not program:
+            return None, ()
+        states = entry.states
+        changed = {path for path in program.leaves() if path not in states or not leaves.has(path, states[path])}
+        # Constants are tensors without a path, so nothing tells whether they were written to: their tables are laid out anew.
+        if entry.kernel is not None and not changed and not program.constants:
+            return entry.kernel, ()
+        return None, _without(program, entry.tables, changed)
+
+    def keep(self, key: Any, kernel: Kernel, leaves: NamedTensors) -> None:
+        """Store a kernel."""
+        states = {path: leaves.states[path] for path in kernel.program.leaves()}
+        self._entries[key] = _Entry(kernel.program, kernel, kernel.tables.laid_out, states)
+
+    def forget(self, paths: Collection[str]) -> None:
+        """Drop the tables of kernels that depend on tensors at these paths."""
+        for key, entry in list(self._entries.items()):
+            if not entry.states.keys().isdisjoint(paths):
+                tables = _without(entry.program, entry.tables, paths)
+                states = {path: state for path, state in entry.states.items() if path not in paths}
+                self._entries[key] = _Entry(entry.program, None, tables, states)
+
+
+def _without(program: Program, tables: Sequence[LaidOut | None], paths: Collection[str]) -> Sequence[LaidOut | None]:
+    """Return the tables of a program, with None for those that depend on leaves at these paths, or on more than leaves."""
+    return [
+        None if leaves is None or not leaves.isdisjoint(paths) else table
+        for leaves, table in zip(program.table_leaves, tables, strict=True)
+    ]
+
+
+class KernelCaches:
+    """Caches of the kernels of a scene: pictures and gradients have other structures, and share tables."""
+
+    #: Most structures; the one that was not asked for the longest is dropped.
+    MOST = 4
+
+    def __init__(self) -> None:
+        self._tables = TableCache()
+        self._by_structure: dict[Any, KernelCache] = {}
+        self._lock = threading.Lock()
+
+    def of(self, structure: Any) -> KernelCache:
+        """Return the cache of a structure."""
+        with self._lock:
+            cache = self._by_structure.pop(structure, None) or KernelCache(self._tables)
+            self._by_structure[structure] = cache  # as the latest
+            if len(self._by_structure) > self.MOST:
+                del self._by_structure[next(iter(self._by_structure))]
+            return cache
 
 
 # ---- Programs: each stage is traced and compiled once for all scenes of one structure
@@ -239,11 +311,13 @@ class Kernels(Layout):
         before: kernels of another render; its tables are shared where they were made of the same tensors.
         fixed: True: the structure of a world object never changes. False with models of a user's own, whose code may change.
         cotangent: see :class:`~torchpt.engines.kernels.backward.VjpKernels`.
+        caches: those of the scene; None: nothing is kept for other renders.
 
     Attributes:
         eager: models whose stage cannot be compiled, with the reason; they run as tensor operations.
         seconds: seconds spent on making kernels.
         structure: key that is equal for renders that can share kernels and memory of threads.
+        caches: those of the scene.
         kernel_cache: shared by renders of the same structure.
         search: argument of searches by kernels; None where the acceleration structure is called.
         non_opaque: uint8 for each primitive, 1 where a ray may pass it, for the acceleration structure.
@@ -257,6 +331,7 @@ class Kernels(Layout):
         before: Kernels | None = None,
         fixed: bool = False,
         cotangent: Tensor | None = None,
+        caches: KernelCaches | None = None,
     ) -> None:
         super().__init__(wave, by_kernels, fused)
         self._leaves = NamedTensors(records_of(self, cotangent), None if before is None else before._leaves)
@@ -266,15 +341,18 @@ class Kernels(Layout):
         own = (fingerprint(wave.integrator), wave.context.crop) if wave.integrator.has_own_stages else None
         parts = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first_surface, own, self._leaves.tensors)
         self.structure = (self._of_world, *map(signature, parts), by_kernels, fused, signature(self.tree))
-        alike = before is not None and before.structure == self.structure
-        self.kernel_cache = before.kernel_cache if alike else KernelCache()  # pyright: ignore[reportOptionalMemberAccess]
-        self._laid_out = self.kernel_cache.tables(self._leaves)
-        self._results = self.kernel_cache.results(self._leaves)
+        self._use(caches or (KernelCaches() if before is None else before.caches))
         self._made: dict[tuple[Any, ...], Kernel] = {}
         self._lock = threading.Lock()
         self.search, self.non_opaque = self._search_inputs()
         self.seconds = 0.0
         self.eager: dict[int, str] = {}
+
+    def _use(self, caches: KernelCaches) -> None:
+        """Use the caches of a scene, once the structure is known."""
+        self.caches, self.kernel_cache = caches, caches.of(self.structure)
+        self._laid_out = self.kernel_cache.tables.tables(self._leaves)
+        self._results = self.kernel_cache.tables.results(self._leaves)
 
     def _search_inputs(self) -> tuple[Any, np.ndarray | None]:
         """Return :attr:`search` and :attr:`non_opaque`."""
@@ -394,20 +472,33 @@ class Kernels(Layout):
             return build(trace, *arguments)
 
         program = self._program(key, listed, traced)
-        cached = self.kernel_cache.kernel(key, program, self._leaves)
+        cached, kept = self.kernel_cache.find(key, program, self._leaves)
         if cached is not None:
             return cached
-        kernel = Kernel(program, self._bind(program))
-        self.kernel_cache.keep(key, kernel, self._laid_out, self._results, self._leaves)
+        tables, results = len(self._laid_out), len(self._results)
+        kernel = Kernel(program, self._bind(program, kept))
+        self.kernel_cache.keep(key, kernel, self._leaves)
+        # Those that were added, at the ends.
+        new_tables = dict(islice(self._laid_out.items(), tables, None))
+        new_results = dict(islice(self._results.items(), results, None))
+        self.kernel_cache.tables.keep(new_tables, new_results, self._leaves)
         return kernel
 
     def _program(self, key: tuple[Any, ...], listed: bool, build: Callable[[Trace], Sinks]) -> Program:
         return program_of(key, self.structure, self._leaves, self, build, listed)
 
-    def _bind(self, program: Program) -> Tables:
-        leaves = self._leaves.tensors
+    def _bind(self, program: Program, kept: Sequence[LaidOut | None]) -> Tables:
+        """Bind a program to the tables of this render; ``kept``: see :func:`torchpt.compiler.program.bind_tables`."""
         return bind_tables(
-            program.tables, program.steps, program.constants, leaves, self._laid_out, program.names, self._results
+            program.tables,
+            program.steps,
+            program.constants,
+            self._leaves.tensors,
+            self._laid_out,
+            program.names,
+            self._results,
+            kept=kept,
+            in_order=program.in_order,
         )
 
 
