@@ -15,7 +15,7 @@ import torch
 
 from torchpt.core import threads
 from torchpt.core.errors import RenderError
-from torchpt.core.threads import TaskQueue, map_in_order, parallel_for
+from torchpt.core.threads import TaskQueue, limited_threads, map_in_order, parallel_for, thread_count
 
 
 def dealt(task: Callable[[int], Any], count: int, **wish: Any) -> list[Any]:
@@ -281,3 +281,34 @@ def test_an_error_of_a_task_that_was_on_its_way_is_not_lost() -> None:
     with pytest.raises(ValueError, match="half of a sum"):
         map_in_order([0, 1], task, 2, each)
     assert seen == [0]
+
+
+def test_few_tasks_run_in_the_calling_thread():
+    """In order, with torch in one thread as in the pool; True or an error ends them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        found = dealt(lambda k: (k, threading.get_ident(), torch.get_num_threads()), 3, here=True)
+        assert found == [(k, threading.get_ident(), 1) for k in range(3)] and torch.get_num_threads() == 3
+        ended: list[int] = []
+        map_in_order(range(9), lambda k: k, 3, lambda k: ended.append(k) or k == 2, here=True)
+        assert ended == [0, 1, 2]
+        with pytest.raises(ZeroDivisionError):
+            dealt(lambda k: 1 // k, 2, here=True)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_small_renders_keep_torch_in_one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        for small, of_torch in ((True, 1), (False, 3)):
+            with limited_threads("auto", small):
+                assert (torch.get_num_threads(), thread_count(None)) == (of_torch, 3)
+            with limited_threads(2, small):
+                assert (torch.get_num_threads(), thread_count(None), thread_count(5)) == (min(of_torch, 2), 2, 5)
+        assert torch.get_num_threads() == thread_count(None) == 3
+    finally:
+        torch.set_num_threads(before)

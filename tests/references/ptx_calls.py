@@ -93,7 +93,7 @@ def _grid(lanes: int, machine: PtxMachine) -> tuple[int, int]:
 
 
 def _add_tables(memory: DeviceMemory, tables: Tables) -> None:
-    block, keep = tables.keep
+    block, keep = tables.pairs, [table for table, _ in tables.laid_out]
     memory.add(np.ctypeslib.as_array(block), constant=True)
     for table in keep:
         memory.add(table.numpy(), constant=True)

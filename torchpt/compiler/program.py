@@ -196,12 +196,12 @@ class Tables:
 
     Attributes:
         address: address of an array of pairs (pointer, number of entries).
-        keep: objects that own the memory.
+        pairs: the object that owns this array.
         laid_out: each table, and its number of entries.
     """
 
     address: int
-    keep: tuple[Any, ...]
+    pairs: Any
     laid_out: tuple[LaidOut, ...]
 
 
@@ -274,9 +274,9 @@ def bind_tables(
     words = [word for laid_out, entries in found for word in (laid_out.data_ptr(), entries)]
     if device is not None:
         pairs = torch.tensor(words or [0], dtype=torch.int64, device=device)
-        return Tables(pairs.data_ptr(), (pairs,), tuple(found))
+        return Tables(pairs.data_ptr(), pairs, tuple(found))
     block = (ctypes.c_int64 * max(len(words), 1))(*words)
-    return Tables(ctypes.addressof(block), (block,), tuple(found))
+    return Tables(ctypes.addressof(block), block, tuple(found))
 
 
 def guards_hold(program: Program, leaves: Mapping[str, Tensor]) -> bool:

@@ -19,7 +19,8 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
 from itertools import pairwise
 from queue import Empty, SimpleQueue
 from typing import Generic, TypeVar
@@ -225,6 +226,7 @@ def map_in_order(
     on_result: Callable[[R | None], bool],
     halt: threading.Event | None = None,
     ahead: int | None = None,
+    here: bool = False,
 ) -> None:
     """Run a task for each item on threads of the pool, and pass the results on in the order of items.
 
@@ -237,12 +239,21 @@ def map_in_order(
         halt: set from outside to end the work, and here after ``on_result`` returned True or something raised. Then no task
             starts, and a running ``task`` may check it to end early.
         ahead: largest number of tasks that start before the oldest one's result was passed on; None: any number.
+        here: True: tasks are so few and short that the calling thread runs them, as a thread of the pool would.
 
     Raises:
         RenderError: there is no memory for a single thread.
         Exception: the exception of a task or of ``on_result``; of several tasks that of the first in order.
     """
     halt = halt or threading.Event()
+    if here:
+        with one_thread():
+            for item in items:
+                if halt.is_set():
+                    return
+                if on_result(task(item)):
+                    halt.set()
+        return
     queue, numbered_items = TaskQueue[int, R](threads), enumerate(items)
     results: dict[int, R | BaseException] = {}  # not passed on yet, by the number of their item
     begun = delivered = 0  # items whose task was queued; results that were passed on
@@ -338,9 +349,13 @@ def parallel_for(work: Callable[[int, int], object], items: int, threads: int, p
 # -- torch's threads and modes
 
 
+#: Number of threads of the render that the calling thread works for; None: torch's.
+_threads_of_render: ContextVar[int | None] = ContextVar("threads_of_render", default=None)
+
+
 def thread_count(threads: int | None) -> int:
-    """Return the number of threads to use: ``threads``, or torch's number."""
-    return max(1, int(threads)) if threads else max(1, torch.get_num_threads())
+    """Return the number of threads to use: ``threads``, or that of the render (:func:`limited_threads`), or torch's."""
+    return max(1, int(threads or _threads_of_render.get() or torch.get_num_threads()))
 
 
 class _TorchThreads:
@@ -358,8 +373,8 @@ class _TorchThreads:
         self.forked, self.lock = forked, threading.Lock()
         self.before, self.renders = 0, 0
 
-    def enter(self, threads: int | str) -> None:
-        """Begin a render with a number of threads, or "auto": as many as torch has."""
+    def enter(self, threads: int | str) -> int:
+        """Begin a render with a number of threads, or "auto": as many as torch has; return the number."""
         with self.lock:
             if self.renders == 0:
                 self.before = torch.get_num_threads()
@@ -369,6 +384,7 @@ class _TorchThreads:
             if count != torch.get_num_threads():
                 torch.set_num_threads(count)
             start_torch_threads()
+            return torch.get_num_threads()
 
     def leave(self) -> None:
         """End a render."""
@@ -383,20 +399,28 @@ _torch_threads = _TorchThreads(forked=False)
 
 
 @contextmanager
-def limited_threads(threads: int | str) -> Iterator[None]:
-    """Let torch use ``threads`` threads within, also in overlapping renders; "auto": as many as before."""
+def limited_threads(threads: int | str, small: bool = False) -> Iterator[None]:
+    """Let torch use ``threads`` threads within, also in overlapping renders; "auto": as many as before.
+
+    Args:
+        threads: the number, or "auto".
+        small: True: torch itself uses one thread, as its tensors are so small that waking others takes longer than they
+            save, above all beside busy processes. :func:`thread_count` is still ``threads``.
+    """
     entered = _torch_threads
-    entered.enter(threads)
+    token = _threads_of_render.set(entered.enter(threads))
     try:
-        yield
+        with one_thread() if small else nullcontext():
+            yield
     finally:
+        _threads_of_render.reset(token)
         if entered is _torch_threads:  # otherwise this is the child of a fork, where another thread may hold the lock
             entered.leave()
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread within, for sums that :func:`sum_all` cannot replace."""
+    """Let torch use one thread within, for sums that :func:`sum_all` cannot replace, and for small tensors."""
     before = torch.get_num_threads()
     if before > 1:
         torch.set_num_threads(1)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.memory import Budget, Span
+from torchpt.core.threads import thread_count
 from torchpt.engines import work
 from torchpt.engines.kernels.engine import LANES as LANES_OF_KERNELS
 from torchpt.engines.kernels.programs import KernelCaches, Kernels, probed_kernels
@@ -152,10 +153,10 @@ def forward_kernels(kernels: Kernels, threads: int | None = None, strict: bool =
 
     Args:
         kernels: of the render.
-        threads: None: as many as torch uses.
+        threads: None: those of the render.
         strict: True: a task ends at its first chunk with a sample that is not finite; the caller has to end the render.
     """
-    return KernelsForward(kernels, threads or torch.get_num_threads(), kernels.wave.integrator.clamp, strict)
+    return KernelsForward(kernels, thread_count(threads), kernels.wave.integrator.clamp, strict)
 
 
 def why_no_kernels(device: torch.device) -> str:

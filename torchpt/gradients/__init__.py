@@ -32,6 +32,7 @@ from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.ranks import Group
 from torchpt.scene import Scene
 from torchpt.scene.memory_estimate import mark_loaded, memory_estimate
+from torchpt.scene.prepare import is_small
 from torchpt.scene.settings import Settings
 
 __all__ = ["attached", "film_space_applies", "gradients"]
@@ -79,7 +80,7 @@ def gradients(
     if (attached or film_space) and integrator.splats:
         expected = "one whose samples light their own pixels alone, where geometry or the camera is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)
-    with limited_threads(settings.render.threads):
+    with limited_threads(settings.render.threads, is_small(scene, settings)):
         attached = needs_direction_gradients(scene, wanted) if film_space else attached
         scene_tape = SceneTape(
             scene,

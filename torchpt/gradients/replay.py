@@ -25,7 +25,7 @@ from torch import Tensor
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import warn_once
 from torchpt.core.memory import Budget, Span, free_memory, is_out_of_memory, release_memory
-from torchpt.core.threads import map_in_order
+from torchpt.core.threads import map_in_order, thread_count
 from torchpt.engines.engine import (
     LANES_OF_KERNELS,
     Backward,
@@ -281,6 +281,7 @@ def _replay_on_threads(
     blocks = scene_tape.blocks(width * height, settings.render.spp)
     engines: list[Backward[Any, Any, Any]] = []  # those that no thread uses
     lock = threading.Lock()
+    is_single = settings.render.spp * sum(pixels for _, pixels in blocks) <= LANES_OF_KERNELS  # a single chunk
 
     def task(span: Span) -> ChunkGradientSums:
         with lock:
@@ -299,7 +300,8 @@ def _replay_on_threads(
     try:
         while True:
             try:
-                map_in_order(_spans(blocks, settings.render.spp), task, budget.threads, merge, ahead=2 * budget.threads)
+                spans = _spans(blocks, settings.render.spp)
+                map_in_order(spans, task, budget.threads, merge, ahead=2 * budget.threads, here=is_single)
                 return ""
             except Unsupported as error:
                 return f"no kernel can be made of {error}"
@@ -345,7 +347,7 @@ def _spans(blocks: Sequence[tuple[int, int]], samples: int, chunks: int = 1) -> 
 
 def _budget_of_kernels(kernels: BackwardKernels, settings: Settings) -> Budget:
     """Return the budget of threads: fewer than torch has if their arenas would take more than half of ``render.max_memory``."""
-    threads = torch.get_num_threads()
+    threads = thread_count(None)
     budget = Budget(torch.device("cpu"), LANES_OF_KERNELS, threads, what="a gradient", fallback="one thread")
     limit = settings.render.max_memory
     if limit is not None:

@@ -43,7 +43,7 @@ from torchpt.scene.memory_estimate import (
     mark_loaded,
     memory_estimate,
 )
-from torchpt.scene.prepare import device_engine, kernel_engine, make_wave, surface_layers, uses_kernels
+from torchpt.scene.prepare import device_engine, is_small, kernel_engine, make_wave, surface_layers, uses_kernels
 from torchpt.scene.settings import Settings
 
 __all__ = ["Run", "render_scene"]
@@ -612,6 +612,7 @@ def render_scene(
         AssetError: the checkpoint is damaged, or is of another render.
         OutputError: the checkpoint cannot be written, or exists without ``render.resume``.
     """
-    with without_autocast(scene.device), limited_threads(settings.render.threads):
+    small = is_small(scene, settings)
+    with without_autocast(scene.device), limited_threads(settings.render.threads, small):
         with together(ranks, "what is rendered", lambda: render_fingerprint(scene, settings, params, dtype)):
             return Run(scene, settings, params, dtype, group=ranks, rays=rays).sample_all(on_progress)

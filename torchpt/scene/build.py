@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,6 +47,11 @@ class SceneBuild:
     unit: float
     sources: tuple[Source, ...] = ()
     copies: tuple[Copy, ...] = ()
+
+    @cached_property
+    def numbers(self) -> int:
+        """Return how many numbers the parameters have."""
+        return sum(np.size(value) for value in self.parameters.values())
 
 
 def build_parts(description: Description, vertex_params: Collection[str] = ()) -> SceneBuild:

@@ -44,6 +44,7 @@ __all__ = [
     "SceneCache",
     "describe_engine",
     "device_engine",
+    "is_small",
     "kernel_engine",
     "kernels_of",
     "make_wave",
@@ -300,6 +301,19 @@ def _pixel_of(world: World, camera: Camera) -> Tensor | None:
         return None
     pixel = moved(camera, torch.device("cpu")).pixel()  # on the host, as the camera was
     return moved(pixel, world.geometry.p0.device)
+
+
+#: Most samples of a small render: up to here torch uses one thread for a tensor with a number a sample.
+SMALL_SAMPLES = 1 << 15
+#: Most numbers of the parameters of a scene of small renders.
+SMALL_NUMBERS = 1 << 18
+
+
+def is_small(scene: Scene, settings: Settings) -> bool:
+    """Return True for a render whose tensors are so small that torch is faster in one thread."""
+    film = settings.film
+    _, _, width, height = film.crop or (0, 0, film.width, film.height)
+    return width * height * settings.render.spp <= SMALL_SAMPLES and scene.numbers <= SMALL_NUMBERS
 
 
 def uses_kernels(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool:

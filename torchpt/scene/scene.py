@@ -248,6 +248,11 @@ class Scene:
         """Return the transform to the coordinates of lanes."""
         return self._space
 
+    @property
+    def numbers(self) -> int:
+        """Return how many numbers its parameters have as they were loaded."""
+        return self._built.numbers
+
     def center(self) -> np.ndarray:
         """Return the centre ``(3,)`` of the bounding box of all surfaces, float64; the origin where there are none."""
         return bounds_center(self._built.parts, self._built.copies)

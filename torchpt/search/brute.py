@@ -145,8 +145,8 @@ class Brute(Accel):
             call(ctypes.addressof(in_memory), end - start)
 
         worthwhile = max(count * sum(self.counts) // _GRAIN, 1)
-        # torch has one thread inside a worker thread, where callers share the work already.
-        threads = min(thread_count(self.threads), torch.get_num_threads(), worthwhile)
+        # A worker thread has one thread, as callers share the work already.
+        threads = min(thread_count(self.threads), thread_count(None), worthwhile)
         parallel_for(search_blocks, -(-count // _BLOCK), threads)
 
     def describe(self) -> dict[str, Any]:

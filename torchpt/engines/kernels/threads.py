@@ -179,7 +179,8 @@ class KernelsForward:
                 unfinished.extend(result.unfinished)
             return each(result)
 
-        map_in_order(blocks, self.task, self.budget.threads, on_result, self._halt)
+        is_small = len(blocks) == 1 and all(size * count <= LANES for _, _, size, _, count in blocks)  # a single chunk
+        map_in_order(blocks, self.task, self.budget.threads, on_result, self._halt, here=is_small)
         return unfinished
 
     def _smaller(self, blocks: list[Block]) -> list[Block]:
