@@ -32,8 +32,10 @@ if TYPE_CHECKING:
     from torchpt.rendering.api import render, trace
     from torchpt.rendering.batches import Renderings, render_batch
     from torchpt.rendering.estimates import GradientEstimate, gradient
+    from torchpt.rendering.renderer import Renderer
     from torchpt.scene import Scene, load
     from torchpt.scene.from_trimesh import from_trimesh
+    from torchpt.scene.prepare import empty_cache
 
 __all__ = [
     "AssetError",
@@ -47,6 +49,7 @@ __all__ = [
     "OtherRankError",
     "OutputError",
     "RenderError",
+    "Renderer",
     "Rendering",
     "Renderings",
     "Scene",
@@ -55,6 +58,7 @@ __all__ = [
     "cameras",
     "data",
     "denoise",
+    "empty_cache",
     "extend",
     "from_trimesh",
     "gradient",
@@ -77,10 +81,12 @@ __all__ = [
 _LAZY_NAMES = {
     "Bsdf": "torchpt.physics.bsdfs",
     "GradientEstimate": "torchpt.rendering.estimates",
+    "Renderer": "torchpt.rendering.renderer",
     "Rendering": "torchpt.rendering",
     "Renderings": "torchpt.rendering.batches",
     "Scene": "torchpt.scene",
     "denoise": "torchpt.images.denoiser",
+    "empty_cache": "torchpt.scene.prepare",
     "from_trimesh": "torchpt.scene.from_trimesh",
     "gradient": "torchpt.rendering.estimates",
     "load": "torchpt.scene",

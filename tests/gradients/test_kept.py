@@ -88,3 +88,18 @@ def test_tables_of_differentiated_tensors_are_given_back() -> None:
     gc.collect()
     assert seen and not any(tensor() is not None for tensor in seen)
     assert scene_cache(scene).kernels is not None
+
+
+def test_scenes_by_other_cameras_share_tables() -> None:
+    """The tensors of one kind of camera are no tensors of another."""
+    flat = {"type": "orthographic", "origin": [0, 1, 6], "target": [0, 1, 0], "width": 2.5}
+    scene = torchpt.load("cornell_box", "cpu")
+    name = next(name for name in scene.params if name.endswith("reflectance"))
+    values = {name: scene.params[name]}
+    for camera in (None, flat, None):
+        kept, fresh = (
+            loaded if camera is None else loaded.seen_by(camera)
+            for loaded in (scene, torchpt.load("cornell_box", "cpu"))
+        )
+        for a, b in zip(gradients(kept, values), gradients(fresh, values), strict=True):
+            assert a.equal(b)

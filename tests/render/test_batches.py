@@ -378,9 +378,9 @@ def counted(monkeypatch):
     plain = loop_kernels.Kernels._make
 
     def make(self, key, *rest):
-        known = self.kernel_cache._kernels.get(key)
+        known = self.kernel_cache._entries.get(key)
         kernel = plain(self, key, *rest)
-        if known is None or kernel is not known[0]:
+        if known is None or kernel is not known.kernel:
             made["tables"].append(key[0])
         return kernel
 

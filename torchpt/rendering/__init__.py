@@ -2,6 +2,7 @@
 
 ===================  ===================================================================================
 ``api.py``           ``render`` and ``trace``, the one entry of the command line and of Python: start here
+``renderer.py``      a scene and its settings, decided once for many calls
 ``requests.py``      one call of ``render``: arguments checked and completed to settings, autograd where gradients are needed
 ``run.py``           one forward render: samples chunks and accumulates them in films
 ``stopping.py``      stop rules, and the number of samples of the next pass

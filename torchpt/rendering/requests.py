@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any, Unpack
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -27,12 +28,15 @@ from torchpt.rendering.graphs import reuse_rendering
 from torchpt.rendering.result import denoise_rendering
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
+from torchpt.scene.formats.description import Description
 from torchpt.scene.formats.description import settings as complete_settings
 from torchpt.scene.settings import (
     SAMPLERS,
     CallArguments,
     CommonOptions,
     Params,
+    RenderOptions,
+    SeedOfCall,
     Settings,
     film_keys,
     seed_number,
@@ -41,9 +45,18 @@ from torchpt.scene.settings import (
 from torchpt.scene.texel_params import update_texels, with_texel_params
 from torchpt.scene.validation import params_as_tensors
 from torchpt.scene.versions import AFTER, check_unchanged
-from torchpt.spec import Role
+from torchpt.spec import Refused, Role
+from torchpt.spec.arguments import SCENE_VALUE, arguments_of
+from torchpt.spec.schema import ResultCache, scene_error
 
-__all__ = ["RenderRequest", "execute_request", "prepare_request", "prepare_trace_request"]
+__all__ = [
+    "RenderRequest",
+    "RequestTemplate",
+    "execute_request",
+    "prepare_request",
+    "prepare_trace_request",
+    "template_of",
+]
 
 _FLOATS = (torch.float32, torch.float64)
 #: Flips bits of a seed, so that backward passes by default draw other numbers than forward passes. (The multiplier of drand48.)
@@ -102,6 +115,79 @@ class RenderRequest:
         update_texels(self.scene, self.caller_scene, self.params)
 
 
+@dataclass(frozen=True)
+class RequestTemplate:
+    """What the requests of one scene and options share, checked: all but parameters and seed.
+
+    Attributes:
+        settings: the complete settings, with the seed of the options or of the scene file.
+        call: options of the call that are no settings, without parameters.
+    """
+
+    settings: Settings
+    call: CallArguments
+
+    def request(self, scene: Scene, params: Params | None, seed: SeedOfCall) -> RenderRequest:
+        """Return the request of a picture.
+
+        Args:
+            scene: the scene.
+            params: tensors in place of the scene's, by name.
+            seed: ``SCENE_VALUE``: that of the settings; None: a new one.
+
+        Raises:
+            SceneError: parameters or seed are not accepted.
+        """
+        settings, full = self.settings, bool(self.call.full)
+        if seed is not SCENE_VALUE:
+            number = _read_argument("seed", seed_number(seed), "render.seed")
+            if number != settings.render.seed:
+                settings = replace(settings, render=settings.render.but(seed=number))
+        given = _parameters(scene, _read_argument("params", params, "params"), full)
+        textured = with_texel_params(scene, given)
+        textured.check_own()
+        request = RenderRequest(scene, textured, settings, self.call, given)
+        return request.with_versions() if request.needs_gradients else request
+
+
+def template_of(scene: Scene, full: bool, options: Mapping[str, Any]) -> RequestTemplate:
+    """Return the template of requests; the latest ones of a scene are kept. ``params`` and ``seed`` are passed over.
+
+    Raises:
+        SceneError: an argument is not accepted.
+        RenderError: the denoiser is missing.
+    """
+    shared = {name: value for name, value in options.items() if name not in ("params", "seed")}
+    templates, description = _templates.get(scene, (None, None))
+    if templates is None or description is not scene.description:
+        templates = ResultCache[RequestTemplate](most=8)
+        _templates[scene] = templates, scene.description
+    return templates.get(full, shared, lambda: _template_of(scene, full, shared))
+
+
+#: Templates of the latest options of each scene, and the description that they were made for.
+_templates: WeakKeyDictionary[Scene, tuple[ResultCache[RequestTemplate], Description]] = WeakKeyDictionary()
+
+
+def _template_of(scene: Scene, full: bool, options: Mapping[str, Any]) -> RequestTemplate:
+    call = CallArguments.of({**options, "full": full})
+    _check_device(scene, options.get("device"))
+    settings = complete_settings(scene.description, settings_of_call(options))
+    if not full:
+        settings = _without_aovs(settings, film_keys(options.get("film")))
+    elif settings.film.denoise:
+        check_denoiser()
+    return RequestTemplate(settings, call)
+
+
+def _read_argument(name: str, value: Any, key: str) -> Any:
+    """Return a checked argument of :func:`torchpt.render`; ``key``: of the error."""
+    try:
+        return arguments_of(RenderOptions)[name].read(value)
+    except Refused as error:
+        raise scene_error(error, key=key, value=value, file=None) from None
+
+
 def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) -> RenderRequest:
     """Return the request that arguments of ``render`` make.
 
@@ -110,20 +196,8 @@ def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) 
         RenderError: the denoiser is missing.
     """
     scene = as_scene(scene)
-    call = CallArguments.of({**options, "full": full})
-    _check_call(scene, call, options.get("device"))
-    if "seed" in options:
-        options["seed"] = seed_number(options["seed"])
-    settings = complete_settings(scene.description, settings_of_call(options))
-    if not full:
-        settings = _without_aovs(settings, film_keys(options.get("film")))
-    elif settings.film.denoise:
-        check_denoiser()
-    params = _parameters(scene, call.params, full)
-    textured = with_texel_params(scene, params)
-    textured.check_own()
-    request = RenderRequest(scene, textured, settings, call, params)
-    return request.with_versions() if request.needs_gradients else request
+    seed = options.get("seed", SCENE_VALUE)
+    return template_of(scene, full, options).request(scene, options.get("params"), seed)
 
 
 def prepare_trace_request(scene: Scene, o: Tensor, d: Tensor, **options: Unpack[CommonOptions]) -> RenderRequest:
@@ -191,7 +265,11 @@ def _parameters(scene: Scene, params: Params | None, full: bool) -> dict[str, Te
         SceneError: an unknown name, or a value that is no tensor with data. Values are checked later, outside of transforms
             of ``torch.func`` (:mod:`torchpt.core.autograd`).
     """
-    given = params_as_tensors(scene, params or {})
+    given: dict[Any, Any] = dict(params or {})
+    for name in given:
+        if not isinstance(name, str):
+            raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.params))}")
+    given = params_as_tensors(scene, given)
     if any(name not in scene.params or not isinstance(value, Tensor) or value.is_meta for name, value in given.items()):
         scene.check(given)
     if full and any(is_batched(value) for value in given.values()):
@@ -251,11 +329,8 @@ def _without_aovs(settings: Settings, film: Mapping[str, Any] | None) -> Setting
     return replace(settings, film=settings.film.but(denoise=False, aovs=aovs))
 
 
-def _check_call(scene: Scene, call: CallArguments, device: str | torch.device | None) -> None:
-    """Raise SceneError for arguments of :func:`render` that do not fit the scene."""
-    for name in call.params or {}:
-        if not isinstance(name, str):
-            raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.params))}")
+def _check_device(scene: Scene, device: str | torch.device | None) -> None:
+    """Raise SceneError for another device than the scene's."""
     if device not in (None, "auto") and not _same_device(device, scene.device):
         raise SceneError("device", str(device), f"the scene's own device {scene.device}; load the scene on the other")
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError, warn_once
+from torchpt.core.memory import on_low_memory, release_memory
 from torchpt.core.tree import moved
 from torchpt.engines import engine
 from torchpt.engines.engine import ForwardDevice, KernelCaches, Kernels, Tasks
@@ -33,6 +34,7 @@ from torchpt.physics.film import Filter
 from torchpt.physics.samplers import ADAPTIVE, Points, Sampler
 from torchpt.physics.world import World
 from torchpt.scene import Scene
+from torchpt.scene.scene import live_scenes
 from torchpt.scene.settings import Settings
 from torchpt.spec import Moves
 from torchpt.spec.schema import ParsedParams
@@ -44,6 +46,7 @@ __all__ = [
     "SceneCache",
     "describe_engine",
     "device_engine",
+    "empty_cache",
     "is_small",
     "kernel_engine",
     "kernels_of",
@@ -86,6 +89,26 @@ _caches: WeakKeyDictionary[Scene, SceneCache] = WeakKeyDictionary()
 def scene_cache(scene: Scene) -> SceneCache:
     """Return the cache of a scene, which lives as long as the scene; its views share it."""
     return _caches.setdefault(scene.origin, SceneCache())
+
+
+def _drop_kept() -> None:
+    """Drop what renders have kept for later ones, but for a scene's own worlds and search structures."""
+    for scene in live_scenes():
+        scene.drop_pieces()
+    for scene in list(_caches):
+        _caches[scene] = SceneCache(outlines=_caches[scene].outlines)
+
+
+on_low_memory(_drop_kept)
+
+
+def empty_cache() -> None:
+    """Give back the memory that renders and gradients keep for later ones; the next of each scene makes it anew.
+
+    Freed are buffers of threads, tables and machine code bound to them, pieces of worlds, reference cycles, and what the
+    allocators of Python and CUDA hold. A scene's own world and search structure stay as long as the scene.
+    """
+    release_memory()
 
 
 # ---- The wave of a render, and its engine: tensor operations or kernels

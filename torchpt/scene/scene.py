@@ -49,7 +49,7 @@ from torchpt.scene.world.pieces import KeptPieces, ParameterReads
 from torchpt.search import Accel
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
-__all__ = ["Scene", "scene_by_number"]
+__all__ = ["Scene", "live_scenes", "scene_by_number"]
 
 #: Attributes that copies take over; all others are rebuilt on demand.
 _COPIED_ATTRIBUTES = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
@@ -62,6 +62,11 @@ _scenes: WeakValueDictionary[int, Scene] = WeakValueDictionary()
 def scene_by_number(number: int) -> Scene | None:
     """Return the scene with a number; None once it is gone."""
     return _scenes.get(number)
+
+
+def live_scenes() -> list[Scene]:
+    """Return all live scenes."""
+    return list(_scenes.values())
 
 
 def _leaf(value: Tensor) -> Tensor:
@@ -233,6 +238,10 @@ class Scene:
         triangles = sum(len(value) for name, value in self.params.items() if name.endswith(".vertices"))
         held = sum(value.numel() * value.element_size() for value in self.params.values())
         return f"{len(self._built.parts)} parts with {triangles} vertices, whose parameters alone take {mb(held)}"
+
+    def drop_pieces(self) -> None:
+        """Drop the pieces that are kept for the next world."""
+        self._pieces.clear()
 
     def replace_build(self, built: SceneBuild) -> None:
         """Replace the build of a new copy by one with other materials, before anything is cached."""

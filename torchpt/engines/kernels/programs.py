@@ -89,7 +89,8 @@ class NamedTensors:
 
     def has(self, path: str, state: TensorVersion) -> bool:
         """Return True if the tensor at ``path`` is the same object with the same contents as in ``state``."""
-        (tensor, version), (kept_tensor, kept_version) = self.states[path], state
+        tensor, version = self.states.get(path, (None, None))  # None: of another structure
+        kept_tensor, kept_version = state
         return tensor is kept_tensor and version == kept_version
 
 
