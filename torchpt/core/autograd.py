@@ -6,6 +6,7 @@ the loss with respect to a result (PyTorch: ``grad_output``).
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
@@ -130,6 +131,12 @@ class _CustomVjp(torch.autograd.Function):
         return _call_for_each(_CustomVjp.apply, info.batch_size, in_dims, arguments)
 
 
+def _with_signature(function: type[torch.autograd.Function]) -> None:
+    """Store the signature of ``forward``, which torch would otherwise read from its code at every call."""
+    forward: Any = function.forward
+    forward.__signature__ = inspect.signature(forward)
+
+
 class _CustomVjpBackward(torch.autograd.Function):
     """The backward pass as a function of its own, on which ``torch.func`` may call ``vmap`` or differentiate again."""
 
@@ -158,6 +165,10 @@ class _CustomVjpBackward(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
         return _call_for_each(_CustomVjpBackward.apply, info.batch_size, in_dims, arguments)
+
+
+_with_signature(_CustomVjp)
+_with_signature(_CustomVjpBackward)
 
 
 def _call_for_each(

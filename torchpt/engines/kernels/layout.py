@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,8 @@ from torchpt.compiler.form import CAPACITY
 from torchpt.compiler.graph import DTYPES
 from torchpt.compiler.sinks import AppendIndex, Scatter, Sinks
 from torchpt.compiler.tracing import Tracer
+from torchpt.core.autograd import outside_transforms
+from torchpt.core.threads import outside_inference_mode
 from torchpt.paths.state import EXTRA, PathState
 from torchpt.paths.wave import camera_state
 from torchpt.physics.samplers import Dimension
@@ -276,12 +279,18 @@ def _key_field(wave: Wave) -> Fields:
     return {"key": ((wave.sampler.points.rows,), "i")}
 
 
+@cache
+def _state_of_one_lane(rows: int) -> PathState:
+    """Return a state of one lane whose key has so many rows, of which only names, shapes and types are read."""
+    with outside_transforms(), outside_inference_mode():
+        vector, key = torch.zeros(3, 1), torch.zeros(rows, 1, dtype=torch.int32)
+        return camera_state(vector, vector, key)
+
+
 def _path_fields(layout: Layout) -> Fields:
     """Return the fields of the arena: the path state of this scene, filter weight, hit, shadow ray, splat."""
     wave, world = layout.wave, layout.world
-    # the state of one lane, of which only names, shapes and types are read
-    vector, key = torch.zeros(3, 1), torch.zeros(wave.sampler.points.rows, 1, dtype=torch.int32)
-    state = wave.with_optional_fields(camera_state(vector, vector, key))
+    state = wave.with_optional_fields(_state_of_one_lane(wave.sampler.points.rows))
     fields: Fields = {name: (tuple(x.shape[:-1]), DTYPES[x.dtype]) for name, x in state_values(state).items()}
     if wave.filter.signed:
         fields["weight"] = ((), "f")

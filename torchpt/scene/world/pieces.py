@@ -180,18 +180,12 @@ class ParameterReads(Mapping[str, Tensor]):
     def _has(self, name: str, state: _State) -> bool:
         """Return True if a parameter is in a state."""
         now = self._state(name)
-        if now is None or now[:2] != state[:2]:
+        if now is state:
+            return True
+        if now is None or not _equal(now, state):
             return False
-        contents, before = now[2], state[2]
-        if isinstance(contents, bytes) or isinstance(before, bytes):
-            return contents == before
-        (tensor, version), (tensor_before, version_before) = contents, before
-        # `before` holds its memory, so that no other tensor can have the same address.
-        return (
-            version == version_before
-            and tensor.data_ptr() == tensor_before.data_ptr()
-            and tensor.stride() == tensor_before.stride()
-        )
+        self._states[name] = state  # so that other pieces find the same object
+        return True
 
     def _state(self, name: str) -> _State | None:
         """Return the state of a parameter; None where pieces made from it cannot be kept: they belong to an autograd tape."""
@@ -207,6 +201,21 @@ class ParameterReads(Mapping[str, Tensor]):
         if not own and value.numel() <= SMALL and value.dtype in _PLAIN:
             return value.dtype, value.shape, value.numpy(force=True).tobytes()
         return value.dtype, value.shape, (value.detach(), value._version)  # with the same memory and count of changes
+
+
+def _equal(now: _State, state: _State) -> bool:
+    if now[:2] != state[:2]:
+        return False
+    contents, before = now[2], state[2]
+    if isinstance(contents, bytes) or isinstance(before, bytes):
+        return contents == before
+    (tensor, version), (tensor_before, version_before) = contents, before
+    # `before` holds its memory, so that no other tensor can have the same address.
+    return (
+        version == version_before
+        and tensor.data_ptr() == tensor_before.data_ptr()
+        and tensor.stride() == tensor_before.stride()
+    )
 
 
 class Pieced:
