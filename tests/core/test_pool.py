@@ -290,7 +290,7 @@ def test_few_tasks_run_in_the_calling_thread():
     try:
         found = dealt(lambda k: (k, threading.get_ident(), torch.get_num_threads()), 3, here=True)
         assert found == [(k, threading.get_ident(), 1) for k in range(3)] and torch.get_num_threads() == 3
-        ended: list[int] = []
+        ended: list[int | None] = []
         map_in_order(range(9), lambda k: k, 3, lambda k: ended.append(k) or k == 2, here=True)
         assert ended == [0, 1, 2]
         with pytest.raises(ZeroDivisionError):
