@@ -5,7 +5,8 @@ is made, the parameters that it reads are recorded, directly or through other pi
 if none of these has changed, so that a render that hands over one colour assembles one material, and kernels find the tables
 of all other tensors laid out (:mod:`torchpt.engines.kernels.programs`).
 
-Parameters of a few numbers are compared by value, larger ones by memory and by torch's count of changes in place.
+Parameters that are handed over are compared by value; pieces made from very large ones are not kept. The scene's own parameters
+are compared by memory and by torch's count of changes in place.
 """
 
 from __future__ import annotations
@@ -27,13 +28,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 M = TypeVar("M", bound="Pieced")
 
-#: Most elements of a parameter that is compared by value: those of poses, colours and factors.
-SMALL = 64
-#: Most bytes of larger parameters, other than the scene's own, that a kept piece may depend on: it keeps them in memory.
-MOST_BYTES = 4 << 20
-
-#: Types that are compared by value; NumPy lacks others.
-_PLAIN = (torch.float32, torch.float64, torch.float16)
+#: Most elements of a parameter that is compared by value; comparing more takes longer than assembling most pieces.
+MOST_COMPARED = 1 << 14
 
 #: State of a parameter: type, shape, and its values as bytes, or a tensor of the same memory and its count of changes.
 _State = tuple[torch.dtype, torch.Size, bytes | tuple[Tensor, int]]
@@ -167,15 +163,12 @@ class ParameterReads(Mapping[str, Tensor]):
     def _states_of(self, names: set[str]) -> dict[str, _State] | None:
         """Return the states of parameters; None if a piece that depends on them cannot be kept."""
         states: dict[str, _State] = {}
-        size = 0  # bytes
         for name in names:
             state = self._state(name)
             if state is None:
                 return None
             states[name] = state
-            if not isinstance(state[2], bytes) and name not in self._own:
-                size += self._parameters[name].nbytes
-        return states if size <= MOST_BYTES else None
+        return states
 
     def _has(self, name: str, state: _State) -> bool:
         """Return True if a parameter is in a state."""
@@ -188,7 +181,7 @@ class ParameterReads(Mapping[str, Tensor]):
         return True
 
     def _state(self, name: str) -> _State | None:
-        """Return the state of a parameter; None where pieces made from it cannot be kept: they belong to an autograd tape."""
+        """Return the state of a parameter; None where pieces made from it cannot be kept."""
         if name == _MORE:
             return None
         if name not in self._states:
@@ -198,9 +191,15 @@ class ParameterReads(Mapping[str, Tensor]):
     def _state_now(self, value: Tensor, *, own: bool) -> _State | None:
         if value.is_inference() or (value.requires_grad and torch.is_grad_enabled()):
             return None
-        if not own and value.numel() <= SMALL and value.dtype in _PLAIN:
-            return value.dtype, value.shape, value.numpy(force=True).tobytes()
-        return value.dtype, value.shape, (value.detach(), value._version)  # with the same memory and count of changes
+        if own:
+            return (
+                value.dtype,
+                value.shape,
+                (value.detach(), value._version),
+            )  # with the same memory and count of changes
+        if value.numel() > MOST_COMPARED:
+            return None
+        return value.dtype, value.shape, value.detach().reshape(-1).view(torch.uint8).numpy(force=True).tobytes()
 
 
 def _equal(now: _State, state: _State) -> bool:
