@@ -199,7 +199,11 @@ class ParameterReads(Mapping[str, Tensor]):
             )  # with the same memory and count of changes
         if value.numel() > MOST_COMPARED:
             return None
-        return value.dtype, value.shape, value.detach().reshape(-1).view(torch.uint8).numpy(force=True).tobytes()
+        return (
+            value.dtype,
+            value.shape,
+            value.detach().flatten().contiguous().view(torch.uint8).numpy(force=True).tobytes(),
+        )
 
 
 def _equal(now: _State, state: _State) -> bool:
