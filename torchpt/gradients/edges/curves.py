@@ -274,6 +274,8 @@ def generator(bodies: Bodies, prim: Tensor, form: Form, view: View, side: Tensor
 
 #: Faces whose unit normals differ by less make no crease.
 _FLAT = 1e-6
+#: Least weight of a crease at which shading or texture coordinates may jump: most creases jump less than outlines.
+_CREASE = 0.05
 #: Points that are closer, against the size of all, are one.
 _SAME = 1e-6
 #: Odd multipliers that make one number of three, any constants.
@@ -287,7 +289,7 @@ class Folds:
     curves: Curves
     others: tuple[Held, Held]  # corners of the two faces off the edge
     border: Tensor  # (N,) bool
-    crease: Tensor  # (N,) bool: where both faces are seen what is seen may jump
+    crease: Tensor  # (N,) from 0 to 1: how much radiance may jump where both faces are seen, beside an outline
     normals: tuple[Tensor, Tensor]  # (3, N) unit, of the two faces
 
 
@@ -371,9 +373,14 @@ def folds_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Iterator
         for first in firsts:
             curves, others = mesh_edges(edges, every, first, turned)
             normals = (_normal(bodies, others[0].prim), _normal(bodies, others[1].prim))
-            bent = dot(normals[0] - normals[1], normals[0] - normals[1]) > _FLAT**2
-            crease = edges.split & (bent | (part.uvs is not None)) if part.smooth else bent
-            yield Folds(curves, others, edges.border, crease & ~edges.border, normals)
+            apart = normals[0] - normals[1]
+            bend = 0.5 * dot(apart, apart).sqrt()
+            jumps = edges.split if part.smooth else ~edges.border  # the shading
+            # Where faces are shaded smooth one side lacks the light below its face: of an angle, near the horizon.
+            crease = torch.where(bend > _FLAT, torch.where(jumps, bend.clamp(_CREASE, 1.0), bend * bend), 0.0)
+            if part.uvs is not None:
+                crease = torch.where(edges.split, crease.clamp_min(_CREASE), crease)
+            yield Folds(curves, others, edges.border, torch.where(edges.border, 0.0, crease), normals)
 
 
 def _normal(bodies: Bodies, prim: Tensor) -> Tensor:

@@ -135,8 +135,6 @@ def share_of(bodies: Bodies, held: Held, mate: Tensor, s: Tensor, prim: Tensor, 
 
 #: Pieces that a round curve is cut into.
 _CUTS = 64
-#: Least weight of a crease against a silhouette of the same length: most creases jump less.
-_CREASE = 0.05
 
 Bounds = tuple[float, float, float, float]
 
@@ -207,9 +205,7 @@ def _silhouettes(bodies: Bodies, folds: Folds, view: View) -> tuple[Curves, Tens
     across = cross(along, view.toward(p))
     one, two = (dot(across, bodies.points(other) - p) for other in folds.others)
     outline = folds.border | (one * two >= 0)
-    apart = folds.normals[0] - folds.normals[1]
-    importance = (dot(apart, apart).sqrt() * 0.5).clamp(_CREASE, 1.0)
-    importance = torch.where(outline, 1.0, torch.where(folds.crease, importance, 0.0))
+    importance = torch.where(outline, 1.0, folds.crease)
     index = (importance > 0).nonzero().squeeze(1)
     return rows(folds.curves, index), take(importance, index)
 
