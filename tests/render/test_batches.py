@@ -21,9 +21,7 @@ from torchpt.engines.kernels import engine, programs
 from torchpt.engines.kernels import programs as loop_kernels
 from torchpt.paths.integrators import base
 from torchpt.rendering import Run
-from torchpt.rendering.batches import batch as batch_module
-from torchpt.rendering.batches import inputs as batch_inputs
-from torchpt.rendering.requests import prepare_request
+from torchpt.rendering.batches import Picture, request_of, task_counts
 from torchpt.scene import scene as scenes_room
 
 SIZE = {"width": 24, "height": 16, "filter": "box"}
@@ -189,12 +187,9 @@ def test_samples_of_each_scene_and_camera():
 
 
 def test_a_picture_of_many_samples_is_more_tasks():
-    counts = batch_module._task_counts(batch_inputs.values_of("spp", [1, 1, 1, 61], 4, 1), 4, 1)
-    scene = room()
-    of_samples = [
-        counts(batch_module._Picture(0, 0, "", prepare_request(scene, full=False, spp=spp))) for spp in (1, 61)
-    ]
-    assert of_samples[0] == 1 and of_samples[1] > 0.9 * TASKS * torch.get_num_threads()
+    scene, counts = room(), task_counts(4, 16.0)
+    few_samples, many = (counts(Picture(0, 0, "", request_of(scene, False, spp=spp))) for spp in (1, 61))
+    assert few_samples == 1 and many > 0.9 * TASKS * torch.get_num_threads()
 
 
 def test_cameras_of_each_scene():

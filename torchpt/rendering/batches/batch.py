@@ -38,11 +38,11 @@ from torchpt.rendering.batches.inputs import (
 from torchpt.rendering.requests import RenderRequest, execute_request, prepare_request
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import BatchOptions, Params, RenderOptions
+from torchpt.scene.settings import BatchOptions, CommonOptions, Params, RenderOptions
 from torchpt.scene.versions import check_unchanged
 from torchpt.spec.arguments import SCENE_VALUE, check_names, expand_signature
 
-__all__ = ["Renderings", "render_batch"]
+__all__ = ["Picture", "Renderings", "render_batch", "render_pictures", "request_of", "task_counts"]
 
 
 @dataclass(repr=False, eq=False)
@@ -73,8 +73,15 @@ class Renderings:
 
 
 @dataclass(frozen=True)
-class _Picture:
-    """One picture of a batch: its indices, its name in errors, and the request."""
+class Picture:
+    """One picture of a batch: its indices, its name in errors, and the request.
+
+    Attributes:
+        scene: number of the scene with its parameters; consecutive pictures of one number differ in cameras and samples only.
+        camera: number of the camera.
+        name: such as ``scenes[3]``; "" if there is nothing to name.
+        request: of the picture, with the versions of the scene's parameters.
+    """
 
     scene: int
     camera: int
@@ -172,10 +179,20 @@ def render_batch(
         raise SceneError("scenes", 0, "one scene at least")
     total = None if size is None else size * batch_cameras.count
     found: dict[tuple[int, int], tuple[RenderRequest | None, Rendering]] = {}  # by scene and camera
+
+    def on_done(picture: Picture, request: RenderRequest | None, rendering: Rendering) -> None:
+        found[picture.scene, picture.camera] = request, rendering
+        if on_progress is not None:
+            on_progress(len(found), total)
+
     with limited_threads(first.request.settings.render.threads):
         _check_memory(first.request, total)
-        tasks_of = _task_counts(spp_of, size, batch_cameras.count)
-        render_many(_queued_renders(chain([first], pictures), tasks_of, found, on_progress, total))
+        given_spp = [spp_of(s, c) for s in range(size or 0) for c in range(batch_cameras.count)]
+        counts = [
+            spp for spp in given_spp if type(spp) is int and spp > 0
+        ]  # others: errors, or None for the scenes' own
+        tasks_of = task_counts(total, sum(counts) / len(counts) if counts else None) if total else lambda picture: 1
+        render_pictures(chain([first], pictures), tasks_of, on_done)
     count = 1 + max(s for s, _ in found)
     rows_of_cameras = None if batch_cameras.shared else batch_cameras.rows
     for key, given in (("params", param_sets), ("cameras", rows_of_cameras), ("spp", spp), ("seed", seed)):
@@ -204,23 +221,17 @@ def _with_gradients(found: tuple[RenderRequest | None, Rendering]) -> Rendering:
     return rendering if request is None else execute_request(request, [rendering])
 
 
-def _task_counts(spp_of: Callable[[int, int], Any], scenes: int | None, cameras: int) -> Callable[[_Picture], int]:
+def task_counts(pictures: int, mean_spp: float | None) -> Callable[[Picture], int]:
     """Return a function that gives the number of tasks of a picture: of all pictures together as many as one render has.
 
     Args:
-        spp_of: returns the samples a pixel of scene ``s`` and camera ``c`` as the caller gave them.
-        scenes: number of scenes; None if not known: one task for each picture.
-        cameras: number of cameras.
+        pictures: number of pictures.
+        mean_spp: mean of their samples a pixel, to which tasks are in proportion; None: as many for each.
     """
-    if scenes is None:
-        return lambda picture: 1
-    tasks_per_picture = TASKS * torch.get_num_threads() / (scenes * cameras)
-    given = [spp_of(s, c) for s in range(scenes) for c in range(cameras)]
-    numbers = [spp for spp in given if type(spp) is int and spp > 0]
-    if not numbers:  # the scenes' own
+    tasks_per_picture = TASKS * torch.get_num_threads() / pictures
+    if mean_spp is None:
         return lambda picture: math.ceil(tasks_per_picture)
-    mean = sum(numbers) / len(numbers)
-    return lambda picture: math.ceil(tasks_per_picture * picture.request.settings.render.spp / mean)
+    return lambda picture: math.ceil(tasks_per_picture * picture.request.settings.render.spp / mean_spp)
 
 
 def _pictures(
@@ -233,7 +244,7 @@ def _pictures(
     *,
     shares_scene: bool,
     full: bool,
-) -> Iterator[_Picture]:
+) -> Iterator[Picture]:
     """Yield the pictures, those of a scene together.
 
     Args:
@@ -263,7 +274,7 @@ def _pictures(
             name = ("" if param_sets is None else f"params[{s}]") if shares_scene else f"scenes[{s}]"
             with naming_errors(name, camera_name):
                 params = {} if param_sets is None else param_sets[s]
-                request = _request(scene, camera, params, spp(s, c), seeds(s, c), options, full=full)
+                request = _request_by(scene, camera, params, spp(s, c), seeds(s, c), options, full=full)
                 film = request.settings.film
                 _, _, *size = film.crop or (0, 0, film.width, film.height)
                 film_facts = {"width": size} | ({"aovs": list(film.aovs), "denoise": film.denoise} if full else {})
@@ -271,10 +282,10 @@ def _pictures(
                 for key, value in film_facts.items():
                     if value != first_facts[key]:
                         raise SceneError(f"film.{key}", value, f"{first_facts[key]}, as of the first picture")
-            yield _Picture(s, c, name, request)
+            yield Picture(s, c, name, request)
 
 
-def _request(
+def _request_by(
     scene: Scene,
     camera: Mapping[str, Any] | Tensor | None,
     params: Params,
@@ -291,7 +302,16 @@ def _request(
         params = {**params, "camera.to_world": camera}
     elif camera is not None:
         scene = scene.seen_by(camera, options.get("film"))
-    request = prepare_request(scene, full=full, params=params, spp=spp, seed=seed, **options)
+    return request_of(scene, full, params=params, spp=spp, seed=seed, **options)
+
+
+def request_of(scene: Scene, full: bool, **options: Unpack[CommonOptions]) -> RenderRequest:
+    """Return the request of a picture for :func:`render_pictures`; arguments as of :func:`torchpt.render`.
+
+    Raises:
+        SceneError: an argument is not accepted.
+    """
+    request = prepare_request(scene, full=full, **options)
     if any(map(is_transformed, request.params.values())):
         raise SceneError(
             "params", "tensors under a transform of torch.func", "plain ones: transforms go through render"
@@ -300,26 +320,26 @@ def _request(
     return request.with_versions()
 
 
-def _queued_renders(
-    pictures: Iterable[_Picture],
-    tasks_of: Callable[[_Picture], int],
-    found: dict[tuple[int, int], tuple[RenderRequest | None, Rendering]],
-    on_progress: Callable[[int, int | None], None] | None,
-    total: int | None,
-) -> Iterator[QueuedRender]:
-    """Return the renders of pictures; they put requests that need gradients, and renderings, into ``found``.
+def render_pictures(
+    pictures: Iterable[Picture],
+    tasks_of: Callable[[Picture], int],
+    on_done: Callable[[Picture, RenderRequest | None, Rendering], None],
+) -> None:
+    """Render pictures side by side, each without gradients.
 
     Args:
-        pictures: the pictures.
+        pictures: the pictures; an iterator may prepare each while others are rendered.
         tasks_of: returns the number of tasks that a picture is cut into, at most.
-        found: the results, by scene and camera.
-        on_progress: as for :func:`render_batch`.
-        total: number of pictures; None if not known.
-    """
-    latest: list[tuple[int, Wave]] = []  # index and wave of the latest scene
+        on_done: called with each picture as it ends, its request if it needs gradients (which :func:`execute_request` adds to
+            the rendering), and the rendering.
 
-    def queued_render(picture: _Picture) -> QueuedRender:
-        request, indices = picture.request, (picture.scene, picture.camera)
+    Raises:
+        RenderError: a scene was changed while its pictures were rendered; others as :func:`torchpt.render`.
+    """
+    latest: list[tuple[int, Wave]] = []  # number and wave of the latest scene
+
+    def queued_render(picture: Picture) -> QueuedRender:
+        request = picture.request
         needs_gradients = request.needs_gradients  # read before gradients are disabled
 
         def make(threads: int) -> Run:
@@ -332,20 +352,21 @@ def _queued_renders(
             latest[:] = [(picture.scene, run.wave)]
             return run
 
-        def on_done(rendering: Rendering) -> None:
+        def finish(rendering: Rendering) -> None:
             request.check_unchanged("while the batch has it")
             # A request keeps its scene alive, and there may be many.
-            found[indices] = (request, rendering) if needs_gradients else (None, execute_request(request, [rendering]))
-            if on_progress is not None:
-                on_progress(len(found), total)
+            if needs_gradients:
+                on_done(picture, request, rendering)
+            else:
+                on_done(picture, None, execute_request(request, [rendering]))
 
         def on_error(error: BaseException) -> None:
             with naming_errors(picture.name, ""):
                 raise error
 
-        return QueuedRender(request.scene.device, make, on_done, on_error, tasks_of(picture))
+        return QueuedRender(request.scene.device, make, finish, on_error, tasks_of(picture))
 
-    return map(queued_render, pictures)
+    render_many(map(queued_render, pictures))
 
 
 def _check_memory(request: RenderRequest, total: int | None) -> None:

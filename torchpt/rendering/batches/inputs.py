@@ -270,7 +270,7 @@ def naming_errors(scene: str, camera: str) -> Iterator[None]:
         if camera and (key == "camera" or key.startswith(("camera.", "params.camera.to_world"))):
             key = f"{camera}{key.removeprefix('params.camera.to_world').removeprefix('camera')}"
         elif scene and not key.startswith(("scenes[", "params[", "cameras", "seed")):
-            key = f"{scene}.{key}"
+            key = f"{scene}.{key}" if key else scene
         error_type = NotBuiltError if isinstance(error, NotBuiltError) else SceneError
         raise error_type(key, error.value, error.expected, error.file) from None
     except AssetError as error:
