@@ -552,10 +552,10 @@ FAULTS = (
         "batch_of_one_seed",
         "rendering/batches/inputs.py",
         "render",
-        "seeds_of",
+        "values_of",
         "row[c] if isinstance(row, Sequence) else row",
         "row[0] if isinstance(row, Sequence) else row",
-        "all cameras of a scene in a batch render with the seed of the first",
+        "all cameras of a scene in a batch render with the seed and samples of the first",
     ),
     # -- reports, stress
     Fault(

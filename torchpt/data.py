@@ -1,30 +1,60 @@
-"""Data sets of rendered pictures for ``torch.utils.data``: ``RenderDataset`` by index, the endless ``RenderStream``.
+"""Data sets of rendered pictures for ``torch.utils.data`` (``RenderDataset``, ``RenderStream``), and a loader of scenes.
 
 An item is a function of its index: it has the same bits in any number of workers, forked or spawned, and on any rank. So must
 be the scene that ``make`` returns: draw its random numbers from ``torch.Generator().manual_seed(index)``. Spawned workers
 pickle the data set, so for them ``make`` must be a function of a module, not a ``lambda``.
+
+:class:`SceneLoader` is for training through the renderer itself: it makes batches of scenes for ``render_batch``, the next ones
+while those before are rendered.
 """
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from typing import Any, NamedTuple, Unpack
 
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from torchpt.core.errors import SceneError
-from torchpt.rendering.api import render
+from torchpt.core.threads import TaskQueue, limited_threads, outside_inference_mode
+from torchpt.rendering import Rendering
+from torchpt.rendering.batches import Picture, naming_errors, render_pictures, request_of, task_counts
+from torchpt.rendering.requests import RenderRequest, execute_request, template_of
 from torchpt.scene import Scene, load
-from torchpt.scene.settings import RenderOptions, base_seed, film_keys
-from torchpt.spec.arguments import check_names
+from torchpt.scene.prepare import make_wave
+from torchpt.scene.settings import BatchOptions, RenderOptions, base_seed, film_keys
+from torchpt.spec.arguments import check_names, expand_signature
 
-__all__ = ["Made", "RenderDataset", "RenderStream"]
+__all__ = ["Made", "RenderDataset", "RenderStream", "SceneBatch", "SceneLoader"]
 
 #: What ``make`` returns: a scene or a mapping of the scene format, optionally with arguments of ``torchpt.render``.
 Made = Scene | Mapping[str, Any] | tuple[Scene | Mapping[str, Any], Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class _Item:
+    """An item that is ready to be rendered.
+
+    Attributes:
+        index: of the item.
+        scene_index: of its scene.
+        params: tensors in place of the scene's, by name.
+        film: settings of the film.
+        request: of its picture.
+    """
+
+    index: int
+    scene_index: int
+    params: Mapping[str, Tensor]
+    film: Mapping[str, Any]
+    request: RenderRequest
 
 
 class _ItemRenderer:
@@ -62,6 +92,34 @@ class _ItemRenderer:
 
     def item(self, index: int) -> dict[str, Tensor]:
         """Return the item of an index, as :class:`RenderDataset` describes it."""
+        with torch.no_grad():
+            item = self._ready(index)
+            return self._tensors(item, execute_request(item.request))
+
+    def items(self, indices: Sequence[int]) -> list[dict[str, Tensor]]:
+        """Return the items of indices, rendered side by side; the next scenes are made while others are rendered."""
+        found: dict[int, dict[str, Tensor]] = {}  # by position in `indices`
+        waiting: dict[int, _Item] = {}
+
+        def pictures() -> Iterator[Picture]:
+            for position, index in enumerate(indices):
+                item = waiting[position] if position in waiting else self._ready(index)
+                waiting[position] = item
+                yield Picture(item.scene_index, position, f"items[{index}]", item.request)
+
+        def on_done(picture: Picture, request: RenderRequest | None, rendering: Rendering) -> None:
+            found[picture.camera] = self._tensors(waiting.pop(picture.camera), rendering)
+
+        if not len(indices):
+            return []
+        with torch.no_grad():
+            waiting[0] = self._ready(indices[0])
+            with limited_threads(waiting[0].request.settings.render.threads):
+                render_pictures(pictures(), task_counts(len(indices), None), on_done)
+        return [found[position] for position in range(len(indices))]
+
+    def _ready(self, index: int) -> _Item:
+        """Make the scene of an index, and the request of its picture."""
         scene_index, camera_index = divmod(index, max(len(self.cameras), 1))
         scene, scene_options = self._scene(scene_index)
         options: dict[str, Any] = {**self.options, **scene_options}
@@ -72,24 +130,27 @@ class _ItemRenderer:
             "denoise": False,
         }
         params = {**(self.cameras[camera_index] if self.cameras else {}), **(options.pop("params", None) or {})}
-        dtypes = {name: value.dtype for name, value in scene.params.items()}
         params = {
-            name: _tensor(f"params.{name}", value, dtypes.get(name, torch.float32)) for name, value in params.items()
+            name: _tensor(f"params.{name}", value, scene.params[name].dtype if name in scene.params else torch.float32)
+            for name, value in params.items()
         }
         if get_worker_info() is not None:
             options.setdefault("threads", 1)  # the workers share the cores
         options = {"spp": self.spp, "seed": self.seed + index, **options, "film": film}
-        with torch.no_grad():
-            rendering = render(scene, params=params, full=True, **options)
-            pose_dtype = dtypes["camera.to_world"]  # float64 far from the origin
-            to_world = scene.merged(params)["camera.to_world"].to(pose_dtype)
-            layers = {name: rendering.layers[name] for name in self.layers}
-            item = {"image": rendering.image, **layers, "to_world": to_world}
-            if "camera.fov" in scene.params:
-                camera = {name: value for name, value in params.items() if name.startswith("camera.")}
-                matrices = scene.pinhole(camera, film, pose_dtype)
-                item |= {"K": matrices.K, "R": matrices.R, "t": matrices.t}
-        return {**{name: value.detach() for name, value in item.items()}, "index": torch.tensor(index)}
+        return _Item(index, scene_index, params, film, request_of(scene, True, params=params, **options))
+
+    def _tensors(self, item: _Item, rendering: Rendering) -> dict[str, Tensor]:
+        """Return picture, layers and camera of a rendered item."""
+        scene, params = item.request.caller_scene, item.params
+        pose_dtype = scene.params["camera.to_world"].dtype  # float64 far from the origin
+        to_world = scene.merged(params)["camera.to_world"].to(pose_dtype)
+        layers = {name: rendering.layers[name] for name in self.layers}
+        found = {"image": rendering.image, **layers, "to_world": to_world}
+        if "camera.fov" in scene.params:
+            camera = {name: value for name, value in params.items() if name.startswith("camera.")}
+            matrices = scene.pinhole(camera, item.film, pose_dtype)
+            found |= {"K": matrices.K, "R": matrices.R, "t": matrices.t}
+        return {**{name: value.detach() for name, value in found.items()}, "index": torch.tensor(item.index)}
 
     def _scene(self, index: int) -> tuple[Scene, dict[str, Any]]:
         """Return a scene and its arguments of ``render``; the latest is cached for its next camera."""
@@ -118,7 +179,7 @@ class RenderDataset(Dataset):
     Item ``i`` is a dict of tensors: ``image (H, W, 3)`` linear RGB; each of ``layers`` by name, ``(H, W, C)``; the camera as
     ``to_world (4, 4)`` and, of a perspective or thin lens one, as OpenCV's ``K (3, 3)`` in pixels, ``R (3, 3)`` and ``t (3,)``
     (docs/reference/cameras.md); ``index ()`` int64. ``torch.utils.data.DataLoader`` collates them into batches if all have one
-    size.
+    size; the items of a batch are rendered side by side, and the next scenes made meanwhile.
 
     The seed of item ``i`` is ``seed + i``. Renders use one thread in workers, and otherwise the scene's number, unless
     ``threads`` is given.
@@ -162,6 +223,19 @@ class RenderDataset(Dataset):
         return self.scenes * max(len(self._items.cameras), 1)
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
+        return self._items.item(self._checked(index))
+
+    def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Tensor]]:
+        """Return the items of a batch, as ``DataLoader`` asks for them; they are rendered side by side."""
+        return self._items.items([self._checked(index) for index in indices])
+
+    def _checked(self, index: Any) -> int:
+        """Return an index from 0; negative ones count from the end.
+
+        Raises:
+            TypeError: not a whole number.
+            IndexError: out of range.
+        """
         try:
             index = operator.index(index)
         except TypeError:
@@ -169,7 +243,7 @@ class RenderDataset(Dataset):
             raise TypeError(f"index of a data set: expected a whole number, got {shown}") from None
         if not -len(self) <= index < len(self):
             raise IndexError(f"index {index} of a data set of {len(self)} items")
-        return self._items.item(index % len(self))
+        return index % len(self)
 
 
 class RenderStream(IterableDataset):
@@ -237,6 +311,146 @@ class RenderStream(IterableDataset):
             **self.__dict__,
             "starter_ranks": self.starter_ranks or _rank_and_world(),
         }  # spawned workers have no process group
+
+
+# ---- Scenes, for training through the renderer
+
+
+class SceneBatch(NamedTuple):
+    """A batch of scenes.
+
+    Attributes:
+        indices: ``(B,)`` int64.
+        scenes: the scenes of these indices, as ``render_batch`` takes them.
+    """
+
+    indices: Tensor
+    scenes: tuple[Scene, ...]
+
+
+class SceneLoader:
+    """Batches of scenes; a thread loads and builds the next ones while the caller works with the batch before.
+
+    Worlds and search structures are built too, so that ``torchpt.render_batch(scenes)`` begins to trace at once. Pictures have
+    the bits of scenes that the caller loads. Each iteration is a new one over ``indices``. An error of ``make`` or of loading
+    is raised where its batch would come.
+
+    Args:
+        make: returns the scene of an index: a :class:`torchpt.Scene`, or a mapping of the scene format. It is called in another
+            thread, index by index in their order.
+        indices: whole numbers: a ``range``, a list, a sampler of ``torch.utils.data`` (``DistributedSampler`` gives each rank
+            its own), or ``itertools.count()`` for no end.
+        batch_size: number of scenes of a batch.
+        drop_last: True leaves out a last batch of fewer scenes.
+        ahead: number of batches that are made ahead of the one in use; 0: each is made when it is asked for.
+        options: arguments that ``render_batch`` will be given; those that decide what is built (``accel``, ``dtype``,
+            ``film``, ``integrator``, ``threads``) should be the same. ``device`` is that on which mappings are loaded.
+
+    Raises:
+        SceneError: an argument is not accepted; during iteration, as ``torchpt.load``, with ``make(index)`` in its key.
+        TypeError: an unknown argument.
+    """
+
+    @expand_signature
+    def __init__(
+        self,
+        make: Callable[[int], Scene | Mapping[str, Any]],
+        indices: Iterable[int],
+        *,
+        batch_size: int = 1,
+        drop_last: bool = False,
+        ahead: int = 1,
+        **options: Unpack[BatchOptions],
+    ) -> None:
+        check_names("SceneLoader", options, BatchOptions, own=("batch_size", "drop_last", "ahead"))
+        if not callable(make):
+            raise SceneError("make", make, "a function from an index to the scene")
+        if isinstance(indices, str | Mapping) or not isinstance(indices, Iterable):
+            raise SceneError("indices", indices, "a range, a list, a sampler or another iterable of whole numbers")
+        for key, value, low in (("batch_size", batch_size, 1), ("ahead", ahead, 0)):
+            if type(value) is not int or value < low:
+                raise SceneError(key, value, f"a whole number >= {low}")
+        if not isinstance(drop_last, bool):
+            raise SceneError("drop_last", drop_last, "True or False")
+        self.make, self.indices, self.batch_size, self.drop_last, self.ahead = (
+            make,
+            indices,
+            batch_size,
+            drop_last,
+            ahead,
+        )
+        self.options: dict[str, Any] = dict(options)
+        self.device = self.options.get("device")
+
+    def __len__(self) -> int:
+        """Return the number of batches.
+
+        Raises:
+            TypeError: ``indices`` has no length.
+        """
+        if not isinstance(self.indices, Sized):
+            raise TypeError(f"a SceneLoader over a {type(self.indices).__name__} has no length")
+        count = len(self.indices)
+        return count // self.batch_size if self.drop_last else -(-count // self.batch_size)
+
+    def __iter__(self) -> Iterator[SceneBatch]:
+        source = iter(self.indices)
+        queue = TaskQueue[None, Scene](1)  # a single thread: scenes come in the order of indices
+        started: deque[list[int]] = deque()  # indices of batches that are being made
+
+        def start(batches: int) -> None:
+            while len(started) < batches and (chunk := [_index(value) for value in islice(source, self.batch_size)]):
+                if len(chunk) < self.batch_size and self.drop_last:
+                    return
+                started.append(chunk)
+                for index in chunk:
+                    queue.add(None, partial(self._built, index))
+
+        try:
+            while True:
+                start(1 + self.ahead)
+                if not started:
+                    return
+                scenes = []
+                while len(scenes) < len(started[0]):
+                    if (finished := queue.next(wait=True)) is None:
+                        continue
+                    if isinstance(finished[1], BaseException):
+                        raise finished[1]
+                    scenes.append(finished[1])
+                indices = started.popleft()
+                start(self.ahead)
+                yield SceneBatch(torch.tensor(indices), tuple(scenes))
+                del scenes  # the caller's from here on
+        finally:
+            queue.close()
+
+    def _built(self, index: int) -> Scene:
+        """Make the scene of an index, and build what a render needs."""
+        with naming_errors(f"make({index})", ""):
+            source = self.make(index)
+            if not isinstance(source, Scene | Mapping):
+                raise SceneError("", source, "a scene from torchpt.load, or a mapping of the scene format")
+            scene = source if isinstance(source, Scene) else load(dict(source), self.device)
+            template = template_of(scene, True, self.options)
+            with outside_inference_mode(), torch.no_grad():
+                make_wave(scene, template.settings, None, template.call.dtype)  # the scene keeps world and search
+        return scene
+
+
+def _index(value: Any) -> int:
+    """Return an index.
+
+    Raises:
+        SceneError: not a whole number.
+    """
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise SceneError("indices", value, "whole numbers") from None
+
+
+# ---- Arguments
 
 
 def _check_options(options: Mapping[str, Any], where: str = "") -> None:

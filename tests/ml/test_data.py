@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import pickle
+import threading
 from typing import Any
 
 import numpy as np
@@ -11,11 +13,13 @@ import pytest
 import torch
 from scene_makers import FILM, dim, flat, room
 from torch import Tensor
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, DistributedSampler
 
 import torchpt
-from torchpt.core.errors import SceneError
-from torchpt.data import RenderDataset, RenderStream
+from torchpt import search
+from torchpt.core.errors import RenderError, SceneError
+from torchpt.data import RenderDataset, RenderStream, SceneLoader
+from torchpt.scene import scene as scene_module
 
 Items = dict[int, dict[str, Tensor]]
 
@@ -171,6 +175,188 @@ def test_wishes_of_a_scene_for_files_are_left_out(monkeypatch):
     scene = torchpt.load({**room(0), "film": {**FILM, "denoise": True, "aovs": ["normal"]}}, "cpu")
     item = RenderDataset(lambda _: scene, 1, spp=1, layers=["depth"])[0]
     assert "depth" in item and "normal" not in item
+
+
+# -- items of a batch, side by side
+
+
+@pytest.mark.parametrize("indices", [[2, 0, 3], [1, 1, -3], [], np.array([3, 1])], ids=str)
+def test_items_of_a_batch_are_those_taken_one_by_one(indices):
+    pose = torchpt.load(room(0), "cpu").params["camera.to_world"].clone()
+    pose[2, 3] += 1
+    items = data(cameras=[pose, {"camera.to_world": pose, "camera.fov": 30.0}], spp=2)
+    batch = items.__getitems__(indices)
+    assert len(batch) == len(indices)
+    for found, index in zip(batch, indices, strict=True):
+        expected = items[index]
+        assert found.keys() == expected.keys()
+        assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_a_batch_of_scenes_with_settings_of_their_own():
+    def make(index: int) -> Any:
+        return dim(index) if index % 2 else (room(index), {"spp": 2, "threads": 1})
+
+    items = RenderDataset(make, 4, film={"width": 5})
+    for found, index in zip(items.__getitems__(range(4)), range(4), strict=True):
+        assert torch.equal(found["image"], items[index]["image"])
+
+
+def test_scenes_of_a_batch_are_made_one_after_another_and_once():
+    made: list[int] = []
+
+    def make(index: int) -> dict[str, Any]:
+        made.append(index)
+        return room(index)
+
+    items = RenderDataset(make, 3, cameras=[torch.eye(4)] * 2, spp=1)
+    items.__getitems__(range(6))
+    assert made == [0, 1, 2]
+
+
+def test_a_scene_that_changes_while_a_batch_has_it_is_an_error():
+    scene = torchpt.load(room(0), "cpu")
+
+    def make(index: int) -> torchpt.Scene:
+        scene.params["materials.wall.reflectance"].fill_(0.1 * index)
+        return scene
+
+    items = RenderDataset(make, 3, spp=1)
+    assert items[1]["image"].shape == (8, 10, 3)
+    with pytest.raises(RenderError, match=r"^items\[.\]: .*changed.* while the batch has it"):
+        items.__getitems__(range(3))
+
+
+def test_an_error_in_a_batch_names_its_item():
+    def make(index: int) -> torchpt.Scene:
+        scene = torchpt.load(room(index), "cpu")
+        if index == 2:
+            scene.params["shapes.lamp.emission"].fill_(torch.nan)
+            scene.check_own = lambda: None  # which refuses that  # type: ignore[method-assign]
+        return scene
+
+    items = RenderDataset(make, 4, spp=1, integrator={"type": "path", "strict": True})
+    with pytest.raises(RenderError, match=r"^items\[2\]: integrator.strict"):
+        items.__getitems__(range(4))
+
+
+# -- a loader of scenes
+
+
+def test_batches_of_scenes():
+    loader = SceneLoader(room, range(5), batch_size=2, device="cpu")
+    batches = list(loader)
+    assert [batch.indices.tolist() for batch in batches] == [[0, 1], [2, 3], [4]] and len(loader) == 3
+    images = torchpt.render_batch(batches[1].scenes, spp=2, seed=[2, 3])
+    for image, index in zip(images, batches[1].indices.tolist(), strict=True):
+        assert torch.equal(image[0], torchpt.render(torchpt.load(room(index), "cpu"), spp=2, seed=index))
+    whole = SceneLoader(room, [3, 1, 0], batch_size=2, drop_last=True, device="cpu")
+    assert [indices.tolist() for indices, _ in whole] == [[3, 1]] and len(whole) == 1
+    assert [indices.tolist() for indices, _ in whole] == [[3, 1]]  # once more from the start
+
+
+@pytest.mark.parametrize("ahead", [0, 1, 2])
+def test_the_next_scenes_are_made_while_the_caller_has_a_batch(ahead):
+    made: list[int] = []
+    arrived = {index: threading.Event() for index in range(20)}
+
+    def make(index: int) -> dict[str, Any]:
+        made.append(index)
+        arrived[index].set()
+        assert threading.current_thread() is not threading.main_thread()
+        return room(index)
+
+    batches: Any = iter(SceneLoader(make, itertools.count(), batch_size=2, ahead=ahead, device="cpu"))
+    for step in range(2):
+        assert next(batches).indices.tolist() == [2 * step, 2 * step + 1]
+        for index in range(2 * (step + 1 + ahead)):
+            assert arrived[index].wait(60)
+        assert len(made) == 2 * (step + 1 + ahead)
+    batches.close()
+    assert len(made) <= 2 * (2 + ahead)
+
+
+def test_what_a_render_needs_is_built_by_the_loader(monkeypatch):
+    built: list[str] = []
+
+    def counting(module: Any, name: str) -> None:
+        plain = getattr(module, name)
+
+        def call(*args: Any, **given: Any) -> Any:
+            built.append(threading.current_thread().name)
+            return plain(*args, **given)
+
+        monkeypatch.setattr(module, name, call)
+
+    counting(scene_module, "assemble")
+    counting(search, "build")
+    for _, scenes in SceneLoader(room, range(2), batch_size=2, device="cpu", film={"aovs": ["uv"]}):
+        before = len(built)
+        assert before and all(name.startswith("torchpt_") for name in built)
+        torchpt.render_batch(scenes, spp=1, film={"aovs": ["uv"]}, full=True)
+        assert len(built) == before
+
+
+def test_gradients_reach_parameters_of_loaded_scenes():
+    (batch,) = SceneLoader(room, range(2), batch_size=2, device="cpu")
+    for scene in batch.scenes:
+        scene.params["materials.wall.reflectance"].requires_grad_()
+    torchpt.render_batch(batch.scenes, spp=2, seed=[1, 2]).sum().backward()
+    for index, scene in enumerate(batch.scenes):
+        own = torchpt.load(room(index), "cpu")
+        leaf = own.params["materials.wall.reflectance"].clone().requires_grad_()
+        torchpt.render(own, params={"materials.wall.reflectance": leaf}, spp=2, seed=1 + index).sum().backward()
+        grad = scene.params["materials.wall.reflectance"].grad
+        assert grad is not None and leaf.grad is not None and torch.equal(grad, leaf.grad) and bool(grad.any())
+
+
+def test_samplers_of_ranks_share_the_indices():
+    shares = []
+    for rank in range(2):
+        sampler = DistributedSampler(range(7), num_replicas=2, rank=rank, shuffle=False, drop_last=True)  # type: ignore[arg-type]
+        shares += [batch.indices.tolist() for batch in SceneLoader(room, sampler, batch_size=3, device="cpu")]
+    assert shares == [[0, 2, 4], [1, 3, 5]]
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (lambda index: {**room(index), "lights": {"sky": {"type": "moon"}}}, r"^make\(2\)\.lights\.sky\.type: "),
+        (lambda index: 3, r"^make\(2\): expected a scene from torchpt.load"),
+    ],
+)
+def test_an_error_comes_with_its_batch(made, message):
+    batches = iter(SceneLoader(lambda index: made(index) if index == 2 else room(index), range(4), device="cpu"))
+    assert [next(batches).indices.tolist() for _ in range(2)] == [[0], [1]]
+    with pytest.raises(SceneError, match=message) as caught:
+        next(batches)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("wish", "key"),
+    [
+        ({"make": 3}, "make"),
+        ({"indices": 3}, "indices"),
+        ({"indices": "ab"}, "indices"),
+        ({"batch_size": 0}, "batch_size"),
+        ({"ahead": -1}, "ahead"),
+        ({"drop_last": 1}, "drop_last"),
+    ],
+)
+def test_arguments_that_a_loader_refuses(wish, key):
+    arguments: dict[str, Any] = {"make": room, "indices": range(2), **wish}
+    with pytest.raises(SceneError, match=f"^{key}: expected"):
+        SceneLoader(**arguments)
+
+
+def test_other_arguments_of_a_loader():
+    with pytest.raises(TypeError, match="'batchsize'. Did you mean 'batch_size'"):
+        SceneLoader(room, range(2), batchsize=3)  # type: ignore[call-arg]
+    with pytest.raises(SceneError, match="^indices: expected whole numbers, got 1.5"):
+        next(iter(SceneLoader(room, [1.5], device="cpu")))  # type: ignore[list-item]
+    with pytest.raises(TypeError, match="over a count has no length"):
+        len(SceneLoader(room, itertools.count()))
 
 
 # -- workers

@@ -23,6 +23,7 @@ from torchpt.scene.settings import (
     BatchOptions,
     CommonOptions,
     Render,
+    RendererOptions,
     RenderOptions,
     TraceOptions,
 )
@@ -48,9 +49,9 @@ def scene() -> torchpt.Scene:
     [
         (torchpt.render, ("scene", "full"), CommonOptions),
         (torchpt.trace, ("scene", "o", "d", "spp", "seed", "params"), TraceOptions),
-        (torchpt.render_batch, ("scenes", "cameras", "params", "seed", "on_progress", "full"), BatchOptions),
-        (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "parametrizations", "full"), BatchOptions),
-        (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), BatchOptions),
+        (torchpt.render_batch, ("scenes", "cameras", "params", "spp", "seed", "on_progress", "full"), BatchOptions),
+        (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "parametrizations", "full"), RendererOptions),
+        (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), RendererOptions),
     ],
 )
 def test_signatures_spell_every_argument_out(function: Any, own: tuple[str, ...], form: Any) -> None:
@@ -104,7 +105,7 @@ def test_an_argument_without_a_spec_is_no_declaration() -> None:
 
 def test_what_a_function_says_itself_comes_first() -> None:
     @expand_signature
-    def f(scene: int, *, seed: int = 0, **wishes: Unpack[BatchOptions]) -> None:
+    def f(scene: int, *, seed: int = 0, **wishes: Unpack[RendererOptions]) -> None:
         """Do it."""
 
     assert tuple(inspect.signature(f).parameters)[:3] == ("scene", "seed", "spp")

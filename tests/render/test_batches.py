@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import weakref
 from contextlib import nullcontext
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +16,12 @@ import torchpt
 from torchpt import search
 from torchpt.core.errors import RenderError, SceneError
 from torchpt.engines import tensors
+from torchpt.engines.engine import TASKS
 from torchpt.engines.kernels import engine, programs
 from torchpt.engines.kernels import programs as loop_kernels
 from torchpt.paths.integrators import base
 from torchpt.rendering import Run
+from torchpt.rendering.batches import Picture, request_of, task_counts
 from torchpt.scene import scene as scenes_room
 
 SIZE = {"width": 24, "height": 16, "filter": "box"}
@@ -165,6 +168,44 @@ def test_seeds():
         and not torch.equal(each[0, 1], grid[0, 1])
     )
     assert torch.equal(grid[0, 1], torchpt.render(scenes[0], seed=7, params={"camera.to_world": given[1]}))
+
+
+def test_samples_of_each_scene_and_camera():
+    scenes, given = [room(), tetrahedron()], poses(room(), 2)
+    each = torchpt.render_batch(scenes, given, spp=[2, 5], full=True)
+    grid = torchpt.render_batch(iter(scenes), given, spp=torch.tensor([[2, 4], [1, 5]]))
+    for picture, s, c, spp in (
+        (each.image[0, 1], 0, 1, 2),
+        (each.image[1, 1], 1, 1, 5),
+        (grid[0, 1], 0, 1, 4),
+        (grid[1, 0], 1, 0, 1),
+    ):
+        assert torch.equal(picture, torchpt.render(scenes[s], spp=spp, params={"camera.to_world": given[c]}))
+    assert [each[s, 0].spp for s in range(2)] == [2, 5]
+    same = torchpt.render_batch(scenes, given, spp=np.array([[2, 2], [5, 5]]))
+    assert torch.equal(same, each.image)
+
+
+def test_a_picture_of_many_samples_is_more_tasks():
+    scene, counts = room(), task_counts(4, 16.0)
+    few_samples, many = (counts(Picture(0, 0, "", request_of(scene, False, spp=spp))) for spp in (1, 61))
+    assert few_samples == 1 and many > 0.9 * TASKS * torch.get_num_threads()
+
+
+def test_cameras_of_each_scene():
+    scenes = [room(0.2), tetrahedron()]
+    given = torch.stack([poses(scene, 3) for scene in scenes])
+    batch = torchpt.render_batch(scenes, given)
+    assert batch.shape == (2, 3, 16, 24, 3)
+    for s, scene in enumerate(scenes):
+        for c in range(3):
+            assert torch.equal(batch[s, c], torchpt.render(scene, params={"camera.to_world": given[s, c]}))
+    for nested in (given.numpy(), given.tolist(), list(given), [list(row) for row in given]):
+        assert torch.equal(torchpt.render_batch(scenes, nested), batch)
+    assert torch.equal(torchpt.render_batch(iter(scenes), given), batch)
+    mixed = torchpt.render_batch(scenes, [BLOCKS[:1], [given[1, 2]]])
+    assert torch.equal(mixed[0, 0], torchpt.render(scenes[0].seen_by(BLOCKS[0])))
+    assert torch.equal(mixed[1], batch[1, 2:])
 
 
 def test_scenes_from_an_iterator():
@@ -342,6 +383,42 @@ def test_gradients_of_poses():
     assert torch.equal(found[1], expected) and bool(expected.any()) and not bool(found[0].any())
 
 
+def test_gradients_of_poses_of_each_scene():
+    """One camera a scene, as training takes them: gradients and layers are those of single renders."""
+    scenes = [room(0.2), tetrahedron()]
+    given = torch.stack([poses(scene, 2)[1:] for scene in scenes]).requires_grad_()
+    options: dict[str, Any] = {"film": {"aovs": ["depth"]}, "edges": False, "full": True}
+    with pytest.warns(torchpt.EdgeWarning):
+        batch = torchpt.render_batch(scenes, given, spp=[2, 3], seed=[4, 9], **options)
+    weights = torch.rand(batch.image.shape, generator=torch.Generator().manual_seed(0))
+    (found,) = torch.autograd.grad((batch.image * weights).sum(), given)
+    for s, scene in enumerate(scenes):
+        own = given[s, 0].detach().clone().requires_grad_()
+        with pytest.warns(torchpt.EdgeWarning):
+            alone = torchpt.render(scene, params={"camera.to_world": own}, seed=(4, 9)[s], spp=2 + s, **options)
+        assert torch.equal(batch.image[s, 0], alone.image)
+        assert torch.equal(batch.layers["depth"][s, 0], alone.layers["depth"])
+        (expected,) = torch.autograd.grad((alone.image * weights[s, 0]).sum(), own)
+        assert torch.equal(found[s, 0], expected) and bool(expected.any())
+
+
+@pytest.mark.parametrize("layer", ["depth", "object_id"])
+def test_gradients_of_layers_are_those_of_single_renders(layer):
+    scene, film = room(0.2), {"aovs": [layer]}
+    given = scene.params["shapes.ball.to_world"].repeat(2, 1, 1)
+    given[1, 0, 3] += 0.3
+    given.requires_grad_()
+    batch = torchpt.render_batch(scene, params={"shapes.ball.to_world": given}, film=film, full=True)
+    assert batch.layers[layer].requires_grad == (layer == "depth")
+    if layer == "depth":
+        (found,) = torch.autograd.grad(batch.layers[layer].sum(), given)
+        for s in range(2):
+            own = given[s].detach().clone().requires_grad_()
+            alone = torchpt.render(scene, params={"shapes.ball.to_world": own}, film=film, full=True)
+            (expected,) = torch.autograd.grad(alone.layers[layer].sum(), own)
+            assert torch.equal(found[s], expected) and bool(expected.any())
+
+
 def test_parameters_of_scenes_that_require_gradients():
     scenes = [room(0.2), room(0.4)]
     for scene in scenes:
@@ -469,6 +546,21 @@ def test_poses_as_nested_lists():
         ({"seed": [1, 2, 3]}, "^seed: "),
         ({"seed": [[1], [1, 2]]}, "^seed: "),
         ({"seed": [1, -2]}, r"render\.seed: "),
+        ({"spp": [1, 2, 3]}, "^spp: expected a whole number, a sequence of 2, or of sequences of 1"),
+        ({"spp": [[1], [1, 2]]}, "^spp: "),
+        ({"spp": [1, 0]}, r"^scenes\[1\]\.render\.spp: "),
+        ({"spp": [1, "a"]}, "^spp: "),
+        ({"spp": 2.5}, "^spp: expected a whole number"),
+        ({"cameras": torch.eye(4).expand(3, 1, 4, 4)}, "^cameras: expected as many as there are scenes, 2, got 3"),
+        ({"cameras": torch.eye(4).expand(2, 0, 4, 4)}, r"^cameras: .*\(S, C, 4, 4\)"),
+        (
+            {"cameras": [BLOCKS[:1], BLOCKS[:2]]},
+            r"^cameras\[1\]: expected as many cameras as of the first scene, 1, got 2",
+        ),
+        ({"cameras": [BLOCKS[:1], [{**BLOCKS[0], "fov": -1}]]}, r"^cameras\[1\]\[0\]\.fov: "),
+        ({"cameras": [BLOCKS[:1], BLOCKS[0]]}, r"^cameras\[1\]: "),
+        ({"cameras": [BLOCKS[:1], []]}, r"^cameras\[1\]: "),
+        ({"cameras": [BLOCKS[:1], [3]]}, r"^cameras\[1\]\[0\]: "),
         ({"spp": 0}, r"render\.spp: "),
         ({"checkpoint": "a.ckpt"}, "^render.checkpoint: "),
         (
@@ -532,9 +624,17 @@ def test_scenes_whose_files_ask_for_other_layers(key, value):
 
 
 @pytest.mark.parametrize("make", [list, np.array, torch.tensor])
-def test_too_many_seeds_for_what_an_iterator_gives(make):
-    with pytest.raises(SceneError, match="^seed: expected as many as there are scenes, 2, got 3"):
-        torchpt.render_batch((room(0.1 * k) for k in range(2)), seed=make([1, 2, 3]))
+@pytest.mark.parametrize("key", ["seed", "spp"])
+def test_more_values_than_an_iterator_gives_scenes(make, key):
+    with pytest.raises(SceneError, match=f"^{key}: expected as many as there are scenes, 2, got 3"):
+        torchpt.render_batch((room(0.1 * k) for k in range(2)), **{key: make([1, 2, 3])})
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_cameras_of_more_or_fewer_scenes_than_an_iterator_gives(count):
+    given = poses(room(), 2).expand(count, 2, 4, 4)
+    with pytest.raises(SceneError, match=f"^cameras: expected as many as there are scenes(, 2)?, got {count}"):
+        torchpt.render_batch((room(0.1 * k) for k in range(2)), given)
 
 
 def test_a_picture_that_renders_alone_is_not_blamed_for_one_before(monkeypatch):

@@ -15,7 +15,7 @@ from torchpt.rendering.api import render
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import BatchOptions, Params, RenderOptions, base_seed
+from torchpt.scene.settings import Params, RendererOptions, RenderOptions, base_seed
 from torchpt.scene.sizes import is_size
 from torchpt.scene.validation import params_as_tensors
 from torchpt.spec.arguments import check_names, expand_signature
@@ -72,7 +72,7 @@ class Renderer(nn.Module):
         rigid: bool = True,
         parametrizations: Mapping[str, ParametrizationOf] | None = None,
         full: bool = False,
-        **options: Unpack[BatchOptions],
+        **options: Unpack[RendererOptions],
     ) -> None:
         super().__init__()
         check_names("Renderer", options, RenderOptions, own=("names", "rigid", "parametrizations"))
@@ -108,7 +108,7 @@ class Renderer(nn.Module):
         *,
         seed: int | Tensor | None = None,
         full: bool | None = None,
-        **options: Unpack[BatchOptions],
+        **options: Unpack[RendererOptions],
     ) -> Any:
         """Render the scene with the current parameters.
 
@@ -121,7 +121,7 @@ class Renderer(nn.Module):
         Returns:
             The picture ``(H, W, 3)``; with ``full=True`` a :class:`torchpt.Rendering`.
         """
-        all_options: BatchOptions = {**self.options, **options}
+        all_options: RendererOptions = {**self.options, **options}
         if seed is None:
             seed = self._next_seed(shares_picture=all_options.get("ranks") is not None)
         full = self.full if full is None else full

@@ -34,6 +34,7 @@ class QueuedRender:
         make: prepares the render for a number of threads; called shortly before it begins.
         on_done: called with the rendering.
         on_error: called with an error instead, and may raise another one.
+        tasks: the number of tasks that each pixel set is cut into, at most.
         run: the prepared render.
         tasks_left: number of its tasks that are not finished.
         unfinished: blocks put back when memory ran out.
@@ -43,12 +44,13 @@ class QueuedRender:
     make: Callable[[int], Run]
     on_done: Callable[[Rendering], None]
     on_error: Callable[[BaseException], None]
+    tasks: int
     run: Run = field(init=False)
     tasks_left: int = field(init=False, default=0)
     unfinished: list[Block] = field(init=False, default_factory=list)
 
 
-def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
+def render_many(entries: Iterable[QueuedRender]) -> None:
     """Render all entries; each picture has the bits that it has alone.
 
     Compiled renders that only ``spp`` ends share the threads and one queue of tasks. Others are rendered one after another:
@@ -56,7 +58,6 @@ def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
 
     Args:
         entries: the renders, taken one by one.
-        tasks: the number of tasks that each pixel set of a render is cut into, at most.
 
     Raises:
         Exception: the error that an entry's ``on_error`` raises; all other renders are cancelled.
@@ -82,11 +83,11 @@ def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
                 engine = entry.run.tasks
                 assert engine is not None
                 started[id(entry)] = entry
-                blocks = engine.blocks(spans, tasks)
+                blocks = engine.blocks(spans, entry.tasks)
                 entry.tasks_left = len(blocks)
                 for block in blocks:
                     queue.add(entry, partial(engine.task, block))
-            _collect(queue, started, most=PREFETCH * queue.threads * tasks)
+            _collect(queue, started, most=PREFETCH * queue.threads * entry.tasks)
         _collect(queue, started, most=0)
     finally:
         for entry in started.values():  # unfinished renders stop at their next kernel

@@ -10,7 +10,7 @@ from torchpt.rendering.api import render
 from torchpt.rendering.requests import execute_request, template_of
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import BatchOptions, CommonOptions, Params, SeedOfCall, Settings
+from torchpt.scene.settings import CommonOptions, Params, RendererOptions, SeedOfCall, Settings
 from torchpt.spec.arguments import SCENE_VALUE, check_names, expand_signature
 
 __all__ = ["Renderer"]
@@ -42,9 +42,9 @@ class Renderer:
 
     @expand_signature
     def __init__(
-        self, scene: Scene, *, full: bool = False, seed: SeedOfCall = SCENE_VALUE, **options: Unpack[BatchOptions]
+        self, scene: Scene, *, full: bool = False, seed: SeedOfCall = SCENE_VALUE, **options: Unpack[RendererOptions]
     ) -> None:
-        check_names("Renderer", options, BatchOptions, own=("full", "seed"))
+        check_names("Renderer", options, RendererOptions, own=("full", "seed"))
         self.scene, self.seed = as_scene(scene), seed
         self._options: CommonOptions = {**options}
         self._full = full

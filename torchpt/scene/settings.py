@@ -54,6 +54,7 @@ __all__ = [
     "Params",
     "Render",
     "RenderOptions",
+    "RendererOptions",
     "SeedOfCall",
     "Settings",
     "TraceOptions",
@@ -303,7 +304,7 @@ class TraceOptions(TypedDict, total=False):
     ]
 
 
-class BatchOptions(_SampleOptions, TraceOptions, total=False):
+class BatchOptions(TraceOptions, total=False):
     """Arguments of :func:`torchpt.render` that are the same for all pictures of a batch."""
 
     film: Annotated[
@@ -375,7 +376,11 @@ class BatchOptions(_SampleOptions, TraceOptions, total=False):
     ]
 
 
-class CommonOptions(BatchOptions, total=False):
+class RendererOptions(_SampleOptions, BatchOptions, total=False):
+    """Arguments of :func:`torchpt.render` beside the scene, ``full``, ``seed`` and ``params``."""
+
+
+class CommonOptions(RendererOptions, total=False):
     """Arguments of :func:`torchpt.render` beside the scene and ``full``."""
 
     seed: Annotated[

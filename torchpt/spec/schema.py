@@ -8,6 +8,7 @@ block is a mapping of a scene file whose keys are the parameters of one kind. Th
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib import import_module
@@ -276,7 +277,8 @@ class ResultCache(Generic[T]):
         if found is None:
             found = self._results[key] = make()
             if len(self._results) > self._most:
-                self._results.pop(next(iter(self._results)), None)
+                with suppress(RuntimeError, StopIteration):  # another thread changed it in between
+                    self._results.pop(next(iter(self._results)), None)
         return found
 
 

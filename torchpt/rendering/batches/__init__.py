@@ -2,6 +2,22 @@
 
 from __future__ import annotations
 
-from torchpt.rendering.batches.batch import Renderings, render_batch
+from torchpt.rendering.batches.batch import (
+    Picture,
+    Renderings,
+    render_batch,
+    render_pictures,
+    request_of,
+    task_counts,
+)
+from torchpt.rendering.batches.inputs import naming_errors
 
-__all__ = ["Renderings", "render_batch"]
+__all__ = [
+    "Picture",
+    "Renderings",
+    "naming_errors",
+    "render_batch",
+    "render_pictures",
+    "request_of",
+    "task_counts",
+]

@@ -6,13 +6,13 @@ without gradients from one queue of tasks, and autograd wraps each afterwards wh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat
 from typing import Any, Literal, Unpack, overload
 from weakref import WeakKeyDictionary
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,15 +23,26 @@ from torchpt.core.threads import limited_threads, outside_inference_mode
 from torchpt.engines.engine import TASKS
 from torchpt.paths.wave import Wave
 from torchpt.rendering import QueuedRender, Rendering, Run, render_many
-from torchpt.rendering.batches.inputs import Cameras, Seeds, cameras_of, naming_errors, params_of, scenes_of, seeds_of
+from torchpt.rendering.batches.inputs import (
+    BatchCameras,
+    Cameras,
+    Counts,
+    Seeds,
+    cameras_of,
+    naming_errors,
+    number_of,
+    params_of,
+    scenes_of,
+    values_of,
+)
 from torchpt.rendering.requests import RenderRequest, execute_request, prepare_request
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import BatchOptions, Params, RenderOptions
+from torchpt.scene.settings import BatchOptions, CommonOptions, Params, RenderOptions
 from torchpt.scene.versions import check_unchanged
 from torchpt.spec.arguments import SCENE_VALUE, check_names, expand_signature
 
-__all__ = ["Renderings", "render_batch"]
+__all__ = ["Picture", "Renderings", "render_batch", "render_pictures", "request_of", "task_counts"]
 
 
 @dataclass(repr=False, eq=False)
@@ -62,8 +73,15 @@ class Renderings:
 
 
 @dataclass(frozen=True)
-class _Picture:
-    """One picture of a batch: its indices, its name in errors, and the request."""
+class Picture:
+    """One picture of a batch: its indices, its name in errors, and the request.
+
+    Attributes:
+        scene: number of the scene with its parameters; consecutive pictures of one number differ in cameras and samples only.
+        camera: number of the camera.
+        name: such as ``scenes[3]``; "" if there is nothing to name.
+        request: of the picture, with the versions of the scene's parameters.
+    """
 
     scene: int
     camera: int
@@ -77,13 +95,15 @@ BatchParams = Params | Sequence[Params] | None
 
 @overload
 def render_batch(
-    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: BatchParams = None, *, seed: Seeds = SCENE_VALUE,
-    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[False] = False, **options: Unpack[BatchOptions],
+    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: BatchParams = None, *, spp: Counts = None,
+    seed: Seeds = SCENE_VALUE, on_progress: Callable[[int, int | None], None] | None = None,
+    full: Literal[False] = False, **options: Unpack[BatchOptions],
 ) -> Tensor: ...  # fmt: skip
 @overload
 def render_batch(
-    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: BatchParams = None, *, seed: Seeds = SCENE_VALUE,
-    on_progress: Callable[[int, int | None], None] | None = None, full: Literal[True], **options: Unpack[BatchOptions],
+    scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: BatchParams = None, *, spp: Counts = None,
+    seed: Seeds = SCENE_VALUE, on_progress: Callable[[int, int | None], None] | None = None,
+    full: Literal[True], **options: Unpack[BatchOptions],
 ) -> Renderings: ...  # fmt: skip
 @expand_signature
 def render_batch(
@@ -91,6 +111,7 @@ def render_batch(
     cameras: Cameras = None,
     params: BatchParams = None,
     *,
+    spp: Counts = None,
     seed: Seeds = SCENE_VALUE,
     on_progress: Callable[[int, int | None], None] | None = None,
     full: bool = False,
@@ -98,19 +119,20 @@ def render_batch(
 ) -> Tensor | Renderings:
     """Render S scenes by C cameras to linear RGB ``(S, C, H, W, 3)``; differentiable in ``params`` and poses.
 
-    Picture ``[s, c]`` is to the bit ``torchpt.render(scenes[s].seen_by(cameras[c]), params=..., seed=...)``. Threads share one
-    queue of tasks of all pictures, and the next pictures are prepared while they trace. World, search structure and kernels
-    are made once for all cameras of a scene. Pictures are rendered one after another by tensor operations (as on CUDA), with
-    a time limit or target error, in bounded memory, or by several ``ranks`` (which share each picture's pixels).
+    Picture ``[s, c]`` is to the bit ``torchpt.render(scenes[s].seen_by(cameras[c]), params=..., spp=..., seed=...)``. Threads
+    share one queue of tasks of all pictures, and the next pictures are prepared while they trace. World, search structure and
+    kernels are made once for all cameras of a scene. Pictures are rendered one after another by tensor operations (as on
+    CUDA), with a time limit or target error, in bounded memory, or by several ``ranks`` (which share each picture's pixels).
 
     Args:
         scenes: scenes of :func:`torchpt.load` with films of one size: a sequence, or an iterator, which may load each while
             others are rendered; or one scene, of which ``params`` make S.
         cameras: shared by all scenes: a sequence of blocks ``camera`` as in scene files (with ``K``, ``R``, ``t`` too), of
-            poses ``camera.to_world (4, 4)`` for the scenes' own cameras, or a tensor of poses ``(C, 4, 4)``; None: each
-            scene's own camera, C = 1.
+            poses ``camera.to_world (4, 4)`` for the scenes' own cameras, or a tensor of poses ``(C, 4, 4)``; for each scene
+            its own: a sequence of S such sequences, or a tensor ``(S, C, 4, 4)``; None: each scene's own camera, C = 1.
         params: values in place of the scenes', by dotted name: a mapping to tensors (or lists) with a leading dimension S, or a
             sequence of S mappings as :func:`torchpt.render` takes them.
+        spp: samples a pixel, of all pictures (None: the scenes' own), a sequence of S, or S sequences of C.
         seed: one seed for all pictures (by default the scenes' own), a sequence of S, or S sequences of C; None: a new one for
             each picture, from torch's default generator.
         on_progress: called after each picture with the number of finished and of all pictures (None: an iterator of scenes).
@@ -131,7 +153,6 @@ def render_batch(
     if checkpoint is not None:
         raise SceneError("render.checkpoint", checkpoint, "null for a batch")
     param_sets = params_of(params, scenes)
-    camera_list = cameras_of(cameras)
     # Number of scenes; None for an iterator.
     size = (
         len(param_sets or [None])
@@ -140,12 +161,15 @@ def render_batch(
         if isinstance(scenes, Sequence)
         else None
     )
+    batch_cameras = cameras_of(cameras, size)
+    spp_of = values_of("spp", spp, size, batch_cameras.count)
     shares_scene = isinstance(scenes, Scene)
     pictures = _pictures(
         repeat(scenes, size or 1) if shares_scene else scenes,
-        camera_list,
+        batch_cameras,
         param_sets,
-        seeds_of(seed, size, len(camera_list)),
+        spp_of,
+        values_of("seed", seed, size, batch_cameras.count),
         options,
         shares_scene=shares_scene,
         full=full,
@@ -153,20 +177,30 @@ def render_batch(
     first = next(pictures, None)
     if first is None:
         raise SceneError("scenes", 0, "one scene at least")
-    total = None if size is None else size * len(camera_list)
+    total = None if size is None else size * batch_cameras.count
     found: dict[tuple[int, int], tuple[RenderRequest | None, Rendering]] = {}  # by scene and camera
+
+    def on_done(picture: Picture, request: RenderRequest | None, rendering: Rendering) -> None:
+        found[picture.scene, picture.camera] = request, rendering
+        if on_progress is not None:
+            on_progress(len(found), total)
+
     with limited_threads(first.request.settings.render.threads):
-        # As many tasks for all pictures together as one render has.
-        tasks = 1 if total is None else -(-TASKS * torch.get_num_threads() // total)
         _check_memory(first.request, total)
-        render_many(_queued_renders(chain([first], pictures), found, on_progress, total), tasks)
+        given_spp = [spp_of(s, c) for s in range(size or 0) for c in range(batch_cameras.count)]
+        counts = [
+            spp for spp in given_spp if type(spp) is int and spp > 0
+        ]  # others: errors, or None for the scenes' own
+        tasks_of = task_counts(total, sum(counts) / len(counts) if counts else None) if total else lambda picture: 1
+        render_pictures(chain([first], pictures), tasks_of, on_done)
     count = 1 + max(s for s, _ in found)
-    seeds = None if isinstance(seed, Tensor) and not seed.dim() else seed  # one for all
-    for key, given in (("params", param_sets), ("seed", seeds)):
-        if isinstance(given, Sequence | Tensor | np.ndarray) and len(given) != count:
-            raise SceneError(key, len(given), f"as many as there are scenes, {count}")
+    rows_of_cameras = None if batch_cameras.shared else batch_cameras.rows
+    for key, given in (("params", param_sets), ("cameras", rows_of_cameras), ("spp", spp), ("seed", seed)):
+        entries = number_of(given)
+        if entries not in (None, count):
+            raise SceneError(key, entries, f"as many as there are scenes, {count}")
     # Gradients last: autograd wraps pictures that are rendered already.
-    rows = tuple(tuple(_with_gradients(found.pop((s, c))) for c in range(len(camera_list))) for s in range(count))
+    rows = tuple(tuple(_with_gradients(found.pop((s, c))) for c in range(batch_cameras.count)) for s in range(count))
     image = _stack([[r.image for r in row] for row in rows])
     if not full:
         return image
@@ -187,23 +221,38 @@ def _with_gradients(found: tuple[RenderRequest | None, Rendering]) -> Rendering:
     return rendering if request is None else execute_request(request, [rendering])
 
 
+def task_counts(pictures: int, mean_spp: float | None) -> Callable[[Picture], int]:
+    """Return a function that gives the number of tasks of a picture: of all pictures together as many as one render has.
+
+    Args:
+        pictures: number of pictures.
+        mean_spp: mean of their samples a pixel, to which tasks are in proportion; None: as many for each.
+    """
+    tasks_per_picture = TASKS * torch.get_num_threads() / pictures
+    if mean_spp is None:
+        return lambda picture: math.ceil(tasks_per_picture)
+    return lambda picture: math.ceil(tasks_per_picture * picture.request.settings.render.spp / mean_spp)
+
+
 def _pictures(
     scenes: Iterable[Scene],
-    cameras: Sequence[Mapping[str, Any] | Tensor | None],
+    cameras: BatchCameras,
     param_sets: Sequence[Params] | None,
+    spp: Callable[[int, int], Any],
     seeds: Callable[[int, int], Any],
     options: BatchOptions,
     *,
     shares_scene: bool,
     full: bool,
-) -> Iterator[_Picture]:
+) -> Iterator[Picture]:
     """Yield the pictures, those of a scene together.
 
     Args:
         scenes: the scenes, in order.
-        cameras: the cameras; None: the scene's own.
+        cameras: the cameras.
         param_sets: parameters of each scene; None: none.
-        seeds: returns the seed of scene ``s`` and camera ``c``.
+        spp: returns the samples a pixel of scene ``s`` and camera ``c``.
+        seeds: returns the seed, likewise.
         options: arguments of ``render`` for all pictures.
         shares_scene: True: all scenes are one, with different parameters.
         full: as for :func:`render_batch`.
@@ -216,16 +265,16 @@ def _pictures(
     for s, candidate in enumerate(scenes):
         scene = as_scene(candidate, f"scenes[{s}]")
         if not shares_scene:  # earlier pictures of the scene may still be in work
-            with naming_errors(f"scenes[{s}]", None):
+            with naming_errors(f"scenes[{s}]", ""):
                 now = scene.versions()
                 check_unchanged(versions.setdefault(scene, now), now, "while the batch has it")
         if param_sets is not None and s >= len(param_sets):
             raise SceneError("params", len(param_sets), "as many as there are scenes")
-        for c, camera in enumerate(cameras):
+        for c, (camera_name, camera) in enumerate(cameras.of_scene(s)):
             name = ("" if param_sets is None else f"params[{s}]") if shares_scene else f"scenes[{s}]"
-            with naming_errors(name, c if camera is not None else None):
+            with naming_errors(name, camera_name):
                 params = {} if param_sets is None else param_sets[s]
-                request = _request(scene, camera, params, seeds(s, c), options, full=full)
+                request = _request_by(scene, camera, params, spp(s, c), seeds(s, c), options, full=full)
                 film = request.settings.film
                 _, _, *size = film.crop or (0, 0, film.width, film.height)
                 film_facts = {"width": size} | ({"aovs": list(film.aovs), "denoise": film.denoise} if full else {})
@@ -233,13 +282,14 @@ def _pictures(
                 for key, value in film_facts.items():
                     if value != first_facts[key]:
                         raise SceneError(f"film.{key}", value, f"{first_facts[key]}, as of the first picture")
-            yield _Picture(s, c, name, request)
+            yield Picture(s, c, name, request)
 
 
-def _request(
+def _request_by(
     scene: Scene,
     camera: Mapping[str, Any] | Tensor | None,
     params: Params,
+    spp: Any,
     seed: Any,
     options: BatchOptions,
     *,
@@ -252,7 +302,16 @@ def _request(
         params = {**params, "camera.to_world": camera}
     elif camera is not None:
         scene = scene.seen_by(camera, options.get("film"))
-    request = prepare_request(scene, full=full, params=params, seed=seed, **options)
+    return request_of(scene, full, params=params, spp=spp, seed=seed, **options)
+
+
+def request_of(scene: Scene, full: bool, **options: Unpack[CommonOptions]) -> RenderRequest:
+    """Return the request of a picture for :func:`render_pictures`; arguments as of :func:`torchpt.render`.
+
+    Raises:
+        SceneError: an argument is not accepted.
+    """
+    request = prepare_request(scene, full=full, **options)
     if any(map(is_transformed, request.params.values())):
         raise SceneError(
             "params", "tensors under a transform of torch.func", "plain ones: transforms go through render"
@@ -261,17 +320,26 @@ def _request(
     return request.with_versions()
 
 
-def _queued_renders(
-    pictures: Iterable[_Picture],
-    found: dict[tuple[int, int], tuple[RenderRequest | None, Rendering]],
-    on_progress: Callable[[int, int | None], None] | None,
-    total: int | None,
-) -> Iterator[QueuedRender]:
-    """Return the renders of pictures; they put requests that need gradients, and renderings, into ``found``."""
-    latest: list[tuple[int, Wave]] = []  # index and wave of the latest scene
+def render_pictures(
+    pictures: Iterable[Picture],
+    tasks_of: Callable[[Picture], int],
+    on_done: Callable[[Picture, RenderRequest | None, Rendering], None],
+) -> None:
+    """Render pictures side by side, each without gradients.
 
-    def queued_render(picture: _Picture) -> QueuedRender:
-        request, indices = picture.request, (picture.scene, picture.camera)
+    Args:
+        pictures: the pictures; an iterator may prepare each while others are rendered.
+        tasks_of: returns the number of tasks that a picture is cut into, at most.
+        on_done: called with each picture as it ends, its request if it needs gradients (which :func:`execute_request` adds to
+            the rendering), and the rendering.
+
+    Raises:
+        RenderError: a scene was changed while its pictures were rendered; others as :func:`torchpt.render`.
+    """
+    latest: list[tuple[int, Wave]] = []  # number and wave of the latest scene
+
+    def queued_render(picture: Picture) -> QueuedRender:
+        request = picture.request
         needs_gradients = request.needs_gradients  # read before gradients are disabled
 
         def make(threads: int) -> Run:
@@ -284,20 +352,21 @@ def _queued_renders(
             latest[:] = [(picture.scene, run.wave)]
             return run
 
-        def on_done(rendering: Rendering) -> None:
+        def finish(rendering: Rendering) -> None:
             request.check_unchanged("while the batch has it")
             # A request keeps its scene alive, and there may be many.
-            found[indices] = (request, rendering) if needs_gradients else (None, execute_request(request, [rendering]))
-            if on_progress is not None:
-                on_progress(len(found), total)
+            if needs_gradients:
+                on_done(picture, request, rendering)
+            else:
+                on_done(picture, None, execute_request(request, [rendering]))
 
         def on_error(error: BaseException) -> None:
-            with naming_errors(picture.name, None):
+            with naming_errors(picture.name, ""):
                 raise error
 
-        return QueuedRender(request.scene.device, make, on_done, on_error)
+        return QueuedRender(request.scene.device, make, finish, on_error, tasks_of(picture))
 
-    return map(queued_render, pictures)
+    render_many(map(queued_render, pictures))
 
 
 def _check_memory(request: RenderRequest, total: int | None) -> None:

@@ -1,9 +1,10 @@
-"""Read and check the arguments of a batch (scenes, cameras, parameters, seeds), and name the scene in errors."""
+"""Read and check the arguments of a batch (scenes, cameras, parameters, samples, seeds), and name the scene in errors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,25 @@ from torchpt.scene.entry import as_scene
 from torchpt.scene.settings import Params, SeedOfCall
 from torchpt.spec.arguments import SceneValue
 
-__all__ = ["Cameras", "Seeds", "cameras_of", "naming_errors", "params_of", "scenes_of", "seeds_of"]
+__all__ = [
+    "BatchCameras",
+    "Cameras",
+    "Counts",
+    "Seeds",
+    "cameras_of",
+    "naming_errors",
+    "number_of",
+    "params_of",
+    "scenes_of",
+    "values_of",
+]
 
-#: Camera blocks as in scene files, poses ``(4, 4)`` (also as lists), or a tensor of poses ``(C, 4, 4)``.
-Cameras = Tensor | Sequence[Mapping[str, Any] | Tensor] | None
+#: A camera block as in scene files, or a pose ``(4, 4)`` (also as lists).
+Camera = Mapping[str, Any] | Tensor | np.ndarray | Sequence[Sequence[float]]
+#: Cameras that scenes share, or a tensor of poses ``(C, 4, 4)``; a sequence of cameras for each scene, or ``(S, C, 4, 4)``.
+Cameras = Tensor | np.ndarray | Sequence[Camera] | Sequence[Sequence[Camera]] | None
+#: Samples a pixel: one number for all pictures, one for each scene, or one for each scene and camera; None: the scenes' own.
+Counts = int | Sequence[int] | Sequence[Sequence[int]] | Tensor | np.ndarray | None
 #: One seed for all pictures, one for each scene, or one for each scene and camera; None: a new one for each picture.
 Seeds = SeedOfCall | Sequence[int] | Sequence[Sequence[int]]
 
@@ -44,32 +60,97 @@ def scenes_of(scenes: Any) -> Scene | Iterable[Scene]:
     return scenes
 
 
-def cameras_of(cameras: Cameras) -> Sequence[Mapping[str, Any] | Tensor | None]:
-    """Return the cameras of a batch as a sequence; None stands for each scene's own.
+@dataclass(frozen=True)
+class BatchCameras:
+    """The cameras of a batch, C for each scene.
+
+    Attributes:
+        rows: the cameras of each scene; a single row is that of all scenes. None stands for the scene's own camera.
+        shared: True if all scenes have the same cameras.
+    """
+
+    rows: Sequence[Sequence[Mapping[str, Any] | Tensor | None]]
+    shared: bool
+
+    @property
+    def count(self) -> int:
+        """Return C, the number of cameras of a scene."""
+        return len(self.rows[0])
+
+    def of_scene(self, s: int) -> Iterator[tuple[str, Mapping[str, Any] | Tensor | None]]:
+        """Yield name in errors ("" for the scene's own) and camera, for the cameras of scene ``s``.
+
+        Raises:
+            SceneError: there are cameras for fewer scenes.
+        """
+        if not self.shared and s >= len(self.rows):
+            raise SceneError("cameras", len(self.rows), "as many as there are scenes")
+        for c, camera in enumerate(self.rows[0 if self.shared else s]):
+            yield "" if camera is None else f"cameras[{c}]" if self.shared else f"cameras[{s}][{c}]", camera
+
+
+def cameras_of(cameras: Cameras, scenes: int | None) -> BatchCameras:
+    """Return the cameras of a batch.
+
+    Args:
+        cameras: the caller's argument.
+        scenes: number of scenes; None if not known.
 
     Raises:
-        SceneError: not a sequence of blocks or poses, nor a tensor of poses.
+        SceneError: not a sequence of blocks or poses, one of such sequences, nor a tensor of poses.
     """
     if cameras is None:
-        return [None]
-    expected = "a sequence of camera blocks or poses (4, 4), or a dense tensor (C, 4, 4)"
+        return BatchCameras([[None]], shared=True)
+    expected = (
+        "a sequence of camera blocks or poses (4, 4), one of these a scene, a dense tensor (C, 4, 4) or (S, C, 4, 4)"
+    )
     if isinstance(cameras, Tensor | np.ndarray):
         poses = _pose("cameras", cameras, expected)
-        if poses.dim() != 3 or not len(poses):
+        if poses.dim() not in (3, 4) or not poses.shape[:-2].numel():
             raise SceneError("cameras", tuple(poses.shape), expected)
-        return list(poses.unbind())
-    if not isinstance(cameras, Sequence) or isinstance(cameras, str) or not cameras:
+        if poses.dim() == 3:
+            return BatchCameras([poses.unbind()], shared=True)
+        rows = [row.unbind() for row in poses.unbind()]
+    elif not isinstance(cameras, Sequence) or isinstance(cameras, str) or not len(cameras):
         raise SceneError("cameras", cameras, expected)
+    elif not any(map(_is_row, cameras)):
+        return BatchCameras([_cameras("cameras", cameras, expected)], shared=True)
+    else:
+        rows = [_cameras(f"cameras[{s}]", row, expected) for s, row in enumerate(cameras)]
+        for s, row in enumerate(rows):
+            if len(row) != len(rows[0]):
+                raise SceneError(f"cameras[{s}]", len(row), f"as many cameras as of the first scene, {len(rows[0])}")
+    if scenes is not None and len(rows) != scenes:
+        raise SceneError("cameras", len(rows), f"as many as there are scenes, {scenes}")
+    return BatchCameras(rows, shared=False)
+
+
+def _is_row(entry: Any) -> bool:
+    """Return True if an entry of a sequence of cameras has the cameras of a scene: poses have numbers at the second level."""
+    if isinstance(entry, Tensor | np.ndarray):
+        return entry.ndim == 3
+    first: Any = entry[0] if isinstance(entry, list | tuple) and entry else None
+    if isinstance(first, Mapping):
+        return True
+    if isinstance(first, Tensor | np.ndarray):
+        return first.ndim == 2
+    return isinstance(first, list | tuple) and bool(first) and isinstance(first[0], list | tuple | Tensor | np.ndarray)
+
+
+def _cameras(key: str, cameras: Any, expected: str) -> Sequence[Mapping[str, Any] | Tensor]:
+    """Return camera blocks and poses of a sequence, or of a tensor of poses; ``key``, ``expected``: for errors."""
+    if not isinstance(cameras, Sequence | Tensor | np.ndarray) or isinstance(cameras, str) or not len(cameras):
+        raise SceneError(key, cameras, expected)
     found: list[Mapping[str, Any] | Tensor] = []
     for c, camera in enumerate(cameras):
         if not isinstance(camera, Mapping | Tensor | np.ndarray | list | tuple):
-            raise SceneError(f"cameras[{c}]", camera, expected)
+            raise SceneError(f"{key}[{c}]", camera, expected)
         if isinstance(camera, Mapping) and not _POSE_KEYS & camera.keys():
             expected_block = (
                 "a whole camera block, with origin and target, to_world, or R and t; hand single numbers over as params"
             )
-            raise SceneError(f"cameras[{c}]", dict(camera), f"{expected_block}, such as camera.fov")
-        found.append(camera if isinstance(camera, Mapping) else _pose(f"cameras[{c}]", camera, "a pose (4, 4), dense"))
+            raise SceneError(f"{key}[{c}]", dict(camera), f"{expected_block}, such as camera.fov")
+        found.append(camera if isinstance(camera, Mapping) else _pose(f"{key}[{c}]", camera, "a pose (4, 4), dense"))
     return found
 
 
@@ -136,52 +217,60 @@ def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Params] 
     raise SceneError("params", params, "a mapping to tensors with a leading dimension, or a sequence of mappings")
 
 
-def seeds_of(seed: Seeds, scenes: int | None, cameras: int) -> Callable[[int, int], Any]:
-    """Return a function of scene ``s`` and camera ``c`` that gives the seed as ``render`` takes it.
+def values_of(key: str, given: Any, scenes: int | None, cameras: int) -> Callable[[int, int], Any]:
+    """Return a function of scene ``s`` and camera ``c`` that gives the value of a picture, as ``render`` takes it.
 
     Args:
-        seed: the caller's argument.
+        key: name of the argument, for errors.
+        given: the caller's argument: a value for all pictures, one for each scene, or one for each scene and camera.
         scenes: number of scenes; None if not known.
         cameras: number of cameras.
 
     Raises:
-        SceneError: too few or too many seeds.
+        SceneError: too few or too many values.
     """
-    nested = seed.tolist() if isinstance(seed, Tensor | np.ndarray) else seed
+    nested = given.tolist() if isinstance(given, Tensor | np.ndarray) else given
     if nested is None or isinstance(nested, int | SceneValue):
         return lambda s, c: nested
     expected = f"a whole number, a sequence of {scenes or 'as many as there are scenes'}, or of sequences of {cameras}"
     if not isinstance(nested, Sequence) or isinstance(nested, str) or (scenes is not None and len(nested) != scenes):
-        raise SceneError("seed", nested, expected)
+        raise SceneError(key, nested, expected)
     for row in nested:
         if isinstance(row, Sequence) and (isinstance(row, str) or len(row) != cameras):
-            raise SceneError("seed", nested, expected)
+            raise SceneError(key, nested, expected)
 
-    def seed_of(s: int, c: int) -> Any:
+    def value_of(s: int, c: int) -> Any:
         if s >= len(nested):
-            raise SceneError("seed", len(nested), "as many as there are scenes")
+            raise SceneError(key, len(nested), "as many as there are scenes")
         row = nested[s]
         return row[c] if isinstance(row, Sequence) else row
 
-    return seed_of
+    return value_of
+
+
+def number_of(given: Any) -> int | None:
+    """Return the number of entries of a sequence, tensor or array; None for a single value."""
+    if isinstance(given, Tensor | np.ndarray):
+        return len(given) if given.ndim else None
+    return len(given) if isinstance(given, Sequence) else None
 
 
 @contextmanager
-def naming_errors(scene: str, camera: int | None) -> Iterator[None]:
+def naming_errors(scene: str, camera: str) -> Iterator[None]:
     """Make errors raised within name the scene of a batch and, for camera blocks, the camera.
 
     Args:
         scene: name such as ``scenes[3]``; "" if there is only one.
-        camera: index of the camera; None for a scene's own.
+        camera: name such as ``cameras[1]``; "" for a scene's own.
     """
     try:
         yield
     except SceneError as error:
         key = error.key
-        if camera is not None and key.startswith(("camera", "params.camera.to_world")):
-            key = f"cameras[{camera}]{key.removeprefix('params.camera.to_world').removeprefix('camera')}"
-        elif scene and not key.startswith(("scenes[", "params[", "cameras[", "seed")):
-            key = f"{scene}.{key}"
+        if camera and (key == "camera" or key.startswith(("camera.", "params.camera.to_world"))):
+            key = f"{camera}{key.removeprefix('params.camera.to_world').removeprefix('camera')}"
+        elif scene and not key.startswith(("scenes[", "params[", "cameras", "seed")):
+            key = f"{scene}.{key}" if key else scene
         error_type = NotBuiltError if isinstance(error, NotBuiltError) else SceneError
         raise error_type(key, error.value, error.expected, error.file) from None
     except AssetError as error:
