@@ -1,7 +1,12 @@
 """Functions of tensors with a custom backward pass (VJP, vector-Jacobian product), for autograd and ``torch.func``.
 
 A render is such a function: :func:`custom_vjp` puts it on autograd's tape as one operation. A *cotangent* is the derivative of
-the loss with respect to a result (PyTorch: ``grad_output``).
+the loss with respect to a result (PyTorch: ``grad_output``), a *tangent* the derivative of an argument or a result with respect
+to the variable of forward mode.
+
+Forward mode (JVP) and second derivatives come from one more function. With the VJP ``g(x, c) = cᵀ J(x)``, that is the
+derivative of ``<g(x, c), u>``: with respect to ``c`` it is the JVP ``J u``, with respect to ``x`` the product of ``u`` with the
+Hessian of ``<c, f(x)>``.
 """
 
 from __future__ import annotations
@@ -9,6 +14,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -25,6 +31,7 @@ from torchpt.core.threads import without_autocast
 __all__ = [
     "Backward",
     "Forward",
+    "Second",
     "custom_vjp",
     "is_batched",
     "is_transformed",
@@ -35,15 +42,22 @@ __all__ = [
 
 Forward = Callable[..., tuple[Tensor, ...]]
 Backward = Callable[..., Sequence[Tensor | None]]
+#: Called as ``second(tangents, cotangents, *tensors)``, with a tangent, or None for 0, of each tensor; returns the JVPs of the
+#: results, then the Hessian products with the tensors, None for 0. Without cotangents (None) it returns the JVPs alone.
+Second = Callable[..., Sequence[Tensor | None]]
 
 # What errors tell the user of derivatives that a render does not have.
 _NO_FORWARD_MODE = (
-    "render has no forward-mode derivatives (jvp, jacfwd): take torch.func.vjp or backward(),"
+    "this layer has no forward-mode derivatives (jvp, jacfwd): take torch.func.vjp or backward(),"
     " or the difference of two renders of one seed"
 )
 _NO_SECOND_DERIVATIVES = (
-    "render has no second derivatives: take the difference of two gradients of one seed_grad,"
+    "this layer has no second derivatives: take the difference of two gradients of one seed_grad,"
     " or torch.func.vjp of the picture for a Gauss-Newton step"
+)
+_NO_THIRD_DERIVATIVES = (
+    "render has no third derivatives, and no second ones in forward mode alone: take the difference of two second derivatives"
+    " of one seed_grad, or forward mode over torch.func.grad"
 )
 _NO_OLD_VMAP = (
     "render takes batches of cotangents by torch.func.jacrev alone, not by vectorize=True or is_grads_batched=True"
@@ -51,24 +65,30 @@ _NO_OLD_VMAP = (
 
 
 def custom_vjp(
-    forward: Forward, backward: Backward, tensors: tuple[Tensor, ...], captured: tuple[Tensor, ...] = ()
+    forward: Forward,
+    backward: Backward,
+    tensors: tuple[Tensor, ...],
+    captured: tuple[Tensor, ...] = (),
+    second: Second | None = None,
 ) -> tuple[Tensor, ...]:
     """Return ``forward(*tensors)``, differentiable in ``tensors`` and ``captured`` by ``backward``.
 
-    Both functions get plain tensors, unwrapped from transforms of ``torch.func``. Under ``vmap``, and for batches of
-    cotangents (``jacrev``), they are called once for each element.
+    All functions get plain tensors, unwrapped from transforms of ``torch.func``. Under ``vmap``, and for batches of
+    cotangents (``jacrev``) or tangents (``jacfwd``), they are called once for each element.
 
     Args:
         forward: returns a tuple of tensors, given ``tensors``.
         backward: the VJP, called as ``backward(cotangents_of_results, *tensors)`` with a tuple first; returns the cotangents of
             ``tensors`` and then of ``captured``, None for 0.
-        tensors: arguments of both.
-        captured: tensors that both functions capture, such as weights of modules; they may change before the backward pass.
+        tensors: arguments of all functions.
+        captured: tensors that the functions capture, such as weights of modules; they may change before the backward pass.
+        second: for forward mode and second derivatives, see :data:`Second`; None: there are none.
 
     Raises:
-        TorchptError: forward-mode derivatives; in the backward pass, second derivatives.
+        TorchptError: derivatives that are not there: forward-mode ones, second ones, third ones.
     """
-    return _CustomVjp.apply(forward, backward, len(captured), *tensors, *captured)  # pyright: ignore[reportReturnType]
+    functions = _Functions(forward, backward, second, len(captured))
+    return _CustomVjp.apply(functions, *tensors, *captured)  # pyright: ignore[reportReturnType]
 
 
 def wants_gradients(value: Tensor) -> bool:
@@ -104,31 +124,198 @@ def _levels(value: Tensor) -> Iterator[Tensor]:
         yield value
 
 
+@dataclass(frozen=True)
+class _Functions:
+    """The functions of a call of :func:`custom_vjp`, and the number of tensors that they capture."""
+
+    forward: Forward
+    vjp: Backward
+    second: Second | None
+    captured: int
+
+    def arguments(self, tensors: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Return tensors without the captured ones, which are the last."""
+        return tensors[: len(tensors) - self.captured]
+
+
 class _CustomVjp(torch.autograd.Function):
-    """One call of :func:`custom_vjp`; the last ``captured`` (a number) of ``tensors`` are the captured ones."""
+    """One call of :func:`custom_vjp`; the captured tensors are the last ones."""
 
     @staticmethod
-    def forward(forward: Forward, backward: Backward, captured: int, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return tuple(forward(*(tensor.detach() for tensor in tensors[: len(tensors) - captured])))
+    def forward(functions: _Functions, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return tuple(functions.forward(*(tensor.detach() for tensor in functions.arguments(tensors))))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        _, ctx.vjp, captured, *tensors = inputs
-        ctx.save_for_backward(*tensors[: len(tensors) - captured])
+        ctx.functions, *tensors = inputs
+        ctx.results = len(output)
+        ctx.set_materialize_grads(False)  # so that forward mode tells constants from variables
+        ctx.like = [(tuple(result.shape), result.dtype, result.device) for result in output]
+        arguments = ctx.functions.arguments(tuple(tensors))
+        ctx.save_for_backward(*arguments)
+        ctx.save_for_forward(*arguments)
 
     @staticmethod
-    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        gradients = _CustomVjpBackward.apply(ctx.vjp, len(cotangents), *cotangents, *ctx.saved_tensors)
+    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        filled = [
+            torch.zeros(shape, dtype=dtype, device=device) if cotangent is None else cotangent
+            for cotangent, (shape, dtype, device) in zip(cotangents, ctx.like, strict=True)
+        ]
+        gradients = _CustomVjpBackward.apply(ctx.functions, ctx.results, *filled, *ctx.saved_tensors)
         assert gradients is not None
-        return (None, None, None, *gradients)  # forward, backward and captured are no tensors
+        return (None, *gradients)  # the functions are no tensor
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        raise TorchptError(_NO_FORWARD_MODE)
+    def jvp(ctx: Any, *changes: Any) -> Any:
+        functions: _Functions = ctx.functions
+        tangents = changes[1:]  # without that of the functions
+        if functions.second is None:
+            raise TorchptError(_NO_FORWARD_MODE)
+        return _second(functions, 0, functions.arguments(tangents), ctx.saved_tensors)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
         return _call_for_each(_CustomVjp.apply, info.batch_size, in_dims, arguments)
+
+
+class _CustomVjpBackward(torch.autograd.Function):
+    """The backward pass as a function of its own, on which ``torch.func`` may call ``vmap`` or differentiate again."""
+
+    @staticmethod
+    def forward(functions: _Functions, results: int, *tensors: Tensor) -> tuple[Tensor | None, ...]:
+        # The first tensors are the cotangents of that many results; the others are the arguments of the forward pass.
+        plain = _plain(tensors)
+        with without_autocast(plain[0].device):
+            return tuple(functions.vjp(plain[:results], *plain[results:]))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.functions, ctx.results, *tensors = inputs
+        ctx.given = [gradient is not None for gradient in output]
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*tensors)
+        ctx.save_for_forward(*tensors)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor | None) -> Any:
+        functions: _Functions = ctx.functions
+        if functions.second is None:
+            raise TorchptError(_NO_SECOND_DERIVATIVES)
+        return (None, None, *_second(functions, ctx.results, functions.arguments(cotangents), ctx.saved_tensors))
+
+    @staticmethod
+    def jvp(ctx: Any, *given: Any) -> Any:
+        functions, results, tangents = ctx.functions, ctx.results, given[2:]
+        if functions.second is None:
+            raise TorchptError(_NO_SECOND_DERIVATIVES)
+        cotangents, tensors = ctx.saved_tensors[:results], ctx.saved_tensors[results:]
+        products: list[Tensor | None] = [None] * len(ctx.given)
+        if any(tangent is not None for tangent in tangents[results:]):  # the Hessian is symmetric
+            products[: len(tensors)] = _second(functions, results, tangents[results:], ctx.saved_tensors)[results:]
+        changes = tangents[:results]
+        if any(change is not None for change in changes):
+            changes = [
+                torch.zeros_like(c) if change is None else change for c, change in zip(cotangents, changes, strict=True)
+            ]
+            linear = _CustomVjpBackward.apply(functions, results, *changes, *tensors)
+            assert linear is not None
+            products = [_sum(a, b) for a, b in zip(products, linear, strict=True)]
+        return tuple(product if given else None for product, given in zip(products, ctx.given, strict=True))
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
+        return _call_for_each(_CustomVjpBackward.apply, info.batch_size, in_dims, arguments)
+
+
+class _Second(torch.autograd.Function):
+    """JVPs of results, and Hessian products, as a function of its own."""
+
+    @staticmethod
+    def forward(functions: _Functions, results: int, *tensors: Tensor | None) -> tuple[Tensor | None, ...]:
+        # First tangents, then the cotangents of so many results, then as many arguments as tangents.
+        count = (len(tensors) - results) // 2
+        plain = _plain(tensors)
+        tangents, cotangents, arguments = plain[:count], plain[count : count + results], plain[count + results :]
+        assert functions.second is not None
+        with without_autocast(arguments[0].device):
+            return tuple(functions.second(tangents, cotangents or None, *arguments))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.functions, ctx.results, *tensors = inputs
+        ctx.count = (len(tensors) - ctx.results) // 2
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*tensors[ctx.count :])
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor | None) -> Any:
+        # Linear in the tangents; the other inputs are :class:`_Constant`.
+        functions, results, count = ctx.functions, ctx.results, ctx.count
+        jvps, products = (cotangents, ()) if results == 0 else (cotangents[:results], cotangents[results:])
+        tensors = ctx.saved_tensors[results:]
+        found: list[Tensor | None] = [None] * count
+        if any(jvp is not None for jvp in jvps):
+            if any(jvp is None for jvp in jvps):
+                raise TorchptError(_NO_THIRD_DERIVATIVES)
+            linear = _CustomVjpBackward.apply(functions, len(jvps), *jvps, *tensors)
+            assert linear is not None
+            found = list(linear[:count])
+        if any(product is not None for product in products):  # the Hessian is symmetric
+            twice = _second(functions, results, products, ctx.saved_tensors)
+            found = [_sum(a, b) for a, b in zip(found, twice[results:], strict=True)]
+        return (None, None, *found, *(None for _ in ctx.saved_tensors))
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        raise TorchptError(_NO_THIRD_DERIVATIVES)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
+        return _call_for_each(_Second.apply, info.batch_size, in_dims, arguments)
+
+
+class _Constant(torch.autograd.Function):
+    """The identity, which cannot be differentiated: an input of a function without that derivative."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(value: Tensor) -> Tensor:
+        return value.view_as(value)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Any) -> Any:
+        raise TorchptError(_NO_THIRD_DERIVATIVES)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        raise TorchptError(_NO_THIRD_DERIVATIVES)
+
+
+def _second(
+    functions: _Functions, results: int, tangents: Sequence[Tensor | None], others: Sequence[Tensor]
+) -> tuple[Tensor | None, ...]:
+    """Call :class:`_Second` with tangents, and with cotangents and tensors (``others``) that are not differentiated again."""
+    found = _Second.apply(functions, results, *tangents, *(_Constant.apply(tensor) for tensor in others))
+    assert found is not None
+    return found
+
+
+def _sum(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+    """Return a sum of which None is 0."""
+    return b if a is None else a if b is None else a + b
+
+
+def _plain(tensors: Sequence[Tensor | None]) -> tuple[Any, ...]:
+    """Return tensors off all tapes."""
+    try:
+        return tuple(None if tensor is None else tensor.detach() for tensor in tensors)
+    except RuntimeError as error:  # tensors of torch's older vmap, which has no rule for a custom Function
+        raise TorchptError(_NO_OLD_VMAP) from error
 
 
 def _with_signature(function: type[torch.autograd.Function]) -> None:
@@ -137,38 +324,9 @@ def _with_signature(function: type[torch.autograd.Function]) -> None:
     forward.__signature__ = inspect.signature(forward)
 
 
-class _CustomVjpBackward(torch.autograd.Function):
-    """The backward pass as a function of its own, on which ``torch.func`` may call ``vmap`` or differentiate again."""
-
-    @staticmethod
-    def forward(vjp: Backward, results: int, *tensors: Tensor) -> tuple[Tensor | None, ...]:
-        # The first tensors are the cotangents of that many results; the others are the arguments of the forward pass.
-        try:
-            plain = tuple(tensor.detach() for tensor in tensors)
-        except RuntimeError as error:  # tensors of torch's older vmap, which has no rule for a custom Function
-            raise TorchptError(_NO_OLD_VMAP) from error
-        with without_autocast(plain[0].device):
-            return tuple(vjp(plain[:results], *plain[results:]))
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *cotangents: Any) -> Any:
-        raise TorchptError(_NO_SECOND_DERIVATIVES)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        raise TorchptError(_NO_SECOND_DERIVATIVES)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
-        return _call_for_each(_CustomVjpBackward.apply, info.batch_size, in_dims, arguments)
-
-
 _with_signature(_CustomVjp)
 _with_signature(_CustomVjpBackward)
+_with_signature(_Second)
 
 
 def _call_for_each(

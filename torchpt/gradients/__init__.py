@@ -3,6 +3,7 @@
 ==================  ==========================================================================================
 ``replay.py``       ``replay``, the default: path replay, paths traced again and differentiated by vertex; start here
 ``tape.py``         ``autograd``: chunks rendered again on one autograd tape
+``second.py``       second derivatives and forward mode
 ``parameters.py``   from parameters to the tensors of waves, differentiated once a backward pass
 ``camera.py``       gradients with respect to the camera in film space, where no surface moves
 ``edges/``          boundary terms of silhouettes and shadow edges that move

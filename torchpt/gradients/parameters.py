@@ -233,6 +233,39 @@ class SceneTape(Tape):
         results = zip((*self._inputs, *self.captured), (*input_grads, *captured_grads), strict=True)
         return [torch.zeros_like(tensor) if gradient is None else gradient for tensor, gradient in results]
 
+    def leaf_tangents(self, tangents: Sequence[Tensor]) -> list[Tensor]:
+        """Return tangents of the leaves, given those of the inputs: the JVP of the assembly, as the VJP of its VJP."""
+        outputs, inputs = self._outputs, self._inputs
+        with torch.enable_grad():
+            cotangents = [torch.zeros_like(output, requires_grad=True) for output in outputs]
+            grads = torch.autograd.grad(outputs, inputs, cotangents, create_graph=True, allow_unused=True)
+            pairs = [(grad, u) for grad, u in zip(grads, tangents, strict=True) if grad is not None]
+            found = torch.autograd.grad([g for g, _ in pairs], cotangents, [u for _, u in pairs], allow_unused=True)
+        return [torch.zeros_like(leaf) if u is None else u for leaf, u in zip(self.leaves, found, strict=True)]
+
+    def products(self, grads: Sequence[Tensor], products: Sequence[Tensor], tangents: Sequence[Tensor]) -> list[Tensor]:
+        """Return Hessian products with the inputs.
+
+        Args:
+            grads: gradients of the leaves.
+            products: Hessian products with the leaves.
+            tangents: of the inputs.
+        """
+        outputs, inputs = self._outputs, self._inputs
+        with torch.enable_grad():
+            first = torch.autograd.grad(outputs, inputs, grads, create_graph=True, allow_unused=True)
+            # The second derivative of the assembly itself, where it is not linear.
+            change = [(grad * u).sum() for grad, u in zip(first, tangents, strict=True) if grad is not None]
+            change = [part for part in change if part.requires_grad]
+            own = (
+                torch.autograd.grad(change, inputs, retain_graph=True, allow_unused=True)
+                if change
+                else [None] * len(inputs)
+            )
+        through = torch.autograd.grad(outputs, inputs, products, allow_unused=True)
+        zeros = (torch.zeros_like(tensor) for tensor in inputs)
+        return [zero + sum(x for x in pair if x is not None) for zero, *pair in zip(zeros, own, through, strict=True)]
+
 
 def _map_tensors(wave: Wave, change: Callable[[Tensor], Tensor]) -> Wave:
     """Return the wave with ``change`` applied to all of its tensors."""

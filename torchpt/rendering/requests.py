@@ -8,6 +8,7 @@ forward pass.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.autograd import custom_vjp, is_batched, wants_gradients
-from torchpt.core.errors import EdgeWarning, NoLightWarning, SceneError, warn_caller
+from torchpt.core.errors import EdgeWarning, NoLightWarning, RenderError, SceneError, warn_caller
 from torchpt.images.denoiser import check_denoiser
 from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.paths.layers import LAYERS, SurfaceLayer
@@ -61,6 +62,9 @@ __all__ = [
 _FLOATS = (torch.float32, torch.float64)
 #: Flips bits of a seed, so that backward passes by default draw other numbers than forward passes. (The multiplier of drand48.)
 _BACKWARD_SEED = 0x5DEECE66D
+
+#: Samples of the backward pass for one of each estimator of edges, which takes longer and varies less.
+_PER_EDGE_SAMPLE = 4
 
 
 @dataclass(frozen=True)
@@ -433,14 +437,23 @@ def _differentiable(request: RenderRequest, render: _RenderWithoutGradients) -> 
 
     def edge_samples() -> int:
         """Return the samples a pixel for visibility edges; 0: none."""
-        return (call.edge_spp or call.spp_grad or forward_spp[0]) if call.edges else 0
+        if not call.edges:
+            return 0
+        return call.edge_spp or math.ceil((call.spp_grad or forward_spp[0]) / _PER_EDGE_SAMPLE)
 
     def edge_request() -> edges.Asked:
         request.check_unchanged(AFTER)
         return edges.Asked(scene, backward_settings(), wanted, dtype, edge_samples())
 
     tensors = (*(params[name] for name in names), *(request.rays or ()))
-    (image,) = custom_vjp(forward, backward_pass, tensors, scene.weights())
+
+    def second(
+        tangents: Sequence[Tensor | None], cotangents: tuple[Tensor, ...] | None, *given: Tensor
+    ) -> list[Tensor | None]:
+        spp = forward_spp[0] if forward_spp else max(made[-1].spp, 1)
+        return _second(request, spp, backward_settings(call.spp_grad or spp), names, tangents, cotangents, given)
+
+    (image,) = custom_vjp(forward, backward_pass, tensors, scene.weights(), second)
     rendering = made[-1]
     made.clear()  # autograd keeps the closures alive: they must not hold pictures
     forward_spp.append(max(rendering.spp, 1))
@@ -451,15 +464,67 @@ def _differentiable(request: RenderRequest, render: _RenderWithoutGradients) -> 
     return replace(rendering, image=image)
 
 
+def _second(
+    request: RenderRequest,
+    spp: int,
+    backward: Settings,
+    names: Sequence[str],
+    tangents: Sequence[Tensor | None],
+    cotangents: tuple[Tensor, ...] | None,
+    tensors: tuple[Tensor, ...],
+) -> list[Tensor | None]:
+    """Return JVPs and Hessian products of a picture, as :data:`torchpt.core.autograd.Second` asks for them.
+
+    JVPs are of the picture's own samples. Products of both, as in the Hessian of a squared loss, are then of samples that do
+    not depend on each other, and have no bias.
+
+    Args:
+        request: of the picture.
+        spp: samples a pixel of the picture.
+        backward: settings of the backward pass.
+        names: of ``tensors``, without the rays, which follow.
+        tangents: of the tensors; None for 0.
+        cotangents: of the picture; None: the JVP alone is wanted.
+        tensors: parameters and rays.
+    """
+    from torchpt.gradients import second
+
+    request.check_unchanged(AFTER)
+    scene, settings, dtype = request.scene, request.settings, request.call.dtype
+    if len(tensors) > len(names):
+        raise RenderError(
+            "trace has no forward-mode and no second derivatives: take the difference of two calls of one seed"
+        )
+    if request.call.ranks is not None:
+        raise SceneError("ranks", "a group", "none, for forward mode and second derivatives")
+    params = dict(zip(names, tensors, strict=True))
+    given = {name: tangent for name, tangent in zip(names, tangents, strict=False) if tangent is not None}
+    forward = replace(settings, render=settings.render.but(spp=spp))
+    pixels = second.jvp(scene, forward, params, given, dtype)
+    _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
+    image = pixels.T.reshape(height, width, 3).to(torch.float32)
+    if cotangents is None:
+        return [image]
+    wanted = [name for name in names if name in given or name in request.differentiated]
+    given = {name: given.get(name, torch.zeros_like(params[name])) for name in wanted}
+    products = second.hessian_products(scene, backward, params, given, dtype, cotangents[0].reshape(-1, 3).T)
+    return [image, *(products.get(name) for name in names)]
+
+
 def _constant(request: RenderRequest, render: _RenderWithoutGradients) -> Rendering:
     """Return a rendering without gradients; parameters and rays may be wrapped by transforms of ``torch.func``."""
-    params, made = request.params, list[Rendering]()
+    params, made, settings = request.params, list[Rendering](), request.settings
 
     def forward(*tensors: Tensor) -> tuple[Tensor]:
         made.append(render(dict(zip(params, tensors, strict=False)), tensors[len(params) :]))
         return (made[-1].image,)
 
-    (image,) = custom_vjp(forward, lambda *_: (), (*params.values(), *(request.rays or ())), ())
+    def second(
+        tangents: Sequence[Tensor | None], cotangents: tuple[Tensor, ...] | None, *given: Tensor
+    ) -> list[Tensor | None]:
+        return _second(request, max(made[-1].spp, 1), settings, list(params), tangents, cotangents, given)
+
+    (image,) = custom_vjp(forward, lambda *_: (), (*params.values(), *(request.rays or ())), (), second)
     return replace(made[-1], image=image)
 
 

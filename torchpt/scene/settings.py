@@ -363,7 +363,7 @@ class BatchOptions(TraceOptions, total=False):
     ]
     edge_spp: Annotated[
         int | None,
-        _whole_number(1, "samples a pixel of each estimator of edges; none: as many as the backward pass takes"),
+        _whole_number(1, "samples a pixel of each estimator of edges; none: a quarter of those of the backward pass"),
     ]
     ranks: Annotated[
         Group | None,

@@ -16,7 +16,7 @@ with ``v`` the velocity of the surface's own point, ``S`` that of the point that
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -29,7 +29,7 @@ from torchpt.math.vectors import cross, dot, largest, rows, take
 from torchpt.paths.roulette import russian_roulette, survival_probability
 from torchpt.physics.shapes.interaction import slide_share
 
-__all__ = ["MovingFrame", "PathVertex", "Prefix", "prefixes_of"]
+__all__ = ["MovingFrame", "PathVertex", "Prefix", "one_of_each", "prefixes_of"]
 
 #: Rounding of a point that the search finds, against its coordinates.
 _ROUNDING = 2.0**-18
@@ -215,6 +215,31 @@ def prefixes_of(
         vertices = [*(rows(vertex, kept) for vertex in vertices), _vertex(frame, spot)]
         wi = -spot.d.double()
     return found
+
+
+def one_of_each(prefixes: list[Prefix], u: Tensor) -> list[Prefix]:
+    """Return one of the paths of each receiver, chosen by their worth and weighted by one over the chance.
+
+    Args:
+        prefixes: as from :func:`prefixes_of`, of N receivers.
+        u: ``(N,)`` in [0, 1).
+    """
+    if len(prefixes) < 2:
+        return prefixes
+    worths = [largest(prefix.weight.abs()) for prefix in prefixes]
+    total = torch.zeros_like(u)
+    for prefix, worth in zip(prefixes, worths, strict=True):
+        total[prefix.lane] += worth
+    rest, chosen = u * total, list[Prefix]()
+    for prefix, worth in zip(prefixes, worths, strict=True):
+        before = take(rest, prefix.lane)
+        rest[prefix.lane] -= worth
+        some = ((before >= 0) & (before < worth)).nonzero().squeeze(1)
+        if len(some):
+            kept = prefix.taken(some)
+            scale = take(take(total, prefix.lane) / worth, some)
+            chosen.append(replace(kept, weight=kept.weight * scale))
+    return chosen
 
 
 def _vertex(frame: MovingFrame, spot: Spot) -> PathVertex:

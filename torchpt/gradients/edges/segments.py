@@ -31,7 +31,7 @@ from torch import Tensor
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import smooth_faces
 from torchpt.gradients.edges.occluders import Occluders
-from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
+from torchpt.gradients.edges.receivers import MovingFrame, Prefix, one_of_each, prefixes_of
 from torchpt.gradients.edges.traced import Use
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.sampling import Distribution1D, uniform_sphere, uniform_triangle
@@ -383,8 +383,10 @@ class Segments:
         moves = self.frame.moving(rays.held.prim) | self.frame.moving(rays.mate)
         for y in seen:
             moves = moves | self.frame.moving(y.hit.prim)
+        found = prefixes_of(self.frame, receiver, -rays.omega, key, self.depth, behind=2, moves=moves)
         prefixes = []
-        for prefix in prefixes_of(self.frame, receiver, -rays.omega, key, self.depth, behind=2, moves=moves):
+        # Light behind the edge costs more than paths to the camera.
+        for prefix in one_of_each(found, self.frame.traced.draws(key).one(Dimension.ROULETTE).double()):
             depth = self.depth if self.depth < 0 else self.depth - prefix.count
             light = [self._reflected(y, o, number, prefix.lane, depth) for y in seen]
             scale = prefix.weight * take(weight, prefix.lane)
