@@ -42,7 +42,7 @@ class SharedBackward:
         # By number of the pass: the cotangent, and the gradients for it, which the picture's node takes.
         self._ready: dict[int, tuple[Tensor, Sequence[Tensor | None]]] = {}
 
-    def suits(self, request: RenderRequest) -> bool:
+    def accepts(self, request: RenderRequest) -> bool:
         """Return True for a picture whose backward pass is a single task by kernels on a CPU."""
         settings, call = request.settings, request.call
         return (
@@ -121,7 +121,7 @@ class _Joined(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        # Not taken are passes that nobody asks for (`torch.autograd.grad` of some inputs), or whose picture the loss leaves out.
+        # Not taken: passes that nobody asks for (`torch.autograd.grad` of some inputs), or whose picture the loss leaves out.
         wanted = {
             number: cotangent.detach()
             for number, (cotangent, node) in enumerate(zip(cotangents, ctx.nodes, strict=True))

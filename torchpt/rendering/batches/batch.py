@@ -207,7 +207,7 @@ def render_batch(
         request, rendering = found.pop((s, c))
         if request is None:
             return rendering
-        if not shared.suits(request):
+        if not shared.accepts(request):
             return execute_request(request, [rendering])
         joint.append((s, c))
         return execute_request(request, [rendering], shared.share)
