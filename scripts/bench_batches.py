@@ -5,7 +5,7 @@
 Scenes: a closed room of 30 rectangles in which a ball and a bumpy mesh of 5,000 triangles move from picture to picture. Each is
 loaded and its trees are built each time: by ``torchpt.load`` from a mapping, by ``mitsuba.load_dict`` from a dict whose mesh is
 a ``mitsuba.Mesh`` of arrays. ``moved`` renders one loaded torchpt scene with changed parameters. Cameras: one such scene
-from several poses.
+from several poses. Gradients: scenes as above, of the mean square of each picture by the colour of a paint (Mitsuba: ``prb``).
 
 All contenders share a process and take turns. Figures are medians over rounds, of pictures a second by wall time and by the
 process's CPU time (all threads); ratios are medians of the ratios within a round. Both sides start from mappings in memory and
@@ -29,6 +29,8 @@ import torch
 import torchpt
 
 DEPTH, RR_DEPTH = 8, 5
+#: The paint whose colour is differentiated.
+PAINT = "white"
 OURS, MOVED, THEIRS = "torchpt", "torchpt, moved", "llvm_ad_rgb"
 COLOURS = {"white": [0.7, 0.7, 0.7], "red": [0.6, 0.06, 0.05], "green": [0.1, 0.5, 0.1]}
 
@@ -184,7 +186,24 @@ def mitsuba(arguments: argparse.Namespace, scenes: list[dict[str, Any]]) -> dict
             [np.asarray(mi.render(one, sensor=view, spp=arguments.spp, seed=k)) for k, view in enumerate(views)]
         )
 
-    return {"scenes": over_scenes, "cameras": over_cameras}
+    dr = importlib.import_module("drjit")
+    backward = mi.load_dict({"type": "prb", "max_depth": DEPTH, "rr_depth": RR_DEPTH})
+
+    def gradients() -> np.ndarray:
+        found = []
+        for k in range(len(given)):
+            scene = loaded(k)
+            params = mi.traverse(scene)
+            (name,) = (
+                key for key in params.keys() if key.startswith(f"{PAINT}.") and key.endswith("reflectance.value")
+            )
+            dr.enable_grad(params[name])
+            image = mi.render(scene, params, integrator=backward, spp=arguments.spp, seed=k)
+            dr.backward(dr.mean(dr.square(image), axis=None))
+            found.append(np.asarray(dr.grad(params[name])).ravel())
+        return np.stack(found)
+
+    return {"scenes": over_scenes, "cameras": over_cameras, "gradients": gradients}
 
 
 def ours(
@@ -214,7 +233,20 @@ def ours(
     def over_cameras() -> np.ndarray:
         return torchpt.render_batch(one, views, seed=[list(range(count))], **wishes).numpy()
 
-    return {"scenes": {OURS: over_scenes, MOVED: over_parameters}, "cameras": {OURS: over_cameras}}
+    def gradients() -> np.ndarray:
+        name = f"materials.{PAINT}.reflectance"
+        colours = torch.tensor([COLOURS[PAINT]] * count, requires_grad=True)
+        loaded = (torchpt.load(scene) for scene in scenes)
+        images = torchpt.render_batch(loaded, params={name: colours}, seed=list(range(count)), **wishes)
+        images.square().mean((1, 2, 3, 4)).sum().backward()
+        assert colours.grad is not None
+        return colours.grad.numpy()
+
+    return {
+        "scenes": {OURS: over_scenes, MOVED: over_parameters},
+        "cameras": {OURS: over_cameras},
+        "gradients": {OURS: gradients},
+    }
 
 
 def measured(
@@ -235,13 +267,14 @@ def measured(
 
 
 def main() -> None:
-    """Print both tables, and write all figures to the JSON file."""
+    """Print all tables, and write all figures to the JSON file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--count", type=int, default=64, help="pictures of a batch")
     parser.add_argument("--size", type=int, default=64, help="of a picture in pixels")
     parser.add_argument("--spp", type=int, default=4)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--only", choices=("scenes", "cameras", "gradients"), help="one of the contests")
     parser.add_argument("--alone", action="store_true", help="without Mitsuba")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
@@ -251,11 +284,13 @@ def main() -> None:
     if not arguments.alone:
         for name, shoot in mitsuba(arguments, scenes).items():
             contests[name][THEIRS] = shoot
+    if arguments.only:
+        contests = {arguments.only: contests[arguments.only]}
     figures = {name: measured(contest, arguments.rounds, arguments.count) for name, contest in contests.items()}
     for contest, rows in figures.items():
         for name, turns in rows.items():
             medians = {key: statistics.median(turn[key] for turn in turns) for key in ("wall", "cpu", "mean")}
-            line = f"{contest:8} {name:15} {medians['wall']:7.1f}/s  {medians['cpu']:7.1f}/s of CPU  mean {medians['mean']:.4f}"
+            line = f"{contest:9} {name:15} {medians['wall']:7.1f}/s  {medians['cpu']:7.1f}/s of CPU  mean {medians['mean']:.4f}"
             if THEIRS in rows and name != THEIRS:
                 pairs = list(zip(turns, rows[THEIRS], strict=True))
                 ratios = {key: statistics.median(a[key] / b[key] for a, b in pairs) for key in ("wall", "cpu")}

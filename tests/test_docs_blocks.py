@@ -45,6 +45,7 @@ NOT_RUN = {
     "-m torchpt render scene=cornell_box render.spp=1024 render.threads=16 out=box.exr": "needs two machines",
     "torchrun --nproc-per-node 2 --max-restarts 3 -m torchpt render scene=cornell_box render.spp=65536 "
     "render.checkpoint=box.npz render.resume=true out=box.exr": RANKS,
+    "torchrun --nproc-per-node 2 scripts/examples/08_distributed.py --out examples_out": "tests/test_examples.py runs it",
 }
 #: Pages whose blocks take less than half a second each.
 QUICK = ("docs/reference/cameras.md",)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -24,6 +27,7 @@ SHORT = {
     "05_camera_calibration": (100, 16, 0.75),
     "06_neural_bsdf": (25, 12, 0.6),
     "07_depth_network": (30, 16, 0.8),
+    "08_distributed": (12, 16, 0.6),
 }
 
 
@@ -48,6 +52,49 @@ def test_an_example_finds_what_it_looks_for(name, example, tmp_path, capsys) -> 
     assert torchpt.read_image(tmp_path / f"{name}.png").std() > 0.01
     told = [float(number) for number in re.findall(r"\d+\.\d+", capsys.readouterr().out)]
     assert any(number in (approx(after, abs=1e-3), approx(100 * after, abs=0.06)) for number in told)
+
+
+@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_workers_give_the_same_pictures(example, start, tmp_path, capsys) -> None:
+    main = example("07_depth_network").main
+    words = ["--out", str(tmp_path), "--steps", "2", "--size", "8"]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        assert main([*words, "--workers", "2", "--start", start]) == main(words)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_two_processes_of_torchrun_have_the_gradient_of_one(example, tmp_path) -> None:
+    words = ["--steps", "3", "--size", "12"]
+    launcher = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--nproc-per-node",
+        "2",
+        str(FOLDER / "08_distributed.py"),
+    ]
+    # torch asks DNS for the name of the other side of each connection, and waits.
+    environment = {**os.environ, "PYTHONPATH": str(FOLDER.parent.parent), "OMP_NUM_THREADS": "1"} | {
+        "RES_OPTIONS": "attempts:0"
+    }
+    work = subprocess.run(
+        [*launcher, *words, "--out", str(tmp_path / "two")],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=300,
+    )
+    assert work.returncode == 0, work.stderr
+    assert work.stdout.startswith("2 processes: error of the paints")
+    example("08_distributed").main([*words, "--out", str(tmp_path / "one")])
+    one, two = (torch.load(tmp_path / name / "08_distributed.pt", weights_only=True) for name in ("one", "two"))
+    largest = float(one["gradient"].abs().max())
+    assert largest > 0
+    torch.testing.assert_close(two["gradient"], one["gradient"], rtol=1e-5, atol=1e-6 * largest)
+    torch.testing.assert_close(two["paints"], one["paints"], rtol=1e-5, atol=1e-6)
 
 
 def test_a_pose_is_rigid(example) -> None:

@@ -1,14 +1,15 @@
 """A small network that sees how far things are, trained on rooms that are rendered as it learns.
 
-    python scripts/examples/07_depth_network.py --out FOLDER
+    python scripts/examples/07_depth_network.py --out FOLDER [--workers 2 --start spawn]
 
-A room is a pure function of its number: the dataset holds nothing, two workers give the same, and no room is seen twice,
-so nothing can be learned by heart. Pictures are noisy (8 samples), which does for noise what photographs need;
-their depth comes with them, as a layer. Rooms of other numbers are for validation.
+A room is a pure function of its number: the dataset holds nothing, workers give the same bits however they are started, and no
+room is seen twice, so nothing can be learned by heart. Pictures are noisy (8 samples), which does for noise what photographs
+need; their depth comes with them, as a layer. Rooms of other numbers are for validation.
 """
 
 from __future__ import annotations
 
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from functools import partial
 from random import Random
@@ -92,13 +93,21 @@ def channels_first(batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
     return batch["image"].permute(0, 3, 1, 2), batch["depth"].permute(0, 3, 1, 2)
 
 
+def worker_arguments(parser: ArgumentParser) -> None:
+    """Add the arguments of ``DataLoader``'s workers."""
+    parser.add_argument("--workers", type=int, default=0, help="processes that render; 0: this one, by all its threads")
+    parser.add_argument("--start", choices=("fork", "spawn"), default="spawn", help="how workers are started")
+
+
 def main(argv: Sequence[str] | None = None) -> tuple[float, float]:
     """Train it; the mean error of depth on the validation rooms at the start and at the end, which are also printed."""
-    args = arguments(__doc__, steps=600, size=32, argv=argv)
+    args = arguments(__doc__, steps=600, size=32, argv=argv, more=worker_arguments)
     torch.manual_seed(args.seed)
     rooms = RenderDataset(partial(room, args.size), VALIDATION + BATCH * args.steps, spp=SPP, layers=["depth"])
     seen, true = channels_first(next(iter(DataLoader(Subset(rooms, range(VALIDATION)), VALIDATION))))
-    batches = DataLoader(Subset(rooms, range(VALIDATION, len(rooms))), BATCH)
+    start = args.start if args.workers else None
+    training = Subset(rooms, range(VALIDATION, len(rooms)))
+    batches = DataLoader(training, BATCH, num_workers=args.workers, multiprocessing_context=start)
 
     network = DepthNetwork()
     optimizer = torch.optim.Adam(network.parameters(), lr=0.005)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -15,13 +15,23 @@ import torchpt
 __all__ = ["arguments", "grid", "pose", "turned_by"]
 
 
-def arguments(about: str | None, steps: int, size: int, argv: Sequence[str] | None) -> argparse.Namespace:
-    """``--out --steps --seed --size`` of an example, whose docstring is its help; the folder ``out`` is made."""
+def arguments(
+    about: str | None,
+    steps: int,
+    size: int,
+    argv: Sequence[str] | None,
+    more: Callable[[argparse.ArgumentParser], object] = lambda parser: None,
+) -> argparse.Namespace:
+    """``--out --steps --seed --size`` of an example, whose docstring is its help; the folder ``out`` is made.
+
+    ``more`` adds arguments of the example's own.
+    """
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("examples_out"), help="folder of what is written")
     parser.add_argument("--steps", type=int, default=steps, help="of the optimizer")
     parser.add_argument("--seed", type=int, default=0, help="of the pictures, and of whatever else is drawn")
     parser.add_argument("--size", type=int, default=size, help="of the square pictures, in pixels")
+    more(parser)
     given = parser.parse_args(argv)
     given.out.mkdir(parents=True, exist_ok=True)
     return given

@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader, DistributedSampler
 import torchpt
 from torchpt import search
 from torchpt.core.errors import RenderError, SceneError
+from torchpt.core.memory import MemoryMeter
 from torchpt.data import RenderDataset, RenderStream, SceneLoader
 from torchpt.scene import scene as scene_module
 
@@ -308,6 +309,20 @@ def test_gradients_reach_parameters_of_loaded_scenes():
         torchpt.render(own, params={"materials.wall.reflectance": leaf}, spp=2, seed=1 + index).sum().backward()
         grad = scene.params["materials.wall.reflectance"].grad
         assert grad is not None and leaf.grad is not None and torch.equal(grad, leaf.grad) and bool(grad.any())
+
+
+@pytest.mark.slow
+def test_500_iterations_over_new_scenes_are_flat_in_memory():
+    """Scenes, worlds, kernels and gradients of an iteration go with it; nothing is released by hand."""
+    meter, held = MemoryMeter(torch.device("cpu")), list[int]()
+    tint = torch.ones(3, requires_grad=True)
+    for indices, scenes in SceneLoader(room, range(1000), batch_size=2, device="cpu"):
+        params = [{"materials.wall.reflectance": tint * s.params["materials.wall.reflectance"]} for s in scenes]
+        torchpt.render_batch(scenes, params=params, spp=4, seed=indices).mean().backward()
+        held.append(meter.now())
+    assert len(held) == 500
+    print(f"{held[100] / 1e6:.1f} MB after 100, {max(held[400:]) / 1e6:.1f} MB after 400 to 500")
+    assert max(held[400:]) <= 1.02 * held[100]
 
 
 def test_samplers_of_ranks_share_the_indices():

@@ -18,9 +18,10 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 @pytest.mark.slow
 def test_the_lessons_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    torch.manual_seed(0)
     names: dict[str, object] = {}
     blocks = BLOCK.findall(PAGE.read_text(encoding="utf-8"))
-    assert len(blocks) == 7
+    assert len(blocks) == 13
     for block in blocks:
         exec(compile(block, str(PAGE), "exec"), names)
     for name in ("fov", "paint"):
@@ -28,16 +29,21 @@ def test_the_lessons_run(tmp_path, monkeypatch, capsys):
         assert isinstance(leaf, torch.Tensor) and leaf.grad is not None and float(leaf.grad.norm()) > 0
     written = torchpt.cameras.read_transforms("transforms.json")
     assert len(written) == 3 and all(torchpt.read_image(str(path)).shape == (16, 16, 3) for path, _, _ in written)
-    found = torch.tensor([float(x) for x in re.findall(r"\d\.\d+", capsys.readouterr().out)])
+    printed = [float(x) for x in re.findall(r"\d\.\d+", capsys.readouterr().out)]
+    found = torch.tensor(printed[:3])  # of the first lesson
     right = torchpt.load("cornell_box", "cpu").params["materials.red.reflectance"]
     torch.testing.assert_close(found, right, rtol=0, atol=0.02)
     irradiance, panorama = names["irradiance"], names["panorama"]
     assert isinstance(irradiance, torch.Tensor) and isinstance(panorama, torch.Tensor)
     rows = (torch.arange(16) + 0.5) / 32 * torch.pi  # the upper half, by its cosine
     weight = (rows.cos() * rows.sin() * torch.pi / 32 * 2 * torch.pi / 64)[:, None, None]
-    torch.testing.assert_close((panorama[:16] * weight).sum((0, 1)), irradiance, rtol=0.1, atol=0.0)
+    torch.testing.assert_close(
+        (panorama[:16] * weight).sum((0, 1)), irradiance, rtol=0.2, atol=0.0
+    )  # some 300 of 4096 rays meet the lamp
     batch = names["batch"]
     assert isinstance(batch, dict) and batch["image"].shape == (2, 16, 16, 3) and batch["K"].shape == (2, 3, 3)
+    tint = names["tint"]
+    assert isinstance(tint, torch.Tensor) and bool((tint.detach() != 1).all())
 
 
 def table(heading: str) -> dict[str, list[str]]:

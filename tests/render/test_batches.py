@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import threading
 import weakref
 from contextlib import nullcontext
 from typing import Any
@@ -13,8 +14,8 @@ import torch
 from few import few
 
 import torchpt
-from torchpt import search
-from torchpt.core.errors import RenderError, SceneError
+from torchpt import gradients, search
+from torchpt.core.errors import RenderError, SceneError, TorchptError
 from torchpt.engines import tensors
 from torchpt.engines.engine import TASKS
 from torchpt.engines.kernels import engine, programs
@@ -400,6 +401,99 @@ def test_gradients_of_poses_of_each_scene():
         assert torch.equal(batch.layers["depth"][s, 0], alone.layers["depth"])
         (expected,) = torch.autograd.grad((alone.image * weights[s, 0]).sum(), own)
         assert torch.equal(found[s, 0], expected) and bool(expected.any())
+
+
+GREY = "materials.grey.reflectance"
+
+
+@pytest.fixture
+def passes(monkeypatch):
+    """Record the threads of backward passes, by name."""
+    seen: list[str] = []
+    plain = gradients.gradients
+
+    def recorded(*args, **given):
+        seen.append(threading.current_thread().name)
+        return plain(*args, **given)
+
+    monkeypatch.setattr(gradients, "gradients", recorded)
+    return seen
+
+
+def colours(count: int) -> torch.Tensor:
+    return torch.linspace(0.1, 0.9, 3 * count).reshape(count, 3).requires_grad_()
+
+
+def expected_gradients(scene, rgb, pose=None):
+    """Gradients of the mean square of each picture, alone."""
+    found = []
+    for row in rgb.detach():
+        leaf = row.clone().requires_grad_()
+        params = {GREY: leaf} | ({} if pose is None else {"camera.to_world": pose})
+        found.append(torch.autograd.grad(torchpt.render(scene, params=params).square().mean(), leaf)[0])
+    return torch.stack(found)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_backward_passes_of_small_pictures_run_on_threads(passes, threads):
+    scene, rgb = room(), colours(5)
+    expected = expected_gradients(scene, rgb)
+    passes.clear()
+    for _ in range(3):  # pieces, tables and buffers of passes before are used again
+        images = torchpt.render_batch(scene, params={GREY: rgb}, threads=threads)
+        (found,) = torch.autograd.grad(images.square().mean((1, 2, 3, 4)).sum(), rgb)
+        assert torch.equal(found, expected)
+    assert len(passes) == 15 and all(name.startswith("torchpt_") for name in passes)
+
+
+def test_backward_passes_of_cameras_of_one_scene(passes):
+    scene, given = room(), poses(room(), 4)
+    rgb = colours(1)
+    for _ in range(3):
+        images = torchpt.render_batch(scene, given, {GREY: rgb}, threads=2)
+        (found,) = torch.autograd.grad(images.square().mean((2, 3, 4)).sum(), rgb)
+        alone = sum(expected_gradients(scene, rgb, pose) for pose in given)
+        torch.testing.assert_close(found, alone, rtol=1e-6, atol=0)
+    assert len(passes) == 3 * 8
+
+
+def test_passes_of_pictures_that_a_loss_leaves_out_are_not_taken(passes):
+    scene, rgb = room(), colours(3)
+    expected = expected_gradients(scene, rgb)
+    passes.clear()
+    images = torchpt.render_batch(scene, params={GREY: rgb})
+    (found,) = torch.autograd.grad(images[1:].square().mean((1, 2, 3, 4)).sum(), rgb, retain_graph=True)
+    assert torch.equal(found[1:], expected[1:]) and not found[0].any() and len(passes) == 3
+    for s, row in enumerate(images):  # one by one
+        (found,) = torch.autograd.grad(row.square().mean(), rgb, retain_graph=True)
+        assert torch.equal(found[s], expected[s])
+
+
+def test_passes_of_inputs_that_nobody_asks_for_are_not_taken(passes):
+    scene, rows = room(), [row.detach().requires_grad_() for row in colours(4)]
+    images = torchpt.render_batch(scene, params=[{GREY: row} for row in rows])
+    found = torch.autograd.grad(images.sum(), rows[1:3])
+    assert len(passes) == 2 and all(bool(gradient.any()) for gradient in found)
+
+
+def test_a_loss_of_pictures_and_of_the_stacked_ones():
+    scene, rgb = room(), colours(2)
+    batch = torchpt.render_batch(scene, params={GREY: rgb}, full=True)
+    (once,) = torch.autograd.grad(batch.image.sum(), rgb, retain_graph=True)
+    (found,) = torch.autograd.grad(batch.image.sum() + batch[1, 0].image.sum(), rgb)
+    assert torch.equal(found[0], once[0])
+    torch.testing.assert_close(found[1], 2 * once[1])
+
+
+def test_an_error_in_a_backward_pass_is_raised():
+    scene, rgb = room(), colours(3)
+    images = torchpt.render_batch(scene, params={GREY: rgb})
+    scene.params["shapes.lamp.emission"].fill_(7.0)
+    with pytest.raises(RenderError, match="changed"):
+        images.sum().backward()
+    with pytest.raises(TorchptError, match="render takes batches of cotangents by torch.func.jacrev alone"):
+        images = torchpt.render_batch(scene, params={GREY: rgb})
+        torch.autograd.grad(images, rgb, torch.ones(2, *images.shape), is_grads_batched=True)
 
 
 @pytest.mark.parametrize("layer", ["depth", "object_id"])

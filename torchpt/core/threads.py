@@ -93,6 +93,7 @@ class _Thread:
         try:
             torch.get_num_threads()  # the first call makes the thread inherit the process's number
             torch.set_num_threads(1)
+            _of_pool.set(True)
         finally:
             self._ready.put(None)
         while (message := self.inbox.get()) is not None:
@@ -103,6 +104,8 @@ class _Thread:
             ended.put(None)
 
 
+#: True in threads of the pool.
+_of_pool: ContextVar[bool] = ContextVar("of_pool", default=False)
 #: Numbers for the names of threads.
 _numbers = itertools.count()
 #: Serializes starts of threads: each changes torch's number of threads for a moment.
@@ -402,11 +405,16 @@ _torch_threads = _TorchThreads(forked=False)
 def limited_threads(threads: int | str, small: bool = False) -> Iterator[None]:
     """Let torch use ``threads`` threads within, also in overlapping renders; "auto": as many as before.
 
+    Within a thread of the pool there is one thread: others of the pool work beside it.
+
     Args:
         threads: the number, or "auto".
         small: True: torch itself uses one thread, as its tensors are so small that waking others takes longer than they
             save, above all beside busy processes. :func:`thread_count` is still ``threads``.
     """
+    if _of_pool.get():
+        yield
+        return
     entered = _torch_threads
     token = _threads_of_render.set(entered.enter(threads))
     try:

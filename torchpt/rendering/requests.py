@@ -18,7 +18,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import custom_vjp, is_batched, wants_gradients
+from torchpt.core.autograd import Backward, custom_vjp, is_batched, wants_gradients
 from torchpt.core.errors import EdgeWarning, NoLightWarning, RenderError, SceneError, warn_caller
 from torchpt.images.denoiser import check_denoiser
 from torchpt.paths.integrators import KINDS as INTEGRATORS
@@ -283,10 +283,17 @@ def _parameters(scene: Scene, params: Params | None, full: bool) -> dict[str, Te
     return {name: value for name, value in scene.params.items() if getattr(value, "requires_grad", False)} | given
 
 
-def execute_request(request: RenderRequest, rendered: list[Rendering] | None = None) -> Rendering:
+def execute_request(
+    request: RenderRequest,
+    rendered: list[Rendering] | None = None,
+    share: Callable[[Backward, tuple[Tensor, ...]], Backward] | None = None,
+) -> Rendering:
     """Render a request: with autograd where it requires gradients, denoised where its film asks for that.
 
-    ``rendered``: a list with the rendering that was already made without gradients; it is removed from the list.
+    Args:
+        request: the request.
+        rendered: a list with the rendering that was already made without gradients; it is removed from the list.
+        share: called with the backward pass and the tensors that autograd calls it with, returns the one to use.
 
     Raises:
         SceneError: a parameter is not accepted.
@@ -304,7 +311,7 @@ def execute_request(request: RenderRequest, rendered: list[Rendering] | None = N
         )
 
     if request.needs_gradients:
-        rendering = _differentiable(request, render)
+        rendering = _differentiable(request, render, share)
     elif request.params or request.rays is not None:
         rendering = _constant(request, render)
     else:
@@ -357,8 +364,15 @@ def _rays_or_none(rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor] | None:
 _RenderWithoutGradients = Callable[[Mapping[str, Tensor], tuple[Tensor, ...]], Rendering]
 
 
-def _differentiable(request: RenderRequest, render: _RenderWithoutGradients) -> Rendering:
-    """Return a rendering whose picture has gradients with respect to parameters and rays; ``render`` makes it without."""
+def _differentiable(
+    request: RenderRequest,
+    render: _RenderWithoutGradients,
+    share: Callable[[Backward, tuple[Tensor, ...]], Backward] | None,
+) -> Rendering:
+    """Return a rendering whose picture has gradients with respect to parameters and rays; ``render`` makes it without.
+
+    ``share``: as for :func:`execute_request`.
+    """
     from torchpt import gradients as adjoint
     from torchpt.gradients import edges
 
@@ -453,7 +467,8 @@ def _differentiable(request: RenderRequest, render: _RenderWithoutGradients) -> 
         spp = forward_spp[0] if forward_spp else max(made[-1].spp, 1)
         return _second(request, spp, backward_settings(call.spp_grad or spp), names, tangents, cotangents, given)
 
-    (image,) = custom_vjp(forward, backward_pass, tensors, scene.weights(), second)
+    backward = backward_pass if share is None else share(backward_pass, tensors)
+    (image,) = custom_vjp(forward, backward, tensors, scene.weights(), second)
     rendering = made[-1]
     made.clear()  # autograd keeps the closures alive: they must not hold pictures
     forward_spp.append(max(rendering.spp, 1))

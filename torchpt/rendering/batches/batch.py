@@ -23,6 +23,7 @@ from torchpt.core.threads import limited_threads, outside_inference_mode
 from torchpt.engines.engine import TASKS
 from torchpt.paths.wave import Wave
 from torchpt.rendering import QueuedRender, Rendering, Run, render_many
+from torchpt.rendering.batches.backward import SharedBackward
 from torchpt.rendering.batches.inputs import (
     BatchCameras,
     Cameras,
@@ -188,9 +189,8 @@ def render_batch(
     with limited_threads(first.request.settings.render.threads):
         _check_memory(first.request, total)
         given_spp = [spp_of(s, c) for s in range(size or 0) for c in range(batch_cameras.count)]
-        counts = [
-            spp for spp in given_spp if type(spp) is int and spp > 0
-        ]  # others: errors, or None for the scenes' own
+        # Others are errors, or None for the scenes' own.
+        counts = [spp for spp in given_spp if type(spp) is int and spp > 0]
         tasks_of = task_counts(total, sum(counts) / len(counts) if counts else None) if total else lambda picture: 1
         render_pictures(chain([first], pictures), tasks_of, on_done)
     count = 1 + max(s for s, _ in found)
@@ -200,8 +200,23 @@ def render_batch(
         if entries not in (None, count):
             raise SceneError(key, entries, f"as many as there are scenes, {count}")
     # Gradients last: autograd wraps pictures that are rendered already.
-    rows = tuple(tuple(_with_gradients(found.pop((s, c))) for c in range(batch_cameras.count)) for s in range(count))
-    image = _stack([[r.image for r in row] for row in rows])
+    shared = SharedBackward(first.request.settings.render.threads)
+    joint: list[tuple[int, int]] = []  # pictures whose backward passes are shared
+
+    def differentiable(s: int, c: int) -> Rendering:
+        request, rendering = found.pop((s, c))
+        if request is None:
+            return rendering
+        if not shared.accepts(request):
+            return execute_request(request, [rendering])
+        joint.append((s, c))
+        return execute_request(request, [rendering], shared.share)
+
+    rows = tuple(tuple(differentiable(s, c) for c in range(batch_cameras.count)) for s in range(count))
+    images = [[rendering.image for rendering in row] for row in rows]
+    for (s, c), image in zip(joint, shared.join([images[s][c] for s, c in joint]), strict=True):
+        images[s][c] = image
+    image = _stack(images)
     if not full:
         return image
     layers = {name: _stack([[r.layers[name] for r in row] for row in rows]) for name in rows[0][0].layers}
@@ -213,12 +228,6 @@ def _stack(rows: list[list[Tensor]]) -> Tensor:
     """Return pictures ``(H, W, C)`` of scenes by cameras as one tensor ``(scenes, cameras, H, W, C)``."""
     with outside_inference_mode():
         return torch.stack([torch.stack(row) for row in rows])
-
-
-def _with_gradients(found: tuple[RenderRequest | None, Rendering]) -> Rendering:
-    """Return a rendering with autograd; without a request it needs none."""
-    request, rendering = found
-    return rendering if request is None else execute_request(request, [rendering])
 
 
 def task_counts(pictures: int, mean_spp: float | None) -> Callable[[Picture], int]:
