@@ -164,6 +164,16 @@ def test_changes_that_torch_does_not_count_reach_their_pieces() -> None:
     assert_same(scene.world(torch.float32, given), fresh.world(torch.float32, given))
 
 
+def test_kept_pieces_do_not_change_with_a_callers_tensor() -> None:
+    for name in world_names(load()):
+        scene = load()
+        given = changed(scene.params[name])
+        wanted = given.clone()
+        scene.world(torch.float32, {name: given})
+        given.view(-1)[0] *= 0.9
+        assert_same(scene.world(torch.float32, {name: wanted}), load().world(torch.float32, {name: wanted}))
+
+
 class Gained(torchpt.Bsdf):
     """Diffuse, times a tensor of its own that it reads in :meth:`prepare`."""
 

@@ -92,16 +92,21 @@ class ParameterReads(Mapping[str, Tensor]):
         usable = not transforms_are_active() and not torch.is_inference_mode_enabled()
         self._kept = kept if usable else None
         self._states: dict[str, _State | None] = {}  # those that were asked for
+        self._copies: dict[str, Tensor] = {}  # of parameters that are compared by value
         self._reads: list[set[str]] = []  # of the pieces that are being made, the innermost last
         self._made: dict[
             Hashable, tuple[Any, Collection[str]]
         ] = {}  # pieces of this assembly, and the names that they depend on
 
     def __getitem__(self, name: str) -> Tensor:
-        value = self._parameters[name]
         if self._reads:
             self._reads[-1].add(name)
-        return value
+        state = None if self._kept is None or name in self._own else self._state(name)
+        if state is None:
+            return self._parameters[name]
+        if name not in self._copies:  # a kept piece must not change with a caller's tensor
+            self._copies[name] = self._parameters[name].detach().clone()
+        return self._copies[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._parameters)
