@@ -214,6 +214,8 @@ def lay_out_table(tensor: Tensor, axis: int | None) -> Tensor:
         Unsupported: integers beyond 32 bits, or 2^31 elements or more.
     """
     tensor = tensor.detach()
+    if axis in (None, 0) and tensor.dtype == torch.float32 and tensor.numel() < 1 << 31 and tensor.is_contiguous():
+        return tensor  # most are so
     if tensor.numel() >= 1 << 31:
         raise Unsupported(f"a table of {tensor.numel()} numbers")
     if axis is not None and tensor.dim() > 1:
@@ -256,21 +258,22 @@ def bind_tables(
         in_order: :attr:`Program.in_order`; None: unknown.
     """
     known = {} if known is None else known
-    tensor = run_prologue(steps, constants, leaves, names, results, in_order)
     found: list[LaidOut] = []
-    for number, table in enumerate(tables):
-        if kept and (earlier := kept[number]) is not None:
-            found.append(earlier)
-            continue
-        key = (table.source.name, table.axis) if table.source.kind == "leaf" else None
-        laid_out = known.get(key) if key is not None else None
-        original = tensor(table.source) if key is None or placed is None else placed[str(table.source.name)]
-        if laid_out is None:
-            laid_out = lay_out_table(original, table.axis)
-            laid_out = laid_out if device is None else laid_out.to(device)
-            if key is not None:
-                known[key] = laid_out
-        found.append((laid_out, original.numel() if table.axis is None else original.shape[table.axis]))
+    with torch.no_grad():
+        tensor = run_prologue(steps, constants, leaves, names, results, in_order)
+        for number, table in enumerate(tables):
+            if kept and (earlier := kept[number]) is not None:
+                found.append(earlier)
+                continue
+            key = (table.source.name, table.axis) if table.source.kind == "leaf" else None
+            laid_out = known.get(key) if key is not None else None
+            original = tensor(table.source) if key is None or placed is None else placed[str(table.source.name)]
+            if laid_out is None:
+                laid_out = lay_out_table(original, table.axis)
+                laid_out = laid_out if device is None else laid_out.to(device)
+                if key is not None:
+                    known[key] = laid_out
+            found.append((laid_out, original.numel() if table.axis is None else original.shape[table.axis]))
     words = [word for laid_out, entries in found for word in (laid_out.data_ptr(), entries)]
     if device is not None:
         pairs = torch.tensor(words or [0], dtype=torch.int64, device=device)

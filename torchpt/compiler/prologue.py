@@ -8,6 +8,7 @@ prologue. A kernel reads all of them from memory, so it serves every scene whose
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
@@ -116,11 +117,12 @@ def without_unused_steps(
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StepKey:
     """An identity of a step, by which prologues share its result.
 
-    Two steps have equal keys, in all prologues of the process, if they are the same operators on leaves of the same paths.
+    Two steps have the same key, one object in all prologues of the process, if they are the same operators on leaves of the
+    same paths.
 
     Attributes:
         number: a unique number.
@@ -168,14 +170,15 @@ def step_keys(steps: Sequence[Step]) -> tuple[StepKey | None, ...]:
                 content_of(step.args),
                 tuple((k, content_of(value)) for k, value in step.kwargs.items()),
             )
-            keys.append(StepKey(_numbers.setdefault(content, next(_count)), frozenset(leaves)))
+            key = _keys.get(content)
+            keys.append(key or _keys.setdefault(content, StepKey(next(_count), frozenset(leaves))))
         except TypeError:  # raised above, or by hash()
             keys.append(None)
     return tuple(keys)
 
 
-#: Number of each step, by operator and arguments.
-_numbers: dict[Any, int] = {}
+#: Key of each step, by operator and arguments.
+_keys: dict[Any, StepKey] = {}
 _count = count()
 
 
@@ -204,33 +207,41 @@ def run_prologue(
     """
     results: list[Any] = [None] * len(steps)
 
+    # These functions are called some hundred times for each new scene: so they are short.
+
     def tensor(source: Source) -> Tensor:
-        if source.kind == "leaf":
-            return leaves[str(source.name)]
-        if source.kind == "constants":
-            return constants[int(source.name)].cpu()  # weights of a user's module may be on a device
-        number = int(source.name)
-        if results[number] is None:
-            run(number)
-        result = results[number]
+        kind, name = source.kind, source.name
+        if kind == "leaf":
+            return leaves[name]  # pyright: ignore[reportArgumentType]
+        if kind == "constants":
+            return constants[int(name)].cpu()  # weights of a user's module may be on a device
+        result = results[name]  # pyright: ignore[reportCallIssue, reportArgumentType]
+        if result is None:
+            result = run(int(name))
         return result if source.item < 0 else result[source.item]
 
     def filled(value: Any) -> Any:
         """Return an argument with tensors in place of sources."""
-        if isinstance(value, Source):
+        kind = type(value)
+        if kind is Source:
             return tensor(value)
-        return type(value)(filled(x) for x in value) if isinstance(value, list | tuple) else value
+        if kind is tuple:
+            return tuple([filled(x) for x in value])
+        return [filled(x) for x in value] if kind is list else value
 
-    def run(number: int) -> None:
+    def run(number: int) -> Any:
+        """Return the result of a step."""
         key = names[number] if names and known is not None else None
         result = None if key is None or known is None else known.get(key)
         if result is None:
             step = steps[number]
-            with torch.no_grad():
-                result = step.function(*filled(step.args), **{k: filled(v) for k, v in step.kwargs.items()})
+            kwargs = {k: filled(v) for k, v in step.kwargs.items()} if step.kwargs else {}
+            with torch.no_grad() if torch.is_grad_enabled() else nullcontext():
+                result = step.function(*[filled(x) for x in step.args], **kwargs)
             if key is not None and known is not None and _small(result):
                 known[key] = result
         results[number] = result
+        return result
 
     if write_into_arguments(steps) if in_order is None else in_order:
         for number in range(len(steps)):

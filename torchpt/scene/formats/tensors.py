@@ -71,7 +71,10 @@ class DictTensors:
     def _without_tensors(self, item: Any, key: Key) -> Any:
         """Return the value at a key with numbers in place of tensors."""
         if isinstance(item, dict):
-            return {name: self._without_tensors(value, (*key, name)) for name, value in item.items()}
+            return {
+                name: value if value.__class__ in _PLAIN_TYPES else self._without_tensors(value, (*key, name))
+                for name, value in item.items()
+            }
         if isinstance(item, list):
             if _PLAIN_TYPES.issuperset(map(type, item)):  # the rows of an inline mesh
                 return item

@@ -272,6 +272,11 @@ def _resolve(text: str) -> Any:
     return text
 
 
+#: Keys that were found to be printable text, and the most of them: scenes repeat theirs.
+_good_keys: set[str] = set()
+MAX_GOOD_KEYS = 4096
+
+
 def plain(source: Any, file: str | None = None) -> Any:
     """Copy nested mappings and sequences to dicts and lists, bounded and safe to validate.
 
@@ -303,12 +308,14 @@ def plain(source: Any, file: str | None = None) -> Any:
         count = 1
         for name, value in item.items() if is_mapping else enumerate(item):
             count += 1
-            if is_mapping:
+            if is_mapping and not (name.__class__ is str and name in _good_keys):
                 if not isinstance(name, str) or not name.strip() or not name.isprintable() or len(name) > MAX_KEY:
                     raise error(name, f"keys that are printable text of at most {MAX_KEY} characters")
                 if name == "_target_":
                     trail.append(name)
                     raise error(value, "no `_target_`: a scene never names Python objects")
+                if len(_good_keys) < MAX_GOOD_KEYS:
+                    _good_keys.add(str(name))
             if value.__class__ not in _SCALARS and isinstance(value, _CONTAINERS):
                 trail.append(str(name))
                 value, inner_count = visit(value)
