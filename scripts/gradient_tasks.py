@@ -78,9 +78,10 @@ def solved(
     scene = described(task)
     with torch.no_grad():
         plain = {"threads": wishes["threads"]} if "threads" in wishes else {}
-        target = torchpt.render(
-            scene, params=task.params(scene, task.true(scene)), spp=target_spp, seed=TARGET, **plain
-        )
+        true, views = task.params(scene, task.true(scene)), task.seen()
+        targets = [
+            torchpt.render(scene, params={**true, **view}, spp=target_spp, seed=TARGET, **plain) for view in views
+        ]
     numbers = task.start(scene).clone().requires_grad_()
     adam = torch.optim.Adam([numbers], lr=task.rate, betas=(0.9, 0.95))
     schedule = torch.optim.lr_scheduler.LambdaLR(
@@ -90,10 +91,14 @@ def solved(
     begin = time.perf_counter()
     for step in range(steps):
         adam.zero_grad()
+        params = task.params(scene, numbers)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", torchpt.EdgeWarning)
-            picture = torchpt.render(scene, params=task.params(scene, numbers), spp=spp, seed=FIRST + step, **wishes)
-        loss(picture, target).backward()
+            pictures = [
+                torchpt.render(scene, params={**params, **view}, spp=spp, seed=FIRST + step, **wishes) for view in views
+            ]
+        losses = [loss(picture, target) for picture, target in zip(pictures, targets, strict=True)]
+        torch.stack(losses).sum().backward()
         assert numbers.grad is not None
         if not torch.isfinite(numbers.grad).all():
             errors.append(math.inf)

@@ -1,4 +1,4 @@
-"""Nine inverse problems with fixed starting points: recover parameters of a scene from one picture.
+"""Seventeen inverse problems with fixed starting points: recover parameters of a scene from one picture, or from several views.
 
 Each has a scene, the numbers that Adam optimises, and functions from these to parameters and to their error. Targets are
 rendered from the true numbers with another seed and many samples.
@@ -7,14 +7,16 @@ rendered from the true numbers with another seed and many samples.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import known_gradients as known
 import torch
+import trimesh
 from torch import Tensor
 
+from torchpt.nn import LargeSteps, look_at_pose
 from torchpt.scene import Scene
 
 __all__ = ["SIZE", "TASKS", "Task", "described"]
@@ -39,6 +41,8 @@ class Task:
         weight: weights of the errors; None: equal weights.
         bounds: range to which the numbers are clamped after each step.
         files: pictures ``(H, W, 3)`` by file name.
+        views: where the camera stands, ``(V, 3)``, looking at the origin; None: the scene's own camera alone.
+        off: returns the errors of the numbers, given the true scene; None: by how much they differ from the true ones.
     """
 
     scene: Mapping[str, Any]
@@ -53,10 +57,20 @@ class Task:
     weight: Callable[[Tensor], Tensor] | None = None
     bounds: tuple[float, float] = (-math.inf, math.inf)
     files: Mapping[str, Callable[[], Tensor]] = field(default_factory=dict)
+    views: Sequence[Sequence[float]] | None = None
+    off: Callable[[Scene, Tensor], Tensor] | None = None
+
+    def seen(self) -> list[dict[str, Tensor]]:
+        """Return the parameters of the views."""
+        if self.views is None:
+            return [{}]
+        places = torch.tensor(self.views)
+        return [{"camera.to_world": pose} for pose in look_at_pose(places, torch.zeros(3))]
 
     def error(self, scene: Scene, numbers: Tensor) -> float:
         """Return the root mean square of the errors of the numbers."""
-        off = (numbers.detach() - self.true(scene)).double() ** 2
+        numbers = numbers.detach()
+        off = (numbers - self.true(scene) if self.off is None else self.off(scene, numbers)).double() ** 2
         if self.weight is None:
             return float(off.mean().sqrt())
         weight = self.weight(off).expand_as(off)
@@ -112,6 +126,11 @@ def _twisted(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
     o = torch.zeros_like(x)
     rows = [torch.stack(row) for row in ((o, -c, b, x), (c, o, -a, y), (-b, a, o, z), (o, o, o, o))]
     return {"camera.to_world": scene.params["camera.to_world"] @ torch.matrix_exp(torch.stack(rows))}
+
+
+def _turned(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
+    """Return the parameter of a camera rotated by three angles about its own axes."""
+    return _twisted(scene, torch.cat((torch.zeros(3), numbers)))
 
 
 def _ball(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
@@ -179,6 +198,168 @@ CHECKED |= {"material": PICTURE["material"]}
 GLOSSY = known.with_shapes(known.TABLE, floor={**known.FLOOR, "material": known.BRUSHED})
 ON_PICTURE = known.with_shapes(known.TABLE, floor=CHECKED, ball=known.BALL)
 
+#: A block over the view whose shadow alone is seen.
+OVER_VIEW = {
+    "camera": {"origin": [0.3, 1.1, 2.2], "target": [0.1, 0, 0.1], "fov": 50},
+    "shapes": {
+        "floor": known.FLOOR,
+        "lamp": {**HIDDEN, "transform": [{"scale": 0.2}, known.DOWN, known.moved(0.2, 5, 0.1)]},
+        "block": {
+            "type": "cube",
+            "material": known.WHITE,
+            "transform": [{"scale": 0.25}, known.turned([0, 1, 0], 20), known.moved(0.15, 1.9, 0.1)],
+        },
+    },
+}
+#: A corridor with a corner: the lamp stands behind it, and lights what is seen by reflection alone.
+ROUND_CORNER = {
+    "camera": {"origin": [-0.9, 1.0, 3.4], "target": [-0.9, 0.7, 0], "fov": 50},
+    "shapes": {
+        "floor": known.FLOOR,
+        "left": known.quad([-2, 0, 4], [-2, 0, -2], [-2, 2, -2], [-2, 2, 4], material=known.WHITE),
+        "back": known.quad([-2, 0, -2], [3, 0, -2], [3, 2, -2], [-2, 2, -2], material=known.WHITE),
+        "right": known.quad([0, 0, 4], [0, 2, 4], [0, 2, 0], [0, 0, 0], material=known.WHITE),
+        "corner": known.quad([0, 0, 0], [0, 2, 0], [3, 2, 0], [3, 0, 0], material=known.WHITE),
+        "lamp": {
+            "type": "rectangle", "emission": [30, 28, 25],
+            "transform": [{"scale": 0.3}, known.DOWN, known.moved(1.2, 1.9, -1.0)],
+        },
+    },
+}  # fmt: skip
+SMOOTH_MIRROR = {"type": "conductor", "eta": [0.3, 0.6, 1.2], "k": [3, 2.5, 2]}
+SUNS = {
+    "east": {"type": "directional", "direction": [0.8, -1, 0.2], "irradiance": [3, 2.5, 2]},
+    "south": {"type": "directional", "direction": [-0.3, -1, -0.9], "irradiance": [1.5, 2, 2.5]},
+}
+CAN = {"type": "cylinder", "radius": 0.45, "height": 1.1, "center": [0.1, 0.55, 0], "material": known.BLUE}
+SIX_SIDES = ((2.6, 0.6, 0.5), (-2.6, 0.5, 0.4), (0.4, 0.6, 2.6), (-0.3, 0.5, -2.6), (0.3, 2.6, 0.4), (0.4, -2.6, -0.3))
+
+
+def _field() -> dict[str, Any]:
+    """Return a flat field of 6 x 6 vertices over a square."""
+    at = torch.linspace(-1, 1, 6)
+    z, x = torch.meshgrid(at, at, indexing="ij")
+    number = torch.arange(36).reshape(6, 6)
+    a, b, c, d = (part.flatten() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    vertices = torch.stack((x.flatten(), torch.zeros(36), z.flatten()), 1)
+    faces = torch.cat((torch.stack((a, c, b), 1), torch.stack((a, d, c), 1)))
+    return {"type": "mesh", "vertices": vertices.tolist(), "faces": faces.tolist(), "face_normals": True}
+
+
+def _heights(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
+    x, _, z = scene.params["shapes.field.vertices"].unbind(1)
+    return {"shapes.field.vertices": torch.stack((x, numbers, z), 1)}
+
+
+def _true_heights(scene: Scene) -> Tensor:
+    x, _, z = scene.params["shapes.field.vertices"].unbind(1)
+    return 0.25 * (2.5 * x + 0.4).cos() * (2.0 * z).cos() + 0.1 * (3 * z - x).sin()
+
+
+def _can(_: Scene, numbers: Tensor) -> dict[str, Tensor]:
+    """Return the parameters of a cylinder that rests on the floor."""
+    radius, height = numbers
+    center = torch.stack((torch.full_like(height, 0.1), 0.5 * height, torch.zeros_like(height)))
+    return {"shapes.can.radius": radius, "shapes.can.height": height, "shapes.can.center": center}
+
+
+def _sphere(levels: int) -> dict[str, Any]:
+    """Return a unit sphere's mesh: an icosahedron, each of whose faces is divided in four ``levels`` times."""
+    ball = trimesh.creation.icosphere(levels)
+    return {"type": "mesh", "vertices": (0.6 * ball.vertices).tolist(), "faces": ball.faces.tolist()}
+
+
+def _waved(d: Tensor) -> Tensor:
+    """Return distances ``(V,)`` of a figure's surface from the origin along unit directions ``(V, 3)``."""
+    return 0.6 * (1 + 0.12 * (3 * d[:, 0] + 0.5).sin() + 0.1 * (2.5 * d[:, 1]).cos() * d[:, 2])
+
+
+def _bumpy(d: Tensor) -> Tensor:
+    return 0.6 * (1 + 0.08 * (5 * d[:, 0]).sin() * (4 * d[:, 1] + 1).cos() + 0.06 * (4 * d[:, 2]).sin())
+
+
+def _directions(vertices: Tensor) -> Tensor:
+    return vertices / vertices.norm(dim=1, keepdim=True)
+
+
+class _Figure:
+    """The vertices of a ball as unknowns, in steps of :class:`torchpt.nn.LargeSteps`, and where a figure's surface is.
+
+    Args:
+        surface: distances from the origin by direction.
+        smoothness: of the steps.
+    """
+
+    def __init__(self, surface: Callable[[Tensor], Tensor], smoothness: float) -> None:
+        self.surface, self._smoothness = surface, smoothness
+        self._steps: LargeSteps | None = None
+
+    def steps(self, scene: Scene) -> LargeSteps:
+        if self._steps is None:
+            self._steps = LargeSteps(scene.faces("shapes.ball"), self._smoothness)
+        return self._steps
+
+    def start(self, scene: Scene) -> Tensor:
+        return self.steps(scene).inverse(scene.params["shapes.ball.vertices"])
+
+    def true(self, scene: Scene) -> Tensor:
+        d = _directions(scene.params["shapes.ball.vertices"])
+        return self.steps(scene).inverse(d * self.surface(d)[:, None])
+
+    def vertices(self, scene: Scene, numbers: Tensor) -> Tensor:
+        return self.steps(scene)(numbers)
+
+    def params(self, scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
+        return {"shapes.ball.vertices": self.vertices(scene, numbers)}
+
+    def off(self, scene: Scene, numbers: Tensor) -> Tensor:
+        """Return how far vertices are from the surface, along their directions."""
+        vertices = self.vertices(scene, numbers)
+        return vertices.norm(dim=1) - self.surface(_directions(vertices))
+
+
+class _PaintedFigure(_Figure):
+    """The same with the texels of a texture as further unknowns, behind the vertices."""
+
+    #: Errors of both are divided by these, so that they weigh about the same.
+    SCALES = 0.03, 0.2
+
+    def start(self, scene: Scene) -> Tensor:
+        return torch.cat((super().start(scene).flatten(), torch.full((8 * 16 * 3,), 0.5)))
+
+    def true(self, scene: Scene) -> Tensor:
+        return torch.cat((super().true(scene).flatten(), _paint(8, 16).flatten()))
+
+    def params(self, scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
+        count = scene.params["shapes.ball.vertices"].numel()
+        texels = numbers[count:].reshape(8, 16, 3)
+        return {
+            **super().params(scene, numbers[:count].reshape(-1, 3)),
+            "materials.paint.reflectance": texels.clamp(0, 1),
+        }
+
+    def off(self, scene: Scene, numbers: Tensor) -> Tensor:
+        count = scene.params["shapes.ball.vertices"].numel()
+        shape = super().off(scene, numbers[:count].reshape(-1, 3)) / self.SCALES[0]
+        texels = (numbers[count:] - _paint(8, 16).flatten()) / self.SCALES[1]
+        return torch.cat((shape / len(shape) ** 0.5, texels / len(texels) ** 0.5))
+
+
+def _paint(rows: int, columns: int) -> Tensor:
+    """Return smooth texels ``(rows, columns, 3)`` that join at their sides."""
+    v, u = torch.meshgrid(torch.arange(rows) / rows, 2 * math.pi * torch.arange(columns) / columns, indexing="ij")
+    return 0.5 + 0.3 * torch.stack(((2 * u).sin(), (u + 4 * v).cos(), (5 * v).sin() * (u).cos()), -1)
+
+
+def _around(mesh: dict[str, Any]) -> dict[str, Any]:
+    """Return a mesh about the origin with texture coordinates by longitude and latitude."""
+    d = _directions(torch.tensor(mesh["vertices"]))
+    u, v = torch.atan2(d[:, 0], d[:, 2]) / (2 * math.pi) + 0.5, 0.5 + torch.asin(d[:, 1].clamp(-1, 1)) / math.pi
+    return {**mesh, "uvs": torch.stack((u, v), 1).tolist()}
+
+
+WAVED, BUMPY = _Figure(_waved, 4.0), _PaintedFigure(_bumpy, 2.0)
+
 TASKS: dict[str, Task] = {
     "albedo": Task(known.ROOM, lambda scene: torch.full((3, 3), 0.4), _albedos, _as_albedos, 0.03, depth=4, bounds=(0, 1)),
     "texture": Task(
@@ -204,6 +385,41 @@ TASKS: dict[str, Task] = {
     ),
     "lit_ball": Task(
         ON_PICTURE, **shifted("shapes.ball.to_world", (0, 1, 2), (0.5, 0.25, 0.4), 0.03),
+        files={"paint.exr": known.painted},
+    ),
+    "shadow": Task(OVER_VIEW, **shifted("shapes.block.to_world", (0, 2), (0.35, -0.3), 0.03, depth=2)),
+    "round_corner": Task(
+        ROUND_CORNER, **shifted("shapes.lamp.to_world", (0, 2), (-0.5, 0.3), 0.03, depth=4),
+    ),
+    "mirror_ball": Task(
+        {**known.UNDER_SKY, "shapes": {"ball": {**known.BUST, "material": SMOOTH_MIRROR}}},
+        **plain("lights.sky.texels", 0.6, 0.05, steps=250, bar=5.0, weight=_solid_angle),
+        bounds=(0, math.inf), files={"sky.exr": known.sky},
+    ),
+    "heights": Task(
+        {**known.ABOVE, "shapes": {"field": _field()}, "lights": SUNS},
+        lambda scene: torch.zeros(36), _true_heights, _heights, 0.03,
+    ),
+    "can": Task(
+        known.with_shapes(known.CORNER, can=CAN), lambda scene: torch.tensor([0.3, 0.7]),
+        lambda scene: torch.tensor([0.45, 1.1]), _can, 0.02, depth=4,
+    ),
+    "figure": Task(
+        {"camera": known.ALONE["camera"], "shapes": {"ball": _sphere(3)}, "lights": {**SUNS, **known.OPEN_SKY}},
+        WAVED.start, WAVED.true, WAVED.params, 0.03, steps=60, spp=8, bar=5.0, views=SIX_SIDES, off=WAVED.off,
+    ),
+    "painted_figure": Task(
+        {
+            "camera": known.ALONE["camera"],
+            "materials": {"paint": {"type": "diffuse", "reflectance": torch.full((8, 16, 3), 0.5)}},
+            "shapes": {"ball": {**_around(_sphere(3)), "material": "paint"}},
+            "lights": {**SUNS, **known.OPEN_SKY},
+        },
+        BUMPY.start, BUMPY.true, BUMPY.params, 0.03, steps=60, spp=8, bar=3.0, views=SIX_SIDES, off=BUMPY.off,
+    ),
+    "turned_camera": Task(  # by five degrees
+        {"camera": known.TABLE["camera"], "shapes": {"floor": CHECKED, "lamp": known.OVERHEAD}},
+        lambda scene: torch.tensor([0.05, 0.06, 0.04]), lambda scene: torch.zeros(3), _turned, 0.01,
         files={"paint.exr": known.painted},
     ),
 }  # fmt: skip
