@@ -364,8 +364,7 @@ def _with_signature(function: type[torch.autograd.Function]) -> None:
 _with_signature(_CustomVjp)
 _with_signature(_CustomVjpBackward)
 _with_signature(_Second)
-
-:func:`gradients_of` pulls cotangents back along a tape.
+_with_signature(_Joined)
 
 
 def _call_for_each(
