@@ -7,6 +7,8 @@ to the variable of forward mode.
 Forward mode (JVP) and second derivatives come from one more function. With the VJP ``g(x, c) = cᵀ J(x)``, that is the
 derivative of ``<g(x, c), u>``: with respect to ``c`` it is the JVP ``J u``, with respect to ``x`` the product of ``u`` with the
 Hessian of ``<c, f(x)>``.
+
+:func:`gradients_of` pulls cotangents back along a tape.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ __all__ = [
     "Forward",
     "Second",
     "custom_vjp",
+    "gradients_of",
     "is_batched",
     "is_transformed",
     "outside_transforms",
@@ -89,6 +92,40 @@ def custom_vjp(
     """
     functions = _Functions(forward, backward, second, len(captured))
     return _CustomVjp.apply(functions, *tensors, *captured)  # pyright: ignore[reportReturnType]
+
+
+def gradients_of(
+    outputs: Sequence[Tensor], inputs: Sequence[Tensor], cotangents: Sequence[Tensor]
+) -> tuple[Tensor | None, ...]:
+    """Return the cotangents of inputs, given those of outputs; None for an input that no output depends on.
+
+    As ``torch.autograd.grad(outputs, inputs, cotangents, allow_unused=True)``. That compares shapes by torch's symbolic shapes,
+    and so imports SymPy: 31 MB that stay, and half a second at the first gradient of a process.
+
+    Args:
+        outputs: tensors of one device, at least one of which requires gradients; those that do not are ignored.
+        inputs: tensors that require gradients.
+        cotangents: one for each output, in its shape.
+    """
+    with torch.enable_grad():
+        joined = _Joined.apply(tuple(cotangents), *outputs)
+    return torch.autograd.grad(joined, inputs, allow_unused=True)  # pyright: ignore[reportArgumentType]
+
+
+class _Joined(torch.autograd.Function):
+    """A number that depends on several outputs, by which the derivatives of the outputs are given cotangents."""
+
+    @staticmethod
+    def forward(cotangents: tuple[Tensor, ...], *outputs: Tensor) -> Tensor:
+        return torch.zeros((), device=outputs[0].device)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.cotangents, *_ = inputs
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> tuple[Tensor | None, ...]:
+        return (None, *ctx.cotangents)
 
 
 def wants_gradients(value: Tensor) -> bool:
@@ -327,6 +364,7 @@ def _with_signature(function: type[torch.autograd.Function]) -> None:
 _with_signature(_CustomVjp)
 _with_signature(_CustomVjpBackward)
 _with_signature(_Second)
+_with_signature(_Joined)
 
 
 def _call_for_each(

@@ -16,6 +16,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchpt.core.autograd import gradients_of
 from torchpt.core.memory import Span
 from torchpt.engines.tensors import Paths, TensorsEngine, escaped
 from torchpt.math.gathers import recording_gathers
@@ -105,7 +106,7 @@ class TensorsBackward(TensorsEngine):
                 )
         self._light(ends, depth, state, hit, chance_cotangent)
         if chance is not None and chance_cotangent is not None:
-            self.sums.add_each(torch.autograd.grad(chance, self.tape.tables, chance_cotangent, allow_unused=True))
+            self.sums.add_each(gradients_of([chance], self.tape.tables, [chance_cotangent]))
         if self.plan.attached:
             for name in ("t", "prim", "u", "v"):
                 getattr(self._next_hit, name).index_copy_(0, state.lane, getattr(hit, name))
@@ -241,7 +242,7 @@ class TensorsBackward(TensorsEngine):
             pairs = [(x, self._ray_cotangents[name]) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
             if pairs:
                 rays, cotangents = [x for x, _ in pairs], [cotangent for _, cotangent in pairs]
-                self.sums.add_each(torch.autograd.grad(rays, self.tape.tables, cotangents, allow_unused=True))
+                self.sums.add_each(gradients_of(rays, self.tape.tables, cotangents))
 
     def _tables(self) -> Sequence[Tensor]:
         """Return the differentiated tables, to which a VJP adds gradients."""

@@ -15,6 +15,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchpt.core.autograd import gradients_of
 from torchpt.core.memory import Budget, Span
 from torchpt.core.tree import map_leaves
 from torchpt.math.sums import GradientSums
@@ -228,7 +229,7 @@ class SceneTape(Tape):
         input_grads: Sequence[Tensor | None] = [None] * len(self._inputs)
         if pairs and self._inputs:
             outputs, cotangents = [output for output, _ in pairs], [grad for _, grad in pairs]
-            input_grads = torch.autograd.grad(outputs, self._inputs, cotangents, allow_unused=True)
+            input_grads = gradients_of(outputs, self._inputs, cotangents)
         captured_grads = leaf_grads[len(self.leaves) :]
         results = zip((*self._inputs, *self.captured), (*input_grads, *captured_grads), strict=True)
         return [torch.zeros_like(tensor) if gradient is None else gradient for tensor, gradient in results]

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchpt.core.autograd import gradients_of
 from torchpt.core.memory import Budget, Span
 from torchpt.core.threads import one_thread
 from torchpt.engines.engine import radiance as radiance_of
@@ -143,7 +144,7 @@ def chunk_sums(scene_tape: SceneTape, chunk_loss: ChunkLoss, span: Span) -> Grad
     if values.requires_grad:  # False: nothing in these pixels depends on the parameters
         leaves = [*scene_tape.leaves, *scene_tape.captured]
         with one_thread():  # several threads would round sums over lanes in another way
-            chunk.add_each(torch.autograd.grad(values, leaves, cotangent.to(values.dtype), allow_unused=True))
+            chunk.add_each(gradients_of([values], leaves, [cotangent.to(values.dtype)]))
     return chunk
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from torchpt.core.autograd import gradients_of
 from torchpt.core.tree import leaves
 from torchpt.math.vectors import take
 from torchpt.paths.state import EXTRA, Emission, PathState, Plan, Shadow, Splat, StageContext, VertexInput
@@ -265,7 +266,7 @@ def _gradients(pairs: Sequence[tuple[Tensor, Tensor]], inputs: Sequence[Tensor])
     if not pairs:
         return (None,) * len(inputs)
     outputs, cotangents = [output for output, _ in pairs], [cotangent for _, cotangent in pairs]
-    return torch.autograd.grad(outputs, inputs, cotangents, allow_unused=True)
+    return gradients_of(outputs, inputs, cotangents)
 
 
 def _vjp(pairs: list[tuple[Tensor, Tensor]], input_leaves: _InputLeaves, extra_leaves: LeafSource) -> InputCotangents:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.core.autograd import gradients_of
 from torchpt.core.errors import SceneError
 from torchpt.rendering.api import render
 from torchpt.scene import Scene
@@ -120,7 +121,7 @@ def gradient(
             raise SceneError(
                 "loss", f"a tensor of shape {tuple(loss.shape)}", f"one of the picture's, {tuple(picture.shape)}"
             )
-        grads = torch.autograd.grad(picture, list(leaves.values()), loss.to(picture), allow_unused=True)
+        grads = gradients_of([picture], list(leaves.values()), [loss.to(picture)])
         for name, grad in zip(leaves, grads, strict=True):
             grad = torch.zeros_like(leaves[name]) if grad is None else grad
             if bool(torch.isfinite(grad).all()):

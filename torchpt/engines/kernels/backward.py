@@ -25,6 +25,7 @@ from torchpt.compiler.graph import Unsupported
 from torchpt.compiler.operators.derivatives import summand_of
 from torchpt.compiler.sinks import Scatter, Sinks
 from torchpt.compiler.tracing import Tracer
+from torchpt.core.autograd import gradients_of
 from torchpt.core.memory import Span
 from torchpt.engines.kernels import stages
 from torchpt.engines.kernels.engine import Chunk, KernelsEngine, Paths
@@ -615,7 +616,7 @@ class KernelsBackward(KernelsEngine):
             if not pairs:
                 return
             cotangents = [self._ray_cotangents(row, n) for _, row in pairs]
-            gradients = torch.autograd.grad([x for x, _ in pairs], self._tables(), cotangents, allow_unused=True)
+            gradients = gradients_of([x for x, _ in pairs], self._tables(), cotangents)
         self.sums.add_each(gradients)
 
     def _vjp_of_camera(self, kernel: Kernel) -> None:
