@@ -10,6 +10,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchpt.core.autograd import gradients_of
 from torchpt.core.threads import limited_threads
 from torchpt.gradients.edges.bodies import Bodies, bodies_of
 from torchpt.gradients.edges.curves import marked_primitives
@@ -103,7 +104,7 @@ class Boundary:
         if self.ranks is not None:
             sums = {name: self.ranks.sum(total) for name, total in sums.items()}
         outputs, inputs = list(self.moving.values()), list(self.leaves.values())
-        grads = torch.autograd.grad(outputs, inputs, list(sums.values()), allow_unused=True)
+        grads = gradients_of(outputs, inputs, list(sums.values()))
         by_name = dict(zip(self.leaves, grads, strict=True))
         return [by_name.get(name) for name in wanted]
 

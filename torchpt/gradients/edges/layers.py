@@ -126,7 +126,7 @@ def _interior(asked: Asked, names: tuple[str, ...], params: dict[str, Tensor], w
                 found = layers_of(wave, names, first, count, sample, many, follow_ray=True)
                 mean = torch.cat([found[name] for name in names]).sum(1) / spp
             if mean.requires_grad:
-                grads = torch.autograd.grad(mean, leaves, flat[:, first : first + count], allow_unused=True)
+                grads = autograd.gradients_of([mean], leaves, [flat[:, first : first + count]])
                 for sum_, grad in zip(total, grads, strict=True):
                     if grad is not None:
                         sum_ += grad
