@@ -1,10 +1,12 @@
-"""Solve nine inverse problems with Adam.
+"""Solve seventeen inverse problems with Adam.
 
     python scripts/gradient_tasks.py [--only albedo camera] [--json FILE] [--markdown]
 
 The problems are those of ``tests/references/inverse_tasks.py``: albedo, texture, roughness, environment map, a free
-light, a light behind an occluder, a camera, the silhouette of a black ball, a lit ball on a textured floor. Each
-starts from fixed values, and must make the error of its numbers at least ten times smaller (the map: five times).
+light, a light behind an occluder, a camera, the silhouette of a black ball, a lit ball on a textured floor; a block by its
+shadow, a light round a corner, the environment of a mirror ball, heights under two suns, a cylinder on a floor, a figure of
+642 vertices, and one with its texture, from six views, a camera turned by five degrees. Each starts from fixed values, and
+must make the error of its numbers at least ten times smaller (the maps and the figure five times, the painted figure three).
 
 The loss is the squared difference from the target at full size and at 1/2, 1/4 and 1/8 of it: the small sizes pull
 objects towards targets that they do not overlap yet. Its gradient is unbiased, since a backward pass draws its own

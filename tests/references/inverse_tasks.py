@@ -341,7 +341,9 @@ class _PaintedFigure(_Figure):
     def off(self, scene: Scene, numbers: Tensor) -> Tensor:
         count = scene.params["shapes.ball.vertices"].numel()
         shape = super().off(scene, numbers[:count].reshape(-1, 3)) / self.SCALES[0]
-        texels = (numbers[count:] - _paint(8, 16).flatten()) / self.SCALES[1]
+        texels = (numbers[count:].reshape(8, 16, 3) - _paint(8, 16)) / self.SCALES[1]
+        latitude = math.pi * ((torch.arange(8) + 0.5) / 8 - 0.5)
+        texels = (texels * latitude.cos()[:, None, None].sqrt()).flatten()  # by area: few pixels show the poles
         return torch.cat((shape / len(shape) ** 0.5, texels / len(texels) ** 0.5))
 
 
@@ -415,7 +417,7 @@ TASKS: dict[str, Task] = {
             "shapes": {"ball": {**_around(_sphere(3)), "material": "paint"}},
             "lights": {**SUNS, **known.OPEN_SKY},
         },
-        BUMPY.start, BUMPY.true, BUMPY.params, 0.03, steps=60, spp=8, bar=3.0, views=SIX_SIDES, off=BUMPY.off,
+        BUMPY.start, BUMPY.true, BUMPY.params, 0.03, steps=120, spp=8, bar=3.0, views=SIX_SIDES, off=BUMPY.off,
     ),
     "turned_camera": Task(  # by five degrees
         {"camera": known.TABLE["camera"], "shapes": {"floor": CHECKED, "lamp": known.OVERHEAD}},
