@@ -82,7 +82,7 @@ def pictures(scene: torchpt.Scene, colours: Tensor, cameras: Tensor, seeds: list
 
 def main(argv: Sequence[str] | None = None) -> tuple[float, float]:
     """Fit the paints; their root mean square error at the start and at the end, which the first process also prints."""
-    args = arguments(__doc__, steps=60, size=32, argv=argv)
+    args = arguments(__doc__, steps=120, size=32, argv=argv)
     rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     if VIEWS % world:
         raise SystemExit(f"08_distributed: {world} processes cannot share {VIEWS} views evenly")
