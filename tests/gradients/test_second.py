@@ -251,3 +251,43 @@ def test_third_derivatives_are_refused():
         torch.func.grad(second)(at)
     with pytest.raises(TorchptError, match="^render has no third derivatives"):
         torch.func.jvp(second, (at,), (torch.ones_like(at),))
+
+
+def test_derivatives_by_what_no_surface_has_are_zero():
+    unused = {**MATERIALS, "unused": {"type": "diffuse", "reflectance": [0.5, 0.4, 0.3]}}
+    camera = {"origin": [0, 0, 4], "target": [0, 0, 0]}
+    scene = torchpt.load(
+        {"camera": camera, "film": {"width": 3, "height": 2}, "materials": unused, "shapes": {}}, "cpu"
+    )
+    name = "materials.unused.reflectance"
+    loss, at = loss_of(scene, name), scene.params[name].clone()
+    assert torch.func.jvp(loss, (at,), (torch.ones_like(at),))[1] == 0.0
+    assert torch.equal(torch.func.hessian(loss)(at), torch.zeros(3, 3))
+
+
+def test_a_jvp_by_its_tangent():
+    """Where the parameter requires gradients, it is the VJP; a constant has none."""
+    scene, name = enclosed(), "materials.ball.roughness"
+    loss, at = loss_of(scene, name), scene.params[name].clone()
+
+    def change(value: Tensor, u: Tensor) -> Tensor:
+        return torch.func.jvp(loss, (value,), (u,))[1]
+
+    leaf, u = at.clone().requires_grad_(), torch.ones_like(at, requires_grad=True)
+    (by_tangent,) = torch.autograd.grad(change(leaf, u), u)
+    torch.testing.assert_close(by_tangent, torch.func.grad(loss)(at), rtol=1e-4, atol=1e-7)
+    with pytest.raises(RenderError, match="^render has no derivatives of a JVP by its tangent"):
+        torch.func.grad(lambda u: change(at, u))(torch.ones_like(at))
+
+
+@pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
+def test_second_derivatives_of_layers_are_refused():
+    scene, name = enclosed(), "shapes.ball.to_world"
+    at = scene.params[name].clone()
+
+    def depth(value: Tensor) -> Tensor:
+        rendering = torchpt.render(scene, params={name: value}, full=True, film={"aovs": ["depth"]}, **WISHES)
+        return rendering.layers["depth"].sum()
+
+    with pytest.raises(TorchptError, match="^this layer has no second derivatives"):
+        torch.func.grad(lambda value: torch.func.grad(depth)(value).sum())(at)

@@ -108,12 +108,12 @@ def gradients_of(
         cotangents: one for each output, in its shape.
     """
     with torch.enable_grad():
-        joined = _Joined.apply(tuple(cotangents), *outputs)
+        joined = _GivenCotangents.apply(tuple(cotangents), *outputs)
     return torch.autograd.grad(joined, inputs, allow_unused=True)  # pyright: ignore[reportArgumentType]
 
 
-class _Joined(torch.autograd.Function):
-    """A number that depends on several outputs, by which the derivatives of the outputs are given cotangents."""
+class _GivenCotangents(torch.autograd.Function):
+    """A number whose derivatives by several outputs are given: their cotangents."""
 
     @staticmethod
     def forward(cotangents: tuple[Tensor, ...], *outputs: Tensor) -> Tensor:
@@ -185,7 +185,6 @@ class _CustomVjp(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
         ctx.functions, *tensors = inputs
-        ctx.results = len(output)
         ctx.set_materialize_grads(False)  # so that forward mode tells constants from variables
         ctx.like = [(tuple(result.shape), result.dtype, result.device) for result in output]
         arguments = ctx.functions.arguments(tuple(tensors))
@@ -198,7 +197,7 @@ class _CustomVjp(torch.autograd.Function):
             torch.zeros(shape, dtype=dtype, device=device) if cotangent is None else cotangent
             for cotangent, (shape, dtype, device) in zip(cotangents, ctx.like, strict=True)
         ]
-        gradients = _CustomVjpBackward.apply(ctx.functions, ctx.results, *filled, *ctx.saved_tensors)
+        gradients = _CustomVjpBackward.apply(ctx.functions, len(filled), *filled, *ctx.saved_tensors)
         assert gradients is not None
         return (None, *gradients)  # the functions are no tensor
 
@@ -292,8 +291,7 @@ class _Second(torch.autograd.Function):
         tensors = ctx.saved_tensors[results:]
         found: list[Tensor | None] = [None] * count
         if any(jvp is not None for jvp in jvps):
-            if any(jvp is None for jvp in jvps):
-                raise TorchptError(_NO_THIRD_DERIVATIVES)
+            assert all(jvp is not None for jvp in jvps)  # a render has one picture
             linear = _CustomVjpBackward.apply(functions, len(jvps), *jvps, *tensors)
             assert linear is not None
             found = list(linear[:count])
@@ -364,7 +362,7 @@ def _with_signature(function: type[torch.autograd.Function]) -> None:
 _with_signature(_CustomVjp)
 _with_signature(_CustomVjpBackward)
 _with_signature(_Second)
-_with_signature(_Joined)
+_with_signature(_GivenCotangents)
 
 
 def _call_for_each(

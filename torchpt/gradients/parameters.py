@@ -237,6 +237,8 @@ class SceneTape(Tape):
     def leaf_tangents(self, tangents: Sequence[Tensor]) -> list[Tensor]:
         """Return tangents of the leaves, given those of the inputs: the JVP of the assembly, as the VJP of its VJP."""
         outputs, inputs = self._outputs, self._inputs
+        if not outputs:  # no lane reads the inputs, such as a material without surfaces
+            return []
         with torch.enable_grad():
             cotangents = [torch.zeros_like(output, requires_grad=True) for output in outputs]
             grads = torch.autograd.grad(outputs, inputs, cotangents, create_graph=True, allow_unused=True)
@@ -253,6 +255,8 @@ class SceneTape(Tape):
             tangents: of the inputs.
         """
         outputs, inputs = self._outputs, self._inputs
+        if not outputs:
+            return [torch.zeros_like(tensor) for tensor in inputs]
         with torch.enable_grad():
             first = torch.autograd.grad(outputs, inputs, grads, create_graph=True, allow_unused=True)
             # The second derivative of the assembly itself, where it is not linear.

@@ -120,6 +120,8 @@ def _along(grads: Sequence[Tensor | None], tangents: Sequence[Tensor]) -> Tensor
 
 def _in_chunks(scene: Scene, scene_tape: SceneTape, settings: Settings, add: Callable[[int, Tensor], None]) -> None:
     """Call ``add`` with chunks of pixels: the first one, and on the tape what samples add to them ``(3, n)``."""
+    if not scene_tape.leaves:  # all derivatives are 0
+        return
     wave, spp, per_lane = scene_tape.taped, settings.render.spp, _TAPES * tape_per_lane(settings)
     _, _, width, height = wave.crop
 

@@ -539,7 +539,14 @@ def _constant(request: RenderRequest, render: _RenderWithoutGradients) -> Render
     ) -> list[Tensor | None]:
         return _second(request, max(made[-1].spp, 1), settings, list(params), tangents, cotangents, given)
 
-    (image,) = custom_vjp(forward, lambda *_: (), (*params.values(), *(request.rays or ())), (), second)
+    def backward(*_: Any) -> Sequence[Tensor | None]:
+        # Autograd gets here from a JVP alone: parameters of a constant do not require gradients.
+        raise RenderError(
+            "render has no derivatives of a JVP by its tangent where the parameter is a constant:"
+            " take torch.func.vjp of the picture"
+        )
+
+    (image,) = custom_vjp(forward, backward, (*params.values(), *(request.rays or ())), (), second)
     return replace(made[-1], image=image)
 
 
