@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
-from known_gradients import ABOVE, OPEN_SKY
+from known_gradients import ABOVE, OPEN_SKY, grid
 from torch import Tensor
 
 import torchpt
@@ -18,17 +17,6 @@ SUN_AND_SKY = {
     "sky": {"type": "constant", "radiance": [0.3, 0.3, 0.3]},
     "sun": {"type": "directional", "direction": [0.5, -1, 0.3], "irradiance": [2, 2, 2]},
 }
-
-
-def grid(count: int, height: Callable[[Tensor, Tensor], Tensor], **more: Any) -> dict[str, Any]:
-    """Return a mesh of heights over a square."""
-    side = torch.linspace(-1, 1, count)
-    x, z = torch.meshgrid(side, side, indexing="xy")
-    vertices = torch.stack([x.flatten(), height(x, z).flatten(), z.flatten()], 1)
-    number = torch.arange(count * count).reshape(count, count)
-    a, b, c, d = (part.flatten() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    faces = torch.cat([torch.stack([a, c, b], 1), torch.stack([a, d, c], 1)])
-    return {"type": "mesh", "vertices": vertices.tolist(), "faces": faces.tolist(), **more}
 
 
 def valley(x: Tensor, _: Tensor) -> Tensor:

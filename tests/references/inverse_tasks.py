@@ -235,17 +235,6 @@ CAN = {"type": "cylinder", "radius": 0.45, "height": 1.1, "center": [0.1, 0.55, 
 SIX_SIDES = ((2.6, 0.6, 0.5), (-2.6, 0.5, 0.4), (0.4, 0.6, 2.6), (-0.3, 0.5, -2.6), (0.3, 2.6, 0.4), (0.4, -2.6, -0.3))
 
 
-def _field() -> dict[str, Any]:
-    """Return a flat field of 6 x 6 vertices over a square."""
-    at = torch.linspace(-1, 1, 6)
-    z, x = torch.meshgrid(at, at, indexing="ij")
-    number = torch.arange(36).reshape(6, 6)
-    a, b, c, d = (part.flatten() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    vertices = torch.stack((x.flatten(), torch.zeros(36), z.flatten()), 1)
-    faces = torch.cat((torch.stack((a, c, b), 1), torch.stack((a, d, c), 1)))
-    return {"type": "mesh", "vertices": vertices.tolist(), "faces": faces.tolist(), "face_normals": True}
-
-
 def _heights(scene: Scene, numbers: Tensor) -> dict[str, Tensor]:
     x, _, z = scene.params["shapes.field.vertices"].unbind(1)
     return {"shapes.field.vertices": torch.stack((x, numbers, z), 1)}
@@ -264,7 +253,7 @@ def _can(_: Scene, numbers: Tensor) -> dict[str, Tensor]:
 
 
 def _sphere(levels: int) -> dict[str, Any]:
-    """Return a unit sphere's mesh: an icosahedron, each of whose faces is divided in four ``levels`` times."""
+    """Return the mesh of a sphere of radius 0.6: an icosahedron, each of whose faces is divided in four ``levels`` times."""
     ball = trimesh.creation.icosphere(levels)
     return {"type": "mesh", "vertices": (0.6 * ball.vertices).tolist(), "faces": ball.faces.tolist()}
 
@@ -350,7 +339,7 @@ class _PaintedFigure(_Figure):
 def _paint(rows: int, columns: int) -> Tensor:
     """Return smooth texels ``(rows, columns, 3)`` that join at their sides."""
     v, u = torch.meshgrid(torch.arange(rows) / rows, 2 * math.pi * torch.arange(columns) / columns, indexing="ij")
-    return 0.5 + 0.3 * torch.stack(((2 * u).sin(), (u + 4 * v).cos(), (5 * v).sin() * (u).cos()), -1)
+    return 0.5 + 0.3 * torch.stack(((2 * u).sin(), (u + 4 * v).cos(), (5 * v).sin() * u.cos()), -1)
 
 
 def _around(mesh: dict[str, Any]) -> dict[str, Any]:
@@ -399,7 +388,7 @@ TASKS: dict[str, Task] = {
         bounds=(0, math.inf), files={"sky.exr": known.sky},
     ),
     "heights": Task(
-        {**known.ABOVE, "shapes": {"field": _field()}, "lights": SUNS},
+        {**known.ABOVE, "shapes": {"field": known.grid(6, lambda x, z: 0 * x, face_normals=True)}, "lights": SUNS},
         lambda scene: torch.zeros(36), _true_heights, _heights, 0.03,
     ),
     "can": Task(

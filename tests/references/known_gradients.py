@@ -298,16 +298,21 @@ PANE = {
 }
 
 
+def grid(count: int, height: Callable[[Tensor, Tensor], Tensor], **more: Any) -> dict[str, Any]:
+    """Return a mesh of ``count`` x ``count`` vertices over a square, of heights by x and z."""
+    side = torch.linspace(-1, 1, count)
+    x, z = torch.meshgrid(side, side, indexing="xy")
+    vertices = torch.stack([x.flatten(), height(x, z).flatten(), z.flatten()], 1)
+    number = torch.arange(count * count).reshape(count, count)
+    a, b, c, d = (part.flatten() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    faces = torch.cat([torch.stack([a, c, b], 1), torch.stack([a, d, c], 1)])
+    return {"type": "mesh", "vertices": vertices.tolist(), "faces": faces.tolist(), **more}
+
+
 def hills(**more: Any) -> dict[str, Any]:
     """Return a mesh of hills and valleys, 4 x 4 vertices."""
-    draw = torch.Generator().manual_seed(0)
-    side = torch.linspace(-1, 1, 4)
-    x, z = torch.meshgrid(side, side, indexing="xy")
-    vertices = torch.stack([x.flatten(), 0.2 * torch.randn(16, generator=draw), z.flatten()], 1)
-    grid = torch.arange(16).reshape(4, 4)
-    a, b, c, d = (part.flatten() for part in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
-    faces = torch.cat([torch.stack([a, c, b], 1), torch.stack([a, d, c], 1)])
-    return {"type": "mesh", "vertices": vertices.tolist(), "faces": faces.tolist(), "material": WHITE, **more}
+    heights = 0.2 * torch.randn(4, 4, generator=torch.Generator().manual_seed(0))
+    return grid(4, lambda x, z: heights, material=WHITE, **more)
 
 
 #: The field seen from above.

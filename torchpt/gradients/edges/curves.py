@@ -291,6 +291,7 @@ class Folds:
     border: Tensor  # (N,) bool
     crease: Tensor  # (N,) from 0 to 1: how much radiance may jump where both faces are seen, beside an outline
     normals: tuple[Tensor, Tensor]  # (3, N) unit, of the two faces
+    bend: Tensor  # (N,) distance of the normals; 0 where the faces lie in one plane
 
 
 @dataclass(frozen=True)
@@ -374,13 +375,14 @@ def folds_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Iterator
             curves, others = mesh_edges(edges, every, first, turned)
             normals = (_normal(bodies, others[0].prim), _normal(bodies, others[1].prim))
             apart = normals[0] - normals[1]
-            bend = 0.5 * dot(apart, apart).sqrt()
+            bend = dot(apart, apart).sqrt()
+            bend = torch.where(bend > _FLAT, bend, 0.0)
             jumps = edges.split if part.smooth else ~edges.border  # the shading
             # Where faces are shaded smooth one side lacks the light below its face: of an angle, near the horizon.
-            crease = torch.where(bend > _FLAT, torch.where(jumps, bend.clamp(_CREASE, 1.0), bend * bend), 0.0)
+            crease = torch.where(jumps & (bend > 0), (0.5 * bend).clamp(_CREASE, 1.0), 0.25 * bend * bend)
             if part.uvs is not None:
                 crease = torch.where(edges.split, crease.clamp_min(_CREASE), crease)
-            yield Folds(curves, others, edges.border, torch.where(edges.border, 0.0, crease), normals)
+            yield Folds(curves, others, edges.border, torch.where(edges.border, 0.0, crease), normals, bend)
 
 
 def _normal(bodies: Bodies, prim: Tensor) -> Tensor:

@@ -31,9 +31,8 @@ __all__ = ["EdgePoints", "Occluders", "occluders_of"]
 
 #: Least weight of an edge between faces that almost lie in one plane, as an outline, against a border of the same length.
 _LEAST_OUTLINE = 0.01
-#: The same as a crease; none between faces at a smaller angle than ``_FLAT``.
+#: The same as a crease.
 _LEAST_CREASE = 0.1
-_FLAT = 1e-6
 #: Weight of curves that do not move, against those that do: only what is behind and before them moves.
 _STATIC = 0.3
 
@@ -149,9 +148,7 @@ def occluders_of(
         cosine = dot(*folds.normals).abs().clamp_max(1.0)
         # Of directions around an edge this share has both faces on one side, whichever way the normals point.
         outline = torch.where(folds.border, 1.0, (torch.acos(cosine) / math.pi).clamp_min(_LEAST_OUTLINE))
-        apart = folds.normals[0] - folds.normals[1]
-        bend = dot(apart, apart).sqrt()
-        crease = torch.where(bend > _FLAT, bend.clamp(_LEAST_CREASE, 1.0), 0.0)
+        crease = torch.where(folds.bend > 0, folds.bend.clamp(_LEAST_CREASE, 1.0), 0.0)
         crease = torch.where(folds.border, 1.0, crease)
         add(folds.curves, dot(along, along).sqrt(), folds.others, outline, crease, ~folds.border, -1.0)
     fixed = plain_of(scene, bodies)
