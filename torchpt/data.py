@@ -372,15 +372,9 @@ class SceneLoader:
                 raise SceneError(key, value, f"a whole number >= {low}")
         if not isinstance(drop_last, bool):
             raise SceneError("drop_last", drop_last, "True or False")
-        self.make, self.indices, self.batch_size, self.drop_last, self.ahead = (
-            make,
-            indices,
-            batch_size,
-            drop_last,
-            ahead,
-        )
+        self.make, self.indices = make, indices
+        self.batch_size, self.drop_last, self.ahead = batch_size, drop_last, ahead
         self.options: dict[str, Any] = dict(options)
-        self.device = self.options.get("device")
 
     def __len__(self) -> int:
         """Return the number of batches.
@@ -431,7 +425,7 @@ class SceneLoader:
             source = self.make(index)
             if not isinstance(source, Scene | Mapping):
                 raise SceneError("", source, "a scene from torchpt.load, or a mapping of the scene format")
-            scene = source if isinstance(source, Scene) else load(dict(source), self.device)
+            scene = source if isinstance(source, Scene) else load(dict(source), self.options.get("device"))
             template = template_of(scene, True, self.options)
             with outside_inference_mode(), torch.no_grad():
                 make_wave(scene, template.settings, None, template.call.dtype)  # the scene keeps world and search

@@ -28,7 +28,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 M = TypeVar("M", bound="Pieced")
 
-#: Most elements of a parameter that is compared by value; comparing more takes longer than assembling most pieces.
+#: Most elements of a parameter that is compared by value, which takes some 15 microseconds of so many.
 MOST_COMPARED = 1 << 14
 
 #: State of a parameter: type, shape, and its values as bytes, or a tensor of the same memory and its count of changes.
@@ -94,9 +94,8 @@ class ParameterReads(Mapping[str, Tensor]):
         self._states: dict[str, _State | None] = {}  # those that were asked for
         self._copies: dict[str, Tensor] = {}  # of parameters that are compared by value
         self._reads: list[set[str]] = []  # of the pieces that are being made, the innermost last
-        self._made: dict[
-            Hashable, tuple[Any, Collection[str]]
-        ] = {}  # pieces of this assembly, and the names that they depend on
+        # Pieces of this assembly, and the names that they depend on.
+        self._made: dict[Hashable, tuple[Any, Collection[str]]] = {}
 
     def __getitem__(self, name: str) -> Tensor:
         if self._reads:
