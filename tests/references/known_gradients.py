@@ -312,7 +312,7 @@ def grid(count: int, height: Callable[[Tensor, Tensor], Tensor], **more: Any) ->
 def hills(**more: Any) -> dict[str, Any]:
     """Return a mesh of hills and valleys, 4 x 4 vertices."""
     heights = 0.2 * torch.randn(4, 4, generator=torch.Generator().manual_seed(0))
-    return grid(4, lambda x, z: heights, material=WHITE, **more)
+    return {**grid(4, lambda x, z: heights), "material": WHITE, **more}
 
 
 #: The field seen from above.
