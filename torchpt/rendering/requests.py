@@ -8,7 +8,6 @@ forward pass.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -62,9 +61,6 @@ __all__ = [
 _FLOATS = (torch.float32, torch.float64)
 #: Flips bits of a seed, so that backward passes by default draw other numbers than forward passes. (The multiplier of drand48.)
 _BACKWARD_SEED = 0x5DEECE66D
-
-#: Samples of the backward pass for one of each estimator of edges, which takes longer and varies less.
-_PER_EDGE_SAMPLE = 4
 
 
 @dataclass(frozen=True)
@@ -453,7 +449,7 @@ def _differentiable(
         """Return the samples a pixel for visibility edges; 0: none."""
         if not call.edges:
             return 0
-        return call.edge_spp or math.ceil((call.spp_grad or forward_spp[0]) / _PER_EDGE_SAMPLE)
+        return call.edge_spp or edges.samples_for(scene, wanted, call.spp_grad or forward_spp[0])
 
     def edge_request() -> edges.Asked:
         request.check_unchanged(AFTER)

@@ -363,7 +363,10 @@ class BatchOptions(TraceOptions, total=False):
     ]
     edge_spp: Annotated[
         int | None,
-        _whole_number(1, "samples a pixel of each estimator of edges; none: a quarter of those of the backward pass"),
+        _whole_number(
+            1,
+            "samples a pixel of each estimator of edges; none: a quarter of the backward pass's, a sixteenth for vertices of meshes",
+        ),
     ]
     ranks: Annotated[
         Group | None,

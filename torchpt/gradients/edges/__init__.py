@@ -10,7 +10,16 @@ by their engines. ``gradients`` adds it all up; ``layers`` does so for layers of
 from __future__ import annotations
 
 from torchpt.gradients.edges.curves import left_out, without_gradient
-from torchpt.gradients.edges.gradients import add_gradients, concerns
+from torchpt.gradients.edges.gradients import add_gradients, concerns, samples_for
 from torchpt.gradients.edges.layers import Asked, differentiable, followed
 
-__all__ = ["Asked", "add_gradients", "concerns", "differentiable", "followed", "left_out", "without_gradient"]
+__all__ = [
+    "Asked",
+    "add_gradients",
+    "concerns",
+    "differentiable",
+    "followed",
+    "left_out",
+    "samples_for",
+    "without_gradient",
+]

@@ -404,7 +404,9 @@ def parts_of(bodies: Bodies, curves: Curves) -> Tensor:
         code = (
             cells[:, 0] * _MIX[0] + cells[:, 1] * _MIX[1] + cells[:, 2] * _MIX[2]
         )  # (2, N), a point each; it may overflow
-        _, group, count = torch.unique(code.sort(0).values, dim=1, return_inverse=True, return_counts=True)
+        low, high = code.sort(0).values
+        pair = low + high * _MIX[2]
+        _, group, count = torch.unique(pair, return_inverse=True, return_counts=True)
         parts = torch.minimum(parts, 1.0 / take(count.double(), group))
     return torch.where(curves.round, 1.0, parts)
 

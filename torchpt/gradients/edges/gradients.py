@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
@@ -30,11 +31,19 @@ from torchpt.scene import Scene
 from torchpt.scene.settings import Settings
 from torchpt.spec import Moves
 
-__all__ = ["Boundary", "add_gradients", "boundary_of", "concerns"]
+__all__ = ["Boundary", "add_gradients", "boundary_of", "concerns", "samples_for"]
 
 #: Samples of a chunk, whose sums are added in order: the same ones whatever the memory. They take about 4 kB each, which is
 #: less in all than any render needs.
 SAMPLES = 1 << 15
+
+#: Samples of a backward pass's paths for one of each estimator of edges, which takes longer and varies less.
+_PER_EDGE_SAMPLE = 4
+#: The same where vertices of a mesh move each by itself: the variance of their gradients is that of the faces' normals, which
+#: turn the more the smaller a face is, and edges bring a tenth to a five-hundredth of it.
+_PER_EDGE_SAMPLE_OF_MESHES = 16
+#: So many vertices are a mesh's.
+_MESH = 64
 
 
 class Samples(Protocol):
@@ -48,6 +57,13 @@ class Samples(Protocol):
 def concerns(scene: Scene, names: Iterable[str]) -> bool:
     """Return True where any of the parameters moves edges."""
     return any(scene.spec(name).moves in (Moves.SURFACES, Moves.SHADOWS) for name in names)
+
+
+def samples_for(scene: Scene, names: Iterable[str], spp: int) -> int:
+    """Return how many samples a pixel each estimator takes beside ``spp`` of the backward pass, by what is differentiated."""
+    moving = [name for name in names if concerns(scene, (name,))]
+    meshes = all(name.endswith(".vertices") and scene.params[name].numel() >= 3 * _MESH for name in moving)
+    return math.ceil(spp / (_PER_EDGE_SAMPLE_OF_MESHES if meshes else _PER_EDGE_SAMPLE))
 
 
 def moving_primitives(scene: Scene, names: Iterable[str]) -> Tensor:

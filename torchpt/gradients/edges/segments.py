@@ -388,9 +388,9 @@ class Segments:
         # Light behind the edge costs more than paths to the camera.
         for prefix in one_of_each(found, self.frame.traced.draws(key).one(Dimension.ROULETTE).double()):
             depth = self.depth if self.depth < 0 else self.depth - prefix.count
-            light = [self._reflected(y, o, number, prefix.lane, depth) for y in seen]
             scale = prefix.weight * take(weight, prefix.lane)
-            prefixes.append((prefix, torch.stack([(scale * part).sum(0) for part in light])))
+            light = self._reflected(seen, o, number, prefix.lane, depth)
+            prefixes.append((prefix, (scale[:, None] * light).sum(0)))
         if not prefixes:
             return None
         sides = [self._side(sign, y, r) for sign, y in zip(_SIGNS, seen, strict=True)]
@@ -408,14 +408,14 @@ class Segments:
         reach = torch.where(y.hit.prim >= 0, y.hit.t.double(), r)
         return Side(sign, y.held(self.frame.bodies), reach, self.frame.share(y.hit.prim, reach))
 
-    def _reflected(self, spot: Spot, o: Tensor, number: Tensor, lane: Tensor, depth: int) -> Tensor:
-        """Return the light ``(3, M)`` that what was met in lanes ``(M,)`` reflects, along paths of so many vertices."""
-        found = torch.zeros(3, len(lane), dtype=torch.float64, device=lane.device)
-        some = (take(spot.hit.prim, lane) >= 0).nonzero().squeeze(1)
-        if not len(some):
-            return found
-        mine = take(lane, some)
-        rays = take(o, mine), take(spot.d, mine).double(), take(number, mine), Use.BEHIND
-        radiance = self.frame.traced.radiance
-        found[:, some] = radiance(*rays, depth) - radiance(*rays, 1)  # without light of sources themselves
-        return found
+    def _reflected(self, seen: list[Spot], o: Tensor, number: Tensor, lane: Tensor, depth: int) -> Tensor:
+        """Return the light ``(3, 2, M)`` that what was met reflects in lanes ``(M,)``, by paths of so many vertices."""
+        found = torch.zeros(3, len(seen) * len(lane), dtype=torch.float64, device=lane.device)
+        met_some = torch.cat([take(y.hit.prim, lane) for y in seen]) >= 0
+        some = met_some.nonzero().squeeze(1)
+        if len(some):
+            mine, d = torch.cat([lane] * len(seen)), torch.cat([take(y.d, lane) for y in seen], 1)
+            rays = take(o, take(mine, some)), take(d, some).double(), take(number, take(mine, some)), Use.BEHIND
+            radiance = self.frame.traced.radiance
+            found[:, some] = radiance(*rays, depth) - radiance(*rays, 1)  # without light of sources themselves
+        return found.view(3, len(seen), -1)
