@@ -365,7 +365,7 @@ class BatchOptions(TraceOptions, total=False):
         int | None,
         _whole_number(
             1,
-            "samples a pixel of each estimator of edges; none: a quarter of the backward pass's, a sixteenth for vertices of meshes",
+            "samples a pixel of each estimator of edges; none: a quarter of the backward pass's, a sixteenth for vertices",
         ),
     ]
     ranks: Annotated[
