@@ -39,6 +39,19 @@ define void @kernel(ptr %a, i64 %n) nounwind {
   ret void
 }
 """
+FUSED = """
+declare float @llvm.fma.f32(float, float, float)
+define void @kernel(ptr %a) nounwind {
+  %second = getelementptr float, ptr %a, i64 1
+  %third = getelementptr float, ptr %a, i64 2
+  %x = load float, ptr %a
+  %y = load float, ptr %second
+  %z = load float, ptr %third
+  %sum = call float @llvm.fma.f32(float %x, float %y, float %z)
+  store float %sum, ptr %a
+  ret void
+}
+"""
 WRITABLE = """
 @count = global i64 4
 define i64 @kernel() nounwind {
@@ -85,6 +98,17 @@ def test_results_are_those_of_llvm(code, monkeypatch):
     assert np.frombuffer(found, np.int64)[0] == 7 and np.frombuffer(found)[1] == 0.7 + 0.1
     assert found[32:] == b"\1" * 20 + b"\0" * 4
     del engine
+
+
+def test_functions_of_the_c_library():
+    """A CPU without fused multiply and add calls ``fmaf``, as LLVM's linker finds it too."""
+    old = machine.new_machine("nehalem")
+    code = old.emit_object(machine.parse(FUSED, old))
+    linked = elf.link(code)
+    assert linked is not None and b"fmaf" in code
+    values = np.array([1 + 2**-12, 1 + 2**-12, -1 - 2**-11], np.float32)
+    ctypes.CFUNCTYPE(None, ctypes.c_void_p)(linked.functions["kernel"])(values.ctypes.data)
+    assert values[0] == 2**-24  # 0 if the product is rounded
 
 
 def test_all_kernels_of_the_package_are_linked_here():
