@@ -12,6 +12,11 @@ imports.
 ``--texture`` times the backward pass through 8 x 8 and 4096 x 4096 texels beside the forward pass of the same
 picture, with torchpt only.
 
+``--memory`` prints the peaks of memory of two gradients, of all cases and of a room with a ball of clear glass at depth 4
+and 64, with both renderers' kernels on disk: compiled beforehand, by processes of their own. ``--growth N`` takes N
+gradients by an albedo in one process, of 8 x 8 and of 32 x 32 pixels with one sample each, and prints the resident memory
+above import as it goes.
+
 ``--agree`` compares gradients number by number: three cases with ``prb``, and three with moving edges with
 ``prb_projective``. For each it prints z-scores of the difference of the means over ``--seeds`` renders: their root mean square
 (1 if only noise differs; numbers that both sides leave at 0 are not counted), the largest, and the difference of the
@@ -82,14 +87,16 @@ def _painted(scene: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _glass() -> dict[str, Any]:
+    return _with_ball({"type": "roughdielectric", "alpha": 0.05})  # the index of smooth glass is constant in Mitsuba
+
+
+def _clear_glass() -> dict[str, Any]:
+    return _with_ball({"type": "dielectric"})
+
+
+def _with_ball(glass: Mapping[str, Any]) -> dict[str, Any]:
     room = _room(ball={"type": "sphere", "center": [0.2, -0.45, 0.2], "radius": 0.5, "material": "glass"})
-    glass = {
-        "type": "roughdielectric",
-        "int_ior": 1.5,
-        "ext_ior": 1.0,
-        "alpha": 0.05,
-    }  # a smooth one's is constant in Mitsuba
-    return {**room, "materials": {**room["materials"], "glass": glass}}
+    return {**room, "materials": {**room["materials"], "glass": {**glass, "int_ior": 1.5, "ext_ior": 1.0}}}
 
 
 def _bumpy(rows: int = 48, columns: int = 96) -> dict[str, Any]:
@@ -153,6 +160,12 @@ CASES: dict[str, Case] = {
     "glass_index": Case(_glass, "materials.glass.int_ior", ("ball", "bsdf.eta")),
     "vertices": Case(lambda: _room(it=_bumpy()), "shapes.it.vertices", ("it", "vertex_positions")),
 }
+#: Cases of ``--memory``.
+MEMORY: dict[str, Case] = {
+    **CASES,
+    "clear_glass_4": Case(_clear_glass, "materials.red.reflectance", ("left", VALUE), 4),
+    "clear_glass_64": Case(_clear_glass, "materials.red.reflectance", ("left", VALUE), 64),
+}
 #: Cases of ``--agree``, each with its own depth.
 AGREE: dict[str, Case] = {
     "albedo": Case(_room, "materials.red.reflectance", ("left", VALUE), 4),
@@ -169,7 +182,7 @@ AGREE: dict[str, Case] = {
 def main() -> None:
     """Run the chosen benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("cases", nargs="*", help=f"of {', '.join(CASES)}; with --agree of {', '.join(AGREE)}")
+    parser.add_argument("cases", nargs="*", help=f"of {', '.join(MEMORY)}; with --agree of {', '.join(AGREE)}")
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--spp", type=int, default=16)
     parser.add_argument("--rounds", type=int, default=7)
@@ -177,6 +190,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1, help="of every contender")
     parser.add_argument("--wish", action="append", default=[], metavar="KEY=VALUE", help="for torchpt.render")
     parser.add_argument("--texture", action="store_true", help="backward beside forward, few texels and many")
+    parser.add_argument("--memory", action="store_true", help="peaks of memory, with kernels compiled beforehand")
+    parser.add_argument("--growth", type=int, metavar="N", help="memory over N gradients of small pictures")
     parser.add_argument("--agree", action="store_true", help="gradients number by number")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the figures go")
     parser.add_argument("--markdown", action="store_true", help="print a Markdown table as well")
@@ -187,6 +202,10 @@ def main() -> None:
         work(arguments)
     elif arguments.texture:
         texture(arguments)
+    elif arguments.memory:
+        memory(arguments)
+    elif arguments.growth:
+        growth(arguments)
     elif arguments.agree:
         agree(arguments)
     else:
@@ -245,6 +264,36 @@ def texture(arguments: argparse.Namespace) -> None:
         size = f"{texels} x {texels}"
         print(f"{size:20s}{row['forward']:12.3f}{row['backward']:12.3f}{row['ratio']:8.2f}{peak:9.0f}", flush=True)
         save(arguments, {"texture": found})
+
+
+def memory(arguments: argparse.Namespace) -> None:
+    """Compare the peaks of memory of two gradients."""
+    found: dict[str, dict[str, float]] = {}
+    print(f"{'MB above import':20s}{OURS:>9s}{'prb':>9s}{'ratio':>8s}")
+    for name in arguments.cases or MEMORY:
+        peaks = {}
+        for engine in (OURS, THEIRS, OURS, THEIRS):  # the first processes compile
+            with _Worker(name, engine, arguments) as worker:
+                peaks[engine] = worker.ask({"seed": 1})["peak"]
+        found[name] = peaks
+        print(f"{name:20s}{peaks[OURS]:9.0f}{peaks[THEIRS]:9.0f}{peaks[OURS] / peaks[THEIRS]:8.2f}", flush=True)
+        save(arguments, {"memory": found})
+
+
+def growth(arguments: argparse.Namespace) -> None:
+    """Print the resident memory of a process that takes many gradients."""
+    found: dict[str, dict[int, float]] = {}
+    arguments.spp = 1
+    for size in (8, 32):
+        arguments.size = size
+        taken = found[str(size)] = {}
+        with _Worker("albedo", OURS, arguments) as worker:
+            for k in range(1, arguments.growth + 1):
+                held = worker.ask({"seed": k})["held"]
+                if k * 10 % arguments.growth == 0 or k == 1:
+                    taken[k] = held
+                    print(f"{size} x {size} pixels, gradient {k}: {held:.1f} MB above import", flush=True)
+        save(arguments, {"growth": found})
 
 
 def agree(arguments: argparse.Namespace) -> None:
@@ -343,7 +392,7 @@ Take = Callable[[int], tuple[Any, float, float]]
 def work(arguments: argparse.Namespace) -> None:
     """Run a worker: warm up, then answer each line on stdin with the JSON of a turn."""
     (name,) = arguments.cases
-    case = (AGREE if arguments.agree else CASES)[name]
+    case = (AGREE if arguments.agree else MEMORY)[name]
     case = replace(case, texels=arguments.texels or case.texels)
     take = (ours if arguments.worker == OURS else theirs)(case, arguments)
     begun = arguments.resident
@@ -354,12 +403,18 @@ def work(arguments: argparse.Namespace) -> None:
         gradient, forward, backward = take(wish["seed"])
         if wish.get("out"):
             np.save(wish["out"], np.asarray(gradient, np.float64), allow_pickle=False)
-        print("\n" + json.dumps({"forward": forward, "backward": backward, "peak": resident() - begun}), flush=True)
+        turn = {"forward": forward, "backward": backward, "peak": resident() - begun, "held": held() - begun}
+        print("\n" + json.dumps(turn), flush=True)
 
 
 def resident() -> float:
     """Return the peak of this process's resident memory in MB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def held() -> float:
+    """Return this process's resident memory in MB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
 
 
 def opened(case: Case, arguments: argparse.Namespace) -> Any:
@@ -369,11 +424,13 @@ def opened(case: Case, arguments: argparse.Namespace) -> Any:
 
     import torchpt
 
+    description = case.scene()
     with tempfile.TemporaryDirectory() as folder:
-        paint = 0.2 + 0.6 * torch.rand(case.texels, case.texels, 3, generator=torch.Generator().manual_seed(3))
-        torchpt.write_image(str(Path(folder) / "paint.exr"), paint)
+        if "paint.exr" in json.dumps(description):  # else the library for EXR files would count without need
+            paint = 0.2 + 0.6 * torch.rand(case.texels, case.texels, 3, generator=torch.Generator().manual_seed(3))
+            torchpt.write_image(str(Path(folder) / "paint.exr"), paint)
         scene = {
-            **known.in_folder(case.scene(), folder),
+            **known.in_folder(description, folder),
             "film": {"width": arguments.size, "height": arguments.size, "filter": "box"},
             "integrator": {"type": "path", "max_depth": case.depth, "rr_depth": RR_DEPTH},
             "render": {"spp": arguments.spp, "threads": arguments.threads},
@@ -425,12 +482,12 @@ def theirs(case: Case, arguments: argparse.Namespace) -> Take:
     mi = load_mitsuba("llvm_ad_rgb")
     dr: Any = importlib.import_module("drjit")
     dr.set_thread_count(arguments.threads)
-    arguments.resident = resident()
     scene = opened(case, arguments)
     with tempfile.TemporaryDirectory() as folder:
         given = convert(mi, scene, settings(scene.description, {}), Path(folder))
         kind = "prb_projective" if case.projective else "prb"
         given["integrator"] = {"type": kind, "max_depth": case.depth, "rr_depth": RR_DEPTH}
+        arguments.resident = resident()  # torchpt's scene, of which Mitsuba's is made, is no work of Mitsuba's
         wanted = their_name(case, scene)
         for optimize in (True, False):  # meshes that Mitsuba merged have no names of their own
             scene_ = mi.load_dict(given, optimize=optimize)

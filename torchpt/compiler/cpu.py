@@ -68,8 +68,8 @@ def compile_ir(ir: str, target: Target | None = None) -> Function:
         function = _functions.get(key)
         if function is None:
             code = cache.read(_entry(key, target))
-            check_address_space()  # LLVM ends the process if it gets no memory
             if code is None:
+                check_address_space()  # LLVM ends the process if it gets no memory
                 code = _code(ir, target)
                 _state["compiled"] += 1
                 cache.write(_entry(key, target), code)
@@ -86,7 +86,6 @@ def load_function(key: str, target: Target | None = None) -> Function | None:
         function = _functions.get(key)
         code = cache.read(_entry(key, target)) if function is None else None
         if code is not None:
-            check_address_space()
             _state["loaded"] += 1
             function = _functions[key] = _loaded(code, target, key)
         return function
@@ -103,9 +102,7 @@ def _entry(key: str, target: Target) -> str:
 
 
 def _identity(target: Target) -> str:
-    import llvmlite
-
-    return "\n".join((_VERSION, llvmlite.__version__, repr(target)))
+    return "\n".join((_VERSION, machine.version(), repr(target)))
 
 
 def _machine(target: Target) -> Any:

@@ -38,7 +38,7 @@ BYTES_PER_LANE = 640
 FEWEST_OF_KERNELS = 1024
 #: Bytes of machine code and tables of libraries, loaded on the first call of a process, by mode.
 CODE_OF_MODE = {"eager": 75_000_000, "compiled": 54_000_000, "tape": 100_000_000}
-#: Bytes of LLVM, which renders by tensor operations load for the search.
+#: Bytes of LLVM, which renders by tensor operations load for the search where its kernels are not cached.
 CODE_OF_LLVM = 60_000_000
 #: Bytes of the machine code of a BSDF model, in addition.
 CODE_OF_MODEL = 3_000_000
@@ -116,7 +116,7 @@ def memory_estimate(settings: Settings, device: torch.device, mode: str, models:
         picture = ADAPTIVE_BYTES if settings.adaptive else PROBES_BYTES
     picture += sum(8 * count + 4 for count in channels)
     code = 0 if mode in _loaded_modes else CODE_OF_MODE[mode] + (CODE_OF_MODEL * models if mode == "compiled" else 0)
-    if mode != "compiled" and "llvmlite" not in sys.modules:
+    if mode not in ("compiled", *_loaded_modes) and "llvmlite.binding" not in sys.modules:
         code += CODE_OF_LLVM
     if device.type != "cpu":
         code = 0
