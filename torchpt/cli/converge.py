@@ -271,4 +271,4 @@ def _default_stem(scenes: tuple[str, ...], file: str | None) -> str:
     """Return the start of the output folder's name: that of the study file, else those of the scenes."""
     if file is not None:
         return Path(file).stem
-    return "_".join(Path(name).stem if name.endswith((".yaml", ".yml")) else name for name in scenes)
+    return "_".join(Path(name).stem if name.endswith((".yaml", ".yml", ".xml")) else name for name in scenes)

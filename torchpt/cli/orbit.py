@@ -210,7 +210,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
 def _outputs(job: Job) -> list[str]:
     """Return the movies to write; in a sweep their names have the job's number."""
     path = Path(job.scene)
-    name = path.stem if path.suffix in (".yaml", ".yml") else path.name
+    name = path.stem if path.suffix in (".yaml", ".yml", ".xml") else path.name
     return [numbered(str(Path(out).expanduser()), job.number) for out in job.outs or (f"{name}.gif",)]
 
 

@@ -231,7 +231,7 @@ def _with_deferred_signals(interrupt: Interrupt, work: Callable[[], Any]) -> Any
 def _scene_name(scene: str) -> str:
     """Return the name of a scene, without the folder and ending of its file."""
     path = Path(scene)
-    return path.stem if path.suffix in (".yaml", ".yml") else path.name
+    return path.stem if path.suffix in (".yaml", ".yml", ".xml") else path.name
 
 
 def _outputs(job: Job, settings: Any) -> list[str]:
