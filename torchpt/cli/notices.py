@@ -21,7 +21,7 @@ _KINDS = (EnergyWarning, ImportedSceneWarning)
 
 @contextmanager
 def printed_scene_warnings() -> Iterator[None]:
-    """Collect scene warnings (`EnergyWarning`, `ImportedSceneWarning`) inside the context and print them at its end, unless it raised.
+    """Collect warnings about scenes (:data:`_KINDS`) inside the context and print them at its end, unless it raised.
 
     Other warnings are shown by Python as usual.
     """

@@ -165,7 +165,9 @@ def _principled(p: Properties, importer: Importer) -> Material:
 
 
 def _principled_thin(p: Properties, importer: Importer) -> Material:
-    p.ignore("diff_trans", "eta", "spec_trans", "diffuse_transmission_sampling_rate", "specular_reflectance_sampling_rate")
+    p.ignore(
+        "diff_trans", "eta", "spec_trans", "diffuse_transmission_sampling_rate", "specular_reflectance_sampling_rate"
+    )
     p.ignore("diffuse_reflectance_sampling_rate", "specular_transmission_sampling_rate")
     keys = {key: p.scalar(key) for key in ("roughness", "spec_tint", "anisotropic", "sheen", "sheen_tint", "flatness")}
     return _opaque("principled", base_color=p.slot("base_color"), **keys) | {"two_sided": True}
@@ -347,7 +349,6 @@ def _grey(p: Properties, importer: Importer) -> Material:
     return _opaque("diffuse", reflectance=[0.5] * 3)
 
 
-
 _GREY = "a model of its own; its reflectance is kept where it has one"
 
 #: Plugins of the tag ``bsdf``.
@@ -359,7 +360,9 @@ BSDFS: dict[str, Plugin] = {
     "conductor": exact("conductor", _conductor),
     "roughconductor": exact("roughconductor", _rough_conductor, "beckmann and phong become ggx, with a warning"),
     "plastic": exact("plastic", _plastic),
-    "roughplastic": exact("roughplastic", _rough_plastic, "beckmann and phong become ggx, with a warning; alpha is a number"),
+    "roughplastic": exact(
+        "roughplastic", _rough_plastic, "beckmann and phong become ggx, with a warning; alpha is a number"
+    ),
     "principled": exact("principled", _principled),
     "twosided": exact("two_sided", _twosided, "one bsdf for both sides"),
     "mask": exact("opacity", _mask),
@@ -371,7 +374,9 @@ BSDFS: dict[str, Plugin] = {
     "phong": exact("phong", _phong),
     "roughdiffuse": nearest("diffuse", _rough_diffuse, "without the roughness of Oren and Nayar"),
     "coating": nearest("plastic", _coating, "the coat absorbs nothing, and one over other than diffuse is left out"),
-    "roughcoating": nearest("roughplastic", _coating, "the coat absorbs nothing, and one over other than diffuse is left out"),
+    "roughcoating": nearest(
+        "roughplastic", _coating, "the coat absorbs nothing, and one over other than diffuse is left out"
+    ),
     "ward": nearest("roughconductor", _ward, "ggx facets blended with diffuse in place of Ward's lobe"),
     "principledthin": nearest("principled", _principled_thin, "light does not pass"),
     "difftrans": nearest("diffuse", _grey, "light does not pass"),

@@ -93,7 +93,9 @@ def parse_scene(path: Path, file: str, given: Mapping[str, str]) -> Element:
         known = sorted(reader.used | reader.declared)
         names = f"one of {', '.join(known)}" if known else "none, as the scene has no parameters"
         hint = did_you_mean(unknown[0], known)
-        raise SceneError(f"scene_params.{unknown[0]}", given[unknown[0]], f"a parameter of the scene: {names}{hint}", file)
+        raise SceneError(
+            f"scene_params.{unknown[0]}", given[unknown[0]], f"a parameter of the scene: {names}{hint}", file
+        )
     return root
 
 

@@ -128,10 +128,25 @@ def _sun_sky(p: Properties, importer: Importer) -> list[Light]:
 def _ignore_sky(p: Properties) -> None:
     """Mark the properties of the sky as read that the warning of its entry covers."""
     _common(p)
-    p.ignore("turbidity", "albedo", "latitude", "longitude", "timezone", "year", "month", "day", "hour", "minute", "second")
-    p.ignore("resolution", "stretch", "sun_radius_scale", "sun_aperture", "to_world", "sun_direction", "complex_sun", "extend")
+    p.ignore(
+        "turbidity", "albedo", "latitude", "longitude", "timezone", "year", "month", "day", "hour", "minute", "second"
+    )
+    p.ignore(
+        "resolution",
+        "stretch",
+        "sun_radius_scale",
+        "sun_aperture",
+        "to_world",
+        "sun_direction",
+        "complex_sun",
+        "extend",
+    )
     p.objects("texture")
 
+
+_SUN_AND_SKY = nearest(
+    "constant and directional", _sun_sky, "the mean radiance of a clear sky, and a sun that is a point"
+)
 
 #: Plugins of the tag ``emitter``.
 EMITTERS: dict[str, Plugin] = {
@@ -143,8 +158,12 @@ EMITTERS: dict[str, Plugin] = {
     "envmap": exact("envmap", _envmap),
     "sky": nearest("constant", _sky, "the mean radiance of a clear sky from all directions"),
     "sun": nearest("directional", _sun, "the sun is a point"),
-    "sunsky": nearest("constant and directional", _sun_sky, "the mean radiance of a clear sky, and a sun that is a point"),
-    "timed_sunsky": nearest("constant and directional", _sun_sky, "the mean radiance of a clear sky, and a sun that is a point"),
+    "sunsky": nearest(
+        "constant and directional", _sun_sky, "the mean radiance of a clear sky, and a sun that is a point"
+    ),
+    "timed_sunsky": nearest(
+        "constant and directional", _sun_sky, "the mean radiance of a clear sky, and a sun that is a point"
+    ),
     "collimated": left_out("a beam without width meets no surface by chance"),
     "directionalarea": left_out("surfaces shine in all directions"),
     "projector": left_out("there are no projectors"),

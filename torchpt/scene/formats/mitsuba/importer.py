@@ -29,7 +29,7 @@ from torchpt.scene.formats.mitsuba.shapes import SHAPES, posed
 from torchpt.scene.formats.mitsuba.textures import TEXTURES
 from torchpt.scene.formats.mitsuba.versions import plugin_name
 
-__all__ = ["Importer", "ImportOptions", "read_mitsuba", "split_import_keys"]
+__all__ = ["ImportOptions", "Importer", "read_mitsuba", "split_import_keys"]
 
 #: Greatest depth of objects inside objects, references followed.
 MAX_NESTING = 32
@@ -232,7 +232,9 @@ class Importer:
         if plugin.twin is Twin.NEAREST:
             self.notes.add(element, f"{element.label} becomes {plugin.becomes}: {plugin.note}")
         if self._depth >= MAX_NESTING:
-            raise element.error(element.label, f"objects at most {MAX_NESTING} deep inside each other, references followed")
+            raise element.error(
+                element.label, f"objects at most {MAX_NESTING} deep inside each other, references followed"
+            )
         self._depth += 1
         properties = Properties(element, name, self)
         result = plugin.build(properties, self)
@@ -365,7 +367,9 @@ class Importer:
                 rest.append(child)
         return inner, rest, has_medium
 
-    def _material_of(self, element: Element | None, *, lit: bool, has_medium: bool) -> tuple[dict[str, Any], str | None]:
+    def _material_of(
+        self, element: Element | None, *, lit: bool, has_medium: bool
+    ) -> tuple[dict[str, Any], str | None]:
         """Return the material of a shape, and its name where it has one."""
         if element is None:
             if has_medium:  # the border of a medium

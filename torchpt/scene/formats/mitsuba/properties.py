@@ -140,8 +140,7 @@ class Properties:
         if element.tag not in _COLOURS:
             raise element.error(f"<{element.written}>", f"a colour or a texture as {name}")
         found = values.colour(element, light=light, find=self.importer.find)
-        assert found is not None
-        if not light and min(found) < 0.0 or (bounded and not light and max(found) > 1.0):
+        if (not light and min(found) < 0.0) or (bounded and not light and max(found) > 1.0):
             self.note(f"{name} outside of 0..1 is clamped" if bounded else f"{name} below 0 becomes 0")
             found = tuple(min(max(value, 0.0), 1.0 if bounded else value) for value in found)
         return list(found)
@@ -211,4 +210,3 @@ class Properties:
                 self._taken.add(id(element))
                 return element
         return None
-

@@ -120,7 +120,9 @@ SENSORS: dict[str, Plugin] = {
 
 
 def _film(p: Properties, importer: Importer) -> Block:
-    p.ignore("file_format", "pixel_format", "component_format", "banner", "high_quality_edges", "attach_log", "sample_border")
+    p.ignore(
+        "file_format", "pixel_format", "component_format", "banner", "high_quality_edges", "attach_log", "sample_border"
+    )
     p.ignore("compensate", "filename", "variable", "digits", "show_messages", "has_variance", "alpha")
     found: Block = {"width": p.integer("width", 768), "height": p.integer("height", 576)}
     if p.has("crop_width", "crop_height", "crop_offset_x", "crop_offset_y"):
@@ -283,9 +285,27 @@ INTEGRATORS: dict[str, Plugin] = {
     **dict.fromkeys(("volpath", "volpathmis", "volpath_simple", "prbvolpath"), nearest("path", _like_path, _MEDIA)),
     **dict.fromkeys(
         (
-            "bdpt", "mlt", "pssmlt", "erpt", "ppm", "sppm", "photonmapper", "vpl", "ptracer", "irrcache", "adaptive", "prb",
-            "prb_basic", "direct_projective", "prb_projective", "emission", "moment", "stokes", "depth", "multichannel",
-        ),  # fmt: skip
+            "bdpt",
+            "mlt",
+            "pssmlt",
+            "erpt",
+            "ppm",
+            "sppm",
+            "photonmapper",
+            "vpl",
+            "ptracer",
+            "irrcache",
+            "adaptive",
+            "prb",
+            "prb_basic",
+            "direct_projective",
+            "prb_projective",
+            "emission",
+            "moment",
+            "stokes",
+            "depth",
+            "multichannel",
+        ),
         nearest("path", _like_path, _OTHER),
     ),
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ from torchpt.math.transforms import is_usable
 from torchpt.physics.shapes import KINDS
 from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, left_out
 from torchpt.scene.formats.mitsuba.properties import Properties
+from torchpt.scene.meshes import MeshPart, load_mesh
 
 if TYPE_CHECKING:
     from torchpt.scene.formats.mitsuba.importer import Importer
@@ -77,16 +77,23 @@ def _mesh(p: Properties, importer: Importer) -> Shape | None:
 
 
 def _flipped(p: Properties, path: Path) -> Any:
-    """Return the parts of a mesh file with flipped texture coordinates."""
-    from torchpt.scene.meshes import load_mesh
-
+    """Return the parts of a mesh file, joined to one, with flipped texture coordinates."""
     try:
         parts = load_mesh(path, materials=False)
     except AssetError as error:
         raise SceneError(f"line {p.element.line}", str(path), error.problem, p.element.file) from None
-    return tuple(
-        part if part.uvs is None else replace(part, uvs=np.stack((part.uvs[:, 0], 1.0 - part.uvs[:, 1]), 1)) for part in parts
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
+    normals = [part.normals for part in parts if part.normals is not None]
+    uvs = [part.uvs for part in parts if part.uvs is not None]
+    joined = MeshPart(
+        "",
+        np.concatenate([part.vertices for part in parts]),
+        faces,
+        normals=np.concatenate(normals) if len(normals) == len(parts) else None,
+        uvs=np.concatenate(uvs) * [1.0, -1.0] + [0.0, 1.0] if len(uvs) == len(parts) else None,
     )
+    return (joined,)
 
 
 def _sphere(p: Properties, importer: Importer) -> Shape:

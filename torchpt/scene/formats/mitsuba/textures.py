@@ -80,7 +80,9 @@ def _bitmap(p: Properties, importer: Importer) -> Any:
 def _checkerboard(p: Properties, importer: Importer) -> Any:
     colours = {key: p.colour(key) for key in ("color0", "color1")}
     if not p.modern:  # the squares' sizes were the same, their colours not
-        colours = {key: value or [default] * 3 for (key, value), default in zip(colours.items(), (0.4, 0.2), strict=True)}
+        colours = {
+            key: value or [default] * 3 for (key, value), default in zip(colours.items(), (0.4, 0.2), strict=True)
+        }
     return {"type": "checkerboard", **{k: v for k, v in colours.items() if v is not None}, **_uv_transform(p)}
 
 

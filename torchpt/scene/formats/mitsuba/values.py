@@ -96,7 +96,7 @@ def vector(element: Element, default: float = 0.0) -> list[float]:
 # ---- Colours
 
 
-def colour(element: Element, *, light: bool, find: FindFile) -> Rgb | None:
+def colour(element: Element, *, light: bool, find: FindFile) -> Rgb:
     """Return the linear sRGB colour of an ``<rgb>``, ``<srgb>``, ``<color>``, ``<spectrum>``, ``<blackbody>`` or ``<float>``.
 
     Args:
@@ -131,9 +131,12 @@ def _decoded(values: Matrix) -> Matrix:
     return np.where(positive <= 0.04045, positive / 12.92, ((positive + 0.055) / 1.055) ** 2.4)
 
 
-def _spectrum(element: Element, *, light: bool, find: FindFile) -> Rgb | None:
+def _spectrum(element: Element, *, light: bool, find: FindFile) -> Rgb:
     """Return the colour of a ``<spectrum>``: one number, ``wavelength:value`` pairs, values at even steps, or a file."""
-    attributes = {**{_name(child): child.attributes.get("value", "") for child in element.children}, **element.attributes}
+    attributes = {
+        **{_name(child): child.attributes.get("value", "") for child in element.children},
+        **element.attributes,
+    }
     if element.type in ("d65", "uniform", "srgb", "rgb"):
         found = numbers(element, attributes.get("color") or attributes.get("value") or "1", (1, 3))
         scale = number(element, attributes.get("scale") or "1")
@@ -150,8 +153,10 @@ def _spectrum(element: Element, *, light: bool, find: FindFile) -> Rgb | None:
         else:
             ends = [number(element, attributes.get(key, "")) for key in _ENDS if key in attributes]
             if len(ends) != 2:
-                raise element.error(attributes["values"], "values with wavelengths, or wavelength_min and wavelength_max")
-            wavelengths = np.linspace(*ends, len(values))
+                raise element.error(
+                    attributes["values"], "values with wavelengths, or wavelength_min and wavelength_max"
+                )
+            wavelengths = np.linspace(ends[0], ends[1], len(values))
     else:
         text = attributes.get("value", "").strip()
         if _HEX.match(text):
