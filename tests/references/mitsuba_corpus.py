@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-__all__ = ["EXACT", "NEAREST", "OLD", "scene", "write_assets"]
+__all__ = ["EXACT", "LIGHT", "NEAREST", "OLD", "scene", "write_assets"]
 
 _HEAD = """\
 <scene version="{version}">
@@ -24,7 +24,7 @@ _FLOOR = """\
   <shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="4"/></transform>
     <bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0.6 0.5 0.4"/></bsdf></bsdf></shape>
 """
-_LIGHT = '  <emitter type="constant"><rgb name="radiance" value="1, 0.9, 0.8"/></emitter>\n'
+LIGHT = '  <emitter type="constant"><rgb name="radiance" value="1, 0.9, 0.8"/></emitter>\n'
 _BALL = '  <shape type="sphere"><point name="center" x="0" y="1" z="0"/>{}</shape>\n'
 
 
@@ -35,14 +35,14 @@ def scene(body: str, version: str = "3.0.0", depth: int = 6) -> str:
     return _HEAD.format(version=version, depth=depth, **names) + body + "</scene>\n"
 
 
-def ball(bsdf: str, light: str = _LIGHT, depth: int = 6) -> str:
+def ball(bsdf: str, light: str = LIGHT, depth: int = 6) -> str:
     """Return a scene of a ball on a floor."""
     return scene(_FLOOR + light + _BALL.format(bsdf), depth=depth)
 
 
 def shape(xml: str) -> str:
     """Return a scene of a shape on a floor."""
-    return scene(_FLOOR + _LIGHT + xml)
+    return scene(_FLOOR + LIGHT + xml)
 
 
 def lamp(emitter: str) -> str:
@@ -103,7 +103,7 @@ EXACT: dict[str, str] = {
     ),
     "blendbsdf": ball(
         '<bsdf type="blendbsdf"><float name="weight" value="0.3"/><bsdf type="diffuse"><rgb name="reflectance" value="1 0 0"/>'
-        '</bsdf><bsdf type="conductor"/></bsdf>'
+        '</bsdf><bsdf type="roughconductor"><string name="distribution" value="ggx"/></bsdf></bsdf>'
     ),
     "blend_texture": shape(
         _RECTANGLE.format(
@@ -150,6 +150,23 @@ EXACT: dict[str, str] = {
             '<string name="filename" value="normals.png"/></texture><bsdf type="diffuse"/></bsdf>'
         )
     ),
+    "bumpmap": shape(
+        _RECTANGLE.format(
+            '<bsdf type="bumpmap"><texture type="bitmap"><boolean name="raw" value="true"/>'
+            '<string name="filename" value="grey.png"/></texture><float name="scale" value="0.5"/><bsdf type="diffuse"/></bsdf>'
+        )
+    ),
+    "bumpmap_mesh": shape(
+        '<shape type="obj"><string name="filename" value="meshes/roof.obj"/><boolean name="face_normals" value="true"/>'
+        '<transform name="to_world"><scale value="1.5"/><translate y="0.5"/></transform><bsdf type="bumpmap">'
+        '<texture type="bitmap"><string name="filename" value="grey.png"/></texture>'
+        '<bsdf type="twosided"><bsdf type="diffuse"/></bsdf></bsdf></shape>'
+    )
+    .replace('<bsdf type="bumpmap">', '<bsdf type="twosided"><bsdf type="bumpmap">')
+    .replace(
+        '<bsdf type="twosided"><bsdf type="diffuse"/></bsdf></bsdf></shape>',
+        '<bsdf type="diffuse"/></bsdf></bsdf></shape>',
+    ),
     "spectrum": ball(
         '<bsdf type="diffuse"><spectrum name="reflectance" value="0.35"/></bsdf>',
         '<emitter type="constant"><spectrum name="radiance" value="400:0.1, 500:0.5, 600:.9, 700:.3"/></emitter>',
@@ -165,7 +182,9 @@ EXACT: dict[str, str] = {
         '<emitter type="area"><texture type="bitmap" name="radiance"><string name="filename" value="a picture.png"/></texture>'
         "</emitter></shape>",
     ),
-    "point": lamp('<emitter type="point"><point name="position" x="1" y="4" z="2"/><rgb name="intensity" value="9"/></emitter>'),
+    "point": lamp(
+        '<emitter type="point"><point name="position" x="1" y="4" z="2"/><rgb name="intensity" value="9"/></emitter>'
+    ),
     "spot": lamp(
         '<emitter type="spot"><transform name="to_world"><lookat origin="1, 4, 2" target="0, 0, 0" up="0, 1, 0"/></transform>'
         '<float name="cutoff_angle" value="25"/><rgb name="intensity" value="40 30 20"/></emitter>'
@@ -200,7 +219,9 @@ EXACT: dict[str, str] = {
         '<translate y="0.8"/></transform></shape>'
     ),
     "sphere_texture": ball(
-        _TEXTURED.format('<texture type="bitmap" name="reflectance"><string name="filename" value="a picture.png"/></texture>')
+        _TEXTURED.format(
+            '<texture type="bitmap" name="reflectance"><string name="filename" value="a picture.png"/></texture>'
+        )
     ),
     "sphere_inside": shape(
         '<shape type="sphere"><point name="center" x="0" y="1" z="0"/><boolean name="flip_normals" value="true"/></shape>'
@@ -268,7 +289,8 @@ OLD: dict[str, tuple[str, str]] = {
         scene(
             '<shape type="rectangle"><transform name="toWorld"><rotate x="1" angle="-90"/></transform>'
             '<bsdf type="twosided"><bsdf type="roughplastic"><string name="distribution" value="ggx"/>'
-            '<float name="intIOR" value="1.5"/><float name="extIOR" value="1"/><srgb name="diffuseReflectance" value="#808080"/>'
+            '<float name="intIOR" value="1.5"/><float name="extIOR" value="1"/>'
+            '<srgb name="diffuseReflectance" value="#808080"/>'
             '<boolean name="nonlinear" value="true"/></bsdf></bsdf></shape>',
             version="0.5.0",
         ),
@@ -312,7 +334,11 @@ OLD: dict[str, tuple[str, str]] = {
 
 #: Scenes with plugins that have no exact twin: what becomes of the ball, and words of the warning.
 NEAREST: dict[str, tuple[str, str, str]] = {
-    "coating": (ball('<bsdf type="coating"><bsdf type="diffuse"/></bsdf>'), "plastic", 'bsdf "coating" becomes plastic'),
+    "coating": (
+        ball('<bsdf type="coating"><bsdf type="diffuse"/></bsdf>'),
+        "plastic",
+        'bsdf "coating" becomes plastic',
+    ),
     "roughcoating": (
         ball('<bsdf type="roughcoating"><float name="alpha" value="0.3"/><bsdf type="diffuse"/></bsdf>'),
         "roughplastic",

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 __all__ = ["HELP", "Turn", "orbit", "poses", "run"]
 
 HELP = """\
-torchpt orbit scene=NAME|FILE.yaml [out=FILE.gif|FILE.mp4] [frames=48] [degrees=360] [key=value ...]
+torchpt orbit scene=NAME|FILE.yaml|FILE.xml [out=FILE.gif|FILE.mp4] [frames=48] [degrees=360] [key=value ...]
 
   Turns the camera about what it looks at (its target, about its up axis; a camera placed by to_world: the middle of the
   scene, about the axis of the scene nearest to its up) and writes the frames as a moving picture.

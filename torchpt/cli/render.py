@@ -38,9 +38,9 @@ __all__ = [
 ]
 
 HELP = """\
-torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
+torchpt render scene=NAME|FILE.yaml|FILE.xml [out=FILE] [key=value ...]
 
-  scene=   a file ending in .yaml, or a scene that ships:
+  scene=   a file ending in .yaml or .xml (Mitsuba), or a scene that ships:
 {scenes}
   out=     .exr .hdr .png .jpg .ppm; several as out=[a.exr,a.png]; NAME.png where nothing is said
   {keys}

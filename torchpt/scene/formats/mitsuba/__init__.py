@@ -6,7 +6,7 @@ gives old names their present ones; ``properties.py`` and ``values.py`` read the
 together, in the form that YAML files have. ``notes.py`` collects the warnings. Start with ``importer.py``.
 
 A :class:`~.plugins.Plugin` of a table says whether its twin is exact, the nearest that there is, or nothing; only the entry of
-the table has to change where an exact twin is written later. ``docs/reference/mitsuba.md`` has these tables.
+the table has to change where an exact twin is written later. ``docs/mitsuba.md`` has these tables.
 """
 
 from torchpt.scene.formats.mitsuba.importer import ImportOptions, read_mitsuba, split_import_keys

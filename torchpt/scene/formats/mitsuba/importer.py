@@ -18,6 +18,7 @@ from torchpt.scene.formats.mitsuba.plugins import Plugin, Twin, left_out, neares
 from torchpt.scene.formats.mitsuba.properties import OBJECTS, Properties
 from torchpt.scene.formats.mitsuba.sensors import (
     FILMS,
+    FILTERS,
     INTEGRATORS,
     SAMPLERS,
     SENSORS,
@@ -29,7 +30,20 @@ from torchpt.scene.formats.mitsuba.shapes import SHAPES, posed
 from torchpt.scene.formats.mitsuba.textures import TEXTURES
 from torchpt.scene.formats.mitsuba.versions import plugin_name
 
-__all__ = ["ImportOptions", "Importer", "read_mitsuba", "split_import_keys"]
+__all__ = ["PLUGINS", "ImportOptions", "Importer", "read_mitsuba", "split_import_keys"]
+
+#: The tables of plugins by tag.
+PLUGINS: dict[str, Mapping[str, Plugin]] = {
+    "bsdf": BSDFS,
+    "texture": TEXTURES,
+    "shape": SHAPES,
+    "emitter": EMITTERS,
+    "sensor": SENSORS,
+    "film": FILMS,
+    "rfilter": FILTERS,
+    "sampler": SAMPLERS,
+    "integrator": INTEGRATORS,
+}
 
 #: Greatest depth of objects inside objects, references followed.
 MAX_NESTING = 32
