@@ -85,4 +85,4 @@ def test_public_scenes_open_as_published(tmp_path: Path) -> None:
         assert bool(image.isfinite().all()) and float(image.mean()) > 0.01, file
         target = tmp_path / f"{file.parent.name}_{file.stem}.yaml"
         assert main(["convert", str(file), str(target)]) == 0
-        assert bool((torchpt.render(str(target), spp=1, film=film, compile="off") == image).all()), file
+        assert bool((torchpt.render(torchpt.load(str(target)), spp=1, film=film, compile="off") == image).all()), file
