@@ -4,7 +4,8 @@
     python scripts/compare_scenes.py scene.xml --pictures out    # both pictures as PNG, to look at
 
 Mitsuba 3.9 opens hardly any published file: it gets a copy that is mended as this program reads the file (integrators that it
-lacks are ``path``, ``beckmann`` is ``ggx``, ``roughdiffuse`` is ``diffuse``, keys that it does not know are dropped). Needs
+lacks are ``path``, ``beckmann`` is ``ggx``, ``roughdiffuse`` is ``diffuse``, keys that it does not know are dropped, a
+sky is the nearest that is taken here). Needs
 the extra `bench`, and LLVM where ``DRJIT_LIBLLVM_PATH`` says. The columns: mean of ours over Mitsuba's with the standard
 error of the seeds; how many blocks of 16 x 16 pixels differ by more than 4 of their standard errors, of all; seconds until
 the scene is loaded and until its first picture at 1 sample a pixel, ours and Mitsuba's; paths a second, ours over Mitsuba's.
@@ -27,6 +28,7 @@ from mitsuba_scene import load_mitsuba
 
 import torchpt
 from torchpt.core.errors import ImportedSceneWarning
+from torchpt.spec.schema import ParsedParams
 
 #: Regular expressions of what Mitsuba 3.9 refuses, and what takes its place.
 MENDS = (
@@ -42,9 +44,13 @@ MENDS = (
 BLOCK = 16
 
 
-def mended(file: Path, folder: Path) -> Path:
+#: Emitters that this program has only nearly: Mitsuba gets what it takes.
+SKY = re.compile(r'<emitter\s+type="(?:sunsky|sky|sun)".*?</emitter>', re.DOTALL)
+
+
+def mended(file: Path, folder: Path, scene: torchpt.Scene) -> Path:
     """Return a copy that Mitsuba opens, in a folder that has links to the files beside the scene."""
-    text = file.read_text(encoding="utf-8")
+    text = SKY.sub("".join(map(_emitter, scene.description.lights.values())), file.read_text(encoding="utf-8"))
     for pattern, replacement in MENDS:
         text = re.sub(pattern, replacement, text)
     for entry in file.resolve().parent.iterdir():
@@ -53,6 +59,13 @@ def mended(file: Path, folder: Path) -> Path:
     copy = folder / file.name
     copy.write_text(text, encoding="utf-8")
     return copy
+
+
+def _emitter(light: ParsedParams) -> str:
+    """Return a constant or directional light as XML."""
+    tags = {"radiance": "rgb", "irradiance": "rgb", "direction": "vector"}
+    inner = (f'<{tags[key]} name="{key}" value="{" ".join(map(str, value))}"/>' for key, value in light.values.items())
+    return f'<emitter type="{light.name}">{"".join(inner)}</emitter>'
 
 
 def blocks(image: np.ndarray) -> np.ndarray:
@@ -81,7 +94,7 @@ def compare(
 
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        peer = mitsuba.load_file(str(mended(file, Path(folder))))
+        peer = mitsuba.load_file(str(mended(file, Path(folder), scene)))
         sensor = _sensor(mitsuba, peer, film)
         integrator = mitsuba.load_dict({"type": "path", "max_depth": limit, "rr_depth": 5})
 

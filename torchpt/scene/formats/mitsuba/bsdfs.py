@@ -214,8 +214,14 @@ def _blended(sides: list[Material], weight: Any, p: Properties) -> Material:
     clear = [_passes(side) for side in sides]
     for side in sides:
         kept = {key: value for key, value in side.items() if key not in (*_OUTER, "two_sided")}
-        if isinstance(kept.get("opacity"), dict):
-            p.note("an opacity texture inside a blend is left out")
+        opacity = kept.get("opacity", 1.0)
+        if isinstance(opacity, dict) or (isinstance(weight, dict) and opacity != 1.0):
+            words = (
+                "an opacity texture inside a blend"
+                if isinstance(opacity, dict)
+                else "an opacity inside a textured blend"
+            )
+            p.note(f"{words} is left out")
             del kept["opacity"]
         for key in _OUTER:
             if key in side:

@@ -140,9 +140,10 @@ class Properties:
         if element.tag not in _COLOURS:
             raise element.error(f"<{element.written}>", f"a colour or a texture as {name}")
         found = values.colour(element, light=light, find=self.importer.find)
-        if (not light and min(found) < 0.0) or (bounded and not light and max(found) > 1.0):
-            self.note(f"{name} outside of 0..1 is clamped" if bounded else f"{name} below 0 becomes 0")
-            found = tuple(min(max(value, 0.0), 1.0 if bounded else value) for value in found)
+        high = 1.0 if bounded and not light else values.LARGEST
+        if min(found) < 0.0 or max(found) > high:
+            self.note(f"{name} outside of 0..1 is clamped" if high == 1.0 else f"{name} below 0 becomes 0")
+            found = tuple(min(max(value, 0.0), high) for value in found)
         return list(found)
 
     def scalar(self, name: str, default: Any = None, *, high: float = 1.0) -> Any:

@@ -228,8 +228,10 @@ UNKNOWN_SAMPLER = nearest("independent", _sampler("independent"), "it is unknown
 
 def _depths(p: Properties) -> Block:
     found: Block = {"max_depth": p.integer("max_depth", -1), "rr_depth": p.integer("rr_depth", 5)}
-    if found["max_depth"] < 1:
-        found["max_depth"] = -1
+    if found["max_depth"] == 0:
+        p.note("max_depth 0, a black picture, becomes 1")
+        found["max_depth"] = 1
+    found["max_depth"] = max(found["max_depth"], -1)
     found["rr_depth"] = max(found["rr_depth"], 1)
     if p.flag("hide_emitters"):
         p.note("hide_emitters is left out: emitters are seen")

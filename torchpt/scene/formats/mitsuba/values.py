@@ -21,7 +21,7 @@ from torchpt.scene.formats.mitsuba.cie import D65, WAVELENGTHS, XYZ
 from torchpt.scene.formats.mitsuba.elements import Element
 from torchpt.scene.formats.mitsuba.notes import Notes
 
-__all__ = ["boolean", "colour", "integer", "number", "numbers", "transform", "vector"]
+__all__ = ["LARGEST", "boolean", "colour", "integer", "number", "numbers", "transform", "vector"]
 
 Rgb = tuple[float, float, float]
 Matrix = NDArray[np.float64]
