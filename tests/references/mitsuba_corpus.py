@@ -214,6 +214,11 @@ EXACT: dict[str, str] = {
         '<texture type="bitmap" name="reflectance"><string name="filename" value="a picture.png"/></texture></bsdf></bsdf>'
         "</shape>"
     ),
+    "ply": shape(
+        '<shape type="ply"><string name="filename" value="meshes/tent.ply"/><transform name="to_world"><translate y="0.2"/>'
+        '</transform><bsdf type="twosided"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
+        '<string name="filename" value="a picture.png"/></texture></bsdf></bsdf></shape>'
+    ),
     "sphere": shape(
         '<shape type="sphere"><float name="radius" value="0.5"/><transform name="to_world"><scale value="1.6"/>'
         '<translate y="0.8"/></transform></shape>'
@@ -391,4 +396,9 @@ def write_assets(folder: Path) -> None:
     (folder / "meshes" / "roof.obj").write_text(
         "v -0.8 0 0.5\nv 0.8 0 0.5\nv 0.8 0.6 0\nv -0.8 0.6 0\nv -0.8 0 -0.5\nv 0.8 0 -0.5\n"
         "vt 0 0\nvt 1 0\nvt 1 0.6\nvt 0 0.6\nvt 0 1\nvt 1 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\nf 4/4 3/3 6/6\nf 4/4 6/6 5/5\n"
+    )
+    (folder / "meshes" / "tent.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nproperty float u\n"
+        "property float v\nelement face 3\nproperty list uchar int vertex_indices\nend_header\n"
+        "-1 0 0.5 0 0\n1 0 0.5 1 0\n0 0 -1 0.3 0.8\n0 1.2 0 0.5 0.5\n3 0 1 3\n3 1 2 3\n3 2 0 3\n"
     )

@@ -25,7 +25,6 @@ from torchpt.scene import settings as run_settings
 from torchpt.scene.formats.cameras import read_camera
 from torchpt.scene.formats.compose import KEYS, Layers, compose
 from torchpt.scene.formats.materials import Kind, check_material, material_types, read_material
-from torchpt.scene.formats.mitsuba import read_mitsuba, split_import_keys
 from torchpt.scene.formats.overrides import overridden_by, override_words
 from torchpt.scene.formats.textures import check_texture, texture_of
 from torchpt.scene.formats.yaml import parse_yaml, plain, read_open, read_yaml
@@ -229,6 +228,8 @@ def read_description(
     if isinstance(source, str) and "\n" in source:
         return describe(parse_yaml(source), file=None, base=Path.cwd())
     if file.endswith(".xml"):
+        from torchpt.scene.formats.mitsuba import read_mitsuba, split_import_keys  # few scenes need it
+
         path, given = Path(file), overrides
         _check_exists(path, file, places)
         options, overrides = split_import_keys(overrides)

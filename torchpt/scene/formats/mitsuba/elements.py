@@ -88,7 +88,7 @@ def parse_scene(path: Path, file: str, given: Mapping[str, str]) -> Element:
     """
     reader = _Reader(dict(given))
     root = reader.read(path, file, trail=())
-    unknown = [name for name in given if name not in reader.used]
+    unknown = [name for name in given if name not in reader.used | reader.declared]
     if unknown:
         known = sorted(reader.used | reader.declared)
         names = f"one of {', '.join(known)}" if known else "none, as the scene has no parameters"

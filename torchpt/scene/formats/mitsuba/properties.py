@@ -111,8 +111,8 @@ class Properties:
             self.note("the animation is left out: its first transform is taken")
             inner = [child for child in element.children if child.tag == "transform"]
             element = inner[0] if inner else element
-            return values.transform(element, self.importer.notes) if inner else np.eye(4)
-        return values.transform(element, self.importer.notes)
+            return values.transform(element) if inner else np.eye(4)
+        return values.transform(element)
 
     def colour(self, name: str, default: Any = None, *, light: bool = False) -> Any:
         """Return a colour ``[r, g, b]``, or ``default``; a texture's place is taken by grey."""

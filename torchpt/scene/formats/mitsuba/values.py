@@ -19,7 +19,6 @@ from torchpt.core.files import read_regular
 from torchpt.math import transforms
 from torchpt.scene.formats.mitsuba.cie import D65, WAVELENGTHS, XYZ
 from torchpt.scene.formats.mitsuba.elements import Element
-from torchpt.scene.formats.mitsuba.notes import Notes
 
 __all__ = ["LARGEST", "boolean", "colour", "integer", "number", "numbers", "transform", "vector"]
 
@@ -230,7 +229,7 @@ def _blackbody(element: Element) -> Rgb:
 # ---- Transforms
 
 
-def transform(element: Element, notes: Notes) -> Matrix:
+def transform(element: Element) -> Matrix:
     """Return the matrix ``(4, 4)`` of a ``<transform>``: its operations, applied in the order listed.
 
     Raises:
@@ -239,7 +238,7 @@ def transform(element: Element, notes: Notes) -> Matrix:
     total = np.eye(4)
     for child in element.children:
         if child.tag == "transform":
-            step = transform(child, notes)
+            step = transform(child)
         elif child.tag in _OPERATIONS:
             step = _operation(child)
         else:
