@@ -50,7 +50,9 @@ SKY = re.compile(r'<emitter\s+type="(?:sunsky|sky|sun)".*?</emitter>', re.DOTALL
 
 def mended(file: Path, folder: Path, scene: torchpt.Scene) -> Path:
     """Return a copy that Mitsuba opens, in a folder that has links to the files beside the scene."""
-    text = SKY.sub("".join(map(_emitter, scene.description.lights.values())), file.read_text(encoding="utf-8"))
+    text = SKY.sub(
+        lambda _: "".join(map(_emitter, scene.description.lights.values())), file.read_text(encoding="utf-8")
+    )
     for pattern, replacement in MENDS:
         text = re.sub(pattern, replacement, text)
     for entry in file.resolve().parent.iterdir():
