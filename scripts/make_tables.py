@@ -3,9 +3,10 @@
     python scripts/make_tables.py            # writes pages of docs/
     python scripts/make_tables.py --check    # exit code 1 where a page is not what would be written
 
-A NAME is a table of types (``lights``, ``materials``, ...), one type of it (``lights.spot``), ``common.lights`` (the parameters
-of all its types), or ``summary.lights`` (a row for each type). ``bounds`` is the table of :mod:`bounds`, ``arguments`` that of
-``render``'s arguments, ``help`` and ``help.render`` are help texts, ``public.cameras`` lists the names of ``torchpt.cameras``.
+A NAME is a table of types (``lights``, ``materials``, ...), one type of it (``lights.spot``), ``common.lights`` (the
+parameters of all its types), or ``summary.lights`` (a row for each type). ``bounds`` is the table of :mod:`bounds`,
+``arguments`` that of ``render``'s arguments, ``mitsuba.TAG`` lists what becomes of Mitsuba's plugins, ``help`` and
+``help.render`` are help texts, ``public.cameras`` lists the names of ``torchpt.cameras``.
 """
 
 from __future__ import annotations
@@ -157,6 +158,17 @@ def public(module: str) -> str:
     return "| name | what it is |\n|---|---|\n" + "".join(lines)
 
 
+def plugins(tag: str) -> str:
+    """Return a table of what becomes of Mitsuba's plugins of a tag, plugins of one fate in one row."""
+    from torchpt.scene.formats.mitsuba.importer import PLUGINS
+
+    rows: dict[tuple[str, str, str], list[str]] = {}
+    for name, plugin in PLUGINS[tag].items():
+        rows.setdefault((plugin.twin.value, plugin.becomes, plugin.note), []).append(f"`{name}`")
+    lines = (f"| {' '.join(names)} | {' | '.join(fate)} |\n" for fate, names in rows.items())
+    return f"| {tag} | twin | becomes | what differs |\n|---|---|---|---|\n" + "".join(lines)
+
+
 def written(name: str) -> str:
     """Return the generated text for NAME."""
     first, _, second = name.partition(".")
@@ -164,6 +176,8 @@ def written(name: str) -> str:
         return bounds.table()
     if name == "arguments":
         return arguments(RenderOptions)
+    if first == "mitsuba":
+        return plugins(second)
     if first == "help":
         return said(second)
     if first == "public":

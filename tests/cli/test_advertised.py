@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 from few import few
+from mitsuba_corpus import LIGHT
+from mitsuba_corpus import scene as mitsuba_scene
 
 from torchpt.cli import main as cli
 from torchpt.cli.main import main
@@ -120,6 +122,7 @@ def test_there_are_commands_from_everywhere() -> None:
         "orbit",
         "info",
         "compare",
+        "convert",
         "converge",
         "stress",
     }
@@ -155,6 +158,11 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "my").mkdir()
     for name in ("my/scene.yaml", "room.yaml", "glass.yaml"):
         (tmp_path / name).write_text(SCENE)
+    for name in ("scene.xml", "staircase2/scene.xml", "room/scene.xml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        defaults = '<default name="spp" value="4"/><default name="resx" value="32"/>'
+        text = mitsuba_scene(f'<shape type="sphere"/>{LIGHT}').replace('"16"', '"$spp"').replace('"32"', '"$resx"')
+        (tmp_path / name).write_text(text.replace(">\n", f">\n{defaults}", 1))
     for name in ("test.exr", "reference.exr"):  # what is compared
         write_image(tmp_path / name, torch.full((12, 12, 3), 0.5), {"albedo": torch.full((12, 12, 3), 0.3)})
     return tmp_path
@@ -165,7 +173,7 @@ def check(where: str, command: str, place: Path, capfd: pytest.CaptureFixture[st
     assert main(shrunk(words) if renders(words) else words) == 0, where
     assert capfd.readouterr().out
     if renders(words):
-        files = [path for path in place.rglob("*") if path.is_file() and path.suffix != ".yaml"]
+        files = [path for path in place.rglob("*") if path.is_file() and path.suffix not in (".yaml", ".xml")]
         assert files and all(path.stat().st_size for path in files)
 
 

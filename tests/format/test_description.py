@@ -276,7 +276,7 @@ def test_shipped_scenes_are_there() -> None:
 
 
 def test_unknown_scene_names_the_known() -> None:
-    with pytest.raises(SceneError, match=r"cornell_box.*\.yaml, got 'cornel_box'"):
+    with pytest.raises(SceneError, match=r"cornell_box.*\.yaml or \.xml, got 'cornel_box'"):
         read_description("cornel_box")
 
 

@@ -220,7 +220,10 @@ def test_tensors_among_overrides_get_gradients() -> None:
 
 
 def test_blocks_are_the_same_where_they_are_listed_twice() -> None:
-    assert set(SCENE_BLOCKS) == set(KEYS) - set(BLOCKS) - {"defaults"}
+    assert set(SCENE_BLOCKS) == set(KEYS) - set(BLOCKS) - {"defaults"} | {
+        "import",
+        "scene_params",
+    }  # of imported scenes
 
 
 #: Words, and what their line says.

@@ -31,8 +31,8 @@ __all__ = [
 
 #: Config groups: the blocks of run settings.
 GROUPS = ("film", "integrator", "sampler", "render")
-#: Blocks of a scene file that are not run settings; their keys depend on the scene.
-SCENE_BLOCKS = ("version", "camera", "textures", "materials", "shapes", "lights")
+#: Blocks of a scene that are not run settings; their keys depend on the scene. The last two are of imported scenes.
+SCENE_BLOCKS = ("version", "camera", "textures", "materials", "shapes", "lights", "import", "scene_params")
 #: Keys of `torchpt orbit` only.
 TURN_KEYS = ("frames", "degrees", "fps", "keep")
 _TURN_WORD = re.compile(rf"({'|'.join(TURN_KEYS)})=(.*)\Z", re.DOTALL)

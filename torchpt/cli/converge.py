@@ -32,7 +32,7 @@ torchpt converge study=NAME|FILE.yaml [key=value ...]
 
   Error against run time: several independent runs of every combination of settings at growing samples a pixel, each timed
   without set-up, compared with a reference. A list makes an axis of the grid: sampler=[independent,sobol].
-  scene=      a file ending in .yaml, or a scene that ships, or a list of them:
+  scene=      a file ending in .yaml or .xml, or a scene that ships, or a list of them:
 {scenes}
   out=        the folder of report.html, report.json, plots/ and runs/; where nothing is said SCENE_converge, or, where
               that holds another study, SCENE_converge_2, ...
@@ -271,4 +271,4 @@ def _default_stem(scenes: tuple[str, ...], file: str | None) -> str:
     """Return the start of the output folder's name: that of the study file, else those of the scenes."""
     if file is not None:
         return Path(file).stem
-    return "_".join(Path(name).stem if name.endswith((".yaml", ".yml")) else name for name in scenes)
+    return "_".join(Path(name).stem if name.endswith((".yaml", ".yml", ".xml")) else name for name in scenes)

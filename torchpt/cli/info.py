@@ -19,10 +19,10 @@ from torchpt.core.errors import TorchptError
 __all__ = ["HELP", "info", "lines", "run"]
 
 HELP = """\
-torchpt info scene=NAME|FILE.yaml [--json] [key=value ...]
+torchpt info scene=NAME|FILE.yaml|FILE.xml [--json] [key=value ...]
 
   What the scene holds, what was built for it, and what was left out because nothing needs it.
-  scene=   a file ending in .yaml, or a scene that ships:
+  scene=   a file ending in .yaml or .xml (Mitsuba), or a scene that ships:
 {scenes}
   {keys}
   {changes}

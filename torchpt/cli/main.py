@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchpt.cli import compare, converge, distributed, gc_pause, info, keys, orbit, render, stress
+from torchpt.cli import compare, converge, convert, distributed, gc_pause, info, keys, orbit, render, stress
 from torchpt.cli.arguments import GROUPS, Arguments, UsageError, parse
 from torchpt.cli.hydra_process import hydra_process
 from torchpt.cli.interrupt import Interrupt, Interrupted, interruption
@@ -491,6 +491,13 @@ COMMANDS = (
         line="how far a picture is from its reference",
         help=compare.HELP,
         run=compare.run,
+    ),
+    Command(
+        name="convert",
+        example="scene.xml scene.yaml",
+        line="a scene of Mitsuba as a YAML file",
+        help=convert.HELP,
+        run=convert.run,
     ),
     Command(
         name="converge",

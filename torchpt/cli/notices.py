@@ -8,23 +8,27 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TextIO
 
-from torchpt.core.errors import EnergyWarning
+from torchpt.core.errors import EnergyWarning, ImportedSceneWarning
 
 if TYPE_CHECKING:
     from torchpt.cli.render import Job
 
 __all__ = ["print_job", "printed_scene_warnings", "warn_nonfinite", "warn_unknown_error"]
 
+#: Warnings about scenes.
+_KINDS = (EnergyWarning, ImportedSceneWarning)
+
 
 @contextmanager
 def printed_scene_warnings() -> Iterator[None]:
-    """Collect scene warnings (`EnergyWarning`) inside the context and print them at its end, unless it raised.
+    """Collect warnings about scenes (:data:`_KINDS`) inside the context and print them at its end, unless it raised.
 
     Other warnings are shown by Python as usual.
     """
     lines: list[str] = []
     with warnings.catch_warnings():
-        warnings.simplefilter("always", EnergyWarning)
+        for kind in _KINDS:
+            warnings.simplefilter("always", kind)
         show = warnings.showwarning
 
         def collect_or_show(
@@ -35,7 +39,7 @@ def printed_scene_warnings() -> Iterator[None]:
             file: TextIO | None = None,
             line: str | None = None,
         ) -> None:
-            if issubclass(category, EnergyWarning):
+            if issubclass(category, _KINDS):
                 lines.append(f"torchpt: warning: {' '.join(str(message).split())}")
             else:
                 show(message, category, filename, lineno, file, line)

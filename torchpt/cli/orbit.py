@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 __all__ = ["HELP", "Turn", "orbit", "poses", "run"]
 
 HELP = """\
-torchpt orbit scene=NAME|FILE.yaml [out=FILE.gif|FILE.mp4] [frames=48] [degrees=360] [key=value ...]
+torchpt orbit scene=NAME|FILE.yaml|FILE.xml [out=FILE.gif|FILE.mp4] [frames=48] [degrees=360] [key=value ...]
 
   Turns the camera about what it looks at (its target, about its up axis; a camera placed by to_world: the middle of the
   scene, about the axis of the scene nearest to its up) and writes the frames as a moving picture.
@@ -210,7 +210,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
 def _outputs(job: Job) -> list[str]:
     """Return the movies to write; in a sweep their names have the job's number."""
     path = Path(job.scene)
-    name = path.stem if path.suffix in (".yaml", ".yml") else path.name
+    name = path.stem if path.suffix in (".yaml", ".yml", ".xml") else path.name
     return [numbered(str(Path(out).expanduser()), job.number) for out in job.outs or (f"{name}.gif",)]
 
 

@@ -38,9 +38,9 @@ __all__ = [
 ]
 
 HELP = """\
-torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
+torchpt render scene=NAME|FILE.yaml|FILE.xml [out=FILE] [key=value ...]
 
-  scene=   a file ending in .yaml, or a scene that ships:
+  scene=   a file ending in .yaml or .xml (Mitsuba), or a scene that ships:
 {scenes}
   out=     .exr .hdr .png .jpg .ppm; several as out=[a.exr,a.png]; NAME.png where nothing is said
   {keys}
@@ -231,7 +231,7 @@ def _with_deferred_signals(interrupt: Interrupt, work: Callable[[], Any]) -> Any
 def _scene_name(scene: str) -> str:
     """Return the name of a scene, without the folder and ending of its file."""
     path = Path(scene)
-    return path.stem if path.suffix in (".yaml", ".yml") else path.name
+    return path.stem if path.suffix in (".yaml", ".yml", ".xml") else path.name
 
 
 def _outputs(job: Job, settings: Any) -> list[str]:

@@ -23,7 +23,7 @@ __all__ = ["HELP", "run"]
 
 HELP = """\
 torchpt stress [quick=true] [case=PATTERN] [out=FOLDER] [key=value|key=[a,b] ...]
-torchpt stress scene=NAME|FILE.yaml [key=value ...]
+torchpt stress scene=NAME|FILE.yaml|FILE.xml [key=value ...]
 
   What breaks path tracers, measured against closed forms and float64: roughness, index, albedo, sizes, distances, radiance,
   lights and path lengths swept over all that float32 holds. With scene= the same of a scene of yours: moved, scaled, turned,

@@ -14,7 +14,9 @@ from functools import cache
 __all__ = [
     "AssetError",
     "EdgeWarning",
+    "EmptyMeshError",
     "EnergyWarning",
+    "ImportedSceneWarning",
     "LostRankError",
     "NoLightWarning",
     "NotBuiltError",
@@ -102,6 +104,10 @@ class AssetError(TorchptError):
         return type(self), (self.file, self.problem)
 
 
+class EmptyMeshError(AssetError):
+    """A mesh file without a face."""
+
+
 class OutputError(TorchptError):
     """A file that cannot be written."""
 
@@ -138,6 +144,10 @@ class EdgeWarning(UserWarning):
 
 class EnergyWarning(UserWarning):
     """Energy may not be conserved: a material reflects more than it receives, or refracting shapes touch."""
+
+
+class ImportedSceneWarning(UserWarning):
+    """A scene of another renderer has what this one lacks; the message says what was done instead."""
 
 
 class NoLightWarning(UserWarning):

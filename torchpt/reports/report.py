@@ -62,7 +62,7 @@ def plot_stems(scenes: Sequence[str]) -> list[str]:
     """Return the beginnings of the names of plot files, distinct for each scene (a name or a scene file)."""
     stems: list[str] = []
     for scene in scenes:
-        is_path = scene.endswith((".yaml", ".yml"))
+        is_path = scene.endswith((".yaml", ".yml", ".xml"))
         # Everything that is no letter, digit or underscore becomes an underscore.
         base = re.sub(r"\W+", "_", Path(scene).stem if is_path else scene)
         candidates = (base if number == 1 else f"{base}_{number}" for number in itertools.count(1))

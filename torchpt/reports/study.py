@@ -412,7 +412,7 @@ def read_study(name: str) -> tuple[dict[str, Any], str]:
         return str(base / file) if isinstance(file, str) else file
 
     def scene_name(scene: Any) -> Any:  # a scene: a path, or the name of one that ships
-        return beside_study(scene) if str(scene).endswith((".yaml", ".yml")) else scene
+        return beside_study(scene) if str(scene).endswith((".yaml", ".yml", ".xml")) else scene
 
     if "scene" in raw:
         raw["scene"] = [scene_name(scene) for scene in _as_list(raw["scene"])]

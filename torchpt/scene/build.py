@@ -67,6 +67,7 @@ def build_parts(description: Description, vertex_params: Collection[str] = ()) -
 
     Warns:
         EnergyWarning: two refracting shapes touch.
+        ImportedSceneWarning: meshes of an imported scene have no area.
     """
     try:
         return _built(description, vertex_params)
@@ -85,6 +86,7 @@ def _built(description: Description, vertex_params: Collection[str]) -> SceneBui
     # `copies` is True for the kind `instance`. Instances come after all meshes, which they may precede in the file.
     parts = [part for entry in entries if not entry.shape.kind.copies for part in builder.parts(entry)]
     copies = [copy for entry in entries if entry.shape.kind.copies for copy in builder.copies(entry, parts)]
+    builder.warn_of_empty_meshes()
     for name, material in description.materials.items():  # those that no shape uses have parameters too
         declare(resolved(material, f"materials.{name}", description.materials, texture_loader), parameters)
     sources = build_lights(description, parameters)

@@ -33,10 +33,10 @@ def load(
     """Load a scene.
 
     Args:
-        source: the name of a scene that ships, a path ending in ``.yaml``, an open file, YAML text (of more than one line),
-            or a dict of the same schema. Relative paths in it start at the file's folder, else at the current one. In a dict
-            numbers, colours, poses, texels and vertices may be arrays, and tensors on any device: those that require
-            gradients get them from every picture (docs/reference/scenes.md, *Tensors in dicts*).
+        source: the name of a scene that ships, a path ending in ``.yaml`` (or in ``.xml``: docs/mitsuba.md), an open file,
+            YAML text (of more than one line), or a dict of the same schema. Relative paths in it start at the file's folder,
+            else at the current one. In a dict numbers, colours, poses, texels and vertices may be arrays, and tensors on any
+            device: those that require gradients get them from every picture (docs/reference/scenes.md, *Tensors in dicts*).
         device: ``auto`` (CUDA where ``scripts/first_gpu.py`` has passed, else the CPU), ``cpu``, ``cuda`` or ``cuda:N``; by
             default the scene's own ``render.device``, which is ``auto`` where it does not say.
         bsdfs: models of your own by the ``type`` that materials name them by. Gradients flow to their weights too.
@@ -48,6 +48,9 @@ def load(
         SceneError: a wrong key or value; the message says where and what is accepted.
         AssetError: a missing or malformed file.
         RenderError: the device is not available.
+
+    Warns:
+        ImportedSceneWarning: a scene of Mitsuba has what this program lacks.
     """
     # No decorator, which would import torch's compiler together with this module.
     if torch.compiler.is_compiling():

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from torchpt.core.errors import AssetError, SceneError
+from torchpt.core.errors import AssetError, EmptyMeshError, ImportedSceneWarning, SceneError, warn_caller
 from torchpt.math.transforms import FINITE_WORDS, is_usable
 from torchpt.physics.bsdfs import KINDS as BSDFS
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
@@ -32,6 +32,9 @@ from torchpt.spec import Pose, Vertices, parameters_of
 from torchpt.spec.schema import ParsedParams
 
 __all__ = ["ShapeBuilder", "ShapeEntry"]
+
+#: Most names that a warning lists.
+MOST_SHOWN = 8
 
 
 @dataclass(frozen=True)
@@ -64,11 +67,13 @@ class ShapeBuilder:
 
     Attributes:
         sources: lights of mesh files, in the order of shapes.
+        empty: names of the meshes that are left out, as none of their faces has an area.
     """
 
     def __init__(self, description: Description, parameters: Parameters, texture_loader: TextureLoader) -> None:
         self.description, self.parameters, self.texture_loader = description, parameters, texture_loader
         self.sources: list[Source] = []
+        self.empty: list[str] = []
         self._named_materials: dict[str, ResolvedMaterial] = {}
         self._declared: set[int] = set()  # ids of the materials whose parameters are declared
 
@@ -142,7 +147,19 @@ class ShapeBuilder:
     def _meshes(self, entry: ShapeEntry, triangles: Triangles) -> list[Part]:
         """Return the parts of a mesh, one for each material of its file."""
         shape, pose = entry.shape, entry.to_world
-        mesh = mesh_of(triangles, entry.key, self.description, self.texture_loader, materials=shape["material"] is None)
+        own_materials = shape["material"] is None
+        try:
+            mesh = mesh_of(triangles, entry.key, self.description, self.texture_loader, materials=own_materials)
+        except EmptyMeshError:
+            if not self.description.allows_empty_meshes:
+                raise
+            self.empty.append(entry.name)
+            return []
+        if self.description.allows_empty_meshes and not any(
+            len(faces_with_area(piece, pose)[0]) for piece in mesh.pieces
+        ):
+            self.empty.append(entry.name)
+            return []
         lights = [light for piece in mesh.pieces for light in piece.lights]
         self.sources += build_file_lights(lights, entry.key, pose, mesh.source, self.parameters)
         labels = unique_labels([piece.name for piece in mesh.pieces])
@@ -168,6 +185,17 @@ class ShapeBuilder:
                 raise AssetError(mesh.source, f"{problem}, named by {entry.key}.path")
             raise SceneError(f"{entry.key}.faces", "no face with area", "a face with area", self.description.file)
         return parts
+
+    def warn_of_empty_meshes(self) -> None:
+        """Warn of the meshes that were left out.
+
+        Warns:
+            ImportedSceneWarning: once for all of them.
+        """
+        if self.empty:
+            shown = ", ".join(self.empty[:MOST_SHOWN]) + (", ..." if len(self.empty) > MOST_SHOWN else "")
+            text = f"meshes without a face that has an area are left out: {shown} ({len(self.empty)} in all)"
+            warn_caller(f"{self.description.file}: {text}", ImportedSceneWarning)
 
     def _material(self, given: Any, stem: str) -> ResolvedMaterial:
         """Return the material of a shape: a named one, one in place, or the default grey.

@@ -52,7 +52,7 @@ T = TypeVar("T")
 #: Types of the first argument of `load`.
 Source = str | os.PathLike[str] | IO[str] | IO[bytes] | Mapping[str, Any]
 #: What errors say is accepted there.
-SOURCES = "a scene's name, a path ending in .yaml, YAML text, an open file, or a mapping"
+SOURCES = "a scene's name, a path ending in .yaml or .xml, YAML text, an open file, or a mapping"
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,7 @@ class Description:
         lights: lights by name.
         overrides: overrides of the scene's keys, in the form of the command line.
         layers: the file that each key comes from, for errors.
+        allows_empty_meshes: True where a mesh without a face that has area is a warning, as in imported scenes.
     """
 
     file: str | None
@@ -90,6 +91,7 @@ class Description:
     lights: dict[str, ParsedParams] = field(default_factory=dict)
     overrides: tuple[str, ...] = ()
     layers: Layers = field(default=Layers(), repr=False, compare=False)
+    allows_empty_meshes: bool = False
 
     def blame(self, error: SceneError) -> SceneError:
         """Return an error with the file that its key comes from."""
@@ -182,12 +184,13 @@ def read_description(
     """Read and validate a scene.
 
     Args:
-        source: the name of a scene in ``configs/scene/``, a path ending in ``.yaml``, an open file, YAML text of more than
-            one line, or a mapping of the same schema. Relative paths start at the file's folder; where there is no file, at
-            the current one.
+        source: the name of a scene in ``configs/scene/``, a path ending in ``.yaml``, or ``.xml`` for scenes of Mitsuba, an
+            open file, YAML text of more than one line, or a mapping of the same schema. Relative paths start at the file's
+            folder; where there is no file, at the current one.
         bsdfs: material types of the caller's own: type name to model instance.
         change: called with the raw scene after ``defaults`` and overrides are merged; returns the one to validate.
-        overrides: values by dotted key, see :func:`torchpt.scene.formats.overrides.overridden_by`.
+        overrides: values by dotted key, see :func:`torchpt.scene.formats.overrides.overridden_by`; for scenes of Mitsuba also
+            ``import.strict``, ``import.missing`` and ``scene_params``.
         places: folders where scenes are looked up by name, also those in ``defaults``, before those that ship.
 
     Raises:
@@ -196,6 +199,7 @@ def read_description(
 
     Warns:
         EnergyWarning: a material may reflect more light than it receives.
+        ImportedSceneWarning: a scene of Mitsuba has what this program lacks.
     """
     types = material_types(bsdfs)
 
@@ -223,6 +227,15 @@ def read_description(
     file = os.fspath(source)
     if isinstance(source, str) and "\n" in source:
         return describe(parse_yaml(source), file=None, base=Path.cwd())
+    if file.endswith(".xml"):
+        from torchpt.scene.formats.mitsuba import read_mitsuba, split_import_keys  # few scenes need it
+
+        path, given = Path(file), overrides
+        _check_exists(path, file, places)
+        options, overrides = split_import_keys(overrides)
+        raw = read_mitsuba(path, file, options)
+        found = describe(raw, file=file, base=path.resolve().parent)
+        return replace(found, overrides=override_words(given or {}), allows_empty_meshes=not options.strict)
     if file.endswith((".yaml", ".yml")):
         path = Path(file)
         _check_exists(path, file, places)
@@ -242,7 +255,7 @@ def _named_scene(name: str, places: Sequence[Path]) -> Path:
     if name not in files:
         local = f"{name}.yaml"
         hint = f" (did you mean {local}?)" if is_regular(local) else did_you_mean(name, files)
-        raise SceneError("scene", name, f"one of {', '.join(sorted(files))}{hint}, or a path ending in .yaml")
+        raise SceneError("scene", name, f"one of {', '.join(sorted(files))}{hint}, or a path ending in .yaml or .xml")
     return files[name]
 
 
@@ -274,7 +287,7 @@ def _check_exists(path: Path, file: str, places: Sequence[Path]) -> None:
         return
     beside: set[str] = set()
     if path.parent.is_dir():
-        beside = {other.name for ending in ("*.yaml", "*.yml") for other in path.parent.glob(ending)}
+        beside = {other.name for ending in ("*.yaml", "*.yml", "*.xml") for other in path.parent.glob(ending)}
     hint = did_you_mean(
         path.name,
         [*sorted(beside), *_files_by_name(places)],

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchpt.core.errors import AssetError
+from torchpt.core.errors import AssetError, EmptyMeshError
 from torchpt.physics.shapes import normals
 
 __all__ = [
@@ -156,13 +156,14 @@ def checked(parts: list[MeshPart], path: Path) -> list[MeshPart]:
     A zero normal becomes the smooth one of its vertex; a texture coordinate that is not finite becomes 0.
 
     Raises:
-        AssetError: no triangle at all, more than :data:`MOST_PARTS` parts, a vertex, normal or colour that is not finite, an
+        EmptyMeshError: no triangle at all.
+        AssetError: more than :data:`MOST_PARTS` parts, a vertex, normal or colour that is not finite, an
             index out of range.
     """
     if len(parts) > MOST_PARTS:
         raise too_many_parts(path)
     if not parts or all(len(part.faces) == 0 for part in parts):
-        raise AssetError(path, "the mesh is empty (no face)")
+        raise EmptyMeshError(path, "the mesh is empty (no face)")
     return [_checked(part, path) for part in parts if len(part.faces)]
 
 

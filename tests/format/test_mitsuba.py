@@ -1,0 +1,351 @@
+"""Scenes of Mitsuba: elements, names of versions, values, references, files, plugins, warnings, errors."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from mitsuba_corpus import EXACT, NEAREST, OLD, scene, write_assets
+
+import torchpt
+from torchpt.core.errors import AssetError, ImportedSceneWarning, SceneError
+from torchpt.scene.formats.description import read_description
+from torchpt.scene.formats.mitsuba import ImportOptions, read_mitsuba
+from torchpt.scene.formats.mitsuba.bsdfs import BSDFS
+from torchpt.scene.formats.mitsuba.importer import PLUGINS
+from torchpt.scene.formats.mitsuba.plugins import Twin
+from torchpt.scene.formats.mitsuba.versions import property_name
+
+
+@pytest.fixture(scope="module")
+def assets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("assets")
+    write_assets(folder)
+    return folder
+
+
+def read(folder: Path, text: str, **options: Any) -> dict[str, Any]:
+    """Return a scene without warnings about it."""
+    file = folder / "scene.xml"
+    file.write_text(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ImportedSceneWarning)
+        return read_mitsuba(file, "scene.xml", ImportOptions(**options))
+
+
+def material(folder: Path, bsdf: str, version: str = "3.0.0") -> dict[str, Any]:
+    """Return what a BSDF becomes."""
+    return read(folder, scene(f'<shape type="sphere">{bsdf}</shape>', version))["shapes"]["sphere_1"]["material"]
+
+
+def rgb(folder: Path, value: str) -> list[float]:
+    """Return the colour of an element that stands as a reflectance."""
+    return material(folder, f'<bsdf type="diffuse">{value}</bsdf>')["reflectance"]
+
+
+def error(folder: Path, text: str, **options: Any) -> str:
+    with pytest.raises((SceneError, AssetError)) as caught:
+        read(folder, text, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# ---- All of the corpus
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_what_is_exact_gives_no_warning(assets: Path, name: str) -> None:
+    file = assets / f"{name}.xml"
+    file.write_text(EXACT[name])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        described = read_description(str(file))
+    assert described.film["width"] == 32 and described.render["spp"] == 16
+    assert read_description(str(file), overrides={"import.strict": True}).shapes.keys() == described.shapes.keys()
+
+
+@pytest.mark.parametrize("name", OLD)
+def test_old_versions_are_read_as_todays(assets: Path, name: str) -> None:
+    old, new = (read(assets, text) for text in OLD[name])
+    for block in ("shapes", "lights", "film", "camera"):
+        assert _near(old.get(block), new.get(block)), block
+
+
+def _near(a: Any, b: Any) -> bool:
+    """Return True for nested values that are equal but for rounding."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(_near(a[key], b[key]) for key in a)
+    if isinstance(a, list) and isinstance(b, list):
+        return len(a) == len(b) and all(map(_near, a, b))
+    return math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-12) if isinstance(a, float) else a == b
+
+
+@pytest.mark.parametrize("name", NEAREST)
+def test_what_is_not_exact_warns_with_its_line_and_is_an_error_where_strict(assets: Path, name: str) -> None:
+    text, becomes, words = NEAREST[name]
+    file = assets / "scene.xml"
+    file.write_text(text)
+    with pytest.warns(ImportedSceneWarning, match=r"scene\.xml:\d+: ") as caught:
+        raw = read_mitsuba(file, "scene.xml", ImportOptions())
+    assert any(words in str(warning.message) for warning in caught)
+    found = [shape["material"]["type"] for shape in raw["shapes"].values() if isinstance(shape["material"], dict)]
+    assert not becomes or becomes in found
+    line = next(str(warning.message).split(":")[1] for warning in caught if words in str(warning.message))
+    assert (
+        f'type="{"ward" if name == "ward_diffuse" else {"beckmann": "roughconductor"}.get(name, name)}"'
+        in (text.splitlines()[int(line) - 1])
+    )
+    strict = error(assets, text, strict=True)
+    assert strict.startswith("scene.xml: line ") and "import.strict" in strict
+
+
+def test_warnings_of_one_kind_are_counted(assets: Path) -> None:
+    text = scene('<shape type="sphere"><bsdf type="coating"><bsdf type="diffuse"/></bsdf></shape>\n' * 3)
+    (assets / "scene.xml").write_text(text)
+    with pytest.warns(ImportedSceneWarning) as caught:
+        read_mitsuba(assets / "scene.xml", "scene.xml", ImportOptions())
+    assert len(caught) == 1 and str(caught[0].message).endswith("(3 times)")
+    assert str(caught[0].message).startswith('scene.xml:9: bsdf "coating" becomes plastic: ')
+
+
+def test_every_entry_that_is_not_exact_says_what_differs() -> None:
+    entries = [(tag, name, plugin) for tag, table in PLUGINS.items() for name, plugin in table.items()]
+    assert len(entries) > 100
+    for tag, name, plugin in entries:
+        assert plugin.twin is Twin.EXACT or plugin.note, (tag, name)
+        assert (plugin.twin is Twin.LEFT_OUT) == (plugin.becomes == "nothing"), (tag, name)
+    covered = "".join(EXACT.values())
+    for name, plugin in BSDFS.items():  # those of old versions alone are not in the corpus, as Mitsuba cannot open them
+        assert plugin.twin is not Twin.EXACT or f'type="{name}"' in covered or name in ("mixturebsdf", "phong"), name
+
+
+# ---- Values
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ('<rgb name="reflectance" value="0.1, 0.2,0.3"/>', [0.1, 0.2, 0.3]),
+        ('<rgb name="reflectance" value="1e-008 .2 3E-1"/>', [1e-8, 0.2, 0.3]),
+        ('<rgb name="reflectance" value="0.4"/>', [0.4] * 3),
+        ('<float name="reflectance" value="0.4"/>', [0.4] * 3),
+        ('<spectrum name="reflectance" value="0.4"/>', [0.4] * 3),
+        ('<srgb name="reflectance" value="#ff8000"/>', [1.0, 0.21586050, 0.0]),
+        ('<rgb name="reflectance" value="#ff8000"/>', [1.0, 0.21586050, 0.0]),
+        ('<srgb name="reflectance" value="0.5, 0.5, 0.04"/>', [0.21404114, 0.21404114, 0.04 / 12.92]),
+        ('<spectrum name="reflectance" value="360:1, 830:1"/>', [1.0] * 3),
+    ],
+)
+def test_colours(assets: Path, value: str, expected: list[float]) -> None:
+    assert rgb(assets, value) == pytest.approx(expected, abs=3e-4 if "360" in value else 1e-7)
+
+
+def test_spectra_are_seen_as_by_mitsuba(assets: Path) -> None:
+    # Of Mitsuba 3.9.1, scalar_rgb; its D65 makes a flat reflectance 0.99887.
+    pairs = "400:0.1, 500:0.5, 600:.9, 700:.3"
+    found = rgb(assets, f'<spectrum name="reflectance" value="{pairs}"/>')
+    assert found == pytest.approx([0.8547973 / 0.99887, 0.6875398 / 0.99887, 0.2650152 / 0.99887], rel=4e-4)
+    (assets / "curve.spd").write_text("# a comment\n400 0.1\n500 0.5 # more\n600 .9\n\n700 .3\n")
+    assert rgb(assets, '<spectrum name="reflectance" filename="curve.spd"/>') == found
+    light = '<emitter type="constant"><spectrum name="radiance" value="{}"/></emitter>'
+    shine = lambda value: read(assets, scene(light.format(value)))["lights"]["constant_1"]["radiance"]  # noqa: E731
+    assert shine(pairs) == pytest.approx([0.999234, 0.6597, 0.229444], rel=5e-4)
+    assert shine("0.7") == pytest.approx([0.843356, 0.663804, 0.636241], rel=5e-4)
+
+
+def test_a_black_body_has_its_luminance(assets: Path) -> None:
+    text = '<emitter type="constant"><blackbody name="radiance" temperature="{}K"/></emitter>'
+    cold, warm = (
+        read(assets, scene(text.format(kelvin)))["lights"]["constant_1"]["radiance"] for kelvin in (3000, 6500)
+    )
+    assert cold[0] > cold[1] > cold[2] and warm[0] < 1.2 * warm[2]
+    # Planck's law at 560 nm, 6500 K, in W / (m^2 sr nm): the luminance lies near.
+    at_560 = 1.191042972e-16 / (560e-9) ** 5 / math.expm1(0.014387769 / (560e-9 * 6500)) * 1e-9
+    assert 0.2126 * warm[0] + 0.7152 * warm[1] + 0.0722 * warm[2] == pytest.approx(at_560, rel=0.02)
+
+
+def test_transforms_are_applied_in_order(assets: Path) -> None:
+    text = (
+        '<shape type="sphere"><transform name="to_world"><scale value="2"/><rotate z="1" angle="90"/><translate x="1"/>'
+        '<matrix value="1 0 0 0  0 1 0 3  0 0 1 0  0 0 0 1"/><transform><translate value="0, 0, 5"/></transform>'
+        "</transform></shape>"
+    )
+    rows = np.array(read(assets, scene(text))["shapes"]["sphere_1"]["transform"][0]["matrix"])
+    assert rows == pytest.approx(np.array([[0, -2, 0, 1], [2, 0, 0, 3], [0, 0, 2, 5], [0, 0, 0, 1.0]]), abs=1e-12)
+    camera = np.array(read(assets, scene(""))["camera"]["to_world"])
+    assert camera[:3, 3] == pytest.approx([0, 3, 6]) and camera[:3, 2] == pytest.approx(
+        np.array([0, -2.4, -6]) / math.hypot(2.4, 6)
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("toWorld", "to_world"), ("intIOR", "int_ior"), ("maxDepth", "max_depth"), ("sunRadiusScale", "sun_radius_scale")],
+)
+def test_names_in_snake_case(name: str, expected: str) -> None:
+    assert property_name("shape", "obj", name) == expected
+
+
+def test_defaults_of_versions(assets: Path) -> None:
+    assert material(assets, '<bsdf type="conductor"/>')["material"] == "none"
+    assert material(assets, '<bsdf type="conductor"/>', "0.6.0")["material"] == "Cu"
+    over = material(
+        assets,
+        '<bsdf type="conductor"><rgb name="eta" value="3"/><rgb name="k" value="6"/><float name="extEta" value="1.5"/></bsdf>',
+        "0.6.0",
+    )
+    assert over["eta"] == pytest.approx([2.0] * 3) and over["k"] == pytest.approx([4.0] * 3)
+    mix = material(
+        assets,
+        '<bsdf type="mixturebsdf"><string name="weights" value="0.2, 0.3 0.5"/><bsdf type="diffuse"/><bsdf type="plastic"/>'
+        '<bsdf type="phong"/></bsdf>',
+        "0.6.0",
+    )
+    assert mix["weight"] == pytest.approx(0.5) and mix["a"]["weight"] == pytest.approx(0.6)
+
+
+# ---- Structure: parameters, files, references
+
+
+def test_parameters_are_given_or_default(assets: Path) -> None:
+    text = scene('<default name="w" value="1.5"/><shape type="sphere"><float name="radius" value="$w"/></shape>')
+    assert read(assets, text)["shapes"]["sphere_1"]["radius"] == 1.5
+    assert read(assets, text, parameters={"w": "2"})["shapes"]["sphere_1"]["radius"] == 2.0
+    assert "scene_params.x: expected a parameter of the scene: one of w" in error(assets, text, parameters={"x": "2"})
+    assert read(assets, text.replace("$w", "$w5"))["shapes"]["sphere_1"]["radius"] == 1.55  # as Mitsuba reads it
+    missing = error(assets, text.replace("$w", "$nothing"))
+    assert "got '$nothing'" in missing and "scene_params={nothing: ...}" in missing
+
+
+def test_includes_stand_in_their_place_and_paths_start_at_their_folder(assets: Path) -> None:
+    inner = assets / "parts"
+    inner.mkdir(exist_ok=True)
+    (inner / "ball.png").write_bytes((assets / "grey.png").read_bytes())
+    (inner / "b.xml").write_text(
+        '<scene version="0.6.0"><default name="r" value="3"/><bsdf type="diffuse" id="d"><texture type="bitmap" '
+        'name="reflectance"><string name="filename" value="ball.png"/></texture></bsdf></scene>'
+    )
+    text = scene(
+        '<include filename="parts\\b.xml"/><alias id="d" as="e"/><shape type="sphere" id="it"><ref id="e"/>'
+        '<float name="radius" value="$r"/></shape>'
+    )
+    found = read(assets, text)
+    assert found["shapes"]["it"] == {"type": "sphere", "radius": 3.0, "material": "d"}
+    assert found["materials"]["d"]["reflectance"]["path"] == "parts/ball.png"
+    (inner / "b.xml").write_text('<scene version="3.0.0"><include filename="b.xml"/></scene>')
+    assert "a file that does not include itself" in error(assets, text)
+    assert "the name of a file that is there" in error(assets, scene('<include filename="none.xml"/>'))
+
+
+def test_a_missing_file_is_an_error_or_grey(assets: Path) -> None:
+    text = scene(
+        '<shape type="rectangle"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">\n'
+        '<string name="filename" value="none.png"/></texture></bsdf></shape>\n'
+        '<shape type="obj"><string name="filename" value="none.obj"/></shape>'
+        '<emitter type="envmap"><string name="filename" value="none.exr"/></emitter>'
+    )
+    assert error(assets, text) == (
+        "scene.xml: line 10: expected a file that is there (import.missing=warn goes on without it), got 'none.png'"
+    )
+    found = read(assets, text, missing=True)
+    assert list(found["shapes"]) == ["rectangle_1"] and found["lights"]["constant_1"]["radiance"] == [0.5] * 3
+    assert found["shapes"]["rectangle_1"]["material"]["reflectance"] == [0.5] * 3
+
+
+def test_a_mesh_without_area_is_left_out(tmp_path: Path) -> None:
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
+    (tmp_path / "empty.obj").write_text("v 0 0 0\n")
+    meshes = "".join(f'<shape type="obj"><string name="filename" value="{n}.obj"/></shape>' for n in ("flat", "empty"))
+    (tmp_path / "scene.xml").write_text(scene(meshes + '<shape type="sphere"/>'))
+    with pytest.warns(ImportedSceneWarning, match=r"are left out: obj_1, obj_2 \(2 in all\)"):
+        loaded = torchpt.load(str(tmp_path / "scene.xml"))
+    assert {part.shape for part in loaded.built.parts} == {"sphere_3"}
+    with pytest.raises(AssetError, match="without area"):
+        torchpt.load(str(tmp_path / "scene.xml"), overrides={"import.strict": True})
+    with pytest.raises(AssetError, match="without area"):
+        camera = {"type": "perspective", "origin": [0, 0, 5], "target": [0, 0, 0]}
+        torchpt.load({"camera": camera, "shapes": {"a": {"type": "mesh", "path": str(tmp_path / "flat.obj")}}})
+
+
+def test_unknown_properties_warn(assets: Path) -> None:
+    (assets / "scene.xml").write_text(
+        scene('<shape type="sphere"><float name="radios" value="1"/><bsdf type="diffuse"/></shape>')
+    )
+    with pytest.warns(ImportedSceneWarning, match='shape "sphere": the property radios is unknown here and left out'):
+        read_mitsuba(assets / "scene.xml", "scene.xml", ImportOptions())
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "well-formed XML"),
+        ("<scene", "well-formed XML"),
+        ("<a/>", "<scene> as the outermost element"),
+        ('<scene version="x"/>', "a version such as"),
+        ('<scene version="3.0.0"/>', "a sensor"),
+        ('<!DOCTYPE scene [<!ENTITY a "b">]><scene version="3.0.0">&a;</scene>', "without document types"),
+        ('<!DOCTYPE scene SYSTEM "http://x/y.dtd"><scene version="3.0.0"/>', "without document types"),
+        (scene('<shape type="sphere"><ref id="none"/></shape>'), "the id of an element"),
+        (scene('<shape type="sphere"><float name="radius" value="a"/></shape>'), "numbers between blanks"),
+        (scene('<shape type="sphere"><float name="radius" value="nan"/></shape>'), "finite numbers"),
+        (scene('<shape type="sphere"><float name="radius" value="-1"/></shape>'), "a radius > 0"),
+        (scene('<shape type="sphere"><float value="1"/></shape>'), "an attribute name"),
+        (scene("<shape/>"), "an attribute type"),
+        (scene("<wish/>"), "one of the elements"),
+        (scene('<bsdf type="diffuse" id="a"/><bsdf type="diffuse" id="a"/>'), "an id of its own"),
+        (scene('<shape type="sphere"><boolean name="flip_normals" value="1"/></shape>'), "true or false"),
+        (
+            scene('<shape type="sphere"><bsdf type="conductor"><string name="material" value="Xx"/></bsdf></shape>'),
+            "metals",
+        ),
+        (scene('<shape type="sphere"><transform name="to_world"><scale value="0"/></transform></shape>'), "inverted"),
+        (scene('<shape type="sphere"><transform name="to_world"><turn/></transform></shape>'), "inside a transform"),
+        (
+            scene('<shape type="sphere"><ref id="a"/></shape><bsdf type="twosided" id="a"><ref id="a"/></bsdf>'),
+            "deep inside each other",
+        ),
+        (scene("<a>" * 70 + "</a>" * 70), "nested at most"),
+    ],
+)
+def test_errors_are_one_line_and_name_a_line(assets: Path, text: str, words: str) -> None:
+    found = error(assets, text)
+    assert words in found and found.startswith("scene.xml: line ")
+
+
+def test_keys_of_the_import_are_checked(assets: Path) -> None:
+    file = assets / "scene.xml"
+    file.write_text(scene('<shape type="sphere"/>'))
+    for key, value, words in (
+        ("import.strict", 1, "true or false"),
+        ("import.missing", "grey", "error or warn"),
+        ("import.nothing", True, "import.strict, import.missing"),
+        ("scene_params", 3, "a mapping"),
+    ):
+        with pytest.raises(SceneError, match=words):
+            read_description(str(file), overrides={key: value})
+    described = read_description(str(file), overrides={"camera.fov": 20, "import": {"strict": True}})
+    assert described.camera["fov"] == 20.0
+    with pytest.raises(SceneError, match="a key of a scene"):
+        read_description("cornell_box", overrides={"import.strict": True})
+
+
+# ---- Pictures
+
+
+def test_a_scene_renders_and_reads_settings(assets: Path) -> None:
+    (assets / "scene.xml").write_text(EXACT["crop"])
+    image = torchpt.render(torchpt.load(str(assets / "scene.xml")), compile="off", spp=1)
+    assert image.shape == (16, 16, 3) and bool(torch.isfinite(image).all())
+
+
+def test_one_sided_surfaces_are_black_from_behind(assets: Path) -> None:
+    found = {}
+    for name in ("one_sided", "twosided"):
+        (assets / "scene.xml").write_text(EXACT[name])
+        found[name] = torchpt.render(torchpt.load(str(assets / "scene.xml")), compile="off", spp=4).mean()
+    assert found["one_sided"] < 0.97 * found["twosided"]

@@ -1,0 +1,474 @@
+"""Put a scene of Mitsuba together: references, files, materials, shapes, lights and settings, as a YAML scene has them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torchpt.core.errors import SceneError, did_you_mean
+from torchpt.core.files import is_regular
+from torchpt.scene.formats.mitsuba.bsdfs import BSDFS, UNKNOWN
+from torchpt.scene.formats.mitsuba.elements import Element, parse_scene, walk
+from torchpt.scene.formats.mitsuba.emitters import EMITTERS
+from torchpt.scene.formats.mitsuba.notes import Notes
+from torchpt.scene.formats.mitsuba.plugins import Plugin, Twin, left_out, nearest
+from torchpt.scene.formats.mitsuba.properties import OBJECTS, Properties
+from torchpt.scene.formats.mitsuba.sensors import (
+    FILMS,
+    FILTERS,
+    INTEGRATORS,
+    SAMPLERS,
+    SENSORS,
+    UNKNOWN_FILM,
+    UNKNOWN_INTEGRATOR,
+    UNKNOWN_SAMPLER,
+)
+from torchpt.scene.formats.mitsuba.shapes import SHAPES, posed
+from torchpt.scene.formats.mitsuba.textures import TEXTURES
+from torchpt.scene.formats.mitsuba.versions import plugin_name
+
+__all__ = ["PLUGINS", "ImportOptions", "Importer", "read_mitsuba", "split_import_keys"]
+
+#: The tables of plugins by tag.
+PLUGINS: dict[str, Mapping[str, Plugin]] = {
+    "bsdf": BSDFS,
+    "texture": TEXTURES,
+    "shape": SHAPES,
+    "emitter": EMITTERS,
+    "sensor": SENSORS,
+    "film": FILMS,
+    "rfilter": FILTERS,
+    "sampler": SAMPLERS,
+    "integrator": INTEGRATORS,
+}
+
+#: Greatest depth of objects inside objects, references followed.
+MAX_NESTING = 32
+_UNKNOWN_TEXTURE = nearest("a colour", lambda p, importer: [0.5, 0.5, 0.5], "it is unknown; grey takes its place")
+_UNKNOWN_SENSOR = nearest("perspective", SENSORS["perspective"].build, "it is unknown")
+_UNKNOWN = left_out("it is unknown")
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """What the keys ``import`` and ``scene_params`` say.
+
+    Attributes:
+        strict: an error in place of every warning.
+        missing: a missing file is a warning; else an error.
+        parameters: values of the scene's parameters as text, by name.
+    """
+
+    strict: bool = False
+    missing: bool = False
+    parameters: Mapping[str, str] = field(default_factory=dict)
+
+
+def split_import_keys(overrides: Mapping[str, Any] | None) -> tuple[ImportOptions, dict[str, Any]]:
+    """Take ``import`` and ``scene_params`` out of the overrides of a scene.
+
+    Args:
+        overrides: values by dotted key, such as ``import.strict`` or ``scene_params.spp``, or by block.
+
+    Returns:
+        The options, and the other overrides.
+
+    Raises:
+        SceneError: an unknown key, or a wrong value.
+    """
+    rest: dict[str, Any] = {}
+    keys: dict[str, Any] = {}
+    parameters: dict[str, str] = {}
+    for name, value in (overrides or {}).items():
+        block, _, key = str(name).lstrip("+").partition(".")
+        if block not in ("import", "scene_params"):
+            rest[name] = value
+            continue
+        if not key and not isinstance(value, Mapping):
+            raise SceneError(block, value, "a mapping, such as {strict: true} or {spp: 16}")
+        for inner, item in {key: value}.items() if key else value.items():
+            if block == "scene_params":
+                parameters[str(inner)] = _as_text(f"scene_params.{inner}", item)
+            else:
+                keys[str(inner)] = item
+    for key, accepted in (("strict", (True, False)), ("missing", ("error", "warn"))):
+        if key in keys and not any(keys[key] is value or keys[key] == value != 1 for value in accepted):
+            words = "true or false" if key == "strict" else "error or warn"
+            raise SceneError(f"import.{key}", keys[key], words)
+    for key in keys:
+        if key not in ("strict", "missing"):
+            raise SceneError(f"import.{key}", keys[key], "one of the keys import.strict, import.missing")
+    return ImportOptions(bool(keys.get("strict", False)), keys.get("missing") == "warn", parameters), rest
+
+
+def _as_text(key: str, value: Any) -> str:
+    """Return the value of a parameter as it stands in XML."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, list | tuple) and all(isinstance(item, int | float) for item in value):
+        return " ".join(map(repr, value))
+    raise SceneError(key, value, "a number, a word, true or false")
+
+
+def read_mitsuba(path: Path, file: str, options: ImportOptions) -> dict[str, Any]:
+    """Read a scene of Mitsuba.
+
+    Args:
+        path: the file.
+        file: the same as errors show it.
+        options: see :class:`ImportOptions`.
+
+    Returns:
+        The scene in the form of a YAML file; relative paths start at the file's folder. Shapes may have ``mesh`` in place of
+        ``path``: parts that are not as the file has them.
+
+    Raises:
+        SceneError: a scene that cannot be read, with its line; a missing file; any warning where the import is strict.
+
+    Warns:
+        ImportedSceneWarning: what has no exact twin, one warning for each kind.
+    """
+    root = parse_scene(path, file, options.parameters)
+    importer = Importer(root, path.resolve().parent, options)
+    scene = importer.scene()
+    importer.notes.warn()
+    return scene
+
+
+class Importer:
+    """Importer of one scene.
+
+    Attributes:
+        notes: the warnings so far.
+        materials: named materials that something uses, by name.
+        textures: named textures that something uses, by name.
+        shapes: shapes by name.
+        lights: lights by name.
+    """
+
+    def __init__(self, root: Element, base: Path, options: ImportOptions) -> None:
+        self.root, self.base, self.options = root, base, options
+        self.notes = Notes(strict=options.strict)
+        self.materials: dict[str, Any] = {}
+        self.textures: dict[str, Any] = {}
+        self.shapes: dict[str, Any] = {}
+        self.lights: dict[str, Any] = {}
+        self._meshes_of_groups: dict[int, dict[int, str]] = {}  # by id of a group: shape drawn, by id of its element
+        self._depth = 0
+        self._folders = [base]
+        self._ids: dict[str, Element] = {}
+        self._find_ids()
+
+    def _find_ids(self) -> None:
+        """Collect ids, ``<alias>`` and ``<path>``."""
+        aliases: list[Element] = []
+        for element in walk(self.root):
+            if element.tag == "alias":
+                aliases.append(element)
+            elif element.tag == "path":
+                value = element.attributes.get("value", "")
+                self._folders.append(element.folder / value.replace("\\", "/"))
+            elif element.tag in OBJECTS and element.id:
+                if element.id in self._ids:
+                    first = self._ids[element.id]
+                    raise element.error(element.id, f"an id of its own ({first.file}:{first.line} has it too)")
+                self._ids[element.id] = element
+        for alias in aliases:
+            source, name = alias.attributes.get("id", ""), alias.attributes.get("as", "")
+            if not name or name in self._ids:
+                raise alias.error(name, "a new name as the attribute `as`")
+            self._ids[name] = self._with_id(source, alias)
+
+    def _with_id(self, name: str, element: Element) -> Element:
+        if name not in self._ids:
+            raise element.error(name, f"the id of an element{did_you_mean(name, self._ids)}")
+        return self._ids[name]
+
+    def target(self, reference: Element) -> Element:
+        """Return the element that a ``<ref>`` names.
+
+        Raises:
+            SceneError: nothing has this id.
+        """
+        return self._with_id(reference.attributes.get("id", ""), reference)
+
+    # ---- Files
+
+    def find(self, element: Element, name: str) -> Path | None:
+        """Return the file that an element names, or None where it is missing and that is a warning.
+
+        Raises:
+            SceneError: no such file.
+        """
+        if name and name.isprintable():
+            for folder in (element.folder, *self._folders):
+                for candidate in dict.fromkeys((name, name.replace("\\", "/"))):
+                    try:
+                        if is_regular(folder / candidate):
+                            return folder / candidate
+                    except (OSError, ValueError):
+                        continue
+        if self.options.missing:
+            self.notes.add(element, f"the file {name} is not there: grey takes its place, or nothing that of a mesh")
+            return None
+        raise element.error(name, "a file that is there (import.missing=warn goes on without it)")
+
+    def path(self, path: Path) -> str:
+        """Return a file as a scene file names it: relative to the scene's folder if below it."""
+        try:
+            text = os.path.relpath(path, self.base) if path.resolve().is_relative_to(self.base) else str(path.resolve())
+        except (OSError, ValueError):
+            text = str(path)
+        return f"./{text}" if text.startswith("$") else text
+
+    # ---- Plugins
+
+    def build(self, table: Mapping[str, Plugin], element: Element, unknown: Plugin) -> Any:
+        """Return what becomes of an element by the table of its plugins; warn where that is not exact.
+
+        Raises:
+            SceneError: a wrong value.
+        """
+        if not element.type:
+            raise element.error(f"<{element.written}>", "an attribute type")
+        name = plugin_name(element.tag, element.type)
+        plugin = table.get(name, unknown)
+        if plugin.twin is Twin.LEFT_OUT:
+            self.notes.add(element, f"{element.label} is left out: {plugin.note}")
+            return None
+        if plugin.twin is Twin.NEAREST:
+            self.notes.add(element, f"{element.label} becomes {plugin.becomes}: {plugin.note}")
+        if self._depth >= MAX_NESTING:
+            raise element.error(
+                element.label, f"objects at most {MAX_NESTING} deep inside each other, references followed"
+            )
+        self._depth += 1
+        properties = Properties(element, name, self)
+        result = plugin.build(properties, self)
+        if plugin is not unknown:
+            properties.left_over()
+        self._depth -= 1
+        return result
+
+    def material(self, element: Element) -> dict[str, Any]:
+        """Return the material of a ``<bsdf>``."""
+        if element.tag != "bsdf":
+            raise element.error(f"<{element.written}>", "a bsdf")
+        if element.id and element.id in self.materials:
+            return self.materials[element.id]
+        return self.build(BSDFS, element, UNKNOWN)
+
+    def texture(self, element: Element) -> Any:
+        """Return a texture for a parameter: a reference to a named one, one in place, or a colour."""
+        if element.id and element.id in self.textures:
+            return {"texture": element.id}
+        value = self.build(TEXTURES, element, _UNKNOWN_TEXTURE)
+        if not element.id or not isinstance(value, dict) or "texture" in value:
+            return value
+        name = _key(element.id)
+        self.textures[name] = value
+        return {"texture": name}
+
+    # ---- The scene
+
+    def scene(self) -> dict[str, Any]:
+        """Return the scene in the form of a YAML file."""
+        found: dict[str, list[Element]] = {tag: [] for tag in OBJECTS}
+        for child in self.root.children:
+            target = self.target(child) if child.tag == "ref" else child
+            if target.tag in found:
+                found[target.tag].append(target)
+            elif target.tag not in ("alias", "path"):
+                known = ", ".join((*OBJECTS, "default", "include", "alias", "ref", "path"))
+                raise child.error(f"<{child.written}>", f"one of the elements {known}")
+        if not found["sensor"]:
+            raise self.root.error("no sensor", "a sensor (a camera)")
+        settings = self._settings(found["sensor"], found["integrator"])
+        for element in found["shape"]:
+            self._shape(element)
+        for element in found["emitter"]:
+            self._emitter(element)
+        for tag in ("medium", "phase", "volume", "subsurface"):
+            for element in found[tag]:
+                self.notes.add(element, f"{element.label} is left out: there are no media")
+        blocks = {name: getattr(self, name) for name in ("textures", "materials", "shapes", "lights")}
+        return {"version": 1, **settings, **{name: block for name, block in blocks.items() if block}}
+
+    def _settings(self, sensors: list[Element], integrators: list[Element]) -> dict[str, Any]:
+        """Return camera, film, sampler, integrator and ``render.spp``."""
+        if len(sensors) > 1:
+            self.notes.add(sensors[1], f"{len(sensors) - 1} more sensor is left out: the first is rendered")
+        sensor = sensors[0]
+        inner: dict[str, Element] = {}
+        rest: list[Element] = []
+        for child in sensor.children:
+            target = self.target(child) if child.tag == "ref" else child
+            if target.tag in ("film", "sampler"):
+                inner[target.tag] = target
+            else:
+                rest.append(child)
+        bare = Element(**{**vars(sensor), "children": rest})
+        camera = self.build(SENSORS, bare, _UNKNOWN_SENSOR)
+        film = {"width": 768, "height": 576, "filter": {"type": "gaussian"}}
+        if "film" in inner:
+            film = self.build(FILMS, inner["film"], UNKNOWN_FILM)
+        sampler, count = "independent", 4
+        if "sampler" in inner:
+            sampler, count = self.build(SAMPLERS, inner["sampler"], UNKNOWN_SAMPLER)
+        integrator: dict[str, Any] = {"type": "path", "max_depth": -1}
+        if integrators:
+            integrator = self.build(INTEGRATORS, integrators[-1], UNKNOWN_INTEGRATOR)
+        layers = integrator.pop("aovs", [])
+        if layers:
+            film = film | {"aovs": layers}
+        return {
+            "camera": camera,
+            "film": film,
+            "integrator": integrator,
+            "sampler": {"type": sampler},
+            "render": {"spp": count},
+        }
+
+    def _shape(self, element: Element) -> None:
+        """Add a shape of the scene."""
+        name = plugin_name(element.tag, element.type)
+        if name == "shapegroup":
+            return  # its instances are drawn
+        if name == "instance":
+            self._instance(element)
+            return
+        shape = self._plain_shape(element)
+        if shape is not None:
+            self.shapes[self._free(self.shapes, element)] = shape
+
+    def _plain_shape(self, element: Element) -> dict[str, Any] | None:
+        """Return a shape with its material and emission; None where it is left out."""
+        inner, rest, has_medium = self._taken_apart(element)
+        bare = Element(**{**vars(element), "children": rest})
+        shape = self.build(SHAPES, bare, _UNKNOWN)
+        if shape is None:
+            return None
+        emitter = inner.get("emitter")
+        material, name = self._material_of(inner.get("bsdf"), lit=emitter is not None, has_medium=has_medium)
+        if emitter is not None:
+            radiance = self._radiance(emitter)
+            if isinstance(radiance, dict):
+                material, name = {**material, "emission": radiance}, None
+            elif radiance is not None:
+                shape["emission"] = radiance
+        return shape | {"material": material if name is None else name}
+
+    def _taken_apart(self, element: Element) -> tuple[dict[str, Element], list[Element], bool]:
+        """Return BSDF and emitter of a shape, its other children, and whether it has a medium."""
+        inner: dict[str, Element] = {}
+        rest: list[Element] = []
+        has_medium = False
+        for child in element.children:
+            target = self.target(child) if child.tag == "ref" else child
+            if target.tag in ("bsdf", "emitter"):
+                inner[target.tag] = target
+            elif target.tag in ("medium", "subsurface"):
+                has_medium |= target.tag == "medium"
+                self.notes.add(target, f"{target.label} is left out: there are no media")
+            else:
+                rest.append(child)
+        return inner, rest, has_medium
+
+    def _material_of(
+        self, element: Element | None, *, lit: bool, has_medium: bool
+    ) -> tuple[dict[str, Any], str | None]:
+        """Return the material of a shape, and its name where it has one."""
+        if element is None:
+            if has_medium:  # the border of a medium
+                return {"type": "null"}, None
+            return {"type": "diffuse", "two_sided": False} | ({"reflectance": [0.0] * 3} if lit else {}), None
+        material = self.material(element)
+        if not element.id:
+            return material, None
+        name = _key(element.id)
+        self.materials[name] = material
+        return material, name
+
+    def _radiance(self, element: Element) -> Any:
+        """Return the radiance of an area emitter: a colour or a texture; None where the emitter is left out."""
+        name = plugin_name(element.tag, element.type)
+        if name != "area":
+            self.notes.add(element, f"{element.label} on a shape is left out: only area emitters are on shapes")
+            return None
+        properties = Properties(element, name, self)
+        properties.ignore("sampling_weight")
+        found = properties.slot("radiance", [1.0] * 3, light=True)
+        properties.left_over()
+        return found
+
+    def _instance(self, element: Element) -> None:
+        """Draw the shapes of a group: the first time as they are, then as instances where they are meshes."""
+        groups: list[Element] = []
+        rest: list[Element] = []
+        for child in element.children:
+            target = self.target(child) if child.tag == "ref" else child
+            (groups if target.tag == "shape" else rest).append(target if target.tag == "shape" else child)
+        if len(groups) != 1 or plugin_name("shape", groups[0].type) != "shapegroup":
+            raise element.error(element.label, "one reference to a shapegroup inside it")
+        properties = Properties(Element(**{**vars(element), "children": rest}), "instance", self)
+        pose = properties.transform()
+        properties.left_over()
+        drawn = self._meshes_of_groups.setdefault(id(groups[0]), {})
+        for child in groups[0].children:
+            target = self.target(child) if child.tag == "ref" else child
+            if target.tag != "shape" or plugin_name("shape", target.type) in ("shapegroup", "instance"):
+                self.notes.add(target, f"{target.label} inside a shapegroup is left out")
+                continue
+            before = self.shapes.get(drawn.get(id(target), ""))
+            shape = self._plain_shape(target) if before is None or before["type"] != "mesh" else None
+            if shape is not None:
+                name = self._free(self.shapes, target)
+                self.shapes[name] = posed(shape, pose)
+                drawn[id(target)] = name
+            elif before is not None:
+                own = self._own_pose(target)
+                copy = posed(posed({"type": "instance", "of": drawn[id(target)]}, own), pose)
+                self.shapes[self._free(self.shapes, target)] = copy
+
+    def _own_pose(self, element: Element) -> Any:
+        """Return the transform of a shape of a group."""
+        _, rest, _ = self._taken_apart(element)
+        plugin = plugin_name(element.tag, element.type)
+        return Properties(Element(**{**vars(element), "children": rest}), plugin, self).transform()
+
+    def _emitter(self, element: Element) -> None:
+        """Add a light that is on no shape."""
+        if plugin_name(element.tag, element.type) == "area":
+            self.notes.add(element, f"{element.label} is left out: it is on no shape")
+            return
+        for light in self.build(EMITTERS, element, _UNKNOWN) or ():
+            if light["type"] in _ENVIRONMENTS and any(other["type"] in _ENVIRONMENTS for other in self.lights.values()):
+                self.notes.add(element, f"{element.label} is left out: there is an environment before it")
+                continue
+            self.lights[self._free(self.lights, element, light["type"])] = light
+
+    def _free(self, taken: Mapping[str, Any], element: Element, kind: str = "") -> str:
+        """Return a name that is not taken: the id of an element, else its type and a number."""
+        stem = _key(element.id) if element.id else kind or element.type
+        if element.id and stem not in taken:
+            return stem
+        number = len(taken) + 1
+        while f"{stem}_{number}" in taken:
+            number += 1
+        return f"{stem}_{number}"
+
+
+_ENVIRONMENTS = ("envmap", "constant")
+
+
+def _key(name: str) -> str:
+    """Return an id as a key of a scene file."""
+    found = "".join(letter if letter.isprintable() else "_" for letter in name).strip()[:200]
+    return found or "_"

@@ -1,0 +1,213 @@
+"""Read the properties of one plugin by their present names, and warn of those that nobody asked for."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.scene.formats.mitsuba import values
+from torchpt.scene.formats.mitsuba.elements import Element
+from torchpt.scene.formats.mitsuba.versions import property_name
+
+if TYPE_CHECKING:
+    from torchpt.scene.formats.mitsuba.importer import Importer
+
+__all__ = ["OBJECTS", "Properties"]
+
+#: Tags of objects, which have a plugin; all other tags are values.
+OBJECTS = (
+    "bsdf", "texture", "shape", "emitter", "sensor", "film", "sampler", "rfilter", "integrator", "medium", "phase", "volume",
+    "subsurface",
+)  # fmt: skip
+_COLOURS = ("rgb", "srgb", "spectrum", "blackbody", "color", "float", "integer")
+_VALUES = (*_COLOURS, "boolean", "string", "point", "vector", "transform", "animation")
+_LUMINANCE = np.array((0.212671, 0.715160, 0.072169))
+
+
+class Properties:
+    """Properties of an element.
+
+    Attributes:
+        element: the element.
+        plugin: present name of its plugin.
+    """
+
+    def __init__(self, element: Element, plugin: str, importer: Importer) -> None:
+        self.element, self.plugin, self.importer = element, plugin, importer
+        self._values: dict[str, Element] = {}
+        self._objects: list[tuple[str, Element]] = []  # name, or "", and the object
+        self._used: set[str] = set()
+        self._taken: set[int] = set()
+        for child in element.children:
+            name = property_name(element.tag, plugin, child.attributes.get("name", ""))
+            target = importer.target(child) if child.tag == "ref" else child
+            if target.tag in OBJECTS:
+                self._objects.append((name, target))
+            elif target.tag not in _VALUES:
+                known = ", ".join((*_VALUES, *OBJECTS, "ref"))
+                raise child.error(f"<{child.written}>", f"one of the elements {known}")
+            elif not name:
+                raise child.error(f"<{child.written}>", "an attribute name")
+            elif name in self._values:
+                raise child.error(name, f"a property only once (line {self._values[name].line} has it too)")
+            else:
+                self._values[name] = target
+
+    @property
+    def modern(self) -> bool:
+        """Return True for a file of Mitsuba 2 or 3, whose defaults differ from those before."""
+        return self.element.version >= (2,)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the values that are given."""
+        return tuple(self._values)
+
+    def has(self, *names: str) -> bool:
+        """Return True where any of the properties is given."""
+        return any(name in self._values or any(name == other for other, _ in self._objects) for name in names)
+
+    def note(self, text: str) -> None:
+        """Note what was done in place of what a property asks for; ``text`` follows the element's name."""
+        self.importer.notes.add(self.element, f"{self.element.label}: {text}")
+
+    def ignore(self, *names: str) -> None:
+        """Mark properties as read that change no picture."""
+        self._used.update(names)
+
+    def number(self, name: str, default: float) -> float:
+        """Return a number."""
+        found = self._text(name)
+        return default if found is None else values.number(self._values[name], found)
+
+    def integer(self, name: str, default: int) -> int:
+        """Return a whole number."""
+        found = self._text(name)
+        return default if found is None else values.integer(self._values[name], found)
+
+    def flag(self, name: str, default: bool = False) -> bool:
+        """Return a boolean."""
+        found = self._text(name)
+        return default if found is None else values.boolean(self._values[name], found)
+
+    def text(self, name: str, default: str = "") -> str:
+        """Return a string, without blanks around it."""
+        found = self._text(name)
+        return default if found is None else found.strip()
+
+    def point(self, name: str) -> list[float] | None:
+        """Return a point or a vector, or None."""
+        element = self._value(name)
+        return None if element is None else values.vector(element)
+
+    def transform(self, name: str = "to_world") -> NDArray[np.float64]:
+        """Return a transform ``(4, 4)``, by default the identity; of an ``<animation>`` the first one."""
+        element = self._value(name)
+        if element is None:
+            return np.eye(4)
+        if element.tag == "animation":
+            self.note("the animation is left out: its first transform is taken")
+            inner = [child for child in element.children if child.tag == "transform"]
+            element = inner[0] if inner else element
+            return values.transform(element) if inner else np.eye(4)
+        return values.transform(element)
+
+    def colour(self, name: str, default: Any = None, *, light: bool = False) -> Any:
+        """Return a colour ``[r, g, b]``, or ``default``; a texture's place is taken by grey."""
+        found = self.slot(name, default, light=light, bounded=False)
+        if isinstance(found, dict):
+            self.note(f"the texture of {name} becomes grey")
+            return [0.5] * 3
+        return found
+
+    def slot(self, name: str, default: Any = None, *, light: bool = False, bounded: bool = True) -> Any:
+        """Return a colour ``[r, g, b]`` or a texture as a scene file has it, or ``default``.
+
+        Args:
+            name: name of the property.
+            default: returned where it is not given.
+            light: True for the colour of a light.
+            bounded: True where the colour is a fraction; more than 1 becomes 1, with a warning.
+        """
+        texture = self._texture(name)
+        if texture is not None:
+            return self.importer.texture(texture)
+        element = self._value(name)
+        if element is None:
+            return default
+        if element.tag not in _COLOURS:
+            raise element.error(f"<{element.written}>", f"a colour or a texture as {name}")
+        found = values.colour(element, light=light, find=self.importer.find)
+        high = 1.0 if bounded and not light else values.LARGEST
+        if min(found) < 0.0 or max(found) > high:
+            self.note(f"{name} outside of 0..1 is clamped" if high == 1.0 else f"{name} below 0 becomes 0")
+            found = tuple(min(max(value, 0.0), high) for value in found)
+        return list(found)
+
+    def scalar(self, name: str, default: Any = None, *, high: float = 1.0) -> Any:
+        """Return a number in 0..``high`` or a texture, or ``default``; numbers outside are clamped, with a warning."""
+        found = self.slot(name, None, bounded=False)
+        if found is None or isinstance(found, dict):
+            return default if found is None else found
+        value = found[0] if len(set(found)) == 1 else float(_LUMINANCE @ found)
+        if value > high:
+            self.note(f"{name} above {high:g} becomes {high:g}")
+        return min(value, high)
+
+    def objects(self, *tags: str) -> list[Element]:
+        """Return the objects of some tags, in the order of the file."""
+        found = [element for _, element in self._objects if element.tag in tags]
+        self._taken.update(map(id, found))
+        return found
+
+    def only(self, tag: str) -> Element:
+        """Return the one object of a tag.
+
+        Raises:
+            SceneError: there is none, or there are several.
+        """
+        found = self.objects(tag)
+        if len(found) != 1:
+            raise self.element.error(self.element.label, f"one {tag} inside it, not {len(found)}")
+        return found[0]
+
+    def file(self, name: str = "filename") -> Any:
+        """Return the file that a property names, None where it is missing and that is a warning.
+
+        Raises:
+            SceneError: the property or the file is missing.
+        """
+        element = self._value(name)
+        if element is None:
+            raise self.element.error(self.element.label, f"a string {name}")
+        return self.importer.find(element, element.attributes.get("value", "").strip())
+
+    def left_over(self) -> None:
+        """Warn of properties and objects that were not read."""
+        for name in self._values:
+            if name not in self._used:
+                self.note(f"the property {name} is unknown here and left out")
+        for _, element in self._objects:
+            if id(element) not in self._taken:
+                self.note(f"the {element.label} inside is left out")
+
+    def _value(self, name: str) -> Element | None:
+        self._used.add(name)
+        return self._values.get(name)
+
+    def _text(self, name: str) -> str | None:
+        element = self._value(name)
+        if element is None:
+            return None
+        if "value" not in element.attributes:
+            raise element.error(f"<{element.written}>", f"an attribute value for {name}")
+        return element.attributes["value"]
+
+    def _texture(self, name: str) -> Element | None:
+        for other, element in self._objects:
+            if other == name and element.tag == "texture":
+                self._taken.add(id(element))
+                return element
+        return None

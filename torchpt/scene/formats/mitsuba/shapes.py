@@ -1,0 +1,150 @@
+"""Mitsuba's shapes: what each becomes here. A shape becomes a mapping of the block ``shapes``, without its material."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.core.errors import AssetError, SceneError
+from torchpt.math.transforms import is_usable
+from torchpt.physics.shapes import KINDS
+from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, left_out
+from torchpt.scene.formats.mitsuba.properties import Properties
+from torchpt.scene.meshes import MeshPart, load_mesh
+
+if TYPE_CHECKING:
+    from torchpt.scene.formats.mitsuba.importer import Importer
+
+__all__ = ["SHAPES", "posed"]
+
+Shape = dict[str, Any]
+Matrix = NDArray[np.float64]
+
+
+def posed(shape: Shape, matrix: Matrix) -> Shape:
+    """Return a shape with a transform ``(4, 4)`` after its own."""
+    before = np.array(shape["transform"][0]["matrix"]) if "transform" in shape else np.eye(4)
+    total = matrix @ before
+    kept = {key: value for key, value in shape.items() if key != "transform"}
+    if np.array_equal(total, np.eye(4)):
+        return kept
+    return kept | {"transform": [{"matrix": [[float(x) for x in row] for row in total]}]}
+
+
+def _shape(p: Properties, type: str, own: Matrix | None = None, **keys: Any) -> Shape:
+    """Return a shape with the transform and the flag that all of Mitsuba's have; keys of None are left out."""
+    found = {"type": type, **{key: value for key, value in keys.items() if value is not None}}
+    if p.flag("flip_normals"):
+        found["flip_normals"] = True
+    pose = p.transform()
+    pose = pose if own is None else pose @ own
+    if type in ("rectangle", "disk"):
+        pose = _with_normal(pose)
+    if not is_usable(pose):
+        raise p.element.error(pose[:3].tolist(), "a to_world that can be inverted")
+    return posed(found, pose)
+
+
+def _with_normal(pose: Matrix) -> Matrix:
+    """Return a pose of a flat shape with a third axis, which does not matter, where that is 0."""
+    if is_usable(pose):
+        return pose
+    across = np.cross(pose[:3, 0], pose[:3, 1])
+    length = np.linalg.norm(across)
+    if length > 0.0:
+        pose = pose.copy()
+        pose[:3, 2] = across / np.sqrt(length)
+    return pose
+
+
+def _mesh(p: Properties, importer: Importer) -> Shape | None:
+    p.ignore("max_smooth_angle", "collapse", "optimize", "shape_index")
+    if p.has("max_smooth_angle"):
+        p.note("max_smooth_angle is left out: normals are smooth, or those of the faces")
+    path = p.file()
+    upright = p.plugin == "obj"  # whether v is flipped where nothing is said
+    flips = p.flag("flip_tex_coords", upright)
+    flat = p.flag("face_normals") or None
+    if path is None:
+        p.transform()
+        return None
+    if flips == upright:
+        return _shape(p, "mesh", path=importer.path(path), face_normals=flat)
+    return _shape(p, "mesh", mesh=_flipped(p, path), face_normals=flat)
+
+
+def _flipped(p: Properties, path: Path) -> Any:
+    """Return the parts of a mesh file, joined to one, with flipped texture coordinates."""
+    try:
+        parts = load_mesh(path, materials=False)
+    except AssetError as error:
+        raise SceneError(f"line {p.element.line}", str(path), error.problem, p.element.file) from None
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
+    normals = [part.normals for part in parts if part.normals is not None]
+    uvs = [part.uvs for part in parts if part.uvs is not None]
+    joined = MeshPart(
+        "",
+        np.concatenate([part.vertices for part in parts]),
+        faces,
+        normals=np.concatenate(normals) if len(normals) == len(parts) else None,
+        uvs=np.concatenate(uvs) * [1.0, -1.0] + [0.0, 1.0] if len(uvs) == len(parts) else None,
+    )
+    return (joined,)
+
+
+def _sphere(p: Properties, importer: Importer) -> Shape:
+    radius = p.number("radius", 1.0)
+    if not radius > 0.0:
+        raise p.element.error(radius, "a radius > 0")
+    return _shape(p, "sphere", center=p.point("center"), radius=None if radius == 1.0 else radius)
+
+
+def _cylinder(p: Properties, importer: Importer) -> Shape:
+    """Return the side of a cylinder between two points. Mitsuba's axis is z, from 0 to 1; ours is y, about 0."""
+    radius, low, high = p.number("radius", 1.0), p.point("p0") or [0.0] * 3, p.point("p1") or [0.0, 0.0, 1.0]
+    along = np.subtract(high, low)
+    length = float(np.linalg.norm(along))
+    if not (length > 0.0 and radius > 0.0):
+        raise p.element.error([low, high, radius], "two points p0 and p1, and a radius > 0")
+    matrix = np.eye(4)
+    z = along / length
+    # The frame about an axis of Duff et al., "Building an Orthonormal Basis, Revisited", 2017, as in Mitsuba.
+    sign = 1.0 if z[2] >= 0.0 else -1.0
+    a = -1.0 / (sign + z[2])
+    b = z[0] * z[1] * a
+    matrix[:3, 0] = radius * np.array([1.0 + sign * z[0] * z[0] * a, sign * b, -sign * z[0]])
+    matrix[:3, 1] = radius * np.array([b, sign + z[1] * z[1] * a, -z[1]])
+    matrix[:3, 2], matrix[:3, 3] = along, low
+    ours = KINDS["cylinder"].own({"center": (0.0, 0.0, 0.0), "radius": 1.0, "height": 1.0})
+    return _shape(p, "cylinder", matrix @ np.linalg.inv(ours), capped=False)
+
+
+def _simple(type: str) -> Any:
+    return lambda p, importer: _shape(p, type)
+
+
+#: Plugins of the tag ``shape``; ``shapegroup`` and ``instance`` are taken apart by the importer.
+SHAPES: dict[str, Plugin] = {
+    "obj": exact("mesh", _mesh),
+    "ply": exact("mesh", _mesh),
+    "sphere": exact("sphere", _sphere),
+    "cylinder": exact("cylinder", _cylinder, "without caps"),
+    "rectangle": exact("rectangle", _simple("rectangle")),
+    "disk": exact("disk", _simple("disk")),
+    "cube": exact("cube", _simple("cube")),
+    "shapegroup": exact("shapes", _simple("shapes"), "its first instance, and instances of that"),
+    "instance": exact("instance", _simple("instance"), "other shapes than meshes are copied"),
+    "serialized": left_out("the format is not read"),
+    "hair": left_out("there are no curves"),
+    "bsplinecurve": left_out("there are no curves"),
+    "linearcurve": left_out("there are no curves"),
+    "heightfield": left_out("there are no heightfields; displacement of a mesh is like it"),
+    "deformable": left_out("meshes do not move"),
+    "sdfgrid": left_out("there are no distance fields"),
+    "ellipsoids": left_out("there are no ellipsoids of volumes"),
+    "ellipsoidsmesh": left_out("there are no ellipsoids of volumes"),
+}

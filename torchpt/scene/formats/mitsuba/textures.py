@@ -1,0 +1,142 @@
+"""Mitsuba's textures: what each becomes here. A texture becomes a mapping of a scene file, or the colour that stands for it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, nearest
+from torchpt.scene.formats.mitsuba.properties import Properties
+
+if TYPE_CHECKING:
+    from torchpt.scene.formats.mitsuba.importer import Importer
+
+__all__ = ["TEXTURES"]
+
+_GREY = [0.5, 0.5, 0.5]
+_WRAPS = {"repeat": "repeat", "clamp": "clamp", "mirror": "mirror"}
+_SHEAR = 1e-6  # relative to the scale: less is rounding
+
+
+def _uv_transform(p: Properties) -> dict[str, Any]:
+    """Return the block ``uv_transform`` of ``to_uv`` and of the older ``uoffset uscale``, which scale after they shift."""
+    matrix = p.transform("to_uv")
+    linear, shift = matrix[:2, :2], matrix[:2, 3]
+    offset = np.array([p.number("uoffset", 0.0), p.number("voffset", 0.0)])
+    factors = np.array([p.number("uscale", 1.0), p.number("vscale", 1.0)])
+    linear, shift = factors[:, None] * linear, factors * (shift + offset)
+    across, along = linear[:, 0], linear[:, 1]
+    length = math.hypot(*across)
+    angle = math.atan2(across[1], across[0]) if length else math.atan2(-along[0], along[1])
+    turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    along = turn @ along
+    if abs(along[0]) > _SHEAR * (length + math.hypot(*along)):
+        p.note("the shear of to_uv is left out")
+    found: dict[str, Any] = {}
+    degrees = math.degrees(angle)
+    if abs(degrees - 180.0) < 1e-9 or abs(degrees + 180.0) < 1e-9:  # a mirror image without rotation
+        length, along, degrees = -length, -along, 0.0
+    if (length, along[1]) != (1.0, 1.0):
+        found["scale"] = [float(length), float(along[1])]
+    if degrees:
+        found["rotate"] = degrees
+    if shift.any():
+        found["translate"] = [float(value) for value in shift]
+    return {"uv_transform": found} if found else {}
+
+
+def _bitmap(p: Properties, importer: Importer) -> Any:
+    """Return an image. What is not ``raw`` is decoded from sRGB in every slot, opacity and roughness included."""
+    p.ignore("accel", "format", "cache", "max_anisotropy")
+    path = p.file()
+    raw = p.flag("raw")
+    gamma = p.number("gamma", -1.0)
+    if gamma not in (-1.0, 0.0, 1.0):
+        p.note(f"gamma {gamma:g} becomes that of sRGB")
+    found: dict[str, Any] = {"type": "image", "path": "" if path is None else importer.path(path)}
+    kind = p.text("filter_type", "bilinear" if p.modern else "ewa")
+    if kind == "nearest":
+        found["filter"] = "nearest"
+    elif kind != "bilinear" and p.has("filter_type"):
+        p.note(f'filter_type "{kind}" becomes bilinear')
+    wraps = [p.text(key, "") for key in ("wrap_mode", "wrap_mode_u", "wrap_mode_v")]
+    for wrap in dict.fromkeys(filter(None, wraps)):
+        if wrap not in _WRAPS:
+            p.note(f'wrap_mode "{wrap}" becomes repeat')
+        elif wrap != "repeat":
+            found["wrap"] = wrap
+    found["colorspace"] = "linear" if raw or gamma == 1.0 else "srgb"
+    channel = p.text("channel")
+    if channel in ("r", "g", "b", "a"):
+        found["channel"] = channel
+    elif channel:
+        p.note(f'channel "{channel}" becomes the luminance')
+    found |= _uv_transform(p)
+    return list(_GREY) if path is None else found
+
+
+def _checkerboard(p: Properties, importer: Importer) -> Any:
+    colours = {key: p.colour(key) for key in ("color0", "color1")}
+    if not p.modern:  # the squares' sizes were the same, their colours not
+        colours = {
+            key: value or [default] * 3 for (key, value), default in zip(colours.items(), (0.4, 0.2), strict=True)
+        }
+    return {"type": "checkerboard", **{k: v for k, v in colours.items() if v is not None}, **_uv_transform(p)}
+
+
+def _scale(p: Properties, importer: Importer) -> Any:
+    factor = p.slot("scale", [1.0] * 3, bounded=False)
+    inner = p.objects("texture")
+    value = importer.texture(inner[0]) if inner else p.slot("value", [1.0] * 3, bounded=False)
+    if isinstance(factor, dict):
+        p.note("the texture of scale is left out")
+        return value
+    return scaled(value, factor, importer)
+
+
+def scaled(value: Any, factor: list[float], importer: Importer) -> Any:
+    """Return a texture, or a colour, multiplied by a colour."""
+    if isinstance(value, list):
+        return [a * b for a, b in zip(value, factor, strict=True)]
+    if "texture" in value:
+        value = importer.textures[value["texture"]]
+    if value["type"] == "image":
+        before = value.get("scale", [1.0] * 3)
+        return {**value, "scale": [a * b for a, b in zip(before, factor, strict=True)]}
+    if value["type"] == "checkerboard":
+        defaults = {"color0": [0.4] * 3, "color1": [0.2] * 3}
+        return value | {
+            key: [a * b for a, b in zip(value.get(key, default), factor, strict=True)]
+            for key, default in defaults.items()
+        }
+    return value
+
+
+def _vertex_color(p: Properties, importer: Importer) -> Any:
+    name = p.text("name", "vertex_color")
+    if name != "vertex_color":
+        p.note(f'the attribute "{name}" becomes the vertex colours of the file')
+    return {"type": "vertex_color"}
+
+
+def _grid(p: Properties, importer: Importer) -> Any:
+    return p.colour("color0", [0.2] * 3)
+
+
+def _mean(p: Properties, importer: Importer) -> Any:
+    return list(_GREY)
+
+
+#: Plugins of the tag ``texture``.
+TEXTURES: dict[str, Plugin] = {
+    "bitmap": exact("image", _bitmap, "a filter_type other than nearest is bilinear; to_uv without shear"),
+    "checkerboard": exact("checkerboard", _checkerboard, "its colours are no textures"),
+    "mesh_attribute": exact("vertex_color", _vertex_color, "the vertex colours of the file"),
+    "scale": exact("scaled", _scale, "of an image, a checkerboard or a colour"),
+    "gridtexture": nearest("a colour", _grid, "the lines are left out"),
+    "wireframe": nearest("a colour", _mean, "grey takes its place"),
+    "curvature": nearest("a colour", _mean, "grey takes its place"),
+    "volume": nearest("a colour", _mean, "grey takes its place"),
+}
