@@ -77,10 +77,9 @@ def blocks(image: np.ndarray) -> np.ndarray:
     return cut.reshape(rows, BLOCK, columns, BLOCK).mean((1, 3))
 
 
-def compare(
-    mitsuba: Any, file: Path, width: int, spp: int, seeds: int, depth: int | None
-) -> tuple[dict[str, Any], Any]:
+def compare(mitsuba: Any, file: Path, given: argparse.Namespace) -> tuple[dict[str, Any], Any]:
     """Render a scene by both programs; return the row of the table and the two mean pictures."""
+    width, spp, seeds = given.width, given.spp, given.seeds
     start = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ImportedSceneWarning)
@@ -88,8 +87,9 @@ def compare(
     loaded = time.perf_counter() - start
     old = scene.description.film
     film = {"width": width, "height": max(1, round(width * old["height"] / old["width"])), "filter": "box"}
-    limit = depth or scene.description.integrator.get("max_depth", -1)
+    limit = given.depth or scene.description.integrator.get("max_depth", -1)
     options: dict[str, Any] = {"film": film, "integrator": {"type": "path", "max_depth": limit, "rr_depth": 5}}
+    options["accel"] = given.accel
     torchpt.render(scene, spp=1, seed=0, **options)
     first = time.perf_counter() - start
     ours, seconds = _rendered(lambda seed: torchpt.render(scene, spp=spp, seed=seed, **options).numpy(), seeds)
@@ -156,12 +156,13 @@ def main() -> int:
     parser.add_argument("--spp", type=int, default=128)
     parser.add_argument("--seeds", type=int, default=12)
     parser.add_argument("--depth", type=int, help="in place of each scene's own")
+    parser.add_argument("--accel", default="auto", help="the search structure of ours")
     parser.add_argument("--pictures", type=Path, help="a folder for both mean pictures as PNG")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     given = parser.parse_args()
     mitsuba = load_mitsuba(given.variant)
     for number, file in enumerate(given.scenes):
-        row, pictures = compare(mitsuba, file, given.width, given.spp, given.seeds, given.depth)
+        row, pictures = compare(mitsuba, file, given)
         if number == 0:
             print("| " + " | ".join(row) + " |\n|" + "---|" * len(row))
         print("| " + " | ".join(row.values()) + " |", flush=True)
