@@ -27,7 +27,7 @@ _OUTER = ("normal_map", "bump_map")
 
 def _opaque(type: str, **keys: Any) -> Material:
     """Return a material that is black from behind; keys of None are left out."""
-    return {"type": type, **{key: value for key, value in keys.items() if value is not None}, "two_sided": False}
+    return _clear(type, **keys) | {"two_sided": False}
 
 
 def _clear(type: str, **keys: Any) -> Material:
@@ -114,7 +114,7 @@ def _metal(p: Properties) -> Material:
         eta, k = p.slot("eta", [0.0] * 3, bounded=False), p.slot("k", [1.0] * 3, bounded=False)
     if divisor != 1.0:
         factor = [1.0 / divisor] * 3
-        eta, k = scaled(eta, factor, p.importer), scaled(k, factor, p.importer)
+        eta, k = scaled(eta, factor, p), scaled(k, factor, p)
     return found | {"eta": eta, "k": k}
 
 
@@ -294,7 +294,7 @@ def _mapped(p: Properties, importer: Importer, key: str) -> Material:
     if key in material:
         p.note(f"the {key} of the bsdf inside is left out")
     if scale != 1.0:
-        value = scaled(value, [scale] * 3, importer)
+        value = scaled(value, [scale] * 3, p)
     return material | {key: value}
 
 
@@ -318,13 +318,13 @@ def _ward(p: Properties, importer: Importer) -> Material:
     if diffuse == [0.0] * 3:
         return metal
     # A blend halves both sides: each reflects twice as much, as far as that is a fraction.
-    sides = [_opaque("diffuse", reflectance=_twice(diffuse, importer)), metal]
-    sides[1]["specular_reflectance"] = _twice(specular, importer)
+    sides = [_opaque("diffuse", reflectance=_twice(diffuse, p)), metal]
+    sides[1]["specular_reflectance"] = _twice(specular, p)
     return _blended(sides, 0.5, p)
 
 
-def _twice(value: Any, importer: Importer) -> Any:
-    found = scaled(value, [2.0] * 3, importer)
+def _twice(value: Any, p: Properties) -> Any:
+    found = scaled(value, [2.0] * 3, p)
     return [min(number, 1.0) for number in found] if isinstance(found, list) else found
 
 

@@ -45,7 +45,7 @@ def _position(p: Properties) -> list[float]:
 
 
 def _axis(p: Properties, name: str = "direction") -> list[float]:
-    """Return a direction: the property, or the z axis of ``to_world``; the property is turned by ``to_world`` too."""
+    """Return a direction: the property, or the z axis of ``to_world``."""
     matrix, given = p.transform(), p.point(name)
     axis = matrix[:3, 2] if given is None else np.array(given)
     if not np.isfinite(axis).all() or not axis.any():
@@ -158,12 +158,8 @@ EMITTERS: dict[str, Plugin] = {
     "envmap": exact("envmap", _envmap),
     "sky": nearest("constant", _sky, "the mean radiance of a clear sky from all directions"),
     "sun": nearest("directional", _sun, "the sun is a point"),
-    "sunsky": nearest(
-        "constant and directional", _sun_sky, "the mean radiance of a clear sky, and a sun that is a point"
-    ),
-    "timed_sunsky": nearest(
-        "constant and directional", _sun_sky, "the mean radiance of a clear sky, and a sun that is a point"
-    ),
+    "sunsky": _SUN_AND_SKY,
+    "timed_sunsky": _SUN_AND_SKY,
     "collimated": left_out("a beam without width meets no surface by chance"),
     "directionalarea": left_out("surfaces shine in all directions"),
     "projector": left_out("there are no projectors"),

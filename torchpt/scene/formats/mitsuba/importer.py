@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -261,18 +261,18 @@ class Importer:
         """Return the material of a ``<bsdf>``."""
         if element.tag != "bsdf":
             raise element.error(f"<{element.written}>", "a bsdf")
-        if element.id and element.id in self.materials:
-            return self.materials[element.id]
+        if element.id and _key(element.id) in self.materials:
+            return self.materials[_key(element.id)]
         return self.build(BSDFS, element, UNKNOWN)
 
     def texture(self, element: Element) -> Any:
         """Return a texture for a parameter: a reference to a named one, one in place, or a colour."""
-        if element.id and element.id in self.textures:
-            return {"texture": element.id}
+        name = _key(element.id)
+        if element.id and name in self.textures:
+            return {"texture": name}
         value = self.build(TEXTURES, element, _UNKNOWN_TEXTURE)
         if not element.id or not isinstance(value, dict) or "texture" in value:
             return value
-        name = _key(element.id)
         self.textures[name] = value
         return {"texture": name}
 
@@ -314,7 +314,7 @@ class Importer:
                 inner[target.tag] = target
             else:
                 rest.append(child)
-        bare = Element(**{**vars(sensor), "children": rest})
+        bare = replace(sensor, children=rest)
         camera = self.build(SENSORS, bare, _UNKNOWN_SENSOR)
         film = {"width": 768, "height": 576, "filter": {"type": "gaussian"}}
         if "film" in inner:
@@ -351,7 +351,7 @@ class Importer:
     def _plain_shape(self, element: Element) -> dict[str, Any] | None:
         """Return a shape with its material and emission; None where it is left out."""
         inner, rest, has_medium = self._taken_apart(element)
-        bare = Element(**{**vars(element), "children": rest})
+        bare = replace(element, children=rest)
         shape = self.build(SHAPES, bare, _UNKNOWN)
         if shape is None:
             return None
@@ -417,7 +417,7 @@ class Importer:
             (groups if target.tag == "shape" else rest).append(target if target.tag == "shape" else child)
         if len(groups) != 1 or plugin_name("shape", groups[0].type) != "shapegroup":
             raise element.error(element.label, "one reference to a shapegroup inside it")
-        properties = Properties(Element(**{**vars(element), "children": rest}), "instance", self)
+        properties = Properties(replace(element, children=rest), "instance", self)
         pose = properties.transform()
         properties.left_over()
         drawn = self._meshes_of_groups.setdefault(id(groups[0]), {})
@@ -441,7 +441,7 @@ class Importer:
         """Return the transform of a shape of a group."""
         _, rest, _ = self._taken_apart(element)
         plugin = plugin_name(element.tag, element.type)
-        return Properties(Element(**{**vars(element), "children": rest}), plugin, self).transform()
+        return Properties(replace(element, children=rest), plugin, self).transform()
 
     def _emitter(self, element: Element) -> None:
         """Add a light that is on no shape."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from torchpt.math.vectors import luminance
 from torchpt.scene.formats.mitsuba import values
 from torchpt.scene.formats.mitsuba.elements import Element
 from torchpt.scene.formats.mitsuba.versions import property_name
@@ -23,7 +25,6 @@ OBJECTS = (
 )  # fmt: skip
 _COLOURS = ("rgb", "srgb", "spectrum", "blackbody", "color", "float", "integer")
 _VALUES = (*_COLOURS, "boolean", "string", "point", "vector", "transform", "animation")
-_LUMINANCE = np.array((0.212671, 0.715160, 0.072169))
 
 
 class Properties:
@@ -62,7 +63,7 @@ class Properties:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the values that are given."""
+        """Return the names of the values that are given."""
         return tuple(self._values)
 
     def has(self, *names: str) -> bool:
@@ -151,7 +152,7 @@ class Properties:
         found = self.slot(name, None, bounded=False)
         if found is None or isinstance(found, dict):
             return default if found is None else found
-        value = found[0] if len(set(found)) == 1 else float(_LUMINANCE @ found)
+        value = found[0] if len(set(found)) == 1 else float(luminance(torch.tensor(found, dtype=torch.float64)))
         if value > high:
             self.note(f"{name} above {high:g} becomes {high:g}")
         return min(value, high)

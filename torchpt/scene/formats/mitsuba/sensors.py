@@ -13,7 +13,16 @@ from torchpt.scene.formats.mitsuba.properties import Properties
 if TYPE_CHECKING:
     from torchpt.scene.formats.mitsuba.importer import Importer
 
-__all__ = ["FILMS", "FILTERS", "INTEGRATORS", "SAMPLERS", "SENSORS", "UNKNOWN_INTEGRATOR"]
+__all__ = [
+    "FILMS",
+    "FILTERS",
+    "INTEGRATORS",
+    "SAMPLERS",
+    "SENSORS",
+    "UNKNOWN_FILM",
+    "UNKNOWN_INTEGRATOR",
+    "UNKNOWN_SAMPLER",
+]
 
 Block = dict[str, Any]
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["TEXTURES"]
 
 _GREY = [0.5, 0.5, 0.5]
-_WRAPS = {"repeat": "repeat", "clamp": "clamp", "mirror": "mirror"}
+_WRAPS = ("repeat", "clamp", "mirror")
 _SHEAR = 1e-6  # relative to the scale: less is rounding
 
 
@@ -62,6 +62,8 @@ def _bitmap(p: Properties, importer: Importer) -> Any:
     elif kind != "bilinear" and p.has("filter_type"):
         p.note(f'filter_type "{kind}" becomes bilinear')
     wraps = [p.text(key, "") for key in ("wrap_mode", "wrap_mode_u", "wrap_mode_v")]
+    if wraps[1] != wraps[2]:
+        p.note("one wrap_mode is taken for both directions")
     for wrap in dict.fromkeys(filter(None, wraps)):
         if wrap not in _WRAPS:
             p.note(f'wrap_mode "{wrap}" becomes repeat')
@@ -93,15 +95,15 @@ def _scale(p: Properties, importer: Importer) -> Any:
     if isinstance(factor, dict):
         p.note("the texture of scale is left out")
         return value
-    return scaled(value, factor, importer)
+    return scaled(value, factor, p)
 
 
-def scaled(value: Any, factor: list[float], importer: Importer) -> Any:
-    """Return a texture, or a colour, multiplied by a colour."""
+def scaled(value: Any, factor: list[float], p: Properties) -> Any:
+    """Return a texture, or a colour, multiplied by a colour; note where a texture cannot be."""
     if isinstance(value, list):
         return [a * b for a, b in zip(value, factor, strict=True)]
     if "texture" in value:
-        value = importer.textures[value["texture"]]
+        value = p.importer.textures[value["texture"]]
     if value["type"] == "image":
         before = value.get("scale", [1.0] * 3)
         return {**value, "scale": [a * b for a, b in zip(before, factor, strict=True)]}
@@ -111,6 +113,7 @@ def scaled(value: Any, factor: list[float], importer: Importer) -> Any:
             key: [a * b for a, b in zip(value.get(key, default), factor, strict=True)]
             for key, default in defaults.items()
         }
+    p.note(f"the scale of a {value['type']} texture is left out")
     return value
 
 

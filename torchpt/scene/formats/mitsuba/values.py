@@ -12,10 +12,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchpt.core.errors import SceneError
 from torchpt.core.files import read_regular
+from torchpt.images.colour import srgb_to_linear
 from torchpt.math import transforms
 from torchpt.scene.formats.mitsuba.cie import D65, WAVELENGTHS, XYZ
 from torchpt.scene.formats.mitsuba.elements import Element
@@ -126,8 +128,7 @@ def _rgb(values: Matrix) -> Rgb:
 
 def _decoded(values: Matrix) -> Matrix:
     """Decode sRGB (IEC 61966-2-1)."""
-    positive = np.maximum(values, 0.0)
-    return np.where(positive <= 0.04045, positive / 12.92, ((positive + 0.055) / 1.055) ** 2.4)
+    return srgb_to_linear(torch.from_numpy(np.maximum(values, 0.0))).numpy()
 
 
 def _spectrum(element: Element, *, light: bool, find: FindFile) -> Rgb:
@@ -174,9 +175,8 @@ _ENDS = ("wavelength_min", "wavelength_max")
 
 def _name(element: Element) -> str:
     name = element.attributes.get("name", "")
-    return {"lambdaMin": "wavelength_min", "lambdaMax": "wavelength_max", "lambda_min": "wavelength_min"}.get(
-        name, "wavelength_max" if name == "lambda_max" else name
-    )
+    end = {"lambdaMin": 0, "lambda_min": 0, "lambdaMax": 1, "lambda_max": 1}.get(name)
+    return name if end is None else _ENDS[end]
 
 
 def _as_rgb(element: Element, text: str) -> Element:
