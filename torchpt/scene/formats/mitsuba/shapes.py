@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError, SceneError
 from torchpt.math.transforms import is_usable
+from torchpt.math.vectors import Frame
 from torchpt.physics.shapes import KINDS
 from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, left_out
 from torchpt.scene.formats.mitsuba.properties import Properties
@@ -111,13 +113,8 @@ def _cylinder(p: Properties, importer: Importer) -> Shape:
     if not (length > 0.0 and radius > 0.0):
         raise p.element.error([low, high, radius], "two points p0 and p1, and a radius > 0")
     matrix = np.eye(4)
-    z = along / length
-    # The frame about an axis of Duff et al., "Building an Orthonormal Basis, Revisited", 2017, as in Mitsuba.
-    sign = 1.0 if z[2] >= 0.0 else -1.0
-    a = -1.0 / (sign + z[2])
-    b = z[0] * z[1] * a
-    matrix[:3, 0] = radius * np.array([1.0 + sign * z[0] * z[0] * a, sign * b, -sign * z[0]])
-    matrix[:3, 1] = radius * np.array([b, sign + z[1] * z[1] * a, -z[1]])
+    frame = Frame.about(torch.from_numpy(along / length)[:, None])  # the one that Mitsuba takes
+    matrix[:3, 0], matrix[:3, 1] = radius * frame.s[:, 0].numpy(), radius * frame.t[:, 0].numpy()
     matrix[:3, 2], matrix[:3, 3] = along, low
     ours = KINDS["cylinder"].own({"center": (0.0, 0.0, 0.0), "radius": 1.0, "height": 1.0})
     return _shape(p, "cylinder", matrix @ np.linalg.inv(ours), capped=False)
