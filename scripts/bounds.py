@@ -35,7 +35,11 @@ BOUNDS: list[tuple[str, str, str]] = [
         "torchpt.scene.meshes.gltf:MOST_PLACED",
         "",
     ),
-    ("what an archive of meshes unfolds to", "torchpt.scene.meshes.trimesh_formats:MAX_UNPACKED", "bytes"),
+    (
+        "what an archive of meshes, or a `.serialized` file, unfolds to",
+        "torchpt.scene.meshes.trimesh_formats:MAX_UNPACKED",
+        "bytes",
+    ),
     ("a picture", "torchpt.images.decode:MAX_PIXELS", "pixels"),
     ("a picture by the texture's `max_pixels`", "torchpt.physics.textures.kinds.image:MOST_PIXELS", "pixels"),
 ]

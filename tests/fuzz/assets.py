@@ -26,6 +26,7 @@ from small_files import (
     gltf_document,
     picture_bytes,
     ply_bytes,
+    serialized_square,
     sixteen_bits,
     zipped,
 )
@@ -50,6 +51,7 @@ def sound(folder: Path) -> dict[str, Sound]:
             for layout in ("ascii", "binary_little_endian", "binary_big_endian")
         },
         "stl": ("a.stl", STL),
+        "serialized": ("a.serialized", serialized_square()),
         "stl ascii": ("a.stl", f"solid a\n{FACET}endsolid a\n".encode()),
         "glb": ("a.glb", glb(document, body)),
         "gltf": ("a.gltf", json.dumps({**document, "buffers": [{"byteLength": len(body), "uri": "a.bin"}]}).encode()),
@@ -248,7 +250,8 @@ def _as_checkpoint(file: Path, rng: np.random.Generator) -> str:
 
 USES: dict[str, Callable[[Path, np.random.Generator], str]] = {
     **dict.fromkeys(
-        ("obj", "mtl", "ply", "stl", "glb", "gltf", "bin", "off", "3mf", "dae", "zae", "xaml", "3dxml"), _as_mesh
+        ("obj", "mtl", "ply", "stl", "serialized", "glb", "gltf", "bin", "off", "3mf", "dae", "zae", "xaml", "3dxml"),
+        _as_mesh,
     ),
     "npz": _as_checkpoint,
 }

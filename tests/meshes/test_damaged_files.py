@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from small_files import (
     gltf_document,
     picture_bytes,
     ply_bytes,
+    serialized_square,
     sixteen_bits,
 )  # fmt: skip
 
@@ -82,6 +84,7 @@ def mesh_corpus(ending: str, rng: np.random.Generator) -> Iterator[dict[str, byt
         "obj": [OBJ.encode()],
         "ply": [ply_bytes(layout) for layout in ("ascii", "binary_little_endian", "binary_big_endian")],
         "stl": [STL, f"solid a\n{FACET}endsolid a\n".encode()],
+        "serialized": [serialized_square(3), serialized_square(4, double=True)],
         "glb": [glb(document, body)],
         "gltf": [json.dumps({**document, "buffers": [{"byteLength": len(body), "uri": "a.bin"}]}).encode()],
     }
@@ -95,7 +98,7 @@ def mesh_corpus(ending: str, rng: np.random.Generator) -> Iterator[dict[str, byt
             yield {f"a.{ending}": damaged(chosen, rng), "a.mtl": MTL.encode(), **beside}
 
 
-ENDINGS = ["obj", "mtl", "ply", "stl", "glb", "gltf", "json"]
+ENDINGS = ["obj", "mtl", "ply", "stl", "serialized", "glb", "gltf", "json"]
 
 
 def run_meshes(folder: Path, ending: str, seed: int, count: int) -> None:
@@ -158,9 +161,13 @@ def test_many_damaged_images(tmp_path: Path, name: str, seed: int, capfd: pytest
     assert capfd.readouterr() == ("", "")
 
 
+def _folded(content: bytes) -> bytes:
+    """Return a serialized file of one mesh."""
+    return struct.pack("<HH", 0x041C, 4) + zlib.compress(content) + struct.pack("<QI", 0, 1)
+
+
 def declared(folder: Path) -> list[Path]:
     """Files that declare far more than they hold."""
-    import zlib
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -189,6 +196,9 @@ def declared(folder: Path) -> list[Path]:
         "b.ply": head.format("binary_little_endian", many, 1).encode(),
         "c.ply": head.format("binary_little_endian", 1, 1).encode() + bytes(12) + struct.pack("<i", many),
         "d.ply": head.format("ascii", 1, 1).encode() + b"0 0 0\n" + str(many).encode() + b" 0 0 0",
+        "a.serialized": _folded(struct.pack("<IxQQ", 0x1000, many, 2 * many)),
+        "b.serialized": _folded(struct.pack("<IxQQ", 0x1000, 2**24, 2**24) + bytes(1000)),
+        "c.serialized": _folded(struct.pack("<I", 0x1000) + b"a" * 2**24),
         "a.stl": bytes(80) + struct.pack("<I", many),
         "a.glb": b"glTF" + struct.pack("<III4s", 2, 4 * 10**9, 4 * 10**9, b"JSON"),
         "b.glb": glb(

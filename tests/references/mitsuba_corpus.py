@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from small_files import serialized_bytes
 
 __all__ = ["EXACT", "LIGHT", "NEAREST", "OLD", "scene", "write_assets"]
 
@@ -219,6 +220,18 @@ EXACT: dict[str, str] = {
         '</transform><bsdf type="twosided"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
         '<string name="filename" value="a picture.png"/></texture></bsdf></bsdf></shape>'
     ),
+    "serialized": shape(
+        '<shape type="serialized"><string name="filename" value="meshes/two.serialized"/>'
+        '<integer name="shape_index" value="1"/><transform name="to_world"><scale value="1.5"/><translate y="0.2"/></transform>'
+        '<bsdf type="twosided"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
+        '<string name="filename" value="a picture.png"/></texture>'
+        "</bsdf></bsdf></shape>"
+    ),
+    "serialized_first": shape(
+        '<shape type="serialized"><string name="filename" value="meshes/old.serialized"/><boolean name="face_normals" '
+        'value="true"/><transform name="to_world"><scale value="1.5"/></transform><bsdf type="twosided"><bsdf type="diffuse"/>'
+        "</bsdf></shape>"
+    ),
     "sphere": shape(
         '<shape type="sphere"><float name="radius" value="0.5"/><transform name="to_world"><scale value="1.6"/>'
         '<translate y="0.8"/></transform></shape>'
@@ -368,11 +381,6 @@ NEAREST: dict[str, tuple[str, str, str]] = {
         'bsdf "roughconductor": distribution "beckmann" becomes ggx',
     ),
     "sunsky": (lamp('<emitter type="sunsky"/>'), "diffuse", 'emitter "sunsky" becomes constant and directional'),
-    "serialized": (
-        shape('<shape type="serialized"><string name="filename" value="x.serialized"/></shape>'),
-        "",
-        'shape "serialized" is left out',
-    ),
     "collimated": (lamp('<emitter type="collimated"/>'), "diffuse", 'emitter "collimated" is left out'),
     "sppm": (ball('<bsdf type="diffuse"/>').replace('type="path"', 'type="sppm"'), "diffuse", "becomes path"),
 }
@@ -397,6 +405,17 @@ def write_assets(folder: Path) -> None:
         "v -0.8 0 0.5\nv 0.8 0 0.5\nv 0.8 0.6 0\nv -0.8 0.6 0\nv -0.8 0 -0.5\nv 0.8 0 -0.5\n"
         "vt 0 0\nvt 1 0\nvt 1 0.6\nvt 0 0.6\nvt 0 1\nvt 1 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\nf 4/4 3/3 6/6\nf 4/4 6/6 5/5\n"
     )
+    tent = {
+        "vertices": [[-1, 0, 0.5], [1, 0, 0.5], [0, 0, -1], [0, 1.2, 0]],
+        "faces": [[0, 1, 3], [1, 2, 3], [2, 0, 3]],
+    }
+    textured = {
+        **tent,
+        "uvs": [[0, 0], [1, 0], [0.3, 0.8], [0.5, 0.5]],
+        "normals": np.add(tent["vertices"], [0, 0.3, 0.1]),
+    }
+    (folder / "meshes" / "two.serialized").write_bytes(serialized_bytes([tent, textured], 4, double=True))
+    (folder / "meshes" / "old.serialized").write_bytes(serialized_bytes([textured, tent], 3))
     (folder / "meshes" / "tent.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nproperty float u\n"
         "property float v\nelement face 3\nproperty list uchar int vertex_indices\nend_header\n"

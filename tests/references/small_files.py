@@ -6,6 +6,7 @@ import io
 import json
 import struct
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,36 @@ def ply_bytes(layout: str) -> bytes:
     body = struct.pack(f"{order}B2f", 2, 0.5, 0.5)
     body += b"".join(struct.pack(f"{order}8f3B", x, y, z, 0, 0, 1, x, y, 1, 2, 3) for x, y, z in SQUARE)
     return header.encode() + body + struct.pack(f"{order}B3iB4i", 3, 0, 1, 2, 4, 0, 1, 2, 3)
+
+
+def serialized_bytes(meshes: list[dict[str, Any]], version: int = 4, *, double: bool = False) -> bytes:
+    """Write Mitsuba's serialized format: ``vertices faces`` and, where given, ``normals uvs colors name flat`` of each mesh."""
+    real, body, starts = "<f8" if double else "<f4", b"", []
+    for mesh in meshes:
+        arrays = [("vertices", 0), ("normals", 0x1), ("uvs", 0x2), ("colors", 0x8)]
+        given = [(np.asarray(mesh[name]), flag) for name, flag in arrays if name in mesh]
+        flags = sum(flag for _, flag in given) + (0x2000 if double else 0x1000) + (0x10 if mesh.get("flat") else 0)
+        content = struct.pack("<I", flags) + (mesh.get("name", "mesh").encode() + b"\0" if version == 4 else b"")
+        content += struct.pack("<QQ", len(mesh["vertices"]), len(mesh["faces"]))
+        content += b"".join(values.astype(real).tobytes() for values, _ in given)
+        content += np.asarray(mesh["faces"]).astype("<u4").tobytes()
+        starts.append(len(body))
+        body += struct.pack("<HH", 0x041C, version) + zlib.compress(content)
+    return body + struct.pack(f"<{len(starts)}{'Q' if version == 4 else 'I'}I", *starts, len(starts))
+
+
+def serialized_square(version: int = 4, *, double: bool = False) -> bytes:
+    """Return a file of two squares: one with all attributes, and a bare one of face normals."""
+    whole = {
+        "vertices": SQUARE,
+        "faces": [[0, 1, 2], [0, 2, 3]],
+        "normals": np.tile([0.0, 0.6, 0.8], (4, 1)),
+        "uvs": SQUARE[:, :2] * 0.5,
+        "colors": np.linspace(0.1, 1.2, 12).reshape(4, 3),
+        "name": "größe",
+    }
+    bare = {"vertices": np.add(SQUARE, [0.0, 0.0, 1.0]), "faces": [[2, 1, 0]], "flat": True}
+    return serialized_bytes([whole, bare], version, double=double)
 
 
 def gltf_document() -> tuple[dict[str, Any], bytes]:

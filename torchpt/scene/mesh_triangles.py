@@ -68,7 +68,7 @@ def mesh_of(
     """
     if triangles.path is not None:
         path = description.resolve(triangles.path, f"{key}.path")
-        pieces, source = load_mesh(path, materials=materials), str(path)
+        pieces, source = load_mesh(path, materials=materials, index=triangles.shape_index), str(path)
     elif isinstance(triangles.object, tuple):
         pieces, source = list(triangles.object), "trimesh"  # parts that `from_trimesh` has made already
     elif triangles.object is not None:

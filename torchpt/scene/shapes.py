@@ -271,14 +271,15 @@ class ShapeBuilder:
 def _with_triangles(part: Part, piece: MeshPart, mesh: Mesh) -> Part:
     """Return a part with its triangles."""
     faces, dropped = faces_with_area(piece, part.to_world)
+    flat = mesh.flat or piece.flat
     return replace(
         part,
         vertices=piece.vertices,
         faces=faces,
-        normals=None if mesh.flat else piece.normals,
+        normals=None if flat else piece.normals,
         uvs=piece.uvs,
         colors=piece.colors,
-        smooth=not mesh.flat,
+        smooth=not flat,
         dropped=dropped,
         source=mesh.source,
         ignored=ignored_features(piece, part.to_world),

@@ -69,6 +69,7 @@ class Triangles:
         faces: ``(F, 3)`` int64 indices of vertices.
         normals: ``(V, 3)`` at the vertices, or None.
         uvs: ``(V, 2)`` texture coordinates at the vertices, or None.
+        shape_index: which mesh of the file is taken; None: all.
         flat: use face normals even if vertex normals are given.
         displacement: ``texture``, ``scale`` and ``subdivisions`` of :class:`~torchpt.physics.shapes.kinds.mesh.Displacement`,
             or None.
@@ -76,6 +77,7 @@ class Triangles:
     """
 
     path: tuple[str, ...] | None = None
+    shape_index: int | None = None
     vertices: Matrix | None = None
     faces: NDArray[np.int64] | None = None
     normals: Matrix | None = None

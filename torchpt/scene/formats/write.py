@@ -112,6 +112,8 @@ def _ply(part: MeshPart) -> bytes:
         columns, names = [*columns, part.normals], [*names, "nx", "ny", "nz"]
     if part.uvs is not None:
         columns, names = [*columns, part.uvs], [*names, "u", "v"]
+    if part.colors is not None:
+        columns, names = [*columns, part.colors], [*names, "red", "green", "blue"]
     properties = "".join(f"property double {name}\n" for name in names)
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(part.vertices)}\n{properties}"

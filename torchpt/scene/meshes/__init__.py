@@ -1,4 +1,4 @@
-"""Read mesh files as plain arrays: OBJ with MTL, PLY, STL and glTF by readers of this package, other formats by trimesh.
+"""Read mesh files as plain arrays: OBJ with MTL, PLY, STL, glTF and `.serialized` by our own readers, others by trimesh.
 
 Read ``mesh.py`` first: it has the records that all readers return. A file becomes *parts*, one for each of its materials.
 :data:`FORMATS` is the table of formats; a reader is imported when a scene has a file for it.
@@ -28,28 +28,37 @@ PARSERS: dict[str, tuple[str, ...]] = {
     ".xaml": ("lxml",),
     ".3dxml": ("lxml", "networkx"),
 }
+#: The format whose files have several meshes by number.
+SERIALIZED = ".serialized"
 #: File ending -> module of this package, whose ``load_<module>(path, data, materials)`` returns the parts.
 FORMATS = {
-    **{".obj": "obj", ".ply": "ply", ".stl": "stl", ".glb": "gltf", ".gltf": "gltf"},
+    **{".obj": "obj", ".ply": "ply", ".stl": "stl", ".glb": "gltf", ".gltf": "gltf", SERIALIZED: "serialized"},
     **dict.fromkeys(PARSERS, "trimesh_formats"),
 }
 
 
-def load_mesh(path: Path, *, materials: bool = True) -> list[MeshPart]:
+def load_mesh(path: Path, *, materials: bool = True, index: int | None = None) -> list[MeshPart]:
     """Return the parts of a mesh file, one per material.
 
     Args:
         path: a file ending in one of ``FORMATS``.
         materials: True to read the file's own materials (MTL files, glTF materials).
+        index: number of the one mesh to be read of a ``.serialized`` file; None: all.
 
     Raises:
-        AssetError: the file cannot be read or is malformed; the message names the element.
+        AssetError: the file cannot be read or is malformed; the message names the element. Or an index for another format.
     """
     path = Path(path)
     format_name = FORMATS.get(path.suffix.lower())
     if format_name is None:
         raise AssetError(path, f"expected a mesh file ending in {', '.join(FORMATS)}, got {path.suffix or 'no ending'}")
+    if index is not None and path.suffix.lower() != SERIALIZED:
+        raise AssetError(path, f"has no meshes by number, as {SERIALIZED} files have; shape_index {index} is asked for")
     try:
+        if index is not None:
+            from torchpt.scene.meshes.serialized import load_serialized_mesh
+
+            return checked(load_serialized_mesh(path, index, materials), path)
         data = read_regular(path)
     except OSError as error:
         raise AssetError(path, f"cannot be read ({error.strerror})") from None

@@ -19,6 +19,8 @@ from torchpt.core.errors import AssetError, EmptyMeshError
 from torchpt.physics.shapes import normals
 
 __all__ = [
+    "COLORED",
+    "MAX_UNPACKED",
     "MOST_PARTS",
     "FileCamera",
     "FileLight",
@@ -62,6 +64,8 @@ def smooth_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> N
 
 #: Most parts of one file: groups of an OBJ file, primitives of all nodes of a glTF file.
 MOST_PARTS = 100_000
+#: Most bytes that the compressed parts of one file may decompress to.
+MAX_UNPACKED = 2**30
 
 #: Largest number of a vertex or colour: those of scenes become float32.
 _LARGEST = float(np.finfo(np.float32).max)
@@ -83,6 +87,10 @@ class FileMaterial:
     name: str
     material: dict[str, Any] = field(default_factory=lambda: {"type": "diffuse"})
     ignored: tuple[str, ...] = ()
+
+
+#: The material of a mesh whose vertices have colours, in formats without materials.
+COLORED = FileMaterial("vertex colors", {"type": "diffuse", "reflectance": {"type": "vertex_color"}})
 
 
 @dataclass(frozen=True)
@@ -136,6 +144,7 @@ class MeshPart:
         ignored: further unsupported features of the file, by name.
         lights: lights of the whole file; only one of its parts has them.
         cameras: cameras of the whole file; only one of its parts has them.
+        flat: the file asks for face normals.
     """
 
     name: str
@@ -148,6 +157,7 @@ class MeshPart:
     ignored: tuple[str, ...] = ()
     lights: tuple[FileLight, ...] = ()
     cameras: tuple[FileCamera, ...] = ()
+    flat: bool = False
 
 
 def checked(parts: list[MeshPart], path: Path) -> list[MeshPart]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
-from torchpt.scene.meshes.mesh import FileMaterial, MeshPart, polygon_fans
+from torchpt.scene.meshes.mesh import COLORED, MeshPart, polygon_fans
 from torchpt.scene.meshes.ply_rows import find_mismatch
 
 __all__ = ["load_ply"]
@@ -29,8 +29,6 @@ _TYPES = {
 #: Names that files have for one thing: the list of a face's vertices, colours, texture coordinates.
 _INDICES = ("vertex_indices", "vertex_index")
 _COLORS = ("red", "green", "blue")
-#: The material of vertices with colours.
-_COLORED = {"type": "diffuse", "reflectance": {"type": "vertex_color"}}
 #: Most bytes of a header.
 _MOST_HEADER = 2**20
 #: The last line of a header with its line end, of whichever kind.
@@ -125,7 +123,7 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], 
     if items.dtype.kind == "f":
         raise AssetError(path, "the vertex indices of element face are no integers")
     colors = _colors(vertex, elements)
-    own = FileMaterial("vertex colors", _COLORED) if materials and colors is not None else None
+    own = COLORED if materials and colors is not None else None
     starts = np.cumsum(counts) - counts
     faces = items.astype(np.int64)[polygon_fans(starts, counts)] if len(counts) else np.zeros((0, 3), np.int64)
     return MeshPart(

@@ -19,7 +19,7 @@ from torchpt.core.errors import AssetError
 from torchpt.core.files import MAX_BYTES, check_regular
 from torchpt.scene.meshes import PARSERS
 from torchpt.scene.meshes.gltf import MOST_PLACED
-from torchpt.scene.meshes.mesh import MeshPart
+from torchpt.scene.meshes.mesh import MAX_UNPACKED, MeshPart
 from torchpt.scene.meshes.trimesh_objects import Notes, mesh_parts_of
 
 __all__ = ["load_trimesh_formats"]
@@ -40,9 +40,6 @@ _ENCODINGS = (
     b"latin1",
     b"windows-1252",
 )
-
-#: Most bytes that an archive may decompress to.
-MAX_UNPACKED = 2**30
 
 
 def load_trimesh_formats(path: Path, data: bytes, materials: bool) -> list[MeshPart]:

@@ -38,7 +38,10 @@ class Mesh(Shape):
 
     name = "mesh"
     parameters: ClassVar = {
-        "path": Path(None, doc="the file: OBJ, PLY, STL, glTF, or one that trimesh reads"),
+        "path": Path(None, doc="the file: OBJ, PLY, STL, glTF, Mitsuba's .serialized, or one that trimesh reads"),
+        "shape_index": Integer(
+            None, also=(None,), doc="which mesh of a .serialized file is taken, from 0; by default all"
+        ),
         "mesh": Custom(
             None,
             reader=_object,
@@ -74,6 +77,12 @@ class Mesh(Shape):
         """See :meth:`Shape.check`."""
         inline = {name: values[name] for name in ("vertices", "faces", "normals", "uvs")}
         vertices, faces = values["vertices"], values["faces"]
+        if values["shape_index"] is not None:
+            paths = values["path"] or ("",)
+            if not all(path.lower().endswith(".serialized") for path in paths):
+                raise Refused(
+                    "no shape_index without a path of a .serialized file", values["shape_index"], ("shape_index",)
+                )
         if values["path"] is not None and values["mesh"] is not None:
             raise Refused("either path or mesh, not both", "an object", ("mesh",))
         for whole in ("path", "mesh"):
@@ -100,7 +109,7 @@ class Mesh(Shape):
     def triangles(cls, values: Mapping[str, Any]) -> Triangles:
         """See :meth:`Shape.triangles`."""
         # Parameters that have the same name in both.
-        same = {name: values[name] for name in ("path", "vertices", "faces", "normals", "uvs")}
+        same = {name: values[name] for name in ("path", "shape_index", "vertices", "faces", "normals", "uvs")}
         return Triangles(
             **same, flat=values["face_normals"], displacement=values["displacement"], object=values["mesh"]
         )

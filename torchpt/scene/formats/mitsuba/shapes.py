@@ -63,9 +63,16 @@ def _with_normal(pose: Matrix) -> Matrix:
 
 
 def _mesh(p: Properties, importer: Importer) -> Shape | None:
-    p.ignore("max_smooth_angle", "collapse", "optimize", "shape_index")
+    p.ignore("max_smooth_angle", "collapse", "optimize")
     if p.has("max_smooth_angle"):
         p.note("max_smooth_angle is left out: normals are smooth, or those of the faces")
+    index = p.integer("shape_index", 0)
+    if p.plugin != "serialized":
+        if p.has("shape_index"):
+            p.note("shape_index is left out: all of the file is taken")
+        index = None
+    elif index < 0:
+        raise p.element.error(index, "a shape_index >= 0")
     path = p.file()
     upright = p.plugin == "obj"  # whether v is flipped where nothing is said
     flips = p.flag("flip_tex_coords", upright)
@@ -74,28 +81,31 @@ def _mesh(p: Properties, importer: Importer) -> Shape | None:
         p.transform()
         return None
     if flips == upright:
-        return _shape(p, "mesh", path=importer.path(path), face_normals=flat)
-    return _shape(p, "mesh", mesh=_flipped(p, path), face_normals=flat)
+        return _shape(p, "mesh", path=importer.path(path), shape_index=index, face_normals=flat)
+    part = _flipped(p, path, index)
+    return _shape(p, "mesh", mesh=(part,), face_normals=flat or part.flat or None)
 
 
-def _flipped(p: Properties, path: Path) -> Any:
+def _flipped(p: Properties, path: Path, index: int | None) -> MeshPart:
     """Return the parts of a mesh file, joined to one, with flipped texture coordinates."""
     try:
-        parts = load_mesh(path, materials=False)
+        parts = load_mesh(path, materials=False, index=index)
     except AssetError as error:
         raise SceneError(f"line {p.element.line}", str(path), error.problem, p.element.file) from None
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
     normals = [part.normals for part in parts if part.normals is not None]
     uvs = [part.uvs for part in parts if part.uvs is not None]
-    joined = MeshPart(
+    colors = [part.colors for part in parts if part.colors is not None]
+    return MeshPart(
         "",
         np.concatenate([part.vertices for part in parts]),
         faces,
         normals=np.concatenate(normals) if len(normals) == len(parts) else None,
         uvs=np.concatenate(uvs) * [1.0, -1.0] + [0.0, 1.0] if len(uvs) == len(parts) else None,
+        colors=np.concatenate(colors) if len(colors) == len(parts) else None,
+        flat=all(part.flat for part in parts),
     )
-    return (joined,)
 
 
 def _sphere(p: Properties, importer: Importer) -> Shape:
@@ -128,6 +138,7 @@ def _simple(type: str) -> Any:
 SHAPES: dict[str, Plugin] = {
     "obj": exact("mesh", _mesh),
     "ply": exact("mesh", _mesh),
+    "serialized": exact("mesh", _mesh, "versions 3 and 4 of the format"),
     "sphere": exact("sphere", _sphere),
     "cylinder": exact("cylinder", _cylinder, "without caps"),
     "rectangle": exact("rectangle", _simple("rectangle")),
@@ -135,7 +146,6 @@ SHAPES: dict[str, Plugin] = {
     "cube": exact("cube", _simple("cube")),
     "shapegroup": exact("shapes", _simple("shapes"), "its first instance, and instances of that"),
     "instance": exact("instance", _simple("instance"), "other shapes than meshes are copied"),
-    "serialized": left_out("the format is not read"),
     "hair": left_out("there are no curves"),
     "bsplinecurve": left_out("there are no curves"),
     "linearcurve": left_out("there are no curves"),
