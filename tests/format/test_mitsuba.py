@@ -20,6 +20,7 @@ from torchpt.scene.formats.mitsuba.bsdfs import BSDFS
 from torchpt.scene.formats.mitsuba.importer import PLUGINS
 from torchpt.scene.formats.mitsuba.plugins import Twin
 from torchpt.scene.formats.mitsuba.versions import property_name
+from torchpt.scene.formats.write import write_scene
 
 
 @pytest.fixture(scope="module")
@@ -349,3 +350,41 @@ def test_one_sided_surfaces_are_black_from_behind(assets: Path) -> None:
         (assets / "scene.xml").write_text(EXACT[name])
         found[name] = torchpt.render(torchpt.load(str(assets / "scene.xml")), compile="off", spp=4).mean()
     assert found["one_sided"] < 0.97 * found["twosided"]
+
+
+# ---- Attributes of meshes
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("vertex_nothing",), "the attribute vertex_nothing is not in its file, white takes its place"),
+        (
+            ("face_shade", "vertex_gloss"),
+            "a mesh carries one attribute, face_shade, which is taken for vertex_gloss as well",
+        ),
+    ],
+)
+def test_attributes_that_a_mesh_cannot_have_are_warnings(assets: Path, names: tuple[str, ...], words: str) -> None:
+    slots = ("diffuse_reflectance", "specular_reflectance")
+    textures = "".join(
+        f'<texture type="mesh_attribute" name="{slot}"><string name="name" value="{name}"/></texture>'
+        for slot, name in zip(slots, names, strict=False)
+    )
+    text = scene(
+        '<shape type="ply"><string name="filename" value="meshes/attributes.ply"/><ref id="m"/></shape>'
+        f'<bsdf type="plastic" id="m">{textures}</bsdf>'
+    )
+    (assets / "scene.xml").write_text(text)
+    with pytest.warns(ImportedSceneWarning, match=words):
+        read_mitsuba(assets / "scene.xml", "scene.xml", ImportOptions())
+
+
+def test_attributes_survive_a_conversion_to_yaml(assets: Path, tmp_path: Path) -> None:
+    for name in ("vertex_color", "vertex_attribute", "face_attribute"):
+        raw = read(assets, EXACT[name])
+        file = tmp_path / f"{name}.yaml"
+        write_scene(raw, assets, file)
+        options: dict[str, Any] = {"spp": 2, "compile": "off", "film": {"width": 16, "height": 12}}
+        images = [torchpt.render(torchpt.load(str(path)), **options) for path in (assets / "scene.xml", file)]
+        assert torch.equal(*images)

@@ -15,6 +15,7 @@ from cubes import unit_cube
 
 from torchpt.core.errors import AssetError
 from torchpt.scene.meshes import MeshPart, load_mesh, smooth_normals
+from torchpt.scene.meshes.ply import load_ply_attribute
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
 HEADER = "ply\nformat {}\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face {}\n"
@@ -404,3 +405,61 @@ def test_malformed_mtl(tmp_path: Path, mtl: str, problem: str) -> None:
     with pytest.raises(AssetError, match=problem) as caught:
         load_mesh(write(tmp_path / "a.obj", f"mtllib a.mtl\n{VERTICES}usemtl x\nf 1 2 3\n"))
     assert caught.value.file.endswith("a.mtl")
+
+
+# ---- Attributes of PLY as Mitsuba names them
+
+ATTRIBUTES = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+property uchar r
+property uchar g
+property uchar b
+property float foo_r
+property float foo_g
+property float foo_b
+property float bar_0
+element face 2
+property list uchar int vertex_indices
+property float red
+property float green
+property float blue
+end_header
+0 0 0 255 0 51 0.1 0.2 0.3 0.5
+1 0 0 0 255 51 0.4 0.5 0.6 0.25
+1 1 0 0 0 51 0.7 0.8 0.9 0.125
+0 1 1 0 0 0 1 2 3 4
+4 0 1 2 3 0.9 0.5 0.1
+3 0 1 3 0.2 0.3 0.4
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "first"),
+    [("color", [1, 0, 0.2]), ("foo", [0.1, 0.2, 0.3]), ("foo_color", [0.1, 0.2, 0.3]), ("bar", [0.5, 0.5, 0.5])],
+)
+def test_vertex_attributes_of_ply_are_colours(tmp_path: Path, name: str, first: list[float]) -> None:
+    part = load_ply_attribute(write(tmp_path / "a.ply", ATTRIBUTES), f"vertex_{name}")
+    assert part is not None and part.colors is not None and part.colors.shape == (4, 3) and part.faces.shape == (3, 3)
+    np.testing.assert_allclose(part.colors[0], first)
+
+
+def test_face_attributes_of_ply_split_the_vertices_and_keep_smooth_normals(tmp_path: Path) -> None:
+    file = write(tmp_path / "a.ply", ATTRIBUTES)
+    (whole,) = load_mesh(file)
+    part = load_ply_attribute(file, "face_color")
+    assert part is not None and part.colors is not None and part.normals is not None
+    np.testing.assert_array_equal(
+        part.colors, np.repeat([[0.9, 0.5, 0.1], [0.9, 0.5, 0.1], [0.2, 0.3, 0.4]], 3, axis=0)
+    )
+    np.testing.assert_array_equal(part.vertices[part.faces], whole.vertices[whole.faces])
+    smooth = smooth_normals(whole.vertices, whole.faces)
+    np.testing.assert_allclose(part.normals[part.faces], smooth[whole.faces], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["vertex_baz", "face_foo", "vertex_", "foo", ""])
+def test_attributes_that_ply_lacks_are_none(tmp_path: Path, name: str) -> None:
+    assert load_ply_attribute(write(tmp_path / "a.ply", ATTRIBUTES), name) is None

@@ -57,6 +57,18 @@ _RECTANGLE = """\
 """
 _GGX = '<string name="distribution" value="ggx"/>'
 
+
+def _attributed(name: str) -> str:
+    """Return a scene of a mesh that shows one of its attributes."""
+    return shape(
+        '<shape type="ply"><string name="filename" value="meshes/attributes.ply"/>'
+        '<boolean name="face_normals" value="true"/><transform name="to_world"><scale value="1.5"/></transform>'
+        '<bsdf type="twosided"><bsdf type="diffuse">'
+        f'<texture type="mesh_attribute" name="reflectance"><string name="name" value="{name}"/></texture>'
+        "</bsdf></bsdf></shape>"
+    )
+
+
 #: Scenes whose twin is exact: the pictures of both renderers are the same but for noise.
 EXACT: dict[str, str] = {
     "diffuse": ball('<bsdf type="diffuse"><rgb name="reflectance" value="0.2, 0.5, 0.8"/></bsdf>'),
@@ -232,6 +244,9 @@ EXACT: dict[str, str] = {
         'value="true"/><transform name="to_world"><scale value="1.5"/></transform><bsdf type="twosided"><bsdf type="diffuse"/>'
         "</bsdf></shape>"
     ),
+    "vertex_color": _attributed("vertex_color"),
+    "vertex_attribute": _attributed("vertex_gloss"),
+    "face_attribute": _attributed("face_shade"),
     "sphere": shape(
         '<shape type="sphere"><float name="radius" value="0.5"/><transform name="to_world"><scale value="1.6"/>'
         '<translate y="0.8"/></transform></shape>'
@@ -416,6 +431,13 @@ def write_assets(folder: Path) -> None:
     }
     (folder / "meshes" / "two.serialized").write_bytes(serialized_bytes([tent, textured], 4, double=True))
     (folder / "meshes" / "old.serialized").write_bytes(serialized_bytes([textured, tent], 3))
+    (folder / "meshes" / "attributes.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nproperty float red\n"
+        "property float green\nproperty float blue\nproperty float gloss_0\nelement face 3\n"
+        "property list uchar int vertex_indices\nproperty float shade_1\nproperty float shade_2\nproperty float shade_3\n"
+        "end_header\n-1 0 0.5 0.9 0 0 0.9\n1 0 0.5 0 0.8 0 0.1\n0 0 -1 0.2 0.2 0.9 0.5\n0 1.2 0 0.9 0.9 0.1 0.3\n"
+        "3 0 1 3 0.8 0.1 0.2\n3 1 2 3 0.1 0.7 0.1\n3 2 0 3 0.2 0.3 0.9\n"
+    )
     (folder / "meshes" / "tent.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nproperty float u\n"
         "property float v\nelement face 3\nproperty list uchar int vertex_indices\nend_header\n"

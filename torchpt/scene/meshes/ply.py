@@ -7,7 +7,7 @@ Declared sizes are checked against the file's before memory is allocated.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
-from torchpt.scene.meshes.mesh import COLORED, MeshPart, polygon_fans
+from torchpt.core.files import read_regular
+from torchpt.scene.meshes.mesh import COLORED, MeshPart, checked, polygon_fans, smooth_normals
 from torchpt.scene.meshes.ply_rows import find_mismatch
 
-__all__ = ["load_ply"]
+__all__ = ["load_ply", "load_ply_attribute"]
 
 #: Types of the format, old and new names, and NumPy's without byte order.
 _TYPES = {
@@ -28,7 +29,7 @@ _TYPES = {
 }
 #: Names that files have for one thing: the list of a face's vertices, colours, texture coordinates.
 _INDICES = ("vertex_indices", "vertex_index")
-_COLORS = ("red", "green", "blue")
+_COLORS = (("red", "green", "blue"), ("r", "g", "b"))
 #: Most bytes of a header.
 _MOST_HEADER = 2**20
 #: The last line of a header with its line end, of whichever kind.
@@ -64,6 +65,62 @@ def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     Raises:
         AssetError: a truncated or malformed file, or one without vertices.
     """
+    vertex, face, elements = _read(path, data)
+    return [_part(path, vertex, face, elements, materials)]
+
+
+def load_ply_attribute(path: Path, name: str) -> MeshPart | None:
+    """Return the faces of a PLY file with a mesh attribute of Mitsuba as their colours; None: the file has no such attribute.
+
+    Mitsuba groups properties ``NAME_0``, or ``NAME_0 NAME_1 NAME_2`` (also ``1 2 3``, ``x y z``, ``r g b``), to the attributes
+    ``vertex_NAME`` and ``face_NAME``; ``red green blue`` or ``r g b`` are ``vertex_color`` and ``face_color``. Colours are as
+    :func:`load_ply` has them; one number is grey. Where faces have the attribute, they share no vertices in what is returned.
+
+    Raises:
+        OSError: the file cannot be read.
+        AssetError: a truncated or malformed file.
+    """
+    vertex, face, elements = _read(path, read_regular(path))
+    part = _part(path, vertex, face, elements, materials=False)
+    owner, _, stem = name.partition("_")
+    colors = _attribute({"vertex": vertex, "face": face}.get(owner, {}), owner, stem, elements)
+    if colors is None or not len(part.faces):
+        return None
+    if owner == "vertex":
+        return checked([replace(part, colors=colors)], path)[0]
+    counts = next(face[key][0] for key in _INDICES if isinstance(face.get(key), tuple))
+    part = checked([part], path)[0]
+    normals = smooth_normals(part.vertices, part.faces) if part.normals is None else part.normals
+    corners = part.faces.ravel()
+    split = replace(
+        part,
+        vertices=part.vertices[corners],
+        faces=np.arange(len(corners)).reshape(-1, 3),
+        normals=normals[corners],
+        uvs=None if part.uvs is None else part.uvs[corners],
+        colors=np.repeat(np.repeat(colors, counts - 2, axis=0), 3, axis=0),  # each polygon is a fan of triangles
+    )
+    return checked([split], path)[0]
+
+
+def _attribute(columns: Columns, owner: str, stem: str, elements: list[_Element]) -> NDArray[np.float64] | None:
+    """Return the values ``(n, 3)`` of a mesh attribute, see :func:`load_ply_attribute`."""
+    plain = stem.removesuffix(
+        "_color"
+    )  # Mitsuba 3.9 says `vertex_NAME_color` where the properties are `NAME_r` and so on
+    groups = [tuple(f"{stem}_{letter}" for letter in letters) for letters in ("012", "123", "xyz", "rgb")]
+    groups += [tuple(f"{plain}_{letter}" for letter in "rgb")]
+    if stem == "color":
+        groups = [*_COLORS, *groups]
+    for names in (*groups, (f"{stem}_0",) * 3, (f"{stem}_1",) * 3, (f"{stem}_x",) * 3, (f"{stem}_r",) * 3):
+        found = _colors(columns, owner, elements, names)
+        if found is not None:
+            return found
+    return None
+
+
+def _read(path: Path, data: bytes) -> tuple[Columns, Columns, list[_Element]]:
+    """Return the columns of the elements ``vertex`` and ``face``, the latter empty where there is none, and all elements."""
     layout, elements, start = _header(path, data)  # start: where the data begin
     reader = _Ascii(path, data, start, elements) if layout == "ascii" else _Binary(path, data, start, layout)
     found: dict[str, Columns] = {}
@@ -79,7 +136,7 @@ def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
         raise AssetError(path, "no element vertex")
     if isinstance(reader, _Ascii):
         reader.check_end()
-    return [_part(path, found["vertex"], found.get("face", {}), elements, materials)]
+    return found["vertex"], found.get("face", {}), elements
 
 
 def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], materials: bool) -> MeshPart:
@@ -122,7 +179,10 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], 
         raise AssetError(path, f"face {too_few[0]} has {counts[too_few[0]]} corners, expected three or more")
     if items.dtype.kind == "f":
         raise AssetError(path, "the vertex indices of element face are no integers")
-    colors = _colors(vertex, elements)
+    colors = next(
+        (found for found in (_colors(vertex, "vertex", elements, names) for names in _COLORS) if found is not None),
+        None,
+    )
     own = COLORED if materials and colors is not None else None
     starts = np.cumsum(counts) - counts
     faces = items.astype(np.int64)[polygon_fans(starts, counts)] if len(counts) else np.zeros((0, 3), np.int64)
@@ -138,13 +198,22 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], 
     )
 
 
-def _colors(vertex: Columns, elements: list[_Element]) -> NDArray[np.float64] | None:
-    """Return linear RGB: floats as stored, integers over the largest of their declared type."""
-    kinds = {p.name: p.kind for element in elements if element.name == "vertex" for p in element.properties}
-    if not all(isinstance(vertex.get(name), np.ndarray) for name in _COLORS):
+def _colors(
+    vertex: Columns, owner: str, elements: list[_Element], names: tuple[str, ...]
+) -> NDArray[np.float64] | None:
+    """Return linear RGB, or None if a property is missing: floats as stored, integers over the largest of their declared type.
+
+    Args:
+        vertex: columns of an element.
+        owner: its name.
+        elements: all elements of the header.
+        names: three of its properties.
+    """
+    kinds = {p.name: p.kind for element in elements if element.name == owner for p in element.properties}
+    if not all(isinstance(vertex.get(name), np.ndarray) for name in names):
         return None
     columns = []
-    for name in _COLORS:
+    for name in names:
         white = 1.0 if kinds[name][0] == "f" else np.iinfo(kinds[name]).max
         columns.append(np.asarray(vertex[name], dtype=np.float64) / white)
     return np.stack(columns, axis=1)

@@ -26,8 +26,8 @@ from torchpt.scene.formats.mitsuba.sensors import (
     UNKNOWN_INTEGRATOR,
     UNKNOWN_SAMPLER,
 )
-from torchpt.scene.formats.mitsuba.shapes import SHAPES, posed
-from torchpt.scene.formats.mitsuba.textures import TEXTURES
+from torchpt.scene.formats.mitsuba.shapes import SHAPES, posed, with_attribute
+from torchpt.scene.formats.mitsuba.textures import TEXTURES, attributes_of
 from torchpt.scene.formats.mitsuba.versions import plugin_name
 
 __all__ = ["PLUGINS", "ImportOptions", "Importer", "read_mitsuba", "split_import_keys"]
@@ -355,6 +355,9 @@ class Importer:
         shape = self.build(SHAPES, bare, _UNKNOWN)
         if shape is None:
             return None
+        names = attributes_of(inner.values(), self)
+        if names:
+            shape = with_attribute(shape, names, element, self)
         emitter = inner.get("emitter")
         material, name = self._material_of(inner.get("bsdf"), lit=emitter is not None, has_medium=has_medium)
         if emitter is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,14 +14,16 @@ from torchpt.core.errors import AssetError, SceneError
 from torchpt.math.transforms import is_usable
 from torchpt.math.vectors import Frame
 from torchpt.physics.shapes import KINDS
+from torchpt.scene.formats.mitsuba.elements import Element
 from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, left_out
 from torchpt.scene.formats.mitsuba.properties import Properties
 from torchpt.scene.meshes import MeshPart, load_mesh
+from torchpt.scene.meshes.ply import load_ply_attribute
 
 if TYPE_CHECKING:
     from torchpt.scene.formats.mitsuba.importer import Importer
 
-__all__ = ["SHAPES", "posed"]
+__all__ = ["SHAPES", "posed", "with_attribute"]
 
 Shape = dict[str, Any]
 Matrix = NDArray[np.float64]
@@ -106,6 +109,40 @@ def _flipped(p: Properties, path: Path, index: int | None) -> MeshPart:
         colors=np.concatenate(colors) if len(colors) == len(parts) else None,
         flat=all(part.flat for part in parts),
     )
+
+
+def with_attribute(shape: Shape, names: Sequence[str], element: Element, importer: Importer) -> Shape:
+    """Return a shape with the mesh attribute that its material reads as vertex colours; note what it cannot have.
+
+    Args:
+        shape: the shape.
+        names: the attributes that its material reads, such as ``vertex_color`` or ``face_NAME``.
+        element: the shape's.
+        importer: the importer.
+    """
+    name, *others = names
+    if others:
+        importer.notes.add(
+            element,
+            f"{element.label}: a mesh carries one attribute, {name}, which is taken for {', '.join(others)} as well",
+        )
+    path = Path(shape.get("path", ""))
+    part = None
+    if path.suffix.lower() == ".ply":
+        path = importer.base / path
+        try:
+            if name == "vertex_color" and load_mesh(path, materials=False)[0].colors is not None:
+                return shape  # as the file is read anyway
+            part = load_ply_attribute(path, name)
+        except OSError as error:
+            raise SceneError(f"line {element.line}", str(path), f"a file ({error.strerror})", element.file) from None
+        except AssetError as error:
+            raise SceneError(f"line {element.line}", str(path), error.problem, element.file) from None
+    if part is not None:
+        return {**{key: value for key, value in shape.items() if key != "path"}, "mesh": (part,)}
+    if name != "vertex_color" or path.suffix.lower() == ".ply":
+        importer.notes.add(element, f"{element.label}: the attribute {name} is not in its file, white takes its place")
+    return shape
 
 
 def _sphere(p: Properties, importer: Importer) -> Shape:

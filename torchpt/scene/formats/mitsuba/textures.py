@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchpt.scene.formats.mitsuba.elements import Element
 from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, nearest
 from torchpt.scene.formats.mitsuba.properties import Properties
+from torchpt.scene.formats.mitsuba.versions import plugin_name
 
 if TYPE_CHECKING:
     from torchpt.scene.formats.mitsuba.importer import Importer
 
-__all__ = ["TEXTURES"]
+__all__ = ["TEXTURES", "attributes_of"]
 
 _GREY = [0.5, 0.5, 0.5]
 _WRAPS = ("repeat", "clamp", "mirror")
@@ -118,10 +121,29 @@ def scaled(value: Any, factor: list[float], p: Properties) -> Any:
 
 
 def _vertex_color(p: Properties, importer: Importer) -> Any:
-    name = p.text("name", "vertex_color")
-    if name != "vertex_color":
-        p.note(f'the attribute "{name}" becomes the vertex colours of the file')
+    p.text("name")  # the shape reads it, by :func:`attributes_of`
     return {"type": "vertex_color"}
+
+
+def attributes_of(elements: Iterable[Element], importer: Importer) -> list[str]:
+    """Return the mesh attributes that textures in some elements name, references followed, each once."""
+    names: dict[str, None] = {}
+    seen: set[int] = set()
+    stack = list(elements)[::-1]
+    while stack:
+        element = stack.pop()
+        if id(element) in seen:
+            continue
+        seen.add(id(element))
+        if element.tag == "texture" and plugin_name(element.tag, element.type) == "mesh_attribute":
+            given = [
+                child.attributes.get("value", "")
+                for child in element.children
+                if child.attributes.get("name") == "name"
+            ]
+            names[given[0].strip() if given else "vertex_color"] = None
+        stack.extend(importer.target(child) if child.tag == "ref" else child for child in reversed(element.children))
+    return list(names)
 
 
 def _grid(p: Properties, importer: Importer) -> Any:
@@ -136,7 +158,11 @@ def _mean(p: Properties, importer: Importer) -> Any:
 TEXTURES: dict[str, Plugin] = {
     "bitmap": exact("image", _bitmap, "a filter_type other than nearest is bilinear; to_uv without shear"),
     "checkerboard": exact("checkerboard", _checkerboard, "its colours are no textures"),
-    "mesh_attribute": exact("vertex_color", _vertex_color, "the vertex colours of the file"),
+    "mesh_attribute": exact(
+        "vertex_color",
+        _vertex_color,
+        "one attribute of 1 or 3 numbers for each PLY mesh, of vertices or faces; integers are fractions of their largest",
+    ),
     "scale": exact("scaled", _scale, "of an image, a checkerboard or a colour"),
     "gridtexture": nearest("a colour", _grid, "the lines are left out"),
     "wireframe": nearest("a colour", _mean, "grey takes its place"),
