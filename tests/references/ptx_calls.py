@@ -239,8 +239,8 @@ class DeviceProbes:
         if own.kernels.search is not None:
             accel = own.kernels.wave.accel
             memory.add(np.ctypeslib.as_array(own.kernels.search), constant=True)
-            memory.add(accel.table.numpy(), constant=True)
-            memory.add(accel.spheres.numpy(), constant=True)
+            for table in accel.tables:
+                memory.add(table.numpy(), constant=True)
 
 
 def _sort_packed(sinks: Sinks, result: Sequence[np.ndarray], before: np.ndarray) -> None:

@@ -85,6 +85,32 @@ def test_what_touches_at_an_edge_goes_to_the_lower_number():
     assert (prim == 0).all() and (t == 1).all() and (u == 0).all() and torch.allclose(v, y, atol=1e-7)
 
 
+def test_edges_are_where_they_are():
+    """A lamp seen from far away at a grazing angle, by rays at its edges: as large as it is, and hit where float64 hits it."""
+    low, high = np.array([-0.24, -0.22]), np.array([0.23, 0.16])
+    lamp, tri = [low[0], 1.98, low[1]], [3.0, 1.0, 0.0]
+    scene = geometry(
+        [tri, lamp], [[4, 1, 0], [high[0], 1.98, low[1]]], [[3, 2, 1], [low[0], 1.98, high[1]]], (1, 1, 0, 0)
+    )
+    rng = np.random.default_rng(0)
+    side, along = rng.integers(4, size=N * 5), rng.random((2, N * 5))
+    at = low + along.T * (high - low)
+    edge = np.where(side < 2, low[side % 2], high[side % 2]) + rng.normal(size=N * 5) * 2e-4
+    at[np.arange(N * 5), side % 2] = edge
+    aim = torch.from_numpy(np.stack([at[:, 0], np.full(N * 5, 1.98), at[:, 1]]).astype(np.float32))
+    eye = torch.tensor([[0.0], [1.0], [6.8]]).expand(3, N * 5)
+    d, far = aim - eye, torch.full((N * 5,), torch.inf)
+    accel = Brute(scene, 1)
+    seen = accel.intersect(eye, d, far)[1] == 1
+    place = eye.double() + d.double() * (np.float64(np.float32(1.98)) - 1.0) / d[1].double()
+    deep = torch.minimum(*((place[k] - scene.p0[k, 1]) for k in (0, 2)))
+    deep = torch.minimum(deep, torch.minimum(scene.p1[0, 1] - place[0], scene.p2[2, 1] - place[2]))
+    assert 0.3 < seen.double().mean() < 0.7
+    assert torch.equal(seen, accel.occluded(eye, d, far))
+    wrong = seen != (deep >= 0)
+    assert wrong.double().mean() < 4e-3 and deep[wrong].abs().max() < 2e-6  # its corners' rounding to float32
+
+
 def test_ends_are_open():
     g = geometry([[-1, -1, 0]], [[1, -1, 0]], [[-1, 1, 0]], (0, 1, 0, 0))
     o = torch.tensor([[0.0], [0.0], [2.0]]).expand(3, 4)

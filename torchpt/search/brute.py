@@ -2,8 +2,8 @@
 
 The kernels have the code that compiled stages contain (:mod:`torchpt.compiler.packet`), so the hits have the same bits in a
 render by tensor operations. They know planar primitives and spheres; quadrics are tested afterwards, one by one
-(:func:`merge_quadric_hits`). Edges are watertight because primitives accept hits within their own rounding error
-(:func:`torchpt.search.tables.tolerances`).
+(:func:`merge_quadric_hits`). Edges are watertight because hits that are nearer to one than their rounding error
+(:func:`torchpt.search.tables.tolerances`) are decided in float64.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from torchpt.native import compile_time
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.base import Accel, Hits
 from torchpt.search.leaf import quadric
-from torchpt.search.tables import Tables, affine_rows, extent, quadric_rows, tolerances
+from torchpt.search.tables import EXACT, Tables, affine_rows, extent, gaps, quadric_rows, tolerances
 
 __all__ = ["MAX_TOLERANCE", "Brute", "Rows", "merge_quadric_hits", "rows_of"]
 
@@ -79,6 +79,7 @@ class Brute(Accel):
         rows: rows of the primitives, if they are known already.
 
     Attributes:
+        tables: the tensors whose addresses are the first of ``words``.
         words: scene data that kernels read, see :func:`torchpt.compiler.packet.scene_words`.
 
     Raises:
@@ -96,10 +97,13 @@ class Brute(Accel):
             raise SceneError("render.accel", "brute", "numba or torch (this scene's scales are too mixed for brute)")
         first_sphere, first_quadric = sum(geometry.counts[:3]), sum(geometry.counts[:4])
         spheres = slice(first_sphere, first_quadric)
-        table = torch.cat([tables.rows64, tolerance[:, None]], 1)[:first_sphere]
-        self.table = table.float().contiguous()
+        columns = (tables.rows64, tolerance[:, None], gaps(tables.rows64, size, geometry.counts)[:, None])
+        rows64 = torch.cat(columns, 1)[:first_sphere].contiguous()
+        rows32 = rows64.float()
+        rows64[:, 12] *= EXACT
         centre_and_radius = torch.cat([geometry.p0, geometry.p1[:1]])[:, spheres].T.double()
-        self.spheres = torch.where(tables.area[spheres, None], centre_and_radius, torch.nan).contiguous()
+        balls = torch.where(tables.area[spheres, None], centre_and_radius, torch.nan).contiguous()
+        self.tables = rows32, rows64, balls
         rows_of_quadrics = quadric_rows(geometry).T.contiguous()
         # for each quadric its numbers and its primitive id
         self.quadrics = [
@@ -109,7 +113,7 @@ class Brute(Accel):
         # the kinds in this scene; KINDS are those that kernels know, without quadrics
         self.kinds = tuple(kind for kind, count in zip(KINDS, self.counts, strict=False) if count)
         self.threads = threads
-        self.words = scene_words(self.table, self.spheres, self.counts, size)
+        self.words = scene_words(*self.tables, self.counts, size)
         self.build_seconds = time.perf_counter() - start
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
@@ -159,7 +163,7 @@ class Brute(Accel):
             "leaves": 0,
             "sah_cost": float(primitives),
             "depth": 0,
-            "bytes": self.table.nbytes + self.spheres.nbytes + sum(row.nbytes for row, _ in self.quadrics),
+            "bytes": sum(x.nbytes for x in (*self.tables, *(row for row, _ in self.quadrics))),
             "build_seconds": self.build_seconds,
         }
 

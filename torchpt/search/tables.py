@@ -10,6 +10,7 @@ P is the number of primitives, Q that of the quadrics among them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,11 +18,13 @@ from torch import Tensor
 
 from torchpt.physics.shapes.geometry import Geometry
 
-__all__ = ["QUADRIC", "ROUNDING", "Tables", "affine_rows", "extent", "quadric_rows", "tolerances"]
+__all__ = ["EXACT", "QUADRIC", "ROUNDING", "Tables", "affine_rows", "extent", "gaps", "quadric_rows", "tolerances"]
 
 #: 32 units of float32 rounding. The affine test of a primitive errs by at most 16 of them times the magnitudes of the terms
 #: (see :func:`tolerances`); the other half covers grazing rays, where ``n . d`` itself is uncertain.
 ROUNDING = 2.0**-19
+#: The rounding of float64 relative to that of float32.
+EXACT = 2.0**-29
 #: Numbers of a quadric: 12 of the transform to its own space, 7 coefficients (:class:`torchpt.physics.shapes.quadrics.Form`).
 QUADRIC = 19
 
@@ -128,3 +131,23 @@ def tolerances(rows: Tensor, scene_extent: float) -> Tensor:
         u, cu = rows[:, first : first + 3].sum(1), rows[:, first + 3]
         worst = torch.maximum(worst, 2 * u * w + (cu * w + cw * u + w) / scene_extent)
     return ROUNDING * worst
+
+
+def gaps(rows: Tensor, scene_extent: float, counts: Sequence[int]) -> Tensor:
+    """Bound how far apart the edges of neighbours can be because their corners are rounded to float32, in parameters.
+
+    Triangles share corners, so there is no gap between them. A rectangle's fourth corner follows from the other three and its
+    pose, each a few roundings of a coordinate off.
+
+    Args:
+        rows: ``(P, 12)`` float64 rows.
+        scene_extent: see :func:`extent`.
+        counts: numbers of primitives of each kind.
+
+    Returns:
+        ``(P,)`` float64.
+    """
+    slope = torch.maximum(rows[:, 4:7].abs().sum(1), rows[:, 8:11].abs().sum(1))
+    prim = torch.arange(len(rows), device=rows.device)
+    rectangle = (prim >= counts[0]) & (prim < counts[0] + counts[1])
+    return torch.where(rectangle, 2.0**-22 * scene_extent * slope, 0.0)

@@ -272,7 +272,7 @@ def _copied(host: Accel, device: torch.device) -> SearchWords | None:
     """Return a search of the host on a device; None if kernels do not know it."""
     tree: TreeSearch | None = None
     if isinstance(host, Brute):
-        tables = host.table.numpy(), host.spheres.numpy()
+        tables = tuple(table.numpy() for table in host.tables)
         numbers = np.frombuffer(host.words, np.int64)[len(tables) :]
     elif isinstance(host, WideBvh):
         (tables, numbers), tree = tree_tables(host), tree_search(host)
