@@ -4,7 +4,7 @@
     python scripts/compare_scenes.py scene.xml --pictures out    # both pictures as PNG, to look at
 
 Mitsuba 3.9 opens hardly any published file: it gets a copy that is mended as this program reads the file (integrators that it
-lacks are ``path``, ``beckmann`` is ``ggx``, ``roughdiffuse`` is ``diffuse``, keys that it does not know are dropped, a
+lacks are ``path``, ``roughdiffuse`` is ``diffuse``, keys that it does not know are dropped, a
 sky is the nearest that is taken here). Needs
 the extra `bench`, and LLVM where ``DRJIT_LIBLLVM_PATH`` says. The columns: mean of ours over Mitsuba's with the standard
 error of the seeds; how many blocks of 16 x 16 pixels differ by more than 4 of their standard errors, of all; seconds until
@@ -37,7 +37,6 @@ MENDS = (
     (r'<boolean\s+name="high_quality_edges"[^>]*/>', ""),
     (r'<float\s+name="(gamma|extEta|ext_eta)"[^>]*/>', ""),
     (r'value="trilinear"', 'value="bilinear"'),
-    (r'value="beckmann"', 'value="ggx"'),
     (r'(<bsdf\s+type="roughdiffuse"[^>]*>\s*<rgb[^>]*/>)\s*<float\s+name="alpha"[^>]*/>', r"\1"),
     (r'type="roughdiffuse"', 'type="diffuse"'),
 )

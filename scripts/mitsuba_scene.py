@@ -507,7 +507,8 @@ def _bare(slot: ResolvedMaterial, opened: Opened) -> dict[str, Any]:
             out["type"] = SMOOTH[model.name]
         else:
             least = {k: max(LEAST_ALPHA, alpha) if isinstance(alpha, float) else alpha for k, alpha in alphas.items()}
-            out |= {"distribution": "ggx", **{key: _value(alpha, opened) for key, alpha in least.items()}}
+            facets = "beckmann" if getattr(model, "beckmann", False) else "ggx"
+            out |= {"distribution": facets, **{key: _value(alpha, opened) for key, alpha in least.items()}}
     if getattr(model, "nonlinear", False):
         out["nonlinear"] = True
     return out | {key: _value(value, opened) for key, value in values.items()}

@@ -115,6 +115,11 @@ RESOLVED: dict[str, tuple[dict[str, Any], Bsdf, dict[str, Any]]] = {  # keys, mo
         RoughConductor(schlick=True, anisotropic=True),
         {"reflectance": GREY, "alpha_u": 0.3, "alpha_v": 0.01},
     ),
+    "roughconductor, beckmann": (
+        {"material": "Au", "distribution": "beckmann", "alpha": 0.2},
+        RoughConductor(beckmann=True),
+        {"eta": METALS["Au"][0], "k": METALS["Au"][1], "alpha": 0.2},
+    ),
     "roughconductor, smooth": (
         {"material": "Cr", "alpha": 0},
         RoughConductor(),
@@ -144,6 +149,11 @@ RESOLVED: dict[str, tuple[dict[str, Any], Bsdf, dict[str, Any]]] = {  # keys, mo
         {"int_ior": "diamond", "ext_ior": 1, "roughness": 1, "energy_compensation": True, "specular_reflectance": 1},
         RoughDielectric(energy_compensation=True),
         {"int_ior": 2.419, "ext_ior": 1.0, "roughness": 1.0, "specular_reflectance": WHITE},
+    ),
+    "roughdielectric, beckmann": (
+        {"distribution": "beckmann", "alpha_u": 0.2, "alpha_v": 0.4},
+        RoughDielectric(beckmann=True, anisotropic=True),
+        {**GLASS, "alpha_u": 0.2, "alpha_v": 0.4},
     ),
     "roughdielectric, alpha": (
         {"alpha": 0.02, "specular_transmittance": 0.5},
@@ -179,6 +189,11 @@ RESOLVED: dict[str, tuple[dict[str, Any], Bsdf, dict[str, Any]]] = {  # keys, mo
             **{"diffuse_reflectance": rgb(0.2), "int_ior": BK7, "ext_ior": 1.0},
             **{"specular_reflectance": WHITE, "roughness": 0.4},
         },
+    ),
+    "roughplastic, beckmann": (
+        {"distribution": "beckmann"},
+        RoughPlastic(beckmann=True),
+        {"diffuse_reflectance": GREY, "int_ior": PP, "ext_ior": AIR, "alpha": 0.1},
     ),
     "roughplastic, alpha": (
         {"alpha": 1},
@@ -296,6 +311,7 @@ BAD: dict[str, tuple[dict[str, Any], str, str]] = {  # name -> material, key bel
     "boolean": ({"type": "principled", "metallic": True}, "metallic", "in 0..1, or a texture, got True"),
     "flag": ({"type": "plastic", "nonlinear": 1}, "nonlinear", "true or false, got 1"),
     "alpha": ({"type": "roughconductor", "alpha": 1.5}, "alpha", "in 0..1, or a texture, got 1.5"),
+    "distribution": ({"type": "roughplastic", "distribution": "phong"}, "distribution", "one of ggx, beckmann, got"),
     "roughness twice": ({"type": "roughconductor", "alpha": 0.1, "roughness": 0.1}, "roughness", "alpha or roughness"),
     "roughness thrice": ({"type": "roughdielectric", "roughness": 0, "alpha_u": 0.1, "alpha_v": 0.1}, "alpha_u", "not"),
     "half a pair": ({"type": "roughconductor", "alpha_v": 0.1}, "alpha_u", "alpha_u and alpha_v together"),

@@ -98,7 +98,7 @@ def test_what_is_not_exact_warns_with_its_line_and_is_an_error_where_strict(asse
     assert not becomes or becomes in found
     line = next(str(warning.message).split(":")[1] for warning in caught if words in str(warning.message))
     assert (
-        f'type="{"ward" if name == "ward_diffuse" else {"beckmann": "roughconductor"}.get(name, name)}"'
+        f'type="{"ward" if name == "ward_diffuse" else {"phong_facets": "roughconductor"}.get(name, name)}"'
         in (text.splitlines()[int(line) - 1])
     )
     strict = error(assets, text, strict=True)

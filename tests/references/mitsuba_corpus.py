@@ -78,6 +78,7 @@ EXACT: dict[str, str] = {
     "dielectric": ball('<bsdf type="dielectric"><string name="int_ior" value="water"/></bsdf>', depth=12),
     "thindielectric": ball('<bsdf type="thindielectric"/>', depth=12),
     "roughdielectric": ball(f'<bsdf type="roughdielectric">{_GGX}<float name="alpha" value="0.3"/></bsdf>', depth=12),
+    "roughdielectric_default": ball('<bsdf type="roughdielectric"/>', depth=12),
     "conductor": ball('<bsdf type="conductor"><string name="material" value="Au"/></bsdf>'),
     "conductor_default": ball('<bsdf type="conductor"/>'),
     "conductor_eta": ball(
@@ -87,6 +88,10 @@ EXACT: dict[str, str] = {
         f'<bsdf type="roughconductor">{_GGX}<string name="material" value="Cu"/><float name="alpha_u" value="0.1"/>'
         '<float name="alpha_v" value="0.4"/></bsdf>'
     ),
+    "roughconductor_beckmann": ball(
+        '<bsdf type="roughconductor"><string name="distribution" value="beckmann"/><string name="material" value="Cu"/>'
+        '<float name="alpha_u" value="0.1"/><float name="alpha_v" value="0.4"/></bsdf>'
+    ),
     "plastic": ball('<bsdf type="plastic"><rgb name="diffuse_reflectance" value="0.1 0.3 0.9"/></bsdf>'),
     "plastic_nonlinear": ball(
         '<bsdf type="plastic"><rgb name="diffuse_reflectance" value="0.1 0.3 0.9"/>'
@@ -94,6 +99,9 @@ EXACT: dict[str, str] = {
     ),
     "roughplastic": ball(
         f'<bsdf type="roughplastic">{_GGX}<float name="alpha" value="0.2"/><float name="int_ior" value="1.6"/></bsdf>'
+    ),
+    "roughplastic_default": ball(
+        '<bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.1 0.3 0.9"/></bsdf>'
     ),
     "principled": ball(
         '<bsdf type="principled"><rgb name="base_color" value="0.8 0.3 0.2"/><float name="roughness" value="0.4"/>'
@@ -390,10 +398,10 @@ NEAREST: dict[str, tuple[str, str, str]] = {
         'bsdf "difftrans" becomes diffuse',
     ),
     "mine": (ball('<bsdf type="mine"><float name="glow" value="2"/></bsdf>'), "diffuse", 'bsdf "mine" becomes diffuse'),
-    "beckmann": (
-        ball('<bsdf type="roughconductor"/>'),
+    "phong_facets": (
+        ball('<bsdf type="roughconductor"><string name="distribution" value="phong"/></bsdf>'),
         "roughconductor",
-        'bsdf "roughconductor": distribution "beckmann" becomes ggx',
+        'bsdf "roughconductor": distribution "phong" becomes beckmann',
     ),
     "sunsky": (lamp('<emitter type="sunsky"/>'), "diffuse", 'emitter "sunsky" becomes constant and directional'),
     "collimated": (lamp('<emitter type="collimated"/>'), "diffuse", 'emitter "collimated" is left out'),

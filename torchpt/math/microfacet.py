@@ -1,4 +1,4 @@
-"""Microfacet theory: the GGX distribution, masking and shadowing, Fresnel equations of dielectrics and conductors."""
+"""Microfacet theory: Fresnel equations, the GGX distribution, masking and shadowing, what all distributions have."""
 
 from __future__ import annotations
 
@@ -15,9 +15,13 @@ from torchpt.math.vectors import dot, normalize
 __all__ = [
     "ALPHA_MIN",
     "BOUNDED",
+    "GGX",
     "INDEX_MATCHED",
+    "Facets",
+    "Ggx",
     "Interface",
     "Reflection",
+    "Seen",
     "clamp_alpha",
     "coat_reflectance",
     "coat_transmittance",
@@ -152,6 +156,7 @@ def diffuse_transmittance(eta: Tensor) -> Tensor:
 
 #: Surfaces of lower roughness are treated as smooth: a delta lobe.
 ALPHA_MIN = 1e-4
+_TINY = 1e-30  # keeps 0 / 0 out of lanes that count for nothing
 #: True: models that only reflect avoid normals that reflect below the surface (Eto and Tokuyoshi 2023).
 BOUNDED = True
 
@@ -292,6 +297,108 @@ def reflection(
     return Reflection(m=m, cos_m=dot(wo, m), value=value, pdf=0.5 * d / (scaled + s_o))
 
 
+# ---- The choice of a distribution
+
+
+class Seen(NamedTuple):
+    """What a pair of directions sees of the facets, each ``(N,)``."""
+
+    area: Tensor  # projected area of the facets that wo sees, over the surface's: D over it is the density of visible normals
+    shadowing: (
+        Tensor  # value over density of a scattered direction, but for Fresnel's factor: the light that is not blocked
+    )
+
+
+class Facets:
+    """A distribution of facet normals with Smith's masking. Instances hold nothing.
+
+    Attributes:
+        bounds: whether :meth:`sample_normal` can leave out normals that reflect below the surface.
+    """
+
+    bounds: bool
+
+    def density(self, m: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
+        """Return the density ``D(m)`` of normals ``(N,)``, per steradian and area of the surface."""
+        raise NotImplementedError
+
+    def sample_normal(self, wo: Tensor, alpha_u: Tensor, alpha_v: Tensor, u: Tensor, bounded: bool = False) -> Tensor:
+        """Draw a visible normal ``(3, N)`` for ``wo.z >= 0``, see :func:`sample_normal`."""
+        raise NotImplementedError
+
+    def reflection(
+        self,
+        wo: Tensor,
+        wi: Tensor,
+        alpha_u: Tensor,
+        alpha_v: Tensor,
+        bounded: bool = False,
+        by_height: bool = False,
+    ) -> Reflection:
+        """Evaluate a rough mirror, see :func:`reflection`."""
+        raise NotImplementedError
+
+    def seen(self, wo: Tensor, wi: Tensor, alpha_u: Tensor, alpha_v: Tensor, by_height: bool = False) -> Seen:
+        """Return the factors of ``D`` in density and value, of directions on either side.
+
+        Args:
+            wo: ``(3, N)``.
+            wi: ``(3, N)``.
+            alpha_u: roughness along x ``(N,)``.
+            alpha_v: roughness along y ``(N,)``.
+            by_height: masking and shadowing correlated by height, rather than the product ``G1(wo) G1(wi)``.
+        """
+        raise NotImplementedError
+
+    def masking(self, w: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
+        """Return Smith's ``G1`` ``(N,)`` of ``w (3, N)``; 0 below the surface."""
+        raise NotImplementedError
+
+
+class Ggx(Facets):
+    """The distribution of Trowbridge and Reitz, by the functions above."""
+
+    bounds = True
+
+    def density(self, m: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
+        """See :meth:`Facets.density`."""
+        return ggx(m, alpha_u, alpha_v)
+
+    def sample_normal(self, wo: Tensor, alpha_u: Tensor, alpha_v: Tensor, u: Tensor, bounded: bool = False) -> Tensor:
+        """See :meth:`Facets.sample_normal`."""
+        return sample_normal(wo, alpha_u, alpha_v, u, bounded)
+
+    def reflection(
+        self,
+        wo: Tensor,
+        wi: Tensor,
+        alpha_u: Tensor,
+        alpha_v: Tensor,
+        bounded: bool = False,
+        by_height: bool = False,
+    ) -> Reflection:
+        """See :meth:`Facets.reflection`."""
+        return reflection(wo, wi, alpha_u, alpha_v, bounded, by_height)
+
+    def seen(self, wo: Tensor, wi: Tensor, alpha_u: Tensor, alpha_v: Tensor, by_height: bool = False) -> Seen:
+        """See :meth:`Facets.seen`."""
+        cos_o, cos_i = wo[2].abs(), wi[2].abs()
+        s_o, s_i = stretched_length(wo, alpha_u, alpha_v), stretched_length(wi, alpha_u, alpha_v)
+        shadowing = height_correlated_masking(cos_o, s_o, cos_i, s_i) if by_height else masking(cos_i, s_i)
+        return Seen(area=0.5 * (cos_o + s_o).clamp_min(_TINY), shadowing=shadowing)
+
+    def masking(self, w: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
+        """See :meth:`Facets.masking`."""
+        return masking(w[2].clamp_min(0.0), stretched_length(w, alpha_u, alpha_v))
+
+
+#: The one instance: it holds nothing.
+GGX = Ggx()
+
+
+# ---- Integrals over visible normals: albedo of facets, reflectance and transmittance of coats
+
+
 def _legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return Gauss-Legendre nodes and weights on [0, 1]."""
     x, weights = np.polynomial.legendre.leggauss(n)
@@ -312,7 +419,13 @@ class _Normals(NamedTuple):
 
 
 def directional_albedo(
-    wo: Tensor, alpha_u: Tensor, alpha_v: Tensor | None, eta: Tensor | None, azimuths: int = 32, heights: int = 32
+    wo: Tensor,
+    alpha_u: Tensor,
+    alpha_v: Tensor | None,
+    eta: Tensor | None,
+    azimuths: int = 32,
+    heights: int = 32,
+    facets: Facets = GGX,
 ) -> Tensor:
     """Compute the single-scattering albedo ``(K,)`` of facets that absorb nothing, with height-correlated masking.
 
@@ -325,6 +438,7 @@ def directional_albedo(
         eta: ``(1,)`` index of the far side over that of the side of ``wo``; None: the facets are mirrors.
         azimuths: number of Gauss-Legendre nodes.
         heights: number of Gauss-Legendre nodes.
+        facets: distribution of the normals.
     """
     (a, wa), (b, wb) = _legendre(azimuths), _legendre(heights)  # nodes and weights of u[0] and of u[1]
     u = wo.new_tensor(np.stack(np.meshgrid(a if alpha_v is not None else 0.5 * a, b, indexing="ij")).reshape(2, -1))
@@ -332,17 +446,24 @@ def directional_albedo(
     wo = wo.repeat_interleave(q, 1)
     au = alpha_u.expand(k * q)
     av = au if alpha_v is None else alpha_v.expand(k * q)
-    m = sample_normal(wo, au, av, u.repeat(1, k), bounded=eta is None)
-    cos, s_o = dot(wo, m), stretched_length(wo, au, av)
+    bounded = eta is None and facets.bounds
+    m = facets.sample_normal(wo, au, av, u.repeat(1, k), bounded=bounded)
+    cos = dot(wo, m)
+
+    def unblocked(w: Tensor, height: Tensor) -> Tensor:
+        """Return the share of light along ``w`` that no facet blocks; ``height (K Q,)`` is its cosine, 0 if it fails."""
+        return facets.seen(wo, torch.stack((w[0], w[1], height)), au, av, by_height=True).shadowing
+
     back = reflect(wo, m, cos)  # the reflected direction
-    out = height_correlated_masking(wo[2], s_o, back[2].clamp_min(0.0), stretched_length(back, au, av))
-    if eta is None:
+    out = unblocked(back, back[2].clamp_min(0.0))
+    if bounded:
         # Bounded sampling has another density; this is the ratio of both.
+        s_o = stretched_length(wo, au, av)
         out = out * (_bound(wo, au, av).k * wo[2] + s_o) / (wo[2] + s_o)
-    else:
+    if eta is not None:
         boundary = fresnel_dielectric(cos, eta)
         on = normalize(refract(wo, m, cos, boundary))  # the refracted direction
-        through = height_correlated_masking(wo[2], s_o, (-on[2]).clamp_min(0.0), stretched_length(on, au, av))
+        through = unblocked(on, (-on[2]).clamp_min(0.0))
         out = boundary.reflectance * out + (1.0 - boundary.reflectance) * through
     return (out.reshape(k, q) * wo.new_tensor(np.outer(wa, wb).ravel())).sum(1)
 
@@ -353,58 +474,64 @@ def _lanes(cosines: Tensor, alpha: Tensor, n: int) -> tuple[Tensor, Tensor]:
     return torch.stack(((1.0 - z * z).clamp_min(0.0).sqrt(), torch.zeros_like(z), z)), alpha.expand_as(z)
 
 
-def _cap_normals(cosines: Tensor, alpha: Tensor, azimuths: int = 32, heights: int = 32) -> _Normals:
-    """Sample normals by :func:`sample_normal` at Gauss-Legendre nodes; by symmetry half the azimuths suffice."""
+def _normals(cosines: Tensor, alpha: Tensor, facets: Facets, azimuths: int = 32, heights: int = 32) -> _Normals:
+    """Sample normals by :meth:`Facets.sample_normal` at Gauss-Legendre nodes; by symmetry half the azimuths suffice."""
     (a, wa), (b, wb) = _legendre(azimuths), _legendre(heights)  # nodes and weights of u[0] and of u[1]
     u = cosines.new_tensor(np.stack(np.meshgrid(0.5 * a, b, indexing="ij")).reshape(2, -1))
     wo, alphas = _lanes(cosines, alpha, u.shape[1])
-    m = sample_normal(wo, alphas, alphas, u.repeat(1, len(cosines)))
+    m = facets.sample_normal(wo, alphas, alphas, u.repeat(1, len(cosines)))
     return _Normals(wo=wo, m=m, alpha=alphas, weights=cosines.new_tensor(np.outer(wa, wb).ravel()))
 
 
-def _disk_normals(cosines: Tensor, alpha: Tensor, n: int = 32) -> _Normals:
-    """Sample normals by projected hemispheres, as in Mitsuba's integrals.
-
-    Heitz, *Sampling the GGX Distribution of Visible Normals*, 2018.
-    """
+def _normals_of_mitsuba(cosines: Tensor, alpha: Tensor, facets: Facets, n: int = 32) -> _Normals:
+    """Sample normals at the nodes of Mitsuba's integrals."""
     (a, wa), (b, wb) = _legendre(n), _legendre(n)
-    half = n // 2  # by symmetry half the disk suffices
-    u = np.stack(np.meshgrid(a[:half], b, indexing="ij")).reshape(2, -1)
-    x, y = concentric_disk(cosines.new_tensor(u)).repeat(1, len(cosines))
+    half = n // 2  # by symmetry half of u[0] suffices
+    u = cosines.new_tensor(np.stack(np.meshgrid(a[:half], b, indexing="ij")).reshape(2, -1))
     wo, alphas = _lanes(cosines, alpha, u.shape[1])
+    u = u.repeat(1, len(cosines))
+    m = _disk_normals(wo, alphas, u) if facets is GGX else facets.sample_normal(wo, alphas, alphas, u)
+    weights = cosines.new_tensor(2.0 * np.outer(wa[:half], wb).ravel())  # 2: for the other half
+    return _Normals(wo=wo, m=m, alpha=alphas, weights=weights)
+
+
+def _disk_normals(wo: Tensor, alphas: Tensor, u: Tensor) -> Tensor:
+    """Sample normals of GGX by projected hemispheres (Heitz, *Sampling the GGX Distribution of Visible Normals*, 2018)."""
+    x, y = concentric_disk(u)
     stretched = normalize(torch.stack((wo[0] * alphas, wo[1], wo[2])))
     s = 0.5 * (1.0 + stretched[2])
     y = (1.0 - s) * (1.0 - x * x).clamp_min(0.0).sqrt() + s * y
     z = (1.0 - x * x - y * y).clamp_min(1e-12).sqrt()
     along, up = stretched[0] * z - stretched[2] * y, stretched[0] * y + stretched[2] * z
-    m = normalize(torch.stack((alphas * along, -alphas * x, up)))
-    weights = cosines.new_tensor(2.0 * np.outer(wa[:half], wb).ravel())  # 2: for the other half of the disk
-    return _Normals(wo=wo, m=m, alpha=alphas, weights=weights)
+    return normalize(torch.stack((alphas * along, -alphas * x, up)))
 
 
-def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor) -> Tensor:
+def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor, facets: Facets = GGX) -> Tensor:
     """Compute the single-scattering reflectance ``(K,)`` of rough dielectric facets: the mean of ``F G1(wi)``.
 
     Args:
         cosines: ``(K,)`` cosines of ``wo``, positive.
         alpha: ``(1,)``.
         eta: ``(1,)`` index of the far side over that of the side of ``wo``.
+        facets: distribution of the normals.
     """
-    nodes = _cap_normals(cosines, alpha)
+    # Total reflection begins at an edge among the nodes, which Beckmann's narrower lobe meets more often.
+    n = 32 if facets is GGX else 64
+    nodes = _normals(cosines, alpha, facets, n, n)
     cos = dot(nodes.wo, nodes.m)
     wi = reflect(nodes.wo, nodes.m, cos)
-    seen = masking(wi[2].clamp_min(0.0), stretched_length(wi, nodes.alpha, nodes.alpha))
+    seen = facets.masking(wi, nodes.alpha, nodes.alpha)
     return nodes.mean(fresnel_dielectric(cos, eta).reflectance * seen)
 
 
-def coat_transmittance(cosines: Tensor, alpha: Tensor, eta: Tensor) -> Tensor:
+def coat_transmittance(cosines: Tensor, alpha: Tensor, eta: Tensor, facets: Facets = GGX) -> Tensor:
     """Compute the single-scattering transmittance ``(K,)`` of rough dielectric facets: the mean of ``(1 - F) G1(wi)``.
 
     At the 32 x 32 nodes of Mitsuba: their error of up to 4e-4 is 1 % of a coat's small reflectance, and shows in comparisons.
     """
-    nodes = _disk_normals(cosines, alpha)
+    nodes = _normals_of_mitsuba(cosines, alpha, facets)
     cos = dot(nodes.wo, nodes.m)
     side = fresnel_dielectric(cos, eta)
     wi = normalize(refract(nodes.wo, nodes.m, cos, side))
-    seen = masking((-wi[2]).clamp_min(0.0), stretched_length(wi, nodes.alpha, nodes.alpha))
+    seen = facets.masking(-wi, nodes.alpha, nodes.alpha)
     return nodes.mean((1.0 - side.reflectance) * seen)

@@ -1,6 +1,6 @@
-"""Roughness parameters of GGX microfacets, and tables of the energy lost between facets.
+"""Roughness and distribution of microfacets, and tables of the energy lost between facets.
 
-GGX's alpha is the width of the distribution of facet normals: 0 a mirror, 1 very rough. It may differ along the surface's
+Alpha is the width of the distribution of facet normals: 0 a mirror, 1 very rough. It may differ along the surface's
 tangents u and v (``alpha_u``, ``alpha_v``). Single-scattering models lose the light that meets more than one facet; a table
 of their directional albedo, made once for each material, lets a model scale it back.
 """
@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from torchpt.math import microfacet
+from torchpt.math.beckmann import BECKMANN
+from torchpt.math.microfacet import GGX, Facets
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Table, Values
 from torchpt.physics.bsdfs.specs import fraction
-from torchpt.spec import Flag, Refused
+from torchpt.spec import Choice, Flag, Refused
 
 __all__ = ["Anisotropic", "Rough", "alphas", "energy_at", "energy_table", "mean_roughness", "roughness_parameters"]
 
@@ -27,12 +29,24 @@ _COSINES, _COSINES_ANISOTROPIC, _AZIMUTHS = 64, 32, 17
 
 
 class Rough(Bsdf, part=True):
-    """Mixin of isotropic microfacet models: roughness."""
+    """Mixin of isotropic microfacet models: roughness, and the distribution of normals.
+
+    Attributes:
+        beckmann: the distribution is Beckmann's, not GGX.
+    """
 
     parameters: ClassVar = {
-        "alpha": fraction(None, f"GGX alpha of the facets; {_DEFAULT_ALPHA:g} by default"),
+        "distribution": Choice("ggx", names=("ggx", "beckmann"), doc="distribution of the facets' normals"),
+        "alpha": fraction(None, f"alpha of the facets; {_DEFAULT_ALPHA:g} by default"),
         "roughness": fraction(None, "square root of `alpha`, in its place"),
     }
+
+    beckmann: bool
+
+    @property
+    def facets(self) -> Facets:
+        """Return the distribution of normals."""
+        return BECKMANN if self.beckmann else GGX
 
     @classmethod
     def check(cls, values: Values, given: frozenset[str]) -> None:
@@ -93,7 +107,7 @@ def alphas(parameters: Parameters) -> tuple[Tensor, Tensor]:
     return u, u if v is None else v
 
 
-def energy_table(parameters: Parameters, etas: Sequence[Tensor | None]) -> Table:
+def energy_table(parameters: Parameters, etas: Sequence[Tensor | None], facets: Facets) -> Table:
     """Return the directional albedo of a lossless microfacet surface as one row of a table, for :func:`energy_at`.
 
     Entries run over cosines first, then over azimuths, then over ``etas``.
@@ -101,6 +115,7 @@ def energy_table(parameters: Parameters, etas: Sequence[Tensor | None]) -> Table
     Args:
         parameters: from :func:`roughness_parameters`, for one material.
         etas: relative indices, or None for a mirror; each gives one block of the table.
+        facets: distribution of the normals.
     """
     alpha_u, alpha_v = alphas(parameters)
     au, av = alpha_u.double(), alpha_v.double()
@@ -122,7 +137,7 @@ def energy_table(parameters: Parameters, etas: Sequence[Tensor | None]) -> Table
         nodes = 64 if isotropic and eta is not None else 32
         index = None if eta is None else eta.double()
         albedo = microfacet.directional_albedo(
-            wo, au, alpha_v=None if isotropic else av, eta=index, azimuths=nodes, heights=nodes
+            wo, au, alpha_v=None if isotropic else av, eta=index, azimuths=nodes, heights=nodes, facets=facets
         )
         blocks.append(albedo)
     values = torch.cat(blocks).clamp_max(1.0).to(alpha_u.dtype)

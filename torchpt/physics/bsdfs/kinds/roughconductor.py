@@ -1,4 +1,4 @@
-"""A rough conductor: GGX microfacets with single scattering, or with compensation of the energy of multiple scattering."""
+"""A rough conductor: microfacets with single scattering, or with compensation of the energy of multiple scattering."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["RoughConductor"]
 
 @dataclass(frozen=True)
 class RoughConductor(Anisotropic, Metal):
-    """A metal with GGX microfacets.
+    """A metal with microfacets.
 
     A row with both alphas below ``1e-4`` is smooth: a delta lobe.
 
@@ -38,6 +38,7 @@ class RoughConductor(Anisotropic, Metal):
 
     Attributes:
         schlick: the colour is ``reflectance`` at normal incidence, not ``eta`` and ``k``.
+        beckmann: the distribution is Beckmann's, not GGX.
         anisotropic: ``alpha_u`` and ``alpha_v`` may differ.
         energy_compensation: scale the lobe by that factor, with height-correlated masking. Not reciprocal.
     """
@@ -46,6 +47,7 @@ class RoughConductor(Anisotropic, Metal):
     delta = True
 
     schlick: bool = False
+    beckmann: bool = False
     anisotropic: bool = False
     energy_compensation: bool = False
 
@@ -55,6 +57,7 @@ class RoughConductor(Anisotropic, Metal):
         return (
             cls(
                 schlick=by_reflectance(values),
+                beckmann=values["distribution"] == "beckmann",
                 anisotropic=values["alpha_u"] is not None,
                 energy_compensation=values["energy_compensation"],
             ),
@@ -63,17 +66,24 @@ class RoughConductor(Anisotropic, Metal):
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
-        """Return all pairs of ``schlick`` and ``anisotropic``, and two variants with energy compensation."""
+        """Return all pairs of ``schlick`` and ``anisotropic``, two with energy compensation, and three of Beckmann's facets."""
         plain = [
             cls(schlick=schlick, anisotropic=anisotropic) for anisotropic in (False, True) for schlick in (False, True)
         ]
-        return *plain, cls(energy_compensation=True), cls(anisotropic=True, energy_compensation=True)
+        compensated = (cls(energy_compensation=True), cls(anisotropic=True, energy_compensation=True))
+        beckmann = (
+            cls(beckmann=True),
+            cls(beckmann=True, anisotropic=True),
+            cls(beckmann=True, energy_compensation=True),
+        )
+        return *plain, *compensated, *beckmann
 
     def tabulate(self, values: Parameters) -> Parameters:
         """Return the table of directional albedo for energy compensation."""
         if not self.energy_compensation:
             return {}
-        return {"energy": energy_table(roughness_parameters(values, anisotropic=self.anisotropic), etas=[None])}
+        surface = roughness_parameters(values, anisotropic=self.anisotropic)
+        return {"energy": energy_table(surface, etas=[None], facets=self.facets)}
 
     def prepare(self, values: Parameters) -> Parameters:
         """Return the parameters of one material, or of all lanes, from its values; see :meth:`Bsdf.prepare`."""
@@ -83,7 +93,7 @@ class RoughConductor(Anisotropic, Metal):
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Bsdf.eval_pdf`."""
-        facets = microfacet.reflection(
+        facets = self.facets.reflection(
             wo, wi, *alphas(parameters), bounded=microfacet.BOUNDED, by_height=self.energy_compensation
         )
         # 1, or 0 where the surface is a mirror: `eval` leaves deltas out.
@@ -96,7 +106,7 @@ class RoughConductor(Anisotropic, Metal):
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         """Reflect at a visible normal, or at the surface normal where the surface is smooth."""
-        m = microfacet.sample_normal(wo, *alphas(parameters), u, bounded=microfacet.BOUNDED)
+        m = self.facets.sample_normal(wo, *alphas(parameters), u, bounded=microfacet.BOUNDED)
         drawn = mixture_sample(self, parameters, wo, microfacet.reflect(wo, m, dot(wo, m)))
         mirror = torch.stack((-wo[0], -wo[1], wo[2]))
         return with_delta(drawn, parameters["smooth"] & (wo[2] > 0), mirror, self._colour(parameters, wo[2]))

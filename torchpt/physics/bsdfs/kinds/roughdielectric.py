@@ -1,4 +1,4 @@
-"""A rough dielectric interface: GGX microfacets that reflect and refract.
+"""A rough dielectric interface: microfacets that reflect and refract.
 
 Walter, Marschner, Li, Torrance, *Microfacet Models for Refraction through Rough Surfaces*, 2007.
 """
@@ -36,16 +36,15 @@ from torchpt.physics.bsdfs.rough import (
 
 __all__ = ["RoughDielectric"]
 
-_TINY = 1e-30  # keeps 0 / 0 out of lanes that count for nothing
-
 
 @dataclass(frozen=True)
 class RoughDielectric(Anisotropic, Glass):
-    """A boundary between two clear media with GGX microfacets: frosted glass.
+    """A boundary between two clear media with microfacets: frosted glass.
 
     A row with both alphas below ``1e-4`` is a smooth interface; with equal indices light passes straight on.
 
     Attributes:
+        beckmann: the distribution is Beckmann's, not GGX.
         anisotropic: ``alpha_u`` and ``alpha_v`` may differ.
         energy_compensation: scale both lobes of ``wo`` by ``1 / E(wo)``, where E is the directional albedo of single
             scattering (Turquin 2019), with height-correlated masking. Not reciprocal.
@@ -57,23 +56,29 @@ class RoughDielectric(Anisotropic, Glass):
     transmits = True
     refracts = True
 
+    beckmann: bool = False
     anisotropic: bool = False
     energy_compensation: bool = False
 
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
         """See :meth:`Bsdf.of`."""
-        variant = cls(anisotropic=values["alpha_u"] is not None, energy_compensation=values["energy_compensation"])
+        variant = cls(
+            beckmann=values["distribution"] == "beckmann",
+            anisotropic=values["alpha_u"] is not None,
+            energy_compensation=values["energy_compensation"],
+        )
         return variant, cls.given(values)
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
         """See :meth:`Bsdf.variants`."""
-        return tuple(
+        ggx = [
             cls(anisotropic=anisotropic, energy_compensation=compensated)
             for compensated in (False, True)
             for anisotropic in (False, True)
-        )
+        ]
+        return *ggx, cls(beckmann=True), cls(beckmann=True, anisotropic=True)
 
     def tabulate(self, values: Parameters) -> Parameters:
         """Return the table of directional albedo for energy compensation, one block for each side."""
@@ -82,7 +87,7 @@ class RoughDielectric(Anisotropic, Glass):
         surface = self._surface(values)
         # A smooth material does not read the table: any index but 1, for which the integral would fail, will do.
         eta = torch.where(surface["smooth"], 1.5, surface["eta"])
-        return {"energy": energy_table(surface, etas=[eta, 1.0 / eta])}
+        return {"energy": energy_table(surface, etas=[eta, 1.0 / eta], facets=self.facets)}
 
     def prepare(self, values: Parameters) -> Parameters:
         """Return the parameters of one material, or of all lanes, from its values; see :meth:`Bsdf.prepare`."""
@@ -107,27 +112,23 @@ class RoughDielectric(Anisotropic, Glass):
         m = normalize(h)
         m = m * torch.copysign(torch.ones_like(m[2]), m[2])
         o, i = dot(wo, m), dot(wi, m)  # cosines at the facet
-        cos_o, cos_i = wo[2].abs(), wi[2].abs()
         # A facet is visible only from the side of the surface on which the direction lies.
         is_visible = torch.minimum(o * wo[2], i * wi[2]) > 0
         counts = is_visible & ~parameters["smooth"]  # deltas are left out
         side = fresnel_dielectric(o, eta)
-        s_o, s_i = microfacet.stretched_length(wo, alpha_u, alpha_v), microfacet.stretched_length(wi, alpha_u, alpha_v)
+        seen = self.facets.seen(wo, wi, alpha_u, alpha_v, by_height=self.energy_compensation)
         h2 = dot(h, h)
         # Jacobian dm / dwi, times the cosine o of the density of visible normals, which the next line leaves out:
         # 1 / (4 o) and eta^2 i / |wo + eta wi|^2, the latter without eta^2, which the last line has.
         refraction_jacobian = (o * i).abs() / torch.where(counts, h2, 1.0)
         jacobian = torch.where(reflects, 0.25, refraction_jacobian)
         # Density of wi by reflection or refraction at visible normals.
-        density = torch.where(
-            counts, microfacet.ggx(m, alpha_u, alpha_v) * 2.0 / (cos_o + s_o).clamp_min(_TINY) * jacobian, 0.0
-        )
+        normals = self.facets.density(m, alpha_u, alpha_v)
+        density = torch.where(counts, normals / seen.area * jacobian, 0.0)
         r = side.reflectance
+        value = density * seen.shadowing
         if self.energy_compensation:
-            energy = energy_at(parameters["energy"], parameters, wo, block=(wo[2] < 0).to(wo.dtype))
-            value = density * microfacet.height_correlated_masking(cos_o, s_o, cos_i, s_i) / energy
-        else:
-            value = density * microfacet.masking(cos_i, s_i)
+            value = value / energy_at(parameters["energy"], parameters, wo, block=(wo[2] < 0).to(wo.dtype))
         colour = torch.where(
             reflects,
             tinted(r * value, parameters["specular_reflectance"]),
@@ -141,7 +142,7 @@ class RoughDielectric(Anisotropic, Glass):
         smooth = parameters["smooth"]
         sign = torch.copysign(torch.ones_like(wo[2]), wo[2])
         # Normals point to the upper side; -wo sees from above the facets that wo sees from below.
-        m = microfacet.sample_normal(wo * sign, *alphas(parameters), u)
+        m = self.facets.sample_normal(wo * sign, *alphas(parameters), u)
         o = dot(wo, m)  # cosine at the facet, negative from below
         side = fresnel_dielectric(o, parameters["eta"])
         reflects = lobe < side.reflectance

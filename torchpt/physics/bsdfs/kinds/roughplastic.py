@@ -33,12 +33,13 @@ _COSINES = 64  # entries of the tables, as in Mitsuba
 
 @dataclass(frozen=True)
 class RoughPlastic(Rough, Coat):
-    """A coat with GGX microfacets over a diffuse base.
+    """A coat with microfacets over a diffuse base.
 
     A row with alpha below ``1e-4`` has a smooth coat. The transmittance of the coat is tabulated for each material, over the
     cosine of a direction.
 
     Attributes:
+        beckmann: the distribution is Beckmann's, not GGX.
         nonlinear: internally reflected light is multiplied by the base's colour again.
     """
 
@@ -47,17 +48,18 @@ class RoughPlastic(Rough, Coat):
     lobed = True  # `sample` reads a number `lobe`, which chooses between coat and base
     delta = True
 
+    beckmann: bool = False
     nonlinear: bool = False
 
     @classmethod
     def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
         """See :meth:`Bsdf.of`."""
-        return cls(nonlinear=values["nonlinear"]), cls.given(values)
+        return cls(beckmann=values["distribution"] == "beckmann", nonlinear=values["nonlinear"]), cls.given(values)
 
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
         """See :meth:`Bsdf.variants`."""
-        return cls(), cls(nonlinear=True)
+        return cls(), cls(nonlinear=True), cls(beckmann=True)
 
     def tabulate(self, values: Parameters) -> Parameters:
         """Return the coat's ``transmittance`` by cosine, and ``inner``, its mean reflectance for diffuse light from below."""
@@ -65,8 +67,8 @@ class RoughPlastic(Rough, Coat):
         surface = roughness_parameters(values, anisotropic=False)
         cosines = torch.linspace(0, 1, _COSINES, dtype=torch.float64, device=eta.device).clamp_min(1e-6)
         alpha, index = surface["alpha_u"].double(), eta.double()
-        transmittance = microfacet.coat_transmittance(cosines, alpha, index)
-        from_below = microfacet.coat_reflectance(cosines, alpha, 1.0 / index)
+        transmittance = microfacet.coat_transmittance(cosines, alpha, index, self.facets)
+        from_below = microfacet.coat_reflectance(cosines, alpha, 1.0 / index, self.facets)
         inner = 2.0 * (from_below * cosines).mean()[None].to(eta.dtype)  # the integral over cosines of 2 R cos
         return {"transmittance": Table(transmittance.to(eta.dtype), count=_COSINES), "inner": inner}
 
@@ -84,7 +86,7 @@ class RoughPlastic(Rough, Coat):
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coat, and the base attenuated by the coat on the way in and out."""
         alpha = parameters["alpha_u"]
-        facets = microfacet.reflection(wo, wi, alpha, alpha, bounded=microfacet.BOUNDED)
+        facets = self.facets.reflection(wo, wi, alpha, alpha, bounded=microfacet.BOUNDED)
         f = fresnel_dielectric(facets.cos_m, parameters["eta"]).reflectance
         t_o, t_i = parameters["transmittance"].at(wo[2]), parameters["transmittance"].at(wi[2])
         # 1, or 0 where the coat is a mirror: `eval` leaves deltas out.
@@ -103,7 +105,7 @@ class RoughPlastic(Rough, Coat):
         t_o = parameters["transmittance"].at(wo[2])
         coat_probability = self._coat_probability(parameters, t_o)
         chosen = lobe < coat_probability
-        m = microfacet.sample_normal(wo, alpha, alpha, u, bounded=microfacet.BOUNDED)
+        m = self.facets.sample_normal(wo, alpha, alpha, u, bounded=microfacet.BOUNDED)
         wi = torch.where(chosen, microfacet.reflect(wo, m, dot(wo, m)), cosine_hemisphere(u))
         drawn = mixture_sample(self, parameters, wo, wi)
         # Keeps reflectance and tabulated transmittance of a smooth coat from adding up to more than 1.

@@ -80,20 +80,26 @@ def _rough_dielectric(p: Properties, importer: Importer) -> Material:
     return _clear("roughdielectric", **_glass(p), **_alphas(p))
 
 
-def _distribution(p: Properties) -> None:
-    """Note a distribution of microfacets other than GGX."""
+def _distribution(p: Properties) -> Any:
+    """Return the distribution of microfacets, None for GGX.
+
+    Phong's, of the exponent ``2 / alpha^2 - 2``, is nearest to Beckmann's (Walter et al. 2007, section 5.2).
+    """
     p.ignore("sample_visible", "exponent_u", "exponent_v")
-    kind = p.text("distribution", "beckmann")
-    if kind not in ("ggx", "trowbridge-reitz"):
-        p.note(f'distribution "{kind}" becomes ggx of the same alpha')
+    kind = p.text("distribution", "beckmann").lower()
+    if kind in ("ggx", "trowbridge-reitz"):
+        return None
+    if kind != "beckmann":
+        p.note(f'distribution "{kind}" becomes beckmann of the same alpha')
+    return "beckmann"
 
 
 def _alphas(p: Properties) -> Material:
-    """Return the roughness, for two directions where they are given."""
-    _distribution(p)
+    """Return the distribution of facets and their roughness, for two directions where they are given."""
+    found: Material = {"distribution": _distribution(p)}
     if p.has("alpha_u", "alpha_v"):
-        return {key: p.scalar(key, 0.1) for key in ("alpha_u", "alpha_v")}
-    return {"alpha": p.scalar("alpha", 0.1)}
+        return found | {key: p.scalar(key, 0.1) for key in ("alpha_u", "alpha_v")}
+    return found | {"alpha": p.scalar("alpha", 0.1)}
 
 
 def _metal(p: Properties) -> Material:
@@ -141,12 +147,11 @@ def _plastic(p: Properties, importer: Importer) -> Material:
 
 
 def _rough_plastic(p: Properties, importer: Importer) -> Material:
-    _distribution(p)
     alpha = p.scalar("alpha", 0.1)
     if isinstance(alpha, dict):
         p.note("the texture of alpha becomes 0.1")
         alpha = 0.1
-    return _opaque("roughplastic", **_coat(p), alpha=alpha)
+    return _opaque("roughplastic", **_coat(p), distribution=_distribution(p), alpha=alpha)
 
 
 _PRINCIPLED = (
@@ -314,7 +319,7 @@ def _ward(p: Properties, importer: Importer) -> Material:
     if p.has("alpha"):
         alphas = {"alpha": p.scalar("alpha", 0.1)}
     diffuse, specular = p.slot("diffuse_reflectance", [0.5] * 3), p.slot("specular_reflectance", [0.2] * 3)
-    metal = _opaque("roughconductor", material="none", specular_reflectance=specular, **alphas)
+    metal = _opaque("roughconductor", distribution="beckmann", material="none", specular_reflectance=specular, **alphas)
     if diffuse == [0.0] * 3:
         return metal
     # A blend halves both sides: each reflects twice as much, as far as that is a fraction.
@@ -330,9 +335,9 @@ def _twice(value: Any, p: Properties) -> Any:
 
 def _coating(p: Properties, importer: Importer) -> Material:
     """Return plastic over a diffuse base; any other base without its coat."""
-    p.ignore("thickness", "sigma_a", "distribution")
+    p.ignore("thickness", "sigma_a")
     index, outside = _index(p, "int_ior", "bk7"), _index(p, "ext_ior", "air")
-    alpha = p.scalar("alpha", 0.1) if p.plugin == "roughcoating" else None
+    alpha, distribution = (p.scalar("alpha", 0.1), _distribution(p)) if p.plugin == "roughcoating" else (None, None)
     tint = p.slot("specular_reflectance")
     base = importer.material(p.only("bsdf"))
     if base["type"] != "diffuse":
@@ -345,7 +350,8 @@ def _coating(p: Properties, importer: Importer) -> Material:
     if isinstance(alpha, dict):
         p.note("the texture of alpha becomes 0.1")
         alpha = 0.1
-    return _opaque("roughplastic", **keys, int_ior=index, ext_ior=outside, alpha=alpha) | kept
+    rough = {"int_ior": index, "ext_ior": outside, "distribution": distribution, "alpha": alpha}
+    return _opaque("roughplastic", **keys, **rough) | kept
 
 
 def _grey(p: Properties, importer: Importer) -> Material:
@@ -362,13 +368,11 @@ BSDFS: dict[str, Plugin] = {
     "diffuse": exact("diffuse", _diffuse),
     "dielectric": exact("dielectric", _dielectric),
     "thindielectric": exact("thindielectric", _thin_dielectric),
-    "roughdielectric": exact("roughdielectric", _rough_dielectric, "beckmann and phong become ggx, with a warning"),
+    "roughdielectric": exact("roughdielectric", _rough_dielectric, "phong becomes beckmann, with a warning"),
     "conductor": exact("conductor", _conductor),
-    "roughconductor": exact("roughconductor", _rough_conductor, "beckmann and phong become ggx, with a warning"),
+    "roughconductor": exact("roughconductor", _rough_conductor, "phong becomes beckmann, with a warning"),
     "plastic": exact("plastic", _plastic),
-    "roughplastic": exact(
-        "roughplastic", _rough_plastic, "beckmann and phong become ggx, with a warning; alpha is a number"
-    ),
+    "roughplastic": exact("roughplastic", _rough_plastic, "phong becomes beckmann, with a warning; alpha is a number"),
     "principled": exact("principled", _principled),
     "twosided": exact("two_sided", _twosided, "one bsdf for both sides"),
     "mask": exact("opacity", _mask),
@@ -383,7 +387,7 @@ BSDFS: dict[str, Plugin] = {
     "roughcoating": nearest(
         "roughplastic", _coating, "the coat absorbs nothing, and one over other than diffuse is left out"
     ),
-    "ward": nearest("roughconductor", _ward, "ggx facets blended with diffuse in place of Ward's lobe"),
+    "ward": nearest("roughconductor", _ward, "beckmann facets blended with diffuse in place of Ward's lobe"),
     "principledthin": nearest("principled", _principled_thin, "light does not pass"),
     "difftrans": nearest("diffuse", _grey, "light does not pass"),
     "hk": nearest("diffuse", _grey, "without scattering below the surface"),
