@@ -1,7 +1,7 @@
 """Curves in which surfaces cut through each other, such as the line where a cylinder that is sunk into a floor meets it.
 
 Such a curve lies on both surfaces and moves with both. With ``n_A``, ``n_B`` their normals and ``τ`` along the curve its
-velocity is ``n_A·v = n_A·v_A``, ``n_B·v = n_B·v_B``, ``τ·v = 0``: the point held on A, and on A's surface as far as B asks for::
+velocity is ``n_A·v = n_A·v_A``, ``n_B·v = n_B·v_B``, ``τ·v = 0``: the point held on A, moved on A as far as B asks for::
 
     v = v_A + u n_B·(v_B - v_A) / (n_B·u),    u = τ × n_A
 
@@ -13,7 +13,7 @@ cuts through itself.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -34,6 +34,8 @@ _PARALLEL = 1e-5
 _TOUCH = 1e-6
 #: Least determinant, against the square of the trace, at which a conic is an ellipse.
 _ELLIPSE = 1e-10
+#: Angles at which an ellipse is compared with the border of a disk, and halvings of the step between them.
+_PLACES, _HALVINGS = 64, 40
 #: Points of a curve by which its length is found.
 _POINTS = 8
 
@@ -322,7 +324,7 @@ def _round_cuts(bodies: Bodies, one: Tensor, two: Tensor) -> list[Curves]:
     x, y = (a12 * l2 - a22 * l1) / safe, (a12 * l1 - a11 * l2) / safe
     size = -(l1 * x + l2 * y) - c
     index = (round_cut & (size > _TOUCH)).nonzero().squeeze(1)
-    found = [_ellipses(*rows((one, two, x, y, size, a11, a12, det, limits), index))]
+    found = [_ellipses(*rows((one, two, x, y, size, a11, a12, det, limits, _is_disk(bodies, one)), index))]
     lines = (~round_cut & (det.abs() <= _ELLIPSE * trace * trace) & (bend == 0)).nonzero().squeeze(1)
     if len(lines):
         one, two, trace, a11, a12, a22, l1, l2, c = rows((one, two, trace, a11, a12, a22, l1, l2, c), lines)
@@ -352,8 +354,9 @@ def _ellipses(
     a12: Tensor,
     det: Tensor,
     limits: list[Tensor],
+    disk: Tensor,
 ) -> Curves:
-    """Return the arcs of ellipses about ``x, y`` on flat surfaces that are within limits."""
+    """Return the arcs of ellipses about ``x, y`` on flat surfaces (``disk``: those that are disks) that are within limits."""
     radius, low = size.sqrt(), a11.sqrt()
     # With A = L L' points are the middle and L'^-1 (cos t, sin t) times the radius.
     b = torch.stack((radius / low, torch.zeros_like(x), torch.zeros_like(x)))
@@ -373,13 +376,45 @@ def _ellipses(
         turn = torch.atan2(gs, gc)
         for t in (turn + half, turn - half):
             turns.append(torch.where(crosses, torch.remainder(t, 2.0 * math.pi), 0.0))
+
+    def beyond(t: Tensor) -> Tensor:
+        """Return how far outside of the disk a curve is, negative within and where it lies on no disk."""
+        at = middle[:2] + b[:2] * torch.cos(t) + c[:2] * torch.sin(t)
+        return torch.where(disk, (at * at).sum(0) - 1.0, -1.0)
+
+    turns += _zeros(beyond, x) if bool(disk.any()) else []
     ends = torch.stack(turns).sort(0).values
     begin, end = ends[:-1], ends[1:]
     t = 0.5 * (begin + end)
     good = end - begin > 1e-9
     for g in limits:
         g0, gc, gs = parts(g)
-        good &= g0 + gc * torch.cos(t) + gs * torch.sin(t) > 0
+        good &= g0 + gc * torch.cos(t) + gs * torch.sin(t) > _TOUCH
+    good &= torch.stack([beyond(row) < 0 for row in t])
     piece, index = good.nonzero(as_tuple=True)
     arcs = circles(take(one, index), take(middle, index), take(b, index), take(c, index))
     return replace(arcs, mate=take(two, index), low=begin[piece, index], high=end[piece, index])
+
+
+def _zeros(f: Callable[[Tensor], Tensor], like: Tensor) -> list[Tensor]:
+    """Return where functions of an angle, trigonometric polynomials of degree 2, change their sign: 4 times each, 0 if fewer.
+
+    Signs are compared at :data:`_PLACES` angles, so two zeros that are closer together are not found.
+    """
+    step = 2.0 * math.pi / _PLACES
+    above = torch.stack([f(torch.full_like(like, k * step)) > 0 for k in range(_PLACES)])
+    changes = above != above.roll(-1, 0)
+    first = (
+        torch.where(changes, 1.0, 0.0)
+        + torch.linspace(0.5, 0.0, _PLACES, dtype=like.dtype, device=like.device)[:, None]
+    )
+    score, place = first.topk(4, 0)
+    found: list[Tensor] = []
+    for k in range(4):
+        low = place[k] * step
+        width, start = torch.full_like(like, step), f(low) > 0
+        for _ in range(_HALVINGS):
+            width = 0.5 * width
+            low = torch.where((f(low + width) > 0) == start, low + width, low)
+        found.append(torch.where(score[k] >= 1.0, low, 0.0))
+    return found

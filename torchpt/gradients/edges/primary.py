@@ -289,6 +289,8 @@ def _arcs(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) ->
 _BEFORE = 1.0 - 2.0**-10
 #: The same where the ray meets the edge's own surface.
 _OWN = 1.0 - 2.0**-6
+#: The same of the ray through the place itself.
+_NEAR = 1.0 - 2.0**-14
 
 #: Values ``(C, N)`` that rays ``o, d (3, N)`` bring, by the numbers of their samples.
 Look = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -360,6 +362,8 @@ class Primary:
         step = steps_at(self.bodies, (take(held.prim, index), mate), s)
         o, d = self._beside(s, unit, step)
         share = self._share(rows(held, index), mate, p, s, step, o, d)
+        if bool(pieces.curves.cut.any()):
+            share = share * self._before_cuts(rows(held, index), mate, take(pieces.curves.cut, index), p, s)
         seen = (share > 0).nonzero().squeeze(1)
         both = torch.cat((seen, seen + len(index)))
         o, d, index = take(o, both), take(d, both), take(index, seen)
@@ -396,6 +400,22 @@ class Primary:
             seen = torch.ones_like(seen)  # what hides may let pass
         near = (t - reach).abs() < reach * 2.0**-8
         return torch.where(seen, share_of(self.bodies, held, mate, s, prim, near, step), 0.0)
+
+    def _before_cuts(self, held: Held, mate: Tensor, cut: Tensor, p: Tensor, s: Tensor) -> Tensor:
+        """Return a mask ``(N,)`` of edges that are not hidden close to them, by a surface that cuts through theirs.
+
+        A step beside an edge tells this too late: behind its outline a round surface comes forward by the root of the step, so
+        that a ray beside an outline below a floor meets what stands out of the floor.
+        """
+        o, d = self.bodies.camera.rays(s[0], s[1], None)
+        o = o.expand_as(d)
+        t, prim = self.traced.nearest(o, d)
+        reach = ((p - o) * d).sum(0)
+        outline = ~cut & ((prim == held.prim) | (prim == mate))  # which the ray may meet a little before, or miss
+        seen = (t > reach * _NEAR) | outline
+        if self.traced.wave.context.world.materials.opacity is not None:
+            seen = torch.ones_like(seen)
+        return seen
 
 
 def primary_of(bodies: Bodies, pieces: Pieces, traced: Traced) -> Primary:
