@@ -8,6 +8,7 @@ line of sight there, so that its points and the outline have the same motion acr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -15,7 +16,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import affine, normalize, take
+from torchpt.math.vectors import affine, cross, dot, normalize, take
 from torchpt.math.vectors import rows as columns
 from torchpt.physics.cameras import Camera
 from torchpt.physics.shapes.geometry import Instances
@@ -24,6 +25,9 @@ from torchpt.scene.settings import Film
 from torchpt.scene.world.primitives import copies_of, copy_maps, corners_of, primitives_of
 
 __all__ = ["Bodies", "Held", "bodies_of"]
+
+#: A unit sphere as a row of :attr:`Bodies.forms`.
+_BALL = (1.0, 0.0, 1.0, -math.inf, math.inf)
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class Bodies:
         e3: ``(3, Q)`` of the quadrics, which come last.
         counts: as in :class:`~torchpt.physics.shapes.geometry.Geometry`.
         copies: instances; None where there are none.
+        forms: ``(5, Q)`` of the quadrics: ``bend shift level low high`` of :class:`~torchpt.physics.shapes.quadrics.Form`.
         camera: in the lanes' coordinates.
         lights: ``(3, L)`` where point and spot lights are, and where directional ones go, by their order among the sources.
     """
@@ -53,6 +58,7 @@ class Bodies:
     e3: Tensor
     counts: tuple[int, int, int, int, int]
     copies: Instances | None
+    forms: Tensor
     camera: Camera
     lights: Tensor
 
@@ -97,6 +103,38 @@ class Bodies:
         p0, x, y, z = self.place(held.prim)
         return affine(p0 + x * held.a[0], y, held.a[1], z, held.a[2])
 
+    def own(self, prim: Tensor, p: Tensor) -> Tensor:
+        """Return the numbers ``(3, N)`` of points ``p (3, N)`` of primitives."""
+        p0, x, y, z = self.place(prim)
+        z = torch.where(self.is_flat(prim), cross(x, y), z)
+        faces = cross(y, z), cross(z, x), cross(x, y)
+        det = dot(x, faces[0])
+        return torch.stack([dot(face, p - p0) for face in faces]) / det
+
+    def normals(self, held: Held) -> Tensor:
+        """Return unit normals ``(3, N)``, of any sign, at points of flat primitives and of quadrics with a known outline."""
+        _, x, y, z = self.place(held.prim)
+        n = cross(x, y)
+        flat = self.is_flat(held.prim)
+        if not bool(flat.all()):
+            forms = self.forms_of(held.prim)
+            slope = held.a[0], held.a[1], forms[0] * (held.a[2] - forms[1])
+            round_n = cross(y, z) * slope[0] + cross(z, x) * slope[1] + n * slope[2]
+            n = torch.where(flat, n, round_n)
+        return normalize(n)
+
+    def forms_of(self, prim: Tensor) -> Tensor:
+        """Return the rows of ``forms (5, N)`` of round primitives ``(N,)``; of anything else those of a unit sphere."""
+        ball = torch.tensor(_BALL, dtype=torch.float64, device=prim.device)[:, None].expand(5, len(prim))
+        if not self.counts[4]:
+            return ball
+        mine = (prim >= self.first_quadric) & (prim < sum(self.counts))
+        return torch.where(mine, take(self.forms, (prim - self.first_quadric).clamp(0, self.counts[4] - 1)), ball)
+
+    def is_flat(self, prim: Tensor) -> Tensor:
+        """Return a mask ``(N,)`` of triangles, parallelograms and disks; copies are of meshes."""
+        return (prim < self.first_sphere) | (prim >= sum(self.counts))
+
     def tensors(self) -> dict[str, Tensor]:
         """Return all that may move, by name."""
         found = {name: getattr(self, name) for name in ("p0", "e1", "e2", "e3", "lights")}
@@ -140,4 +178,7 @@ def bodies_of(scene: Scene, film: Film, params: Mapping[str, Tensor]) -> Bodies:
         places.append(place)
     lights = torch.stack(places, 1) if places else torch.zeros(3, 0, dtype=wide, device=scene.device)
     camera = scene.camera(film, merged, wide)
-    return Bodies(primitives.p0, primitives.e1, primitives.e2, e3, primitives.counts, copies, camera, lights)
+    forms = [part.quadric.form for part in built.parts if part.quadric is not None]
+    table = [(form.bend, form.shift, form.level, form.low, form.high) for form in forms]
+    quadrics = torch.tensor(table, dtype=wide, device=scene.device).reshape(-1, 5).T
+    return Bodies(primitives.p0, primitives.e1, primitives.e2, e3, primitives.counts, copies, quadrics, camera, lights)

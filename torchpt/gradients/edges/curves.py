@@ -141,6 +141,7 @@ class Curves:
     round: Tensor  # (N,) bool
     low: Tensor  # (N,) from where t runs
     high: Tensor  # (N,) to where
+    cut: Tensor  # (N,) bool: the primitive and its mate cut there (:mod:`torchpt.gradients.edges.cuts`)
 
     def within(self, low: Tensor, high: Tensor) -> Curves:
         """Return the same from ``low`` to ``high``."""
@@ -170,13 +171,14 @@ def straight(prim: Tensor, begin: Tensor, end: Tensor, mate: Tensor | None = Non
     """Return segments between numbers ``(3, N)``, ``t`` from 0 to 1."""
     zero, one = torch.zeros_like(begin[0]), torch.ones_like(begin[0])
     mate = torch.full_like(prim, -1) if mate is None else mate
-    return Curves(prim, mate, begin, end - begin, torch.zeros_like(begin), zero.bool(), zero, one)
+    return Curves(prim, mate, begin, end - begin, torch.zeros_like(begin), zero.bool(), zero, one, zero.bool())
 
 
 def circles(prim: Tensor, middle: Tensor, b: Tensor, c: Tensor) -> Curves:
     """Return whole circles, ``t`` from 0 to 2 pi."""
     zero = torch.zeros_like(middle[0])
-    return Curves(prim, torch.full_like(prim, -1), middle, b, c, zero == 0, zero, zero + 2.0 * math.pi)
+    none = torch.full_like(prim, -1)
+    return Curves(prim, none, middle, b, c, zero == 0, zero, zero + 2.0 * math.pi, zero.bool())
 
 
 def mesh_edges(edges: Edges, index: Tensor, first: int, turned: bool) -> tuple[Curves, tuple[Held, Held]]:

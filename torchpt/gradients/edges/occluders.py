@@ -22,6 +22,7 @@ from torchpt.gradients.edges.curves import (
     rounds_of,
     straight,
 )
+from torchpt.gradients.edges.cuts import cuts_of
 from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import concatenate_lanes, cross, dot, rows, take
 from torchpt.physics.shapes.quadrics import Form
@@ -156,6 +157,10 @@ def occluders_of(
         _, _, along = fixed.moving(bodies, fixed.low)
         own = Held(fixed.prim, fixed.a)
         add(fixed, dot(along, along).sqrt() * (fixed.high - fixed.low), (own, own), 1.0, 1.0, 0.0, -1.0)
+    cuts = cuts_of(scene, bodies)
+    if cuts is not None:  # which hide nothing that the surfaces do not
+        own = Held(cuts[0].prim, cuts[0].a)
+        add(cuts[0], cuts[1], (own, own), 0.0, 1.0, 0.0, -1.0)
     forms: list[Form] = []
     for rounds in rounds_of(scene, bodies):
         if rounds.form is not None:

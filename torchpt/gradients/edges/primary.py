@@ -21,6 +21,7 @@ from torchpt.gradients.edges.curves import (
     round_outline,
     rounds_of,
 )
+from torchpt.gradients.edges.cuts import Crossing, crossing_of, cuts_of
 from torchpt.gradients.edges.film import Worth, film_places, slopes
 from torchpt.gradients.edges.traced import Traced, Use
 from torchpt.math.sampling import Distribution1D
@@ -184,6 +185,11 @@ def pieces_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bo
         for mine, cut in ((fixed.round, _arcs), (~fixed.round, _lines)):
             some = rows(fixed, mine.nonzero().squeeze(1))
             found.append(cut(bodies, some, torch.ones_like(some.low), bounds))
+    cuts = cuts_of(scene, bodies)
+    if cuts is not None:
+        for mine, cut in ((cuts[0].round, _arcs), (~cuts[0].round, _lines)):
+            some = rows(cuts[0], mine.nonzero().squeeze(1))
+            found.append(cut(bodies, some, torch.ones_like(some.low), bounds))
     for rounds in rounds_of(scene, bodies):
         if rounds.form is None:
             curves, some = round_outline(bodies, rounds.prim, view)
@@ -249,21 +255,22 @@ def _arcs(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) ->
     some = (importance > 0).nonzero().squeeze(1)
     curves, importance = rows(curves, some), take(importance, some)
     many = torch.arange(len(some), device=some.device).repeat_interleave(_CUTS)
-    step = 2.0 * math.pi / _CUTS
-    low = torch.arange(_CUTS, dtype=torch.float64, device=some.device).repeat(len(some)) * step
-    cut = rows(curves, many).within(low, low + step)
+    whole = rows(curves, many)
+    step = (whole.high - whole.low) / _CUTS
+    low = whole.low + torch.arange(_CUTS, dtype=torch.float64, device=some.device).repeat(len(some)) * step
+    cut = whole.within(low, low + step)
     ends = [bodies.camera.film_of(cut.moving(bodies, t)[1]) for t in (cut.low, cut.high)]
     first, last = ends
     assert first is not None and last is not None
     x0, x1, y0, y1 = bounds
-    whole = math.hypot(x1 - x0, y1 - y0)
+    across = math.hypot(x1 - x0, y1 - y0)
     front = (torch.minimum(first[2], last[2]) > 0) & (torch.minimum(first[3], last[3]) > 0)
     behind = (torch.maximum(first[2], last[2]) <= 0) | (torch.maximum(first[3], last[3]) <= 0)
-    length = torch.where(front, _apart(first, last), whole)
+    length = torch.where(front, _apart(first, last), across)
     a, b = (film_places(bodies.camera, cut.moving(bodies, t)[1]) for t in (cut.low, cut.high))
     near = torch.minimum(a, b) - length, torch.maximum(a, b) + length  # no arc leaves its chord by more than that
     outside = (near[0][0] > x1) | (near[1][0] < x0) | (near[0][1] > y1) | (near[1][1] < y0)
-    weight = torch.where(behind | (front & outside), 0.0, length.clamp_max(whole)) * take(importance, many)
+    weight = torch.where(behind | (front & outside), 0.0, length.clamp_max(across)) * take(importance, many)
     index = (weight > 0).nonzero().squeeze(1)
     one = torch.ones(2, len(index), dtype=torch.float64, device=index.device)
     return Pieces(rows(cut, index), one, take(weight, index))
@@ -282,6 +289,8 @@ def _arcs(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) ->
 _BEFORE = 1.0 - 2.0**-10
 #: The same where the ray meets the edge's own surface.
 _OWN = 1.0 - 2.0**-6
+#: The same of the ray through the place itself.
+_NEAR = 1.0 - 2.0**-14
 
 #: Values ``(C, N)`` that rays ``o, d (3, N)`` bring, by the numbers of their samples.
 Look = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -297,11 +306,14 @@ class Along:
 
     held: Held
     weight: Tensor  # (2, N)
+    crossing: Crossing | None = None
     beside: tuple[Tensor, Tensor, Tensor] | None = None
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
-        total = (film_places(bodies.camera, bodies.points(self.held)) * self.weight).sum()
+        p = bodies.points(self.held)
+        p = p if self.crossing is None else self.crossing.moved(bodies, p)
+        total = (film_places(bodies.camera, p) * self.weight).sum()
         if self.beside is None:
             return total
         origin, away, weight = self.beside
@@ -350,6 +362,8 @@ class Primary:
         step = steps_at(self.bodies, (take(held.prim, index), mate), s)
         o, d = self._beside(s, unit, step)
         share = self._share(rows(held, index), mate, p, s, step, o, d)
+        if bool(pieces.curves.cut.any()):
+            share = share * self._before_cuts(rows(held, index), mate, take(pieces.curves.cut, index), p, s)
         seen = (share > 0).nonzero().squeeze(1)
         both = torch.cat((seen, seen + len(index)))
         o, d, index = take(o, both), take(d, both), take(index, seen)
@@ -364,7 +378,8 @@ class Primary:
             t, prim = self.traced.nearest(o, d)
             met = prim >= 0
             beside = torch.where(met, o, torch.inf), torch.where(met, t, 1.0) * d, normal.repeat(1, 2) * each
-        return Along(rows(held, index), normal * (worthy / chance), beside)
+        held, mate, cut = rows((held, pieces.curves.mate, pieces.curves.cut), index)
+        return Along(held, normal * (worthy / chance), crossing_of(self.bodies, cut, held, mate), beside)
 
     def _beside(self, s: Tensor, unit: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """Return rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""
@@ -385,6 +400,22 @@ class Primary:
             seen = torch.ones_like(seen)  # what hides may let pass
         near = (t - reach).abs() < reach * 2.0**-8
         return torch.where(seen, share_of(self.bodies, held, mate, s, prim, near, step), 0.0)
+
+    def _before_cuts(self, held: Held, mate: Tensor, cut: Tensor, p: Tensor, s: Tensor) -> Tensor:
+        """Return a mask ``(N,)`` of edges that are not hidden close to them, by a surface that cuts through theirs.
+
+        A step beside an edge tells this too late: behind its outline a round surface comes forward by the root of the step, so
+        that a ray beside an outline below a floor meets what stands out of the floor.
+        """
+        o, d = self.bodies.camera.rays(s[0], s[1], None)
+        o = o.expand_as(d)
+        t, prim = self.traced.nearest(o, d)
+        reach = ((p - o) * d).sum(0)
+        outline = ~cut & ((prim == held.prim) | (prim == mate))  # which the ray may meet a little before, or miss
+        seen = (t > reach * _NEAR) | outline
+        if self.traced.wave.context.world.materials.opacity is not None:
+            seen = torch.ones_like(seen)
+        return seen
 
 
 def primary_of(bodies: Bodies, pieces: Pieces, traced: Traced) -> Primary:

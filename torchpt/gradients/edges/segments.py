@@ -30,6 +30,7 @@ from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import smooth_faces
+from torchpt.gradients.edges.cuts import Crossing, crossing_of
 from torchpt.gradients.edges.occluders import Occluders
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, one_of_each, prefixes_of
 from torchpt.gradients.edges.traced import Use
@@ -62,6 +63,7 @@ class SegmentRays:
     Attributes:
         held: the points.
         mate: the other face at each; -1: there is none.
+        cut: ``(N,)`` bool: the two cut there.
         e: where they are ``(3, N)``.
         out: normals of round surfaces ``(3, N)``; 0 on edges.
         curvature: ``(N,)`` of round surfaces along ``omega``; 0 on edges.
@@ -75,6 +77,7 @@ class SegmentRays:
 
     held: Held
     mate: Tensor
+    cut: Tensor
     e: Tensor
     out: Tensor
     curvature: Tensor
@@ -206,7 +209,7 @@ class SegmentSampler:
         sine = dot(side, side).sqrt()
         m, zero = side / torch.where(sine > 0, sine, 1.0), torch.zeros_like(e)
         weight = sine * length * span * take(self.occluders.part, index) / sample.chance
-        return SegmentRays(held, part.mate, e, zero, zero[0], omega, density, target, aimed, m, weight)
+        return SegmentRays(held, part.mate, part.cut, e, zero, zero[0], omega, density, target, aimed, m, weight)
 
     def _across(self, face: Held, e: Tensor, tangent: Tensor) -> Tensor:
         """Return unit vectors in faces ``(3, N)``, across their edges."""
@@ -233,7 +236,9 @@ class SegmentSampler:
         curvature = (own[0] + own[1] + (1.0 if form is None else form.bend) * own[2]).abs() / steep
         weight = curvature * area * (2.0 * math.pi) / sample.chance
         none, one = torch.full_like(prim, -1), torch.ones_like(weight)
-        return SegmentRays(Held(prim, a), none, e, normal, curvature, omega, one, e, none >= 0, normal, weight)
+        return SegmentRays(
+            Held(prim, a), none, none >= 0, e, normal, curvature, omega, one, e, none >= 0, normal, weight
+        )
 
 
 def _place(form: Form | None, u: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -291,6 +296,7 @@ class SegmentSamples:
         r: ``(N,)`` from the receivers to the edge.
         sides: what is seen on both sides.
         prefixes: of the receivers, each with the light ``(2, M)`` from both sides.
+        crossing: those of the places where surfaces cut.
     """
 
     edge: Held
@@ -298,11 +304,13 @@ class SegmentSamples:
     r: Tensor
     sides: list[Side]
     prefixes: list[tuple[Prefix, Tensor]]
+    crossing: Crossing | None
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
         value = torch.zeros((), dtype=self.r.dtype, device=self.r.device)
-        e = dot(self.m, bodies.points(self.edge))
+        p = bodies.points(self.edge)
+        e = dot(self.m, p if self.crossing is None else self.crossing.moved(bodies, p))
         ends = [dot(self.m, bodies.points(side.held)) for side in self.sides]
         for prefix, light in self.prefixes:
             lane = prefix.lane
@@ -394,7 +402,8 @@ class Segments:
         if not prefixes:
             return None
         sides = [self._side(sign, y, r) for sign, y in zip(_SIGNS, seen, strict=True)]
-        return SegmentSamples(rays.held, rays.m, r, sides, prefixes)
+        crossing = crossing_of(self.frame.bodies, rays.cut, rays.held, rays.mate)
+        return SegmentSamples(rays.held, rays.m, r, sides, prefixes, crossing)
 
     def _ends_at(self, rays: SegmentRays, y: Spot, r: Tensor, step: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of rays beside edges that do not end before these, but for what touches there."""

@@ -1,0 +1,420 @@
+"""Curves in which surfaces cut through each other, such as the line where a cylinder that is sunk into a floor meets it.
+
+Such a curve lies on both surfaces and moves with both. With ``n_A``, ``n_B`` their normals and ``τ`` along the curve its
+velocity is ``n_A·v = n_A·v_A``, ``n_B·v = n_B·v_B``, ``τ·v = 0``: the point held on A, moved on A as far as B asks for::
+
+    v = v_A + u n_B·(v_B - v_A) / (n_B·u),    u = τ × n_A
+
+Curves are written in the numbers of the flat surface A: a line where B is flat too, an ellipse or two lines where it is a
+sphere, an ellipsoid, a cylinder or a cone. Left out: a cone cut lengthwise (a hyperbola), two round surfaces, and a mesh that
+cuts through itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.curves import Curves, circles, joined, known, straight
+from torchpt.math.vectors import cross, dot, rows, take
+from torchpt.scene import Scene
+
+__all__ = ["Crossing", "crossing_of", "cuts_of"]
+
+#: Pairs of primitives that are looked at at a time.
+_PAIRS = 1 << 21
+#: Flat surfaces at a smaller sine do not cut.
+_PARALLEL = 1e-5
+#: Curves that are so near a border, in a flat surface's own numbers, are that border: there surfaces touch.
+_TOUCH = 1e-6
+#: Least determinant, against the square of the trace, at which a conic is an ellipse.
+_ELLIPSE = 1e-10
+#: Angles at which an ellipse is compared with the border of a disk, and halvings of the step between them.
+_PLACES, _HALVINGS = 64, 40
+#: Points of a curve by which its length is found.
+_POINTS = 8
+
+
+# ---- How a cut moves
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Those K of N points that lie on cuts.
+
+    Attributes:
+        lane: ``(K,)`` of the points.
+        other: the same points held on the other surface.
+        across: unit normals of that ``(3, K)``.
+        slide: ``(3, K)`` how points move in their own surface for a motion of 1 along ``across``.
+    """
+
+    lane: Tensor
+    other: Held
+    across: Tensor
+    slide: Tensor
+
+    def moved(self, bodies: Bodies, p: Tensor) -> Tensor:
+        """Return points ``p (3, N)``, held on their own surfaces, where the cuts are; differentiable in ``bodies``."""
+        apart = dot(self.across, bodies.points(self.other) - take(p, self.lane))
+        return p.index_add(1, self.lane, self.slide * apart)
+
+
+def crossing_of(bodies: Bodies, cut: Tensor, held: Held, mate: Tensor) -> Crossing | None:
+    """Return those of N points that lie on cuts; None where none does.
+
+    Args:
+        bodies: detached.
+        cut: ``(N,)`` bool: which.
+        held: the points.
+        mate: the other primitive at each ``(N,)``.
+    """
+    lane = cut.nonzero().squeeze(1)
+    if not len(lane):
+        return None
+    own, other = rows(held, lane), take(mate, lane)
+    on_other = Held(other, bodies.own(other, bodies.points(own)))
+    n, across = bodies.normals(own), bodies.normals(on_other)
+    u = cross(cross(n, across), n)
+    return Crossing(lane, on_other, across, u / dot(across, u))
+
+
+# ---- Where surfaces cut
+
+
+def cuts_of(scene: Scene, bodies: Bodies) -> tuple[Curves, Tensor] | None:
+    """Return the curves, and their lengths ``(N,)``; None where there are none.
+
+    Args:
+        scene: whose.
+        bodies: detached.
+    """
+    found: list[Curves] = []
+    for one, two in _pairs(scene, bodies):
+        flat = bodies.is_flat(two)
+        for mask, make in ((flat, _flat_cuts), (~flat, _round_cuts)):
+            some = mask.nonzero().squeeze(1)
+            if len(some):
+                found += make(bodies, take(one, some), take(two, some))
+    found = [curves for curves in found if len(curves.prim)]
+    if not found:
+        return None
+    curves = joined(found)
+    curves = replace(curves, cut=torch.ones_like(curves.cut))
+    span, length = curves.high - curves.low, torch.zeros_like(curves.low)
+    for k in range(_POINTS):
+        _, _, along = curves.moving(bodies, curves.low + span * ((k + 0.5) / _POINTS))
+        length += dot(along, along).sqrt() * (span / _POINTS)
+    return curves, length
+
+
+def _pairs(scene: Scene, bodies: Bodies) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield pairs of primitives of different shapes whose boxes overlap, the first of which is flat, block by block."""
+    owners = _owners(scene, bodies)
+    if len({name for name, _, _ in owners}) < 2:
+        return
+    prim = torch.arange(sum(count for _, _, count in owners), device=scene.device)
+    low, high = _boxes(bodies, prim)
+    wanted, shape = torch.zeros_like(prim, dtype=torch.bool), torch.zeros_like(prim)
+    names = {name: k for k, name in enumerate(dict.fromkeys(name for name, _, _ in owners))}
+    spans = [slice(first, first + count) for _, first, count in owners]
+    for (name, _, _), span in zip(owners, spans, strict=True):
+        shape[span] = names[name]
+    lows, highs = (torch.stack([fold(x[:, span]) for span in spans], 1) for fold, x in ((_least, low), (_most, high)))
+    which = torch.tensor([names[name] for name, _, _ in owners], device=scene.device)
+    for k, span in enumerate(spans):
+        near = _overlap(lows[:, k : k + 1], highs[:, k : k + 1], lows, highs) & (which != which[k])
+        for j in near.nonzero().squeeze(1).tolist():
+            wanted[span] |= _overlap(low[:, span], high[:, span], lows[:, j : j + 1], highs[:, j : j + 1])
+    wanted &= ~_unknown(scene, bodies, prim)
+    prim = wanted.nonzero().squeeze(1)
+    if not len(prim):
+        return
+    low, high, shape = take(low, prim), take(high, prim), take(shape, prim)
+    # Boxes in the order of their lower ends along the longest way: each may overlap those that follow up to its upper end.
+    axis = int((_most(high) - _least(low)).argmax())
+    order = low[axis].argsort()
+    prim, low, high, shape = take(prim, order), take(low, order), take(high, order), take(shape, order)
+    after = torch.searchsorted(low[axis].contiguous(), high[axis].contiguous(), right=True)
+    count = (after - torch.arange(len(prim), device=prim.device) - 1).clamp_min(0)
+    ends = count.cumsum(0)
+    flat = bodies.is_flat(prim)
+    for first in range(0, int(ends[-1]), _PAIRS):
+        number = torch.arange(first, min(first + _PAIRS, int(ends[-1])), device=prim.device)
+        one = torch.searchsorted(ends, number, right=True)
+        two = one + 1 + number - (take(ends, one) - take(count, one))
+        good = _overlap(take(low, one), take(high, one), take(low, two), take(high, two))
+        good &= (take(shape, one) != take(shape, two)) & (take(flat, one) | take(flat, two))
+        some = good.nonzero().squeeze(1)
+        one, two = take(one, some), take(two, some)
+        swap = ~take(flat, one)
+        yield take(prim, torch.where(swap, two, one)), take(prim, torch.where(swap, one, two))
+
+
+def _owners(scene: Scene, bodies: Bodies) -> list[tuple[str, int, int]]:
+    """Return the shape, the first primitive and the number of primitives of each part and copy."""
+    found, at, counts = list[tuple[str, int, int]](), 0, dict[str, int]()
+    for part in scene.built.parts:
+        found.append((part.shape, at, part.primitive_count))
+        counts[part.name] = part.primitive_count
+        at += part.primitive_count
+    for copy in scene.built.copies:
+        found.append((copy.shape, at, counts[copy.of]))
+        at += counts[copy.of]
+    return found
+
+
+def _unknown(scene: Scene, bodies: Bodies, prim: Tensor) -> Tensor:
+    """Return a mask ``(P,)`` of quadrics that cuts are not known of."""
+    forms = [part.quadric.form for part in scene.built.parts if part.quadric is not None]
+    if all(known(form) for form in forms):
+        return torch.zeros_like(prim, dtype=torch.bool)
+    odd = torch.tensor([not known(form) for form in forms], device=prim.device)
+    mine = (prim >= bodies.first_quadric) & (prim < sum(bodies.counts))
+    return mine & take(odd, (prim - bodies.first_quadric).clamp(0, len(odd) - 1))
+
+
+def _least(x: Tensor) -> Tensor:
+    return x.amin(1)
+
+
+def _most(x: Tensor) -> Tensor:
+    return x.amax(1)
+
+
+def _overlap(low: Tensor, high: Tensor, others_low: Tensor, others_high: Tensor) -> Tensor:
+    """Return a mask of the boxes ``(3, N)`` that overlap."""
+    return ((low <= others_high) & (others_low <= high)).all(0)
+
+
+def _boxes(bodies: Bodies, prim: Tensor) -> tuple[Tensor, Tensor]:
+    """Return lower and upper corners ``(3, N)`` of boxes about primitives ``(N,)``."""
+    p0, x, y, z = bodies.place(prim)
+    zero = torch.zeros_like(p0)
+    triangle = (prim < bodies.counts[0]) | (prim >= sum(bodies.counts))
+    four = ~triangle & (prim < sum(bodies.counts[:2]))
+    corners = torch.stack((zero, x, y, torch.where(four, x + y, zero)))
+    low, high = corners.amin(0), corners.amax(0)
+    ring = (x * x + y * y).sqrt()
+    ball = (x * x + y * y + z * z).sqrt()
+    tall = ~bodies.is_flat(prim) & torch.isfinite(bodies.forms_of(prim)[3])
+    for mask, reach, up in ((~triangle & ~four, ball, zero), (tall, ring, z)):
+        low = torch.where(mask, -reach + torch.minimum(up, zero), low)
+        high = torch.where(mask, reach + torch.maximum(up, zero), high)
+    return p0 + low, p0 + high
+
+
+# ---- In the numbers of a flat surface: functions ``g (3, N)`` stand for ``g0 + g1 a0 + g2 a1``
+
+
+def _on(bodies: Bodies, one: Tensor, two: Tensor) -> Tensor:
+    """Return the numbers of ``two`` as functions on ``one``: ``(3 numbers, 3, N)``."""
+    p0, x, y, _ = bodies.place(one)
+    base = bodies.own(two, p0)
+    return torch.stack((base, bodies.own(two, p0 + x) - base, bodies.own(two, p0 + y) - base), 1)
+
+
+def _limits(bodies: Bodies, prim: Tensor, b0: Tensor, b1: Tensor) -> list[Tensor]:
+    """Return functions that are not negative within flat primitives ``(N,)``, by their numbers; of disks constant ones."""
+    triangle = (prim < bodies.counts[0]) | (prim >= sum(bodies.counts))
+    disk = ~triangle & (prim >= sum(bodies.counts[:2]))
+    one = torch.zeros_like(b0)
+    one[0] = 1.0
+    rest = one - b0 - b1
+    every = b0, b1, torch.where(triangle, rest, one - b0), torch.where(triangle, rest, one - b1)
+    return [torch.where(disk, one, g) for g in every]
+
+
+def _is_disk(bodies: Bodies, prim: Tensor) -> Tensor:
+    return (prim >= sum(bodies.counts[:2])) & (prim < bodies.first_sphere)
+
+
+def _identity(like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the numbers themselves as functions ``(3, N)``."""
+    a0, a1 = torch.zeros_like(like), torch.zeros_like(like)
+    a0[1], a1[2] = 1.0, 1.0
+    return a0, a1
+
+
+def _line(
+    one: Tensor, two: Tensor, at: Tensor, d: Tensor, limits: list[Tensor], disks: list[tuple[Tensor, Tensor, Tensor]]
+) -> Curves:
+    """Return lines ``at + t d (2, N)`` on flat primitives, within limits and within disks (which, and their numbers)."""
+    low, high = torch.full_like(at[0], -torch.inf), torch.full_like(at[0], torch.inf)
+
+    def along(g: Tensor) -> tuple[Tensor, Tensor]:
+        return g[0] + g[1] * at[0] + g[2] * at[1], g[1] * d[0] + g[2] * d[1]
+
+    def clip(some: Tensor, begin: Tensor, end: Tensor) -> None:
+        nonlocal low, high
+        low = torch.where(some & (begin > low), begin, low)
+        high = torch.where(some & (end < high), end, high)
+
+    everywhere = torch.full_like(low, torch.inf)
+    for g in limits:
+        a, slope = along(g)
+        zero = -a / torch.where(slope == 0, 1.0, slope)
+        clip(slope > 0, zero, everywhere)
+        clip(slope < 0, -everywhere, zero)
+        clip((slope == 0) & (a < 0), everywhere, -everywhere)
+    for mask, b0, b1 in disks:
+        (p, u), (q, v) = along(b0), along(b1)
+        square, half, rest = u * u + v * v, p * u + q * v, p * p + q * q - 1.0
+        inner = half * half - square * rest
+        root = inner.clamp_min(0.0).sqrt()
+        square = torch.where(square > 0, square, 1.0)
+        clip(mask, (-half - root) / square, (-half + root) / square)
+        clip(mask & (inner <= 0), everywhere, -everywhere)
+    good = (high > low) & torch.isfinite(low) & torch.isfinite(high)
+    middle = torch.where(good, 0.5 * (low + high), 0.0)
+    for g in limits:
+        a, slope = along(g)
+        good &= a + slope * middle > _TOUCH
+    index = good.nonzero().squeeze(1)
+    at, d, low, high = take(at, index), take(d, index), take(low, index), take(high, index)
+    ends = [torch.cat((at + d * t, torch.zeros_like(at[:1]))) for t in (low, high)]
+    return straight(take(one, index), ends[0], ends[1], take(two, index))
+
+
+def _flat_cuts(bodies: Bodies, one: Tensor, two: Tensor) -> list[Curves]:
+    """Return the lines in which flat surfaces cut."""
+    n = [bodies.normals(Held(prim, torch.zeros(3, len(prim), dtype=torch.float64))) for prim in (one, two)]
+    b0, b1, height = _on(bodies, one, two)
+    size = (height[1] * height[1] + height[2] * height[2]).sqrt()
+    steep = cross(n[0], n[1])
+    some = ((dot(steep, steep) > _PARALLEL * _PARALLEL) & (size > 0)).nonzero().squeeze(1)
+    one, two, size = take(one, some), take(two, some), take(size, some)
+    b0, b1, height = (take(g, some) for g in (b0, b1, height))
+    at = -height[1:] * (height[0] / (size * size))
+    d = torch.stack((-height[2], height[1])) / size
+    a0, a1 = _identity(height)
+    limits = _limits(bodies, one, a0, a1) + _limits(bodies, two, b0, b1)
+    disks = [(_is_disk(bodies, one), a0, a1), (_is_disk(bodies, two), b0, b1)]
+    return [_line(one, two, at, d, limits, disks)]
+
+
+def _round_cuts(bodies: Bodies, one: Tensor, two: Tensor) -> list[Curves]:
+    """Return the ellipses and lines in which flat surfaces ``one`` cut round ones ``two``."""
+    q = _on(bodies, one, two)
+    forms = bodies.forms_of(two)
+    bend, shift, level = forms[0], forms[1], forms[2]
+    limits = _limits(bodies, one, *_identity(q[0]))
+    ends = torch.isfinite(forms[3])
+    whole = torch.zeros_like(q[0])
+    whole[0] = 1.0
+    limits += [torch.where(ends, q[2] - whole * forms[3].nan_to_num(), whole)]
+    limits += [torch.where(ends, whole * forms[4].nan_to_num() - q[2], whole)]
+    w = torch.stack((q[0], q[1], q[2] - whole * shift))
+    by = torch.stack((torch.ones_like(bend), torch.ones_like(bend), bend))
+
+    def product(i: int, j: int) -> Tensor:
+        return (by * w[:, i] * w[:, j]).sum(0)
+
+    # The surface's equation on the plane: a'Aa + 2 l'a + c = 0
+    a11, a12, a22, l1, l2 = product(1, 1), product(1, 2), product(2, 2), product(0, 1), product(0, 2)
+    c = product(0, 0) - level
+    det, trace = a11 * a22 - a12 * a12, a11 + a22
+    round_cut = (a11 > 0) & (det > _ELLIPSE * trace * trace)
+    safe = torch.where(round_cut, det, 1.0)
+    x, y = (a12 * l2 - a22 * l1) / safe, (a12 * l1 - a11 * l2) / safe
+    size = -(l1 * x + l2 * y) - c
+    index = (round_cut & (size > _TOUCH)).nonzero().squeeze(1)
+    found = [_ellipses(*rows((one, two, x, y, size, a11, a12, det, limits, _is_disk(bodies, one)), index))]
+    lines = (~round_cut & (det.abs() <= _ELLIPSE * trace * trace) & (bend == 0)).nonzero().squeeze(1)
+    if len(lines):
+        one, two, trace, a11, a12, a22, l1, l2, c = rows((one, two, trace, a11, a12, a22, l1, l2, c), lines)
+        limits = [take(g, lines) for g in limits]
+        wide = a11 > a22
+        v = torch.stack((torch.where(wide, a11, a12), torch.where(wide, a12, a22)))
+        v = v / (v * v).sum(0).sqrt().clamp_min(torch.finfo(v.dtype).tiny)
+        half = l1 * v[0] + l2 * v[1]
+        inner = half * half - trace * c
+        root = inner.clamp_min(0.0).sqrt()
+        disk = [(_is_disk(bodies, one), *_identity(limits[0]))]
+        d = torch.stack((-v[1], v[0]))
+        some = (inner > _TOUCH * trace).nonzero().squeeze(1)
+        for sign in (1.0, -1.0):
+            at = v * ((sign * root - half) / trace)
+            found.append(_line(*rows((one, two, at, d, limits, disk), some)))
+    return found
+
+
+def _ellipses(
+    one: Tensor,
+    two: Tensor,
+    x: Tensor,
+    y: Tensor,
+    size: Tensor,
+    a11: Tensor,
+    a12: Tensor,
+    det: Tensor,
+    limits: list[Tensor],
+    disk: Tensor,
+) -> Curves:
+    """Return the arcs of ellipses about ``x, y`` on flat surfaces (``disk``: those that are disks) that are within limits."""
+    radius, low = size.sqrt(), a11.sqrt()
+    # With A = L L' points are the middle and L'^-1 (cos t, sin t) times the radius.
+    b = torch.stack((radius / low, torch.zeros_like(x), torch.zeros_like(x)))
+    c = torch.stack((-a12 / (low * det.sqrt()) * radius, low / det.sqrt() * radius, torch.zeros_like(x)))
+    middle = torch.stack((x, y, torch.zeros_like(x)))
+
+    def parts(g: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        flat = [g[1] * v[0] + g[2] * v[1] for v in (middle, b, c)]
+        return g[0] + flat[0], flat[1], flat[2]
+
+    turns = [torch.zeros_like(x), torch.full_like(x, 2.0 * math.pi)]
+    for g in limits:
+        g0, gc, gs = parts(g)
+        reach = (gc * gc + gs * gs).sqrt()
+        crosses = g0.abs() < reach
+        half = torch.acos(torch.where(crosses, -g0 / torch.where(crosses, reach, 1.0), 0.0))
+        turn = torch.atan2(gs, gc)
+        for t in (turn + half, turn - half):
+            turns.append(torch.where(crosses, torch.remainder(t, 2.0 * math.pi), 0.0))
+
+    def beyond(t: Tensor) -> Tensor:
+        """Return how far outside of the disk a curve is, negative within and where it lies on no disk."""
+        at = middle[:2] + b[:2] * torch.cos(t) + c[:2] * torch.sin(t)
+        return torch.where(disk, (at * at).sum(0) - 1.0, -1.0)
+
+    turns += _zeros(beyond, x) if bool(disk.any()) else []
+    ends = torch.stack(turns).sort(0).values
+    begin, end = ends[:-1], ends[1:]
+    t = 0.5 * (begin + end)
+    good = end - begin > 1e-9
+    for g in limits:
+        g0, gc, gs = parts(g)
+        good &= g0 + gc * torch.cos(t) + gs * torch.sin(t) > _TOUCH
+    good &= torch.stack([beyond(row) < 0 for row in t])
+    piece, index = good.nonzero(as_tuple=True)
+    arcs = circles(take(one, index), take(middle, index), take(b, index), take(c, index))
+    return replace(arcs, mate=take(two, index), low=begin[piece, index], high=end[piece, index])
+
+
+def _zeros(f: Callable[[Tensor], Tensor], like: Tensor) -> list[Tensor]:
+    """Return where functions of an angle, trigonometric polynomials of degree 2, change their sign: 4 times each, 0 if fewer.
+
+    Signs are compared at :data:`_PLACES` angles, so two zeros that are closer together are not found.
+    """
+    step = 2.0 * math.pi / _PLACES
+    above = torch.stack([f(torch.full_like(like, k * step)) > 0 for k in range(_PLACES)])
+    changes = above != above.roll(-1, 0)
+    first = (
+        torch.where(changes, 1.0, 0.0)
+        + torch.linspace(0.5, 0.0, _PLACES, dtype=like.dtype, device=like.device)[:, None]
+    )
+    score, place = first.topk(4, 0)
+    found: list[Tensor] = []
+    for k in range(4):
+        low = place[k] * step
+        width, start = torch.full_like(like, step), f(low) > 0
+        for _ in range(_HALVINGS):
+            width = 0.5 * width
+            low = torch.where((f(low + width) > 0) == start, low + width, low)
+        found.append(torch.where(score[k] >= 1.0, low, 0.0))
+    return found
