@@ -173,6 +173,10 @@ class Distribution1D:
         return outcome, ((u - low) / torch.where(width > 0, width, 1.0)).clamp(0.0, 1.0)
 
 
+#: Entries of a block, and the most that are searched without blocks.
+_BLOCK, _SMALL = 64, 2**15
+
+
 @dataclass(frozen=True)
 class Distribution2D:
     """A discrete distribution over the cells of an R x C grid, by rows, then by columns.
@@ -184,11 +188,14 @@ class Distribution2D:
         columns: ``(R C + 1,)`` float64: row number plus the cumulative sums within that row. They never decrease, so one
             binary search finds a cell of any row.
         width: ``()`` int64, the number C of columns.
+        blocks: every 64th entry of ``columns``, which fit into a cache where all of them do not; None for a small grid.
+            ``columns`` ends with infinity up to a whole block.
     """
 
     rows: Tensor
     columns: Tensor
     width: Tensor
+    blocks: Tensor | None
 
     @staticmethod
     def of(weights: Tensor) -> Distribution2D:
@@ -203,9 +210,12 @@ class Distribution2D:
         down = torch.cumsum(total[:, 0], 0)
         zero = down.new_zeros(1)
         width = torch.tensor(w.shape[1], dtype=torch.int64, device=w.device)
-        return Distribution2D(
-            rows=torch.cat((zero, down / down[-1])), columns=torch.cat((zero, along.reshape(-1))), width=width
-        )
+        columns, blocks = torch.cat((zero, along.reshape(-1))), None
+        if len(columns) > _SMALL:
+            rest = -len(columns) % _BLOCK
+            columns = torch.cat((columns, columns.new_full((rest,), torch.inf)))
+            blocks = columns[::_BLOCK].contiguous()
+        return Distribution2D(rows=torch.cat((zero, down / down[-1])), columns=columns, width=width, blocks=blocks)
 
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Draw rows and columns ``(N,)`` int64 by ``u (2, N)`` in ``[0, 1)``; return them and remapped ``u``.
@@ -216,9 +226,20 @@ class Distribution2D:
         v = u.double().contiguous().clamp_max(1.0 - 2.0**-32)
         row = torch.searchsorted(self.rows, v[1], right=True) - 1
         across = v[0] + row
-        cell = torch.searchsorted(self.columns, across, right=True) - 1
+        cell = self._cell(across)
         rest = torch.stack((_within(self.columns, cell, across), _within(self.rows, row, v[1])))
         return row, cell - row * self.width, rest.to(u.dtype)
+
+    def _cell(self, across: Tensor) -> Tensor:
+        """Return the last entries ``(N,)`` of ``columns`` that are not above ``across (N,)``."""
+        if self.blocks is None:
+            return torch.searchsorted(self.columns, across, right=True) - 1
+        cell = (torch.searchsorted(self.blocks, across, right=True) - 1) * _BLOCK
+        step = _BLOCK // 2
+        while step:
+            cell = torch.where(take(self.columns, cell + step) <= across, cell + step, cell)
+            step //= 2
+        return cell
 
 
 def _within(cdf: Tensor, index: Tensor, v: Tensor) -> Tensor:
