@@ -4,7 +4,7 @@
     python scripts/compare_scenes.py scene.xml --pictures out    # both pictures as PNG, to look at
 
 Mitsuba 3.9 opens hardly any published file: it gets a copy that is mended as this program reads the file (integrators that it
-lacks are ``path``, ``roughdiffuse`` is ``diffuse``, keys that it does not know are dropped, a
+lacks are ``path``, ``roughdiffuse`` is ``diffuse`` (ours gets its alpha as 0), keys that it does not know are dropped, a
 sky is the nearest that is taken here). Needs
 the extra `bench`, and LLVM where ``DRJIT_LIBLLVM_PATH`` says. The columns: mean of ours over Mitsuba's with the standard
 error of the seeds; how many blocks of 16 x 16 pixels differ by more than 4 of their standard errors, of all; seconds until
@@ -83,6 +83,9 @@ def compare(mitsuba: Any, file: Path, given: argparse.Namespace) -> tuple[dict[s
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ImportedSceneWarning)
         scene = torchpt.load(str(file))
+        rough = [name for name, m in scene.description.materials.items() if m.name == "roughdiffuse"]
+        if rough:
+            scene = torchpt.load(str(file), overrides={f"materials.{name}.alpha": 0.0 for name in rough})
     loaded = time.perf_counter() - start
     old = scene.description.film
     film = {"width": width, "height": max(1, round(width * old["height"] / old["width"])), "filter": "box"}

@@ -41,7 +41,7 @@ scene = torchpt.load({
     "film": {"width": 24, "height": 16, "filter": "lanczos"},
     "sampler": {"type": "lattice"},
     "textures": {"lines": {"type": "stripes", "count": 3}},
-    "materials": {"clay": {"type": "roughdiffuse", "reflectance": {"texture": "lines"}, "sigma": 30}},
+    "materials": {"clay": {"type": "minnaert", "reflectance": {"texture": "lines"}, "k": 2}},
     "shapes": {
         "floor": {
             "type": "rectangle", "material": "clay",
@@ -56,12 +56,12 @@ for wish in ({}, {"integrator": "ao"}, {"integrator": "aov", "film": {"aovs": ["
     eager, compiled = (torchpt.render(scene, spp=32, compile=mode, **wish) for mode in (False, True))
     assert bool(torch.isfinite(eager).all()) and float(eager.mean()) > 0.01, wish
     assert torch.allclose(eager.mean(), compiled.mean(), rtol=1e-3), wish
-for name in ("materials.clay.sigma", "textures.lines.color1", "lights.lamp.exponent", "camera.fov", "shapes.glow.emission"):
+for name in ("materials.clay.k", "textures.lines.color1", "lights.lamp.exponent", "camera.fov", "shapes.glow.emission"):
     given = {name: scene.params[name].clone().requires_grad_()}
     image = torchpt.render(scene, spp=4, params=given)
     (gradient,) = torch.autograd.grad(image.mean(), given[name])
     assert bool(torch.isfinite(gradient).all()) and bool(gradient.any()), name
-for name, value in (("materials.clay.sigma", 91.0), ("lights.lamp.exponent", -1.0), ("camera.fov", 400.0)):
+for name, value in (("materials.clay.k", 11.0), ("lights.lamp.exponent", -1.0), ("camera.fov", 400.0)):
     try:
         torchpt.render(scene, spp=1, params={name: torch.tensor(value)})
     except torchpt.SceneError as error:

@@ -139,6 +139,18 @@ def _diffuse_edges(model: Bsdf) -> Iterator[Case]:
     yield Case(model, {"reflectance": WHITE})
 
 
+def _rough_diffuse(model: Bsdf) -> Iterator[Case]:
+    for colour, alpha in ((RED, 0.3), (WHITE, 1.0), (RED, 0.05), ((1.0, 0.0, 0.3), 0.6)):
+        yield Case(model, {"reflectance": colour, "alpha": alpha})
+    yield Case(model, {"reflectance": WHITE, "alpha": 0.0}, lossless=True)
+
+
+def _rough_diffuse_edges(model: Bsdf) -> Iterator[Case]:
+    for colour in (BLACK, WHITE):
+        for alpha in (0.0, 1e-4, 1.0):
+            yield Case(model, {"reflectance": colour, "alpha": alpha})
+
+
 def _glossy(model: Bsdf) -> Iterator[Case]:
     for diffuse, specular, exponent in (
         (RED, (0.1, 0.15, 0.2), 30.0),
@@ -470,6 +482,7 @@ Builder = Callable[[Bsdf], Iterator[Case]]
 #: more, such as that a white one loses nothing.
 BUILDERS: dict[str, tuple[Builder, Builder]] = {
     "diffuse": (_diffuse, _diffuse_edges),
+    "roughdiffuse": (_rough_diffuse, _rough_diffuse_edges),
     "phong": (_glossy, _glossy_edges),
     "blinn_phong": (_glossy, _glossy_edges),
     "conductor": (_conductor, _conductor_edges),

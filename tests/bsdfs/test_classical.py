@@ -1,4 +1,4 @@
-"""Phong, Blinn-Phong, nonmetal and microfacet: against their formulas written out, one pair of directions at a time."""
+"""Phong, Blinn-Phong, nonmetal, microfacet, Oren-Nayar: against their formulas written out, pair by pair of directions."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from torchpt.physics.bsdfs.kinds.nonmetal import Nonmetal
 from torchpt.physics.bsdfs.kinds.phong import Phong
 from torchpt.physics.bsdfs.kinds.plastic import Plastic
 from torchpt.physics.bsdfs.kinds.roughconductor import RoughConductor
+from torchpt.physics.bsdfs.kinds.roughdiffuse import RoughDiffuse
 
 RED, GREY = (0.8, 0.5, 0.1), (0.2, 0.3, 0.4)
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -72,7 +73,33 @@ def microfacet(v: dict[str, Any], wo: Vector, wi: Vector) -> list[float]:
     ]
 
 
+def oren_nayar(v: dict[str, Any], wo: Vector, wi: Vector, fast: bool = False) -> list[float]:
+    """Oren and Nayar 1994 by angles: their functional approximation, or the qualitative model."""
+    sigma2 = (v["alpha"] / math.sqrt(2)) ** 2
+    theta_r, theta_i = (math.acos(min(w[2], 1.0)) for w in (wo, wi))
+    alpha, beta = max(theta_r, theta_i), min(theta_r, theta_i)
+    cos_phi = math.cos(math.atan2(wo[1], wo[0]) - math.atan2(wi[1], wi[0]))
+    c1, c2 = 1 - 0.5 * sigma2 / (sigma2 + 0.33), 0.45 * sigma2 / (sigma2 + 0.09)
+    if fast:
+        once, twice = c1 + c2 * max(0, cos_phi) * math.sin(alpha) * math.tan(beta), 0.0
+    else:
+        c2 *= math.sin(alpha) if cos_phi >= 0 else math.sin(alpha) - (2 * beta / math.pi) ** 3
+        c3 = 0.125 * sigma2 / (sigma2 + 0.09) * (4 * alpha * beta / math.pi**2) ** 2
+        once = c1 + cos_phi * c2 * math.tan(beta) + (1 - abs(cos_phi)) * c3 * math.tan((alpha + beta) / 2)
+        twice = 0.17 * sigma2 / (sigma2 + 0.13) * (1 - cos_phi * (2 * beta / math.pi) ** 2)
+    return [max(rho * once + rho * rho * twice, 0.0) / math.pi * wi[2] for rho in v["reflectance"]]
+
+
+def oren_nayar_fast(v: dict[str, Any], wo: Vector, wi: Vector) -> list[float]:
+    return oren_nayar(v, wo, wi, fast=True)
+
+
 FORMULAS = [
+    *(
+        (RoughDiffuse(use_fast_approx=fast), oren_nayar_fast if fast else oren_nayar, {"reflectance": rho, "alpha": a})
+        for fast in (False, True)
+        for rho, a in ((RED, 0.2), (WHITE, 1.0), (GREY, 0.5), ((0.0, 0.01, 1.0), 1.0))
+    ),
     *(
         (model, formula, {"diffuse": RED, "specular": GREY, "exponent": n})
         for n in (0.0, 0.5, 30.0, 1000.0, 1e5)

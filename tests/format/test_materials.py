@@ -30,6 +30,7 @@ from torchpt.physics.bsdfs.kinds.plastic import Plastic
 from torchpt.physics.bsdfs.kinds.principled import Principled
 from torchpt.physics.bsdfs.kinds.roughconductor import RoughConductor
 from torchpt.physics.bsdfs.kinds.roughdielectric import RoughDielectric
+from torchpt.physics.bsdfs.kinds.roughdiffuse import RoughDiffuse
 from torchpt.physics.bsdfs.kinds.roughplastic import RoughPlastic
 from torchpt.physics.bsdfs.kinds.thindielectric import ThinDielectric
 from torchpt.physics.bsdfs.presets import INDICES, METALS, metal_index
@@ -75,6 +76,12 @@ GLASS = {"int_ior": BK7, "ext_ior": AIR}
 RESOLVED: dict[str, tuple[dict[str, Any], Bsdf, dict[str, Any]]] = {  # keys, model, its values
     "diffuse": ({}, Diffuse(), {"reflectance": GREY}),
     "diffuse, a colour": ({"reflectance": [0.1, 0.2, 0.3]}, Diffuse(), {"reflectance": (0.1, 0.2, 0.3)}),
+    "roughdiffuse": ({}, RoughDiffuse(), {"reflectance": GREY, "alpha": 0.2}),
+    "roughdiffuse, all keys": (
+        {"reflectance": [0.1, 0.2, 0.3], "alpha": 0.7, "use_fast_approx": True},
+        RoughDiffuse(use_fast_approx=True),
+        {"reflectance": (0.1, 0.2, 0.3), "alpha": 0.7},
+    ),
     "phong": ({}, Phong(), {"diffuse": GREY, "specular": rgb(0.2), "exponent": 30.0}),
     "phong, all keys": (
         {"diffuse": 0.1, "specular": [0.2, 0.3, 0.4], "exponent": 7},
@@ -613,6 +620,7 @@ def test_indices_are_mitsubas() -> None:
 WARNED: dict[str, tuple[dict[str, Any], str]] = {
     "phong": ({"type": "phong", "diffuse": [0.1, 0.8, 0.1], "specular": 0.3}, "diffuse + specular is 1.1"),
     "blinn_phong": ({"type": "blinn_phong", "diffuse": 0.4, "specular": 0.2}, "diffuse + 4 specular is 1.2"),
+    "roughdiffuse": ({"type": "roughdiffuse", "reflectance": [0.1, 0.96, 0.1]}, "a reflectance of 0.96 is above 0.95"),
 }
 
 
@@ -635,6 +643,8 @@ def test_no_gain_no_warning() -> None:
         warnings.simplefilter("error")
         read({"p": {"type": "phong", "diffuse": 0.7, "specular": 0.3}})
         read({"p": {"type": "blinn_phong", "diffuse": 0.2, "specular": 0.2}})
+        read({"p": {"type": "roughdiffuse", "reflectance": 0.95, "alpha": 1}})
+        read({"p": {"type": "roughdiffuse", "reflectance": 1, "alpha": 0}})
 
 
 # --- the caller's own models ---

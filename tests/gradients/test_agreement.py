@@ -17,6 +17,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
 COLOUR = {"plate": {"type": "diffuse", "reflectance": [0.6, 0.5, 0.4]}}
 PLATES: dict[str, tuple[dict[str, Any], str]] = {
     "diffuse": (COLOUR["plate"], "reflectance"),
+    "roughdiffuse": ({"type": "roughdiffuse", "alpha": 0.4}, "alpha"),
     "conductor": ({"type": "conductor", "eta": [0.2, 0.4, 1.4], "k": [3.2, 2.4, 1.7]}, "eta"),
     "dielectric": ({"type": "dielectric", "int_ior": 1.5}, "int_ior"),
     "thindielectric": ({"type": "thindielectric", "int_ior": 1.5}, "int_ior"),

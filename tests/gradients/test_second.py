@@ -20,6 +20,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's
 MATERIALS: dict[str, dict[str, Any]] = {
     "diffuse": {"type": "diffuse", "reflectance": [0.6, 0.4, 0.2]},
     "roughconductor": {"type": "roughconductor", "roughness": 0.4, "eta": [0.2, 0.4, 1.4], "k": [3.2, 2.4, 1.7]},
+    "roughdiffuse": {"type": "roughdiffuse", "reflectance": [0.6, 0.4, 0.2], "alpha": 0.5},
     "beckmann": {
         "type": "roughconductor",
         "distribution": "beckmann",

@@ -358,6 +358,17 @@ OLD: dict[str, tuple[str, str]] = {
             '<rgb name="irradiance" value="1"/></emitter>'
         ),
     ),
+    "roughdiffuse": (
+        scene(
+            '<shape type="sphere"><bsdf type="roughdiffuse"><spectrum name="diffuseReflectance" value="0.4"/>'
+            '<boolean name="useFastApprox" value="true"/></bsdf></shape>',
+            version="0.6.0",
+        ),
+        scene(
+            '<shape type="sphere"><bsdf type="roughdiffuse"><rgb name="reflectance" value="0.4"/>'
+            '<boolean name="use_fast_approx" value="true"/></bsdf></shape>'
+        ),
+    ),
     "uoffset": (
         scene(
             '<shape type="rectangle"><bsdf type="diffuse"><texture type="checkerboard" name="reflectance">'
@@ -391,7 +402,6 @@ NEAREST: dict[str, tuple[str, str, str]] = {
         'bsdf "ward" becomes roughconductor',
     ),
     "ward_diffuse": (ball('<bsdf type="ward"/>'), "blend", 'bsdf "ward" becomes roughconductor'),
-    "roughdiffuse": (ball('<bsdf type="roughdiffuse"/>'), "diffuse", 'bsdf "roughdiffuse" becomes diffuse'),
     "difftrans": (
         ball('<bsdf type="difftrans"><rgb name="transmittance" value="0.5"/></bsdf>'),
         "diffuse",

@@ -15,6 +15,8 @@ MATERIALS: dict[str, dict[str, Any]] = {
     "blinn_phong": {"type": "blinn_phong", "diffuse": [0.3, 0.2, 0.1], "specular": 0.1, "exponent": 60},
     "mirror": {"type": "conductor"},
     "silver": {"type": "conductor", "material": "Ag"},
+    "clay": {"type": "roughdiffuse", "reflectance": [0.6, 0.4, 0.3], "alpha": 0.5},
+    "clay_fast": {"type": "roughdiffuse", "alpha": 0.5, "use_fast_approx": True},
     "gold": {"type": "roughconductor", "material": "Au", "alpha": 0.2},
     "bronze": {"type": "roughconductor", "reflectance": [0.7, 0.5, 0.3], "roughness": 0.5},
     "brushed": {"type": "roughconductor", "material": "Al", "alpha_u": 0.05, "alpha_v": 0.4},

@@ -17,6 +17,7 @@ KINDS: Kinds[Bsdf] = Kinds(
     "torchpt.physics.bsdfs.kinds",
     (
         "diffuse",
+        "roughdiffuse",
         "phong",
         "blinn_phong",
         "conductor",

@@ -40,8 +40,8 @@ def _diffuse(p: Properties, importer: Importer) -> Material:
 
 
 def _rough_diffuse(p: Properties, importer: Importer) -> Material:
-    p.ignore("alpha", "use_fast_approx")
-    return _opaque("diffuse", reflectance=p.slot("reflectance"))
+    fast = p.flag("use_fast_approx") or None
+    return _opaque("roughdiffuse", reflectance=p.slot("reflectance"), alpha=p.scalar("alpha"), use_fast_approx=fast)
 
 
 def _index(p: Properties, name: str, default: Any) -> Any:
@@ -382,7 +382,7 @@ BSDFS: dict[str, Plugin] = {
     "bumpmap": exact("bump_map", _bump_map),
     "normalmap": exact("normal_map", _normal_map),
     "phong": exact("phong", _phong),
-    "roughdiffuse": nearest("diffuse", _rough_diffuse, "without the roughness of Oren and Nayar"),
+    "roughdiffuse": exact("roughdiffuse", _rough_diffuse, "alpha above 1 becomes 1, with a warning"),
     "coating": nearest("plastic", _coating, "the coat absorbs nothing, and one over other than diffuse is left out"),
     "roughcoating": nearest(
         "roughplastic", _coating, "the coat absorbs nothing, and one over other than diffuse is left out"
