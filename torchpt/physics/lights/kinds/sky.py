@@ -134,13 +134,16 @@ class Sun:
         frame: where it is.
         over_sine: ``()`` one over the sine of its angular radius.
         cap: ``()`` one minus the cosine of its angular radius.
-        profile: ``(6, 4, 3)`` radiance, as :func:`~torchpt.physics.lights.hosek_wilkie.sun_profile` has it.
+        scale: ``()`` factor of the radiance.
+        profile: six of ``(4, 3)``, radiance as :func:`~torchpt.physics.lights.hosek_wilkie.sun_profile` has it. Kernels sum no
+            gradient of a larger tensor in each lane.
     """
 
     frame: SunFrame
     over_sine: Tensor
     cap: Tensor
-    profile: Tensor
+    scale: Tensor
+    profile: tuple[Tensor, ...]
 
 
 @dataclass(frozen=True)
@@ -193,12 +196,12 @@ def _disc(sun: Sun, d: Tensor) -> tuple[Tensor, Tensor]:
     m = (1.0 - square).clamp_min(1e-12).sqrt()
     v = up.clamp(-1.0, 1.0)
     radiance: Tensor | None = None
-    for j in reversed(range(sun.profile.shape[0])):
-        a, b, c, e = (sun.profile[j, k][:, None] for k in range(4))
+    for coefficients in reversed(sun.profile):
+        a, b, c, e = (coefficients[k][:, None] for k in range(4))
         term = ((e * v + c) * v + b) * v + a
         radiance = term if radiance is None else radiance * m + term
     assert radiance is not None
-    return radiance.clamp_min(0.0), met
+    return radiance.clamp_min(0.0) * sun.scale, met
 
 
 def _toward_sun(sun: Sun, u: Tensor) -> Tensor:
@@ -289,7 +292,7 @@ class Sky(Environment):
         if values["sun_direction"] is not None and both:
             raise Refused("either sun_direction or a place and a time, not both", values[both[0]], (both[0],))
         height = math.degrees(0.5 * math.pi - _angles(_sun_direction(values))[0])
-        if height < 0.0:
+        if height < -1e-6:  # rounding lets no sun set
             key = "hour" if values["sun_direction"] is None else "sun_direction"
             raise Refused(f"a sun above the horizon (it stands at {height:.1f} degrees)", values[key], (key,))
 
@@ -311,8 +314,8 @@ class Sky(Environment):
         cap = 2.0 * math.sin(half / 2.0) ** 2
         wider = 2.0 * math.sin(SUN_RADIUS / 2.0) ** 2 / cap  # a wider sun sends as much light
         before, after = (SunFrame(*map(number, _frame(z, bearing, turn))) for z in (zenith, zenith * stretch))
-        profile = sun_profile(turbidity, elevation) * (sun_scale * wider)
-        sun = Sun(after, number(1.0 / math.sin(half)), number(cap), number(profile))
+        profile = tuple(map(number, (sun_profile(turbidity, elevation) * wider).unbind()))
+        sun = Sun(after, number(1.0 / math.sin(half)), number(cap), number(sun_scale), profile)
         horizon = math.cos(0.5 * math.pi * stretch) if stretch > 1.0 else 0.0
         horizon = horizon if stretch < 2.0 else -1.01  # rounding hides no direction
         # Half of the samples each, whatever the numbers; all for one where the other is switched off.
