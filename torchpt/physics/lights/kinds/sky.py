@@ -28,7 +28,7 @@ from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.lights.sun_position import sun_angles
 from torchpt.spec import Angle, Color, Direction, Integer, Pose, Refused, Scalar
 
-__all__ = ["Dome", "Sky", "Sun", "SunFrame"]
+__all__ = ["Dome", "Sky", "Sun", "SunFrame", "sky_angles", "sky_turn"]
 
 #: Rows and columns of the map; a row lies on the horizon.
 _HEIGHT, _WIDTH = 257, 512
@@ -76,7 +76,7 @@ _TIME = ("latitude", "longitude", "timezone", "year", "month", "day", "hour", "m
 Matrix = NDArray[np.float64]
 
 
-def _turn(values: Mapping[str, Any]) -> Matrix:
+def sky_turn(values: Mapping[str, Any]) -> Matrix:
     """Return the orthogonal matrix ``(3, 3)`` from the world to the light's own space."""
     pose = values["transform"]
     if pose is None:
@@ -90,7 +90,7 @@ def _sun_direction(values: Mapping[str, Any]) -> Matrix:
     given = values["sun_direction"]
     if given is not None:
         along = np.asarray(given, np.float64) / np.abs(given).max()
-        return _turn(values) @ (along / np.linalg.norm(along))
+        return sky_turn(values) @ (along / np.linalg.norm(along))
     hours = values["hour"] + values["minute"] / 60.0 + values["second"] / 3600.0
     latitude, longitude, timezone, year, month, day = (values[key] for key in _TIME[:6])
     return _direction(*sun_angles(latitude, longitude, timezone, year, month, day, hours))
@@ -106,6 +106,11 @@ def _angles(direction: Matrix) -> tuple[float, float]:
     """Return the angles of a direction ``(3,)`` from the zenith, and from north over east."""
     x, y, z = direction.tolist()
     return math.atan2(math.hypot(x, z), y), math.atan2(x, -z)
+
+
+def sky_angles(values: Mapping[str, Any]) -> tuple[float, float]:
+    """Return where the sun of a light stands, before ``stretch``: radians from the zenith, and from north over east."""
+    return _angles(_sun_direction(values))
 
 
 # ---- The records of the world
@@ -291,7 +296,7 @@ class Sky(Environment):
         both = [key for key in _TIME if key in given]
         if values["sun_direction"] is not None and both:
             raise Refused("either sun_direction or a place and a time, not both", values[both[0]], (both[0],))
-        height = math.degrees(0.5 * math.pi - _angles(_sun_direction(values))[0])
+        height = math.degrees(0.5 * math.pi - sky_angles(values)[0])
         if height < -1e-6:  # rounding lets no sun set
             key = "hour" if values["sun_direction"] is None else "sun_direction"
             raise Refused(f"a sun above the horizon (it stands at {height:.1f} degrees)", values[key], (key,))
@@ -302,8 +307,8 @@ class Sky(Environment):
         turbidity, albedo, sky_scale, sun_scale = (
             scene[key] for key in ("turbidity", "albedo", "sky_scale", "sun_scale")
         )
-        values, device, turn = scene.values, turbidity.device, _turn(scene.values)
-        zenith, bearing = _angles(_sun_direction(values))
+        values, device, turn = scene.values, turbidity.device, sky_turn(scene.values)
+        zenith, bearing = sky_angles(values)
         stretch, elevation = values["stretch"], max(0.0, 0.5 * math.pi - zenith)
 
         def number(value: Any) -> Tensor:
