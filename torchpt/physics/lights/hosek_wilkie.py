@@ -74,9 +74,9 @@ def sky_radiance(model: tuple[Tensor, Tensor], cos_zenith: Tensor, cos_gamma: Te
     square = cos_gamma * cos_gamma
     across = 1.0 + i * i - 2.0 * i * cos_gamma
     chi = (1.0 + square) / (across * across.sqrt())
-    falling = 1.0 + a * torch.exp(b / (cos_zenith + 0.01))
-    glowing = c + d * torch.exp(e * gamma) + f * square + g * chi + h * cos_zenith.sqrt()
-    return (falling * glowing * mean[:, None]).clamp_min(0.0)
+    gradation = 1.0 + a * torch.exp(b / (cos_zenith + 0.01))
+    indicatrix = c + d * torch.exp(e * gamma) + f * square + g * chi + h * cos_zenith.sqrt()
+    return (gradation * indicatrix * mean[:, None]).clamp_min(0.0)
 
 
 def sun_radiance(turbidity: Tensor, elevation: Tensor) -> Tensor:
