@@ -4,11 +4,11 @@
     python scripts/compare_scenes.py scene.xml --pictures out    # both pictures as PNG, to look at
 
 Mitsuba 3.9 opens hardly any published file: it gets a copy that is mended as this program reads the file (integrators that it
-lacks are ``path``, ``roughdiffuse`` is ``diffuse`` (ours gets its alpha as 0), keys that it does not know are dropped, a
-sky is the nearest that is taken here). Needs
-the extra `bench`, and LLVM where ``DRJIT_LIBLLVM_PATH`` says. The columns: mean of ours over Mitsuba's with the standard
-error of the seeds; how many blocks of 16 x 16 pixels differ by more than 4 of their standard errors, of all; seconds until
-the scene is loaded and until its first picture at 1 sample a pixel, ours and Mitsuba's; paths a second, ours over Mitsuba's.
+lacks are ``path``, ``roughdiffuse`` is ``diffuse`` (ours gets its alpha as 0), keys that it does not know are dropped, an
+old sky is its own of today). Needs the extra `bench`, and LLVM where ``DRJIT_LIBLLVM_PATH`` says. The columns: mean of ours
+over Mitsuba's with the standard error of the seeds; how many blocks of 16 x 16 pixels differ by more than 4 of their
+standard errors, of all; seconds until the scene is loaded and until its first picture at 1 sample a pixel, ours and
+Mitsuba's; paths a second, ours over Mitsuba's.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from mitsuba_scene import load_mitsuba
+from mitsuba_scene import load_mitsuba, sky_pose, sky_values
 
 import torchpt
 from torchpt.core.errors import ImportedSceneWarning
@@ -43,7 +43,7 @@ MENDS = (
 BLOCK = 16
 
 
-#: Emitters that this program has only nearly: Mitsuba gets what it takes.
+#: Emitters that Mitsuba has under another name and with other keys today.
 SKY = re.compile(r'<emitter\s+type="(?:sunsky|sky|sun)".*?</emitter>', re.DOTALL)
 
 
@@ -63,10 +63,18 @@ def mended(file: Path, folder: Path, scene: torchpt.Scene) -> Path:
 
 
 def _emitter(light: ParsedParams) -> str:
-    """Return a constant or directional light as XML."""
-    tags = {"radiance": "rgb", "irradiance": "rgb", "direction": "vector"}
-    inner = (f'<{tags[key]} name="{key}" value="{" ".join(map(str, value))}"/>' for key, value in light.values.items())
-    return f'<emitter type="{light.name}">{"".join(inner)}</emitter>'
+    """Return a sky as XML; others stand in the file as they are."""
+    if light.name != "sky":
+        return ""
+    matrix = " ".join(f"{value:.9g}" for value in sky_pose(light.values).ravel())
+    inner = [f'<transform name="to_world"><matrix value="{matrix}"/></transform>']
+    for name, value in {**sky_values(light.values), "albedo": light["albedo"]}.items():
+        if name == "type":
+            continue
+        tag = {"sun_direction": "vector", "albedo": "rgb", "complex_sun": "boolean"}.get(name, "float")
+        text = " ".join(map(repr, value)) if isinstance(value, list | tuple) else str(value).lower()
+        inner.append(f'<{tag} name="{name}" value="{text}"/>')
+    return f'<emitter type="sunsky">{"".join(inner)}</emitter>'
 
 
 def blocks(image: np.ndarray) -> np.ndarray:

@@ -26,6 +26,7 @@ from torchpt.math.vectors import cross, dot, luminance
 from torchpt.physics.bsdfs import KINDS, Bsdf
 from torchpt.physics.bsdfs.metal import by_reflectance
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
+from torchpt.physics.lights.kinds.sky import sky_angles, sky_turn
 from torchpt.physics.parts import Part, Source
 from torchpt.physics.shapes import KINDS as SHAPES
 from torchpt.physics.shapes import Shape
@@ -42,7 +43,7 @@ from torchpt.spec.schema import ParsedParams, read_params
 
 __all__ = [
     "NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "lets_pass", "load_mitsuba", "nearest",
-    "replacements", "sensor",
+    "replacements", "sensor", "sky_pose", "sky_values",
 ]  # fmt: skip
 
 #: Models with the same parameters in both renderers; microfacet models become smooth below ``LEAST_ALPHA``.
@@ -133,6 +134,8 @@ def _source(mitsuba: Any, scene: Scene, source: Source) -> dict[str, Any]:
         return {"type": "envmap", "bitmap": picture, "scale": float(scale), "to_world": mitsuba.ScalarTransform4f(turn)}
     name = source.name.removeprefix("lights.")
     given = scene.description.lights[name].values
+    if source.kind == "sky":
+        return {**sky_values(given), "to_world": _transform(mitsuba, sky_pose(given)), "albedo": _rgb(given["albedo"])}
     found: dict[str, Any] = {"type": source.kind}
     for key, value in given.items():
         if key in ("intensity", "irradiance", "radiance"):
@@ -147,6 +150,28 @@ def _source(mitsuba: Any, scene: Scene, source: Source) -> dict[str, Any]:
         up = [1.0, 0.0, 0.0] if abs(along[0]) < 0.9 * np.linalg.norm(along) else [0.0, 1.0, 0.0]
         found["to_world"] = mitsuba.ScalarTransform4f().look_at(origin=origin, target=target, up=up)
     return found
+
+
+def sky_values(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return Mitsuba's ``sunsky`` of the light ``sky``, without ``to_world`` and ``albedo``.
+
+    Raises:
+        NoCounterpartError: a sky that is stretched.
+    """
+    if given["stretch"] != 1.0:
+        raise NoCounterpartError("Mitsuba's sky is not stretched")
+    zenith, bearing = sky_angles(given)
+    along = np.array([math.sin(zenith) * math.sin(bearing), math.cos(zenith), -math.sin(zenith) * math.cos(bearing)])
+    to_sun = np.linalg.inv(sky_turn(given)) @ along
+    scales = {key: given[key] for key in ("turbidity", "sky_scale", "sun_scale", "sun_aperture")}
+    return {"type": "sunsky", "sun_direction": to_sun.tolist(), "complex_sun": True, **scales}
+
+
+def sky_pose(given: Mapping[str, Any]) -> np.ndarray:
+    """Return the pose ``(4, 4)`` of Mitsuba's ``sunsky``, whose up is z, of the light ``sky``."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.linalg.inv(sky_turn(given)) @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    return pose
 
 
 def sensor(mitsuba: Any, camera: ParsedParams) -> dict[str, Any]:

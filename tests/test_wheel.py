@@ -39,5 +39,7 @@ def test_the_wheel_carries_configs_and_scenes(tmp_path: Path) -> None:
                 assert f"torchpt/share/{path.relative_to(ROOT)}" in names
     kernels = {path.name for path in (ROOT / "torchpt" / "native" / "ir").iterdir()}
     assert kernels and {f"torchpt/native/ir/{name}" for name in kernels} <= names
+    assert "torchpt/physics/lights/hosek_wilkie.npz" in names
+    assert sum("hosek_wilkie.LICENSE" in name for name in names) == 2  # beside the numbers, and among the licences
     assert any(name.endswith("entry_points.txt") for name in names)
     assert not any(name.startswith(("configs", "tests")) for name in names)

@@ -49,6 +49,8 @@ class Case:
         within: how many degrees off that a direction may be drawn.
         together: values that do not go together with the others, by the key that is refused.
         brightest: radiant intensity at most, over what its bounds say.
+        density_moves: parameters change the density of draws, over edges of the radiance: differences are those of an integral
+            over directions.
     """
 
     keys: dict[str, Any]
@@ -56,6 +58,7 @@ class Case:
     within: float = 0.0
     together: dict[str, Any] = field(default_factory=dict)
     brightest: float = 1.0
+    density_moves: bool = False
 
 
 def _column(values: Any) -> Tensor:
@@ -87,6 +90,8 @@ CASES: dict[str, Case] = {
     "directional": Case({"direction": [1, -2, 0.5], "irradiance": COLOR}, _of_sun),
     "constant": Case({"radiance": COLOR}),
     "envmap": Case({"path": SKY, "scale": 0.7, "transform": TURN}),
+    "sky": Case({"sun_direction": [0.5, 0.8, 0.6], "turbidity": 4.3, "sun_aperture": 30, "transform": [
+        {"rotate": {"axis": [1, 0.3, 0.2], "angle": 20}}]}, density_moves=True),
     "triangle": Case({
         "type": "mesh", "vertices": [[-0.2, 0, 0], [0.3, 0.1, 0], [0, 0.4, 0.1]], "faces": [[0, 1, 2]],
         "face_normals": True, "transform": TURN,
@@ -185,9 +190,10 @@ def test_rows_are_in_order():
     """Near lights, those infinitely far, the environment last."""
     ordered = sorted(lights.KINDS, key=lights.sort_key)
     assert ordered[:2] == ["point", "spot"] and lights.KINDS[ordered[-1]].environment
-    many = {name: {"type": name, **CASES[name].keys} for name in reversed(ordered) if name != "constant"}
+    ordered = [name for name in ordered if not lights.KINDS[name].environment or name == "envmap"]
+    many = {name: {"type": name, **CASES[name].keys} for name in reversed(ordered)}
     scene = torchpt.load({**block("disk"), "lights": many}, device="cpu")
-    assert table_of(scene).kinds == ("disk", *(name for name in ordered if name != "constant"))
+    assert table_of(scene).kinds == ("disk", *ordered)
 
 
 @pytest.mark.parametrize("mis", [False, True], ids=["alone", "mis"])
@@ -356,12 +362,21 @@ def test_derivatives_are_those_of_differences(name):
         light = drawn(table, x, u)
         return (light.radiance * light.weight * dot(light.wi, axis).clamp_min(0) * weights).sum(0).mean()
 
+    def integral(given: dict[str, Tensor]) -> Tensor:
+        if not CASES[name].density_moves:
+            return irradiance(given)
+        table, d = scene.world(torch.float64, given)[0].lights, sphere(squares(400))
+        kind = lights.KINDS[name]
+        assert table is not None and issubclass(kind, lights.Environment)
+        radiance, _ = kind.radiance_pdf(table.environment, d, mis=True)
+        return (radiance * dot(d, axis).clamp_min(0) * weights).sum(0).mean() * (4 * math.pi)
+
     for key, value in params.items():
         change = _towards(name, key, value, scene.spec(key))
         tensor = value.clone().requires_grad_()
         (slope,) = torch.autograd.grad(irradiance({**params, key: tensor}), tensor)
         step = 1e-3 if key.endswith("to_world") and name in lights.KINDS else 1e-5
-        ends = [float(irradiance({**params, key: value + sign * step * change})) for sign in (1, -1)]
+        ends = [float(integral({**params, key: value + sign * step * change})) for sign in (1, -1)]
         expected = (ends[0] - ends[1]) / (2 * step)
         assert abs(expected) > 1e-3, key
         assert float((slope * change).sum()) == pytest.approx(expected, rel=2e-2), key

@@ -119,6 +119,12 @@ FEATURES: dict[str, Feature] = {
         ("world.lights.environment",),
         module="torchpt.physics.lights.kinds.envmap",
     ),
+    "sky and sun": Feature(
+        ("physics/lights/kinds/sky.py", "physics/lights/hosek_wilkie.py"),
+        lambda scene: _light(scene, type="sky", sun_direction=[1, 1, 1]),
+        ("world.lights.environment",),
+        module="torchpt.physics.lights.kinds.sky",
+    ),
     "point light": Feature(
         ("physics/lights/kinds/point.py",),
         lambda scene: _light(scene, type="point", position=[1, 2, 1], intensity=5),

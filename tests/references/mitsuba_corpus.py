@@ -222,6 +222,15 @@ EXACT: dict[str, str] = {
         '<emitter type="envmap"><string name="filename" value="sky.exr"/><float name="scale" value="1.5"/>'
         '<transform name="to_world"><rotate y="1" angle="70"/><rotate x="1" angle="20"/></transform></emitter>'
     ),
+    "sunsky": lamp(
+        '<emitter type="sunsky"><vector name="sun_direction" x="0.5" y="0.6" z="0.4"/><float name="turbidity" value="4.5"/>'
+        '<rgb name="albedo" value="0.3 0.6 0.2"/><boolean name="complex_sun" value="true"/><float name="sky_scale" value="2"/>'
+        '<transform name="to_world"><rotate x="1" angle="-90"/><rotate z="1" angle="10"/></transform></emitter>'
+    ),
+    "sky": lamp(
+        '<emitter type="sunsky"><float name="sun_scale" value="0"/><float name="hour" value="9"/>'
+        '<transform name="to_world"><rotate x="1" angle="-90"/></transform></emitter>'
+    ),
     "obj": shape(
         '<shape type="obj"><string name="filename" value="meshes\\roof.obj"/><transform name="to_world">'
         '<scale value="1.5"/><translate y="0.5"/></transform><bsdf type="twosided"><bsdf type="diffuse">'
@@ -369,6 +378,18 @@ OLD: dict[str, tuple[str, str]] = {
             '<boolean name="use_fast_approx" value="true"/></bsdf></shape>'
         ),
     ),
+    "sunsky": (
+        scene(
+            '<emitter type="sky"><float name="turbidity" value="4"/><vector name="sunDirection" x="1" y="2" z="3"/>'
+            '<float name="scale" value="3"/><integer name="resolution" value="1024"/></emitter>',
+            version="0.6.0",
+        ),
+        scene(
+            '<emitter type="sunsky"><float name="turbidity" value="4"/><vector name="sun_direction" x="1" y="2" z="3"/>'
+            '<float name="sky_scale" value="3"/><float name="sun_scale" value="0"/><rgb name="albedo" value="0.2"/>'
+            '<transform name="to_world"><rotate x="1" angle="-90"/></transform></emitter>'
+        ),
+    ),
     "uoffset": (
         scene(
             '<shape type="rectangle"><bsdf type="diffuse"><texture type="checkerboard" name="reflectance">'
@@ -413,7 +434,7 @@ NEAREST: dict[str, tuple[str, str, str]] = {
         "roughconductor",
         'bsdf "roughconductor": distribution "phong" becomes beckmann',
     ),
-    "sunsky": (lamp('<emitter type="sunsky"/>'), "diffuse", 'emitter "sunsky" becomes constant and directional'),
+    "timed_sunsky": (lamp('<emitter type="timed_sunsky"/>'), "diffuse", 'emitter "timed_sunsky" becomes sky'),
     "collimated": (lamp('<emitter type="collimated"/>'), "diffuse", 'emitter "collimated" is left out'),
     "sppm": (ball('<bsdf type="diffuse"/>').replace('type="path"', 'type="sppm"'), "diffuse", "becomes path"),
 }

@@ -136,6 +136,9 @@ ROWS: dict[str, Row] = {
     "opacity": Row(leaves),
     "textures and normal maps": Row(textured),
     "environment map": Row(mapped),
+    "sky and sun": Row(
+        lambda _: room(lights={"sky": {"type": "sky", "sun_direction": [0.4, 0.5, 0.7], "sun_aperture": 3}})
+    ),
     "many lights": Row(many, {"integrator": {**PATH, "light_choice": "tree"}}),
     "layers": Row(leaves, {"film": {"aovs": LAYERS}}),
     "clamp": Row(lambda _: room(), {"integrator": {**PATH, "clamp": 0.8}}),
@@ -195,7 +198,7 @@ def scene_of(tmp_path) -> Callable[[str], torchpt.Scene]:
 def slow(name: str, mode: str) -> list[pytest.MarkDecorator]:
     """Mark jobs whose kernels take long to compile, or of which one of a kind is left that shows the same."""
     rows = ("many lights", "textures and normal maps", "strategy light", "some materials", "preview", "environment map",
-            "searched by a tree", "parallel projection", "lens of six blades", "filter mitchell")  # fmt: skip
+            "sky and sun", "searched by a tree", "parallel projection", "lens of six blades", "filter mitchell")  # fmt: skip
     others = name.startswith(("sampler ", "filter ", "strategy ")) and name not in ("sampler sobol", "filter mitchell")
     eager = ("textures and normal maps", "many lights", "layers")  # of the scene of "opacity"
     return [pytest.mark.slow] * (others or (name in rows if mode == "compiled" else name not in eager))

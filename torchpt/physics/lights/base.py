@@ -266,7 +266,9 @@ def bright(color: Tensor) -> Tensor:
 
 
 #: The kinds of lights without a surface.
-KINDS: Kinds[Light] = Kinds("torchpt.physics.lights.kinds", ("point", "spot", "directional", "constant", "envmap"))
+KINDS: Kinds[Light] = Kinds(
+    "torchpt.physics.lights.kinds", ("point", "spot", "directional", "constant", "envmap", "sky")
+)
 
 
 def sort_key(name: str) -> tuple[bool, bool, str]:

@@ -5,12 +5,14 @@ An emitter becomes one or more mappings of the block ``lights``.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpt.math.transforms import apply_points
+from torchpt.math.transforms import apply_points, similarity_scale
+from torchpt.physics.lights.sun_position import sun_angles
 from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, left_out, nearest
 from torchpt.scene.formats.mitsuba.properties import Properties
 
@@ -23,19 +25,10 @@ Light = dict[str, Any]
 Matrix = NDArray[np.float64]
 
 _ONE = [1.0, 1.0, 1.0]
-# The sky and the sun of Mitsuba's `sunsky` without properties: mean radiance of the upper half of the sky, irradiance of a
-# surface that faces the sun, and the direction to it (up is z).
-_SKY = (0.071, 0.107, 0.166)
-_SUN = (1.47, 1.21, 0.894)
-_TO_SUN = (0.05, 0.69, 0.72)
 
 
 def _common(p: Properties) -> None:
     p.ignore("sampling_weight", "shadow_sample_count")
-
-
-def _times(colour: list[float], factor: float) -> list[float]:
-    return [value * factor for value in colour]
 
 
 def _position(p: Properties) -> list[float]:
@@ -98,55 +91,97 @@ def _envmap(p: Properties, importer: Importer) -> list[Light]:
     return [found]
 
 
-def _sky(p: Properties, importer: Importer) -> list[Light]:
-    scale = p.number("scale", 1.0) * p.number("sky_scale", 1.0)
-    _ignore_sky(p)
-    p.ignore("sun_scale")
-    return [{"type": "constant", "radiance": _times(list(_SKY), scale)}]
-
-
-def _sun(p: Properties, importer: Importer) -> list[Light]:
-    scale = p.number("scale", 1.0) * p.number("sun_scale", 1.0)
-    matrix, to_sun = p.transform(), p.point("sun_direction")
-    _ignore_sky(p)
-    p.ignore("sky_scale")
-    if to_sun is None:
-        x, y, z = _TO_SUN
-        to_sun = [x, y, z] if p.modern else [x, z, -y]  # up was y
-    direction = -(matrix[:3, :3] @ np.array(to_sun))
-    if scale <= 0.0 or not direction.any():
-        return []
-    return [
-        {"type": "directional", "direction": [float(x) for x in direction], "irradiance": _times(list(_SUN), scale)}
-    ]
-
-
 def _sun_sky(p: Properties, importer: Importer) -> list[Light]:
-    return [*_sky(p, importer), *_sun(p, importer)]
-
-
-def _ignore_sky(p: Properties) -> None:
-    """Mark the properties of the sky as read that the warning of its entry covers."""
+    """Return a sky: of ``sky`` without a sun, of ``sun`` without a sky."""
     _common(p)
-    p.ignore(
-        "turbidity", "albedo", "latitude", "longitude", "timezone", "year", "month", "day", "hour", "minute", "second"
-    )
-    p.ignore(
-        "resolution",
-        "stretch",
-        "sun_radius_scale",
-        "sun_aperture",
-        "to_world",
-        "sun_direction",
-        "complex_sun",
-        "extend",
-    )
-    p.objects("texture")
+    p.ignore("resolution", "complex_sun", "shutter_open", "shutter_close")
+    scale = p.number("scale", 1.0)
+    scales = {f"{part}_scale": p.number(f"{part}_scale", scale) for part in ("sky", "sun")}
+    if p.plugin in ("sky", "sun"):
+        scales |= {"sun_scale": 0.0} if p.plugin == "sky" else {"sky_scale": 0.0}
+    albedo = p.slot("albedo", [0.3 if p.modern else 0.2] * 3)
+    if isinstance(albedo, dict):
+        p.note("the texture of albedo becomes 0.3")
+        albedo = [0.3] * 3
+    to_sun, pose = _to_sun(p), _upright(p)
+    found: Light = {"type": "sky", "turbidity": _within(p, "turbidity", 3.0, 1.0, 10.0), "albedo": albedo}
+    found |= {"sun_direction": [float(x) for x in to_sun], **scales}
+    aperture = p.number("sun_aperture", 0.5358) * p.number("sun_radius_scale", 1.0)
+    found["sun_aperture"] = min(max(aperture, 0.01), 60.0)
+    if aperture > 60.0:
+        p.note("a sun of more than 60 degrees becomes one of 60")
+    found["stretch"] = _within(p, "stretch", 1.0, 1.0, 2.0)
+    if p.flag("extend"):
+        p.note("extend is left out: the sky is black below the horizon")
+    if not p.modern and scales["sun_scale"]:
+        p.note("the sun is that of Hosek and Wilkie, where Mitsuba of this file's time had that of Preetham et al.")
+    if not np.allclose(pose, np.eye(4), atol=1e-9):
+        found["transform"] = [{"matrix": [[float(x) for x in row] for row in pose]}]
+    if float((np.linalg.inv(pose) @ [*to_sun, 0.0])[1]) < 0.0:
+        p.note("it is left out: its sun is below the horizon")
+        return []
+    return [found]
 
 
-_SUN_AND_SKY = nearest(
-    "constant and directional", _sun_sky, "the mean radiance of a clear sky, and a sun that is a point"
-)
+def _within(p: Properties, name: str, default: float, low: float, high: float) -> float:
+    """Return a number, the nearest in a range; note one outside."""
+    value = p.number(name, default)
+    if not low <= value <= high:
+        p.note(f"{name} outside of {low:g}..{high:g} is clamped")
+    return min(max(value, low), high)
+
+
+def _upright(p: Properties) -> Matrix:
+    """Return the transform ``(4, 4)`` of a sky whose up is +y; in files of Mitsuba 2 and 3 it is +z."""
+    pose = np.eye(4)
+    linear = p.transform()[:3, :3]
+    if similarity_scale(p.transform()) is None:
+        p.note("a to_world that keeps no angles is left out")
+    else:
+        pose[:3, :3] = linear / abs(np.linalg.det(linear)) ** (1.0 / 3.0)
+    return pose @ _Z_UP if p.modern else pose
+
+
+#: Turns +y to +z.
+_Z_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def _to_sun(p: Properties) -> Matrix:
+    """Return the unit direction ``(3,)`` to the sun in the scene, given or by place and time."""
+    given = p.point("sun_direction")
+    latitude, longitude = p.number("latitude", 35.6894), p.number("longitude", 139.6917)
+    timezone = p.number("timezone", 9.0)
+    timed = p.plugin == "timed_sunsky"
+    start = "start_" if timed else ""
+    year, month, day = (
+        p.integer(start + key, value)
+        for key, value in (("year", 2025 if timed else 2010), ("month", 1 if timed else 7), ("day", 1 if timed else 10))
+    )
+    if timed:
+        p.ignore("end_year", "end_month", "end_day")
+        hours = 0.5 * (p.number("window_start_time", 7.0) + p.number("window_end_time", 19.0))
+    else:
+        hours = p.number("hour", 15.0) + p.number("minute", 0.0) / 60.0 + p.number("second", 0.0) / 3600.0
+    if given is not None:
+        return _unit(p, given)
+    if not (1900 <= year <= 2100 and 1 <= month <= 12 and abs(hours) < 1e4 and abs(timezone) < 1e4 and abs(day) < 1e4):
+        raise p.element.error([year, month, day, hours], "a date of 1900 to 2100, and an hour")
+    zenith, azimuth = sun_angles(latitude, longitude, timezone, year, month, day, hours)
+    level, up = math.sin(zenith), math.cos(zenith)
+    north, east = level * math.cos(azimuth), level * math.sin(azimuth)
+    # Mitsuba 3 has up as z, south as x and west as y; before, up was y, south z and east x.
+    local = (-north, -east, up) if p.modern else (east, up, -north)
+    return _unit(p, p.transform()[:3, :3] @ local)
+
+
+def _unit(p: Properties, along: Any) -> Matrix:
+    """Return a vector at length 1."""
+    along = np.asarray(along, np.float64)
+    if not (np.isfinite(along).all() and along.any()):
+        raise p.element.error([float(x) for x in along], "a direction to the sun other than 0")
+    along = along / np.abs(along).max()
+    return along / np.linalg.norm(along)
+
 
 #: Plugins of the tag ``emitter``.
 EMITTERS: dict[str, Plugin] = {
@@ -156,10 +191,10 @@ EMITTERS: dict[str, Plugin] = {
     "directional": exact("directional", _directional),
     "constant": exact("constant", _constant),
     "envmap": exact("envmap", _envmap),
-    "sky": nearest("constant", _sky, "the mean radiance of a clear sky from all directions"),
-    "sun": nearest("directional", _sun, "the sun is a point"),
-    "sunsky": _SUN_AND_SKY,
-    "timed_sunsky": _SUN_AND_SKY,
+    "sky": exact("sky", _sun_sky),
+    "sun": exact("sky", _sun_sky, "before version 2 the sun was that of Preetham et al., with a warning"),
+    "sunsky": exact("sky", _sun_sky, "before version 2 the sun was that of Preetham et al., with a warning"),
+    "timed_sunsky": nearest("sky", _sun_sky, "the first day, at the middle of its hours"),
     "collimated": left_out("a beam without width meets no surface by chance"),
     "directionalarea": left_out("surfaces shine in all directions"),
     "projector": left_out("there are no projectors"),

@@ -468,7 +468,7 @@ class Importer:
         return f"{stem}_{number}"
 
 
-_ENVIRONMENTS = ("envmap", "constant")
+_ENVIRONMENTS = ("envmap", "constant", "sky")
 
 
 def _key(name: str) -> str:
