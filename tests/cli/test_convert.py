@@ -23,7 +23,9 @@ def corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("name", ["obj_flipped", "envmap", "references", "instances", "mask_texture", "crop"])
+@pytest.mark.parametrize(
+    "name", ["obj_flipped", "envmap", "sunsky", "serialized", "references", "instances", "mask_texture", "crop"]
+)
 def test_the_picture_is_the_same_to_the_bit(corpus: Path, capsys: Captured, name: str) -> None:
     (corpus / "in").mkdir()
     write_assets(corpus / "in")

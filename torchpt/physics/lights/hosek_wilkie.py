@@ -37,9 +37,9 @@ def _numbers() -> dict[str, Tensor]:
 def _at_turbidity(name: str, turbidity: Tensor) -> Tensor:
     """Return numbers interpolated in turbidity, their first axis."""
     numbers = _numbers()[name].to(turbidity.device)
-    low = int(turbidity.detach().floor().clamp(1.0, 9.0))
-    share = turbidity - low
-    return numbers[low - 1] * (1.0 - share) + numbers[low] * share
+    low = turbidity.detach().floor().clamp(1.0, 9.0)
+    share, row = turbidity - low, low.long()
+    return numbers[row - 1] * (1.0 - share) + numbers[row] * share
 
 
 def sky_model(turbidity: Tensor, albedo: Tensor, elevation: float) -> tuple[Tensor, Tensor]:

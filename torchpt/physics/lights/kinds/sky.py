@@ -324,8 +324,11 @@ class Sky(Environment):
         horizon = math.cos(0.5 * math.pi * stretch) if stretch > 1.0 else 0.0
         horizon = horizon if stretch < 2.0 else -1.01  # rounding hides no direction
         # Half of the samples each, whatever the numbers; all for one where the other is switched off.
-        off = [not bool(scale) and not scale.requires_grad for scale in (sky_scale, sun_scale)]
-        share = 0.5 if off[0] == off[1] else float(off[1])
+        sky_off, sun_off = (
+            torch.zeros_like(scale) if scale.requires_grad else (scale.detach() == 0.0).double()
+            for scale in (sky_scale, sun_scale)
+        )
+        share = 0.5 + 0.5 * (sun_off - sky_off)
         black = envmap.build(torch.zeros(_HEIGHT, 1, 3, dtype=scene.dtype, device=device), number(turn), number(1.0))
         dome = Dome(
             map=black,
