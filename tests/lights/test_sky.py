@@ -199,6 +199,12 @@ def test_a_transform_turns_sky_and_sun_of_a_time_but_not_a_given_direction() -> 
     torch.testing.assert_close(
         Sky.radiance_pdf(plain, d, True)[0], Sky.radiance_pdf(turned, quarter, True)[0], rtol=1e-5, atol=1e-6
     )
+    mirrored = dome_of(transform=[{"scale": [-1, 1, 1]}])
+    torch.testing.assert_close(
+        mirrored.sun.frame.axis, torch.tensor([-x, y, z], dtype=torch.float64), rtol=0, atol=1e-7
+    )
+    across = d * torch.tensor([[-1.0], [1.0], [1.0]])
+    torch.testing.assert_close(Sky.radiance_pdf(plain, d, True)[0], Sky.radiance_pdf(mirrored, across, True)[0])
     given = toward(30)
     tilted = dome_of(sun_direction=given, transform=[{"rotate": {"axis": [1, 0, 0], "angle": 20}}])
     torch.testing.assert_close(tilted.sun.frame.axis, torch.tensor(given, dtype=torch.float64), rtol=0, atol=1e-7)
@@ -373,7 +379,7 @@ def test_the_image_has_all_of_the_light() -> None:
 # ---- Derivatives
 
 
-@pytest.mark.parametrize("compiled", ["off", "auto"])
+@pytest.mark.parametrize("compiled", ["off", pytest.param("auto", marks=pytest.mark.slow)])
 def test_derivatives_of_a_picture(compiled: str) -> None:
     """The picture is linear in both scales; by turbidity and albedo beside differences of the irradiance."""
     keys: dict[str, Any] = {"sun_direction": toward(35), "turbidity": 3.4, "albedo": 0.4}

@@ -28,7 +28,7 @@ from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.lights.sun_position import sun_angles
 from torchpt.spec import Angle, Color, Direction, Integer, Pose, Refused, Scalar
 
-__all__ = ["Dome", "Sky", "Sun", "SunFrame", "sky_angles", "sky_turn"]
+__all__ = ["Atmosphere", "Dome", "Sky", "Sun", "SunFrame", "sky_angles", "sky_turn"]
 
 #: Rows and columns of the map; a row lies on the horizon.
 _HEIGHT, _WIDTH = 257, 512
@@ -152,43 +152,58 @@ class Sun:
 
 
 @dataclass(frozen=True)
-class Dome:
-    """The sky and its sun.
+class Atmosphere:
+    """The sky without its sun.
 
     Attributes:
-        map: the density of samples of the sky; its own space is that of the light.
-        model: parameters ``(9, 3)`` and mean radiance ``(3,)`` of the sky, scaled.
-        about: where the sun is for the formula of the sky: that of ``sun``, or before ``stretch``.
+        turn: ``(3, 3)`` orthogonal, from the world to the light's own space; its second row is the zenith.
+        model: parameters ``(9, 3)`` and mean radiance ``(3,)``, scaled.
+        about: where the sun is for the formula: that of the disc, or before ``stretch``.
         stretch: ``()`` factor of all angles from the zenith; None for 1.
         horizon: ``()`` cosine of the angle from the zenith below which all is black.
-        sun: the sun.
-        share: ``()`` probability with which light sampling takes the map, else the sun.
     """
 
-    map: envmap.EnvironmentMap
+    turn: Tensor
     model: tuple[Tensor, Tensor]
     about: SunFrame
     stretch: Tensor | None
     horizon: Tensor
+
+
+@dataclass(frozen=True)
+class Dome:
+    """The sky and its sun.
+
+    Attributes:
+        atmosphere: the sky.
+        sun: the sun.
+        map: the density of samples of the sky, in the light's own space.
+        share: ``()`` probability with which light sampling takes the map, else the sun.
+    """
+
+    atmosphere: Atmosphere
     sun: Sun
+    map: envmap.EnvironmentMap
     share: Tensor
 
 
-def _sky(dome: Dome, d: Tensor) -> tuple[Tensor, Tensor]:
+def _sky(atmosphere: Atmosphere, d: Tensor) -> tuple[Tensor, Tensor]:
     """Return the radiance ``(3, N)`` of the sky from unit directions, 0 below the horizon; and whether they are above it."""
-    up = dome.map.turn[1][:, None]
+    up = atmosphere.turn[1][:, None]
     cosine = dot(up, d)
-    above = cosine >= dome.horizon
-    if dome.stretch is not None:
+    above = cosine >= atmosphere.horizon
+    if atmosphere.stretch is not None:
         level = torch.addcmul(d, up, cosine, value=-1)
         sine = dot(level, level).clamp_min(_LEAST_COSINE**2).sqrt()
-        zenith = (azimuth(cosine, sine) * (1.0 / dome.stretch)).clamp_max(0.5 * math.pi)
+        zenith = (azimuth(cosine, sine) * (1.0 / atmosphere.stretch)).clamp_max(0.5 * math.pi)
         cosine = torch.cos(zenith)
         d = up * cosine + level * (torch.sin(zenith) / sine)
-    cos_gamma, across, rise = (dot(axis[:, None], d) for axis in (dome.about.axis, dome.about.side, dome.about.rise))
+    cos_gamma, across, rise = (
+        dot(axis[:, None], d) for axis in (atmosphere.about.axis, atmosphere.about.side, atmosphere.about.rise)
+    )
     sin_gamma = torch.addcmul(across * across, rise, rise).clamp_min(_LEAST_COSINE**2).sqrt()
     gamma = azimuth(cos_gamma, sin_gamma)
-    radiance = sky_radiance(dome.model, cosine.clamp_min(_LEAST_COSINE), cos_gamma, gamma)
+    radiance = sky_radiance(atmosphere.model, cosine.clamp_min(_LEAST_COSINE), cos_gamma, gamma)
     return torch.where(above, radiance, 0.0), above
 
 
@@ -228,7 +243,7 @@ def _shining(dome: Dome, d: Tensor, mis: bool, aimed: Tensor | None = None) -> t
         mis: whether samples are combined with BSDF sampling by MIS.
         aimed: ``(N,)`` True for directions that were sampled on the sun, which meet it whatever rounding says.
     """
-    light, above = _sky(dome, d)
+    light, above = _sky(dome.atmosphere, d)
     sun, met = _disc(dome.sun, d)
     met = met if aimed is None else met | aimed
     cone = (1.0 - dome.share) / (2.0 * math.pi * dome.sun.cap)
@@ -236,13 +251,13 @@ def _shining(dome: Dome, d: Tensor, mis: bool, aimed: Tensor | None = None) -> t
     return light + torch.where(met & above, sun, 0.0), density
 
 
-def _sun_points(dome: Dome) -> tuple[Tensor, Tensor]:
+def _sun_points(sun: Sun, atmosphere: Atmosphere) -> tuple[Tensor, Tensor]:
     """Return directions ``(3, N)`` to the sun and the radiance ``(3, N)`` from each, 0 below the horizon."""
-    like = dome.sun.cap
+    like = sun.cap
     middles = (torch.arange(_POINTS, dtype=torch.float64, device=like.device) + 0.5) / _POINTS
-    d = _toward_sun(dome.sun, torch.cartesian_prod(middles, middles).T.to(like.dtype))
-    above = dot(dome.map.turn[1][:, None], d) >= dome.horizon
-    return d, torch.where(above, _disc(dome.sun, d)[0], 0.0)
+    d = _toward_sun(sun, torch.cartesian_prod(middles, middles).T.to(like.dtype))
+    above = dot(atmosphere.turn[1][:, None], d) >= atmosphere.horizon
+    return d, torch.where(above, _disc(sun, d)[0], 0.0)
 
 
 # ---- The light
@@ -254,12 +269,11 @@ def _frame(zenith: float, bearing: float, turn: Matrix) -> Matrix:
     return np.stack((*rows, _direction(zenith - 0.5 * math.pi, bearing))) @ turn
 
 
-def _texels(dome: Dome, below: float) -> Tensor:
-    """Return the sky without the sun at the texels of the map ``(3, H, W)``; ``below`` lowers the cosine of the horizon."""
-    dome, map = replace(dome, horizon=dome.horizon - below), dome.map
-    d = directions(_HEIGHT, _WIDTH).to(map.turn).reshape(3, -1)
-    world = torch.stack([dot(map.turn[:, k][:, None], d) for k in range(3)])
-    return _sky(dome, world)[0].view(3, _HEIGHT, _WIDTH)
+def _texels(atmosphere: Atmosphere, below: float) -> Tensor:
+    """Return the sky at the texels of the map ``(3, H, W)``; ``below`` lowers the cosine of the horizon."""
+    d = directions(_HEIGHT, _WIDTH).to(atmosphere.turn).reshape(3, -1)
+    world = torch.stack([dot(atmosphere.turn[:, k][:, None], d) for k in range(3)])
+    return _sky(replace(atmosphere, horizon=atmosphere.horizon - below), world)[0].view(3, _HEIGHT, _WIDTH)
 
 
 class Sky(Environment):
@@ -307,45 +321,42 @@ class Sky(Environment):
         turbidity, albedo, sky_scale, sun_scale = (
             scene[key] for key in ("turbidity", "albedo", "sky_scale", "sun_scale")
         )
-        values, device, turn = scene.values, turbidity.device, sky_turn(scene.values)
+        values, device = scene.values, turbidity.device
         zenith, bearing = sky_angles(values)
         stretch, elevation = values["stretch"], max(0.0, 0.5 * math.pi - zenith)
 
         def number(value: Any) -> Tensor:
             return torch.as_tensor(value, dtype=torch.float64, device=device).to(scene.dtype)
 
+        turn = sky_turn(values)
+        before, after = (SunFrame(*map(number, _frame(z, bearing, turn))) for z in (zenith, zenith * stretch))
         parameters, mean = sky_model(turbidity, albedo, elevation)
+        horizon = math.cos(0.5 * math.pi * stretch) if stretch > 1.0 else 0.0
+        atmosphere = Atmosphere(
+            turn=number(turn),
+            model=(number(parameters), number(mean * sky_scale)),
+            about=before,
+            stretch=number(stretch) if stretch > 1.0 else None,
+            horizon=number(horizon if stretch < 2.0 else -1.01),  # rounding hides no direction
+        )
         half = math.radians(values["sun_aperture"]) / 2.0
         cap = 2.0 * math.sin(half / 2.0) ** 2
         wider = 2.0 * math.sin(SUN_RADIUS / 2.0) ** 2 / cap  # a wider sun sends as much light
-        before, after = (SunFrame(*map(number, _frame(z, bearing, turn))) for z in (zenith, zenith * stretch))
         profile = tuple(map(number, (sun_profile(turbidity, elevation) * wider).unbind()))
         sun = Sun(after, number(1.0 / math.sin(half)), number(cap), number(sun_scale), profile)
-        horizon = math.cos(0.5 * math.pi * stretch) if stretch > 1.0 else 0.0
-        horizon = horizon if stretch < 2.0 else -1.01  # rounding hides no direction
         # Half of the samples each, whatever the numbers; all for one where the other is switched off.
         sky_off, sun_off = (
             torch.zeros_like(scale) if scale.requires_grad else (scale.detach() == 0.0).double()
             for scale in (sky_scale, sun_scale)
         )
         share = 0.5 + 0.5 * (sun_off - sky_off)
-        black = envmap.build(torch.zeros(_HEIGHT, 1, 3, dtype=scene.dtype, device=device), number(turn), number(1.0))
-        dome = Dome(
-            map=black,
-            model=(number(parameters), number(mean * sky_scale)),
-            about=before,
-            stretch=number(stretch) if stretch > 1.0 else None,
-            horizon=number(horizon),
-            sun=sun,
-            share=number(share),
-        )
         # Texels on the horizon, and those next below it where no row lies on it, have the sky's colour.
-        texels = _texels(dome, 1e-4 if stretch == 1.0 else math.pi / (_HEIGHT - 1))
-        dome = replace(dome, map=envmap.build(texels.detach().permute(1, 2, 0), number(turn), number(1.0)))
-        color = _mean_sky(texels.double(), horizon) + _sun_points(dome)[1].double().mean(1) * (0.5 * cap)
+        texels = _texels(atmosphere, 1e-4 if stretch == 1.0 else math.pi / (_HEIGHT - 1))
+        density = envmap.build(texels.detach().permute(1, 2, 0), atmosphere.turn, number(1.0))
+        color = _mean_sky(texels.double(), horizon) + _sun_points(sun, atmosphere)[1].double().mean(1) * (0.5 * cap)
         # From each direction through a disk as wide as the scene, whose radius is `reach`; `bright` is the detached luminance.
         power = 4.0 * math.pi**2 * scene.reach**2 * bright(color)
-        return Row(radiance=color, power=power, environment=dome)
+        return Row(radiance=color, power=power, environment=Dome(atmosphere, sun, density, number(share)))
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
@@ -371,12 +382,12 @@ class Sky(Environment):
     def environment_image(cls, around: Dome) -> EnvironmentImage:
         """See :meth:`Environment.environment_image`; the sun is spread over the texels next to it."""
         map = around.map
-        d, radiance = _sun_points(around)
+        d, radiance = _sun_points(around.sun, around.atmosphere)
         local = torch.stack([dot(map.turn[k][:, None], d) for k in range(3)])
         cells, weights = corners(*coordinates(local), map.height, map.width)
         size = solid_angles(map.height, map.width).to(d).repeat_interleave(map.width)
         each = radiance * (around.sun.cap * (2.0 * math.pi / d.shape[1]))  # of a point, times its solid angle
-        texels = _texels(around, 1e-4).reshape(3, -1)
+        texels = _texels(around.atmosphere, 1e-4).reshape(3, -1)
         for cell, weight in zip(cells, weights, strict=True):
             texels = texels.index_add(1, cell, each * (weight / size[cell]))
         return EnvironmentImage(texels=texels.T.reshape(map.height, map.width, 3), turn=map.turn)
