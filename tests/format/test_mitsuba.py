@@ -392,3 +392,61 @@ def test_attributes_survive_a_conversion_to_yaml(assets: Path, tmp_path: Path) -
         options: dict[str, Any] = {"spp": 2, "compile": "off", "film": {"width": 16, "height": 12}}
         images = [torchpt.render(torchpt.load(str(path)), **options) for path in (assets / "scene.xml", file)]
         assert torch.equal(*images)
+
+
+# ---- Skies
+
+
+def sky(folder: Path, plugin: str, inner: str, version: str = "3.0.0") -> dict[str, Any]:
+    """Return what a sky becomes."""
+    (light,) = read(folder, scene(f'<emitter type="{plugin}">{inner}</emitter>', version))["lights"].values()
+    return light
+
+
+def test_scales_and_sizes_of_skies_are_those_of_their_version(assets: Path) -> None:
+    both = '<float name="scale" value="3"/><float name="sunScale" value="2"/><float name="sunRadiusScale" value="4"/>'
+    old = sky(assets, "sunsky", both, "0.6.0")
+    assert (old["sky_scale"], old["sun_scale"], old["albedo"]) == (3.0, 2.0, [0.2] * 3)
+    assert old["sun_aperture"] == pytest.approx(4 * 0.5358) and "transform" not in old
+    assert sky(assets, "sun", both, "0.6.0")["sky_scale"] == 0.0 == sky(assets, "sky", both, "0.6.0")["sun_scale"]
+    new = sky(assets, "sunsky", '<float name="sun_aperture" value="2"/><float name="turbidity" value="7"/>')
+    assert (new["sun_aperture"], new["turbidity"], new["albedo"]) == (2.0, 7.0, [0.3] * 3)
+    matrix = np.array(new["transform"][0]["matrix"])
+    np.testing.assert_allclose(matrix @ [0, 1, 0, 0], [0, 0, 1, 0], atol=1e-12)  # up is z
+
+
+def test_the_suns_of_a_time_stand_in_the_south_of_each_version(assets: Path) -> None:
+    noon = '<float name="latitude" value="48"/><float name="longitude" value="15"/><float name="timezone" value="1"/>'
+    noon += '<float name="hour" value="12"/>'
+    old = np.array(sky(assets, "sunsky", noon, "0.6.0")["sun_direction"])
+    new = np.array(sky(assets, "sunsky", noon)["sun_direction"])
+    turned = np.array(sky(assets, "sunsky", noon + '<transform name="to_world"><rotate x="1" angle="-90"/></transform>')
+                      ["sun_direction"])  # fmt: skip
+    assert abs(old[0]) < 0.05 and 0.85 < old[1] < 0.95 and old[2] > 0.4  # south is z
+    np.testing.assert_allclose(new, [old[2], -old[0], old[1]], atol=1e-12)  # south is x, west is y
+    np.testing.assert_allclose(turned, [new[0], new[2], -new[1]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("inner", "words"),
+    [
+        ('<float name="hour" value="2"/>', "its sun is below the horizon"),
+        ('<float name="turbidity" value="12"/>', "turbidity outside of 1..10 is clamped"),
+        ('<float name="stretch" value="0.5"/>', "stretch outside of 1..2 is clamped"),
+        ('<float name="sun_radius_scale" value="300"/>', "a sun of more than 60 degrees"),
+        ('<boolean name="extend" value="true"/>', "extend is left out"),
+        ('<transform name="to_world"><scale x="2"/></transform>', "a to_world that keeps no angles is left out"),
+    ],
+)
+def test_what_a_sky_cannot_have_is_a_warning(assets: Path, inner: str, words: str) -> None:
+    (assets / "scene.xml").write_text(scene(f'<emitter type="sunsky">{inner}</emitter>'))
+    with pytest.warns(ImportedSceneWarning, match=words):
+        raw = read_mitsuba(assets / "scene.xml", "scene.xml", ImportOptions())
+    assert len(raw.get("lights", {})) == (0 if "hour" in inner else 1)
+
+
+@pytest.mark.parametrize(
+    "inner", ['<vector name="sun_direction" value="0 0 0"/>', '<integer name="month" value="13"/>']
+)
+def test_wrong_skies_are_one_line(assets: Path, inner: str) -> None:
+    assert "line " in error(assets, scene(f'<emitter type="sunsky">{inner}</emitter>'))
