@@ -21,6 +21,7 @@ CASES = [
     "two",
     "three",
     "nine",
+    "twenty, some dark",
     "mixed",
     "coincident",
     "collinear",
@@ -30,7 +31,7 @@ CASES = [
     "all dark",
     "one way",
 ]
-SIZES = {"one": 1, "two": 2, "three": 3, "nine": 9, "lopsided": 3000}
+SIZES = {"one": 1, "two": 2, "three": 3, "nine": 9, "twenty, some dark": 20, "lopsided": 3000}
 
 
 def uniform(*shape: int) -> Tensor:
@@ -54,7 +55,7 @@ def emitters(case: str, count: int | None = None) -> dict[str, Tensor]:
     elif case == "lopsided":
         centre, radius = centre * 1.01 ** -torch.arange(count), torch.zeros(count)
         intensity = 1.02 ** -torch.arange(float(count))
-    elif case == "some dark":
+    elif case.endswith("some dark"):
         intensity[uniform(count) < 0.4] = 0.0
     elif case == "one bright":
         intensity[count // 2] = 1e6
@@ -135,7 +136,35 @@ def test_the_tensor_form_is_the_kernels_reference(case):
     assert (built.levels > tree.STEPS) == (case == "lopsided")  # whose ways take two words
 
 
-@pytest.mark.parametrize("case", ["nine", "mixed", "coincident", "one bright"])
+@pytest.mark.parametrize("case", ["nine", "mixed"])
+def test_lanes_may_have_a_row_already(case):
+    lights = emitters(case)
+    built, (x, n) = tree.build(**lights), points(500)
+    u, given = tree.from_digits(uniform(2, 500)), torch.randint(-5, len(lights["intensity"]), (500,), generator=G)
+    given = given.clamp_min(-1)
+    drawn, p, rest = tree.sample(built, x, n, u)
+    row, q, remapped = tree.sample(built, x, n, u, given)
+    free = given < 0
+    assert 0 < free.sum() < 500
+    assert torch.equal(row, torch.where(free, drawn, given))
+    assert torch.equal(q, torch.where(free, p, tree.probability(built, row, x, n)))
+    assert torch.equal(remapped[free], rest[free])
+
+
+def test_a_wide_root_has_the_fields_of_a_node():
+    """Eight lights are a node by the builder of trees; the same ones beside two more are children of a wide root."""
+    eight = emitters("eight", 8)
+    eight["axis"][:, 3] = 0.0
+    more = {name: torch.cat((value, value[..., :2] * 0.5), -1) for name, value in eight.items()}
+    node, wide = tree.build(**eight), tree.build(**more)
+    assert node.levels == wide.levels == 1 and wide.child.shape[1] == 2 * tree.WIDTH
+    place = [(~built.child[0]).tolist() for built in (node, wide)]
+    for light in range(8):
+        fields = [built.nodes[0, :, at.index(light)] for built, at in zip((node, wide), place, strict=True)]
+        torch.testing.assert_close(*fields, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("case", ["nine", "twenty, some dark", "mixed", "coincident", "one bright"])
 def test_frequencies_are_the_probabilities(case):
     lights, n_draws = emitters(case), 1 << 16
     built, count, (x, n) = tree.build(**lights), len(lights["intensity"]), points(3)

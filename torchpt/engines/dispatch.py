@@ -32,7 +32,7 @@ for _draw in (samplers.draw_1d, samplers.draw_2d, samplers.draw_further):
 
 solid_angle.sample.register(Lanewise(solid_angle.sample.function, lanes=("row", "x", "u"), detached=True))
 solid_angle.angles.register(Lanewise(solid_angle.angles.function, lanes=("row", "x"), detached=True))
-tree.sample.register(Lanewise(tree.sample.function, lanes=("x", "n", "u"), detached=True))
+tree.sample.register(Lanewise(tree.sample.function, lanes=("x", "n", "u", "given"), detached=True))
 tree.probability.register(Lanewise(tree.probability.function, lanes=("row", "x", "n"), detached=True))
 
 hashing.reverse_bits.register(bits.reverse_bits)

@@ -177,16 +177,20 @@ def _draw_local(choice: TreeSampler, u: Tensor, x: Tensor, n: Tensor | None) -> 
         return tree.sample(choice.tree, x, n, u)
     p_uniform = choice.uniform_probability
     is_uniform = u < p_uniform
-    row, _, remapped = tree.sample(choice.tree, x, n, ((u - p_uniform) / (1.0 - p_uniform)).clamp_min(0.0))
     uniform_row, uniform_remapped = choice.uniform.draw((u / p_uniform).clamp_max(_BELOW_ONE))
-    row, remapped = torch.where(is_uniform, uniform_row, row), torch.where(is_uniform, uniform_remapped, remapped)
+    given = torch.where(is_uniform, uniform_row, -1)
     # Either way may have chosen the row, so the probability is that of the mixture.
-    return row, _local_probability(choice, row, x, n), remapped
+    row, p, remapped = tree.sample(choice.tree, x, n, ((u - p_uniform) / (1.0 - p_uniform)).clamp_min(0.0), given)
+    return row, _mixed(choice, row, p), torch.where(is_uniform, uniform_remapped, remapped)
 
 
 def _local_probability(choice: TreeSampler, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """Return the probability ``(N,)`` of ``row (N,)``, given that a local light is chosen."""
-    p = tree.probability(choice.tree, row, x, n)
+    return _mixed(choice, row, tree.probability(choice.tree, row, x, n))
+
+
+def _mixed(choice: TreeSampler, row: Tensor, p: Tensor) -> Tensor:
+    """Return the probability ``(N,)`` of rows of which the tree has the probabilities ``p (N,)``."""
     if choice.uniform is None:
         return p
     p_uniform = choice.uniform_probability.to(p.dtype)

@@ -14,17 +14,26 @@ children are chosen uniformly, so that the probabilities of all rows sum to 1 at
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchpt.core.dispatch import dispatched
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
 __all__ = ["FIELDS", "WIDTH", "LightTree", "build", "from_digits", "probability", "sample"]
 
 #: Children of a node: as many as a vector of AVX2 holds float32.
 WIDTH = 8
+#: Up to so many lights are the children of one node, whose fields are the same for all lanes: reading those of a lane's own
+#: node takes longer than weighing two more rows of eight. A multiple of WIDTH.
+MOST_FLAT = 24
 #: Fields of each child of a node: bounding sphere, cone of the axes, angle of emission beyond the cone (angles as cosines), and
 #: intensity relative to the brightest child.
 FIELDS = ("x", "y", "z", "radius", "axis x", "axis y", "axis z", "cos o", "sin o", "cos e", "intensity")
@@ -33,8 +42,8 @@ SLACK = 2.0**-20
 #: Squared distances are at least this fraction of the squared radius. With 1/4, and cosines as in `_weigh`, variance was 1.4
 #: to 6 times lower than with 1 and with bounds alone, for 1,000 lights in four kinds of scenes.
 NEAR = 0.25
-#: Levels of a path through the tree that one 32-bit word holds.
-STEPS = 10
+#: Levels of a path through the tree that one 32-bit word holds, and bits of each; of the one level of a wider root.
+STEPS, BITS, WIDE_BITS = 10, 3, 5
 #: Least intensity of a light over the sum of all, so that it stays in the range of float32.
 _DIMMEST = 1e-30
 
@@ -43,13 +52,18 @@ _DIMMEST = 1e-30
 class LightTree:
     """A tree over K lights."""
 
-    nodes: Tensor  # (M, F, 8) float32: a field of FIELDS, for each of eight children
+    nodes: Tensor  # (M, F, 8) float32: a field of FIELDS, for each of eight children; a single node may have 16 or 24
     child: Tensor  # (M, 8) int32: index of a node, or ~row (negative) for the light of that row of the light table
     full: Tensor  # (M,) int32 number of children
     trail: Tensor  # (W, K) int32 path from the root: three bits a level, ten levels a word, the first level lowest
     depth: Tensor  # (K,) int32 number of levels; 0 for lights without intensity, which are not in the tree
     count: Tensor  # () int64 K
     levels: int  # the largest of `depth`
+
+    @property
+    def bits(self) -> int:
+        """Return the bits of a level in ``trail``."""
+        return BITS if self.child.shape[1] == WIDTH else WIDE_BITS
 
 
 def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor, intensity: Tensor) -> LightTree:
@@ -87,6 +101,8 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
     lights[:, 9], lights[:, 10], lights[:, 11] = array(cos_e), power, 1.0
     lights = np.nan_to_num(lights)
     ids = np.nonzero(shining)[0].astype(np.int32)
+    if WIDTH < len(ids) <= MOST_FLAT:
+        return _flat(lights, cone, ids, device)
     max_nodes = max(len(ids) - 1, 1)  # every node has at least two children
     nodes = np.zeros((max_nodes, len(FIELDS), WIDTH), np.float32)
     child = np.zeros((max_nodes, WIDTH), np.int32)
@@ -96,7 +112,7 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
     num_nodes = kernel("light_tree", "build")(lights, cone, ids, nodes, child, full, trail, depth, *scratch)
     levels = int(depth.max())
     # Three bits a level; a word of int32 holds those of STEPS levels.
-    words = [trail >> 3 * first & (1 << 3 * STEPS) - 1 for first in range(0, max(levels, 1), STEPS)]
+    words = [trail >> BITS * first & (1 << BITS * STEPS) - 1 for first in range(0, max(levels, 1), STEPS)]
     tensors = (
         torch.from_numpy(a).to(device)
         for a in (
@@ -110,6 +126,38 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
     return LightTree(*tensors, count=torch.tensor(count, dtype=torch.int64, device=device), levels=levels)
 
 
+def _flat(
+    lights: NDArray[np.float64], cone: NDArray[np.float64], ids: NDArray[np.int32], device: torch.device
+) -> LightTree:
+    """Return the tree of one node, whose children are the lights ``ids``; see :func:`build` for ``lights`` and ``cone``."""
+    import numpy as np
+
+    some, width = lights[ids], -(-len(ids) // WIDTH) * WIDTH
+    low, high, axis, power = some[:, 0:3], some[:, 3:6], some[:, 6:9], some[:, 10]
+    length = np.linalg.norm(axis, axis=1, keepdims=True)
+    turned = length[:, 0] > 0  # else the light shines all around
+    angle = np.where(turned, np.arccos(cone[ids].clip(-1.0, 1.0)), math.pi)
+    # The radius is enlarged by the rounding of float32.
+    radius = np.linalg.norm(0.5 * (high - low), axis=1) * (1.0 + 2.0**-20)
+    radius += np.maximum(abs(low), abs(high)).max(1) * 2.0**-21
+    columns = [
+        *(0.5 * (low + high)).T,
+        radius,
+        *np.where(turned[:, None], axis / np.where(length > 0, length, 1.0), 0.0).T,
+        np.cos(angle),
+        np.sin(angle),
+        some[:, 9],
+        power / power.max(),
+    ]
+    nodes, child = np.zeros((1, len(FIELDS), width), np.float32), np.zeros((1, width), np.int32)
+    nodes[0, :, : len(ids)], child[0, : len(ids)] = np.stack(columns), ~ids
+    trail, depth = np.zeros((1, len(lights)), np.int32), np.zeros(len(lights), np.int32)
+    trail[0, ids], depth[ids] = np.arange(len(ids)), 1
+    full = np.array([len(ids)], np.int32)
+    tensors = (torch.from_numpy(a).to(device) for a in (nodes, child, full, trail, depth))
+    return LightTree(*tensors, count=torch.tensor(len(lights), dtype=torch.int64, device=device), levels=1)
+
+
 def from_digits(u: Tensor) -> Tensor:
     """Return ``u (2, N)`` in [0, 1) as one number ``(N,)`` float64 of 48 bits: the second continues the digits of the first.
 
@@ -120,7 +168,9 @@ def from_digits(u: Tensor) -> Tensor:
 
 @dispatched
 @torch.no_grad()
-def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def sample(
+    tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor, given: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Choose a light for each point.
 
     Args:
@@ -129,12 +179,13 @@ def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Ten
         n: unit normals ``(3, N)`` of surfaces lit on their front only; zero where light counts from both sides. None: zero
             everywhere.
         u: ``(N,)`` in [0, 1), float64, see :func:`from_digits`.
+        given: rows ``(N,)`` int64 that are chosen whatever ``u`` is, -1 where there is none. None: nowhere.
 
     Returns:
-        Rows ``(N,)`` int64, their probabilities ``(N,)``, always positive, and the remapped ``u``: ``(N,)`` float64 in [0, 1],
-        uniform given the choice.
+        Rows ``(N,)`` int64, their probabilities by ``u`` ``(N,)``, positive but for given rows, and the remapped ``u``:
+        ``(N,)`` float64 in [0, 1], uniform given the choice, of no meaning for given rows.
     """
-    row, p, remapped = _walk(tree, x, n, u=u, row=None)
+    row, p, remapped = _walk(tree, x, n, u=u, row=given)
     assert remapped is not None
     return row, p, remapped
 
@@ -148,7 +199,7 @@ def probability(tree: LightTree, row: Tensor, x: Tensor, n: Tensor | None) -> Te
 
 
 def _weigh(nodes: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
-    """Return weights ``(N, 8)`` of the children of ``nodes (N, F, 8)`` in float32, zero only where no light contributes.
+    """Return weights ``(N, 8)`` of the children of ``nodes (N, F, 8)``, or of more, in float32, zero only where no light contributes.
 
     Pharr et al., PBRT 4th ed., section 12.6.3: with theta_w the angle between a child's axis and the direction to p, and
     theta_b the angle that the child subtends, its lights emit toward p at least theta_w - theta_o - theta_b off their normals;
@@ -192,27 +243,32 @@ def _root(a: Tensor) -> Tensor:
 def _walk(
     tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor | None, row: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Descend the tree, by ``u`` or to ``row``; return the rows reached, their probabilities, and the remapped ``u``."""
+    """Descend the tree; return the rows reached, their probabilities, and the remapped ``u``.
+
+    The way is that to ``row``, by ``u`` where that is negative. Either may be None.
+    """
     node = torch.zeros(x.shape[1], dtype=torch.int64, device=x.device)
     p = torch.ones(x.shape[1], dtype=torch.float64, device=x.device)
     child_index = torch.arange(tree.child.shape[1], device=x.device)
-    trail: Tensor | None = None  # (N,) children on the way down to `row`, three bits each
+    trail: Tensor | None = None  # (N,) children on the way down to `row`
     remapped = None if u is None else u.double()
     for level in range(tree.levels):
         if row is not None and level % STEPS == 0:
-            trail = tree.trail[level // STEPS][row]
+            trail = tree.trail[level // STEPS][row.clamp_min(0)]
         inner = node.clamp_min(0)  # lanes that have arrived at a light read the root; what they compute is dropped
         weight = _weigh(tree.nodes[inner], x, n).double()
         total = weight.sum(1, keepdim=True)
         weight = torch.where(total > 0, weight, (child_index < tree.full[inner, None]).double())
         ends = weight.cumsum(1)
         aim = None if remapped is None else remapped * ends[:, -1]
-        if aim is None:
-            assert trail is not None
-            chosen, trail = (trail & 7).long(), trail >> 3
-        else:
+        chosen: Tensor | None = None
+        if aim is not None:
             # The last child of positive weight whose interval starts at or before `aim`.
             chosen = torch.where((weight > 0) & (ends - weight <= aim[:, None]), child_index, 0).amax(1)
+        if row is not None and trail is not None:
+            next_child, trail = (trail & (1 << tree.bits) - 1).long(), trail >> tree.bits
+            chosen = next_child if chosen is None else torch.where(row < 0, chosen, next_child)
+        assert chosen is not None
         chosen_weight, end = (a.gather(1, chosen[:, None])[:, 0] for a in (weight, ends))
         deeper = node >= 0
         if aim is not None and remapped is not None:
@@ -221,5 +277,5 @@ def _walk(
         p = torch.where(deeper, p * chosen_weight / ends[:, -1], p)
         node = torch.where(deeper, tree.child[inner, chosen].long(), node)
     if row is not None:
-        p = torch.where(tree.depth[row] > 0, p, 0.0)
+        p = torch.where((row < 0) | (tree.depth[row.clamp_min(0)] > 0), p, 0.0)
     return ~node, p.to(x.dtype), remapped
