@@ -425,6 +425,16 @@ TEXTURES: dict[str, tuple[dict[str, Any], str, str]] = {
         "reflectance.uv_transform.rotate",
         "degrees",
     ),
+    "transform rows": (
+        {"type": "diffuse", "reflectance": {**IMAGE, "uv_transform": {"matrix": [[1, 0], [0, 1]]}}},
+        "reflectance.uv_transform.matrix",
+        "two rows of three finite numbers",
+    ),
+    "two transforms": (
+        {"type": "diffuse", "reflectance": {**IMAGE, "uv_transform": {"matrix": [[1, 0, 0], [0, 1, 0]], "scale": 2}}},
+        "reflectance.uv_transform.matrix",
+        "either matrix, or scale",
+    ),
     "transform key": (
         {"type": "diffuse", "reflectance": {**IMAGE, "uv_transform": {"turn": 1}}},
         "reflectance.uv_transform.turn",

@@ -151,6 +151,14 @@ EXACT: dict[str, str] = {
             )
         )
     ),
+    "bitmap_sheared": shape(
+        _RECTANGLE.format(
+            _TEXTURED.format(
+                '<texture type="bitmap" name="reflectance"><string name="filename" value="a picture.png"/>'
+                '<transform name="to_uv"><matrix value="1.3 0.4 0 0.2 -0.3 0.9 0 -0.6 0 0 1 0 0 0 0 1"/></transform></texture>'
+            )
+        )
+    ),
     "bitmap_roughness": shape(
         _RECTANGLE.format(
             f'<bsdf type="roughconductor">{_GGX}<texture type="bitmap" name="alpha">'

@@ -31,6 +31,7 @@ COLOUR = Color((0.0, 0.0, 0.0), low=0.0, high=1.0, texture=True)
 NUMBER = Scalar(0.0, low=0.0, high=1.0, texture=True)
 HEIGHT = Scalar(0.0, low=None, texture=True)
 TURN = {"scale": [1.5, 0.75], "rotate": 30.0, "translate": [0.2, -0.4]}
+SHEAR = {"matrix": [[1.3, 0.4, 0.2], [-0.3, 0.9, -0.4]]}
 MATRIX = (
     (1.5 * math.cos(math.pi / 6), -0.75 * math.sin(math.pi / 6), 0.2),
     (1.5 * math.sin(math.pi / 6), 0.75 * math.cos(math.pi / 6), -0.4),
@@ -175,25 +176,27 @@ def test_a_number_is_a_channel_of_the_colour(name: str, opened: Callable[..., Op
         assert torch.allclose(read(table, point, False), values, atol=1e-6), channel
 
 
+@pytest.mark.parametrize(("transform", "rows"), [(TURN, MATRIX), (SHEAR, SHEAR["matrix"])], ids=["parts", "matrix"])
 @pytest.mark.parametrize("name", MAPPED)
-def test_the_transform_moves_the_coordinates(name: str, opened: Callable[..., Opened]):
-    plain, turned = table_of(opened(name)), table_of(opened(name, uv_transform=TURN))
+def test_the_transform_moves_the_coordinates(name: str, transform: Any, rows: Any, opened: Callable[..., Opened]):
+    plain, turned = table_of(opened(name)), table_of(opened(name, uv_transform=transform))
     point = points()
     assert point.uv is not None
-    (a, b, c), (d, e, f) = MATRIX
+    (a, b, c), (d, e, f) = rows
     u, v = point.uv
     moved = TexturePoint(torch.stack((a * u + b * v + c, d * u + e * v + f)))
     assert torch.allclose(read(turned, point), read(plain, moved), atol=1e-9)
     assert float((read(turned, point) - read(plain, point)).abs().max()) > 0.1
 
 
+@pytest.mark.parametrize("transform", [TURN, SHEAR], ids=["parts", "matrix"])
 @pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.parametrize("name", MAPPED)
-def test_the_slope_is_the_derivative(name: str, wide: bool, opened: Callable[..., Opened]):
+def test_the_slope_is_the_derivative(name: str, wide: bool, transform: Any, opened: Callable[..., Opened]):
     """Of what is read at points, and of what a footprint leaves of it."""
     filters = ROWS[name].filters if wide else {}
     footprint = torch.full((1000,), 0.1, dtype=torch.float64) if wide else None
-    table = table_of(opened(name, HEIGHT, uv_transform=TURN, **filters))
+    table = table_of(opened(name, HEIGHT, uv_transform=transform, **filters))
     point = points(1000, footprint=footprint)
     uv, h = point.uv, 1e-6
     assert uv is not None

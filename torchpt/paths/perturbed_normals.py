@@ -95,4 +95,5 @@ def perturb_normal(
     square = dot(normal, n).square().clamp_min(_LEAST_SQUARE)
     # alpha^2 of the tilt, tan^2 / 8, as in the paper at `shadowing`.
     alpha2 = (0.125 * (1.0 - square).clamp_min(0.0) / square).clamp_max(1.0)
-    return Frame.along(normal, at.tangent), PerturbedNormal(normal=n, alpha2=alpha2)
+    # By the tangent of the frame before, not by that of the face: as Mitsuba turns anisotropic lobes under a normal map.
+    return Frame.along(normal, base.s), PerturbedNormal(normal=n, alpha2=alpha2)

@@ -20,7 +20,7 @@ from torch import Tensor
 from torchpt.core.errors import SceneError
 from torchpt.math.transforms import uv_matrix
 from torchpt.spec import Angle, Color, Custom, Moves, Pair, Refused, Spec, parameters_of
-from torchpt.spec.reading import LARGEST, as_refused
+from torchpt.spec.reading import LARGEST, as_refused, vector
 from torchpt.spec.schema import ParsedParams, read_params
 
 if TYPE_CHECKING:
@@ -39,6 +39,8 @@ Matrix = tuple[tuple[float, float, float], tuple[float, float, float]]
 #: The identity transform of texture coordinates.
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _ONE = (1.0, 1.0, 1.0)
+_TRANSFORM = "a mapping with scale, rotate, translate, or with matrix"
+_ROWS = "two rows of three finite numbers [[a, b, c], [d, e, f]]"
 
 
 @dataclass(frozen=True)
@@ -316,29 +318,48 @@ class Texture:
         return None
 
 
+def _read_rows(value: Any) -> Matrix:
+    """Return the two rows of an affine transform from lists or arrays of three numbers."""
+    if not isinstance(value, list | tuple | np.ndarray) or len(value) != 2:
+        raise Refused(_ROWS)
+    return vector(value[0], _ROWS), vector(value[1], _ROWS)
+
+
 @dataclass(frozen=True)
 class UvTransform:
-    """An affine transform of texture coordinates: scale, then rotation, then translation."""
+    """An affine transform of texture coordinates: scale, then rotation, then translation; or a matrix."""
 
     parameters: ClassVar = {
         "scale": Pair((1.0, 1.0), single=True, doc="factors of u and v"),
         "rotate": Angle(0.0, low=None, doc="rotation from u to v, after the scale"),
         "translate": Pair((0.0, 0.0), doc="added last"),
+        "matrix": Custom(None, reader=_read_rows, words=_ROWS, doc="any affine transform, in place of the others"),
     }
 
     scale: tuple[float, float] = (1.0, 1.0)
     rotate: float = 0.0
     translate: tuple[float, float] = (0.0, 0.0)
+    matrix: Matrix | None = None
 
-    def matrix(self, repeats: tuple[float, float] = (1.0, 1.0)) -> Matrix:
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """Refuse a matrix beside the parts of another transform."""
+        if values["matrix"] is not None and len(given) > 1:
+            raise Refused("either matrix, or scale, rotate and translate", values["matrix"], ("matrix",))
+
+    def rows(self, repeats: tuple[float, float] = (1.0, 1.0)) -> Matrix:
         """Return the rows ``(2, 3)`` of the transform, followed by a scale by ``repeats``."""
-        return uv_matrix(self.scale, self.rotate, self.translate, repeats)
+        if self.matrix is None:
+            return uv_matrix(self.scale, self.rotate, self.translate, repeats)
+        (a, b, c), (d, e, f) = self.matrix
+        x, y = repeats
+        return (x * a, x * b, x * c), (y * d, y * e, y * f)
 
 
 def _uv_transform(value: Any) -> UvTransform:
     """Return the transform of a mapping of a scene file, or refuse it."""
     if not isinstance(value, Mapping):
-        raise Refused("a mapping with scale, rotate, translate")
+        raise Refused(_TRANSFORM)
     try:
         return UvTransform(**read_params(UvTransform, value, key="", file=None, words="uv_transform").values)
     except SceneError as error:
@@ -352,16 +373,16 @@ class Mapped(Texture):
         "uv_transform": Custom(
             None,
             reader=_uv_transform,
-            words="a mapping with scale, rotate, translate",
+            words=_TRANSFORM,
             doc="applied to texture coordinates: `scale` 1 (a number or [u, v]), `rotate` 0 (degrees, from u to v), "
-            "`translate` [0, 0], in this order",
+            "`translate` [0, 0], in this order; or `matrix` [[a, b, c], [d, e, f]]: u becomes a u + b v + c, v d u + e v + f",
         ),
     }
 
     @staticmethod
     def matrix(values: Mapping[str, Any], repeats: tuple[float, float] = (1.0, 1.0)) -> Matrix:
         """Return the rows ``(2, 3)`` of the transform of texture coordinates, followed by a scale by ``repeats``."""
-        return (values["uv_transform"] or UvTransform()).matrix(repeats)
+        return (values["uv_transform"] or UvTransform()).rows(repeats)
 
 
 def transform_uv(maps: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:

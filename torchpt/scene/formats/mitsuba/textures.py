@@ -24,7 +24,10 @@ _SHEAR = 1e-6  # relative to the scale: less is rounding
 
 
 def _uv_transform(p: Properties) -> dict[str, Any]:
-    """Return the block ``uv_transform`` of ``to_uv`` and of the older ``uoffset uscale``, which scale after they shift."""
+    """Return the block ``uv_transform`` of ``to_uv`` and of the older ``uoffset uscale``, which scale after they shift.
+
+    A transform that shears is given as a matrix, any other by its parts.
+    """
     matrix = p.transform("to_uv")
     linear, shift = matrix[:2, :2], matrix[:2, 3]
     offset = np.array([p.number("uoffset", 0.0), p.number("voffset", 0.0)])
@@ -36,7 +39,8 @@ def _uv_transform(p: Properties) -> dict[str, Any]:
     turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
     along = turn @ along
     if abs(along[0]) > _SHEAR * (length + math.hypot(*along)):
-        p.note("the shear of to_uv is left out")
+        rows = np.column_stack((linear, shift)).tolist()
+        return {"uv_transform": {"matrix": rows}}
     found: dict[str, Any] = {}
     degrees = math.degrees(angle)
     if abs(degrees - 180.0) < 1e-9 or abs(degrees + 180.0) < 1e-9:  # a mirror image without rotation
@@ -156,7 +160,7 @@ def _mean(p: Properties, importer: Importer) -> Any:
 
 #: Plugins of the tag ``texture``.
 TEXTURES: dict[str, Plugin] = {
-    "bitmap": exact("image", _bitmap, "a filter_type other than nearest is bilinear; to_uv without shear"),
+    "bitmap": exact("image", _bitmap, "a filter_type other than nearest is bilinear"),
     "checkerboard": exact("checkerboard", _checkerboard, "its colours are no textures"),
     "mesh_attribute": exact(
         "vertex_color",
