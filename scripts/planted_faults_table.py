@@ -142,7 +142,7 @@ FAULTS = (
         "share_of_even_draws",
         "physics/lights/choice.py",
         "lights integrators",
-        "_local_probability",
+        "_mixed",
         "p * (1.0 - p_uniform)",
         "p",
         "scenes of 3 to 64 lamps are too dark: probabilities of lights sum to more than 1",

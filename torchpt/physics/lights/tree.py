@@ -199,7 +199,7 @@ def probability(tree: LightTree, row: Tensor, x: Tensor, n: Tensor | None) -> Te
 
 
 def _weigh(nodes: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
-    """Return weights ``(N, 8)`` of the children of ``nodes (N, F, 8)``, or of more, in float32, zero only where no light contributes.
+    """Return weights ``(N, 8)`` of the children of ``nodes (N, F, 8)``, in float32, zero only where no light contributes.
 
     Pharr et al., PBRT 4th ed., section 12.6.3: with theta_w the angle between a child's axis and the direction to p, and
     theta_b the angle that the child subtends, its lights emit toward p at least theta_w - theta_o - theta_b off their normals;
