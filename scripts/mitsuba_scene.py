@@ -1,6 +1,6 @@
 """Convert a torchpt scene to Mitsuba 3 such that both render the same picture. For references and benchmarks.
 
-Rough models use GGX, opaque materials are ``twosided``, meshes have torchpt's own shading normals. Mitsuba counts light that
+Opaque materials are ``twosided``, meshes have torchpt's own shading normals. Mitsuba counts light that
 passes an opacity or ``null`` as a bounce, torchpt does not: scenes with such surfaces need a large ``max_depth``.
 
 :func:`comparable` leaves out what Mitsuba cannot express; :func:`nearest` replaces it in the description, which both
