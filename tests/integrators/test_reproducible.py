@@ -167,7 +167,7 @@ def _compiling() -> bool:
     """Return True where the lane compiler asks: what it traces becomes a kernel, and what it does to tables is no lane."""
     frame: FrameType | None = sys._getframe(2)
     while frame is not None:
-        if "/torchpt/lanes/" in frame.f_code.co_filename:
+        if "/torchpt/compiler/" in frame.f_code.co_filename:
             return True
         frame = frame.f_back
     return False
