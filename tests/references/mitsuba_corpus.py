@@ -296,7 +296,7 @@ EXACT: dict[str, str] = {
         "</texture></bsdf></shape>"
     ),
     "cube": shape(
-        '<shape type="cube"><transform name="to_world"><scale value="0.7"/><rotate y="1" angle="30"/><translate y="0.7"/>'
+        '<shape type="cube"><transform name="to_world"><scale value="0.7"/><rotate y="1" angle="30"/><translate y="0.8"/>'
         '</transform><bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
         '<string name="filename" value="a picture.png"/></texture></bsdf></shape>'
     ),
