@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from torch import Tensor
 
 import torchpt
 from torchpt.core.errors import ImportedSceneWarning
+from torchpt.math.vectors import rows
 from torchpt.paths.surface import emission_map, opacity_map, surface_at
 from torchpt.paths.vertex import shading_weight
 from torchpt.physics.lights import table
@@ -103,11 +104,6 @@ def agreements(file: Path, count: int, seed: int = 1) -> dict[str, Agreement]:
     return {name: Agreement.of(ours[name], theirs[name]) for name in ours if name in theirs}
 
 
-def _taken(at: Interaction, lanes: Tensor) -> Interaction:
-    values = (getattr(at, field.name) for field in fields(at))
-    return Interaction(*(None if x is None else x[..., lanes] for x in values))
-
-
 def _ours(world: World, o: Tensor, d: Tensor, wi: Tensor, hit: Hit) -> dict[str, Tensor]:
     at = interact(world, o, d, Hit(hit.t, hit.prim.long(), hit.u, hit.v))
     key, models = world.materials.key[at.slot + 1].long(), len(world.materials.models)
@@ -116,7 +112,7 @@ def _ours(world: World, o: Tensor, d: Tensor, wi: Tensor, hit: Hit) -> dict[str,
         lanes = (key % models == number).nonzero()[:, 0]
         if not len(lanes) or model.smooth:
             continue
-        some = _taken(at, lanes)
+        some = rows(at, lanes)
         surface = surface_at(world, number, d[:, lanes], some)
         local = surface.frame.to_local(wi[:, lanes])
         reflected, pdf = model.eval_pdf(surface.parameters, surface.wo, local)
@@ -131,7 +127,7 @@ def _ours(world: World, o: Tensor, d: Tensor, wi: Tensor, hit: Hit) -> dict[str,
     shining = (key < models).nonzero()[:, 0]
     if len(shining):
         assert world.lights is not None
-        some = _taken(at, shining)
+        some = rows(at, shining)
         light = table.emitted(world.lights, o[:, shining], some, d[:, shining])[0]
         emission[:, shining] = light if world.textures.emission is None else light * emission_map(world, some)
     normal = at.ng * torch.sign(-(at.ng * d).sum(0))
