@@ -19,7 +19,7 @@ from torchpt.paths.surface import emission_map, opacity_map, surface_at
 from torchpt.paths.vertex import shading_weight
 from torchpt.physics.lights import table
 from torchpt.physics.shapes import interact
-from torchpt.physics.shapes.geometry import Hit, Interaction
+from torchpt.physics.shapes.geometry import Hit
 from torchpt.physics.world import World
 
 __all__ = ["Agreement", "agreements", "rays"]
