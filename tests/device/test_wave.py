@@ -36,6 +36,7 @@ SCENES = (
     "cornell_bunny",
     "instances",
     "env_teapot",
+    "terrace",
     "cornell_transmissive",
 )
 FILM = {"width": 32, "height": 24, "filter": "mitchell", "aovs": ["albedo", "normal", "depth", "variance"]}
@@ -83,7 +84,7 @@ def test_ptx_gives_the_bits_of_the_cpu(threads, device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cornell_box", "veach_mis", "env_teapot"])
+@pytest.mark.parametrize("name", ["cornell_box", "veach_mis", "env_teapot", "terrace"])
 def test_ptx_of_scenes_gives_the_bits_of_the_cpu(name, device):
     scene = torchpt.load(name, device="cpu")
     keys = {"film": {"width": 12, "height": 8}, "render": {"spp": 1}}
