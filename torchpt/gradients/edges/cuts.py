@@ -51,18 +51,18 @@ class Crossing:
         lane: ``(K,)`` of the points.
         other: the same points held on the other surface.
         across: unit normals of that ``(3, K)``.
-        slide: ``(3, K)`` how points move in their own surface for a motion of 1 along ``across``.
+        shift: ``(3, K)`` how points move in their own surface for a motion of 1 along ``across``.
     """
 
     lane: Tensor
     other: Held
     across: Tensor
-    slide: Tensor
+    shift: Tensor
 
     def moved(self, bodies: Bodies, p: Tensor) -> Tensor:
         """Return points ``p (3, N)``, held on their own surfaces, where the cuts are; differentiable in ``bodies``."""
         apart = dot(self.across, bodies.points(self.other) - take(p, self.lane))
-        return p.index_add(1, self.lane, self.slide * apart)
+        return p.index_add(1, self.lane, self.shift * apart)
 
 
 def crossing_of(bodies: Bodies, cut: Tensor, held: Held, mate: Tensor) -> Crossing | None:
