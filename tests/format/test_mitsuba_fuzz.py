@@ -1,9 +1,10 @@
-"""Damaged scenes of Mitsuba: an error of one line or a scene, never a traceback, never a wait."""
+"""Damaged scenes of Mitsuba: an error of one line or a scene, never a traceback, never a wait, in bounded memory."""
 
 from __future__ import annotations
 
 import os
 import random
+import resource
 import time
 import warnings
 from pathlib import Path
@@ -23,6 +24,8 @@ TOKENS = (
 TEXTS = [*EXACT.values(), *(text for text, *_ in NEAREST.values()), *(text for pair in OLD.values() for text in pair)]
 #: Longest that one scene may take, in seconds; most take a few milliseconds.
 LONGEST = 20.0
+#: Most bytes that the process may grow to beside what it has before.
+MOST_BYTES = 2**31
 
 
 def damaged(text: str, rng: random.Random) -> str:
@@ -55,6 +58,7 @@ def damaged(text: str, rng: random.Random) -> str:
 def check(folder: Path, count: int, seed: int, texts: list[str]) -> int:
     """Read ``count`` damaged scenes; return how many were scenes still."""
     rng, readable = random.Random(seed), 0
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for _ in range(count):
         text = damaged(rng.choice(texts), rng)
         file = folder / "scene.xml"
@@ -71,6 +75,7 @@ def check(folder: Path, count: int, seed: int, texts: list[str]) -> int:
             except Exception as error:
                 raise AssertionError(f"{error!r} of {text}") from error
         assert time.perf_counter() - start < LONGEST, text
+        assert 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) < MOST_BYTES, text
     return readable
 
 
