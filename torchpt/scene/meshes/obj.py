@@ -24,11 +24,9 @@ from torchpt.scene.meshes.mesh import (
     too_many_parts,
 )
 from torchpt.scene.meshes.mtl import decoded_lines, find_file, read_mtl
+from torchpt.scene.meshes.obj_arrays import CURVES, Statements, parse_plain
 
 __all__ = ["load_obj"]
-
-#: Statements of curves, surfaces, lines and points, which are not read.
-_CURVES = ("curv", "curv2", "surf", "l", "p")
 
 
 @dataclass
@@ -60,16 +58,16 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     Raises:
         AssetError: a malformed line, an index out of range, a malformed MTL file.
     """
-    text = _split(decoded_lines(data), path)
+    text = parse_plain(data)
+    if text is None:  # not in the usual form
+        text = _by_lines(data, path)
     known = _libraries(text, path) if materials else {}
-    positions = _numbers(text, "v", 3, path)
-    uvs = _numbers(text, "vt", 2, path)
-    normals = _numbers(text, "vn", 3, path)
-    if not text.f:
+    if not len(text.counts):
         return []
-    corners, corner_of_word, counts = _corners(text, path, (len(positions), len(uvs), len(normals)))
+    positions, uvs, normals = text.positions, text.uvs, text.normals
+    corners, corner_of_word, counts = text.corners, text.corner_of_word, text.counts
     triangles = polygon_fans(np.cumsum(counts) - counts, counts)  # (F, 3) into the words of all faces
-    group_of_triangle = np.repeat(np.array(text.face_groups), counts - 2)
+    group_of_triangle = np.repeat(text.face_groups, counts - 2)
     uvs[:, 1] = 1.0 - uvs[:, 1]
     # A vertex for each distinct corner.
     all_positions, all_faces = positions[corners[:, 0]], corner_of_word[triangles]
@@ -105,6 +103,34 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     return parts
 
 
+def _by_lines(data: bytes, path: Path) -> Statements:
+    """Return the statements of any file, read line by line.
+
+    Raises:
+        AssetError: names the first line that is malformed.
+    """
+    text = _split(decoded_lines(data), path)
+    positions = _numbers(text, "v", 3, path)
+    uvs = _numbers(text, "vt", 2, path)
+    normals = _numbers(text, "vn", 3, path)
+    none = np.zeros(0, np.int64)
+    corners, corner_of_word, counts = np.zeros((0, 3), np.int64), none, none
+    if text.f:
+        corners, corner_of_word, counts = _corners(text, path, (len(positions), len(uvs), len(normals)))
+    return Statements(
+        positions,
+        uvs,
+        normals,
+        corners,
+        corner_of_word,
+        counts,
+        np.array(text.face_groups, np.int64),
+        text.groups,
+        text.libraries,
+        text.ignored,
+    )
+
+
 def _split(lines: list[str], path: Path) -> _Text:
     """Sort the lines of a file into statements; faces without a material before them form the group ""."""
     text = _Text()
@@ -131,7 +157,7 @@ def _split(lines: list[str], path: Path) -> _Text:
             group = text.groups.setdefault(name, len(text.groups))
         elif key == "mtllib":
             text.libraries.append(line.strip().removeprefix("mtllib").strip())
-        elif key in _CURVES:
+        elif key in CURVES:
             text.ignored.append(key)
     return text
 
@@ -164,7 +190,7 @@ def _absolute(words: list[str], counts: tuple[int, int, int], path: Path, number
     return result
 
 
-def _libraries(text: _Text, path: Path) -> dict[str, FileMaterial]:
+def _libraries(text: Statements, path: Path) -> dict[str, FileMaterial]:
     """Return the materials of all MTL files by name; missing files are added to ``text.ignored``."""
     known: dict[str, FileMaterial] = {}
     for name in text.libraries:
