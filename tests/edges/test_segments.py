@@ -27,7 +27,7 @@ def drawn(shape: dict[str, Any]) -> tuple[SegmentRays, float]:
     scene = torchpt.load(described, "cpu")
     bodies = bodies_of(scene, settings(scene.description, {}).film, {})
     moves = torch.ones(sum(bodies.counts), dtype=torch.bool)
-    occluders = occluders_of(scene, bodies, scene.merged({}), moves, lights_move=False)
+    occluders = occluders_of(scene, bodies, scene.merged({}), moves, None, lights_move=False)
     assert occluders is not None
     sampler = SegmentSampler(occluders, smooth_of(scene, bodies))
     g = torch.Generator().manual_seed(4)

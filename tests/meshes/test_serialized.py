@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import time
 import zlib
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,7 @@ MALFORMED = {
     "no mesh": (WHOLE[:-4] + bytes(4), "says 0 meshes"),
     "many": (WHOLE[:-4] + b"\xff\xff\xff\xff", "says 4294967295 meshes"),
     "offset": (WHOLE[:-12] + struct.pack("<QI", len(WHOLE), 2), "the offset of mesh 1 is"),
+    "twice": (WHOLE[:-12] + struct.pack("<QQI", 0, 0, 2), "the offset of mesh 1 is 0"),
     "stream": (WHOLE[:6] + b"\xff\xff" + WHOLE[8:], "mesh 0 is malformed"),
     "short": (
         one(struct.pack("<IxQQ", 0x1000, 3, 1) + bytes(36)),
@@ -139,8 +141,23 @@ def test_malformed_files_are_one_line(tmp_path: Path, name: str) -> None:
 
 def test_a_file_unfolds_to_a_bounded_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchpt.scene.meshes.serialized.MAX_UNPACKED", 200)
-    square = {"vertices": SQUARE, "faces": [[0, 1, 2], [0, 2, 3]]}  # 72 bytes
+    square = {"vertices": SQUARE, "faces": [[0, 1, 2], [0, 2, 3]]}  # 72 bytes, and 4 of its name
     file = write(tmp_path, serialized_bytes([square] * 3))
     assert len(load_mesh(file, index=2)) == 1
-    with pytest.raises(AssetError, match="mesh 2 unfolds to 72 bytes"):
+    with pytest.raises(AssetError, match="mesh 2 unfolds to 76 bytes"):
         load_mesh(file)
+
+
+def test_long_names_take_no_longer_than_other_bytes(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    meshes, starts, at = [], [], 0
+    for _ in range(1000):
+        name = rng.integers(1, 128, 4000, np.uint8).tobytes() + b"\0"
+        content = struct.pack("<I", 0x1000) + name + struct.pack("<QQ9f3I", 3, 1, *range(9), 0, 1, 2)
+        meshes.append(struct.pack("<HH", 0x041C, 4) + zlib.compress(content))
+        starts.append(at)
+        at += len(meshes[-1])
+    file = write(tmp_path, b"".join(meshes) + struct.pack("<1000QI", *starts, 1000))
+    start = time.process_time()
+    assert len(load_mesh(file)) == 1000
+    assert time.process_time() - start < 5.0

@@ -135,6 +135,10 @@ class Bodies:
         """Return a mask ``(N,)`` of triangles, parallelograms and disks; copies are of meshes."""
         return (prim < self.first_sphere) | (prim >= sum(self.counts))
 
+    def is_triangle(self, prim: Tensor) -> Tensor:
+        """Return a mask ``(N,)`` of triangles, copies of them included."""
+        return (prim < self.counts[0]) | (prim >= sum(self.counts))
+
     def tensors(self) -> dict[str, Tensor]:
         """Return all that may move, by name."""
         found = {name: getattr(self, name) for name in ("p0", "e1", "e2", "e3", "lights")}

@@ -19,15 +19,19 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchpt.core.errors import EdgeWarning, warn_caller
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import Curves, circles, joined, known, straight
 from torchpt.math.vectors import cross, dot, rows, take
 from torchpt.scene import Scene
 
-__all__ = ["Crossing", "crossing_of", "cuts_of"]
+__all__ = ["Crossing", "Cuts", "crossing_of", "cuts_of"]
 
-#: Pairs of primitives that are looked at at a time.
-_PAIRS = 1 << 21
+#: Curves, and their lengths ``(N,)``.
+Cuts = tuple[Curves, Tensor]
+
+#: Pairs of primitives that are looked at at a time, and at all: a second's work for each some million.
+_PAIRS, _MOST = 1 << 21, 1 << 22
 #: Flat surfaces at a smaller sine do not cut.
 _PARALLEL = 1e-5
 #: Curves that are so near a border, in a flat surface's own numbers, are that border: there surfaces touch.
@@ -87,8 +91,8 @@ def crossing_of(bodies: Bodies, cut: Tensor, held: Held, mate: Tensor) -> Crossi
 # ---- Where surfaces cut
 
 
-def cuts_of(scene: Scene, bodies: Bodies) -> tuple[Curves, Tensor] | None:
-    """Return the curves, and their lengths ``(N,)``; None where there are none.
+def cuts_of(scene: Scene, bodies: Bodies) -> Cuts | None:
+    """Return the curves; None where there are none, and, with a warning, where there are too many pairs to look at.
 
     Args:
         scene: whose.
@@ -125,7 +129,8 @@ def _pairs(scene: Scene, bodies: Bodies) -> Iterator[tuple[Tensor, Tensor]]:
     spans = [slice(first, first + count) for _, first, count in owners]
     for (name, _, _), span in zip(owners, spans, strict=True):
         shape[span] = names[name]
-    lows, highs = (torch.stack([fold(x[:, span]) for span in spans], 1) for fold, x in ((_least, low), (_most, high)))
+    lows = torch.stack([low[:, span].amin(1) for span in spans], 1)
+    highs = torch.stack([high[:, span].amax(1) for span in spans], 1)
     which = torch.tensor([names[name] for name, _, _ in owners], device=scene.device)
     for k, span in enumerate(spans):
         near = _overlap(lows[:, k : k + 1], highs[:, k : k + 1], lows, highs) & (which != which[k])
@@ -137,12 +142,16 @@ def _pairs(scene: Scene, bodies: Bodies) -> Iterator[tuple[Tensor, Tensor]]:
         return
     low, high, shape = take(low, prim), take(high, prim), take(shape, prim)
     # Boxes in the order of their lower ends along the longest way: each may overlap those that follow up to its upper end.
-    axis = int((_most(high) - _least(low)).argmax())
+    axis = int((high.amax(1) - low.amin(1)).argmax())
     order = low[axis].argsort()
     prim, low, high, shape = take(prim, order), take(low, order), take(high, order), take(shape, order)
     after = torch.searchsorted(low[axis].contiguous(), high[axis].contiguous(), right=True)
     count = (after - torch.arange(len(prim), device=prim.device) - 1).clamp_min(0)
     ends = count.cumsum(0)
+    if int(ends[-1]) > _MOST:
+        said = "the gradient leaves out curves where surfaces cut: too many of their triangles are near each other"
+        warn_caller(said, EdgeWarning)
+        return
     flat = bodies.is_flat(prim)
     for first in range(0, int(ends[-1]), _PAIRS):
         number = torch.arange(first, min(first + _PAIRS, int(ends[-1])), device=prim.device)
@@ -179,14 +188,6 @@ def _unknown(scene: Scene, bodies: Bodies, prim: Tensor) -> Tensor:
     return mine & take(odd, (prim - bodies.first_quadric).clamp(0, len(odd) - 1))
 
 
-def _least(x: Tensor) -> Tensor:
-    return x.amin(1)
-
-
-def _most(x: Tensor) -> Tensor:
-    return x.amax(1)
-
-
 def _overlap(low: Tensor, high: Tensor, others_low: Tensor, others_high: Tensor) -> Tensor:
     """Return a mask of the boxes ``(3, N)`` that overlap."""
     return ((low <= others_high) & (others_low <= high)).all(0)
@@ -196,7 +197,7 @@ def _boxes(bodies: Bodies, prim: Tensor) -> tuple[Tensor, Tensor]:
     """Return lower and upper corners ``(3, N)`` of boxes about primitives ``(N,)``."""
     p0, x, y, z = bodies.place(prim)
     zero = torch.zeros_like(p0)
-    triangle = (prim < bodies.counts[0]) | (prim >= sum(bodies.counts))
+    triangle = bodies.is_triangle(prim)
     four = ~triangle & (prim < sum(bodies.counts[:2]))
     corners = torch.stack((zero, x, y, torch.where(four, x + y, zero)))
     low, high = corners.amin(0), corners.amax(0)
@@ -221,7 +222,7 @@ def _on(bodies: Bodies, one: Tensor, two: Tensor) -> Tensor:
 
 def _limits(bodies: Bodies, prim: Tensor, b0: Tensor, b1: Tensor) -> list[Tensor]:
     """Return functions that are not negative within flat primitives ``(N,)``, by their numbers; of disks constant ones."""
-    triangle = (prim < bodies.counts[0]) | (prim >= sum(bodies.counts))
+    triangle = bodies.is_triangle(prim)
     disk = ~triangle & (prim >= sum(bodies.counts[:2]))
     one = torch.zeros_like(b0)
     one[0] = 1.0

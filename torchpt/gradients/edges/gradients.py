@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain
 from typing import Protocol
 
@@ -15,6 +16,7 @@ from torchpt.core.autograd import gradients_of
 from torchpt.core.threads import limited_threads
 from torchpt.gradients.edges.bodies import Bodies, bodies_of
 from torchpt.gradients.edges.curves import marked_primitives
+from torchpt.gradients.edges.cuts import Cuts, cuts_of
 from torchpt.gradients.edges.film import Worth
 from torchpt.gradients.edges.horizons import Horizons, horizons_of
 from torchpt.gradients.edges.occluders import occluders_of
@@ -104,6 +106,12 @@ class Boundary:
     pixels: int
     ranks: Group | None = None
 
+    @cached_property
+    def _cuts(self) -> Cuts | None:
+        """Return the curves where surfaces cut."""
+        with torch.no_grad():
+            return cuts_of(self.scene, self.still)
+
     def gradients(self, samples: Iterable[Samples], wanted: Iterable[str]) -> list[Tensor | None]:
         """Return what samples add to the gradients of ``wanted``; None for those that move no edges."""
         sums = {name: torch.zeros_like(t) for name, t in self.moving.items()}
@@ -133,7 +141,7 @@ class Boundary:
         if self.moving.keys() <= {"lights"}:  # none of which is seen
             return
         with torch.no_grad():
-            pieces = pieces_of(self.scene, self.still, self.scene.merged(self.params), self.worth.bounds())
+            pieces = pieces_of(self.scene, self.still, self.scene.merged(self.params), self.worth.bounds(), self._cuts)
         if pieces is None:
             return
         primary = primary_of(self.still, pieces, self.traced)
@@ -167,7 +175,7 @@ class Boundary:
             emitters_move = bool(take(moves, sources.prim[: sources.surfaces]).any())
             poses = self.scene.merged(self.params)
             occluders = occluders_of(
-                self.scene, still, poses, moves, lights_move=emitters_move or "lights" in self.moving
+                self.scene, still, poses, moves, self._cuts, lights_move=emitters_move or "lights" in self.moving
             )
             camera_moves = any(name.startswith("camera.") for name in self.leaves)
             near = near_of(self.scene, world.geometry, self.leaves)

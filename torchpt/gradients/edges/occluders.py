@@ -22,7 +22,7 @@ from torchpt.gradients.edges.curves import (
     rounds_of,
     straight,
 )
-from torchpt.gradients.edges.cuts import cuts_of
+from torchpt.gradients.edges.cuts import Cuts
 from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import concatenate_lanes, cross, dot, rows, take
 from torchpt.physics.shapes.quadrics import Form
@@ -122,7 +122,7 @@ class Occluders:
 
 
 def occluders_of(
-    scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Tensor, *, lights_move: bool
+    scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Tensor, cuts: Cuts | None, *, lights_move: bool
 ) -> Occluders | None:
     """Return all curves of a scene that may hide light; None where there are none.
 
@@ -131,6 +131,7 @@ def occluders_of(
         bodies: detached.
         poses: the parameters.
         moves: ``(P,)`` bool: primitives that move.
+        cuts: the curves where surfaces cut.
         lights_move: True: lights do.
     """
     curves: list[Curves] = []
@@ -157,7 +158,6 @@ def occluders_of(
         _, _, along = fixed.moving(bodies, fixed.low)
         own = Held(fixed.prim, fixed.a)
         add(fixed, dot(along, along).sqrt() * (fixed.high - fixed.low), (own, own), 1.0, 1.0, 0.0, -1.0)
-    cuts = cuts_of(scene, bodies)
     if cuts is not None:  # which hide nothing that the surfaces do not
         own = Held(cuts[0].prim, cuts[0].a)
         add(cuts[0], cuts[1], (own, own), 0.0, 1.0, 0.0, -1.0)

@@ -21,7 +21,7 @@ from torchpt.gradients.edges.curves import (
     round_outline,
     rounds_of,
 )
-from torchpt.gradients.edges.cuts import Crossing, crossing_of, cuts_of
+from torchpt.gradients.edges.cuts import Crossing, Cuts, crossing_of
 from torchpt.gradients.edges.film import Worth, film_places, slopes
 from torchpt.gradients.edges.traced import Traced, Use
 from torchpt.math.sampling import Distribution1D
@@ -169,7 +169,9 @@ def view_of(bodies: Bodies) -> View:
     return View(pixel[:3, None], float(pixel[3]))
 
 
-def pieces_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bounds) -> Pieces | None:
+def pieces_of(
+    scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bounds, cuts: Cuts | None
+) -> Pieces | None:
     """Return all that may be seen within ``bounds`` of the film; None where nothing may.
 
     Args:
@@ -177,6 +179,7 @@ def pieces_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bo
         bodies: detached.
         poses: the parameters.
         bounds: least and greatest x, then y.
+        cuts: the curves where surfaces cut.
     """
     view = view_of(bodies)
     found = [_lines(bodies, *_silhouettes(bodies, folds, view), bounds) for folds in folds_of(scene, bodies, poses)]
@@ -185,7 +188,6 @@ def pieces_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bo
         for mine, cut in ((fixed.round, _arcs), (~fixed.round, _lines)):
             some = rows(fixed, mine.nonzero().squeeze(1))
             found.append(cut(bodies, some, torch.ones_like(some.low), bounds))
-    cuts = cuts_of(scene, bodies)
     if cuts is not None:
         for mine, cut in ((cuts[0].round, _arcs), (~cuts[0].round, _lines)):
             some = rows(cuts[0], mine.nonzero().squeeze(1))
@@ -363,7 +365,7 @@ class Primary:
         o, d = self._beside(s, unit, step)
         share = self._share(rows(held, index), mate, p, s, step, o, d)
         if bool(pieces.curves.cut.any()):
-            share = share * self._before_cuts(rows(held, index), mate, take(pieces.curves.cut, index), p, s)
+            share = share * self._visible_nearby(rows(held, index), mate, take(pieces.curves.cut, index), p, s)
         seen = (share > 0).nonzero().squeeze(1)
         both = torch.cat((seen, seen + len(index)))
         o, d, index = take(o, both), take(d, both), take(index, seen)
@@ -401,7 +403,7 @@ class Primary:
         near = (t - reach).abs() < reach * 2.0**-8
         return torch.where(seen, share_of(self.bodies, held, mate, s, prim, near, step), 0.0)
 
-    def _before_cuts(self, held: Held, mate: Tensor, cut: Tensor, p: Tensor, s: Tensor) -> Tensor:
+    def _visible_nearby(self, held: Held, mate: Tensor, cut: Tensor, p: Tensor, s: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of edges that are not hidden close to them, by a surface that cuts through theirs.
 
         A step beside an edge tells this too late: behind its outline a round surface comes forward by the root of the step, so

@@ -42,8 +42,9 @@ def load_serialized(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     """
     file = io.BytesIO(data)
     unpacked, parts = 0, []
-    for number, start in enumerate(_offsets(path, file, len(data))):
-        part, size = _read(path, file, start, number, materials, MAX_UNPACKED - unpacked)
+    starts = _offsets(path, file, len(data)).tolist()
+    for number, (start, end) in enumerate(zip(starts, [*starts[1:], len(data)], strict=True)):
+        part, size = _read(path, file, (start, end), number, materials, MAX_UNPACKED - unpacked)
         unpacked += size
         parts.append(part)
     return parts
@@ -63,15 +64,15 @@ def load_serialized_mesh(path: Path, index: int, materials: bool) -> list[MeshPa
     """
     size = check_regular(path, MAX_BYTES)
     with Path(path).open("rb") as file:
-        start = 0  # the first one is found without the offsets, which some files lack
+        start, end = 0, size  # the first one is found without the offsets, which some files lack
         if index:
             starts = _offsets(path, file, size)
             if index >= len(starts):
                 raise AssetError(
                     path, f"has {len(starts)} meshes, 0..{len(starts) - 1}; shape_index {index} is asked for"
                 )
-            start = int(starts[index])
-        return [_read(path, file, start, index, materials, MAX_UNPACKED)[0]]
+            start, end = [*starts.tolist(), size][index : index + 2]
+        return [_read(path, file, (start, end), index, materials, MAX_UNPACKED)[0]]
 
 
 def _offsets(path: Path, file: BinaryIO, size: int) -> NDArray[np.int64]:
@@ -88,8 +89,9 @@ def _offsets(path: Path, file: BinaryIO, size: int) -> NDArray[np.int64]:
     file.seek(at)
     starts = np.frombuffer(file.read(count * kind.itemsize), kind, count)
     bad = np.flatnonzero(starts >= np.uint64(at))
-    if starts[0] != 0 or len(bad):
-        first = bad[0] if len(bad) else 0
+    if starts[0] != 0 or len(bad) or (starts[1:] <= starts[:-1]).any():
+        falls = np.flatnonzero(starts[1:] <= starts[:-1]) + 1
+        first = next((found[0] for found in (bad, falls) if len(found)), 0)
         raise AssetError(path, f"truncated or malformed: the offset of mesh {first} is {starts[first]}")
     return starts.astype(np.int64)
 
@@ -106,26 +108,29 @@ def _version(path: Path, file: BinaryIO, start: int, number: int) -> int:
     return version
 
 
-def _read(path: Path, file: BinaryIO, start: int, number: int, materials: bool, most: int) -> tuple[MeshPart, int]:
+def _read(
+    path: Path, file: BinaryIO, span: tuple[int, int], number: int, materials: bool, most: int
+) -> tuple[MeshPart, int]:
     """Return a mesh and the bytes that it unfolds to.
 
     Args:
         path: the file, for errors.
         file: the same, open.
-        start: offset of the mesh.
+        span: where the mesh starts and the next one.
         number: its index, for errors.
         materials: True for a material that shows vertex colours.
         most: largest number of bytes that it may unfold to.
     """
+    start, end = span
     version = _version(path, file, start, number)
-    stream = _Stream(path, file, number)
+    stream = _Stream(path, file, number, end - start - 4)
     (flags,) = struct.unpack("<I", stream.take(4))
     name = stream.name() if version == 4 else ""
     vertices, faces = struct.unpack("<QQ", stream.take(16))
     double = bool(flags & _DOUBLE)
     real, index = np.dtype("<f8" if double else "<f4"), np.dtype("<u8" if vertices > 0xFFFFFFFF else "<u4")
     columns = 3 + sum(width for flag, width in ((_NORMALS, 3), (_UVS, 2), (_COLORS, 3)) if flags & flag)
-    size = vertices * columns * real.itemsize + faces * 3 * index.itemsize
+    size = len(name) + vertices * columns * real.itemsize + faces * 3 * index.itemsize
     if size > most:
         problem = f"mesh {number} unfolds to {size} bytes ({vertices} vertices, {faces} faces); at most {most} are read"
         raise AssetError(path, problem)
@@ -153,11 +158,32 @@ def _read(path: Path, file: BinaryIO, start: int, number: int, materials: bool, 
 
 
 class _Stream:
-    """The zlib stream of a mesh, unfolded only as far as is asked for."""
+    """The zlib stream of a mesh, decompressed only as far as is asked for.
 
-    def __init__(self, path: Path, file: BinaryIO, number: int) -> None:
-        self.path, self.file, self.number = path, file, number
-        self.inflate, self.folded = zlib.decompressobj(), b""
+    Args:
+        path: the file, for errors.
+        file: the same, open where the stream starts.
+        number: index of the mesh, for errors.
+        size: bytes up to the next mesh.
+    """
+
+    def __init__(self, path: Path, file: BinaryIO, number: int, size: int) -> None:
+        self.path, self.file, self.number, self.left = path, file, number, size
+        self.inflate, self.packed, self.ready = zlib.decompressobj(), b"", bytearray()
+
+    def _more(self, most: int) -> bool:
+        """Decompress up to ``most`` bytes further; return False at the end of the stream."""
+        if not self.packed:
+            self.packed = self.file.read(min(_CHUNK, self.left))
+            self.left -= len(self.packed)
+        if self.inflate.eof or not self.packed:
+            return False
+        try:
+            self.ready += self.inflate.decompress(self.packed, most)
+        except zlib.error as error:
+            raise AssetError(self.path, f"mesh {self.number} is malformed ({error})") from None
+        self.packed = self.inflate.unconsumed_tail
+        return True
 
     def take(self, size: int) -> bytearray:
         """Return the next bytes.
@@ -165,27 +191,19 @@ class _Stream:
         Raises:
             AssetError: the stream is malformed, or ends before.
         """
-        found = bytearray()
-        while len(found) < size:
-            self.folded = self.folded or self.file.read(_CHUNK)
-            if self.inflate.eof or not self.folded:
-                break
-            try:
-                found += self.inflate.decompress(self.folded, size - len(found))
-            except zlib.error as error:
-                raise AssetError(self.path, f"mesh {self.number} is malformed ({error})") from None
-            self.folded = self.inflate.unconsumed_tail
-        if len(found) < size:
-            problem = f"truncated: mesh {self.number} has {len(found)} bytes where {size} are declared"
+        while len(self.ready) < size and self._more(size - len(self.ready)):
+            pass
+        if len(self.ready) < size:
+            problem = f"truncated: mesh {self.number} has {len(self.ready)} bytes where {size} are declared"
             raise AssetError(self.path, problem)
+        found, self.ready = self.ready[:size], self.ready[size:]
         return found
 
     def name(self) -> str:
         """Return the next text, which ends with a zero."""
-        found = bytearray()
-        while len(found) <= _MOST_NAME:
-            letter = self.take(1)
-            if letter == b"\0":
-                return found.decode("utf-8", "replace")
-            found += letter
-        raise AssetError(self.path, f"mesh {self.number} has a name of more than {_MOST_NAME} bytes")
+        while b"\0" not in self.ready and len(self.ready) <= _MOST_NAME and self._more(_MOST_NAME):
+            pass
+        end = self.ready.find(b"\0")
+        if not 0 <= end <= _MOST_NAME:
+            raise AssetError(self.path, f"mesh {self.number} has a name of more than {_MOST_NAME} bytes, or none")
+        return self.take(end + 1)[:end].decode("utf-8", "replace")
