@@ -384,6 +384,19 @@ def test_attributes_that_a_mesh_cannot_have_are_warnings(assets: Path, names: tu
         read_mitsuba(assets / "scene.xml", "scene.xml", ImportOptions())
 
 
+def test_a_flipped_mesh_keeps_its_attribute(assets: Path) -> None:
+    plain, flipped = (
+        read(
+            assets,
+            EXACT["vertex_attribute"].replace('<boolean name="face_normals"', f'{flag}<boolean name="face_normals"'),
+        )
+        for flag in ("", '<boolean name="flip_tex_coords" value="true"/>')
+    )
+    parts = [next(x["mesh"][0] for x in raw["shapes"].values() if "mesh" in x) for raw in (plain, flipped)]
+    assert parts[0].colors is not None
+    np.testing.assert_array_equal(parts[0].colors, parts[1].colors)
+
+
 def test_attributes_survive_a_conversion_to_yaml(assets: Path, tmp_path: Path) -> None:
     for name in ("vertex_color", "vertex_attribute", "face_attribute"):
         raw = read(assets, EXACT[name])

@@ -136,7 +136,7 @@ def test_the_tensor_form_is_the_kernels_reference(case):
     assert (built.levels > tree.STEPS) == (case == "lopsided")  # whose ways take two words
 
 
-@pytest.mark.parametrize("case", ["nine", "mixed"])
+@pytest.mark.parametrize("case", ["nine", "twenty, some dark", "mixed"])
 def test_lanes_may_have_a_row_already(case):
     lights = emitters(case)
     built, (x, n) = tree.build(**lights), points(500)

@@ -35,7 +35,8 @@ from torchpt.search.tables import EXACT, Tables, affine_rows, extent, gaps, quad
 
 __all__ = ["MAX_TOLERANCE", "Brute", "Rows", "merge_quadric_hits", "rows_of"]
 
-#: Largest enlargement of a primitive, relative to its size (for rays at right angles to it, from within the scene).
+#: Largest tolerance at an edge, relative to the primitive's size (for rays at right angles to it, from within the scene): where
+#: it is more, too many rays would be searched twice.
 MAX_TOLERANCE = 1e-3
 #: Rays of a block, by which threads share the work: a multiple of the 16 rays of a packet.
 _BLOCK = 64
@@ -51,7 +52,7 @@ class Rows(NamedTuple):
     Attributes:
         tables: affine rows of the primitives.
         size: largest coordinate of the scene.
-        tolerance: ``(P,)`` float64 enlargement of each primitive, see :func:`torchpt.search.tables.tolerances`.
+        tolerance: ``(P,)`` float64, how near to an edge a hit is in doubt, see :func:`torchpt.search.tables.tolerances`.
     """
 
     tables: Tables

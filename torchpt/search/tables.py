@@ -114,8 +114,8 @@ def tolerances(rows: Tensor, scene_extent: float) -> Tensor:
 
     With ``U(x) = sum |a_i x_i| + |ca|`` and ``W`` likewise for the plane, the parameter ``u = u(o) - w(o) u(d) / w(d)``
     of a hit is computed with an error below ``16 eps (U(o) W(d) + W(o) U(d) + W(d)) / |w(d)|`` (standard model,
-    eps = 2^-24; five roundings in each of the rows' sums, rounded rows included). A primitive that accepts this much
-    beyond its edges accepts every hit that is inside in exact arithmetic, so shared edges do not leak.
+    eps = 2^-24; five roundings in each of the rows' sums, rounded rows included). A test that accepts this much beyond the
+    edges accepts every hit that is inside in exact arithmetic; those within this much of an edge are tested again in float64.
 
     Args:
         rows: ``(P, 12)`` float64 rows.

@@ -152,7 +152,7 @@ class Traced:
 def traced_of(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Traced:
     """Return the wave of a scene under ``params``; its numbers are independent from sample to sample."""
     plain = replace(settings, sampler=ParsedParams(SAMPLERS["independent"], {}))
-    # Packets widen primitives by their rounding, further than edges look beside.
+    # Packets search rays near an edge twice, and these all are.
     wave = make_wave(scene, plain, params, dtype, tree=True)
     wave = replace(wave, sampler=Sampler(wave.sampler.points, settings.render.seed))
     return Traced(wave, Along(scene, settings, wave))

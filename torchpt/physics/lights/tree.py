@@ -52,10 +52,10 @@ _DIMMEST = 1e-30
 class LightTree:
     """A tree over K lights."""
 
-    nodes: Tensor  # (M, F, 8) float32: a field of FIELDS, for each of eight children; a single node may have 16 or 24
+    nodes: Tensor  # (M, F, 8) float32: a field of FIELDS, for each child; a single node may have 16 or 24 in place of 8
     child: Tensor  # (M, 8) int32: index of a node, or ~row (negative) for the light of that row of the light table
     full: Tensor  # (M,) int32 number of children
-    trail: Tensor  # (W, K) int32 path from the root: three bits a level, ten levels a word, the first level lowest
+    trail: Tensor  # (W, K) int32 path from the root: `bits` a level, ten levels a word, the first level lowest
     depth: Tensor  # (K,) int32 number of levels; 0 for lights without intensity, which are not in the tree
     count: Tensor  # () int64 K
     levels: int  # the largest of `depth`
@@ -278,4 +278,5 @@ def _walk(
         node = torch.where(deeper, tree.child[inner, chosen].long(), node)
     if row is not None:
         p = torch.where((row < 0) | (tree.depth[row.clamp_min(0)] > 0), p, 0.0)
-    return ~node, p.to(x.dtype), remapped
+    reached = ~node if row is None else torch.where(row < 0, ~node, row)  # a row may be that of no light of the tree
+    return reached, p.to(x.dtype), remapped

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,10 +106,15 @@ def _flipped(p: Properties, path: Path, index: int | None) -> MeshPart:
         np.concatenate([part.vertices for part in parts]),
         faces,
         normals=np.concatenate(normals) if len(normals) == len(parts) else None,
-        uvs=np.concatenate(uvs) * [1.0, -1.0] + [0.0, 1.0] if len(uvs) == len(parts) else None,
+        uvs=_upside_down(np.concatenate(uvs)) if len(uvs) == len(parts) else None,
         colors=np.concatenate(colors) if len(colors) == len(parts) else None,
         flat=all(part.flat for part in parts),
     )
+
+
+def _upside_down(uvs: Matrix) -> Matrix:
+    """Return texture coordinates ``(n, 2)`` with v counted from the other end."""
+    return uvs * [1.0, -1.0] + [0.0, 1.0]
 
 
 def with_attribute(shape: Shape, names: Sequence[str], element: Element, importer: Importer) -> Shape:
@@ -126,21 +132,26 @@ def with_attribute(shape: Shape, names: Sequence[str], element: Element, importe
             element,
             f"{element.label}: a mesh carries one attribute, {name}, which is taken for {', '.join(others)} as well",
         )
-    path = Path(shape.get("path", ""))
+    flipped = "path" not in shape  # its mesh has been read, with flipped texture coordinates
+    given = next(
+        (x.attributes.get("value", "") for x in element.children if x.attributes.get("name") == "filename"), ""
+    )
+    path = importer.find(element, given.strip()) if given else None
     part = None
-    if path.suffix.lower() == ".ply":
-        path = importer.base / path
+    if path is not None and path.suffix.lower() == ".ply":
         try:
             if name == "vertex_color" and load_mesh(path, materials=False)[0].colors is not None:
                 return shape  # as the file is read anyway
             part = load_ply_attribute(path, name)
+            if part is not None and part.uvs is not None and flipped:
+                part = replace(part, uvs=_upside_down(part.uvs))
         except OSError as error:
             raise SceneError(f"line {element.line}", str(path), f"a file ({error.strerror})", element.file) from None
         except AssetError as error:
             raise SceneError(f"line {element.line}", str(path), error.problem, element.file) from None
     if part is not None:
         return {**{key: value for key, value in shape.items() if key != "path"}, "mesh": (part,)}
-    if name != "vertex_color" or path.suffix.lower() == ".ply":
+    if name != "vertex_color" or (path is not None and path.suffix.lower() == ".ply"):
         importer.notes.add(element, f"{element.label}: the attribute {name} is not in its file, white takes its place")
     return shape
 
