@@ -70,7 +70,7 @@ def test_visible_normals_cover_the_view_once(au, av, angle, facets):
     m, jacobian = normals(au, av, psi, phi)
     wo = towards(angle, len(psi))
     rough = lanes(au, av, len(psi))
-    d, area = facets.density(m, *rough), facets.seen(wo, wo, *rough).area
+    d, area = facets.density(m, *rough), facets.masking_terms(wo, wo, *rough).area
     total = (d * dot(wo, m).clamp_min(0) / area * jacobian).reshape(900, -1).mul(weights).sum()
     assert abs(float(total) - 1) < 1e-3
     # Walter et al. give 0.35 % for their fit of Beckmann's.

@@ -361,10 +361,9 @@ class _SearchFunction(Block):
         slack = self.fma(ty, size, row[12], row[13]) if self.exact else self.mul(ty, size, row[12])
         # how far the hit is inside of its nearest edge
         if kind == "triangle":
+            # by half, as the error of a sum is twice as large
             half = self.constant(ty, 0.5)
-            other = self.fma(
-                ty, self.negative(ty, half), self.add(ty, u, v), half
-            )  # the error of a sum is twice as large
+            other = self.fma(ty, self.negative(ty, half), self.add(ty, u, v), half)
         else:
             other = self.sub(ty, one, self._larger(u, v))
         depth = self._smaller(self._smaller(u, v), other)

@@ -19,7 +19,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchpt.math.microfacet import Facets, Reflection, Seen, half_vector
+from torchpt.math.microfacet import MaskingTerms, MicrofacetDistribution, Reflection, half_vector
 from torchpt.math.vectors import dot, normalize
 
 __all__ = ["BECKMANN", "Beckmann"]
@@ -48,19 +48,19 @@ _LEAST_Q = 2e-10  # 1 + erf(s) of the steepest slope: w = 22
 _LEAST_U = 2.0**-26
 
 
-class Beckmann(Facets):
-    """Facets of a surface with Gaussian heights."""
+class Beckmann(MicrofacetDistribution):
+    """MicrofacetDistribution of a surface with Gaussian heights."""
 
-    bounds = False
+    bounded_sampling = False
 
     def density(self, m: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
-        """See :meth:`Facets.density`: ``exp(-(x^2/au^2 + y^2/av^2) / z^2) / (pi au av z^4)``."""
+        """See :meth:`MicrofacetDistribution.density`: ``exp(-(x^2/au^2 + y^2/av^2) / z^2) / (pi au av z^4)``."""
         x, y = m[0] / alpha_u, m[1] / alpha_v
         z2 = (m[2] * m[2]).clamp_min(_STEEPEST_COS2)
         return torch.exp(-torch.addcmul(x * x, y, y) / z2) / (math.pi * (alpha_u * alpha_v) * (z2 * z2))
 
     def sample_normal(self, wo: Tensor, alpha_u: Tensor, alpha_v: Tensor, u: Tensor, bounded: bool = False) -> Tensor:
-        """See :meth:`Facets.sample_normal`; there is no bound.
+        """See :meth:`MicrofacetDistribution.sample_normal`; there is no bound.
 
         For alpha 1, the slope ``s`` along ``wo`` has the density ``(z - t s) exp(-s^2)`` up to ``s = a`` (Heitz and d'Eon,
         *Importance Sampling Microfacet-Based BSDFs using the Distribution of Visible Normals*, 2014), the slope across is
@@ -105,15 +105,17 @@ class Beckmann(Facets):
         bounded: bool = False,
         by_height: bool = False,
     ) -> Reflection:
-        """See :meth:`Facets.reflection`."""
+        """See :meth:`MicrofacetDistribution.reflection`."""
         m = half_vector(wo, wi)
         above = torch.minimum(wo[2], wi[2]).sign().clamp_min(0.0)
-        seen = self.seen(wo, wi, alpha_u, alpha_v, by_height)
+        seen = self.masking_terms(wo, wi, alpha_u, alpha_v, by_height)
         pdf = 0.25 * self.density(m, alpha_u, alpha_v) * above / seen.area
         return Reflection(m=m, cos_m=dot(wo, m), value=pdf * seen.shadowing, pdf=pdf)
 
-    def seen(self, wo: Tensor, wi: Tensor, alpha_u: Tensor, alpha_v: Tensor, by_height: bool = False) -> Seen:
-        """See :meth:`Facets.seen`."""
+    def masking_terms(
+        self, wo: Tensor, wi: Tensor, alpha_u: Tensor, alpha_v: Tensor, by_height: bool = False
+    ) -> MaskingTerms:
+        """See :meth:`MicrofacetDistribution.masking_terms`."""
         cos_o, cos_i = wo[2].abs(), wi[2].abs()
         t_o, t_i = _stretched(wo, alpha_u, alpha_v), _stretched(wi, alpha_u, alpha_v)
         area = cos_o + _hidden(cos_o, t_o)
@@ -122,10 +124,10 @@ class Beckmann(Facets):
             weight = cos_i * area / torch.addcmul(area * cos_i, cos_o, _hidden(cos_i, t_i)).clamp_min(_LEAST_T2)
         else:
             weight = area * _masking_by_cos(cos_o, t_o) * (cos_i * _masking_by_cos(cos_i, t_i))
-        return Seen(area=area, shadowing=weight)
+        return MaskingTerms(area=area, shadowing=weight)
 
     def masking(self, w: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
-        """See :meth:`Facets.masking`."""
+        """See :meth:`MicrofacetDistribution.masking`."""
         cos = w[2].clamp_min(0.0)
         return cos * _masking_by_cos(cos, _stretched(w, alpha_u, alpha_v))
 

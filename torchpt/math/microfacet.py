@@ -17,11 +17,11 @@ __all__ = [
     "BOUNDED",
     "GGX",
     "INDEX_MATCHED",
-    "Facets",
     "Ggx",
     "Interface",
+    "MaskingTerms",
+    "MicrofacetDistribution",
     "Reflection",
-    "Seen",
     "clamp_alpha",
     "coat_reflectance",
     "coat_transmittance",
@@ -300,23 +300,26 @@ def reflection(
 # ---- The choice of a distribution
 
 
-class Seen(NamedTuple):
-    """What a pair of directions sees of the facets, each ``(N,)``."""
+class MaskingTerms(NamedTuple):
+    """Smith's terms of a pair of directions, each ``(N,)``.
 
-    area: Tensor  # projected area of the facets that wo sees, over the surface's: D over it is the density of visible normals
-    shadowing: (
-        Tensor  # value over density of a scattered direction, but for Fresnel's factor: the light that is not blocked
-    )
+    Attributes:
+        area: projected area of the facets that ``wo`` sees, over the surface's: D over it is the density of visible normals.
+        shadowing: value over density of a scattered direction, but for Fresnel's factor: the light that is not blocked.
+    """
+
+    area: Tensor
+    shadowing: Tensor
 
 
-class Facets:
+class MicrofacetDistribution:
     """A distribution of facet normals with Smith's masking. Instances hold nothing.
 
     Attributes:
-        bounds: whether :meth:`sample_normal` can leave out normals that reflect below the surface.
+        bounded_sampling: whether :meth:`sample_normal` can leave out normals that reflect below the surface.
     """
 
-    bounds: bool
+    bounded_sampling: bool
 
     def density(self, m: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
         """Return the density ``D(m)`` of normals ``(N,)``, per steradian and area of the surface."""
@@ -338,7 +341,9 @@ class Facets:
         """Evaluate a rough mirror, see :func:`reflection`."""
         raise NotImplementedError
 
-    def seen(self, wo: Tensor, wi: Tensor, alpha_u: Tensor, alpha_v: Tensor, by_height: bool = False) -> Seen:
+    def masking_terms(
+        self, wo: Tensor, wi: Tensor, alpha_u: Tensor, alpha_v: Tensor, by_height: bool = False
+    ) -> MaskingTerms:
         """Return the factors of ``D`` in density and value, of directions on either side.
 
         Args:
@@ -355,17 +360,17 @@ class Facets:
         raise NotImplementedError
 
 
-class Ggx(Facets):
+class Ggx(MicrofacetDistribution):
     """The distribution of Trowbridge and Reitz, by the functions above."""
 
-    bounds = True
+    bounded_sampling = True
 
     def density(self, m: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
-        """See :meth:`Facets.density`."""
+        """See :meth:`MicrofacetDistribution.density`."""
         return ggx(m, alpha_u, alpha_v)
 
     def sample_normal(self, wo: Tensor, alpha_u: Tensor, alpha_v: Tensor, u: Tensor, bounded: bool = False) -> Tensor:
-        """See :meth:`Facets.sample_normal`."""
+        """See :meth:`MicrofacetDistribution.sample_normal`."""
         return sample_normal(wo, alpha_u, alpha_v, u, bounded)
 
     def reflection(
@@ -377,18 +382,20 @@ class Ggx(Facets):
         bounded: bool = False,
         by_height: bool = False,
     ) -> Reflection:
-        """See :meth:`Facets.reflection`."""
+        """See :meth:`MicrofacetDistribution.reflection`."""
         return reflection(wo, wi, alpha_u, alpha_v, bounded, by_height)
 
-    def seen(self, wo: Tensor, wi: Tensor, alpha_u: Tensor, alpha_v: Tensor, by_height: bool = False) -> Seen:
-        """See :meth:`Facets.seen`."""
+    def masking_terms(
+        self, wo: Tensor, wi: Tensor, alpha_u: Tensor, alpha_v: Tensor, by_height: bool = False
+    ) -> MaskingTerms:
+        """See :meth:`MicrofacetDistribution.masking_terms`."""
         cos_o, cos_i = wo[2].abs(), wi[2].abs()
         s_o, s_i = stretched_length(wo, alpha_u, alpha_v), stretched_length(wi, alpha_u, alpha_v)
         shadowing = height_correlated_masking(cos_o, s_o, cos_i, s_i) if by_height else masking(cos_i, s_i)
-        return Seen(area=0.5 * (cos_o + s_o).clamp_min(_TINY), shadowing=shadowing)
+        return MaskingTerms(area=0.5 * (cos_o + s_o).clamp_min(_TINY), shadowing=shadowing)
 
     def masking(self, w: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
-        """See :meth:`Facets.masking`."""
+        """See :meth:`MicrofacetDistribution.masking`."""
         return masking(w[2].clamp_min(0.0), stretched_length(w, alpha_u, alpha_v))
 
 
@@ -425,7 +432,7 @@ def directional_albedo(
     eta: Tensor | None,
     azimuths: int = 32,
     heights: int = 32,
-    facets: Facets = GGX,
+    facets: MicrofacetDistribution = GGX,
 ) -> Tensor:
     """Compute the single-scattering albedo ``(K,)`` of facets that absorb nothing, with height-correlated masking.
 
@@ -446,13 +453,13 @@ def directional_albedo(
     wo = wo.repeat_interleave(q, 1)
     au = alpha_u.expand(k * q)
     av = au if alpha_v is None else alpha_v.expand(k * q)
-    bounded = eta is None and facets.bounds
+    bounded = eta is None and facets.bounded_sampling
     m = facets.sample_normal(wo, au, av, u.repeat(1, k), bounded=bounded)
     cos = dot(wo, m)
 
     def unblocked(w: Tensor, height: Tensor) -> Tensor:
         """Return the share of light along ``w`` that no facet blocks; ``height (K Q,)`` is its cosine, 0 if it fails."""
-        return facets.seen(wo, torch.stack((w[0], w[1], height)), au, av, by_height=True).shadowing
+        return facets.masking_terms(wo, torch.stack((w[0], w[1], height)), au, av, by_height=True).shadowing
 
     back = reflect(wo, m, cos)  # the reflected direction
     out = unblocked(back, back[2].clamp_min(0.0))
@@ -474,8 +481,10 @@ def _lanes(cosines: Tensor, alpha: Tensor, n: int) -> tuple[Tensor, Tensor]:
     return torch.stack(((1.0 - z * z).clamp_min(0.0).sqrt(), torch.zeros_like(z), z)), alpha.expand_as(z)
 
 
-def _normals(cosines: Tensor, alpha: Tensor, facets: Facets, azimuths: int = 32, heights: int = 32) -> _Normals:
-    """Sample normals by :meth:`Facets.sample_normal` at Gauss-Legendre nodes; by symmetry half the azimuths suffice."""
+def _normals(
+    cosines: Tensor, alpha: Tensor, facets: MicrofacetDistribution, azimuths: int = 32, heights: int = 32
+) -> _Normals:
+    """Sample visible normals at Gauss-Legendre nodes; by symmetry half the azimuths suffice."""
     (a, wa), (b, wb) = _legendre(azimuths), _legendre(heights)  # nodes and weights of u[0] and of u[1]
     u = cosines.new_tensor(np.stack(np.meshgrid(0.5 * a, b, indexing="ij")).reshape(2, -1))
     wo, alphas = _lanes(cosines, alpha, u.shape[1])
@@ -483,7 +492,7 @@ def _normals(cosines: Tensor, alpha: Tensor, facets: Facets, azimuths: int = 32,
     return _Normals(wo=wo, m=m, alpha=alphas, weights=cosines.new_tensor(np.outer(wa, wb).ravel()))
 
 
-def _normals_of_mitsuba(cosines: Tensor, alpha: Tensor, facets: Facets, n: int = 32) -> _Normals:
+def _normals_of_mitsuba(cosines: Tensor, alpha: Tensor, facets: MicrofacetDistribution, n: int = 32) -> _Normals:
     """Sample normals at the nodes of Mitsuba's integrals."""
     (a, wa), (b, wb) = _legendre(n), _legendre(n)
     half = n // 2  # by symmetry half of u[0] suffices
@@ -506,7 +515,7 @@ def _disk_normals(wo: Tensor, alphas: Tensor, u: Tensor) -> Tensor:
     return normalize(torch.stack((alphas * along, -alphas * x, up)))
 
 
-def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor, facets: Facets = GGX) -> Tensor:
+def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor, facets: MicrofacetDistribution = GGX) -> Tensor:
     """Compute the single-scattering reflectance ``(K,)`` of rough dielectric facets: the mean of ``F G1(wi)``.
 
     Args:
@@ -524,7 +533,7 @@ def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor, facets: Facets
     return nodes.mean(fresnel_dielectric(cos, eta).reflectance * seen)
 
 
-def coat_transmittance(cosines: Tensor, alpha: Tensor, eta: Tensor, facets: Facets = GGX) -> Tensor:
+def coat_transmittance(cosines: Tensor, alpha: Tensor, eta: Tensor, facets: MicrofacetDistribution = GGX) -> Tensor:
     """Compute the single-scattering transmittance ``(K,)`` of rough dielectric facets: the mean of ``(1 - F) G1(wi)``.
 
     At the 32 x 32 nodes of Mitsuba: their error of up to 4e-4 is 1 % of a coat's small reflectance, and shows in comparisons.

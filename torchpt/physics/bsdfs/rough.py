@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchpt.math import microfacet
 from torchpt.math.beckmann import BECKMANN
-from torchpt.math.microfacet import GGX, Facets
+from torchpt.math.microfacet import GGX, MicrofacetDistribution
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Table, Values
 from torchpt.physics.bsdfs.specs import fraction
 from torchpt.spec import Choice, Flag, Refused
@@ -44,7 +44,7 @@ class Rough(Bsdf, part=True):
     beckmann: bool
 
     @property
-    def facets(self) -> Facets:
+    def facets(self) -> MicrofacetDistribution:
         """Return the distribution of normals."""
         return BECKMANN if self.beckmann else GGX
 
@@ -107,7 +107,7 @@ def alphas(parameters: Parameters) -> tuple[Tensor, Tensor]:
     return u, u if v is None else v
 
 
-def energy_table(parameters: Parameters, etas: Sequence[Tensor | None], facets: Facets) -> Table:
+def energy_table(parameters: Parameters, etas: Sequence[Tensor | None], facets: MicrofacetDistribution) -> Table:
     """Return the directional albedo of a lossless microfacet surface as one row of a table, for :func:`energy_at`.
 
     Entries run over cosines first, then over azimuths, then over ``etas``.

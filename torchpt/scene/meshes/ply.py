@@ -105,9 +105,8 @@ def load_ply_attribute(path: Path, name: str) -> MeshPart | None:
 
 def _attribute(columns: Columns, owner: str, stem: str, elements: list[_Element]) -> NDArray[np.float64] | None:
     """Return the values ``(n, 3)`` of a mesh attribute, see :func:`load_ply_attribute`."""
-    plain = stem.removesuffix(
-        "_color"
-    )  # Mitsuba 3.9 says `vertex_NAME_color` where the properties are `NAME_r` and so on
+    # Mitsuba 3.9 says `vertex_NAME_color` where the properties are `NAME_r` and so on
+    plain = stem.removesuffix("_color")
     groups = [tuple(f"{stem}_{letter}" for letter in letters) for letters in ("012", "123", "xyz", "rgb")]
     groups += [tuple(f"{plain}_{letter}" for letter in "rgb")]
     if stem == "color":

@@ -78,7 +78,12 @@ class RoughDielectric(Anisotropic, Glass):
             for compensated in (False, True)
             for anisotropic in (False, True)
         ]
-        return *ggx, cls(beckmann=True), cls(beckmann=True, anisotropic=True)
+        beckmann = (
+            cls(beckmann=True),
+            cls(beckmann=True, anisotropic=True),
+            cls(beckmann=True, energy_compensation=True),
+        )
+        return *ggx, *beckmann
 
     def tabulate(self, values: Parameters) -> Parameters:
         """Return the table of directional albedo for energy compensation, one block for each side."""
@@ -97,7 +102,7 @@ class RoughDielectric(Anisotropic, Glass):
     def _surface(self, values: Parameters) -> Parameters:
         """Return the parameters of the interface and of its facets, without the table."""
         out = {**dielectric_parameters(values), **roughness_parameters(values, anisotropic=self.anisotropic)}
-        # Facets between equal indices do not bend light.
+        # MicrofacetDistribution between equal indices do not bend light.
         out["smooth"] = out["smooth"] | ((out["eta"] - 1.0).abs() < INDEX_MATCHED)
         return out
 
@@ -116,7 +121,7 @@ class RoughDielectric(Anisotropic, Glass):
         is_visible = torch.minimum(o * wo[2], i * wi[2]) > 0
         counts = is_visible & ~parameters["smooth"]  # deltas are left out
         side = fresnel_dielectric(o, eta)
-        seen = self.facets.seen(wo, wi, alpha_u, alpha_v, by_height=self.energy_compensation)
+        seen = self.facets.masking_terms(wo, wi, alpha_u, alpha_v, by_height=self.energy_compensation)
         h2 = dot(h, h)
         # Jacobian dm / dwi, times the cosine o of the density of visible normals, which the next line leaves out:
         # 1 / (4 o) and eta^2 i / |wo + eta wi|^2, the latter without eta^2, which the last line has.
