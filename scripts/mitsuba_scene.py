@@ -26,7 +26,7 @@ from torchpt.math.vectors import cross, dot, luminance
 from torchpt.physics.bsdfs import KINDS, Bsdf
 from torchpt.physics.bsdfs.metal import by_reflectance
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
-from torchpt.physics.lights.kinds.sky import sky_angles, sky_turn
+from torchpt.physics.lights.kinds.sky import direction_of, sky_angles, sky_turn
 from torchpt.physics.parts import Part, Source
 from torchpt.physics.shapes import KINDS as SHAPES
 from torchpt.physics.shapes import Shape
@@ -160,9 +160,7 @@ def sky_values(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     if given["stretch"] != 1.0:
         raise NoCounterpartError("Mitsuba's sky is not stretched")
-    zenith, bearing = sky_angles(given)
-    along = np.array([math.sin(zenith) * math.sin(bearing), math.cos(zenith), -math.sin(zenith) * math.cos(bearing)])
-    to_sun = np.linalg.inv(sky_turn(given)) @ along
+    to_sun = np.linalg.inv(sky_turn(given)) @ direction_of(*sky_angles(given))
     scales = {key: given[key] for key in ("turbidity", "sky_scale", "sun_scale", "sun_aperture")}
     return {"type": "sunsky", "sun_direction": to_sun.tolist(), "complex_sun": True, **scales}
 

@@ -46,7 +46,7 @@ def test_places_are_stratified_over_all_edges() -> None:
     assert torch.equal((place * TOTAL).long(), number)
 
 
-def test_rays_of_edges_never_meet_widened_primitives() -> None:
+def test_rays_of_edges_are_searched_by_the_tree() -> None:
     assert [traced(0, accel).wave.accel.name for accel in ("auto", "brute", "numba", "torch")] == [
         *("numba", "numba", "numba"),
         "torch",

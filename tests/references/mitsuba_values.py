@@ -32,7 +32,7 @@ _DELTA = ("point", "spot", "directional")
 
 @dataclass(frozen=True)
 class Agreement:
-    """How near values come.
+    """Agreement of two renderers in one kind of value.
 
     Attributes:
         count: how many were compared.

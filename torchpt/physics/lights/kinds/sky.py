@@ -28,7 +28,7 @@ from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.lights.sun_position import sun_angles
 from torchpt.spec import Angle, Color, Direction, Integer, Pose, Refused, Scalar
 
-__all__ = ["Atmosphere", "Dome", "Sky", "Sun", "SunFrame", "sky_angles", "sky_turn"]
+__all__ = ["Atmosphere", "Dome", "Sky", "Sun", "SunFrame", "direction_of", "sky_angles", "sky_turn"]
 
 #: Rows and columns of the map; a row lies on the horizon.
 _HEIGHT, _WIDTH = 257, 512
@@ -93,10 +93,10 @@ def _sun_direction(values: Mapping[str, Any]) -> Matrix:
         return sky_turn(values) @ (along / np.linalg.norm(along))
     hours = values["hour"] + values["minute"] / 60.0 + values["second"] / 3600.0
     latitude, longitude, timezone, year, month, day = (values[key] for key in _TIME[:6])
-    return _direction(*sun_angles(latitude, longitude, timezone, year, month, day, hours))
+    return direction_of(*sun_angles(latitude, longitude, timezone, year, month, day, hours))
 
 
-def _direction(zenith: float, bearing: float) -> Matrix:
+def direction_of(zenith: float, bearing: float) -> Matrix:
     """Return the direction ``(3,)`` of angles from the zenith, and from north over east."""
     sine = math.sin(zenith)
     return np.array([sine * math.sin(bearing), math.cos(zenith), -sine * math.cos(bearing)])
@@ -265,8 +265,8 @@ def _sun_points(sun: Sun, atmosphere: Atmosphere) -> tuple[Tensor, Tensor]:
 
 def _frame(zenith: float, bearing: float, turn: Matrix) -> Matrix:
     """Return the rows ``(3, 3)`` of a :class:`SunFrame` in the world, of a sun at two angles of the light's own space."""
-    rows = (_direction(zenith, bearing), (math.cos(bearing), 0.0, math.sin(bearing)))
-    return np.stack((*rows, _direction(zenith - 0.5 * math.pi, bearing))) @ turn
+    rows = (direction_of(zenith, bearing), (math.cos(bearing), 0.0, math.sin(bearing)))
+    return np.stack((*rows, direction_of(zenith - 0.5 * math.pi, bearing))) @ turn
 
 
 def _texels(atmosphere: Atmosphere, below: float) -> Tensor:
@@ -381,16 +381,16 @@ class Sky(Environment):
     @classmethod
     def environment_image(cls, around: Dome) -> EnvironmentImage:
         """See :meth:`Environment.environment_image`; the sun is spread over the texels next to it."""
-        map = around.map
+        texture = around.map
         d, radiance = _sun_points(around.sun, around.atmosphere)
-        local = torch.stack([dot(map.turn[k][:, None], d) for k in range(3)])
-        cells, weights = corners(*coordinates(local), map.height, map.width)
-        size = solid_angles(map.height, map.width).to(d).repeat_interleave(map.width)
+        local = torch.stack([dot(texture.turn[k][:, None], d) for k in range(3)])
+        cells, weights = corners(*coordinates(local), texture.height, texture.width)
+        size = solid_angles(texture.height, texture.width).to(d).repeat_interleave(texture.width)
         each = radiance * (around.sun.cap * (2.0 * math.pi / d.shape[1]))  # of a point, times its solid angle
         texels = _texels(around.atmosphere, 1e-4).reshape(3, -1)
         for cell, weight in zip(cells, weights, strict=True):
             texels = texels.index_add(1, cell, each * (weight / size[cell]))
-        return EnvironmentImage(texels=texels.T.reshape(map.height, map.width, 3), turn=map.turn)
+        return EnvironmentImage(texels=texels.T.reshape(texture.height, texture.width, 3), turn=texture.turn)
 
     @classmethod
     def info(cls, around: Dome) -> dict[str, Any]:
