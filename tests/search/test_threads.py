@@ -13,6 +13,7 @@ from accel_reference import rays, soup
 from torchpt.search import build
 
 ROOT = Path(__file__).resolve().parents[2]
+REFERENCES = ROOT / "tests" / "references"
 PREAMBLE = """
 import multiprocessing, sys, threading
 import torch
@@ -29,7 +30,7 @@ def work(seed=0, kind="numba"):
 
 def _run(body, errors=False, **env):
     """Runs a script in its own process and returns the words it prints, and where asked what it prints to stderr."""
-    code = PREAMBLE.format(tests=str(Path(__file__).parent)) + textwrap.dedent(body)
+    code = PREAMBLE.format(tests=str(REFERENCES)) + textwrap.dedent(body)
     settings = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "2", **env}
     done = subprocess.run([sys.executable, "-c", code], env=settings, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -79,7 +80,7 @@ def test_two_python_threads(expected):
 def test_worker_processes_after_the_parent_worked(method, expected, tmp_path):
     script = tmp_path / "workers.py"
     script.write_text(
-        PREAMBLE.format(tests=str(Path(__file__).parent))
+        PREAMBLE.format(tests=str(REFERENCES))
         + textwrap.dedent(
             f"""
             if __name__ == "__main__":
