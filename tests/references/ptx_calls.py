@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -37,8 +38,11 @@ from torchpt.engines.kernels.programs import Kernel
 
 __all__ = [
     "LANES",
+    "WISH",
     "DeviceProbes",
     "Probe",
+    "call_backward",
+    "call_forward",
     "differing_kernel",
     "differing_results",
     "probed",
@@ -50,6 +54,31 @@ __all__ = [
 LANES = 256
 #: Instructions of a PTX text beyond which each thread takes one lane only, to save time.
 LONG = 1500
+
+
+LAYERS = ["albedo", "normal", "depth", "position", "uv", "object_id"]
+WISH: dict[str, Any] = {"spp": 1, "threads": 1, "compile": "on"}
+
+
+def call_forward(scene: torchpt.Scene) -> None:
+    """Render a picture, and layers."""
+    torchpt.render(scene, film={"width": 64, "height": 64}, **WISH)
+    torchpt.render(scene, film={"width": 24, "height": 24, "aovs": LAYERS}, integrator="aov", **WISH)
+
+
+def call_backward(scene: torchpt.Scene) -> None:
+    """Render a gradient by all parameters; of scenes with opacity by vertices and poses alone.
+
+    Opacity is differentiated by tensor operations, and so is a texture whose table it shares.
+    """
+    owners, named = (*scene.built.parts, *scene.built.copies), dict(scene.params)
+    if any(owner.material.opacity != 1.0 for owner in owners):
+        named = {name: value for name, value in named.items() if name.endswith((".vertices", ".to_world"))}
+    given = {name: value.clone().requires_grad_() for name, value in named.items()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # which edges a gradient leaves out does not matter here
+        image = torchpt.render(scene, params=given, film={"width": 32, "height": 32}, **WISH)
+        torch.autograd.grad(image.mean(), list(given.values()), allow_unused=True)
 
 
 @contextmanager

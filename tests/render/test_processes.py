@@ -12,6 +12,7 @@ import threading
 from pathlib import Path
 
 import pytest
+import torch
 
 import torchpt
 
@@ -96,6 +97,24 @@ def test_threads_then_a_fork_give_the_same_picture():
     found.append(queue.get(timeout=100))
     process.join()
     assert len(found) == 3 and set(found) == {expected("cornell_box")}
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_torch_has_one_thread_in_a_forked_child():
+    """Its pool's threads are the parent's: a child that loads a mesh would wait for them forever."""
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        process = context.Process(target=lambda: queue.put(torch.get_num_threads()))
+        process.start()
+        assert queue.get(timeout=100) == 1
+        process.join()
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 # Both CPU searches: packets and the wide tree.

@@ -102,7 +102,7 @@ made, original = [], machine.object_code
 machine.object_code = lambda ir: made.append(ir) or original(ir)
 work()
 o, d, t_max = (x.numpy() for x in rays(7, 64))
-t, prim, out = t_max.copy(), t_max.astype("int32"), t_max.astype("int32")
+t, prim, out = t_max.copy(), (0 * d[0]).astype("int32"), (0 * d[0]).astype("int32")
 accel = build(soup(3), "numba", 1)
 accel.nearest(o, d, t_max, 64, t, prim, t.copy(), t.copy()), accel.blocked(o, d, t_max, 64, out)
 print(len(made))

@@ -143,8 +143,12 @@ def _before_fork() -> None:
 
 
 def _after_fork() -> None:
-    """Forget all threads after a fork: the child has neither its parent's nor torch's, and would wait forever."""
+    """Forget all threads after a fork: the child has neither its parent's nor torch's, and would wait forever.
+
+    Torch, too, is set to one thread, as in the workers of its data loaders: the OpenMP threads of its pool are the parent's.
+    """
     global _torch_threads, _start_lock
+    torch.set_num_threads(1)
     _idle.clear()
     _start_lock = threading.Lock()  # another thread may have held the old one during the fork
     _torch_threads = _TorchThreads(forked=True)
