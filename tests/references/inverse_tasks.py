@@ -349,7 +349,7 @@ def _around(mesh: dict[str, Any]) -> dict[str, Any]:
     return {**mesh, "uvs": torch.stack((u, v), 1).tolist()}
 
 
-WAVED, BUMPY = _Figure(_waved, 4.0), _PaintedFigure(_bumpy, 2.0)
+WAVED, BUMPY = _Figure(_waved, 4.0), _PaintedFigure(_bumpy, 4.0)
 
 TASKS: dict[str, Task] = {
     "albedo": Task(known.ROOM, lambda scene: torch.full((3, 3), 0.4), _albedos, _as_albedos, 0.03, depth=4, bounds=(0, 1)),
@@ -406,7 +406,7 @@ TASKS: dict[str, Task] = {
             "shapes": {"ball": {**_around(_sphere(3)), "material": "paint"}},
             "lights": {**SUNS, **known.OPEN_SKY},
         },
-        BUMPY.start, BUMPY.true, BUMPY.params, 0.03, steps=120, spp=8, bar=3.0, views=SIX_SIDES, off=BUMPY.off,
+        BUMPY.start, BUMPY.true, BUMPY.params, 0.03, steps=60, spp=8, bar=3.0, views=SIX_SIDES, off=BUMPY.off,
     ),
     "turned_camera": Task(  # by five degrees
         {"camera": known.TABLE["camera"], "shapes": {"floor": CHECKED, "lamp": known.OVERHEAD}},
