@@ -73,9 +73,10 @@ def commands(program: str) -> list[tuple[str, str]]:
             if (
                 span.startswith(f"{program} ")
                 and whole
-                and not re.search(r"\b(NAME|COMMAND|FILE|FOLDER|PATTERN)\b", span)
+                and not re.search(r"\b(NAME|COMMAND|FILE|FOLDER|PATTERN|SCENE)\b", span)
             ):
-                found.setdefault(span.partition(" #")[0].strip(), where)
+                command = span.partition(" #")[0].strip().replace("{{", "{").replace("}}", "}")  # of a format string
+                found.setdefault(command, where)
     return [(where, command) for command, where in found.items()]
 
 

@@ -10,6 +10,7 @@ import base64
 import json
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from torchpt.compiler.target import Target
 from torchpt.native import cache
 from torchpt.native.content import code_of_folder
 
-__all__ = ["MOST_PROGRAMS", "cache_key", "clear_programs", "compile_stage", "load", "program_of", "store"]
+__all__ = ["MOST_PROGRAMS", "cache_key", "clear_programs", "compile_stage", "load", "prefetch", "program_of", "store"]
 
 
 # ---- Programs on disk: the result of tracing, so that another process need not trace the stage again
@@ -175,6 +176,10 @@ def _step_from_json(value: list[Any]) -> Step:
 MOST_PROGRAMS = 512
 #: Programs by structure and target, the newest last.
 _programs: dict[Any, Program] = {}
+#: Most programs that are begun and not asked for yet.
+MOST_BEGUN = 64
+#: Programs without their functions, and the IR of these, which other processes compile; by structure and target.
+_begun: dict[Any, tuple[Program, str]] = {}
 _tracing = threading.Lock()
 
 
@@ -201,6 +206,11 @@ def program_of(
         disk_key = cache_key(structure, target) if program is None else None
         if program is None and disk_key is not None:
             program = load(disk_key, target)
+        if program is None and key in _begun:
+            begun, ir = _begun.pop(key)
+            program = replace(begun, function=cpu.compile_ir(ir, target))
+            if disk_key is not None:
+                store(disk_key, program)
         if program is None or not guards_hold(program, tensors):
             program = compile_stage(trace(), target)
             if disk_key is not None:
@@ -213,6 +223,40 @@ def program_of(
         return program
 
 
+def prefetch(
+    structure: Any,
+    tensors: Mapping[str, Tensor],
+    trace: Callable[[], TracedStage],
+    processes: int,
+    target: Target | None = None,
+) -> None:
+    """Trace a stage and begin to compile it in another process, for a later :func:`program_of`, if its program is not there.
+
+    Args:
+        structure: as for :func:`program_of`, and so are the others.
+        tensors: see there.
+        trace: see there.
+        processes: most that run at a time.
+        target: see there.
+
+    Raises:
+        Unsupported: the stage does something that the lane compiler cannot compile.
+    """
+    with _tracing:
+        key = structure, target
+        disk_key = cache_key(structure, target)
+        if key in _programs or key in _begun or len(_begun) == MOST_BEGUN or disk_key is None:
+            return
+        program = load(disk_key, target)
+        if program is not None:
+            _programs[key] = program
+            return
+        stage = trace()
+        ir = kernel_ir(stage, (target or cpu.host()).form)
+        if cpu.begin(ir, target, processes):
+            _begun[key] = Program.of(stage, cpu.NOT_COMPILED), ir
+
+
 def compile_stage(stage: TracedStage, target: Target | None = None) -> Program:
     """Compile a traced stage for a target; None is this machine."""
     target = target or cpu.host()
@@ -222,3 +266,4 @@ def compile_stage(stage: TracedStage, target: Target | None = None) -> Program:
 def clear_programs() -> None:
     """Drop all programs in memory; entries on disk stay."""
     _programs.clear()
+    _begun.clear()

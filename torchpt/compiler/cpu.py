@@ -7,15 +7,19 @@ from __future__ import annotations
 
 import ctypes
 import threading
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
 from torchpt.compiler.target import Target
 from torchpt.core.memory import check_address_space
 from torchpt.native import cache, machine
+from torchpt.native.codegen import Job, compile_job
+from torchpt.native.compilers import submit
 
 __all__ = [
     "Function",
+    "begin",
     "compile_ir",
     "counts",
     "host",
@@ -24,11 +28,13 @@ __all__ = [
 ]
 
 #: Part of every key: raised when compilation changes, so that older entries are not read.
-_VERSION = "5"
+_VERSION = "6"
+#: Most modules whose code is kept until it is asked for.
+MOST_PENDING = 64
 _lock = threading.Lock()
 _state: dict[str, Any] = {"compiled": 0, "loaded": 0}  # counters for `counts`, and the target of this machine
 _functions: dict[str, Function] = {}  # by key
-_machines: dict[Target, Any] = {}  # LLVM's target machines
+_pending: dict[str, Future[bytes | None]] = {}  # by key, the code of modules that other processes compile
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,10 @@ class Function:
     code: bytes
     engine: Any
     key: str = ""
+
+
+#: Of programs whose code is not there yet.
+NOT_COMPILED = Function(call=None, code=b"", engine=None)
 
 
 def host() -> Target:
@@ -69,14 +79,43 @@ def compile_ir(ir: str, target: Target | None = None) -> Function:
         if function is None:
             code = cache.read(_entry(key, target))
             if code is None:
-                check_address_space()  # LLVM ends the process if it gets no memory
-                code = _code(ir, target)
+                future = _pending.pop(key, None)
+                code = None if future is None else future.result()
+                if code is None:
+                    check_address_space()  # LLVM ends the process if it gets no memory
+                    code = compile_job(_job(ir, target))
+                    cache.write(_entry(key, target), code)
                 _state["compiled"] += 1
-                cache.write(_entry(key, target), code)
             else:
                 _state["loaded"] += 1
             function = _functions[key] = _loaded(code, target, key)
         return function
+
+
+def begin(ir: str, target: Target | None, processes: int) -> bool:
+    """Begin to compile a module in another process, for a later :func:`compile_ir`; return False if none can be started.
+
+    ``processes``: most that run at a time.
+    """
+    with _lock:
+        target = target or host()
+        key = cache.digest(_identity(target), ir)
+        if key in _functions or key in _pending or cache.read(_entry(key, target)) is not None:
+            return True
+        future = submit(_job(ir, target), processes)
+        if future is None:
+            return False
+        future.add_done_callback(lambda done: _keep(_entry(key, target), done.result()))
+        _pending[key] = future
+        if len(_pending) > MOST_PENDING:  # the oldest, which nobody has asked for
+            del _pending[next(iter(_pending))]
+        return True
+
+
+def _keep(entry: str, code: bytes | None) -> None:
+    """Write code to disk."""
+    if code is not None:
+        cache.write(entry, code)
 
 
 def load_function(key: str, target: Target | None = None) -> Function | None:
@@ -105,31 +144,8 @@ def _identity(target: Target) -> str:
     return "\n".join((_VERSION, machine.version(), repr(target)))
 
 
-def _machine(target: Target) -> Any:
-    if target not in _machines:
-        opt = 3 if target.form.threads else 2
-        _machines[target] = machine.new_machine(target.cpu, target.features, target.triple, opt)
-    return _machines[target]
-
-
-def _code(ir: str, target: Target) -> bytes:
-    """Compile IR to an object file, or for threads to the text of PTX."""
-    llvm, target_machine, threads = machine.llvm(), _machine(target), target.form.threads
-    module = machine.parse(ir, target_machine)
-    # The IR is already vectorized and its constants are folded: LLVM's standard pipelines take three times as long as these
-    # passes, and the code is no faster; kernels of GPUs then need more registers.
-    passes = llvm.create_new_module_pass_manager()
-    if threads:
-        passes.add_always_inliner_pass()
-        passes.add_sroa_pass()
-    passes.add_simplify_cfg_pass()
-    passes.add_instruction_combine_pass()
-    passes.add_new_gvn_pass()
-    passes.add_aggressive_dce_pass()
-    if threads:  # definitions of functions that were inlined
-        passes.add_global_dead_code_eliminate_pass()
-    passes.run(module, llvm.create_pass_builder(target_machine, llvm.create_pipeline_tuning_options()))
-    return target_machine.emit_assembly(module).encode() if threads else target_machine.emit_object(module)
+def _job(ir: str, target: Target) -> Job:
+    return Job(ir, target.cpu, target.features, target.triple, target.form.threads)
 
 
 def _loaded(code: bytes, target: Target, key: str) -> Function:

@@ -249,6 +249,10 @@ class BackwardKernels(Protocol):
 
     eager_vjps: dict[tuple[Any, ...], str]
 
+    def prefetch(self, processes: int) -> None:
+        """Begin to compile the large kernels in other processes, unless some were made before; at most so many at a time."""
+        ...
+
     def engine(self) -> Backward[Any, Any, ChunkGradientSums]:
         """Return an engine for one more thread."""
         ...

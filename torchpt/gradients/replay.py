@@ -297,6 +297,7 @@ def _replay_on_threads(
             sums.merge(chunk)
         return False  # True would stop the threads
 
+    kernels.prefetch(budget.threads)
     try:
         while True:
             try:

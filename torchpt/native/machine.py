@@ -17,19 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.core.memory import check_address_space
-from torchpt.native import cache, elf
+from torchpt.native import cache, codegen, elf
+from torchpt.native.codegen import llvm, parse
 
 __all__ = ["host", "identity", "llvm", "load_object", "new_machine", "object_code", "parse", "version"]
-
-
-@functools.cache
-def llvm() -> Any:
-    """Return llvmlite's binding, initialized for this machine."""
-    import llvmlite.binding
-
-    llvmlite.binding.initialize_native_target()
-    llvmlite.binding.initialize_native_asmprinter()
-    return llvmlite.binding
 
 
 @functools.cache
@@ -83,13 +74,9 @@ def new_machine(cpu: str = "", features: str = "", triple: str | None = None, op
         triple: of another machine; None: this one, for code that is loaded into this process (``jit``).
         opt: level of code generation, by default LLVM's: it selects instructions and registers, and runs no passes on the IR.
     """
-    if triple is not None:
-        llvm().initialize_all_targets()
-        llvm().initialize_all_asmprinters()
     if not cpu:
         cpu, features = host()
-    kind = llvm().Target.from_default_triple() if triple is None else llvm().Target.from_triple(triple)
-    return kind.create_target_machine(cpu=cpu, features=features, opt=opt, jit=triple is None)
+    return codegen.target_machine(cpu, features, triple, opt)
 
 
 def object_code(ir: str) -> bytes:
@@ -101,15 +88,6 @@ def object_code(ir: str) -> bytes:
     check_address_space()
     machine = new_machine()
     return machine.emit_object(parse(ir, machine))
-
-
-def parse(ir: str, machine: Any) -> Any:
-    """Parse IR as :func:`object_code` takes it; return the verified module, with triple and data layout of a target machine."""
-    # The layout comes before the instructions: LLVM gives loads and stores their alignment as it reads them.
-    head = f'target datalayout = "{machine.target_data}"\ntarget triple = "{machine.triple}"\n'
-    module = llvm().parse_assembly(head + ir)
-    module.verify()
-    return module
 
 
 def load_object(code: bytes) -> tuple[Any, Callable[[str], int]]:

@@ -37,17 +37,23 @@ def russian_roulette(chance: Tensor, draws: Draws, alive: Tensor, throughput: Te
 
 
 def survival_probability(
-    rr_prob: float | None, cap: float, brightest: Tensor, eta: Tensor | None, *, tape: bool = False
+    rr_prob: float | None, cap: float | Tensor, brightest: Tensor, eta: Tensor | None, *, tape: bool = False
 ) -> Tensor:
     """Return the survival probability of paths ``(N,)``.
 
     Args:
         rr_prob: the integrator's constant probability; None: ``min(cap, brightest * eta^2)``.
-        cap: upper bound: 1, or :data:`DEEP_CAP` for deep paths.
+        cap: upper bound: 1, or :data:`DEEP_CAP` for deep paths. A tensor ``(1,)`` may also be 0: no roulette, probability 1.
         brightest: largest component of the throughput ``(N,)``.
         eta: index of refraction at the path's end over that at the camera ``(N,)``; None where nothing refracts.
         tape: True under differentiation: the probability is then at least :data:`LEAST`.
     """
+    if isinstance(cap, Tensor):
+        bounded = brightest if rr_prob is None else torch.full_like(brightest, rr_prob)
+        if rr_prob is None:
+            bounded = torch.minimum(bounded if eta is None else bounded * eta * eta, cap)
+            bounded = torch.maximum(bounded, cap.clamp_max(LEAST)) if tape else bounded
+        return torch.where(cap > 0, bounded, 1.0)
     if rr_prob is not None:
         return torch.full_like(brightest, rr_prob)
     # Refraction scales radiance by 1 / eta^2, which the path gets back when it leaves the glass.

@@ -167,7 +167,7 @@ class StageContext:
         salts: ``(len(Dimension),)`` int32, the hashed random dimensions of this vertex: with a path's key they give its random
             numbers, see :func:`torchpt.physics.samplers.salts`.
         follow_ray: True: hit points are intersected anew along their rays, see :func:`torchpt.physics.shapes.interact`.
-        roulette: upper bound of the survival probability; 0: no roulette at this vertex.
+        roulette: upper bound of the survival probability; 0: no roulette at this vertex. A tensor ``(1,)`` in kernels for any.
         search: returns the hits of rays that leave; called only where ``plan.attached``.
         camera: the camera of the picture; None for an integrator without splats.
         crop: ``(x, y, width, height)`` of the picture on the camera's film, in pixels; None for an integrator without splats.
@@ -179,7 +179,7 @@ class StageContext:
     near: Tensor | None = None
     salts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int32))
     follow_ray: bool = False
-    roulette: float = 0.0
+    roulette: float | Tensor = 0.0
     search: Callable[[PathState], Hit] = no_search
     camera: Camera | None = None
     crop: tuple[int, int, int, int] | None = None
@@ -188,7 +188,7 @@ class StageContext:
         self,
         salts: Tensor,
         follow_ray: bool = False,
-        roulette: float = 0.0,
+        roulette: float | Tensor = 0.0,
         search: Callable[[PathState], Hit] = no_search,
     ) -> StageContext:
         """Return the context of one vertex: a copy with its dimensions, bound of roulette and search."""

@@ -298,11 +298,11 @@ def attach(
 
 
 def continue_paths(
-    plan: Plan, state: PathState, surface: Surface, drawn: Drawn, draws: Draws, roulette: float
+    plan: Plan, state: PathState, surface: Surface, drawn: Drawn, draws: Draws, roulette: float | Tensor
 ) -> Continuation:
     """Return the throughput behind the surface and the mask of paths that go on: not black, and alive after roulette.
 
-    ``roulette``: upper bound of the survival probability; 0: no roulette at this vertex.
+    ``roulette``: upper bound of the survival probability; 0: no roulette at this vertex. A number, or a tensor ``(1,)``.
     """
     weight = drawn.weight
     if surface.perturbed_normal is not None:
@@ -314,7 +314,7 @@ def continue_paths(
     eta = state.eta
     if eta is not None and drawn.eta is not None:
         eta = eta * drawn.eta.detach()
-    if not roulette:
+    if not isinstance(roulette, Tensor) and not roulette:
         return Continuation(alive=alive, throughput=throughput, eta=eta, carried=throughput, chance=None)
     chance = survival_probability(plan.rr_prob, roulette, brightest, eta, tape=plan.tape)
     alive, survivors = russian_roulette(chance, draws, alive, throughput)

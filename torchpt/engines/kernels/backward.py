@@ -12,7 +12,7 @@ cotangents of the rays that left the vertex, and writes those of the rays that c
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -115,8 +115,10 @@ class _RecordedGathers:
         return [*(leaf for _, _, leaf in self.taken), *self.kernels.tape.leaves]
 
 
-def bounce_vjp(trace: Trace, model: int, roulette: float, follow_ray: bool) -> Sinks:
+def bounce_vjp(trace: Trace, model: int, roulette: float | None, follow_ray: bool) -> Sinks:
     """Pull cotangents back through the surfaces of a BSDF model, see :func:`torchpt.paths.adjoint.bounce_vjp`.
+
+    ``roulette``: see :meth:`torchpt.engines.kernels.layout.Trace.roulette`.
 
     Besides sinks, a VJP sets ``trace.sums``: for each table with gradients its number, the row of the index (-1: the gradient
     of the whole table comes from every lane), the first row of the values, and their number.
@@ -138,7 +140,7 @@ def bounce_vjp(trace: Trace, model: int, roulette: float, follow_ray: bool) -> S
 
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
-        context = kernels.taped.at(salts, follow_ray=follow_ray, roulette=roulette)
+        context = kernels.taped.at(salts, follow_ray=follow_ray, roulette=trace.roulette(roulette))
         vertex = VertexInput(state, hit)
         input_cotangents = adjoint.bounce_vjp(
             integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, gathers.leaves, of_splat
@@ -367,10 +369,30 @@ class VjpKernels(Kernels):
         if key in self.eager_vjps:
             return None
         try:
-            return self._get(key[0] != "rays", _STAGES[key[0]], *key[1:])  # all lanes of a chunk have a ray
+            return self._get(
+                key[0] != "rays", _STAGES[key[0]], *self._vjp_arguments(key)
+            )  # all lanes of a chunk have a ray
         except Unsupported as error:
             self.eager_vjps[key] = str(error)
             return None
+
+    def _vjp_arguments(self, key: tuple[Any, ...]) -> tuple[Any, ...]:
+        stage, *arguments = key
+        if stage == "bounce":
+            arguments[1] = self.bound(arguments[1])
+        return tuple(arguments)
+
+    def large_kernels(self) -> Iterator[tuple[bool, Callable[..., Sinks], tuple[Any, ...]]]:
+        """See :class:`torchpt.engines.kernels.programs.Kernels`."""
+        yield from super().large_kernels()
+        attached = self.taped.plan.attached  # then all hits follow their rays
+        keys: list[tuple[Any, ...]] = [("bounce", *key, attached) for key in self.bounces()]
+        if self.has_emitters:
+            keys.append(("emit", attached))
+        if self.has_environment:
+            keys.append(("escape",))
+        for key in keys:
+            yield True, _STAGES[key[0]], key[1:]
 
     def release(self, engines: Sequence[KernelsBackward]) -> None:
         """Keep the engines of threads for the next pass of the same structure, and drop what no other pass can use again.
@@ -499,7 +521,7 @@ class KernelsBackward(KernelsEngine):
         kernels, calls, depth = self.back, self.calls, paths.depth
         limits = self.wave.integrator.limits
         follow_ray = follows_ray(kernels.taped.plan, kernels.world, depth)
-        calls.set_dimensions(depth)
+        calls.set_dimensions(depth, roulette=limits.roulette(depth))
         if depth < limits.last:
             for model, count in enumerate(paths.groups):
                 if count:

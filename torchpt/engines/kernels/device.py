@@ -377,6 +377,7 @@ class DeviceCalls:
         self._look = LateCheck(self.cuda)
         self._prepared: dict[int, Arguments] = {}  # by id of the kernel, which they refer to
         self._salts: dict[tuple[int, int], Tensor] = {}
+        self._bounds: dict[float, Tensor] = {}
         self._uniforms = {"place": self.place.data_ptr()}
 
     def memory(self, rows: int) -> Any:
@@ -446,12 +447,15 @@ class DeviceCalls:
         """See :meth:`torchpt.engines.kernels.engine.Calls.set_chunk`."""
         self.place.copy_(self.cuda.to_device(torch.from_numpy(numbers)))
 
-    def set_dimensions(self, depth: int, step: int = 0) -> None:
+    def set_dimensions(self, depth: int, step: int = 0, roulette: float = 0.0) -> None:
         """See :meth:`torchpt.engines.kernels.engine.Calls.set_dimensions`."""
         known = self._salts.get((depth, step))
         if known is None:
             known = self._salts[depth, step] = self.cuda.to_device(salts(depth, torch.device("cpu"), step))
-        self._uniforms["salts"] = known.data_ptr()
+        bound = self._bounds.get(roulette)
+        if bound is None:
+            bound = self._bounds[roulette] = self.cuda.to_device(torch.tensor([roulette]))
+        self._uniforms |= {"salts": known.data_ptr(), "roulette": bound.data_ptr()}
 
     def run(
         self,

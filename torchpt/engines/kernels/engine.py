@@ -133,6 +133,7 @@ class Calls:
         self.slots = Memory(3)
         self._prepared: dict[int, Arguments] = {}  # by id of the kernel, which they refer to
         self._salts: dict[tuple[int, int], Any] = {}  # by depth and step
+        self._bounds: dict[float, np.ndarray] = {}  # of survival probabilities, as uniforms
         self._uniforms = {"place": self.place.ctypes.data}  # address of each uniform
 
     def unbind(self) -> None:
@@ -181,12 +182,18 @@ class Calls:
         """Set the chunk: int32 numbers, see :data:`torchpt.engines.kernels.stages.CHUNK_FIELDS`."""
         self.place[:] = numbers
 
-    def set_dimensions(self, depth: int, step: int = 0) -> None:
-        """Set the random dimensions of kernels to those of a vertex, and of a step of transmission before it."""
+    def set_dimensions(self, depth: int, step: int = 0, roulette: float = 0.0) -> None:
+        """Set the random dimensions of kernels to those of a vertex, and of a step of transmission before it.
+
+        ``roulette``: upper bound of the survival probability, for kernels that have it as an input.
+        """
         vertex_salts = self._salts.get((depth, step))
         if vertex_salts is None:
             vertex_salts = self._salts[depth, step] = salts(depth, torch.device("cpu"), step)
-        self._uniforms["salts"] = vertex_salts.data_ptr()
+        bound = self._bounds.get(roulette)
+        if bound is None:
+            bound = self._bounds[roulette] = np.array([roulette], np.float32)
+        self._uniforms |= {"salts": vertex_salts.data_ptr(), "roulette": bound.ctypes.data}
 
     def run(
         self,
@@ -684,7 +691,7 @@ class KernelsEngine:
         starts, total = calls.running_sums(paths.groups)
         after = self._begin(self.room(paths.depth + 1), paths.depth + 1, total)
         calls.clear()
-        calls.set_dimensions(paths.depth)
+        calls.set_dimensions(paths.depth, roulette=roulette)
         for model, (count, start) in enumerate(zip(paths.groups, starts, strict=True)):
             if not count:
                 continue

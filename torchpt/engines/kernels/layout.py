@@ -342,6 +342,10 @@ class Trace:
         """Return the salts of the vertex, hashes of its sampling dimensions, one for each :class:`Dimension`."""
         return self.uniform("salts", torch.zeros(len(Dimension), dtype=torch.int32))
 
+    def roulette(self, bound: float | None) -> float | Tensor:
+        """Return the upper bound of the survival probability; 0: no roulette at the vertex. None: an input ``(1,)``."""
+        return self.uniform("roulette", torch.zeros(1)) if bound is None else bound
+
     def state(self) -> tuple[PathState, dict[str, Tensor]]:
         """Return the path state, and rows that stages do not read but that are passed on: the filter ``weight``."""
         rows = self.layout.state

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -29,6 +31,7 @@ from torchpt.core.tree import fingerprint, named_leaves, signature
 from torchpt.engines.kernels import stages
 from torchpt.engines.kernels.layout import Layout, Trace
 from torchpt.engines.kernels.stages import kinds_of
+from torchpt.paths.roulette import DEEP
 from torchpt.paths.transmission import non_opaque
 
 if TYPE_CHECKING:
@@ -168,6 +171,11 @@ class KernelCache:
         self.tables = tables
         self._entries: dict[Any, _Entry] = {}
 
+    @property
+    def known(self) -> bool:
+        """Return True if a kernel was stored."""
+        return bool(self._entries)
+
     def find(self, key: Any, program: Program, leaves: NamedTensors) -> tuple[Kernel | None, Sequence[LaidOut | None]]:
         """Return the cached kernel of a stage, if it was made of the same program and tensors, and tables to make another of.
 
@@ -250,6 +258,20 @@ def program_of(
     return cache.program_of((key, structure), leaves.tensors, lambda: trace_stage(leaves, layout, build, listed))
 
 
+def prefetch_program(
+    key: tuple[Any, ...],
+    structure: Any,
+    leaves: NamedTensors,
+    layout: Layout,
+    build: Callable[[Trace], Sinks],
+    listed: bool,
+    processes: int,
+) -> None:
+    """Begin to compile the program of a stage in another process; arguments as for :func:`program_of`."""
+    trace = partial(trace_stage, leaves, layout, build, listed)
+    cache.prefetch((key, structure), leaves.tensors, trace, processes)
+
+
 def trace_stage(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> TracedStage:
     """Trace a stage; arguments as for :func:`program_of`."""
     # A number of lanes that divides no axis of a leaf: axes of lanes are told apart from those of tables by their length.
@@ -300,6 +322,10 @@ class Kernel:
 
     program: Program
     tables: Tables
+
+
+#: Models of a scene from which on their kernels have the bound of roulette as an input.
+MANY_MODELS = 3
 
 
 class Kernels(Layout):
@@ -403,7 +429,15 @@ class Kernels(Layout):
 
     def bounce(self, model: int, roulette: float) -> Kernel:
         """See :func:`torchpt.engines.kernels.stages.bounce`."""
-        return self._get(self.listed, stages.bounce, model, roulette)
+        return self._get(self.listed, stages.bounce, model, self.bound(roulette))
+
+    def bound(self, roulette: float) -> float | None:
+        """Return the bound of the survival probability that kernels are made for; None: it is an input of theirs.
+
+        With an input a model has one kernel, and not two with and without roulette, which then take twice the time to compile.
+        It costs some 2 % of a bounce where there is no roulette, so scenes of few models have two.
+        """
+        return None if self.models >= MANY_MODELS else roulette
 
     def terminate(self) -> Kernel:
         """See :func:`torchpt.engines.kernels.stages.terminate`."""
@@ -448,6 +482,51 @@ class Kernels(Layout):
         return self._get(False, stages.accumulate, channels, clamp)
 
     # -- compilation
+
+    def prefetch(self, processes: int) -> None:
+        """Begin to compile the large kernels that paths need in other processes, unless some were made before.
+
+        Kernels of models that no path hits are compiled in vain. ``processes``: most that run at a time.
+        """
+        if processes < 2 or not self.wave.integrator.light or self.kernel_cache.known:
+            return
+        start = time.perf_counter()
+        for listed, build, arguments in self.large_kernels():
+            with suppress(Unsupported):  # the call of the kernel will say so
+                prefetch_program(
+                    (build.__name__, *arguments),
+                    self.structure,
+                    self._leaves,
+                    self,
+                    lambda trace, build=build, arguments=arguments: build(trace, *arguments),
+                    listed,
+                    processes,
+                )
+        self.seconds += time.perf_counter() - start
+
+    def large_kernels(self) -> Iterator[tuple[bool, Callable[..., Sinks], tuple[Any, ...]]]:
+        """Yield the arguments of :meth:`_get` for the kernels that take long to compile, about in the order of their use."""
+        if self.fused:  # with a search inside
+            yield False, stages.generate, (False, self.wave.start_rays is not None)
+        if self.has_opacity:
+            yield True, stages.transmit, (False,)
+            yield False, stages.transmit, (True,)
+            yield False, stages.attenuate_shadow_rays, ()
+        if self.has_emitters:
+            yield True, stages.emit, ()
+        if self.has_environment:
+            yield True, stages.escape, ()
+        for key in self.bounces():
+            yield self.listed, stages.bounce, key
+
+    def bounces(self) -> Iterator[tuple[int, float | None]]:
+        """Yield model and bound of roulette of the kernels of surfaces, about in the order of their use."""
+        limits = self.wave.integrator.limits
+        depths = range(1, min(limits.last, DEEP + 2))
+        for bound in dict.fromkeys(self.bound(limits.roulette(depth)) for depth in depths):
+            for model in range(self.models):
+                if model not in self.eager:
+                    yield model, bound
 
     def _get(self, listed: bool, build: Callable[..., Sinks], *arguments: Any) -> Kernel:
         """Return the kernel that ``build(trace, *arguments)`` traces, compiled when it is first asked for.

@@ -239,17 +239,17 @@ def terminate(trace: Trace) -> Sinks:
     return Sinks(scatter=[trace.ended(_ALL_LANES, state.lane, state.radiance, passthrough)])
 
 
-def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
+def bounce(trace: Trace, model: int, roulette: float | None) -> Sinks:
     """Run the stage of surfaces of one BSDF model, and store the paths that go on.
 
-    ``model``: index of the BSDF model. ``roulette``: upper bound of the survival probability; 0: no roulette at this vertex.
+    ``model``: index of the BSDF model. ``roulette``: see :meth:`torchpt.engines.kernels.layout.Trace.roulette`.
     """
     layout, tracer = trace.layout, trace.tracer
     salts = trace.salts()
     state, passthrough = trace.state()
     hit = trace.hit()
     with tracer:
-        context = layout.wave.context.at(salts, roulette=roulette)
+        context = layout.wave.context.at(salts, roulette=trace.roulette(roulette))
         output = layout.wave.bounce(context, model, VertexInput(state, hit))
         check_output(layout.wave.integrator, output)
     after, shadow = output.leaving, output.shadow

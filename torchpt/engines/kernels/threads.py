@@ -148,6 +148,7 @@ class KernelsForward:
         Returns:
             True if all samples were rendered.
         """
+        self.kernels.prefetch(self.budget.threads)
         return self.take(self.blocks(spans, self.budget.threads * TASKS), each)
 
     def blocks(self, spans: Sequence[tuple[PixelSet, int, int]], tasks: int) -> list[Block]:

@@ -1,0 +1,106 @@
+"""Processes that compile for this one: the same code, and no code where they die or cannot run."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchpt
+from torchpt.compiler import cache as programs
+from torchpt.compiler import cpu
+from torchpt.native import cache, compilers, machine
+from torchpt.native.codegen import Job, compile_job
+
+IR = """
+define void @kernel(i8* %words, i64 %count) {
+  ret void
+}
+"""
+
+#: Code of the tests: kernels that outlast them are called by their addresses.
+ALIVE: list[dict[str, cpu.Function]] = []
+
+
+def job(ir: str = IR) -> Job:
+    return Job(ir, *machine.host(), None, False)
+
+
+@pytest.fixture(autouse=True)
+def ended():
+    yield
+    compilers._end()
+
+
+def test_the_code_is_that_of_this_process():
+    futures = [compilers.submit(job(IR.replace("kernel", f"kernel{k}")), 2) for k in range(4)]
+    for k, future in enumerate(futures):
+        assert future is not None
+        assert future.result(60) == compile_job(job(IR.replace("kernel", f"kernel{k}")))
+
+
+def test_one_thread_needs_no_process():
+    assert compilers.submit(job(), 1) is None
+
+
+def test_a_program_with_an_interpreter_inside_is_not_started(monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/usr/bin/blender")
+    assert compilers.submit(job(), 2) is None
+
+
+@pytest.mark.parametrize("executable", ["python-that-is-not-there", None])
+def test_no_code_where_the_process_ends(monkeypatch, executable):
+    """It cannot be started, or LLVM does not take the module, which ends it."""
+    if executable is not None:
+        monkeypatch.setattr(sys, "executable", executable)
+    future = compilers.submit(job("no module"), 2)
+    assert future is not None and future.result(60) is None
+    monkeypatch.undo()
+    again = compilers.submit(job(), 2)
+    assert again is not None and again.result(60) == compile_job(job())
+
+
+def test_processes_end_when_nothing_is_left(monkeypatch):
+    monkeypatch.setattr(compilers, "IDLE", 0.05)
+    future = compilers.submit(job(), 2)
+    assert future is not None and future.result(60) is not None
+    end = time.monotonic() + 60
+    while compilers._compilers and time.monotonic() < end:
+        time.sleep(0.02)
+    assert not compilers._compilers
+
+
+def test_a_render_has_the_same_bits(monkeypatch, tmp_path):
+    """With nothing in caches, by two processes and by this one; all code of the first is of other processes."""
+    monkeypatch.setattr(cache, "_folder", lambda: tmp_path)
+    wish = {
+        "film": {"width": 16, "height": 12},
+        "spp": 2,
+        "integrator": {"type": "path", "max_depth": 8},
+        "compile": "on",
+    }
+    pictures, here = [], []
+    monkeypatch.setattr(cpu, "compile_job", lambda job: here.append(job.ir) or compile_job(job))
+    for threads in (2, 1):
+        programs.clear_programs()
+        ALIVE.append({})
+        monkeypatch.setattr(cpu, "_functions", ALIVE[-1])
+        for path in tmp_path.iterdir():
+            path.unlink()
+        here.clear()
+        pictures.append(torchpt.render(torchpt.load("cornell_box", "cpu"), threads=threads, **wish))
+        assert (max(map(len, here)) > 100_000) == (threads == 1)  # small ones are compiled where they are needed
+    assert torch.equal(*pictures)
+    programs.clear_programs()
+
+
+def test_the_program_imports_nothing_of_the_package():
+    """Torch would take a second."""
+    import torchpt.native.codegen as codegen
+
+    assert "torchpt" not in Path(codegen.__file__).read_text().split('"""', 2)[2].replace(
+        "torchpt.native.compilers", ""
+    )
