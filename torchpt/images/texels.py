@@ -41,10 +41,21 @@ class Texels:
         values: ``(H, W, C)`` float32, row 0 at the top, as stored; integer formats are scaled to 0..1. C is 1 (grey),
             2 (grey, alpha), 3 or 4 (RGB, alpha).
         eight_bit: True: stored with at most 8 bits a value, so colours are sRGB-encoded by convention.
+        white: largest value of the integers that were stored; None: floats.
     """
 
     values: NDArray[np.float32]
     eight_bit: bool
+    white: int | None = None
+
+    def linear(self, channels: int) -> NDArray[np.float32]:
+        """Return the first channels, decoded from sRGB; values of 8 bits by a table."""
+        values = self.values[..., :channels]
+        if self.white is None or self.white > 255:
+            return srgb_to_linear(torch.from_numpy(np.ascontiguousarray(values))).numpy()
+        numbers = np.arange(self.white + 1, dtype=np.float32) / np.float32(self.white)
+        table = srgb_to_linear(torch.from_numpy(numbers)).numpy()
+        return table[np.rint(values * np.float32(self.white)).astype(np.uint8)]
 
 
 def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MAX_PIXELS) -> Texels:
@@ -71,7 +82,7 @@ def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MA
             raise AssetError(label, f"holds a value that is not finite (row {bad[0]})")
     else:
         scaled /= np.float32(pixels.white)
-    return Texels(scaled, eight_bit=pixels.eight_bit)
+    return Texels(scaled, pixels.eight_bit, None if values.dtype.kind == "f" else int(pixels.white))
 
 
 def texels_from_array(value: Any) -> Texels:
@@ -96,9 +107,10 @@ def texels_from_array(value: Any) -> Texels:
     bad = np.flatnonzero(~np.isfinite(values).all(axis=(1, 2)))
     if len(bad):
         raise Refused(ACCEPTED_TEXELS, f"a value that is not finite (row {bad[0]})")
-    if array.dtype in (np.uint8, np.uint16):
-        values /= np.float32(np.iinfo(array.dtype).max)
-    return Texels(values, eight_bit=array.dtype == np.uint8)
+    white = int(np.iinfo(array.dtype).max) if array.dtype in (np.uint8, np.uint16) else None
+    if white is not None:
+        values /= np.float32(white)
+    return Texels(values, array.dtype == np.uint8, white)
 
 
 def texels_to_radiance(texels: Texels, source: str, key: str) -> NDArray[np.float32]:
@@ -112,9 +124,10 @@ def texels_to_radiance(texels: Texels, source: str, key: str) -> NDArray[np.floa
     Raises:
         Refused: a negative value.
     """
-    values = texels.values[..., :3] if texels.values.shape[2] >= 3 else texels.values[..., :1].repeat(3, 2)
-    if texels.eight_bit:
-        values = srgb_to_linear(torch.from_numpy(np.ascontiguousarray(values))).numpy()
+    channels = 3 if texels.values.shape[2] >= 3 else 1
+    values = texels.linear(channels) if texels.eight_bit else texels.values[..., :channels]
+    if channels == 1:
+        values = values.repeat(3, 2)
     if values.min() < 0:
         raise Refused(f"numbers >= 0 in the texels of {source}", float(values.min()), (key,))
     return np.ascontiguousarray(values)

@@ -14,7 +14,6 @@ import torch
 
 from torchpt.core.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, Texels, read_texels
-from torchpt.images.colour import srgb_to_linear
 from torchpt.images.decode import MAX_PIXELS
 from torchpt.images.texels import ACCEPTED_TEXELS, check_source, texels_from_array
 from torchpt.physics.textures.atlas import WRAPS, ImageNode
@@ -179,6 +178,6 @@ def _decoded(opening: Opening, label: str, picture: Texels) -> np.ndarray:
         values = picture.values.copy()
         # The last of 2 or 4 channels is alpha.
         colours = values.shape[2] - (1 if values.shape[2] in (2, 4) else 0)
-        values[..., :colours] = srgb_to_linear(torch.from_numpy(values[..., :colours])).numpy()
+        values[..., :colours] = picture.linear(colours)
         opening.image_cache[key] = values
     return opening.image_cache[key]
