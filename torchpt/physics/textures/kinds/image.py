@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 
 from torchpt.core.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, Texels, read_texels
