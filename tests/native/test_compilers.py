@@ -97,6 +97,52 @@ def test_a_render_has_the_same_bits(monkeypatch, tmp_path):
     programs.clear_programs()
 
 
+@pytest.fixture
+def empty(monkeypatch, tmp_path):
+    """Caches without code; returns the folder of that on disk."""
+    monkeypatch.setattr(cache, "_folder", lambda: tmp_path)
+    ALIVE.append({})
+    monkeypatch.setattr(cpu, "_functions", ALIVE[-1])
+    monkeypatch.setitem(cpu._state, "processes", 2)
+    return tmp_path
+
+
+def wait_for(there):
+    end = time.monotonic() + 60
+    while not there() and time.monotonic() < end:
+        time.sleep(0.01)
+    assert there()
+
+
+def test_quick_code_is_replaced(empty):
+    assert cpu.begin(IR)
+    function = cpu.compile_ir(IR)
+    quick, call = function.code, function.call
+    call(0, 0)
+    wait_for(lambda: function.call is not call)
+    function.call(0, 0)
+    call(0, 0)  # its code is still there
+    cpu.wait_for_final_code()
+    assert function.code == compile_job(job()) and quick == compile_job(job()._replace(quick=True))
+    assert sorted(path.suffix for path in empty.iterdir()) == [".o", ".quick"]
+
+
+def test_quick_code_of_an_earlier_process_is_replaced(empty, monkeypatch):
+    """That process has ended before the final code was there."""
+    assert cpu.begin(IR)
+    function = cpu.compile_ir(IR)
+    wait_for(lambda: len(list(empty.iterdir())) == 2)
+    (empty / f"{function.key}.o").unlink()
+    ALIVE.append({})
+    monkeypatch.setattr(cpu, "_functions", ALIVE[-1])
+    monkeypatch.setitem(cpu._state, "processes", 1)
+    assert cpu.load_function(function.key) is None  # no other process may compile: it is compiled here, at once
+    monkeypatch.setitem(cpu._state, "processes", 2)
+    again = cpu.load_function(function.key)
+    assert again is not None and again is not function
+    wait_for(lambda: (empty / f"{function.key}.o").exists())
+
+
 def test_the_program_imports_nothing_of_the_package():
     """Torch would take a second."""
     import torchpt.native.codegen as codegen

@@ -227,7 +227,6 @@ def prefetch(
     structure: Any,
     tensors: Mapping[str, Tensor],
     trace: Callable[[], TracedStage],
-    processes: int,
     target: Target | None = None,
 ) -> None:
     """Trace a stage and begin to compile it in another process, for a later :func:`program_of`, if its program is not there.
@@ -236,7 +235,6 @@ def prefetch(
         structure: as for :func:`program_of`, and so are the others.
         tensors: see there.
         trace: see there.
-        processes: most that run at a time.
         target: see there.
 
     Raises:
@@ -253,7 +251,7 @@ def prefetch(
             return
         stage = trace()
         ir = kernel_ir(stage, (target or cpu.host()).form)
-        if cpu.begin(ir, target, processes):
+        if cpu.begin(ir, target):
             _begun[key] = Program.of(stage, cpu.NOT_COMPILED), ir
 
 

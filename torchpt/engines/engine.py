@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import torch
 from torch import Tensor
 
+from torchpt.compiler.cpu import wait_for_final_code
 from torchpt.core.memory import Budget, Span
 from torchpt.core.threads import thread_count
 from torchpt.engines import work
@@ -52,6 +53,7 @@ __all__ = [
     "radiance",
     "seen",
     "trace",
+    "wait_for_final_code",
     "weighted_radiance",
     "why_no_kernels",
 ]

@@ -1,9 +1,9 @@
 """The cache of kernels on disk: a folder of limited size.
 
 An entry is a file. Its name is a digest of the code that it was compiled from, so all checkouts and processes of a user share
-the folder. Its suffix says what it holds: ``.o`` object code, ``.ptx`` code for a GPU, ``.json`` digests of source files
-(:mod:`torchpt.native.content`) or checks of a GPU. Entries are executed, so only the user may access the folder (mode 0700,
-owner checked), and each entry has a checksum. Without such a folder nothing is cached.
+the folder. Its suffix says what it holds: ``.o`` object code, ``.quick`` quick code and its IR, ``.ptx`` code for a GPU,
+``.json`` digests of source files (:mod:`torchpt.native.content`) or checks of a GPU. Entries are executed, so only the user
+may access the folder (mode 0700, owner checked), and each entry has a checksum. Without such a folder nothing is cached.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _CHECKSUM_BYTES = 32
 _UNFINISHED = "unfinished-"
 #: Names of files that this module may remove, since the folder may hold other files, such as the results of
 #: device checks, which are few and stay. Earlier versions wrote ``.nbc``.
-_OURS = re.compile(rf"[0-9a-f]{{{_KEY_DIGITS}}}\.(o|json|nbc|ptx)|{_UNFINISHED}.*")
+_OURS = re.compile(rf"[0-9a-f]{{{_KEY_DIGITS}}}\.(o|json|nbc|ptx|quick)|{_UNFINISHED}.*")
 
 
 def digest(*texts: str) -> str:

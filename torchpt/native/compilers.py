@@ -7,6 +7,7 @@ dies, is left to the caller.
 from __future__ import annotations
 
 import atexit
+import itertools
 import json
 import os
 import queue
@@ -28,7 +29,9 @@ IDLE = 1.0
 MOST = 16
 
 _lock = threading.Lock()
-_jobs: queue.SimpleQueue[tuple[Future[bytes | None], Job]] = queue.SimpleQueue()
+#: Quick jobs first; the number keeps the order of the others.
+_jobs: queue.PriorityQueue[tuple[bool, int, Future[bytes | None], Job]] = queue.PriorityQueue()
+_numbers = itertools.count()
 _compilers: set[_Compiler] = set()
 
 
@@ -42,7 +45,7 @@ class _Compiler:
     def _serve(self) -> None:
         while True:
             try:
-                future, job = _jobs.get(timeout=IDLE)
+                _, _, future, job = _jobs.get(timeout=IDLE)
             except queue.Empty:
                 with _lock:
                     if _jobs.empty():
@@ -108,7 +111,7 @@ def submit(job: Job, most: int) -> Future[bytes | None] | None:
         return None
     future: Future[bytes | None] = Future()
     with _lock:
-        _jobs.put((future, job))
+        _jobs.put((not job.quick, next(_numbers), future, job))
         if len(_compilers) < min(most, MOST):
             _compilers.add(_Compiler())
     return future
@@ -130,7 +133,7 @@ def _end() -> None:
 def _after_fork() -> None:
     """Forget the processes, which are the parent's, and its jobs."""
     global _lock, _jobs
-    _lock, _jobs = threading.Lock(), queue.SimpleQueue()
+    _lock, _jobs = threading.Lock(), queue.PriorityQueue()
     _compilers.clear()
 
 

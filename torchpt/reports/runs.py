@@ -19,6 +19,7 @@ from torch import Tensor
 from torchpt.core.errors import AssetError, OutputError, SceneError
 from torchpt.core.tree import fingerprint
 from torchpt.core.version import __version__
+from torchpt.engines.engine import wait_for_final_code
 from torchpt.images import colour, read_image, read_layers, write_image
 from torchpt.images.denoiser import check_denoiser, denoiser_version
 from torchpt.images.metrics import relative
@@ -450,6 +451,7 @@ def measure(
             if job is not latest:  # other settings: warm up, so that caches are filled
                 _swap_kernels(latest, job)
                 warm_up = _render(job, min(study.options["spp"][0], spp), seed, progress, counts=False)
+                wait_for_final_code()
                 if not progress.stop:
                     _denoise(job, warm_up)  # the first call takes longer
                 latest = job

@@ -20,7 +20,6 @@ import ctypes
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import accumulate
 from typing import Any, ClassVar, cast
 
@@ -231,7 +230,8 @@ class Calls:
         search = self.kernels.search
         arguments = Arguments(kernel, CAPACITY, 0 if search is None else ctypes.addressof(search))
         arguments.words[WORD["counters"]] = self.counters.ctypes.data
-        arguments.function = partial(kernel.program.call, ctypes.addressof(arguments.words))
+        function, address = kernel.program.function, ctypes.addressof(arguments.words)
+        arguments.function = lambda count: function.call(address, count)  # quick code may be replaced
         return arguments
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.compiler import cache, operators  # noqa: F401  (the operators register how they are lowered)
+from torchpt.compiler import cache, cpu, operators  # noqa: F401  (the operators register how they are lowered)
 from torchpt.compiler.graph import Unsupported
 from torchpt.compiler.packet import PacketSearch
 from torchpt.compiler.program import LaidOut, Program, Tables, TracedStage, bind_tables
@@ -265,11 +265,10 @@ def prefetch_program(
     layout: Layout,
     build: Callable[[Trace], Sinks],
     listed: bool,
-    processes: int,
 ) -> None:
     """Begin to compile the program of a stage in another process; arguments as for :func:`program_of`."""
     trace = partial(trace_stage, leaves, layout, build, listed)
-    cache.prefetch((key, structure), leaves.tensors, trace, processes)
+    cache.prefetch((key, structure), leaves.tensors, trace)
 
 
 def trace_stage(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> TracedStage:
@@ -486,11 +485,13 @@ class Kernels(Layout):
     def prefetch(self, processes: int) -> None:
         """Begin to compile the large kernels that paths need in other processes, unless some were made before.
 
-        Kernels of models that no path hits are compiled in vain. ``processes``: most that run at a time.
+        Kernels of models that no path hits are compiled in vain. They begin with quick code, which the final one replaces.
+        ``processes``: most that run at a time.
         """
         if processes < 2 or not self.wave.integrator.light or self.kernel_cache.known:
             return
         start = time.perf_counter()
+        cpu.allow(processes)
         for listed, build, arguments in self.large_kernels():
             with suppress(Unsupported):  # the call of the kernel will say so
                 prefetch_program(
@@ -500,7 +501,6 @@ class Kernels(Layout):
                     self,
                     lambda trace, build=build, arguments=arguments: build(trace, *arguments),
                     listed,
-                    processes,
                 )
         self.seconds += time.perf_counter() - start
 
