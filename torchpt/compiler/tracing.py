@@ -8,6 +8,7 @@ for other tables of the same shapes: a kernel reads tables from memory and does 
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -386,13 +387,18 @@ def _with_valid_indices(name: str, args: Any) -> Any:
 
 def _files_on_stack() -> tuple[str, ...]:
     """Return the package's files on the stack, innermost first, without those of the lane compiler."""
-    files: list[str] = []
+    files: dict[str, None] = {}
     frame: Any = sys._getframe(2)  # the caller of __torch_dispatch__
     while frame is not None:
-        name = frame.f_code.co_filename
-        if name.startswith(_PACKAGE):
-            name = name[len(_PACKAGE) :]
-            if not name.startswith("compiler") and name not in files:
-                files.append(name)
+        name = _file_of_package(frame.f_code.co_filename)
+        if name:
+            files[name] = None
         frame = frame.f_back
     return tuple(files)
+
+
+@functools.cache
+def _file_of_package(path: str) -> str:
+    """Return the path of a file of the package within it; empty for other files, and for those of the lane compiler."""
+    name = path.removeprefix(_PACKAGE)
+    return "" if name == path or name.startswith("compiler") else name

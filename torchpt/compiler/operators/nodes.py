@@ -32,11 +32,11 @@ def apply(tracer: Tracer, out: Tensor, function: Nodes, *operands: Any) -> None:
     arrays = [
         tracer.get(x).nodes if isinstance(x, Tensor) else np.array(_constant_node(graph, x), object) for x in operands
     ]
-    shape = np.broadcast_shapes(*(nodes.shape for nodes in arrays))
-    arrays = [np.broadcast_to(nodes, shape) for nodes in arrays]
+    shapes = {nodes.shape for nodes in arrays}
+    shape = np.broadcast_shapes(*shapes) if len(shapes) > 1 else shapes.pop()
+    flat = [(nodes if nodes.shape == shape else np.broadcast_to(nodes, shape)).flat for nodes in arrays]
     result = np.empty(shape, object)
-    for entry in np.ndindex(*shape):
-        result[entry] = function(*(nodes[entry] for nodes in arrays))
+    result.flat = [function(*given) for given in zip(*flat, strict=True)]
     tracer.put(out, result)
 
 
