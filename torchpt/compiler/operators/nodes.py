@@ -36,7 +36,9 @@ def apply(tracer: Tracer, out: Tensor, function: Nodes, *operands: Any) -> None:
     shape = np.broadcast_shapes(*shapes) if len(shapes) > 1 else shapes.pop()
     flat = [(nodes if nodes.shape == shape else np.broadcast_to(nodes, shape)).flat for nodes in arrays]
     result = np.empty(shape, object)
-    result.flat = [function(*given) for given in zip(*flat, strict=True)]
+    entries = result.reshape(-1)  # a view
+    for k, given in enumerate(zip(*flat, strict=True)):
+        entries[k] = function(*given)
     tracer.put(out, result)
 
 
