@@ -88,8 +88,8 @@ def compile_ir(ir: str, target: Target | None = None) -> Function:
                 _state["loaded"] += 1
                 function = _loaded(code, target, key)
             else:
-                _state["compiled"] += 1
                 function = _compiled_by_others(key, ir, target) or _compiled(key, ir, target)
+                _state["compiled"] += 1
             _functions[key] = function
         return function
 
