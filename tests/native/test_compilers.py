@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 import time
 from pathlib import Path
@@ -141,6 +142,22 @@ def test_quick_code_of_an_earlier_process_is_replaced(empty, monkeypatch):
     again = cpu.load_function(function.key)
     assert again is not None and again is not function
     wait_for(lambda: (empty / f"{function.key}.o").exists())
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Python's, of a fork beside threads
+def test_a_forked_child_does_not_wait_for_compilers_of_its_parent(empty, monkeypatch):
+    monkeypatch.setattr(compilers, "_Compiler", object)  # none that would do the job
+    assert cpu.begin(IR)
+    context = multiprocessing.get_context("fork")
+    made = context.Queue()
+    child = context.Process(target=lambda: made.put(cpu.compile_ir(IR).code))
+    child.start()
+    assert made.get(timeout=60) == compile_job(job())
+    child.join()
+    cpu._pending.clear()
+    compilers._compilers.clear()
+    compilers._end()
 
 
 def test_the_program_imports_nothing_of_the_package():

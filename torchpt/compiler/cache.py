@@ -215,12 +215,17 @@ def program_of(
             program = compile_stage(trace(), target)
             if disk_key is not None:
                 store(disk_key, program)
-        if _programs.get(key) is not program:  # put last, as the newest
-            _programs.pop(key, None)
-            _programs[key] = program
-            if len(_programs) > MOST_PROGRAMS:
-                del _programs[next(iter(_programs))]
+        if _programs.get(key) is not program:
+            _keep(key, program)
         return program
+
+
+def _keep(key: Any, program: Program) -> None:
+    """Store a program in memory as the newest; the oldest goes if there are too many."""
+    _programs.pop(key, None)
+    _programs[key] = program
+    if len(_programs) > MOST_PROGRAMS:
+        del _programs[next(iter(_programs))]
 
 
 def prefetch(
@@ -247,7 +252,7 @@ def prefetch(
             return
         program = load(disk_key, target)
         if program is not None:
-            _programs[key] = program
+            _keep(key, program)
             return
         stage = trace()
         ir = kernel_ir(stage, (target or cpu.host()).form)

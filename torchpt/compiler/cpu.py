@@ -6,6 +6,7 @@ Code is cached in memory and on disk; its key is a hash of the IR, the target an
 from __future__ import annotations
 
 import ctypes
+import os
 import threading
 import zlib
 from concurrent.futures import Future, wait
@@ -166,6 +167,18 @@ def _replace(function: Function, target: Target, done: Future[bytes | None]) -> 
         final = _loaded(code, target, function.key)
         function.engine = function.engine, final.engine
         function.call, function.code = final.call, code
+
+
+def _after_fork() -> None:
+    """Forget what the parent's compilers make, which never arrives in a forked child."""
+    global _lock
+    _lock = threading.Lock()  # another thread may have held the old one
+    _pending.clear()
+    _improving.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def wait_for_final_code() -> None:

@@ -54,7 +54,7 @@ class _Compiler:
                 continue
             try:
                 code = self._compile(job)
-            except OSError:
+            except (OSError, ValueError):  # ValueError: the pipes were closed, as this process exits
                 self.close()
                 code = None
             future.set_result(code)
@@ -124,6 +124,10 @@ def _is_python() -> bool:
 
 def _end() -> None:
     """End all processes: this one exits."""
+    with suppress(queue.Empty):
+        while True:  # so that no thread starts a process again
+            _, _, future, _ = _jobs.get_nowait()
+            future.set_result(None)
     with _lock:
         compilers = list(_compilers)
     for compiler in compilers:

@@ -258,19 +258,6 @@ def program_of(
     return cache.program_of((key, structure), leaves.tensors, lambda: trace_stage(leaves, layout, build, listed))
 
 
-def prefetch_program(
-    key: tuple[Any, ...],
-    structure: Any,
-    leaves: NamedTensors,
-    layout: Layout,
-    build: Callable[[Trace], Sinks],
-    listed: bool,
-) -> None:
-    """Begin to compile the program of a stage in another process; arguments as for :func:`program_of`."""
-    trace = partial(trace_stage, leaves, layout, build, listed)
-    cache.prefetch((key, structure), leaves.tensors, trace)
-
-
 def trace_stage(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> TracedStage:
     """Trace a stage; arguments as for :func:`program_of`."""
     # A number of lanes that divides no axis of a leaf: axes of lanes are told apart from those of tables by their length.
@@ -488,20 +475,15 @@ class Kernels(Layout):
         Kernels of models that no path hits are compiled in vain. They begin with quick code, which the final one replaces.
         ``processes``: most that run at a time.
         """
+        cpu.allow(processes)
         if processes < 2 or not self.wave.integrator.light or self.kernel_cache.known:
             return
         start = time.perf_counter()
-        cpu.allow(processes)
         for listed, build, arguments in self.large_kernels():
+            traced = partial(_with_arguments, build, arguments)
+            trace = partial(trace_stage, self._leaves, self, traced, listed)
             with suppress(Unsupported):  # the call of the kernel will say so
-                prefetch_program(
-                    (build.__name__, *arguments),
-                    self.structure,
-                    self._leaves,
-                    self,
-                    lambda trace, build=build, arguments=arguments: build(trace, *arguments),
-                    listed,
-                )
+                cache.prefetch(((build.__name__, *arguments), self.structure), self._leaves.tensors, trace)
         self.seconds += time.perf_counter() - start
 
     def large_kernels(self) -> Iterator[tuple[bool, Callable[..., Sinks], tuple[Any, ...]]]:
@@ -548,10 +530,7 @@ class Kernels(Layout):
     def _make(
         self, key: tuple[Any, ...], listed: bool, build: Callable[..., Sinks], arguments: tuple[Any, ...]
     ) -> Kernel:
-        def traced(trace: Any) -> Sinks:
-            return build(trace, *arguments)
-
-        program = self._program(key, listed, traced)
+        program = self._program(key, listed, partial(_with_arguments, build, arguments))
         cached, kept = self.kernel_cache.find(key, program, self._leaves)
         if cached is not None:
             return cached
@@ -580,6 +559,10 @@ class Kernels(Layout):
             kept=kept,
             in_order=program.in_order,
         )
+
+
+def _with_arguments(build: Callable[..., Sinks], arguments: tuple[Any, ...], trace: Trace) -> Sinks:
+    return build(trace, *arguments)
 
 
 K = TypeVar("K", bound=Kernels)
