@@ -190,7 +190,7 @@ def test_a_misspelt_scene_gets_a_suggestion(
 
 
 LATER: dict[str, tuple[dict[str, Any], str]] = {
-    "integrator": (scene(integrator={"type": "bdpt"}), "integrator.type"),
+    "integrator": (scene(integrator={"type": "vcm"}), "integrator.type"),
 }
 
 

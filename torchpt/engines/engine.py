@@ -147,7 +147,10 @@ def kernels_of(
     """
     packets = uses_packets(wave)
     make = partial(Kernels, wave, packets, before=before, fixed=not own, caches=caches)
-    return probed_kernels(wave, own, packets, make)
+    kernels = probed_kernels(wave, own, packets, make)
+    if wave.light_paths is not None:
+        kernels.light_paths = kernels_of(wave.light_paths, own, None if before is None else before.light_paths, caches)
+    return kernels
 
 
 def forward_kernels(kernels: Kernels, threads: int | None = None, strict: bool = False) -> Tasks:

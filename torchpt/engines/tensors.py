@@ -133,7 +133,9 @@ class TensorsEngine:
     def _clear(self, lanes: int) -> None:
         """Set the radiance of ``lanes`` samples to zero."""
         self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=self.wave.centre.device)
-        self.lost = torch.zeros_like(self.radiance[0], dtype=torch.bool) if self.wave.integrator.splats else None
+        self.lost = (
+            torch.zeros_like(self.radiance[0], dtype=torch.bool) if self.wave.integrator.splats_at_surfaces else None
+        )
 
     def spawn(self, state: PathState) -> Paths:
         """Return the population of paths that start with rays."""
@@ -232,7 +234,9 @@ class TensorsEngine:
         follow_ray = follows_ray(self.plan, self.world, paths.depth)
         salt = salts(paths.depth, paths.state.lane.device)
         search = partial(self.hits, depth=paths.depth + 1)
-        return self.context.at(salt, follow_ray=follow_ray, roulette=roulette, search=search)
+        first = paths.depth == 1 and self.wave.integrator.starts_on_lights
+        start_salts = salts(0, paths.state.lane.device) if first else None
+        return self.context.at(salt, follow_ray, roulette, search, start_salts)
 
     def _input(self, paths: Paths, index: Tensor) -> VertexInput:
         return VertexInput(rows(paths.state, index), rows(paths.hits, index))

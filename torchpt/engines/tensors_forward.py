@@ -110,6 +110,9 @@ def _computed_piece(wave: Wave, pixel_set: PixelSet, span: Span) -> Piece:
     if wave.integrator.light:
         splats: list[Splats] = []
         radiance = tensors.weighted_radiance(wave, wave.rays(*span, pixel_set), piece.tally, splats=splats)
+        if wave.light_paths is not None:  # their radiance is 0, or NaN where a splat is not finite
+            starts = wave.light_paths.rays(*span, pixel_set)
+            radiance = radiance + tensors.trace(wave.light_paths, starts, piece.tally, splats=splats)
         radiance = radiance.view(3, samples, pixels)
         finite = torch.isfinite(radiance).all(0)
         if not bool(finite.all()):

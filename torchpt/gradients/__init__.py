@@ -78,6 +78,9 @@ def gradients(
     if attached and integrator.has_own_transmit:
         expected = "one without a transmit of its own, where geometry is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)
+    if integrator.light_walk() is not None:
+        expected = "one without light paths where gradients are asked for, such as path"
+        raise NotBuiltError("integrator.type", integrator.name, expected)
     if (attached or film_space) and integrator.splats:
         expected = "one whose samples light their own pixels alone, where geometry or the camera is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)

@@ -25,6 +25,7 @@ from torchpt.physics.world import World
 if TYPE_CHECKING:
     from torchpt.paths.surface import Surface
     from torchpt.physics.cameras import Camera
+    from torchpt.physics.film import Filter
 
 __all__ = [
     "EXTRA",
@@ -169,8 +170,11 @@ class StageContext:
         follow_ray: True: hit points are intersected anew along their rays, see :func:`torchpt.physics.shapes.interact`.
         roulette: upper bound of the survival probability; 0: no roulette at this vertex. A tensor ``(1,)`` in kernels for any.
         search: returns the hits of rays that leave; called only where ``plan.attached``.
-        camera: the camera of the picture; None for an integrator without splats.
+        camera: the camera of the picture; None outside :meth:`torchpt.paths.integrators.base.Integrator.generate` for an
+            integrator without splats.
+        filter: the reconstruction filter; None as above.
         crop: ``(x, y, width, height)`` of the picture on the camera's film, in pixels; None for an integrator without splats.
+        start_salts: salts of depth 0, at the first vertex of a path that started on a light; None elsewhere.
     """
 
     plan: Plan
@@ -182,6 +186,8 @@ class StageContext:
     roulette: float | Tensor = 0.0
     search: Callable[[PathState], Hit] = no_search
     camera: Camera | None = None
+    filter: Filter | None = None
+    start_salts: Tensor | None = None
     crop: tuple[int, int, int, int] | None = None
 
     def at(
@@ -190,9 +196,12 @@ class StageContext:
         follow_ray: bool = False,
         roulette: float | Tensor = 0.0,
         search: Callable[[PathState], Hit] = no_search,
+        start_salts: Tensor | None = None,
     ) -> StageContext:
         """Return the context of one vertex: a copy with its dimensions, bound of roulette and search."""
-        return replace(self, salts=salts, follow_ray=follow_ray, roulette=roulette, search=search)
+        return replace(
+            self, salts=salts, follow_ray=follow_ray, roulette=roulette, search=search, start_salts=start_salts
+        )
 
 
 @dataclass(frozen=True)

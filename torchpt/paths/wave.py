@@ -17,7 +17,6 @@ from torch import Tensor
 from torchpt.math.vectors import take
 from torchpt.paths.integrators.base import Integrator
 from torchpt.paths.state import PathState, StageContext, VertexInput, VertexOutput
-from torchpt.paths.vertex import generate
 from torchpt.physics import lights
 from torchpt.physics.cameras import Camera
 from torchpt.physics.film import Film, Filter, filter_of
@@ -112,7 +111,8 @@ class Wave:
             :attr:`torchpt.scene.space.Space.shift` returns it: lanes count from there, so that float32 is exact enough. Only
             the layer of positions adds it.
         first_surface: shading of first surfaces, of an integrator that stops there; None: paths go on.
-        start_rays: rays that paths start with; None: camera rays.
+        start_rays: rays that paths start with; None: those of :meth:`Integrator.generate`.
+        light_paths: the wave of light paths that are traced beside the samples, one for each; None: there are none.
     """
 
     context: StageContext
@@ -125,6 +125,7 @@ class Wave:
     centre: Tensor
     first_surface: FirstSurface | None = None
     start_rays: Rays | None = None
+    light_paths: Wave | None = None
 
     @property
     def bounce(self) -> Bounce:
@@ -173,7 +174,12 @@ class Wave:
         key = self.sampler.key(pixel, sample, randomizations)
         x, y = x.to(self.context.plan.dtype), y.to(self.context.plan.dtype)
         camera_salts = salts(0, self.centre.device)  # depth 0: the camera's random dimensions
-        return generate(self.context.plan, self.camera, self.filter, x, y, key, camera_salts)
+        return self.generate(x, y, key, camera_salts)
+
+    def generate(self, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+        """Return the first rays of paths, see :meth:`Integrator.generate`."""
+        context = replace(self.context, camera=self.camera, filter=self.filter)
+        return self.integrator.generate(context, x, y, key, salts)
 
     def with_rays(self, rays: Rays) -> Wave:
         """Return the wave whose paths start with ``rays``, a picture of one row; samples have no filter weights."""
@@ -196,7 +202,9 @@ class Wave:
         if lights.depends_on_point(world.lights):
             state = replace(state, p=state.o.clone(), n=torch.zeros_like(state.o))
         if self.integrator.fields:
-            state = replace(state, extra={own.name: own.begin(state.t_max) for own in self.integrator.fields})
+            given = state.extra
+            begun = {own.name: own.begin(state.t_max) for own in self.integrator.fields if own.name not in given}
+            state = replace(state, extra={**given, **begun})
         return state
 
     def weight(self, state: PathState) -> Tensor:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torchpt.physics.bsdfs.records import LaneMaterials
+    from torchpt.physics.lights.emission import Emission
     from torchpt.physics.lights.records import Lights
     from torchpt.physics.shapes.geometry import LaneGeometry
     from torchpt.physics.textures.records import LaneTextures
@@ -22,3 +23,4 @@ class World:
     materials: LaneMaterials
     textures: LaneTextures
     lights: Lights | None  # None if nothing emits
+    emission: Emission | None = None  # where light paths start; None where there are none

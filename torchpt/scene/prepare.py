@@ -31,11 +31,14 @@ from torchpt.paths.state import Plan, StageContext
 from torchpt.paths.wave import Rays, Wave
 from torchpt.physics.cameras import Camera
 from torchpt.physics.film import Filter
+from torchpt.physics.lights.emission import emission_of
 from torchpt.physics.samplers import ADAPTIVE, Points, Sampler
+from torchpt.physics.shapes.geometry import Geometry
 from torchpt.physics.world import World
 from torchpt.scene import Scene
 from torchpt.scene.scene import live_scenes
 from torchpt.scene.settings import Settings
+from torchpt.search.bounds import primitive_bounds
 from torchpt.spec import Moves
 from torchpt.spec.schema import ParsedParams
 
@@ -71,6 +74,7 @@ class SceneCache:
         kernel_caches: machine code bound to tables, of the latest pictures and gradients.
         first_surface: integrator, world, and the ``FirstSurface`` made from them: what shades first surfaces on its own.
         without_lights: a world, and a copy of it without lights.
+        with_emission: a world, and a copy of it with the rays that leave its lights.
         camera: of the latest render: key, objects whose ids are in the key, and the camera on its film.
         outlines: edges of the meshes, found by :mod:`torchpt.gradients.edges.curves`.
     """
@@ -79,6 +83,7 @@ class SceneCache:
     kernel_caches: KernelCaches = field(default_factory=KernelCaches)
     first_surface: tuple[Integrator, World, FirstSurface] | None = None
     without_lights: tuple[World, World] | None = None
+    with_emission: tuple[World, World] | None = None
     camera: tuple[Any, Any, Camera] | None = None
     outlines: dict[str, Any] = field(default_factory=dict)
 
@@ -157,6 +162,8 @@ def make_wave(
         accel = scene.accel(settings.render.accel, threads, geometry if surfaces_move else None)
         if tree and accel.name == "brute":  # it tests packets of rays against all primitives; `numba` is a tree
             accel = scene.accel("numba", threads, geometry if surfaces_move else None)
+        if integrator.light_walk() is not None:
+            world = _with_emission(scene, world, geometry, own=own)
         if not integrator.lit:  # an integrator that does not use lights
             world = _without_lights(scene, world, own=own)
     else:
@@ -180,7 +187,42 @@ def make_wave(
         centre=scene.space.shift,
         first_surface=_first_surface(scene, integrator, world, own=own) if like is None else like.first_surface,
     )
+    wave = replace(wave, light_paths=_light_paths(wave))
     return wave if rays is None else wave.with_rays(_lane_rays(scene, *rays, dtype))
+
+
+#: Xor mask that gives light paths a seed of their own, any constant below 2^63.
+_LIGHT_SEED = 0x3C6EF372FE94F82B
+
+
+def _light_paths(wave: Wave) -> Wave | None:
+    """Return the wave of light paths beside the samples of a wave; None: its integrator has none, or nothing emits."""
+    integrator, world = wave.integrator.light_walk(), wave.context.world
+    if integrator is None or world.emission is None:
+        return None
+    plan = integrator.plan(wave.context.plan.sampler, wave.context.plan.dtype)
+    # Their vertices sample no light, and emission that they meet counts nothing.
+    context = replace(wave.context, plan=plan, world=replace(world, lights=None), filter=wave.filter)
+    sampler = replace(wave.sampler, seed=wave.sampler.seed ^ _LIGHT_SEED)
+    return replace(wave, context=context, integrator=integrator, sampler=sampler, first_surface=None)
+
+
+def _with_emission(scene: Scene, world: World, geometry: Geometry, *, own: bool) -> World:
+    """Return the world with the rays that leave its lights, cached with the scene where the world is the scene's ``own``."""
+    if world.lights is None:
+        return world
+    cache = scene_cache(scene)
+    if own and cache.with_emission is not None and cache.with_emission[0] is world:
+        return cache.with_emission[1]
+    low, high = (box.double() for box in primitive_bounds(geometry))
+    low, high = (
+        (low.amin(1), high.amax(1)) if low.shape[1] else (scene.space.shift * 0.0 - 1.0, scene.space.shift * 0.0 + 1.0)
+    )
+    emission = emission_of(world.lights, 0.5 * (low + high), 0.5 * (high - low).norm())
+    found = replace(world, emission=emission)
+    if own:
+        cache.with_emission = world, found
+    return found
 
 
 def _lane_rays(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:

@@ -11,7 +11,7 @@ __all__ = ["KEYS", "TYPES"]
 #: Name of a table of kinds -> its unsupported types -> the keys of each beside ``type``.
 TYPES: dict[str, dict[str, tuple[str, ...]]] = {
     "integrator": {
-        "bdpt": ("max_depth", "rr_depth", "rr_prob", "clamp", "strict"),
+        "vcm": ("max_depth", "rr_depth", "rr_prob", "radius", "alpha", "strict"),
     },
 }
 

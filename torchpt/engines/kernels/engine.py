@@ -133,7 +133,9 @@ class Calls:
         self._prepared: dict[int, Arguments] = {}  # by id of the kernel, which they refer to
         self._salts: dict[tuple[int, int], Any] = {}  # by depth and step
         self._bounds: dict[float, np.ndarray] = {}  # of survival probabilities, as uniforms
-        self._uniforms = {"place": self.place.ctypes.data}  # address of each uniform
+        self._start_salts = salts(0, torch.device("cpu"))
+        # Address of each uniform.
+        self._uniforms = {"place": self.place.ctypes.data, "start_salts": self._start_salts.data_ptr()}
 
     def unbind(self) -> None:
         """Drop all references to the render and its kernels."""
@@ -269,7 +271,10 @@ def bounce_eagerly(
     with torch.no_grad():
         state = path_state(rows.take(source, lanes, rows.state))
         vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
-        context = kernels.wave.context.at(salts(depth, state.t_max.device), roulette=roulette)
+        device = state.t_max.device
+        first = depth == 1 and kernels.wave.integrator.starts_on_lights
+        start_salts = salts(0, device) if first else None
+        context = kernels.wave.context.at(salts(depth, device), roulette=roulette, start_salts=start_salts)
         output = kernels.wave.bounce(context, model, vertex)
         check_output(kernels.wave.integrator, output)
         after, no_ray = output.leaving, no_shadow(output.leaving)
@@ -510,6 +515,12 @@ class KernelsEngine:
         self.splats: list[Splats] = []
         self._lost: list[Any] = []  # samples with splats that are not finite
         self._rooms = [self._room() for _ in range(2)]  # memory of even and of odd vertices
+        self.light_paths = self._make_light_paths(halt)
+
+    def _make_light_paths(self, halt: threading.Event | None) -> KernelsEngine | None:
+        """Return the engine of the light paths that are traced beside the samples; None: there are none."""
+        light_paths = self.kernels.light_paths
+        return None if light_paths is None else KernelsEngine(light_paths, halt)
 
     def _make_search(self) -> ChunkSearch:
         return ChunkSearch(self.calls)
@@ -534,6 +545,7 @@ class KernelsEngine:
     def unbind(self) -> int:
         """Drop all references to the render; return the bytes of memory kept for another one of the same structure."""
         size = sum(memory.words.nbytes for memory in self.memories())
+        size += 0 if self.light_paths is None else self.light_paths.unbind()
         self.calls.unbind()
         self.splats, self._lost = [], []
         del self.kernels, self.wave, self.search.kernels
@@ -550,13 +562,27 @@ class KernelsEngine:
         self.kernels, self.wave = kernels, kernels.wave
         self.calls.rebind(kernels, halt)
         self.search.kernels = kernels
+        if self.light_paths is not None:
+            assert kernels.light_paths is not None
+            self.light_paths.rebind(kernels.light_paths, halt)
 
     def trace(self, chunk: Chunk) -> RayCounts:
         """Fill ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other."""
         self.tally = RayCounts()
         walk(self, self.spawn(chunk), self.wave.integrator.limits)
         self.mark_lost()
+        if self.light_paths is not None:
+            self._trace_light_paths(self.light_paths, chunk)
         return self.tally
+
+    def _trace_light_paths(self, engine: KernelsEngine, chunk: Chunk) -> None:
+        """Trace the light paths of a chunk, one for each sample, and take over their splats and counts."""
+        tally, count = engine.trace(chunk), chunk.pixels * chunk.samples
+        self.splats = engine.splats
+        self.tally.rays += tally.rays
+        self.tally.truncated += tally.truncated
+        # Their radiance is 0, or NaN where a splat is not finite.
+        self.slots.floats[:3, :count] += engine.slots.floats[:3, :count]
 
     def mark_lost(self) -> None:
         """Set samples to NaN whose splats are not finite, once all paths ended."""
@@ -704,7 +730,7 @@ class KernelsEngine:
                 continue
             if not kernels.fused:
                 calls.write_from(start)
-            kernel = kernels.bounce(model, roulette)
+            kernel = kernels.bounce(model, roulette, paths.depth)
             lanes = lanes if kernels.listed else None
             calls.run(kernel, count, paths.arena, after.arena, lanes, lists=after.lists)
             self._count_rays(count, kernel.program.shadows + int(kernels.fused))  # with the rays to the next vertex

@@ -295,10 +295,10 @@ def _path_fields(layout: Layout) -> Fields:
     if wave.filter.signed:
         fields["weight"] = ((), "f")
     fields |= HIT
-    if wave.integrator.splats:
+    if wave.integrator.splats_at_surfaces:
         fields |= SPLAT
     shadows = world.lights is not None if wave.first_surface is None else wave.first_surface.shadows(world)
-    if not layout.fused and (shadows or wave.integrator.splats):
+    if not layout.fused and (shadows or wave.integrator.splats_at_surfaces):
         fields |= SHADOW
         if layout.has_opacity:
             fields["transmittance"] = ((), "f")
@@ -341,6 +341,10 @@ class Trace:
     def salts(self) -> Tensor:
         """Return the salts of the vertex, hashes of its sampling dimensions, one for each :class:`Dimension`."""
         return self.uniform("salts", torch.zeros(len(Dimension), dtype=torch.int32))
+
+    def start_salts(self) -> Tensor:
+        """Return the salts of depth 0."""
+        return self.uniform("start_salts", torch.zeros(len(Dimension), dtype=torch.int32))
 
     def roulette(self, bound: float | None) -> float | Tensor:
         """Return the upper bound of the survival probability; 0: no roulette at the vertex. None: an input ``(1,)``."""

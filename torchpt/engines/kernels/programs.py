@@ -332,6 +332,7 @@ class Kernels(Layout):
         structure: key that is equal for renders that can share kernels and memory of threads.
         caches: those of the scene.
         kernel_cache: shared by renders of the same structure.
+        light_paths: kernels of the light paths that are traced beside the samples; None: there are none.
         search: argument of searches by kernels; None where the acceleration structure is called.
         non_opaque: uint8 for each primitive, 1 where a ray may pass it, for the acceleration structure.
     """
@@ -351,7 +352,9 @@ class Kernels(Layout):
         same = fixed and before is not None and before.world is self.world
         self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
         # The crop is None without splats, which only stages of an integrator's own add.
-        own = (fingerprint(wave.integrator), wave.context.crop) if wave.integrator.has_own_stages else None
+        own = None
+        if wave.integrator.has_own_stages:  # splats choose a pixel within the filter's radius
+            own = fingerprint(wave.integrator), wave.context.crop, wave.filter.radius
         parts = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first_surface, own, self._leaves.tensors)
         self.structure = (self._of_world, *map(signature, parts), by_kernels, fused, signature(self.tree))
         self._use(caches or (KernelCaches() if before is None else before.caches))
@@ -360,6 +363,7 @@ class Kernels(Layout):
         self.search, self.non_opaque = self._search_inputs()
         self.seconds = 0.0
         self.eager: dict[int, str] = {}
+        self.light_paths: Kernels | None = None
 
     def _use(self, caches: KernelCaches) -> None:
         """Use the caches of a scene, once the structure is known."""
@@ -393,7 +397,8 @@ class Kernels(Layout):
         (:class:`torchpt.engines.kernels.engine.KernelsEngine`).
         """
         channels = sum(len(layer.channels) for layer in layers.values())
-        return 2 * self.state.count + 2 * (self.models + 2) + 3 + channels
+        of_light = 0 if self.light_paths is None else self.light_paths.rows({})
+        return 2 * self.state.count + 2 * (self.models + 2) + 3 + channels + of_light
 
     # -- vertices of paths
 
@@ -413,8 +418,10 @@ class Kernels(Layout):
         """See :func:`torchpt.engines.kernels.stages.escape`."""
         return self._get(True, stages.escape)
 
-    def bounce(self, model: int, roulette: float) -> Kernel:
-        """See :func:`torchpt.engines.kernels.stages.bounce`."""
+    def bounce(self, model: int, roulette: float, depth: int = 0) -> Kernel:
+        """See :func:`torchpt.engines.kernels.stages.bounce`; ``depth``: number of the vertex, 0 for any."""
+        if self.wave.integrator.starts_on_lights and depth == 1:
+            return self._get(self.listed, stages.bounce, model, self.bound(roulette), True)
         return self._get(self.listed, stages.bounce, model, self.bound(roulette))
 
     def bound(self, roulette: float) -> float | None:
@@ -478,6 +485,8 @@ class Kernels(Layout):
         cpu.allow(processes)
         if processes < 2 or not self.wave.integrator.light or self.kernel_cache.known:
             return
+        if self.light_paths is not None:
+            self.light_paths.prefetch(processes)
         start = time.perf_counter()
         for listed, build, arguments in self.large_kernels():
             traced = partial(_with_arguments, build, arguments)
@@ -501,9 +510,11 @@ class Kernels(Layout):
         for key in self.bounces():
             yield self.listed, stages.bounce, key
 
-    def bounces(self) -> Iterator[tuple[int, float | None]]:
-        """Yield model and bound of roulette of the kernels of surfaces, about in the order of their use."""
+    def bounces(self) -> Iterator[tuple[Any, ...]]:
+        """Yield the arguments of the kernels of surfaces, about in the order of their use."""
         limits = self.wave.integrator.limits
+        if self.wave.integrator.starts_on_lights:
+            yield from ((model, self.bound(limits.roulette(1)), True) for model in range(self.models))
         depths = range(1, min(limits.last, DEEP + 2))
         for bound in dict.fromkeys(self.bound(limits.roulette(depth)) for depth in depths):
             for model in range(self.models):
@@ -579,7 +590,7 @@ def probed_kernels(wave: Wave, own: Sequence[int], packets: bool, make: Callable
         make: makes the kernels; True: fused.
     """
     opaque = wave.context.world.materials.opacity is None and not wave.integrator.has_own_transmit
-    kernels = make(packets and opaque and wave.first_surface is None and not wave.integrator.splats)
+    kernels = make(packets and opaque and wave.first_surface is None and not wave.integrator.splats_at_surfaces)
     eager = kernels.probe(own) if wave.integrator.light else {}
     if eager and kernels.fused:  # stages that run as tensor operations need searches between the stages
         kernels = make(False)

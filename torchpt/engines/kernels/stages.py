@@ -17,7 +17,6 @@ from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 from torchpt.compiler.tracing import Tracer
 from torchpt.engines.kernels.layout import Trace, path_state
 from torchpt.paths import layers as aov
-from torchpt.paths import vertex
 from torchpt.paths.integrators.base import check_fields, check_output
 from torchpt.paths.state import PathState, Shadow, Splat, VertexInput, no_shadow
 from torchpt.paths.transmission import non_opaque, opacity_at, origins_behind
@@ -150,7 +149,7 @@ def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
         if given:
             state = camera_state(rays["o"], rays["d"], key)
         else:
-            state = vertex.generate(layout.plan, wave.camera, wave.filter, x, y, key, salts)
+            state = wave.generate(x, y, key, salts)
         if wave.filter.signed:
             passthrough["weight"] = wave.filter.weight(Draws(layout.plan.sampler, key, salts).two(Dimension.PIXEL))
         state = wave.with_optional_fields(state)
@@ -239,17 +238,19 @@ def terminate(trace: Trace) -> Sinks:
     return Sinks(scatter=[trace.ended(_ALL_LANES, state.lane, state.radiance, passthrough)])
 
 
-def bounce(trace: Trace, model: int, roulette: float | None) -> Sinks:
+def bounce(trace: Trace, model: int, roulette: float | None, first: bool = False) -> Sinks:
     """Run the stage of surfaces of one BSDF model, and store the paths that go on.
 
-    ``model``: index of the BSDF model. ``roulette``: see :meth:`torchpt.engines.kernels.layout.Trace.roulette`.
+    ``model``: index of the BSDF model. ``roulette``: see :meth:`torchpt.engines.kernels.layout.Trace.roulette`. ``first``:
+    True: at the first vertex of paths that started on lights.
     """
     layout, tracer = trace.layout, trace.tracer
     salts = trace.salts()
     state, passthrough = trace.state()
     hit = trace.hit()
     with tracer:
-        context = layout.wave.context.at(salts, roulette=trace.roulette(roulette))
+        start_salts = trace.start_salts() if first else None
+        context = layout.wave.context.at(salts, roulette=trace.roulette(roulette), start_salts=start_salts)
         output = layout.wave.bounce(context, model, VertexInput(state, hit))
         check_output(layout.wave.integrator, output)
     after, shadow = output.leaving, output.shadow

@@ -25,12 +25,24 @@ from torchpt.spec import Choice, Flag, FrozenConfig, Scalar, Spec, parameters_of
 if TYPE_CHECKING:
     from typing import Self
 
+    from torch import Tensor
+
     from torchpt.paths.integrators.first_surface import FirstSurface
     from torchpt.paths.state import PathState
     from torchpt.physics.samplers import Points
     from torchpt.physics.world import World
 
-__all__ = ["ENDLESS", "LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits", "check_fields", "check_output"]
+__all__ = [
+    "ENDLESS",
+    "LIGHT_CHOICE",
+    "SAMPLES",
+    "STRATEGY",
+    "STRICT",
+    "Integrator",
+    "Limits",
+    "check_fields",
+    "check_output",
+]
 
 #: With ``max_depth`` -1 roulette ends the paths; those that reach this depth are truncated, and counted. With ``DEEP_CAP`` not
 #: one path in 10^12 comes so far, even if it loses nothing: only a later ``rr_depth`` or ``rr_prob`` near 1 truncates paths.
@@ -51,9 +63,10 @@ LIGHT_CHOICE: dict[str, Spec] = {
         doc="which of many lights is sampled",
     ),
 }
+STRICT: dict[str, Spec] = {"strict": Flag(False, doc="whether a sample that is not finite is an error")}
 SAMPLES: dict[str, Spec] = {
     "clamp": Scalar(None, above=0.0, words="null or a number > 0", doc="largest component of a sample; biased"),
-    "strict": Flag(False, doc="whether a sample that is not finite is an error"),
+    **STRICT,
 }
 
 
@@ -97,7 +110,8 @@ class Integrator(FrozenConfig):
         layers: layers shown where ``film.aovs`` lists none.
         lit: True: it uses the scene's lights. False: its world has none.
         fields: fields of its own in the path state.
-        splats: True: its stages add radiance to pixels other than a sample's own.
+        splats: True: samples add radiance to pixels other than their own, by its stages or by those of its light paths.
+        starts_on_lights: True: its paths start on lights, and the stage of the first vertex differs from that of others.
         strategy: how light is found, one of :data:`torchpt.paths.state.STRATEGIES`. This value and those below are for kinds
             without a parameter of the name.
         rr_prob: constant survival probability of roulette; None: by throughput.
@@ -112,6 +126,7 @@ class Integrator(FrozenConfig):
     lit: ClassVar[bool] = True
     fields: ClassVar[Sequence[Field]] = ()
     splats: ClassVar[bool] = False
+    starts_on_lights: ClassVar[bool] = False
 
     strategy: str = "mis"
     rr_prob: float | None = None
@@ -134,6 +149,28 @@ class Integrator(FrozenConfig):
         return Plan(
             sampler=sampler, strategy=self.strategy, rr_prob=self.rr_prob, dtype=dtype, tape=tape, attached=attached
         )
+
+    def light_walk(self) -> Integrator | None:
+        """Return the integrator of light paths that are traced beside the samples, one for each; None: there are none."""
+        return None
+
+    @property
+    def splats_at_surfaces(self) -> bool:
+        """Return True if its own stages return splats, and not those of its light paths."""
+        return self.splats and self.light_walk() is None
+
+    def generate(self, context: StageContext, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+        """Return the first rays of paths: camera rays. A stage.
+
+        Args:
+            context: of the render, with camera and filter.
+            x: column of each pixel on the whole film ``(N,)``, in the lanes' dtype.
+            y: row of each pixel, likewise.
+            key: the sampler's keys ``(rows, N)`` int32.
+            salts: the random dimensions of depth 0.
+        """
+        assert context.camera is not None and context.filter is not None
+        return stages.generate(context.plan, context.camera, context.filter, x, y, key, salts)
 
     def counted_in(self, unit: float) -> Self:
         """Return a copy with parameters that are lengths divided by ``unit``, the world unit in scene units."""
@@ -180,7 +217,8 @@ class Integrator(FrozenConfig):
         """Return True if the kind has fields, splats or stages of its own, which need kernels of their own."""
         kind, base = type(self), Integrator
         overrides = any(
-            getattr(kind, name) is not getattr(base, name) for name in ("emit", "escape", "bounce", "transmit")
+            getattr(kind, name) is not getattr(base, name)
+            for name in ("generate", "emit", "escape", "bounce", "transmit")
         )
         return overrides or bool(self.fields) or self.splats
 

@@ -30,6 +30,7 @@ class Camera(ABC):
         parameters: specs of the parameters; those whose spec is ``differentiable`` are tensors.
         lens: whether rays also depend on a point on a lens.
         reaches: names of parameters that bound the distance of ray origins from the camera's origin, such as a lens radius.
+        parallel: whether all rays are parallel.
         projects: whether :meth:`project` is implemented.
         sized_by: hint for the error about a pose with a scale: the parameter that sizes the picture instead.
         to_world: pose ``(4, 4)``; its scale is ignored, as only the axes' directions and the origin matter.
@@ -45,6 +46,7 @@ class Camera(ABC):
     parameters: ClassVar[Mapping[str, Spec]] = POSES
     lens: ClassVar[bool] = False
     reaches: ClassVar[tuple[str, ...]] = ()
+    parallel: ClassVar[bool] = False
     projects: ClassVar[bool] = False
     sized_by: ClassVar[str] = ""
 
@@ -79,6 +81,26 @@ class Camera(ABC):
 
         Returns:
             Origins, ``(3, 1)`` if all rays share one, else ``(3, N)``, and unit directions ``(3, N)``.
+        """
+
+    @abstractmethod
+    def connect(self, p: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the places where rays of the camera start that come through points.
+
+        Args:
+            p: points ``(3, N)``.
+            u: ``(2, N)`` in [0, 1), samples the lens as in :meth:`rays`; None without a lens.
+
+        Returns:
+            Origins of the rays ``(3, N)``, the film positions ``x, y (N,)`` that they belong to, as for :meth:`rays`, and a
+            mask ``(N,)`` of points in front of the camera, without which the others are meaningless.
+        """
+
+    @abstractmethod
+    def film_density(self, d: Tensor) -> Tensor:
+        """Return the density ``(N,)`` of film positions, in square pixels, over unit directions ``d (3, N)`` of rays.
+
+        It is per steradian at the origin of the rays; if all rays are parallel, per area across them.
         """
 
     @abstractmethod

@@ -133,6 +133,17 @@ class Pinhole(Camera):
             up = up / self.pixel_aspect
         return right * half, up * half
 
+    def area_scale(self, depth: Tensor) -> Tensor:
+        """Return square pixels per solid angle ``(N,)`` along vectors of length 1 with these depths ``(N,)``."""
+        # Pixels per unit of slope, squared; the solid angle of an area on a plane falls with the third power of the depth.
+        scale = (0.5 * self.film[0] / self.half_width()) ** 2 / depth.abs() ** 3
+        scale = scale * torch.linalg.det(self.covectors()).abs()  # 1 for orthogonal axes
+        return scale if self.pixel_aspect is None else scale * self.pixel_aspect
+
+    def film_density(self, d: Tensor) -> Tensor:
+        """See :meth:`Camera.film_density`; a lens changes nothing, as its rays meet in a plane."""
+        return self.area_scale(self.project_homogeneous(d)[2])
+
     def film_of(self, p: Tensor) -> Tensor | None:
         """Return homogeneous film coordinates, as :meth:`Camera.film_of`; None with a lens."""
         return None if self.lens else self.project_homogeneous(p - self.origin())

@@ -7,6 +7,7 @@ and how to sample it; :class:`Tabulated` samples any profile.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -80,6 +81,32 @@ class Filter(ABC):
         """Return weights ``(N,)`` of samples at the offsets of ``u (2, N)``; called only if ``signed``."""
         return torch.ones_like(u[0])
 
+    @abstractmethod
+    def density(self, x: Tensor) -> Tensor:
+        """Return the profile, of integral 1, at distances ``x (N,)`` from the centre in pixels."""
+
+    def splat(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Choose along one axis a pixel that light at a film position counts for, by the profile about the pixels' centres.
+
+        Args:
+            x: positions ``(N,)`` in pixels from the film's edge.
+            u: ``(N,)`` in [0, 1).
+
+        Returns:
+            Indices ``(N,)`` int64 of the pixels, which may lie beside the film, and weights ``(N,)``: the chance of a pixel
+            times the weight is :meth:`density` about its centre.
+        """
+        first = torch.ceil(x - (self.radius + 0.5))  # the lowest pixel whose centre is within the radius
+        values = [self.density(first + (k + 0.5) - x) for k in range(math.ceil(2.0 * self.radius))]
+        total = torch.stack([value.abs() for value in values]).sum(0)
+        bar, below = u * total, torch.zeros_like(total)
+        index, weight = torch.zeros_like(first), total * torch.sign(values[0])
+        for k, value in enumerate(values[1:], 1):
+            below = below + values[k - 1].abs()
+            here = (bar >= below) & (value != 0)
+            index, weight = torch.where(here, float(k), index), torch.where(here, total * torch.sign(value), weight)
+        return (first + index).to(torch.int64), weight
+
     def kind(self) -> tuple[object, ...]:
         """Return all that kernels depend on beside :meth:`tensors`, as a part of their cache key."""
         return self.name, self.signed
@@ -120,6 +147,7 @@ class Tabulated(Filter):
             return torch.tensor(x, dtype=torch.float32, device=device)
 
         self._inverse = torch.from_numpy(tables.inverse_cdf).to(device)
+        self._profile = torch.from_numpy(tables.profile).to(device)
         self._negative = number(tables.negative_fraction)
         self._shifts = [(number(end), number(shift)) for end, shift in tables.shifts]
         self.signed = tables.negative_fraction > 0
@@ -133,7 +161,13 @@ class Tabulated(Filter):
         shifts = {}
         for k, (end, shift) in enumerate(self._shifts):
             shifts |= {f"end{k}": end, f"shift{k}": shift}
-        return {**super().tensors(), "inverse": self._inverse, "negative": self._negative, **shifts}
+        return {
+            **super().tensors(),
+            "inverse": self._inverse,
+            "profile": self._profile,
+            "negative": self._negative,
+            **shifts,
+        }
 
     def offset(self, u: Tensor) -> Tensor:
         """Sample offsets by the shifted numbers and the table, read with linear interpolation: :meth:`Filter.offset`."""
@@ -147,6 +181,13 @@ class Tabulated(Filter):
         cell = position.to(torch.int64)
         low = torch.take(self._inverse, cell)
         return low + (torch.take(self._inverse, cell + 1) - low) * (position - cell)
+
+    def density(self, x: Tensor) -> Tensor:
+        """Return the profile by its table: :meth:`Filter.density`."""
+        position = (x.abs() * (_CELLS / self.radius)).clamp_max(float(_CELLS))
+        cell = position.to(torch.int64).clamp_max(_CELLS - 1)
+        low = torch.take(self._profile, cell)
+        return low + (torch.take(self._profile, cell + 1) - low) * (position - cell)
 
     def weight(self, u: Tensor) -> Tensor:
         """Return the sign of the filter at the offsets of ``u (2, N)``, times the integral of its magnitude over its own."""
@@ -169,12 +210,14 @@ class _Tables(NamedTuple):
 
     Attributes:
         inverse_cdf: offsets in pixels ``(_CELLS + 1,)`` float32, the inverse CDF of the profile's magnitude at equal steps.
+        profile: the filter, of integral 1, at ``_CELLS + 1`` equal steps from its centre to its radius, float32.
         negative_fraction: fraction of the magnitude's integral where the profile is negative, 0 to below 1/2.
         shifts: pairs ``(end, shift)``, ends ascending. The first shift whose end lies above a number is added to it, so that
             the lowest numbers fall into the negative intervals. Empty for a profile that is nowhere negative.
     """
 
     inverse_cdf: NDArray[np.float32]
+    profile: NDArray[np.float32]
     negative_fraction: float
     shifts: tuple[tuple[float, float], ...]
 
@@ -187,6 +230,9 @@ def _tables(key: _FilterKey) -> _Tables:
     weight = key.filter.profile(0.5 * (x[1:] + x[:-1]))
     cdf = np.concatenate(([0.0], np.cumsum(np.abs(weight))))
     inverse = np.interp(np.linspace(0.0, 1.0, _CELLS + 1), cdf / cdf[-1], x).astype(np.float32)
+    step = 2.0 * radius / len(weight)
+    values = key.filter.profile(np.linspace(0.0, radius, _CELLS + 1)) / (float(weight.sum()) * step)
+    half_profile = values.astype(np.float32)
     # Sign changes on the left half, as numbers of steps; mirrored on the right.
     below = weight < 0
     half = len(weight) // 2
@@ -199,7 +245,7 @@ def _tables(key: _FilterKey) -> _Tables:
     # From the last to the first: so the leftmost one mostly moves as the positive interval beside it, with one shift for both.
     negative = [(first, end) for first, end, is_below in reversed(runs) if is_below]
     if not negative:
-        return _Tables(inverse, 0.0, ())
+        return _Tables(inverse, half_profile, 0.0, ())
     order = [*negative, *((first, end) for first, end, is_below in runs if not is_below)]
     shifts: list[tuple[float, float]] = []
     total = 0  # steps before the interval, in the order of numbers
@@ -209,4 +255,4 @@ def _tables(key: _FilterKey) -> _Tables:
         if shifts and shifts[-1][1] == shift:  # the interval before moves alike: one entry for both
             shifts.pop()
         shifts.append((total / _STEPS, shift))
-    return _Tables(inverse, sum(end - first for first, end in negative) / _STEPS, tuple(shifts))
+    return _Tables(inverse, half_profile, sum(end - first for first, end in negative) / _STEPS, tuple(shifts))

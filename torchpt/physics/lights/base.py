@@ -7,6 +7,7 @@ makes the row from the parameters in the scene file; while paths are traced, :me
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import luminance, take
+from torchpt.math.sampling import concentric_disk
+from torchpt.math.vectors import Frame, luminance, safe_reciprocal, take
 from torchpt.math.vectors import rows as rows_of
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.lights.solid_angle import OTHER
@@ -29,11 +31,13 @@ __all__ = [
     "COLUMNS",
     "KINDS",
     "Cone",
+    "EmittedRay",
     "Emitter",
     "Environment",
     "EnvironmentImage",
     "Light",
     "Row",
+    "Scope",
     "Setting",
     "bright",
     "lane_rows",
@@ -158,6 +162,47 @@ class Row:
     environment: Any = None
 
 
+@dataclass(frozen=True)
+class Scope:
+    """A ball around all surfaces of a scene, through which light of distant lights is sent.
+
+    Attributes:
+        centre: ``(3,)``.
+        radius: ``()``.
+    """
+
+    centre: Tensor
+    radius: Tensor
+
+    def density(self) -> Tensor:
+        """Return the density ``()`` of points on a disk as wide as the ball, across the light."""
+        return safe_reciprocal(self.radius * self.radius * math.pi)
+
+    def origins(self, d: Tensor, u: Tensor) -> Tensor:
+        """Return origins ``(3, N)`` of rays along unit ``d (3, N)``: on disks that touch the ball; ``u (2, N)`` in [0, 1)."""
+        frame, (x, y) = Frame.about(d), concentric_disk(u).to(d.dtype)
+        return self.centre[:, None] + (frame.s * x + frame.t * y - d) * self.radius
+
+
+@dataclass(frozen=True)
+class EmittedRay:
+    """Rays that leave lights of a kind without a surface, N lanes.
+
+    Attributes:
+        o: origins ``(3, N)``.
+        d: unit directions ``(3, N)``.
+        radiance: ``(3, N)`` along the ray; intensity or irradiance of a light without extent.
+        density: ``(N,)`` of the ray, see :mod:`torchpt.physics.lights.emission`.
+        pdf: ``(N,)`` density of the direction ``-d`` under :meth:`Light.sample`; 1 for lights without extent.
+    """
+
+    o: Tensor
+    d: Tensor
+    radiance: Tensor
+    density: Tensor
+    pdf: Tensor
+
+
 class Light(Emitter):
     """A kind of light without a surface.
 
@@ -221,6 +266,33 @@ class Light(Emitter):
             For a delta light ``weight`` is the factor of ``radiance``.
         """
         raise NotImplementedError
+
+    @classmethod
+    def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope) -> EmittedRay:
+        """Sample rays that leave the light; here those of a distant light, whose directions :meth:`sample` draws.
+
+        Args:
+            at: rows of the table, one a lane.
+            u: ``(2, N)`` in [0, 1), chooses the direction.
+            v: ``(2, N)`` in [0, 1), chooses the point.
+            scope: a ball around the scene.
+        """
+        drawn = cls.sample(at, scope.centre[:, None].expand(3, u.shape[1]), u, mis=True)
+        d = -drawn.wi
+        pdf = drawn.pdf if cls.environment else torch.ones_like(drawn.pdf)
+        return EmittedRay(scope.origins(d, v), d, drawn.radiance, cls.emission_density(at, pdf, scope), pdf)
+
+    @classmethod
+    def emission_density(cls, at: Lights, pdf: Tensor, scope: Scope) -> Tensor:
+        """Return the density ``(N,)`` of rays under :meth:`emit`; here those of a distant light.
+
+        Args:
+            at: rows of the table, one a lane.
+            pdf: density ``(N,)`` of their directions under :meth:`sample`; not read for lights without extent.
+            scope: a ball around the scene.
+        """
+        across = scope.density()
+        return pdf * across if cls.environment else across.expand_as(pdf)
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ class Lights:
     #: (K,) area in the world; for a quadric the area in object space times |det|, see torchpt.physics.lights.surfaces.quadric
     area: Tensor
     bound: Tensor  # (K,) rounding bound, see LaneGeometry.bound
+    power: Tensor  # (K,) float64, emitted power as luminance, detached
     radiance: Tensor  # (3, K); intensity of a point or spot light, irradiance of a directional light
     opacity: Tensor | None  # (K,) opacity of the emissive surface; None if all are opaque
     environment: Any  # Row.environment of the last row; None without an environment
@@ -65,3 +66,4 @@ class LightSample:
     at: Interaction | None = None  # the point, without tangents; None without textured emission
     bare: Tensor | None = None  # (N,) bool: the light has no surface, so `at` is meaningless; None: nowhere
     row: Tensor | None = None  # (N,) int64 row in the light table; None for a single row
+    normal: Tensor | None = None  # (3, N) unit, on the emitting side; None where no surface emits

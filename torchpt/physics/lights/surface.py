@@ -91,15 +91,27 @@ class Surface(Emitter):
         return super().bounds(at, intensity) if cls.convex else Cone(cos_o=1.0, cos_e=0.0, intensity=intensity)
 
     @classmethod
+    def sample_area(cls, at: Lights, u: Tensor) -> SurfaceSample:
+        """Sample points by area, with the density ``1 / size``; a quadric's is even in its object space.
+
+        Args:
+            at: rows of the table, one a lane.
+            u: ``(2, N)`` in [0, 1).
+        """
+        raise NotImplementedError
+
+    @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
-        """Sample points as seen from ``x``. Not called for kinds that :mod:`torchpt.physics.lights.solid_angle` samples.
+        """Sample points as seen from ``x``, by default by area.
+
+        Not called for kinds that :mod:`torchpt.physics.lights.solid_angle` samples.
 
         Args:
             at: rows of the table, one a lane.
             x: reference points ``(3, N)``; the sampled points are not differentiated in them.
             u: ``(2, N)`` in [0, 1).
         """
-        raise NotImplementedError
+        return cls.sample_area(at, u)
 
     @classmethod
     def size(cls, at: Lights, normal: Tensor) -> Tensor | None:

@@ -20,18 +20,29 @@ from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.lights.surface import SURFACES, Surface, emitter, flat_inverse_pdf, flat_point
 from torchpt.physics.shapes.geometry import Interaction
 
-__all__ = ["emitted", "environment", "environment_image", "sample", "without_environment"]
+__all__ = [
+    "emitted",
+    "environment",
+    "environment_image",
+    "inverse_pdf",
+    "kind_indices",
+    "pick",
+    "sample",
+    "surface_kinds",
+    "textured_point",
+    "without_environment",
+]
 
 #: The largest float32 below 1.
 _BELOW_ONE = 1.0 - 2.0**-24
 
 
-def _surfaces(lights: Lights) -> list[tuple[int, type[Surface]]]:
+def surface_kinds(lights: Lights) -> list[tuple[int, type[Surface]]]:
     """Return the kinds of emissive surfaces in the table, each with its index in ``Lights.kinds``."""
     return [(number, SURFACES[name]) for number, name in enumerate(lights.kinds) if name in SURFACES]
 
 
-def _kind_indices(lights: Lights, row: Tensor | None) -> Tensor | None:
+def kind_indices(lights: Lights, row: Tensor | None) -> Tensor | None:
     """Return the index of each lane's kind ``(N,)``; None for a single kind."""
     if len(lights.kinds) == 1:
         return None
@@ -39,7 +50,7 @@ def _kind_indices(lights: Lights, row: Tensor | None) -> Tensor | None:
     return take(lights.kind, row)
 
 
-def _pick(number: Tensor | None, k: int, a: Tensor, b: Tensor | None) -> Tensor:
+def pick(number: Tensor | None, k: int, a: Tensor, b: Tensor | None) -> Tensor:
     """Return ``a`` in the lanes whose kind is ``k``, else ``b``; ``a`` everywhere without ``b`` or with a single kind."""
     return a if number is None or b is None else torch.where(number == k, a, b)
 
@@ -70,8 +81,8 @@ def sample(
     if lights.choice is not None and which is not None:
         row, probability, remapped = choice.draw(lights.choice, which, x, n)
         u = torch.stack((remapped.to(u.dtype).clamp_max(_BELOW_ONE), u[1]))
-    at, number = lane_rows(lights, row), _kind_indices(lights, row)
-    surfaces = _surfaces(lights)
+    at, number = lane_rows(lights, row), kind_indices(lights, row)
+    surfaces = surface_kinds(lights)
     drawn = _on_surfaces(lights, at, row, number, x, u, offset, probability) if surfaces else None
     bare: Tensor | None = None
     distant: Tensor | None = None
@@ -119,7 +130,7 @@ def _on_surfaces(
     target: Tensor | None = None
     normal: Tensor | None = None
     in_object: Tensor | None = None  # SurfaceSample.own, of quadrics
-    uv, angle, kinds = torch.zeros_like(u), None, _surfaces(lights)
+    uv, angle, kinds = torch.zeros_like(u), None, surface_kinds(lights)
     if lights.solid is not None:
         uv, angle = solid_angle.sample(lights.solid, row, x, u, lights.shapes)
         target, normal = flat_point(at.p0, at.e1, at.e2, uv), at.normal.expand_as(x)
@@ -127,8 +138,8 @@ def _on_surfaces(
         if kind.code != solid_angle.OTHER:  # sampled above, by solid angle
             continue
         found = kind.sample(at, x, u)
-        target, normal = _pick(number, k, found.p, target), _pick(number, k, found.normal, normal)
-        uv = uv if found.uv is None else _pick(number, k, found.uv, uv)
+        target, normal = pick(number, k, found.p, target), pick(number, k, found.normal, normal)
+        uv = uv if found.uv is None else pick(number, k, found.uv, uv)
         in_object = in_object if found.own is None else found.own
     assert target is not None and normal is not None
     to = target - x
@@ -137,22 +148,29 @@ def _on_surfaces(
     bound = at.bound
     for k, kind in kinds:
         other = kind.bound(at, normal)
-        bound = bound if other is None else _pick(number, k, other, bound)
-    inverse = _inverse_pdf(at, kinds, number, x, normal, wi, square, angle)
+        bound = bound if other is None else pick(number, k, other, bound)
+    inverse = inverse_pdf(at, kinds, number, x, normal, wi, square, angle)
     if lights.choice is not None:
         inverse = inverse / probability
     # Where the light is not visible the weight is 0, and the pdf does not matter.
     pdf = safe_reciprocal(inverse.detach())
-    point = None if lights.prim is None else _textured(lights, row, target, normal, uv, in_object)
+    point = None if lights.prim is None else textured_point(lights, row, target, normal, uv, in_object)
     # Shadow rays end off the surface of the light, so that they do not hit it.
     target = torch.addcmul(target, normal, bound * offset)
     radiance = at.radiance if at.opacity is None else at.radiance * at.opacity
     return LightSample(
-        wi=wi, target=target, distant=None, radiance=radiance.expand_as(wi), pdf=pdf, weight=inverse, at=point
+        wi=wi,
+        target=target,
+        distant=None,
+        radiance=radiance.expand_as(wi),
+        pdf=pdf,
+        weight=inverse,
+        at=point,
+        normal=normal,
     )
 
 
-def _inverse_pdf(
+def inverse_pdf(
     at: Lights,
     kinds: list[tuple[int, type[Surface]]],
     number: Tensor | None,
@@ -169,17 +187,17 @@ def _inverse_pdf(
     area = at.area
     for k, kind in kinds:
         other = kind.size(at, normal)
-        area = area if other is None else _pick(number, k, other, area)
+        area = area if other is None else pick(number, k, other, area)
     inverse = flat_inverse_pdf(normal, area, wi, square)
     if angle is not None:
         inverse = solid_angle.inverse_pdf(angle, inverse)
     for k, kind in kinds:
         other = kind.inverse_pdf(at, x, normal, wi, square, inverse)
-        inverse = inverse if other is None else _pick(number, k, other, inverse)
+        inverse = inverse if other is None else pick(number, k, other, inverse)
     return inverse
 
 
-def _textured(
+def textured_point(
     lights: Lights, row: Tensor | None, p: Tensor, normal: Tensor, uv: Tensor, in_object: Tensor | None
 ) -> Interaction:
     """Return the point on the light as an interaction, for textured emission."""
@@ -219,8 +237,8 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | 
     with torch.no_grad():
         to = at.p - x
         angle = None if lights.solid is None else solid_angle.angles(lights.solid, row, x, lights.shapes)
-        number = _kind_indices(lights, row)
-        inverse = _inverse_pdf(table, _surfaces(lights), number, x, at.ng, wi, dot(to, to), angle)
+        number = kind_indices(lights, row)
+        inverse = inverse_pdf(table, surface_kinds(lights), number, x, at.ng, wi, dot(to, to), angle)
         facing = dot(wi, at.ng) < 0
         pdf = safe_reciprocal(inverse)
         if lights.choice is not None and row is not None:
@@ -256,7 +274,7 @@ def without_environment(lights: Lights | None) -> Lights | None:
     num_left = len(lights.area) - 1
     if not num_left:
         return None
-    columns = (*COLUMNS, "opacity", "quadric", "prim", "kind")
+    columns = (*COLUMNS, "opacity", "quadric", "prim", "kind", "power")
     kept = {name: getattr(lights, name) for name in columns}
     kept = {name: None if value is None else value[..., :num_left] for name, value in kept.items()}
     kept["solid"] = None if lights.solid is None else lights.solid[:num_left]

@@ -129,6 +129,7 @@ def lights_of(
         kinds=kinds,
         kind=torch.tensor([kinds.index(name) for name in names], device=device) if len(names) > 1 else None,
         **joined,
+        power=power,
         opacity=row_opacity,
         environment=next((environment for environment in environments if environment is not None), None),
         row_of_prim=row_of_prim,

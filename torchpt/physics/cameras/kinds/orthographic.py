@@ -26,6 +26,7 @@ class Orthographic(Camera):
     parameters: ClassVar = {
         "width": Scalar(2.0, above=0.0, length=True, moves=Moves.SURFACES, doc="width of the film in the scene"),
     }
+    parallel: ClassVar[bool] = True
     reaches: ClassVar[tuple[str, ...]] = ("width",)
     sized_by: ClassVar[str] = "an orthographic camera is sized by width"
 
@@ -38,6 +39,17 @@ class Orthographic(Camera):
         half = 0.5 * self.width
         o = self.origin() + up * (along * half) + right * (across * half)
         return o, ahead.expand_as(o).clone()
+
+    def connect(self, p: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """See :meth:`Camera.connect`."""
+        x, y, _, depth = self.film_of(p)
+        _, _, ahead = self.axes()
+        return p - ahead * depth, x, y, depth > 0
+
+    def film_density(self, d: Tensor) -> Tensor:
+        """See :meth:`Camera.film_density`."""
+        side = self.film[0] / self.width  # pixels per unit of length
+        return (side * side).expand_as(d[0])
 
     def film_of(self, p: Tensor) -> Tensor:
         """See :meth:`Camera.film_of`."""

@@ -27,10 +27,14 @@ class Perspective(Pinhole):
         across, along = self.slopes(x, y)
         return self.origin(), normalize(ahead + up * along + right * across)
 
+    def connect(self, p: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """See :meth:`Camera.connect`."""
+        x, y, depth, _ = self.project_homogeneous(p - self.origin())
+        ahead = depth > 0
+        depth = torch.where(ahead, depth, 1.0)
+        return self.origin().expand_as(p), x / depth, y / depth, ahead
+
     def project(self, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See :meth:`Camera.project`."""
         x, y, depth, _ = self.project_homogeneous(offset)  # x and y times the depth
-        # Pixels per unit of slope, squared; the solid angle of an area on a plane falls with the third power of the depth.
-        scale = (0.5 * self.film[0] / self.half_width()) ** 2 / depth.abs() ** 3
-        scale = scale * torch.linalg.det(self.covectors()).abs()  # 1 for orthogonal axes
-        return x / depth, y / depth, scale if self.pixel_aspect is None else scale * self.pixel_aspect
+        return x / depth, y / depth, self.area_scale(depth)

@@ -50,7 +50,7 @@ class ThinLens(Pinhole):
     def rays(self, x: Tensor, y: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
         """See :meth:`Camera.rays`."""
         assert u is not None
-        left, high = concentric_disk(u) if self.blades == 0 else uniform_polygon(u, self.blades)
+        left, high = self._lens(u)
         right, up, ahead = self.axes()
         across, along = self.slopes(x, y)  # of the pinhole's ray: right and up per unit of depth
         # From the point on the lens to the point in focus, divided by the larger of radius and distance: nothing overflows, and
@@ -60,3 +60,21 @@ class ThinLens(Pinhole):
         d = ahead * far + up * (along * far - high * near) + right * (across * far + left * near)
         o = self.origin() + up * (high * self.aperture_radius) - right * (left * self.aperture_radius)
         return o, normalize(d)
+
+    def _lens(self, u: Tensor) -> Tensor:
+        """Return points ``(2, N)`` on a lens of radius 1: to the left in the picture, and up."""
+        return concentric_disk(u) if self.blades == 0 else uniform_polygon(u, self.blades)
+
+    def connect(self, p: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """See :meth:`Camera.connect`."""
+        assert u is not None
+        left, high = self._lens(u) * self.aperture_radius
+        right, up, _ = self.axes()
+        on_lens = up * high - right * left  # from the camera's origin
+        away = p - (self.origin() + on_lens)
+        depth = self.project_homogeneous(away)[2]
+        ahead = depth > 0
+        # The ray's point in the plane of focus, as the pinhole sees it.
+        focus = on_lens + away * (self.focus_distance / torch.where(ahead, depth, 1.0))
+        x, y, far, _ = self.project_homogeneous(focus)
+        return self.origin() + on_lens, x / far, y / far, ahead

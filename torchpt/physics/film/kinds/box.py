@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -30,3 +31,11 @@ class Box(Filter):
     def offset(self, u: Tensor) -> Tensor:
         """Return offsets that are uniform over the pixel, from ``u`` in [0, 1)."""
         return (u - 0.5) * (2.0 * self._radius)
+
+    def density(self, x: Tensor) -> Tensor:
+        """Return 1 within the pixel: :meth:`Filter.density`."""
+        return (x.abs() <= self._radius).to(x.dtype)
+
+    def splat(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the pixel around ``x``, of weight 1: :meth:`Filter.splat`."""
+        return torch.floor(x).to(torch.int64), torch.ones_like(x)

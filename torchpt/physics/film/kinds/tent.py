@@ -33,3 +33,7 @@ class Tent(Filter):
         """Return offsets distributed as the triangle, from ``u`` in [0, 1): the inverse CDF, both halves at once."""
         t = 2.0 * u - 1.0
         return torch.copysign(1.0 - (1.0 - t.abs()).sqrt(), t) * self._radius
+
+    def density(self, x: Tensor) -> Tensor:
+        """Return the triangle, of integral 1, at distances ``x`` from the centre: :meth:`Filter.density`."""
+        return (1.0 - x.abs() / self._radius).clamp_min(0.0) / self._radius

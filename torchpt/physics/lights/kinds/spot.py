@@ -13,8 +13,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import azimuth, cross, dot, luminance, normalize
-from torchpt.physics.lights.base import Cone, Light, Row, Setting, bright
+from torchpt.math.sampling import uniform_cone
+from torchpt.math.vectors import Frame, azimuth, cross, dot, luminance, normalize
+from torchpt.physics.lights.base import Cone, EmittedRay, Light, Row, Scope, Setting, bright
 from torchpt.physics.lights.kinds import point
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.spec import Angle, Color, Moves, Point, Refused
@@ -35,6 +36,12 @@ def falloff(wi: Tensor, axis: Tensor, cutoff: Tensor, slope: Tensor) -> Tensor:
     sine = dot(aside, aside).clamp_min(torch.finfo(wi.dtype).tiny).sqrt()
     # `azimuth(cosine, sine)` is the angle between the axis and the direction away from the light.
     return ((cutoff - azimuth(-dot(wi, axis), sine)) * slope).clamp(0.0, 1.0)
+
+
+def _width(cutoff: Tensor) -> Tensor:
+    """Return ``1 - cos(cutoff)``, positive also for angles below a float's resolution of the cosine."""
+    half = torch.sin(0.5 * cutoff)
+    return (2.0 * half * half).clamp_min(torch.finfo(cutoff.dtype).tiny)
 
 
 def _most_of_the_cone(values: Mapping[str, Any]) -> float:
@@ -103,3 +110,18 @@ class Spot(Light):
         drawn = point.Point.sample(at, x, u, mis)
         fraction = falloff(drawn.wi, axis=at.normal, cutoff=at.e1[0], slope=at.e1[1])
         return replace(drawn, radiance=drawn.radiance * fraction)
+
+    @classmethod
+    def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope) -> EmittedRay:
+        """See :meth:`Light.emit`: evenly within the cone."""
+        axis = at.normal.expand(3, v.shape[1])
+        d = Frame.about(axis).to_world(uniform_cone(v.to(axis.dtype), _width(at.e1[0])))
+        fraction = falloff(-d, axis=at.normal, cutoff=at.e1[0], slope=at.e1[1])
+        one = torch.ones_like(d[0])
+        density = cls.emission_density(at, one, scope)
+        return EmittedRay(at.p0.expand_as(d), d, at.radiance * fraction, density, one)
+
+    @classmethod
+    def emission_density(cls, at: Lights, pdf: Tensor, scope: Scope) -> Tensor:
+        """See :meth:`Light.emission_density`: by solid angle alone."""
+        return (0.5 / math.pi) / _width(at.e1[0]).expand_as(pdf)

@@ -20,7 +20,7 @@ class Disk(Surface):
     area_factor = math.pi  # area of an ellipse over the product of its half axes, which `e1` and `e2` are
 
     @classmethod
-    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
-        """See :meth:`Surface.sample`."""
+    def sample_area(cls, at: Lights, u: Tensor) -> SurfaceSample:
+        """See :meth:`Surface.sample_area`."""
         uv = concentric_disk(u)
         return SurfaceSample(p=flat_point(at.p0, at.e1, at.e2, uv), normal=at.normal, uv=uv)

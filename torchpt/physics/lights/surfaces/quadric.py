@@ -47,8 +47,8 @@ class Quadric(Surface):
         return area.index_select(0, faces.column), whole.index_select(0, faces.column)
 
     @classmethod
-    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
-        """See :meth:`Surface.sample`."""
+    def sample_area(cls, at: Lights, u: Tensor) -> SurfaceSample:
+        """See :meth:`Surface.sample_area`."""
         assert at.quadrics is not None
         own = quadrics.sample(at.quadrics, u)  # (3, N) in object space
         p = affine(at.p0 + at.e1 * own[0], at.e2, own[1], at.quadrics.e3, own[2])

@@ -66,6 +66,12 @@ class Sphere(Surface):
         return area, area.detach()
 
     @classmethod
+    def sample_area(cls, at: Lights, u: Tensor) -> SurfaceSample:
+        """See :meth:`Surface.sample_area`."""
+        outward = uniform_sphere(u)
+        return SurfaceSample(p=at.p0 + outward * at.e1[0], normal=outward * at.flip)
+
+    @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> SurfaceSample:
         """See :meth:`Surface.sample`."""
         # Detached: as the reference point moves, the point stays fixed on the light, as on planar lights.

@@ -1,0 +1,129 @@
+"""Bidirectional path tracing: the strategies of ``path``, and light paths whose vertices are joined to the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import dot, safe_reciprocal
+from torchpt.paths import vertex as stages
+from torchpt.paths.integrators.base import LIGHT_CHOICE, STRICT, Integrator, Limits
+from torchpt.paths.integrators.kinds.path import Path
+from torchpt.paths.integrators.light_paths import LightPaths
+from torchpt.paths.integrators.path import PathIntegrator
+from torchpt.paths.integrators.weights import FIELDS, Arrival, behind, reduced, reverse_pdf
+from torchpt.paths.state import Emission, PathState, StageContext, VertexInput, VertexOutput
+from torchpt.physics.lights.emission import density_of_environment, density_of_hit, density_of_sample
+from torchpt.physics.shapes import interact
+from torchpt.physics.shapes.geometry import Interaction
+from torchpt.spec import Scalar
+
+__all__ = ["Bdpt"]
+
+
+class Bdpt(PathIntegrator):
+    """Bidirectional path tracing: camera paths with light samples, and light paths joined to the camera."""
+
+    name = "bdpt"
+    parameters: ClassVar = {
+        **{key: Path.parameters[key] for key in ("max_depth", "rr_depth", "rr_prob")},
+        "light_paths": Scalar(1.0, above=0.0, high=1.0, doc="number of light paths for each camera path"),
+        **LIGHT_CHOICE,
+        **STRICT,
+    }
+    splats = True
+    fields = FIELDS
+
+    @property
+    def limits(self) -> Limits:
+        """Return the depth limits that the parameters set."""
+        return Limits(self.max_depth, self.rr_depth)
+
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """Refuse values by which paths would never end; arguments as for :meth:`torchpt.spec.FrozenConfig.check`."""
+        Path.check(values, given)
+
+    def light_walk(self) -> Integrator:
+        """Return the integrator of the light paths: :meth:`Integrator.light_walk`."""
+        return LightPaths(
+            max_depth=self.max_depth,
+            rr_depth=self.rr_depth,
+            rr_prob=self.rr_prob,
+            fraction=self.light_paths,
+        )
+
+    def generate(self, context: StageContext, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+        """Return camera rays; see :meth:`Integrator.generate`."""
+        camera, crop = context.camera, context.crop
+        assert camera is not None and crop is not None
+        state = super().generate(context, x, y, key, salts)
+        # Light paths for each sample of a pixel, over the density with which the camera samples the direction.
+        dvcm = self.light_paths * float(crop[2] * crop[3]) * safe_reciprocal(camera.film_density(state.d))
+        return replace(state, extra={"dvcm": dvcm, "dvc": torch.zeros_like(dvcm)})
+
+    def _arrival(self, context: StageContext, vertex: VertexInput) -> tuple[Arrival, Interaction]:
+        """Return the numbers of MIS at a vertex, and the surface points."""
+        state, camera = vertex.state, context.camera
+        assert camera is not None
+        at = interact(context.world, state.o, state.d, vertex.hit, follow_ray=context.follow_ray)
+        cosine = Arrival.cosine_of(state.d, at)
+        dvcm = state.extra["dvcm"] / cosine
+        if not camera.parallel:
+            way = at.p - state.o
+            dvcm = dvcm * dot(way, way)
+        return Arrival(dvcm, state.extra["dvc"] / cosine, cosine), at
+
+    def emit(self, context: StageContext, vertex: VertexInput) -> Emission:
+        """Return the emission of emitters that paths hit; see :meth:`Integrator.emit`."""
+        assert context.world.emission is not None
+        state = vertex.state
+        at = interact(context.world, state.o, state.d, vertex.hit, follow_ray=context.follow_ray)
+        density = density_of_hit(context.world.emission, at)
+        return _reduced(stages.emit(context, vertex), density * state.extra["dvc"])
+
+    def escape(self, context: StageContext, vertex: VertexInput) -> Emission:
+        """Return the radiance of the environment; see :meth:`Integrator.escape`."""
+        assert context.world.emission is not None
+        found = stages.escape(context, vertex)
+        density = density_of_environment(context.world.emission, found.pdf)
+        return _reduced(found, density * vertex.state.extra["dvc"])
+
+    def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
+        """Return the outputs of a vertex: as of ``path``, with weights in which light paths take part."""
+        world, state = context.world, vertex.state
+        kind = world.materials.models[model]
+        arrival, at = self._arrival(context, vertex)
+        surface, direct, shadow = stages.shade(context, model, state, at)
+        if direct is not None and shadow is not None:
+            assert world.emission is not None
+            wi = direct.sample.wi
+            reverse = reverse_pdf(context, model, at, surface, -state.d, wi)
+            density = density_of_sample(world.emission, direct.sample) * direct.sample.weight
+            other = density * dot(wi, at.ng).abs() * arrival.others(reverse)
+            shadow = replace(shadow, radiance=shadow.radiance * reduced(direct.weight, other))
+        leaving, next_hit, drawn, continuation = stages.scatter(context, model, state, at, surface)
+        reverse = None if kind.smooth else reverse_pdf(context, model, at, surface, -state.d, drawn.d)
+        dvc = behind(context, model, at, surface, arrival, drawn.d, drawn.pdf, drawn.eta, reverse)
+        leaving = replace(leaving, extra={"dvcm": torch.zeros_like(dvc), "dvc": dvc})
+        return VertexOutput(
+            leaving=leaving,
+            next_hit=next_hit,
+            shadow=shadow,
+            at=at,
+            surface=surface,
+            direct=direct,
+            drawn=drawn,
+            carried=continuation.carried,
+            chance=continuation.chance,
+        )
+
+
+def _reduced(emission: Emission, other: Tensor) -> Emission:
+    """Return emission with the weight that is left where light paths find it too, with ``other (N,)`` times the density."""
+    factor = reduced(emission.weight, other)
+    return replace(emission, weight=emission.weight * factor, brought=emission.brought * factor)

@@ -1,0 +1,200 @@
+"""Light paths: paths that start on the lights, and whose vertices are joined to the camera (light tracing).
+
+A light path carries flux. At each vertex the light that it sends to the camera is a splat, on whatever pixel sees the vertex.
+The adjoint of a BSDF differs from the BSDF where light is refracted (``eta^2``) and where shading normals are not those of the
+geometry (Veach, *Robust Monte Carlo Methods for Light Transport Simulation*, 1997, sections 5.2 and 5.3): values are those of
+the BSDF with light that comes from where the path does, over the cosine of its arrival, so that both are in them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import dot, largest, safe_reciprocal
+from torchpt.paths import vertex as stages
+from torchpt.paths.integrators.base import Integrator, Limits
+from torchpt.paths.integrators.weights import FIELDS, Arrival, behind, reduced, seen_from
+from torchpt.paths.state import Drawn, Field, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
+from torchpt.paths.surface import Surface, emission_map, opacity_map, surface_at
+from torchpt.paths.wave import camera_state
+from torchpt.physics import lights
+from torchpt.physics.lights.emission import LightRay, emit, light_weight
+from torchpt.physics.samplers import Dimension, Draws
+from torchpt.physics.shapes import interact, offset_origin
+from torchpt.physics.shapes.geometry import Interaction
+from torchpt.physics.shapes.interaction import OFFSET
+from torchpt.spec import Integer, Scalar
+
+__all__ = ["LightPaths"]
+
+
+class LightPaths(Integrator):
+    """Light tracing: the stages of paths that start on lights; :class:`~torchpt.paths.integrators.kinds.bdpt.Bdpt` uses it."""
+
+    name = "light_paths"
+    parameters: ClassVar = {
+        "max_depth": Integer(16, low=-1, doc="longest path in edges, from the light to the camera"),
+        "rr_depth": Integer(5, low=1, doc="roulette may end paths from this depth on"),
+        "rr_prob": Scalar(None, above=0.0, high=1.0, words="null or a number", doc="chance to survive roulette"),
+        "fraction": Scalar(1.0, above=0.0, high=1.0, doc="number of light paths for each camera path"),
+    }
+    lit = False
+    splats = True
+    #: ``flux``: factor of throughput and radiance, so that roulette sees a throughput that begins at 1.
+    fields = (*FIELDS, Field("flux"))
+    starts_on_lights = True
+
+    @property
+    def limits(self) -> Limits:
+        """Return the depth limits: a vertex of depth k, joined to the camera, makes a path of k + 1 edges."""
+        return Limits(self.max_depth, self.rr_depth)
+
+    # -- the start
+
+    def _ray(self, context: StageContext, key: Tensor, salts: Tensor) -> LightRay:
+        """Return the rays with which paths of random ``key`` start; ``salts``: those of depth 0."""
+        emission = context.world.emission
+        assert emission is not None
+        draws, which = Draws(context.plan.sampler, key, salts), None
+        u, v = draws.two(Dimension.LIGHT), draws.two(Dimension.BSDF)
+        if emission.choice is not None:
+            which = lights.from_digits(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS))))
+        return emit(emission, which, u.to(context.plan.dtype), v.to(context.plan.dtype), OFFSET)
+
+    def generate(self, context: StageContext, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+        """Return the rays that leave the lights; arguments as for :meth:`Integrator.generate`."""
+        world, ray = context.world, self._ray(context, key, salts)
+        radiance = ray.radiance
+        if ray.at is not None:
+            factor = torch.ones_like(radiance)
+            if world.textures.emission is not None:
+                factor = factor * emission_map(world, ray.at)
+            if world.textures.opacity is not None:
+                factor = factor * opacity_map(world, ray.at)
+            radiance = radiance * (factor if ray.bare is None else torch.where(ray.bare, 1.0, factor))
+        inverse = safe_reciprocal(ray.density)
+        weight = radiance * inverse
+        flux = largest(weight.abs())
+        starts = flux > 0
+        if self.fraction < 1.0:
+            starts = starts & (Draws(context.plan.sampler, key, salts).one(Dimension.ROULETTE) < self.fraction)
+        state = camera_state(ray.o, ray.d, key)
+        return replace(
+            state,
+            throughput=weight / torch.where(flux > 0, flux, 1.0),
+            t_max=torch.where(starts, math.inf, 0.0).to(flux.dtype),
+            extra={"dvcm": torch.zeros_like(flux), "dvc": ray.met * inverse, "flux": flux},
+        )
+
+    # -- vertices
+
+    def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
+        """Return the splats of a vertex, and the rays that go on; see :meth:`Integrator.bounce`."""
+        world, state, hit = context.world, vertex.state, vertex.hit
+        kind = world.materials.models[model]
+        at = interact(world, state.o, state.d, hit, follow_ray=context.follow_ray)
+        surface = surface_at(world, model, state.d, at, context.pixel)
+        arrival = self._arrival(context, model, state, at, surface)
+        # Normals and sides are asked of the direction to the light alone, as in a camera path.
+        share = stages.shading_weight(world, model, at, surface, -state.d, surface.wo)
+        if share is not None:
+            state = replace(state, throughput=state.throughput * share)
+        splat = None if kind.smooth else self._splat(context, model, state, at, surface, arrival)
+        leaving = self._leaving(context, model, state, at, surface, arrival)
+        return VertexOutput(leaving=leaving, next_hit=None, shadow=None, at=at, surface=surface, splat=splat)
+
+    def _arrival(
+        self, context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface
+    ) -> Arrival:
+        """Return the numbers of MIS at a vertex; at the first one a light sample competes."""
+        cosine = Arrival.cosine_of(state.d, at)
+        dvc = state.extra["dvc"] / cosine
+        if context.start_salts is None:
+            return Arrival(torch.zeros_like(cosine), dvc, cosine)
+        emission = context.world.emission
+        assert emission is not None
+        ray = self._ray(context, state.key, context.start_salts)
+        n = None if context.world.materials.models[model].transmits else surface.frame.n
+        weight = light_weight(emission, ray, at.p, n)
+        return Arrival(safe_reciprocal(ray.density * weight * cosine), dvc, cosine)
+
+    def _splat(
+        self, context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface, arrival: Arrival
+    ) -> Splat:
+        """Return the light that surface points send to the camera."""
+        plan, camera, crop, filter = context.plan, context.camera, context.crop, context.filter
+        assert camera is not None and crop is not None and filter is not None
+        kind, draws = context.world.materials.models[model], Draws(plan.sampler, state.key, context.salts)
+        lens = draws.two(Dimension.LENS).to(plan.dtype) if camera.lens else None
+        eye, x, y, ahead = camera.connect(at.p, lens)
+        to = eye - at.p
+        square = dot(to, to)
+        w = to / square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
+        # Square pixels for each area across the ray, over the number of light paths of a sample of all pixels.
+        density = camera.film_density(-w) / (self.fraction * float(crop[2] * crop[3]))
+        if not camera.parallel:
+            density = density * safe_reciprocal(square)
+        view = seen_from(context, model, at, surface, w)
+        wo, wi = view.frame.to_local(w), view.frame.to_local(-state.d)
+        value, reverse = kind.eval_pdf(view.parameters, wo, wi)
+        u = draws.two(Dimension.PIXEL)
+        (column, weight_x), (row, weight_y) = filter.splat(x, u[0].to(plan.dtype)), filter.splat(y, u[1].to(plan.dtype))
+        column, row = column - crop[0], row - crop[1]
+        seen = ahead & (column >= 0) & (column < crop[2]) & (row >= 0) & (row < crop[3])
+        if not kind.transmits:
+            seen = seen & (wo[2] > 0)
+        area = density * dot(w, at.ng).abs()  # square pixels for each area of the surface
+        scale = area * state.extra["flux"] * reduced(None, area * arrival.others(reverse)) / arrival.cosine
+        radiance = state.throughput * value * (scale * weight_x * weight_y)
+        radiance = torch.where(seen, radiance, 0.0)
+        o = offset_origin(context.world, at, w)
+        t_max = (largest(radiance.abs()) > 0).to(plan.dtype)
+        pixel = torch.where(seen, row * crop[2] + column, -1)
+        return Splat(pixel, Shadow(o=o, d=eye - o, t_max=t_max, radiance=radiance))
+
+    def _leaving(
+        self, context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface, arrival: Arrival
+    ) -> PathState:
+        """Return the paths with the rays that leave surface points: sampled as a camera path's, weighted by the adjoint."""
+        plan, kind = context.plan, context.world.materials.models[model]
+        draws = Draws(plan.sampler, state.key, context.salts)
+        lobe = draws.one(Dimension.LOBE).to(plan.dtype) if kind.lobed else None
+        sample = kind.sample(surface.parameters, surface.wo, lobe, draws.two(Dimension.BSDF).to(plan.dtype))
+        d, pdf = surface.frame.to_world(sample.wi), sample.pdf
+        cosine, sharp = dot(d, at.ng).abs(), torch.isinf(pdf) if kind.delta else None
+        turned = cosine / arrival.cosine
+        weight, reverse, least = sample.weight, None, pdf
+        if kind.delta:
+            # A delta lobe's weight is that of light from `wi`: with the cosines of both normals it becomes the adjoint.
+            weight = weight * (turned * surface.wo[2].abs() * safe_reciprocal(sample.wi[2].abs()))
+            if sample.eta is not None:
+                weight = weight * (sample.eta * sample.eta)
+        view = seen_from(context, model, at, surface, d)
+        if not kind.smooth:
+            value, reverse = kind.eval_pdf(view.parameters, view.frame.to_local(d), view.frame.to_local(-state.d))
+            finite = pdf if sharp is None else torch.where(sharp, 0.0, pdf)
+            rough = value * (turned * safe_reciprocal(finite))
+            weight = rough if sharp is None else torch.where(sharp, weight, rough)
+        if kind.delta and surface.perturbed_normal is not None:  # light along `d` would meet another normal
+            same = dot(view.frame.n, surface.frame.n) > 1.0 - 1e-4
+            least = torch.where(torch.isinf(pdf) & ~same, 0.0, least)
+        drawn = Drawn(
+            o=offset_origin(context.world, at, d),
+            d=d,
+            wi=sample.wi,
+            pdf=pdf,
+            weight=weight,
+            least=least,
+            sharp=sharp,
+            eta=None,  # flux is not scaled by refraction
+        )
+        without_shadowing = replace(surface, perturbed_normal=None)  # it is of the light's direction
+        continuation = stages.continue_paths(plan, state, without_shadowing, drawn, draws, context.roulette)
+        leaving = stages.next_ray(context, model, state, at, surface, drawn, continuation)
+        dvc = behind(context, model, at, surface, arrival, d, pdf, sample.eta, reverse)
+        return replace(leaving, extra={**state.extra, "dvcm": torch.zeros_like(dvc), "dvc": dvc})
