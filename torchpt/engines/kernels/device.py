@@ -15,6 +15,7 @@ tree of tensors where it is asked for, run as tensor operations between kernels;
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -101,7 +102,10 @@ def on_host(wave: Wave, known: dict[int, Tensor]) -> Wave:
     ``known``: tensors of the host by the id of the device's, used in place of new copies; new ones are added.
     """
     host = torch.device("cpu")
-    return replace(moved(wave, host, known), filter=type(wave.filter)(wave.filter.values, host))
+    filter = type(wave.filter)(wave.filter.values, host)
+    there = moved(replace(wave, light_paths=None), host, known)
+    context = replace(there.context, filter=None if there.context.filter is None else filter)
+    return replace(there, context=context, filter=filter)
 
 
 class _HostLeaves(Mapping[str, Tensor]):
@@ -378,7 +382,8 @@ class DeviceCalls:
         self._prepared: dict[int, Arguments] = {}  # by id of the kernel, which they refer to
         self._salts: dict[tuple[int, int], Tensor] = {}
         self._bounds: dict[float, Tensor] = {}
-        self._uniforms = {"place": self.place.data_ptr()}
+        self._start_salts = self.cuda.to_device(salts(0, torch.device("cpu")))
+        self._uniforms = {"place": self.place.data_ptr(), "start_salts": self._start_salts.data_ptr()}
 
     def memory(self, rows: int) -> Any:
         """Return new memory for kernels."""
@@ -561,6 +566,10 @@ class DeviceEngine(KernelsEngine):
     def _make_search(self) -> ChunkSearch:
         return DeviceSearch(self.calls)
 
+    def _make_light_paths(self, halt: threading.Event | None) -> DeviceEngine | None:
+        light_paths = self.kernels.light_paths
+        return DeviceEngine(light_paths) if isinstance(light_paths, KernelsOnDevice) else None
+
     def _count_rays(self, lanes: Count, each: int = 1) -> None:
         self._rays += [(counter, each) for counter in lanes.counters] if each else []
 
@@ -576,6 +585,11 @@ class DeviceEngine(KernelsEngine):
         """Launch all kernels that fill ``slots`` with the radiance of a chunk's samples, after :meth:`begin_wave`."""
         walk(self, self.spawn(chunk), self.wave.integrator.limits)
         self.mark_lost()
+        if self.light_paths is not None:
+            assert isinstance(self.light_paths, DeviceEngine)
+            self.light_paths.begin_wave(chunk)
+            self.light_paths.launch(chunk)
+            self.take_over(self.light_paths, chunk)
 
     def sort(self, paths: Paths) -> Counts:
         """See :class:`torchpt.paths.walk.Engine`; all kinds of hits count as present until no paths are left."""
@@ -589,6 +603,7 @@ class DeviceEngine(KernelsEngine):
         """Start to copy the wave's counters to the host; return a function that waits for them and counts rays and paths."""
         copied = self._cuda.to_host(torch.stack(self.device_calls.blocks))
         rays, truncated, known = self._rays, self._truncated, self.tally
+        of_light_paths = self.light_paths.tallies() if isinstance(self.light_paths, DeviceEngine) else RayCounts
 
         def counted() -> RayCounts:
             counters = copied.values().tolist()
@@ -596,7 +611,8 @@ class DeviceEngine(KernelsEngine):
             def total(factors: list[tuple[tuple[int, int, int], int]]) -> int:
                 return sum(each * counters[block][row][column] for (block, row, column), each in factors)
 
-            return RayCounts(known.rays + total(rays), known.truncated + total(truncated))
+            more = of_light_paths()
+            return RayCounts(known.rays + total(rays) + more.rays, known.truncated + total(truncated) + more.truncated)
 
         return counted
 
@@ -647,7 +663,11 @@ def device_kernels(
     """
     packets = search is not None and search.tree is None
     make = partial(DeviceKernels, wave, cuda, target, search, before=before, fixed=not own)
-    return probed_kernels(wave, own, packets, make)
+    kernels = probed_kernels(wave, own, packets, make)
+    if wave.light_paths is not None:
+        earlier = None if before is None else before.light_paths
+        kernels.light_paths = device_kernels(wave.light_paths, own, cuda, target, search, earlier)
+    return kernels
 
 
 def device_forward(

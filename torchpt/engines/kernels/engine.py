@@ -572,17 +572,17 @@ class KernelsEngine:
         walk(self, self.spawn(chunk), self.wave.integrator.limits)
         self.mark_lost()
         if self.light_paths is not None:
-            self._trace_light_paths(self.light_paths, chunk)
+            tally = self.light_paths.trace(chunk)
+            self.tally.rays += tally.rays
+            self.tally.truncated += tally.truncated
+            self.take_over(self.light_paths, chunk)
         return self.tally
 
-    def _trace_light_paths(self, engine: KernelsEngine, chunk: Chunk) -> None:
-        """Trace the light paths of a chunk, one for each sample, and take over their splats and counts."""
-        tally, count = engine.trace(chunk), chunk.pixels * chunk.samples
-        self.splats = engine.splats
-        self.tally.rays += tally.rays
-        self.tally.truncated += tally.truncated
+    def take_over(self, light_paths: KernelsEngine, chunk: Chunk) -> None:
+        """Take over the splats of the light paths of a chunk, one path for each sample."""
+        self.splats, count = light_paths.splats, chunk.pixels * chunk.samples
         # Their radiance is 0, or NaN where a splat is not finite.
-        self.slots.floats[:3, :count] += engine.slots.floats[:3, :count]
+        self.slots.floats[:3, :count] += light_paths.slots.floats[:3, :count]
 
     def mark_lost(self) -> None:
         """Set samples to NaN whose splats are not finite, once all paths ended."""
