@@ -24,7 +24,7 @@ from torchpt.scene.meshes.mesh import (
     too_many_parts,
 )
 from torchpt.scene.meshes.mtl import decoded_lines, find_file, read_mtl
-from torchpt.scene.meshes.obj_arrays import CURVES, Statements, parse_plain
+from torchpt.scene.meshes.obj_text import CURVES, Statements, parse_plain
 
 __all__ = ["load_obj"]
 
@@ -81,9 +81,10 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     ends = np.searchsorted(group_of_triangle[order], np.arange(1, len(text.groups) + 1))
     for (name, _), rows in zip(text.groups.items(), np.split(order, ends[:-1]), strict=True):
         faces = all_faces[rows]
-        used, part_faces = np.unique(
-            faces, return_inverse=True
-        )  # vertices of the part, and its faces as indices into them
+        is_used = np.zeros(len(corners), bool)
+        is_used[faces] = True
+        used = np.flatnonzero(is_used)  # vertices of the part
+        row_in_part = np.cumsum(is_used) - 1
         material = known.get(name)
         if material is None and name and materials:
             material = FileMaterial(name, ignored=("not defined in an MTL file",))
@@ -93,7 +94,7 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
             MeshPart(
                 name=name,
                 vertices=all_positions[used],
-                faces=part_faces.reshape(-1, 3),
+                faces=row_in_part[faces],
                 normals=part_normals,
                 uvs=part_uvs,
                 material=material,
