@@ -147,6 +147,10 @@ class Curves:
         """Return the same from ``low`` to ``high``."""
         return replace(self, low=low, high=high)
 
+    def move(self, moves: Tensor) -> Tensor:
+        """Return a mask ``(N,)`` of the curves that move, given that of primitives ``(P,)``."""
+        return take(moves, self.prim) | ((self.mate >= 0) & take(moves, self.mate.clamp_min(0)))
+
     def at(self, t: Tensor) -> tuple[Held, Tensor]:
         """Return points at ``t (N,)``, and how their numbers change with it ``(3, N)``."""
         cos, sin = torch.cos(t), torch.sin(t)

@@ -106,6 +106,10 @@ class Boundary:
     pixels: int
     ranks: Group | None = None
 
+    @property
+    def _camera_moves(self) -> bool:
+        return any(name.startswith("camera.") for name in self.moving)
+
     @cached_property
     def _cuts(self) -> Cuts | None:
         """Return the curves where surfaces cut."""
@@ -141,7 +145,10 @@ class Boundary:
         if self.moving.keys() <= {"lights"}:  # none of which is seen
             return
         with torch.no_grad():
-            pieces = pieces_of(self.scene, self.still, self.scene.merged(self.params), self.worth.bounds(), self._cuts)
+            # Elsewhere a curve that stands still may have what moves behind it, but the film has it where it was.
+            moves = None if self._camera_moves else moving_primitives(self.scene, self.leaves)
+            poses = self.scene.merged(self.params)
+            pieces = pieces_of(self.scene, self.still, poses, self.worth.bounds(), self._cuts, moves)
         if pieces is None:
             return
         primary = primary_of(self.still, pieces, self.traced)
@@ -172,19 +179,16 @@ class Boundary:
             if sources is None:
                 return
             moves = moving_primitives(self.scene, self.leaves)
-            emitters_move = bool(take(moves, sources.prim[: sources.surfaces]).any())
+            lights_move = "lights" in self.moving or bool(take(moves, sources.prim[: sources.surfaces]).any())
             poses = self.scene.merged(self.params)
-            occluders = occluders_of(
-                self.scene, still, poses, moves, self._cuts, lights_move=emitters_move or "lights" in self.moving
-            )
-            camera_moves = any(name.startswith("camera.") for name in self.leaves)
+            occluders = occluders_of(self.scene, still, poses, moves, self._cuts, lights_move=lights_move)
             near = near_of(self.scene, world.geometry, self.leaves)
-            frame = MovingFrame(still, self.traced, self.worth, near, moves, holds_first, camera_moves)
+            frame = MovingFrame(still, self.traced, self.worth, near, moves, holds_first, self._camera_moves)
             reflects = bool(self.moving.keys() - {"lights"})
             smooth = smooth_of(self.scene, still) if reflects else None
             horizons = horizons_of(self.scene, frame, depth) if reflects else None
         if occluders is not None:
-            yield Shadows(frame, occluders, sources, reach, depth)
+            yield Shadows(frame, occluders, sources, reach, depth, lights_move)
             if reflects and not 0 <= depth < 3:
                 yield Segments(frame, SegmentSampler(occluders, smooth), depth)
         if horizons is not None:

@@ -174,7 +174,7 @@ def occluders_of(
     length, outline, crease, folded, form = torch.cat(columns, 1)
     if not bool((length > 0).any()):
         return None
-    moving = take(moves, every.prim) | ((every.mate >= 0) & take(moves, every.mate.clamp_min(0)))
+    moving = every.move(moves)
     known = ((form < 0) & (crease > 0)).nonzero().squeeze(1)
     return Occluders(
         bodies,

@@ -170,9 +170,9 @@ def view_of(bodies: Bodies) -> View:
 
 
 def pieces_of(
-    scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bounds, cuts: Cuts | None
+    scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bounds, cuts: Cuts | None, moves: Tensor | None
 ) -> Pieces | None:
-    """Return all that may be seen within ``bounds`` of the film; None where nothing may.
+    """Return all that may be seen within ``bounds`` of the film and moves on it; None where nothing does.
 
     Args:
         scene: whose.
@@ -180,6 +180,7 @@ def pieces_of(
         poses: the parameters.
         bounds: least and greatest x, then y.
         cuts: the curves where surfaces cut.
+        moves: ``(P,)`` bool: primitives that move; None: the camera does, and so all that it sees.
     """
     view = view_of(bodies)
     found = [_lines(bodies, *_silhouettes(bodies, folds, view), bounds) for folds in folds_of(scene, bodies, poses)]
@@ -204,7 +205,11 @@ def pieces_of(
     if not found:
         return None
     near, weight = torch.cat([p.near for p in found], 1), torch.cat([p.weight for p in found])
-    return Pieces(joined([p.curves for p in found]), near, weight)
+    pieces = Pieces(joined([p.curves for p in found]), near, weight)
+    if moves is None:
+        return pieces
+    some = pieces.curves.move(moves).nonzero().squeeze(1)
+    return rows(pieces, some) if len(some) else None
 
 
 def _silhouettes(bodies: Bodies, folds: Folds, view: View) -> tuple[Curves, Tensor]:

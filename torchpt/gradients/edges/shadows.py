@@ -260,6 +260,7 @@ class Shadows:
         sources: the lights.
         reach: radius of the scene.
         depth: vertices of paths at most; -1: any number.
+        lights_move: True: lights may move.
     """
 
     frame: MovingFrame
@@ -267,6 +268,7 @@ class Shadows:
     sources: Sources
     reach: float
     depth: int
+    lights_move: bool
 
     @torch.no_grad()
     def samples(self, first: int, count: int, total: int) -> Cast | None:
@@ -324,8 +326,10 @@ class Shadows:
         brought = self.sources.brought(beam, x) * (dot(n, wi).abs() / (passed.density * total))
         edge = cross(n, along)
         edge = edge * -torch.sign(dot(edge, across))
+        moves = self.frame.moving(passed.held.prim) | self.frame.moving(passed.mate)
+        moves = None if self.lights_move else moves | self.frame.moving(spot.hit.prim)
         prefixes = []
-        for prefix in prefixes_of(self.frame, spot, wi, key, self.depth, behind=1):
+        for prefix in prefixes_of(self.frame, spot, wi, key, self.depth, behind=1, moves=moves):
             value = (prefix.weight * take(brought, prefix.lane)).sum(0)
             prefixes.append((prefix, take(edge, prefix.lane) * value))
         if not prefixes:
