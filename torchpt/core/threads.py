@@ -1,9 +1,10 @@
 """Threads: the thread pool of the process, and torch's number of threads and modes while it works.
 
 A caller takes idle threads of the pool and starts the missing ones, so overlapping renders never wait for each other's threads.
-There are three ways to use them: :func:`map_in_order` runs a task for each item and passes results on in the order of items; a
-:class:`TaskQueue` runs tasks of a queue that may grow; :func:`parallel_for` splits a range into a part for each thread. Idle
-threads end before the process forks; a child has a pool of its own.
+There are four ways to use them: :func:`map_in_order` runs a task for each item and passes results on in the order of items; a
+:class:`TaskQueue` runs tasks of a queue that may grow; :func:`parallel_for` splits a range into a part for each thread;
+:class:`ReadAhead` makes calls before their results are asked for. Idle threads end before the process forks; a child has a
+pool of its own.
 
 On a CPU torch splits a tensor of more than 32,768 elements among its threads. The last elements of a part do not fill a vector,
 and functions whose scalar code differs from their vector code (``atan2``, ``pow``) round them differently. A sum over all
@@ -32,6 +33,7 @@ from torchpt.core.errors import RenderError
 from torchpt.core.memory import check_address_space, fits_in_memory
 
 __all__ = [
+    "ReadAhead",
     "TaskQueue",
     "limited_threads",
     "map_in_order",
@@ -351,6 +353,79 @@ def parallel_for(work: Callable[[int, int], object], items: int, threads: int, p
             ended.get()
     if errors:
         raise errors[0]
+
+
+class ReadAhead:
+    """Calls that threads of the pool make before their results are asked for; a context, which waits for these threads.
+
+    A call that no thread has begun is made where its result is asked for, so with one thread all of them are.
+
+    Args:
+        threads: number of threads, the caller's included.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._most = threads - 1
+        self._working = self._started = 0  # threads that take calls now; those that ever did
+        self._todo, self._lock = deque[Callable[[], object]](), threading.Lock()
+        self._ended = SimpleQueue[None]()
+
+    def add(self, call: Callable[[], R]) -> Callable[[], R]:
+        """Queue a call; return a function that returns its result or raises its exception."""
+        once = _Once(call)
+        with self._lock:
+            self._todo.append(once.make)
+            more = self._working < self._most
+            self._working += more
+        if more and _run_in_pool(self._work, self._ended):
+            self._started += 1
+        return once.result
+
+    def __enter__(self) -> ReadAhead:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._todo.clear()
+        for _ in range(self._started):
+            self._ended.get()
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                if not self._todo:
+                    self._working -= 1
+                    return
+                make = self._todo.popleft()
+            make()
+
+
+class _Once(Generic[R]):
+    """A call that is made once, by the first thread that comes."""
+
+    def __init__(self, call: Callable[[], R]) -> None:
+        self._lock = threading.Lock()
+        self._call: Callable[[], R] | None = call
+        self._value: list[R] = []
+        self._error: BaseException | None = None
+
+    def make(self) -> None:
+        """Make the call, or wait for another thread that is making it."""
+        with self._lock:
+            if self._call is None:
+                return
+            try:
+                self._value.append(self._call())
+            except BaseException as error:
+                self._error = error
+            self._call = None
+
+    def result(self) -> R:
+        """Return the result of the call, or raise its exception."""
+        self.make()
+        if self._error is not None:
+            raise self._error
+        return self._value[0]
 
 
 # -- torch's threads and modes

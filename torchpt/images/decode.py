@@ -6,13 +6,17 @@ checked against the limit and, where the format allows it, against the size of t
 
 from __future__ import annotations
 
+import re
 import tempfile
+import threading
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -213,9 +217,39 @@ def _decode_by_pillow(source: Path | EncodedImage, label: str, ending: str, max_
     plugin = {".png": PngImageFile, ".jpg": JpegImageFile, ".jpeg": JpegImageFile, ".bmp": BmpImageFile}
     plugin |= {".tga": TgaImageFile, ".ppm": PpmImageFile, ".pgm": PpmImageFile}
     data = read_regular(source) if isinstance(source, Path) else source.data
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow warns of odd metadata, which is not used
+    with _quiet_pillow():
         return _pillow_pixels(plugin[ending](BytesIO(data)), label, len(data), max_pixels)
+
+
+_quiet_lock, _quiet_count = threading.Lock(), 0
+#: Modules that Pillow's warnings name.
+_WARNING_MODULES = r"PIL\b|torchpt\.images\.decode$"
+
+
+@contextmanager
+def _quiet_pillow() -> Iterator[None]:
+    """Ignore Pillow's warnings within: they are of odd metadata, which is not used.
+
+    Several threads may be within at a time. The filters are the process's: :func:`warnings.catch_warnings` would drop the
+    warnings of other threads, and restore filters that others have changed.
+    """
+    global _quiet_count
+    with _quiet_lock:
+        _quiet_count += 1
+        if _quiet_count == 1:
+            warnings.filterwarnings("ignore", module=_WARNING_MODULES)
+    try:
+        yield
+    finally:
+        with _quiet_lock:
+            _quiet_count -= 1
+            if _quiet_count == 0:
+                filters = cast("list[Any]", warnings.filters)
+                filters[:] = [entry for entry in filters if entry != _FILTER]
+
+
+#: The entry that this filter makes: action, message, category, module, line.
+_FILTER = ("ignore", None, Warning, re.compile(_WARNING_MODULES), 0)
 
 
 def _pillow_pixels(picture: Any, label: str, size: int, max_pixels: int) -> Pixels:

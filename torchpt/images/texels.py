@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from typing import Any
 
@@ -31,6 +32,8 @@ __all__ = [
 
 #: What is accepted as an array of texels, for errors.
 ACCEPTED_TEXELS = "texels (H, W, C), channels last, or (H, W), C from 1 to 4: finite numbers, or 8 bits a value (uint8)"
+#: Values that are decoded at a time.
+_BAND = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -38,24 +41,46 @@ class Texels:
     """Values of an image, not decoded.
 
     Attributes:
-        values: ``(H, W, C)`` float32, row 0 at the top, as stored; integer formats are scaled to 0..1. C is 1 (grey),
-            2 (grey, alpha), 3 or 4 (RGB, alpha).
+        stored: ``(H, W, C)``, row 0 at the top: integers, booleans or float32. C is 1 (grey), 2 (grey, alpha), 3 or 4 (RGB,
+            alpha).
         eight_bit: True: stored with at most 8 bits a value, so colours are sRGB-encoded by convention.
-        white: largest value of the integers that were stored; None: floats.
+        white: the integer that stands for 1; None: floats.
     """
 
-    values: NDArray[np.float32]
+    stored: NDArray[Any]
     eight_bit: bool
     white: int | None = None
 
+    @cached_property
+    def values(self) -> NDArray[np.float32]:
+        """``(H, W, C)`` float32; integers are scaled to 0..1."""
+        if self.white is None:
+            return self.stored
+        values = self.stored.astype(np.float32)
+        values /= np.float32(self.white)
+        return values
+
+    @cached_property
+    def decoded(self) -> NDArray[np.float32]:
+        """``(H, W, C)`` float32, colours decoded from sRGB; the last of 2 or 4 channels is alpha, which is not."""
+        channels = self.stored.shape[2]
+        colours = channels - (1 if channels in (2, 4) else 0)
+        linear = self.linear(colours)
+        return linear if colours == channels else np.concatenate((linear, self.values[..., colours:]), axis=2)
+
     def linear(self, channels: int) -> NDArray[np.float32]:
         """Return the first channels, decoded from sRGB; values of 8 bits by a table."""
-        values = self.values[..., :channels]
         if self.white is None or self.white > 255:
-            return srgb_to_linear(torch.from_numpy(np.ascontiguousarray(values))).numpy()
+            return srgb_to_linear(torch.from_numpy(np.ascontiguousarray(self.values[..., :channels]))).numpy()
         numbers = np.arange(self.white + 1, dtype=np.float32) / np.float32(self.white)
         table = srgb_to_linear(torch.from_numpy(numbers)).numpy()
-        return table[np.rint(values * np.float32(self.white)).astype(np.uint8)]
+        linear = np.empty((*self.stored.shape[:2], channels), np.float32)
+        rows = max(1, _BAND // max(1, linear[0].size))
+        for first in range(0, len(linear), rows):
+            # numpy makes indices of 8 bytes: a band of them fits the cache. "clip" needs no copy of `out`.
+            numbers = self.stored[first : first + rows, :, :channels].astype(np.uint8)
+            np.take(table, numbers, out=linear[first : first + rows], mode="clip")
+        return linear
 
 
 def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MAX_PIXELS) -> Texels:
@@ -75,14 +100,13 @@ def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MA
     values = select_picture(pixels)
     if values.shape[-1] > 4:
         raise AssetError(label, f"has {values.shape[-1]} channels, expected 1 to 4")
-    scaled = np.ascontiguousarray(values, dtype=np.float32)
-    if values.dtype.kind == "f":
-        bad = np.flatnonzero(~np.isfinite(scaled).all(axis=(1, 2)))
-        if len(bad):
-            raise AssetError(label, f"holds a value that is not finite (row {bad[0]})")
-    else:
-        scaled /= np.float32(pixels.white)
-    return Texels(scaled, pixels.eight_bit, None if values.dtype.kind == "f" else int(pixels.white))
+    if values.dtype.kind != "f":
+        return Texels(values, pixels.eight_bit, int(pixels.white))
+    values = np.ascontiguousarray(values, dtype=np.float32)
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=(1, 2)))
+    if len(bad):
+        raise AssetError(label, f"holds a value that is not finite (row {bad[0]})")
+    return Texels(values, pixels.eight_bit)
 
 
 def texels_from_array(value: Any) -> Texels:
@@ -107,10 +131,9 @@ def texels_from_array(value: Any) -> Texels:
     bad = np.flatnonzero(~np.isfinite(values).all(axis=(1, 2)))
     if len(bad):
         raise Refused(ACCEPTED_TEXELS, f"a value that is not finite (row {bad[0]})")
-    white = int(np.iinfo(array.dtype).max) if array.dtype in (np.uint8, np.uint16) else None
-    if white is not None:
-        values /= np.float32(white)
-    return Texels(values, array.dtype == np.uint8, white)
+    if array.dtype not in (np.uint8, np.uint16):
+        return Texels(values, eight_bit=False)
+    return Texels(array.copy(), array.dtype == np.uint8, int(np.iinfo(array.dtype).max))
 
 
 def texels_to_radiance(texels: Texels, source: str, key: str) -> NDArray[np.float32]:
@@ -124,7 +147,7 @@ def texels_to_radiance(texels: Texels, source: str, key: str) -> NDArray[np.floa
     Raises:
         Refused: a negative value.
     """
-    channels = 3 if texels.values.shape[2] >= 3 else 1
+    channels = 3 if texels.stored.shape[2] >= 3 else 1
     values = texels.linear(channels) if texels.eight_bit else texels.values[..., :channels]
     if channels == 1:
         values = values.repeat(3, 2)

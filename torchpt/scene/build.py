@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from torchpt.core.errors import SceneError
+from torchpt.core.threads import ReadAhead, thread_count
 from torchpt.physics.lights import sort_key
 from torchpt.physics.parts import Copy, Parameters, Part, Source
 from torchpt.physics.shapes.geometry import KINDS
@@ -21,7 +22,7 @@ from torchpt.scene.formats.description import Description
 from torchpt.scene.materials import declare, resolved
 from torchpt.scene.mesh_triangles import warn_of_coplanar_refraction
 from torchpt.scene.shapes import ShapeBuilder, ShapeEntry
-from torchpt.scene.sources import build_lights, check_coordinates, declare_vertex_attributes
+from torchpt.scene.sources import build_lights, check_coordinates, declare_vertex_attributes, read_light_files
 from torchpt.scene.space import centre_and_unit
 from torchpt.scene.texture_loader import TextureLoader
 
@@ -70,14 +71,17 @@ def build_parts(description: Description, vertex_params: Collection[str] = ()) -
         ImportedSceneWarning: meshes of an imported scene have no area.
     """
     try:
-        return _built(description, vertex_params)
+        with ReadAhead(thread_count(None)) as ahead:
+            return _built(description, vertex_params, ahead)
     except SceneError as error:
         raise description.layers.blame(error) from None  # names the file that the key comes from
 
 
-def _built(description: Description, vertex_params: Collection[str]) -> SceneBuild:
+def _built(description: Description, vertex_params: Collection[str], ahead: ReadAhead) -> SceneBuild:
     parameters = Parameters()
     texture_loader = TextureLoader(description.textures, description, parameters)
+    texture_loader.read_ahead(ahead)
+    light_files = read_light_files(description, ahead)
     builder = ShapeBuilder(description, parameters, texture_loader)
     entries = [
         ShapeEntry(name=name, number=number, shape=shape)
@@ -89,7 +93,7 @@ def _built(description: Description, vertex_params: Collection[str]) -> SceneBui
     builder.warn_of_empty_meshes()
     for name, material in description.materials.items():  # those that no shape uses have parameters too
         declare(resolved(material, f"materials.{name}", description.materials, texture_loader), parameters)
-    sources = build_lights(description, parameters)
+    sources = build_lights(description, parameters, light_files)
     # `builder.sources` are the lights in mesh files.
     sources = sorted([*sources, *builder.sources], key=lambda source: sort_key(source.kind))
     parameters.declare_all("camera", description.camera.kind, description.camera.values)

@@ -15,12 +15,13 @@ import numpy as np
 from torch import Tensor
 
 from torchpt.core.errors import AssetError, SceneError
+from torchpt.core.threads import ReadAhead
 from torchpt.math.transforms import apply_points
 from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.parts import Parameters, Part, Source
 from torchpt.scene.formats.description import Description
 from torchpt.scene.meshes import FileLight
-from torchpt.spec import Refused, VertexAttribute, parameters_of
+from torchpt.spec import Refused, Spec, VertexAttribute, parameters_of
 from torchpt.spec.schema import ParsedParams, scene_error
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "check_coordinates",
     "check_light_params",
     "declare_vertex_attributes",
+    "read_light_files",
     "unique_labels",
 ]
 
@@ -73,8 +75,27 @@ def check_coordinates(parts: Sequence[Part], texels_in_scene: Collection[str], f
 # ---- Delta lights and environments, from the lights block and from mesh files
 
 
-def build_lights(description: Description, parameters: Parameters) -> list[Source]:
-    """Return the lights of the lights block, and declare their parameters."""
+#: Arrays of a light's files by the name of the parameter, with their specs.
+LightArrays = dict[str, tuple[Any, Spec]]
+
+
+def read_light_files(description: Description, ahead: ReadAhead) -> dict[str, Callable[[], LightArrays]]:
+    """Begin to read the files of the lights block; return a function for each light that returns their arrays.
+
+    A kind of light that reads files (an environment map) returns their arrays, which become parameters.
+    """
+
+    def files(name: str, light: ParsedParams) -> LightArrays:
+        with description.reading_files() as resolve:
+            return light.kind.files(light.values, partial(_file_of, resolve, f"lights.{name}", light))
+
+    return {name: ahead.add(partial(files, name, light)) for name, light in description.lights.items()}
+
+
+def build_lights(
+    description: Description, parameters: Parameters, files: Mapping[str, Callable[[], LightArrays]]
+) -> list[Source]:
+    """Return the lights of the lights block, and declare their parameters; ``files``: by :func:`read_light_files`."""
     lights = description.lights
     environments = [name for name, light in lights.items() if light.kind.environment]
     if len(environments) > 1:
@@ -85,9 +106,7 @@ def build_lights(description: Description, parameters: Parameters) -> list[Sourc
         key = f"lights.{name}"
         parameters.declare_all(key, light.kind, light.values)
         try:
-            # A kind of light that reads files (an environment map) returns their arrays, which become parameters.
-            with description.reading_files() as resolve:
-                arrays = light.kind.files(light.values, partial(_file_of, resolve, key, light))
+            arrays = files[name]()
         except Refused as error:
             raise scene_error(error, key=key, value=None, file=description.file) from None
         for stem, (values, spec) in arrays.items():

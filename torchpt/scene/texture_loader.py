@@ -7,13 +7,15 @@ parameter is to add it to ``scene.params``. The builders of shapes and materials
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from torchpt.core.errors import AssetError, SceneError
+from torchpt.core.threads import ReadAhead
 from torchpt.physics.parts import Parameters
 from torchpt.physics.textures import Node, Opening, TextureInput, TexturePoint, TextureReference
 from torchpt.scene.formats.description import Description
@@ -38,6 +40,24 @@ class TextureLoader:
         self._nodes: dict[str, Node] = {}  # by key: many shapes may share a material
         # Of mesh files, by prefix of their images' names: name of each image by its label (its path, or a hash).
         self._image_names: dict[str, dict[str, str]] = {}
+
+    def read_ahead(self, ahead: ReadAhead) -> None:
+        """Begin to read the images of all materials and shapes beside; errors come when slots open them."""
+        description = self._description
+
+        def find(path: tuple[str, ...]) -> Path | None:
+            try:
+                return description.resolve(path, "")
+            except (SceneError, AssetError):
+                return None
+
+        for block in (*description.materials.values(), *description.shapes.values()):
+            for slot in _slots(block):
+                texture = slot.texture
+                if isinstance(texture, TextureReference):
+                    texture = self._textures.get(texture.texture)
+                if texture is not None:
+                    texture.kind.read_ahead(slot, texture.values, find, self._pictures, ahead)
 
     def __call__(self, slot: TextureInput, key: str) -> Node:
         """Return the texture node of the slot ``key``.
@@ -108,3 +128,12 @@ class TextureLoader:
             return table.look_up(rows, point, coloured=False).numpy()
 
         return look_up
+
+
+def _slots(block: ParsedParams) -> Iterator[TextureInput]:
+    """Yield the textures among the values of a block, and of the blocks in it."""
+    for value in block.values.values():
+        if isinstance(value, TextureInput):
+            yield value
+        elif isinstance(value, ParsedParams):
+            yield from _slots(value)

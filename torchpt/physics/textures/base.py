@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError
+from torchpt.core.threads import ReadAhead
 from torchpt.math.transforms import uv_matrix
 from torchpt.spec import Angle, Color, Custom, Moves, Pair, Refused, Spec, parameters_of
 from torchpt.spec.reading import LARGEST, as_refused, vector
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from torchpt.physics.parts import Parameters
 
 __all__ = [
-    "CHANNELS", "IDENTITY", "Mapped", "Matrix", "Node", "Opening", "Table", "Texture", "TextureInput", "TexturePoint",
+    "CHANNELS", "IDENTITY", "Find", "Mapped", "Matrix", "Node", "Opening", "Table", "Texture", "TextureInput", "TexturePoint",
     "TextureReference", "UvTransform", "transform_uv",
 ]  # fmt: skip
 
@@ -38,6 +39,8 @@ CHANNELS = ("luminance", "r", "g", "b", "a")
 Matrix = tuple[tuple[float, float, float], tuple[float, float, float]]
 #: The identity transform of texture coordinates.
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+#: Returns the file of a path as written, or None where there is none.
+Find = Callable[[tuple[str, ...]], Path | None]
 _ONE = (1.0, 1.0, 1.0)
 _TRANSFORM = "a mapping with scale, rotate, translate, or with matrix"
 _ROWS = "two rows of three finite numbers [[a, b, c], [d, e, f]]"
@@ -300,6 +303,20 @@ class Texture:
 
         Raises:
             Refused: with the accepted values.
+        """
+
+    @classmethod
+    def read_ahead(
+        cls, slot: TextureInput, values: Mapping[str, Any], find: Find, image_cache: dict[Any, Any], ahead: ReadAhead
+    ) -> None:
+        """Begin to read the files that :meth:`open` will ask for; errors come when it does.
+
+        Args:
+            slot: the slot for which the texture will be opened.
+            values: the values of the parameters.
+            find: returns the file of a path as written, or None where there is none.
+            image_cache: as of :class:`Opening`; gets what was begun, under keys of the kind's own.
+            ahead: makes calls beside.
         """
 
     @classmethod

@@ -7,16 +7,17 @@ A slot is the parameter of a material whose values the texture gives; opened for
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
+from pathlib import Path as FilePath
 from typing import Any, ClassVar
 
-import numpy as np
-
 from torchpt.core.errors import AssetError, SceneError
+from torchpt.core.threads import ReadAhead
 from torchpt.images import EncodedImage, Texels, read_texels
 from torchpt.images.decode import MAX_PIXELS
 from torchpt.images.texels import ACCEPTED_TEXELS, check_source, texels_from_array
 from torchpt.physics.textures.atlas import WRAPS, ImageNode
-from torchpt.physics.textures.base import CHANNELS, Mapped, Node, Opening
+from torchpt.physics.textures.base import CHANNELS, Find, Mapped, Node, Opening, TextureInput
 from torchpt.spec import Choice, Color, Custom, Integer, Path, Refused
 from torchpt.spec import Texels as TexelsSpec
 
@@ -87,6 +88,20 @@ class Image(Mapped):
             raise Refused("one number as scale where a number is wanted", list(values["scale"]), ("scale",))
 
     @classmethod
+    def read_ahead(
+        cls, slot: TextureInput, values: Mapping[str, Any], find: Find, image_cache: dict[Any, Any], ahead: ReadAhead
+    ) -> None:
+        """See :meth:`Texture.read_ahead`."""
+        if not isinstance(values["path"], tuple):
+            return
+        path = find(values["path"])
+        max_pixels = MAX_PIXELS if values["max_pixels"] is None else values["max_pixels"]
+        if path is not None and (key := (str(path), max_pixels)) not in image_cache:
+            space = values["colorspace"]
+            linear = space == "linear" or (space == "auto" and slot.linear)
+            image_cache[key] = ahead.add(partial(_read_converted, path, max_pixels, linear))
+
+    @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
         """See :meth:`Texture.open`."""
         slot, scale = opening.slot, values["scale"]
@@ -96,7 +111,7 @@ class Image(Mapped):
         space = values["colorspace"]
         # Files of 8 bits a value hold sRGB, unless the file says otherwise or the slot's values are no colours (`slot.linear`).
         decode = picture.eight_bit and (space == "srgb" or (space == "auto" and (alpha or not slot.linear)))
-        channels = picture.values.shape[2]
+        channels = picture.stored.shape[2]
         if alpha and channels in (1, 3):
             raise AssetError(label, f"has no alpha channel, asked for by {opening.key}")
         if not slot.coloured and len(set(scale)) > 1:
@@ -136,9 +151,17 @@ def _read_image(values: Mapping[str, Any], opening: Opening) -> tuple[str, Texel
     max_pixels = MAX_PIXELS if values["max_pixels"] is None else values["max_pixels"]
     picture = opening.image_cache.get(label)
     # An image that another slot allowed to be larger is read again, which refuses it by name.
-    if picture is None or picture.values.shape[0] * picture.values.shape[1] > max_pixels:
-        picture = opening.image_cache[label] = read_texels(source, max_pixels)
+    if picture is None or picture.stored.shape[0] * picture.stored.shape[1] > max_pixels:
+        begun = opening.image_cache.pop((label, max_pixels), None)  # see `Image.read_ahead`
+        picture = opening.image_cache[label] = read_texels(source, max_pixels) if begun is None else begun()
     return label, picture
+
+
+def _read_converted(path: FilePath, max_pixels: int, linear: bool) -> Texels:
+    """Read an image, and convert it to the values that a slot wants which takes 8 bits a value as ``linear`` ones or not."""
+    picture = read_texels(path, max_pixels)
+    _ = picture.values if linear or not picture.eight_bit else picture.decoded
+    return picture
 
 
 def _declare_texels(
@@ -154,7 +177,7 @@ def _declare_texels(
         decode: whether colours are decoded from sRGB.
         alpha: whether the slot reads the alpha channel: then either form will do, as alpha is the same in both.
     """
-    texels = _decoded(opening, label, picture) if decode else picture.values
+    texels = picture.decoded if decode else picture.values
     name, parameters = opening.name, opening.parameters
     if name in parameters and parameters[name] is not texels and not alpha:
         name += ".decoded" if decode else ".stored"  # an image for both colours and numbers has two sets of texels
@@ -168,15 +191,3 @@ def _declare_texels(
     if label == f"{opening.name}.data":
         opening.parameters.texels_in_scene.add(name)
     return name
-
-
-def _decoded(opening: Opening, label: str, picture: Texels) -> np.ndarray:
-    """Return the texels with colours decoded from sRGB."""
-    key = (label, "decoded")  # cached, as other slots recognize the array by its identity
-    if key not in opening.image_cache:
-        values = picture.values.copy()
-        # The last of 2 or 4 channels is alpha.
-        colours = values.shape[2] - (1 if values.shape[2] in (2, 4) else 0)
-        values[..., :colours] = picture.linear(colours)
-        opening.image_cache[key] = values
-    return opening.image_cache[key]
