@@ -12,7 +12,7 @@ from few import few
 from few_lanes import few_lanes
 
 import torchpt
-from torchpt.core.errors import SceneError
+from torchpt.core.errors import NotBuiltError, SceneError
 from torchpt.paths.integrators import KINDS
 from torchpt.paths.integrators.base import Integrator
 from torchpt.paths.layers import LAYERS
@@ -81,6 +81,17 @@ ROWS = {
         smooth={"max_depth": 4},
     ),
     "direct": Row(accepted={"strategy": "uniform", "strict": True}, refused={**LIT, "strategy": "bdpt"}),
+    "bdpt": Row(
+        accepted={"max_depth": 3, "rr_depth": 2, "rr_prob": 0.8, "light_paths": 0.5},
+        refused={
+            "max_depth": -2,
+            "rr_depth": 0,
+            "rr_prob": 1.01,
+            "light_paths": 0,
+            "light_choice": "nearest",
+            "strict": 1,
+        },
+    ),
     "ibl": Row(accepted={"light_choice": "power", "clamp": 1.0}, refused=LIT),
     "aov": Row(gradient=None),
 }
@@ -142,6 +153,11 @@ def test_gradients(name):
     if not KINDS[name].light:
         with pytest.raises(SceneError, match="where gradients are wanted"):
             torchpt.render(scene, params={"materials.clay.reflectance": leaf}, **wish)
+        return
+    if KINDS[name]().light_walk() is not None:
+        image = torchpt.render(scene, params={"materials.clay.reflectance": leaf}, **wish)
+        with pytest.raises(NotBuiltError, match="light paths"):
+            image.mean().backward()
         return
     if key is None:
         torchpt.render(scene, params={"materials.clay.reflectance": leaf}, **wish).mean().backward()

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchpt.engines.engine import hits, seen
 from torchpt.math.vectors import Frame, dot, rows
+from torchpt.paths.integrators.base import Integrator
 from torchpt.paths.integrators.path import PathIntegrator, partition
 from torchpt.paths.state import PathState
 from torchpt.paths.wave import Wave, camera_state
@@ -79,11 +80,18 @@ def find_missing_light(
                 return MissingLight(f"lights.{names.light(row)}: {problem}", 0.0)
     black = (picture == 0.0).all(2).reshape(-1)
     if bool(black.all()):
-        return MissingLight("no sample met any light", 1.0)
+        return MissingLight(f"no sample met any light{_hint(wave.integrator)}", 1.0)
     dark_share = _share_of_dark_pixels(search, black)
     if dark_share > min(LARGEST_DARK_SHARE, relmse):
-        return MissingLight(f"no sample met any light in {100.0 * dark_share:.2g} % of the picture", dark_share)
+        reason = f"no sample met any light in {100.0 * dark_share:.2g} % of the picture"
+        return MissingLight(reason + _hint(wave.integrator), dark_share)
     return MissingLight("", dark_share)
+
+
+def _hint(integrator: Integrator) -> str:
+    """Return what to try where paths from the camera alone find no light."""
+    alone = isinstance(integrator, PathIntegrator) and integrator.light_walk() is None
+    return " (integrator bdpt, whose paths start on lights too, may find some)" if alone else ""
 
 
 class _Search:
@@ -211,7 +219,10 @@ def _why_unreachable(search: _Search, names: Names, lights: Lights, row: int, ki
     if not transmitting or not all(model.smooth for model in hit_models):
         return ""
     shape, material = names.shape(int(slot[transmitting[0]]))
-    return f"a {kind} light {'inside' if len(hit_models) == LIGHT_RAYS else 'behind'} {shape} ({material}) {cannot_be_found}"
+    where = f"a {kind} light {'inside' if len(hit_models) == LIGHT_RAYS else 'behind'} {shape} ({material})"
+    if integrator.light_walk() is not None:
+        return f"{where} cannot be found by integrator {integrator.name} where it is seen through glass or in a mirror"
+    return f"{where} {cannot_be_found} (bdpt finds it where it is not seen through glass or in a mirror)"
 
 
 def _light_rays(search: _Search, lights: Lights, row: int, kind: str) -> tuple[Tensor, Tensor]:

@@ -268,6 +268,10 @@ def _like_path(p: Properties, importer: Importer) -> Block:
     return {"type": "path", **_depths(p)}
 
 
+def _like_bdpt(p: Properties, importer: Importer) -> Block:
+    return {**_like_path(p, importer), "type": "bdpt"}
+
+
 _LAYERS = {"albedo": "albedo", "depth": "depth", "position": "position", "uv": "uv", "sh_normal": "normal"}
 
 
@@ -295,16 +299,15 @@ INTEGRATORS: dict[str, Plugin] = {
     "aov": exact("aovs", _aov),
     **dict.fromkeys(("volpath", "volpathmis", "volpath_simple", "prbvolpath"), nearest("path", _like_path, _MEDIA)),
     **dict.fromkeys(
+        ("bdpt", "ppm", "sppm", "photonmapper", "ptracer"),
+        nearest("bdpt", _like_bdpt, "light paths are joined to the camera alone, and no photons are kept"),
+    ),
+    **dict.fromkeys(
         (
-            "bdpt",
             "mlt",
             "pssmlt",
             "erpt",
-            "ppm",
-            "sppm",
-            "photonmapper",
             "vpl",
-            "ptracer",
             "irrcache",
             "adaptive",
             "prb",
