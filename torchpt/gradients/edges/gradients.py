@@ -18,7 +18,7 @@ from torchpt.gradients.edges.bodies import Bodies, bodies_of
 from torchpt.gradients.edges.curves import marked_primitives
 from torchpt.gradients.edges.cuts import Cuts, cuts_of
 from torchpt.gradients.edges.film import Worth
-from torchpt.gradients.edges.guide import Lesson, Round
+from torchpt.gradients.edges.guide import Round, first_round
 from torchpt.gradients.edges.horizons import Horizons, horizons_of
 from torchpt.gradients.edges.occluders import occluders_of
 from torchpt.gradients.edges.primary import Look, pieces_of, primary_of
@@ -45,10 +45,6 @@ _PER_EDGE_SAMPLE = 4
 #: The same where vertices of a mesh move each by itself: the variance of their gradients is that of the faces' normals, which
 #: turn the more the smaller a face is, and edges bring a tenth to a five-hundredth of it.
 _PER_EDGE_SAMPLE_OF_MESHES = 16
-#: One sample in so many teaches where to draw the others, but not more than so many in all, nor fewer.
-_FIRST_OF, _MOST_FIRST, _LEAST_FIRST = 8, 1 << 13, 1 << 10
-#: A later sample counts as so many of them.
-_GAIN = 3.0
 #: So many vertices are a mesh's.
 _MESH = 64
 
@@ -157,8 +153,8 @@ class Boundary:
         if pieces is None:
             return
         primary = primary_of(self.still, pieces, self.traced)
-        for turn, first, count in self._rounds(total):
-            yield primary.samples(turn, first, count, self.worth, look, held)
+        for first, count in self._chunks(total):
+            yield primary.samples(first, count, total, self.worth, look, held)
 
     def shadows(self, spp: int, holds_first: bool = False) -> Iterator[Samples]:
         """Yield samples of the edges of shadows of lights, of edges in reflected light, and of horizons.
@@ -167,7 +163,13 @@ class Boundary:
         """
         total = spp * self.pixels
         for estimator in self._estimators(holds_first):
-            for turn, first, count in self._rounds(total):
+            turn = first_round(total)
+            if turn is not None:  # every rank draws it, as all learn from it
+                found = estimator.samples(turn, 0, turn.count)
+                if found is not None and (self.ranks is None or self.ranks.rank == 0):
+                    yield found
+            turn = Round(0, total) if turn is None else turn.then(total)
+            for first, count in self._chunks(turn.count):
                 found = estimator.samples(turn, first, count)
                 if found is not None:
                     yield found
@@ -199,23 +201,10 @@ class Boundary:
         if horizons is not None:
             yield horizons
 
-    def _rounds(self, total: int) -> Iterator[tuple[Round, int, int]]:
-        """Yield rounds, each once for each of its chunks, with their first samples and numbers of samples.
-
-        What the first round brought guides the second.
-        """
-        few = min(total // _FIRST_OF, _MOST_FIRST)
-        guide = None
-        if few >= _LEAST_FIRST:
-            lesson = Lesson()
-            weight = few / (few + _GAIN * (total - few))
-            yield Round(0, few, weight, lesson=lesson), 0, few
-            guide = lesson.guide()
-            turn = Round(few, total - few, 1.0 - weight, guide)
-        else:
-            turn = Round(0, total, 1.0)
-        for _, first in share(range(0, turn.count, SAMPLES), self.ranks):
-            yield turn, first, min(SAMPLES, turn.count - first)
+    def _chunks(self, total: int) -> Iterator[tuple[int, int]]:
+        """Yield the first samples of chunks and their numbers."""
+        for _, first in share(range(0, total, SAMPLES), self.ranks):
+            yield first, min(SAMPLES, total - first)
 
 
 def boundary_of(

@@ -115,15 +115,18 @@ class Horizons:
         y = met(traced, o, d)
         r = torch.where(y.hit.prim >= 0, y.hit.t.double(), 1.0)
         moves = self.frame.moving(prim) | self.frame.moving(y.hit.prim)
-        prefixes, brought = [], torch.zeros_like(u)
+        prefixes = []
         for prefix in prefixes_of(
             self.frame, spot, omega, key, self.depth, behind=1, moves=moves, side=side.to(spot.p)
         ):
             lane, depth = prefix.lane, self.depth if self.depth < 0 else self.depth - prefix.count
             light = traced.radiance(take(o, lane), take(d, lane), take(number, lane), Use.BEHIND, depth)
             prefixes.append((prefix, (light * prefix.weight).sum(0) * take(weight, lane)))
-            brought.index_add_(0, lane, prefixes[-1][1].abs())
-        turn.learn(even, brought / scale)
+        if turn.lesson is not None:
+            brought = torch.zeros_like(u)
+            for prefix, light in prefixes:
+                brought.index_add_(0, prefix.lane, light.abs())
+            turn.lesson.append((even, brought / scale))
         seen, share = y.held(bodies), self.frame.share(y.hit.prim, r)
         return HorizonSamples(face, n, omega, seen, r, share, prefixes) if prefixes else None
 

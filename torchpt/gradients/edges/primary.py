@@ -347,13 +347,12 @@ class Primary:
     traced: Traced
 
     @torch.no_grad()
-    def samples(self, turn: Round, first: int, count: int, worth: Worth, look: Look, over: bool = False) -> Along:
-        """Return samples ``first .. first + count`` of a round: those that are seen.
+    def samples(self, first: int, count: int, total: int, worth: Worth, look: Look, over: bool = False) -> Along:
+        """Return samples ``first .. first + count`` of ``total``: those that are seen.
 
         ``over``: they count as they move over what is seen on both sides, which is held in place.
         """
-        number, _, even, _ = self.traced.edges(turn, first, count, Use.PRIMARY)
-        (u,), scale = turn.draw(even[None])
+        number, _, u, _ = self.traced.edges(Round(0, total), first, count, Use.PRIMARY)
         index, rest = self.choice.draw(u)
         chance = take(self.choice.pmf, index)
         pieces = rows(self.pieces, index)
@@ -379,7 +378,7 @@ class Primary:
         values = look(o, d, take(number, index).repeat(2)) if len(index) else torch.zeros(len(value), 0).to(value)
         jump = values[:, : len(index)] - values[:, len(index) :]
         worthy = (take(value, index) * jump).sum(0) * take(share, seen)
-        chance, normal = take(chance * density / scale, index), take(normal, seen)
+        chance, normal = take(chance * density, index) * total, take(normal, seen)
         beside = None
         if over:
             each = (take(value, index).repeat(1, 2) * values).sum(0) * (take(share, seen) / chance).repeat(2)
@@ -387,9 +386,6 @@ class Primary:
             t, prim = self.traced.nearest(o, d)
             met = prim >= 0
             beside = torch.where(met, o, torch.inf), torch.where(met, t, 1.0) * d, normal.repeat(1, 2) * each
-        if turn.lesson is not None:
-            size = (normal * normal).sum(0).sqrt() * worthy.abs() / chance
-            turn.learn(even[None], torch.zeros_like(u).index_copy_(0, index, size) / scale)
         held, mate, cut = rows((held, pieces.curves.mate, pieces.curves.cut), index)
         return Along(held, normal * (worthy / chance), crossing_of(self.bodies, cut, held, mate), beside)
 

@@ -374,7 +374,7 @@ class Segments:
         found = self._samples(rays, spot, *rows((number, key, scale), lane)) if len(lane) else None
         if turn.lesson is not None and found is not None:
             brought = torch.zeros_like(scale).index_add_(0, found.number - number[0], found.brought(self.frame))
-            turn.learn(even, brought / scale)
+            turn.lesson.append((even, brought / scale))
         return found
 
     def _receivers(self, rays: SegmentRays) -> tuple[SegmentRays, Spot, Tensor]:

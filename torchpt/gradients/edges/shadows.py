@@ -292,7 +292,7 @@ class Shadows:
             brought = torch.zeros_like(scale)
             for prefix, weight in cast.prefixes:
                 brought.index_add_(0, take(passed.lane, prefix.lane), dot(weight, weight).sqrt())
-            turn.learn(even, brought / scale)
+            turn.lesson.append((even, brought / scale))
         return cast
 
     def _past(self, beam: Beam, passed: EdgePoints) -> tuple[Beam, EdgePoints, Spot, Tensor]:
