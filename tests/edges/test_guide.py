@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import known_gradients as known
 import pytest
 import torch
 from torch import Tensor
 
+import torchpt
+from torchpt.gradients.edges import gradients as gradients_module
 from torchpt.gradients.edges import guide as guiding
-from torchpt.gradients.edges.gradients import boundary_of
+from torchpt.gradients.edges.gradients import boundary_of, samples_for
 from torchpt.gradients.edges.guide import Guide, first_round, guide_of
 from torchpt.scene.formats.description import settings
 
@@ -72,7 +75,7 @@ def test_nothing_is_learned_of_nothing():
 
 
 def test_rounds_share_the_samples_and_the_estimate():
-    assert first_round(8000) is None
+    assert first_round(4000) is None
     first = first_round(80_000)
     assert first is not None and first.lesson == []
     then = first.then(80_000)
@@ -110,3 +113,49 @@ def test_gradients_of_edges_keep_their_mean_and_vary_less(case: str, monkeypatch
     assert abs(float(even.mean() - guided.mean())) < 4 * error
     assert guided.var() < even.var()
     assert not torch.equal(guided, even)
+
+
+class Rank:
+    """One of two processes, which adds up nothing."""
+
+    def __init__(self, rank: int) -> None:
+        self.rank, self.size = rank, 2
+
+    def sum(self, total: Tensor) -> Tensor:
+        return total
+
+
+def test_ranks_learn_the_same_and_count_the_first_samples_once(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(gradients_module, "SAMPLES", 2048)
+    pair = known.PAIRS["block_in_corner"]
+    scene, parameter = known.loaded(pair), pair.parameter
+    cotangent = known.weights().float().permute(2, 0, 1)
+
+    def gradient(ranks: Any) -> Tensor:
+        poses, given = {parameter: scene.params[parameter]}, settings(scene.description, {})
+        edges = boundary_of(scene, given, poses, [parameter], torch.float32, cotangent, ranks)
+        assert edges is not None
+        (value,) = edges.gradients(edges.shadows(16), [parameter])
+        assert value is not None
+        return value
+
+    alone, parts = gradient(None), [gradient(Rank(k)) for k in range(2)]
+    assert all(part.abs().max() > 0 for part in parts)
+    torch.testing.assert_close(parts[0] + parts[1], alone, rtol=1e-4, atol=1e-6)
+
+
+def test_samples_by_what_is_differentiated():
+    shapes = {"ball": {"type": "sphere"}, "fine": mesh(100), "coarse": mesh(10)}
+    scene = torchpt.load({"camera": {"origin": [0, 0, 4]}, "shapes": shapes}, "cpu")
+    ball, fine, coarse = "shapes.ball.to_world", "shapes.fine.vertices", "shapes.coarse.vertices"
+    assert samples_for(scene, [ball], 64, 1000) == 8
+    assert samples_for(scene, [ball, "shapes.ball.material.reflectance"], 20, 1000) == 2.5
+    assert samples_for(scene, [ball], 16, 256 * 256) == 1
+    assert samples_for(scene, [coarse], 64, 1000) == samples_for(scene, [coarse, fine], 64, 1000) == 16
+    assert samples_for(scene, [fine, ball], 64, 1000) == 16
+    assert samples_for(scene, [fine], 16, 256 * 256) == 0.5
+
+
+def mesh(count: int) -> dict[str, Any]:
+    points = numbers(7, count=count).T.tolist()
+    return {"type": "mesh", "vertices": points, "faces": [[k, k + 1, k + 2] for k in range(count - 2)]}

@@ -27,7 +27,7 @@ _EVEN = 0.5
 #: Times that the cube is halved, and the fewest samples of a box that is.
 _HALVINGS, _FEWEST = 9, 24
 #: One sample in so many is of the first round, but neither more nor fewer than so many in all.
-_FIRST_OF, _MOST_FIRST, _LEAST_FIRST = 8, 1 << 13, 1 << 10
+_FIRST_OF, _MOST_FIRST, _LEAST_FIRST = 8, 1 << 13, 1 << 9
 #: So many samples of the first round count as one of the second.
 _GAIN = 3.0
 
