@@ -146,7 +146,7 @@ def test_ranks_learn_the_same_and_count_the_first_samples_once(monkeypatch: pyte
 
 def test_samples_by_what_is_differentiated():
     shapes = {"ball": {"type": "sphere"}, "fine": mesh(100), "coarse": mesh(10)}
-    scene = torchpt.load({"camera": {"origin": [0, 0, 4]}, "shapes": shapes}, "cpu")
+    scene = torchpt.load({"camera": {"origin": [0, 0, 4], "target": [0, 0, 0]}, "shapes": shapes}, "cpu")
     ball, fine, coarse = "shapes.ball.to_world", "shapes.fine.vertices", "shapes.coarse.vertices"
     assert samples_for(scene, [ball], 64, 1000) == 8
     assert samples_for(scene, [ball, "shapes.ball.material.reflectance"], 20, 1000) == 2.5
