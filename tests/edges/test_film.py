@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import torchpt
-from torchpt.gradients.edges.film import Worth, film_places
+from torchpt.gradients.edges.film import Worth, film_places, slopes
 from torchpt.scene.formats.description import settings
 
 PLACE = {"origin": [1, 2, 3], "target": [0, 0.5, 0], "up": [0, 1, 0.2]}
@@ -68,3 +68,14 @@ def test_a_lens_has_no_edges() -> None:
     scene = scene_of({"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2})
     camera = scene.camera(settings(scene.description).film, scene.params, torch.float64)
     assert camera.film_of(torch.zeros(3, 1, dtype=torch.float64)) is None
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_slopes_are_derivatives_of_places(name: str) -> None:
+    scene = scene_of(CAMERAS[name])
+    made = scene.camera(settings(scene.description).film, scene.params, torch.float64)
+    p = 2 * torch.randn(3, 50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)  # some behind
+    s, found = slopes(made, p)
+    expected = torch.autograd.functional.jacobian(lambda q: film_places(made, q).sum(1), p)
+    torch.testing.assert_close(s, film_places(made, p))
+    torch.testing.assert_close(found, expected)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from torchpt.gradients.edges.gradients import Boundary, boundary_of, moving_primitives
+from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.primary import pieces_of
 from torchpt.gradients.edges.shadows import Shadows
 from torchpt.scene.formats.description import settings
@@ -53,7 +54,7 @@ def test_shadows_of_what_stands_still_on_what_stands_still_add_nothing():
     given = boundary(MOVES)
     (shadows,) = (e for e in given._estimators(False) if isinstance(e, Shadows))  # pyright: ignore[reportPrivateUsage]
     assert not shadows.lights_move
-    some, every = (e.samples(0, 20_000, 20_000) for e in (shadows, replace(shadows, lights_move=True)))
+    some, every = (e.samples(Round(0, 20_000), 0, 20_000) for e in (shadows, replace(shadows, lights_move=True)))
     assert some is not None and every is not None
     assert sum(len(p.lane) for p, _ in some.prefixes) < 0.9 * sum(len(p.lane) for p, _ in every.prefixes)
     (a,), (b,) = (boundary(MOVES).gradients([found], [MOVES]) for found in (some, every))

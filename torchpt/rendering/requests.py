@@ -8,6 +8,7 @@ forward pass.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -431,7 +432,7 @@ def _differentiable(
             differentiates_rays=differentiates_rays,
         )
         if edge_spp and edges.concerns(scene, wanted):
-            _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
+            width, height = film_size()
             on_film = cotangent.T.reshape(height, width, 3)
             edge_grads = edges.add_gradients(
                 scene, backward_settings(spp=1), given, wanted, dtype, on_film, edge_spp, film_space, ranks
@@ -445,11 +446,18 @@ def _differentiable(
         spp = spp or call.spp_grad or forward_spp[0]
         return replace(settings, render=settings.render.but(seed=seed, spp=spp))
 
-    def edge_samples() -> int:
+    def film_size() -> tuple[int, int]:
+        """Return the width and the height of the picture."""
+        _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
+        return width, height
+
+    def edge_samples() -> float:
         """Return the samples a pixel for visibility edges; 0: none."""
         if not call.edges:
             return 0
-        return call.edge_spp or edges.samples_for(scene, wanted, call.spp_grad or forward_spp[0])
+        return call.edge_spp or edges.samples_for(
+            scene, wanted, call.spp_grad or forward_spp[0], math.prod(film_size())
+        )
 
     def edge_request() -> edges.Asked:
         request.check_unchanged(AFTER)

@@ -365,7 +365,8 @@ class BatchOptions(TraceOptions, total=False):
         int | None,
         _whole_number(
             1,
-            "samples a pixel of each estimator of edges; none: a quarter of the backward pass's, a sixteenth for vertices",
+            "samples a pixel of each estimator of edges; none: an eighth of the backward pass's, a sixteenth of many, "
+            "a quarter for vertices, a thirty-second for large meshes",
         ),
     ]
     ranks: Annotated[

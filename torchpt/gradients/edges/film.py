@@ -70,8 +70,13 @@ def film_places(camera: Camera, p: Tensor) -> Tensor:
 
 def slopes(camera: Camera, p: Tensor) -> tuple[Tensor, Tensor]:
     """Return places ``(2, N)`` of points on the film and how they change with them ``(2, 3, N)``, detached."""
-    with torch.enable_grad():
-        leaf = p.detach().clone().requires_grad_()
-        s = film_places(camera, leaf)
-        rows = [torch.autograd.grad(s[k].sum(), leaf, retain_graph=k == 0)[0] for k in range(2)]
-    return s.detach(), torch.stack(rows)
+    # Homogeneous places are affine in the points.
+    corners = torch.cat((torch.zeros_like(p[:, :1]), torch.eye(3, dtype=p.dtype, device=p.device)), 1)
+    at, seen = camera.film_of(corners), camera.film_of(p)
+    assert at is not None and seen is not None
+    slope = (at[:3, 1:] - at[:3, :1]).detach()
+    h = torch.where(seen[2] > 0, seen[2], 1.0).detach()
+    s = seen[:2].detach() / h
+    turned = torch.where(seen[2] > 0, s, 0.0)
+    rows = [(slope[k, :, None] - slope[2, :, None] * turned[k]) / h for k in range(2)]
+    return s, torch.stack(rows)

@@ -18,6 +18,7 @@ from torchpt.gradients.edges.bodies import Bodies, bodies_of
 from torchpt.gradients.edges.curves import marked_primitives
 from torchpt.gradients.edges.cuts import Cuts, cuts_of
 from torchpt.gradients.edges.film import Worth
+from torchpt.gradients.edges.guide import Round, first_round
 from torchpt.gradients.edges.horizons import Horizons, horizons_of
 from torchpt.gradients.edges.occluders import occluders_of
 from torchpt.gradients.edges.primary import Look, pieces_of, primary_of
@@ -39,13 +40,14 @@ __all__ = ["Boundary", "add_gradients", "boundary_of", "concerns", "samples_for"
 #: less in all than any render needs.
 SAMPLES = 1 << 15
 
-#: Samples of a backward pass's paths for one of each estimator of edges, which takes longer and varies less.
-_PER_EDGE_SAMPLE = 4
-#: The same where vertices of a mesh move each by itself: the variance of their gradients is that of the faces' normals, which
-#: turn the more the smaller a face is, and edges bring a tenth to a five-hundredth of it.
-_PER_EDGE_SAMPLE_OF_MESHES = 16
-#: So many vertices are a mesh's.
-_MESH = 64
+#: Samples of a backward pass's paths for one of each estimator of edges, which takes longer and varies less; and where there
+#: are so many paths that what guides samples knows more.
+_PER_EDGE_SAMPLE, _PER_EDGE_SAMPLE_OF_MANY, _MANY = 8, 16, 1 << 19
+#: The same where vertices move each by itself: what guides samples learns less of so many directions.
+_PER_EDGE_SAMPLE_OF_VERTICES = 4
+#: The same of meshes of so many: the variance of their gradients is that of the faces' normals, which turn the more the smaller
+#: a face is, and edges bring a tenth to a five-hundredth of it.
+_PER_EDGE_SAMPLE_OF_MESHES, _MESH = 32, 64
 
 
 class Samples(Protocol):
@@ -61,11 +63,14 @@ def concerns(scene: Scene, names: Iterable[str]) -> bool:
     return any(scene.spec(name).moves in (Moves.SURFACES, Moves.SHADOWS) for name in names)
 
 
-def samples_for(scene: Scene, names: Iterable[str], spp: int) -> int:
+def samples_for(scene: Scene, names: Iterable[str], spp: int, pixels: int) -> float:
     """Return how many samples a pixel each estimator takes beside ``spp`` of the backward pass, by what is differentiated."""
     moving = [name for name in names if concerns(scene, (name,))]
-    meshes = all(name.endswith(".vertices") and scene.params[name].numel() >= 3 * _MESH for name in moving)
-    return math.ceil(spp / (_PER_EDGE_SAMPLE_OF_MESHES if meshes else _PER_EDGE_SAMPLE))
+    vertices = [scene.params[name].numel() // 3 for name in moving if name.endswith(".vertices")]
+    if not vertices:
+        return spp / (_PER_EDGE_SAMPLE_OF_MANY if spp * pixels >= _MANY else _PER_EDGE_SAMPLE)
+    meshes = len(vertices) == len(moving) and min(vertices) >= _MESH
+    return spp / (_PER_EDGE_SAMPLE_OF_MESHES if meshes else _PER_EDGE_SAMPLE_OF_VERTICES)
 
 
 def moving_primitives(scene: Scene, names: Iterable[str]) -> Tensor:
@@ -136,12 +141,12 @@ class Boundary:
         by_name = dict(zip(self.leaves, grads, strict=True))
         return [by_name.get(name) for name in wanted]
 
-    def primary(self, spp: int, look: Look, held: bool = False) -> Iterator[Samples]:
+    def primary(self, spp: float, look: Look, held: bool = False) -> Iterator[Samples]:
         """Yield samples of the edges that the camera sees, chunk by chunk; ``look``: what rays beside them see.
 
         ``held``: they count as they move over what is seen beside them.
         """
-        total = spp * self.pixels
+        total = math.ceil(spp * self.pixels)
         if self.moving.keys() <= {"lights"}:  # none of which is seen
             return
         with torch.no_grad():
@@ -155,15 +160,21 @@ class Boundary:
         for first, count in self._chunks(total):
             yield primary.samples(first, count, total, self.worth, look, held)
 
-    def shadows(self, spp: int, holds_first: bool = False) -> Iterator[Samples]:
+    def shadows(self, spp: float, holds_first: bool = False) -> Iterator[Samples]:
         """Yield samples of the edges of shadows of lights, of edges in reflected light, and of horizons.
 
         ``holds_first``: the interior holds in place what the camera sees.
         """
-        total = spp * self.pixels
+        total = math.ceil(spp * self.pixels)
         for estimator in self._estimators(holds_first):
-            for first, count in self._chunks(total):
-                found = estimator.samples(first, count, total)
+            turn = first_round(total)
+            if turn is not None:  # every rank draws it, as all learn from it
+                found = estimator.samples(turn, 0, turn.count)
+                if found is not None and (self.ranks is None or self.ranks.rank == 0):
+                    yield found
+            turn = Round(0, total) if turn is None else turn.then(total)
+            for first, count in self._chunks(turn.count):
+                found = estimator.samples(turn, first, count)
                 if found is not None:
                     yield found
 
@@ -246,7 +257,7 @@ def add_gradients(
     wanted: tuple[str, ...],
     dtype: torch.dtype,
     cotangent: Tensor,
-    samples: int,
+    samples: float,
     held: bool = False,
     ranks: Group | None = None,
 ) -> list[Tensor | None]:

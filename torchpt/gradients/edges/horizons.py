@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import smooth_faces
+from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
 from torchpt.gradients.edges.traced import Use
 from torchpt.gradients.edges.vertices import Spot, met
@@ -91,14 +92,16 @@ class Horizons:
     depth: int
 
     @torch.no_grad()
-    def samples(self, first: int, count: int, total: int) -> HorizonSamples | None:
-        """Return samples ``first .. first + count`` of ``total``; None where none of them counts."""
+    def samples(self, turn: Round, first: int, count: int) -> HorizonSamples | None:
+        """Return samples ``first .. first + count`` of a round; None where none of them counts."""
         traced, bodies = self.frame.traced, self.frame.bodies
-        number, key, u, coin = traced.edges(first, count, total, Use.HORIZONS)
+        number, key, u, coin = traced.edges(turn, first, count, Use.HORIZONS)
         draws = traced.draws(key)
-        place, angle = draws.two(Dimension.LIGHT).double(), 2.0 * math.pi * draws.two(Dimension.BSDF)[0].double()
+        even = torch.stack((u, draws.two(Dimension.BSDF)[0].double(), *draws.two(Dimension.LIGHT).double()))
+        (u, angle, *place), scale = turn.draw(even)
+        place, angle = torch.stack(place), 2.0 * math.pi * angle
         index, _ = self.choice.draw(u)
-        weight = take(self.area, index) * (2.0 * 2.0 * math.pi) / (take(self.choice.pmf, index) * total)
+        weight = take(self.area, index) * (2.0 * 2.0 * math.pi) * scale / take(self.choice.pmf, index)
         prim, uv = take(self.prim, index), uniform_triangle(place)
         face = Held(prim, torch.cat((uv, torch.zeros_like(uv[:1]))))
         x = bodies.points(face)
@@ -119,6 +122,11 @@ class Horizons:
             lane, depth = prefix.lane, self.depth if self.depth < 0 else self.depth - prefix.count
             light = traced.radiance(take(o, lane), take(d, lane), take(number, lane), Use.BEHIND, depth)
             prefixes.append((prefix, (light * prefix.weight).sum(0) * take(weight, lane)))
+        if turn.lesson is not None:
+            brought = torch.zeros_like(u)
+            for prefix, light in prefixes:
+                brought.index_add_(0, prefix.lane, light.abs())
+            turn.lesson.append((even, brought / scale))
         seen, share = y.held(bodies), self.frame.share(y.hit.prim, r)
         return HorizonSamples(face, n, omega, seen, r, share, prefixes) if prefixes else None
 

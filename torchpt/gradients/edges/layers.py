@@ -40,7 +40,7 @@ class Asked:
     settings: Settings
     wanted: tuple[str, ...]
     dtype: torch.dtype
-    edges: int
+    edges: float
 
 
 def followed(settings: Settings) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from torchpt.gradients.edges.curves import (
 )
 from torchpt.gradients.edges.cuts import Crossing, Cuts, crossing_of
 from torchpt.gradients.edges.film import Worth, film_places, slopes
+from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.traced import Traced, Use
 from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import cross, dot, rows, take
@@ -351,7 +352,7 @@ class Primary:
 
         ``over``: they count as they move over what is seen on both sides, which is held in place.
         """
-        number, _, u, _ = self.traced.edges(first, count, total, Use.PRIMARY)
+        number, _, u, _ = self.traced.edges(Round(0, total), first, count, Use.PRIMARY)
         index, rest = self.choice.draw(u)
         chance = take(self.choice.pmf, index)
         pieces = rows(self.pieces, index)

@@ -17,6 +17,7 @@ with ``v`` the velocity of the surface's own point, ``S`` that of the point that
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -131,6 +132,15 @@ class Prefix:
         for vertex in self.vertices:
             moving = moving | self.frame.moving(vertex.held.prim)
         return moving
+
+    def motion(self) -> Tensor:
+        """Return about how far receivers move where all that moves does by 1 ``(M,)``."""
+        how = replace(self, vertices=self.vertices[:1]).moves().double()
+        for before, vertex in pairwise(self.vertices):
+            away = vertex.p - before.p
+            share = self.frame.share(vertex.held.prim, dot(away, away).sqrt())
+            how = (1.0 - share) * self.frame.moving(vertex.held.prim) + share * how
+        return how
 
     def receivers(self, bodies: Bodies) -> Tensor:
         """Return where the receivers are in the interior's frame ``(3, M)``, differentiable in ``bodies``."""

@@ -31,6 +31,7 @@ from torch import Tensor
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import smooth_faces
 from torchpt.gradients.edges.cuts import Crossing, crossing_of
+from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.occluders import Occluders
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, one_of_each, prefixes_of
 from torchpt.gradients.edges.traced import Use
@@ -278,12 +279,14 @@ class Side:
         held: the points.
         r: ``(N,)`` how far they are.
         share: ``(N,)`` by which they slide.
+        moves: ``(N,)`` bool: they move.
     """
 
     sign: float
     held: Held
     r: Tensor
     share: Tensor
+    moves: Tensor
 
 
 @dataclass(frozen=True)
@@ -291,7 +294,9 @@ class SegmentSamples:
     """Samples of segments; the derivative of the loss is that of :meth:`sum`.
 
     Attributes:
+        number: of the samples ``(N,)``.
         edge: the places on edges.
+        mate: the other face at each ``(N,)``; -1: there is none.
         m: unit vectors across them, as receivers see them ``(3, N)``.
         r: ``(N,)`` from the receivers to the edge.
         sides: what is seen on both sides.
@@ -299,7 +304,9 @@ class SegmentSamples:
         crossing: those of the places where surfaces cut.
     """
 
+    number: Tensor
     edge: Held
+    mate: Tensor
     m: Tensor
     r: Tensor
     sides: list[Side]
@@ -321,6 +328,23 @@ class SegmentSamples:
                 value = value - side.sign * ((c - (1.0 - take(side.share, lane)) * d) * arrives).sum()
         return value
 
+    def brought(self, frame: MovingFrame) -> Tensor:
+        """Return the root of the sum of squares ``(N,)`` of the derivatives by how far edges, receivers and ends move."""
+        size = torch.zeros_like(self.r)
+        edge, ends, receivers = size.clone(), [size.clone() for _ in self.sides], size.clone()
+        for prefix, light in self.prefixes:
+            lane, x = prefix.lane, torch.zeros_like(light[0])
+            for side, end, arrives in zip(self.sides, ends, light, strict=True):
+                turned = take((1.0 - side.share) * self.r / side.r, lane) * arrives
+                end.index_add_(0, lane, turned)
+                edge.index_add_(0, lane, side.sign * arrives)
+                x += side.sign * (arrives - turned)
+            receivers.index_add_(0, lane, x.abs() * prefix.motion())
+        square = (frame.moving(self.edge.prim) | frame.moving(self.mate)) * edge.square() + receivers.square()
+        for side, end in zip(self.sides, ends, strict=True):
+            square += side.moves * end.square()
+        return square.sqrt()
+
 
 @dataclass(frozen=True)
 class Segments:
@@ -337,16 +361,21 @@ class Segments:
     depth: int
 
     @torch.no_grad()
-    def samples(self, first: int, count: int, total: int) -> SegmentSamples | None:
-        """Return samples ``first .. first + count`` of ``total``; None where none of them counts."""
+    def samples(self, turn: Round, first: int, count: int) -> SegmentSamples | None:
+        """Return samples ``first .. first + count`` of a round; None where none of them counts."""
         traced = self.frame.traced
-        number, key, u, coin = traced.edges(first, count, total, Use.REFLECTED)
+        number, key, u, coin = traced.edges(turn, first, count, Use.REFLECTED)
         draws = traced.draws(key)
-        direction, aim = draws.two(Dimension.BSDF).double(), draws.two(Dimension.LIGHT).double()
+        aim = draws.two(Dimension.LIGHT).double()
         coins = torch.stack((coin, draws.one(Dimension.LOBE).double()))
-        rays, spot, lane = self._receivers(self.sampler.draw(u, direction, aim, coins))
-        number, key = take(number, lane), take(key, lane)
-        return self._samples(rays, spot, number, key, total) if len(lane) else None
+        even = torch.cat((u[None], draws.two(Dimension.BSDF).double()))
+        u, scale = turn.draw(even)
+        rays, spot, lane = self._receivers(self.sampler.draw(u[0], u[1:], aim, coins))
+        found = self._samples(rays, spot, *rows((number, key, scale), lane)) if len(lane) else None
+        if turn.lesson is not None and found is not None:
+            brought = torch.zeros_like(scale).index_add_(0, found.number - number[0], found.brought(self.frame))
+            turn.lesson.append((even, brought / scale))
+        return found
 
     def _receivers(self, rays: SegmentRays) -> tuple[SegmentRays, Spot, Tensor]:
         """Return the rays that meet a receiver, the receivers, and which lanes these are."""
@@ -369,7 +398,7 @@ class Segments:
         return rows(rays, lane), spot.taken(lane), lane
 
     def _samples(
-        self, rays: SegmentRays, receiver: Spot, number: Tensor, key: Tensor, total: int
+        self, rays: SegmentRays, receiver: Spot, number: Tensor, key: Tensor, scale: Tensor
     ) -> SegmentSamples | None:
         """Return the samples of rays and the receivers that they met; None where none of them counts."""
         x, n = receiver.p.double(), receiver.n.double()
@@ -378,7 +407,7 @@ class Segments:
         way = rays.e - o
         r = dot(way, way).sqrt()
         step = r * _STEP + tiny
-        weight = rays.weight / (rays.density * total)
+        weight = rays.weight * scale / rays.density
         counts = (r > 16.0 * tiny) & (weight > 0) & torch.isfinite(weight)
         seen = [met(self.frame.traced, o, way + rays.m * (step * sign)) for sign in _SIGNS]
         for y in seen:
@@ -403,7 +432,7 @@ class Segments:
             return None
         sides = [self._side(sign, y, r) for sign, y in zip(_SIGNS, seen, strict=True)]
         crossing = crossing_of(self.frame.bodies, rays.cut, rays.held, rays.mate)
-        return SegmentSamples(rays.held, rays.m, r, sides, prefixes, crossing)
+        return SegmentSamples(number, rays.held, rays.mate, rays.m, r, sides, prefixes, crossing)
 
     def _ends_at(self, rays: SegmentRays, y: Spot, r: Tensor, step: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of rays beside edges that do not end before these, but for what touches there."""
@@ -415,7 +444,8 @@ class Segments:
     def _side(self, sign: float, y: Spot, r: Tensor) -> Side:
         """Return what receivers see beside the edge; nothing is as far as the edge."""
         reach = torch.where(y.hit.prim >= 0, y.hit.t.double(), r)
-        return Side(sign, y.held(self.frame.bodies), reach, self.frame.share(y.hit.prim, reach))
+        share, moves = self.frame.share(y.hit.prim, reach), self.frame.moving(y.hit.prim)
+        return Side(sign, y.held(self.frame.bodies), reach, share, moves)
 
     def _reflected(self, seen: list[Spot], o: Tensor, number: Tensor, lane: Tensor, depth: int) -> Tensor:
         """Return the light ``(3, 2, M)`` that what was met reflects in lanes ``(M,)``, by paths of so many vertices."""

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import View
+from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.occluders import EdgePoints, Occluders
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
 from torchpt.gradients.edges.traced import Use
@@ -68,13 +69,17 @@ class Sources:
     prim: Tensor
     surfaces: int
 
-    def draw(self, draws: Draws) -> Beam:
-        """Draw points on lights."""
+    def numbers(self, draws: Draws) -> Tensor:
+        """Return the numbers ``(2, N)`` float64 of points on lights."""
+        u = draws.two(Dimension.LIGHT)
+        return torch.stack((from_digits(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS)))), u[1].double()))
+
+    def draw(self, u: Tensor) -> Beam:
+        """Draw points on lights by numbers ``(2, N)``."""
         lights = self.world.lights
         assert lights is not None
-        u = draws.two(Dimension.LIGHT)
-        row, rest = self.choice.draw(from_digits(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS)))))
-        chance, u = take(self.choice.pmf, row), torch.stack((rest, u[1].double()))
+        row, rest = self.choice.draw(u[0])
+        chance, u = take(self.choice.pmf, row), torch.stack((rest, u[1]))
         a, e, w = torch.zeros(3, len(row), dtype=torch.float64, device=row.device), None, (row < self.surfaces).double()
         prim = take(self.prim, row)
         for k, name in enumerate(lights.kinds):
@@ -271,16 +276,24 @@ class Shadows:
     lights_move: bool
 
     @torch.no_grad()
-    def samples(self, first: int, count: int, total: int) -> Cast | None:
-        """Return samples ``first .. first + count`` of ``total``; None where none of them counts."""
+    def samples(self, turn: Round, first: int, count: int) -> Cast | None:
+        """Return samples ``first .. first + count`` of a round; None where none of them counts."""
         traced = self.frame.traced
-        _, key, u, coin = traced.edges(first, count, total, Use.LIGHTS)
-        beam = self.sources.draw(traced.draws(key))
-        passed = self.occluders.outline_points(u, coin, beam.view)
+        _, key, u, coin = traced.edges(turn, first, count, Use.LIGHTS)
+        even = torch.cat((u[None], self.sources.numbers(traced.draws(key))))
+        u, scale = turn.draw(even)
+        beam = self.sources.draw(u[1:])
+        passed = self.occluders.outline_points(u[0], coin, beam.view)
         beam, passed, spot, outward = self._past(rows(beam, passed.lane), passed)
         if not len(passed.lane):
             return None
-        return self._cast(take(key, passed.lane), beam, passed, spot, outward, total)
+        cast = self._cast(take(key, passed.lane), beam, passed, spot, outward, take(scale, passed.lane))
+        if turn.lesson is not None and cast is not None:
+            brought = torch.zeros_like(scale)
+            for prefix, weight in cast.prefixes:
+                brought.index_add_(0, take(passed.lane, prefix.lane), dot(weight, weight).sqrt())
+            turn.lesson.append((even, brought / scale))
+        return cast
 
     def _past(self, beam: Beam, passed: EdgePoints) -> tuple[Beam, EdgePoints, Spot, Tensor]:
         """Trace rays past edges: return what they meet, and unit vectors ``(3, N)`` across the edge to the lit side."""
@@ -310,7 +323,7 @@ class Shadows:
         return rows(beam, index), rows(passed, index), spot.taken(some), take(outward, some)
 
     def _cast(
-        self, key: Tensor, beam: Beam, passed: EdgePoints, spot: Spot, outward: Tensor, total: int
+        self, key: Tensor, beam: Beam, passed: EdgePoints, spot: Spot, outward: Tensor, scale: Tensor
     ) -> Cast | None:
         x, n = spot.p.double(), spot.n.double()
         toward = beam.view.toward(x)
@@ -323,7 +336,7 @@ class Shadows:
             return (v - leaving * (dot(n, v) / slope)) * stretch
 
         along, across = follow(passed.along), follow(outward)
-        brought = self.sources.brought(beam, x) * (dot(n, wi).abs() / (passed.density * total))
+        brought = self.sources.brought(beam, x) * (dot(n, wi).abs() * scale / passed.density)
         edge = cross(n, along)
         edge = edge * -torch.sign(dot(edge, across))
         moves = self.frame.moving(passed.held.prim) | self.frame.moving(passed.mate)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchpt.compiler.graph import Unsupported
 from torchpt.engines.engine import Kernels, forward_kernels, trace
+from torchpt.gradients.edges.guide import Round
 from torchpt.paths.state import T_MAX, PathState
 from torchpt.paths.wave import PixelSet, Rays, Wave, clamp_scale
 from torchpt.physics.film import Film
@@ -112,11 +113,12 @@ class Traced:
         place, other = self.draws(key).two(Dimension.EDGE).double()
         return (number + place) / total, other
 
-    def edges(self, first: int, count: int, total: int, use: Use) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return numbers and keys of samples ``first .. first + count`` of ``total``, then what :meth:`edge` returns."""
-        number = torch.arange(first, first + count, device=self.wave.centre.device)
+    def edges(self, turn: Round, first: int, count: int, use: Use) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return numbers and keys of samples ``first .. first + count`` of a round, then what :meth:`edge` returns."""
+        local = torch.arange(first, first + count, device=self.wave.centre.device)
+        number = local + turn.first
         key = self.key(number, use)
-        return number, key, *self.edge(number, key, total)
+        return number, key, *self.edge(local, key, turn.count)
 
     def nearest(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """Return how far rays ``(3, N)`` go, in units of ``d``, and the primitives that they meet; -1 for none."""
