@@ -87,6 +87,8 @@ ROWS = {
             "max_depth": -2,
             "rr_depth": 0,
             "rr_prob": 1.01,
+            "strategy": "uniform",
+            "weighted": 1,
             "light_paths": 0,
             "light_choice": "nearest",
             "strict": 1,

@@ -28,7 +28,7 @@ from torchpt.physics.samplers import Dimension, Draws
 from torchpt.physics.shapes import interact, offset_origin
 from torchpt.physics.shapes.geometry import Interaction
 from torchpt.physics.shapes.interaction import OFFSET
-from torchpt.spec import Integer, Scalar
+from torchpt.spec import Flag, Integer, Scalar
 
 __all__ = ["LightPaths"]
 
@@ -42,6 +42,8 @@ class LightPaths(Integrator):
         "rr_depth": Integer(5, low=1, doc="roulette may end paths from this depth on"),
         "rr_prob": Scalar(None, above=0.0, high=1.0, words="null or a number", doc="chance to survive roulette"),
         "fraction": Scalar(1.0, above=0.0, high=1.0, doc="number of light paths for each camera path"),
+        "counted": Flag(True, doc="whether they bring anything"),
+        "weighted": Flag(True, doc="whether what they bring is weighted among all strategies"),
     }
     lit = False
     splats = True
@@ -52,7 +54,7 @@ class LightPaths(Integrator):
     @property
     def limits(self) -> Limits:
         """Return the depth limits: a vertex of depth k, joined to the camera, makes a path of k + 1 edges."""
-        return Limits(self.max_depth, self.rr_depth)
+        return Limits(self.max_depth if self.counted else 0, self.rr_depth)
 
     # -- the start
 
@@ -64,7 +66,8 @@ class LightPaths(Integrator):
         u, v = draws.two(Dimension.LIGHT), draws.two(Dimension.BSDF)
         if emission.choice is not None:
             which = lights.from_digits(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS))))
-        return emit(emission, which, u.to(context.plan.dtype), v.to(context.plan.dtype), OFFSET)
+        u, v = u.to(context.plan.dtype), v.to(context.plan.dtype)
+        return emit(emission, which, u, v, OFFSET, mis=self.weighted)
 
     def generate(self, context: StageContext, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
         """Return the rays that leave the lights; arguments as for :meth:`Integrator.generate`."""
@@ -149,7 +152,9 @@ class LightPaths(Integrator):
         if not kind.transmits:
             seen = seen & (wo[2] > 0)
         area = density * dot(w, at.ng).abs()  # square pixels for each area of the surface
-        scale = area * state.extra["flux"] * reduced(None, area * arrival.others(reverse)) / arrival.cosine
+        scale = area * state.extra["flux"] / arrival.cosine
+        if self.weighted:
+            scale = scale * reduced(None, area * arrival.others(reverse))
         radiance = state.throughput * value * (scale * weight_x * weight_y)
         radiance = torch.where(seen, radiance, 0.0)
         o = offset_origin(context.world, at, w)

@@ -30,6 +30,8 @@ __all__ = ["FIELDS", "Arrival", "behind", "reduced", "reverse_pdf", "root_of_squ
 
 #: The fields of a path that its weights need; see above.
 FIELDS = (Field("dvcm"), Field("dvc"))
+#: Bound of ratios of densities: its square is still a float32, and its weight 0.
+_MOST = 2.0**60
 #: Least cosine that is divided by: rays along a surface meet it at no point.
 _LEAST_COSINE = 1e-7
 
@@ -66,6 +68,7 @@ def reduced(weight: Tensor | None, other: Tensor) -> Tensor:
         weight: the weight ``(N,)`` without it; None: 1.
         other: density of that strategy over the own one ``(N,)``.
     """
+    other = other.clamp_max(_MOST)
     square = other * other
     return 1.0 / (1.0 + (square if weight is None else weight * square))
 
@@ -126,6 +129,7 @@ def behind(
     rough = None
     if reverse is not None:
         rough = cosine * safe_reciprocal(torch.where(torch.isinf(pdf), 0.0, pdf)) * arrival.others(reverse)
+        rough = rough.clamp_max(_MOST)
     if not kind.delta:
         assert rough is not None
         return rough

@@ -268,7 +268,7 @@ class Light(Emitter):
         raise NotImplementedError
 
     @classmethod
-    def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope) -> EmittedRay:
+    def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope, mis: bool) -> EmittedRay:
         """Sample rays that leave the light; here those of a distant light, whose directions :meth:`sample` draws.
 
         Args:
@@ -276,8 +276,9 @@ class Light(Emitter):
             u: ``(2, N)`` in [0, 1), chooses the direction.
             v: ``(2, N)`` in [0, 1), chooses the point.
             scope: a ball around the scene.
+            mis: as for :meth:`sample`.
         """
-        drawn = cls.sample(at, scope.centre[:, None].expand(3, u.shape[1]), u, mis=True)
+        drawn = cls.sample(at, scope.centre[:, None].expand(3, u.shape[1]), u, mis)
         d = -drawn.wi
         pdf = drawn.pdf if cls.environment else torch.ones_like(drawn.pdf)
         return EmittedRay(scope.origins(d, v), d, drawn.radiance, cls.emission_density(at, pdf, scope), pdf)

@@ -99,7 +99,7 @@ def emission_of(lights: Lights, centre: Tensor, radius: Tensor) -> Emission:
     return Emission(lights, chosen, Scope(centre.to(dtype), (radius * (1.0 + 2.0**-12)).to(dtype)))
 
 
-def emit(emission: Emission, which: Tensor | None, u: Tensor, v: Tensor, offset: float) -> LightRay:
+def emit(emission: Emission, which: Tensor | None, u: Tensor, v: Tensor, offset: float, mis: bool = True) -> LightRay:
     """Sample rays that leave the lights.
 
     Args:
@@ -108,6 +108,7 @@ def emit(emission: Emission, which: Tensor | None, u: Tensor, v: Tensor, offset:
         u: ``(2, N)`` in [0, 1), chooses the point; of a distant light the direction.
         v: ``(2, N)`` in [0, 1), chooses the direction; of a distant light the point.
         offset: distance of the origins from the light's surface, in units of ``Lights.bound``.
+        mis: whether light paths are combined with other strategies by MIS, as for :func:`torchpt.physics.lights.sample`.
     """
     lights, row, probability = emission.lights, None, torch.ones_like(u[0])
     if emission.choice is not None and which is not None:
@@ -121,7 +122,7 @@ def emit(emission: Emission, which: Tensor | None, u: Tensor, v: Tensor, offset:
     for k, name in enumerate(lights.kinds[len(surfaces) :], len(surfaces)):
         in_kinds = torch.ones_like(u[0], dtype=torch.bool) if number is None else number >= k
         bare = in_kinds if bare is None else bare
-        ray = KINDS[name].emit(at, u, v, emission.scope)
+        ray = KINDS[name].emit(at, u, v, emission.scope, mis)
         one = torch.ones_like(ray.density)
         met = one if KINDS[name].environment else torch.zeros_like(one)
         given = LightRay(row, ray.o, ray.d, ray.o, None, ray.radiance, ray.density, met, ray.pdf, None, None)
@@ -205,7 +206,7 @@ def density_of_sample(emission: Emission, sample: LightSample) -> Tensor:
         pdf = sample.pdf / choice.environment(lights.choice) if kind.environment else sample.pdf
         density = pick(number, k, kind.emission_density(at, pdf, emission.scope), density)
     assert density is not None
-    return density * _probability(emission, row)
+    return (density * _probability(emission, row)).expand_as(sample.pdf)
 
 
 def density_of_hit(emission: Emission, at: Interaction) -> Tensor:

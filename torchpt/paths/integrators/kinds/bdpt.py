@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -16,13 +16,19 @@ from torchpt.paths.integrators.kinds.path import Path
 from torchpt.paths.integrators.light_paths import LightPaths
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.paths.integrators.weights import FIELDS, Arrival, behind, reduced, reverse_pdf
-from torchpt.paths.state import Emission, PathState, StageContext, VertexInput, VertexOutput
+from torchpt.paths.state import Emission, PathState, Plan, StageContext, VertexInput, VertexOutput
 from torchpt.physics.lights.emission import density_of_environment, density_of_hit, density_of_sample
 from torchpt.physics.shapes import interact
 from torchpt.physics.shapes.geometry import Interaction
-from torchpt.spec import Scalar
+from torchpt.spec import Choice, Flag, Refused, Scalar
 
-__all__ = ["Bdpt"]
+if TYPE_CHECKING:
+    from torchpt.physics.samplers import Points
+
+__all__ = ["STRATEGIES", "Bdpt"]
+
+#: Ways to find light: a camera path meets it, a light sample ends a camera path, a light path is joined to the camera.
+STRATEGIES = ("bsdf", "light", "light_paths")
 
 
 class Bdpt(PathIntegrator):
@@ -31,7 +37,13 @@ class Bdpt(PathIntegrator):
     name = "bdpt"
     parameters: ClassVar = {
         **{key: Path.parameters[key] for key in ("max_depth", "rr_depth", "rr_prob")},
-        "light_paths": Scalar(1.0, above=0.0, high=1.0, doc="number of light paths for each camera path"),
+        "strategy": Choice(
+            "mis",
+            names=("mis", *STRATEGIES),
+            doc="how light is found: all ways weighted; or by camera paths that meet it, light samples or light paths alone",
+        ),
+        "weighted": Flag(False, doc="whether one strategy alone keeps its weight among all"),
+        "light_paths": Scalar(0.5, above=0.0, high=1.0, doc="number of light paths for each camera path"),
         **LIGHT_CHOICE,
         **STRICT,
     }
@@ -40,13 +52,36 @@ class Bdpt(PathIntegrator):
 
     @property
     def limits(self) -> Limits:
-        """Return the depth limits that the parameters set."""
-        return Limits(self.max_depth, self.rr_depth)
+        """Return the depth limits that the parameters set; camera paths end at once where light paths alone count."""
+        return Limits(0 if self.strategy == "light_paths" else self.max_depth, self.rr_depth)
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
         """Refuse values by which paths would never end; arguments as for :meth:`torchpt.spec.FrozenConfig.check`."""
         Path.check(values, given)
+        if values["weighted"] and values["strategy"] == "mis":
+            raise Refused("one strategy alone beside weighted", "mis", ("strategy",))
+
+    def plan(self, sampler: Points, dtype: torch.dtype, *, tape: bool = False, attached: bool = False) -> Plan:
+        """Return the static configuration of the stages; see :meth:`Integrator.plan`."""
+        # Light samples alone have no weights, and draw dim parts of environment maps too.
+        alone = self.strategy == "light" and not self.weighted
+        strategy = "light" if alone else "mis"
+        return Plan(sampler=sampler, strategy=strategy, rr_prob=self.rr_prob, dtype=dtype, tape=tape, attached=attached)
+
+    def _scale(self, strategy: str, reduced: Tensor, weight: Tensor | None) -> Tensor | float:
+        """Return the factor on contributions of a strategy, which have its weight among those of ``path``.
+
+        Args:
+            strategy: one of :data:`STRATEGIES`.
+            reduced: factor ``(N,)`` by which the weight falls among all strategies.
+            weight: the weight ``(N,)``; None: 1.
+        """
+        if self.strategy == "mis" or (self.weighted and self.strategy == strategy):
+            return reduced
+        if self.strategy != strategy:
+            return 0.0
+        return 1.0 if weight is None else safe_reciprocal(weight)
 
     def light_walk(self) -> Integrator:
         """Return the integrator of the light paths: :meth:`Integrator.light_walk`."""
@@ -55,6 +90,8 @@ class Bdpt(PathIntegrator):
             rr_depth=self.rr_depth,
             rr_prob=self.rr_prob,
             fraction=self.light_paths,
+            counted=self.strategy in ("mis", "light_paths"),
+            weighted=self.strategy == "mis" or self.weighted,
         )
 
     def generate(self, context: StageContext, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
@@ -84,14 +121,19 @@ class Bdpt(PathIntegrator):
         state = vertex.state
         at = interact(context.world, state.o, state.d, vertex.hit, follow_ray=context.follow_ray)
         density = density_of_hit(context.world.emission, at)
-        return _reduced(stages.emit(context, vertex), density * state.extra["dvc"])
+        return self._reduced(stages.emit(context, vertex), density * state.extra["dvc"])
 
     def escape(self, context: StageContext, vertex: VertexInput) -> Emission:
         """Return the radiance of the environment; see :meth:`Integrator.escape`."""
         assert context.world.emission is not None
         found = stages.escape(context, vertex)
         density = density_of_environment(context.world.emission, found.pdf)
-        return _reduced(found, density * vertex.state.extra["dvc"])
+        return self._reduced(found, density * vertex.state.extra["dvc"])
+
+    def _reduced(self, emission: Emission, other: Tensor) -> Emission:
+        """Return emission where light paths find it too, with ``other (N,)`` times the density."""
+        factor = self._scale("bsdf", reduced(emission.weight, other), emission.weight)
+        return replace(emission, weight=emission.weight * factor, brought=emission.brought * factor)
 
     def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
         """Return the outputs of a vertex: as of ``path``, with weights in which light paths take part."""
@@ -105,7 +147,8 @@ class Bdpt(PathIntegrator):
             reverse = reverse_pdf(context, model, at, surface, -state.d, wi)
             density = density_of_sample(world.emission, direct.sample) * direct.sample.weight
             other = density * dot(wi, at.ng).abs() * arrival.others(reverse)
-            shadow = replace(shadow, radiance=shadow.radiance * reduced(direct.weight, other))
+            factor = self._scale("light", reduced(direct.weight, other), direct.weight)
+            shadow = replace(shadow, radiance=shadow.radiance * factor)
         leaving, next_hit, drawn, continuation = stages.scatter(context, model, state, at, surface)
         reverse = None if kind.smooth else reverse_pdf(context, model, at, surface, -state.d, drawn.d)
         dvc = behind(context, model, at, surface, arrival, drawn.d, drawn.pdf, drawn.eta, reverse)
@@ -121,9 +164,3 @@ class Bdpt(PathIntegrator):
             carried=continuation.carried,
             chance=continuation.chance,
         )
-
-
-def _reduced(emission: Emission, other: Tensor) -> Emission:
-    """Return emission with the weight that is left where light paths find it too, with ``other (N,)`` times the density."""
-    factor = reduced(emission.weight, other)
-    return replace(emission, weight=emission.weight * factor, brought=emission.brought * factor)

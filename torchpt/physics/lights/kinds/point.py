@@ -51,7 +51,7 @@ class Point(Light):
         return LightSample(wi=wi, target=target, distant=None, radiance=radiance, pdf=infinite, weight=weight)
 
     @classmethod
-    def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope) -> EmittedRay:
+    def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope, mis: bool) -> EmittedRay:
         """See :meth:`Light.emit`."""
         d = uniform_sphere(v).to(at.p0.dtype)
         one = torch.ones_like(d[0])

@@ -112,7 +112,7 @@ class Spot(Light):
         return replace(drawn, radiance=drawn.radiance * fraction)
 
     @classmethod
-    def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope) -> EmittedRay:
+    def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope, mis: bool) -> EmittedRay:
         """See :meth:`Light.emit`: evenly within the cone."""
         axis = at.normal.expand(3, v.shape[1])
         d = Frame.about(axis).to_world(uniform_cone(v.to(axis.dtype), _width(at.e1[0])))
