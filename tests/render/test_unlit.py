@@ -131,7 +131,9 @@ def test_dark_pixels_count_where_they_show_what_reflects():
     on_floor, on_black, on_sky = [(x, 40) for x in range(20, 30)], (32, 20), (2, 2)
     assert dark(0.1) == dark(0.1, on_black) == dark(0.1, on_sky) == MissingLight("", 0.0)
     assert dark(0.1, *on_floor, on_black, on_sky) == MissingLight("", 10 / 3072)
-    assert dark(0.001, *on_floor).reason.startswith("no sample met any light in 0.33 % of the picture (integrator bdpt")  # more than is known
+    assert dark(0.001, *on_floor).reason.startswith(
+        "no sample met any light in 0.33 % of the picture (integrator bdpt"
+    )  # more than is known
     half = [(x, y) for y in range(40, 48) for x in range(20, 40)]
     found = dark(0.2, *half)
     assert found.reason.startswith("no sample met any light in 5.2 % of the picture") and found.dark_share == 160 / 3072
