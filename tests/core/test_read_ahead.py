@@ -15,6 +15,7 @@ import torchpt
 from torchpt.core.errors import AssetError
 from torchpt.core.threads import ReadAhead
 from torchpt.images import decode
+from torchpt.scene import Scene, prepare
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
@@ -105,6 +106,28 @@ def test_a_scene_read_by_several_threads_is_the_same(scene: dict[str, object]) -
         several = torchpt.load(scene).params
         assert list(one) == list(several)
         assert all(torch.equal(one[name], several[name]) for name in one)
+
+
+def test_texels_are_kept_once(scene: dict[str, object]) -> None:
+    loaded = torchpt.load(scene)
+    names = [name for name, value in loaded.built.parameters.items() if value.dtype == np.float32]
+    assert len(names) >= 4
+    for name in names:
+        assert loaded.built.parameters[name].ctypes.data == loaded.params[name].data_ptr()
+    assert len({loaded.params[name].data_ptr() for name in names}) == len(names)  # each parameter is its own
+
+
+@pytest.mark.parametrize("most", [0, 1 << 25])
+def test_tables_are_built_by_one_thread_of_torch(
+    scene: dict[str, object], most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prepare, "QUICK_NUMBERS", most)
+    threads: list[int] = []
+    build = Scene.world
+    monkeypatch.setattr(Scene, "world", lambda *a, **k: threads.append(torch.get_num_threads()) or build(*a, **k))
+    torch.set_num_threads(2)
+    torchpt.render(torchpt.load(scene), spp=1, film=(256, 256), threads=2)
+    assert threads and set(threads) == {1 if most else 2} and torch.get_num_threads() == 2
 
 
 @pytest.mark.parametrize("broken", ["grey.png", "sky.exr", "missing"])

@@ -203,17 +203,17 @@ class Distribution2D:
         w = weights.detach().double()
         num_rows = w.shape[0]
         along = torch.cumsum(w, 1)  # (R, C) over the columns of each row
-        total = along[:, -1:]
-        # A row without weight is never drawn.
-        along = torch.where(total > 0, along / torch.where(total > 0, total, 1.0), 1.0)
+        total = along[:, -1:].clone()
+        # In place, as grids may be large. A row without weight is never drawn.
+        along.div_(torch.where(total > 0, total, 1.0)).masked_fill_(total <= 0, 1.0)
         along += torch.arange(num_rows, dtype=w.dtype, device=w.device)[:, None]
         down = torch.cumsum(total[:, 0], 0)
         zero = down.new_zeros(1)
         width = torch.tensor(w.shape[1], dtype=torch.int64, device=w.device)
-        columns, blocks = torch.cat((zero, along.reshape(-1))), None
-        if len(columns) > _SMALL:
-            rest = -len(columns) % _BLOCK
-            columns = torch.cat((columns, columns.new_full((rest,), torch.inf)))
+        count, blocks = 1 + along.numel(), None
+        rest = -count % _BLOCK if count > _SMALL else 0
+        columns = torch.cat((zero, along.reshape(-1), zero.new_full((rest,), torch.inf)))
+        if count > _SMALL:
             blocks = columns[::_BLOCK].contiguous()
         return Distribution2D(rows=torch.cat((zero, down / down[-1])), columns=columns, width=width, blocks=blocks)
 

@@ -9,6 +9,7 @@ Renders, gradients and ``torchpt info`` begin with :func:`make_wave`; only rende
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError, warn_once
 from torchpt.core.memory import on_low_memory, release_memory
+from torchpt.core.threads import one_thread
 from torchpt.core.tree import moved
 from torchpt.engines import engine
 from torchpt.engines.engine import ForwardDevice, KernelCaches, Kernels, Tasks
@@ -154,14 +156,15 @@ def make_wave(
     own = not world_params  # the world is the scene's own, so objects made from it may be cached
     if like is None:
         uv = any(layer.uv for layer in surface_layers(settings).values())  # an AOV shows texture coordinates
-        world, geometry = scene.world(dtype, world_params, uv=uv, choice=settings.light_choice)
-        threads = None if settings.render.threads == "auto" else int(settings.render.threads)
-        surfaces_move = any(
-            name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in world_params
-        )
-        accel = scene.accel(settings.render.accel, threads, geometry if surfaces_move else None)
-        if tree and accel.name == "brute":  # it tests packets of rays against all primitives; `numba` is a tree
-            accel = scene.accel("numba", threads, geometry if surfaces_move else None)
+        with one_thread() if scene.numbers <= QUICK_NUMBERS else nullcontext():
+            world, geometry = scene.world(dtype, world_params, uv=uv, choice=settings.light_choice)
+            threads = None if settings.render.threads == "auto" else int(settings.render.threads)
+            surfaces_move = any(
+                name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in world_params
+            )
+            accel = scene.accel(settings.render.accel, threads, geometry if surfaces_move else None)
+            if tree and accel.name == "brute":  # it tests packets of rays against all primitives; `numba` is a tree
+                accel = scene.accel("numba", threads, geometry if surfaces_move else None)
         if integrator.light_walk() is not None:
             world = _with_emission(scene, world, geometry, own=own)
         if not integrator.lit:  # an integrator that does not use lights
@@ -372,6 +375,9 @@ def _pixel_of(world: World, camera: Camera) -> Tensor | None:
 SMALL_SAMPLES = 1 << 15
 #: Most numbers of the parameters of a scene of small renders.
 SMALL_NUMBERS = 1 << 18
+#: Most numbers of a scene's parameters up to which torch builds its tables in one thread. It takes about as long as several
+#: where they are idle, and a tenth of it where other processes use them: these then wait for each other in each operation.
+QUICK_NUMBERS = 1 << 25
 
 
 def is_small(scene: Scene, settings: Settings) -> bool:

@@ -107,12 +107,15 @@ class Scene:
         # A centre other than 0 means that the scene lies far from its origin. Then positions stay in float64: float32 would
         # lose detail before they are moved to the origin.
         far = bool(self._built.centre.any())
-        self.params: dict[str, Tensor] = {
-            name: torch.from_numpy(value.copy()).to(
-                device, torch.float64 if far and self.spec(name).holds_positions else torch.float32
-            )
-            for name, value in self._built.parameters.items()
-        }
+        self.params: dict[str, Tensor] = {}
+        parameters = self._built.parameters
+        for name, value in parameters.items():
+            positions = far and self.spec(name).holds_positions
+            with np.errstate(over="ignore"):  # infinite in float32: the check of the world says so
+                tensor = torch.from_numpy(value.astype(np.float64 if positions else np.float32, order="C"))
+            if value.dtype == np.float32:
+                parameters[name] = tensor.numpy()  # texels may be large: they are kept once
+            self.params[name] = tensor.to(device)
         after = meter.peak()
         #: Peak bytes while the scene was read, above those after import; 0 where unknown, and where no new peak was reached.
         self.peak = after - meter.base() if after > before else 0

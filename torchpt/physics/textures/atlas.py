@@ -152,7 +152,7 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
         dtype: dtype of the world.
         device: device of the atlas.
     """
-    planes: list[Tensor] = []  # flat, one for each level
+    planes: list[Tensor] = []  # (1 or 3, H, W), one for each level
     # Nodes that read the same channels of an image share its planes. By image and channel: for each level first texel, stride
     # between channels, width, height.
     levels_of: dict[tuple[str, int | None], list[list[int]]] = {}
@@ -168,7 +168,7 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
             for level in levels:
                 channels, height, width = level.shape
                 levels_of[source].append([end, width * height if channels == 3 else 0, width, height])
-                planes.append(level.reshape(-1).to(device=device, dtype=dtype))
+                planes.append(level)
                 end += level.numel()
         modes = [WRAPS.index(node.wrap), 0 if node.nearest else 1]
         finest, *others = levels_of[source]
@@ -190,7 +190,7 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
         layouts += [layout for levels in coarser for layout in levels]
         transforms += [row for row, levels in zip(list(transforms), coarser, strict=True) for _ in levels]
     return Atlas(
-        texels=torch.cat(planes),
+        texels=_joined(planes, dtype, device),
         layouts=torch.tensor(layouts, dtype=torch.int64, device=device).T.contiguous(),
         transforms=torch.tensor(transforms, dtype=dtype, device=device).T.contiguous(),
         wraps=tuple(wrap for wrap in WRAPS if any(node.wrap == wrap for node in nodes)),
@@ -198,6 +198,16 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
         transformed=any(node.transform != IDENTITY for node in nodes),
         mipmaps=mipmaps,
     )
+
+
+def _joined(planes: Sequence[Tensor], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return all numbers of planes, one after the other."""
+    if torch.is_grad_enabled() and any(plane.requires_grad for plane in planes):
+        return torch.cat([plane.reshape(-1).to(device=device, dtype=dtype) for plane in planes])
+    joined = torch.empty(sum(plane.numel() for plane in planes), dtype=dtype, device=device)
+    for part, plane in zip(joined.split([plane.numel() for plane in planes]), planes, strict=True):
+        part.view(plane.shape).copy_(plane)  # images are large: no copies on the way
+    return joined
 
 
 def _density(node: ImageNode, width: int, height: int) -> float:

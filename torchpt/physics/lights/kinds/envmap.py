@@ -153,8 +153,9 @@ def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None
 def _weights(values: Tensor, heights: Tensor) -> Tensor:
     """Return integrals ``(H - 1, W)`` float64 over the cells of values ``(H, W)`` at the texels; the sphere has measure 1."""
     v = values.double()
-    v = v + v.roll(-1, 1)
-    return 0.25 * (v[:-1] + v[1:]) * (heights / values.shape[1])[:, None]
+    v = v.roll(-1, 1).add_(v)
+    # In place: a map may be large.
+    return (v[:-1] + v[1:]).mul_(0.25).mul_((heights / values.shape[1])[:, None])
 
 
 def _uneven(weights: Tensor, mean: Tensor, heights: Tensor) -> bool:
