@@ -164,6 +164,20 @@ def test_a_trace_of_classes_that_are_not_the_packages_is_not_kept():
     assert cache.cache_key(("a", torch.float32, Curve, 2)) is None
 
 
+def test_keys_of_long_structures_differ_where_the_structures_do():
+    """The text of a long part is kept: equal parts have equal keys, and others have others, also at a memory address again."""
+    keys = {}
+    for _ in range(2):
+        for k in range(40):
+            for last in (1, True, 1.0):  # equal numbers of other types
+                keys.setdefault((k, repr(last)), set()).add(cache.cache_key(("a", ("b",) * 500 + (k, last))))
+    assert all(len(found) == 1 for found in keys.values())
+    assert len(set.union(*keys.values())) == len(keys) == 120
+    shared = ("b",) * 500
+    assert len({cache.cache_key((name, shared)) for name in ("a", "b", ("a", "b"))}) == 3
+    assert cache.cache_key(("a", shared)) == cache.cache_key(("a", ("b",) * 500))
+
+
 SCRIPT = """
 import torch
 from torchpt.compiler import cache, cpu

@@ -41,6 +41,10 @@ _MOST_ELEMENTS = 1 << 16
 _LIBRARIES = ("torchpt", "torch", "builtins")
 #: Attributes of a program that JSON takes as they are.
 _PLAIN = ("uniforms", "lists", "counters", "tensors", "results", "shadows", "nodes", "sums")
+#: Long parts of structures by ``id``, with their text: tuples of values that never change.
+_texts: dict[int, tuple[Any, str]] = {}
+#: Characters from which on a text is kept, and the most that are.
+_LONG, _MOST_TEXTS = 1000, 16
 
 
 class _NotStorable(Exception):
@@ -53,9 +57,24 @@ def cache_key(structure: Any, target: Target | None = None) -> str | None:
     None if the structure holds objects that exist in this process alone.
     """
     try:
-        return cache.digest(code_of_folder(), torch.__version__, cpu.identity(target), _canonical(structure))
+        parts = structure if isinstance(structure, tuple) else (structure,)
+        text = "\0".join(map(_text_of_part, parts))
+        return cache.digest(code_of_folder(), torch.__version__, cpu.identity(target), text)
     except _NotStorable:
         return None
+
+
+def _text_of_part(part: Any) -> str:
+    """Return :func:`_canonical` of a part of a structure; that of a long one is kept, as the kernels of a render share it."""
+    known = _texts.get(id(part))
+    if known is not None and known[0] is part:
+        return known[1]
+    text = _canonical(part)
+    if len(text) >= _LONG and isinstance(part, tuple):
+        if len(_texts) >= _MOST_TEXTS:
+            _texts.clear()
+        _texts[id(part)] = part, text
+    return text
 
 
 def _canonical(value: Any) -> str:
