@@ -199,9 +199,18 @@ _LIGHT_SEED = 0x3C6EF372FE94F82B
 
 
 def _light_paths(wave: Wave) -> Wave | None:
-    """Return the wave of light paths beside the samples of a wave; None: its integrator has none, or nothing emits."""
+    """Return the wave of light paths beside the samples of a wave; None: its integrator has none, or nothing emits.
+
+    Raises:
+        SceneError: light paths cannot be joined to the camera.
+    """
     integrator, world = wave.integrator.light_walk(), wave.context.world
-    if integrator is None or world.emission is None:
+    if integrator is None:
+        return None
+    if type(wave.camera).connect is Camera.connect:
+        expected = f"a camera whose kind defines `connect`, beside integrator.type={wave.integrator.name}"
+        raise SceneError("camera.type", wave.camera.name, expected)
+    if world.emission is None:
         return None
     plan = integrator.plan(wave.context.plan.sampler, wave.context.plan.dtype)
     # Their vertices sample no light, and emission that they meet counts nothing.

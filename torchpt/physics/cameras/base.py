@@ -83,7 +83,6 @@ class Camera(ABC):
             Origins, ``(3, 1)`` if all rays share one, else ``(3, N)``, and unit directions ``(3, N)``.
         """
 
-    @abstractmethod
     def connect(self, p: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the places where rays of the camera start that come through points.
 
@@ -94,14 +93,19 @@ class Camera(ABC):
         Returns:
             Origins of the rays ``(3, N)``, the film positions ``x, y (N,)`` that they belong to, as for :meth:`rays`, and a
             mask ``(N,)`` of points in front of the camera, without which the others are meaningless.
-        """
 
-    @abstractmethod
+        Raises:
+            NotImplementedError: light paths cannot be joined to cameras of this kind.
+        """
+        raise NotImplementedError
+
     def film_density(self, d: Tensor) -> Tensor:
         """Return the density ``(N,)`` of film positions, in square pixels, over unit directions ``d (3, N)`` of rays.
 
-        It is per steradian at the origin of the rays; if all rays are parallel, per area across them.
+        It is per steradian at the origin of the rays; if all rays are parallel, per area across them. Needed beside
+        :meth:`connect`.
         """
+        raise NotImplementedError
 
     @abstractmethod
     def pixel(self) -> Tensor:

@@ -81,9 +81,9 @@ class Filter(ABC):
         """Return weights ``(N,)`` of samples at the offsets of ``u (2, N)``; called only if ``signed``."""
         return torch.ones_like(u[0])
 
-    @abstractmethod
     def density(self, x: Tensor) -> Tensor:
-        """Return the profile, of integral 1, at distances ``x (N,)`` from the centre in pixels."""
+        """Return the profile, of integral 1, at distances ``x (N,)`` from the centre in pixels; for light paths."""
+        raise NotImplementedError
 
     def splat(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """Choose along one axis a pixel that light at a film position counts for, by the profile about the pixels' centres.

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchpt.math.sampling import concentric_disk
+from torchpt.math.sampling import concentric_disk, uniform_sphere
 from torchpt.math.vectors import Frame, luminance, safe_reciprocal, take
 from torchpt.math.vectors import rows as rows_of
 from torchpt.physics.lights.records import Lights, LightSample
@@ -269,7 +269,9 @@ class Light(Emitter):
 
     @classmethod
     def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope, mis: bool) -> EmittedRay:
-        """Sample rays that leave the light; here those of a distant light, whose directions :meth:`sample` draws.
+        """Sample rays that leave the light.
+
+        Here those of a distant light, whose directions :meth:`sample` draws, or of a point, evenly in all directions.
 
         Args:
             at: rows of the table, one a lane.
@@ -278,6 +280,11 @@ class Light(Emitter):
             scope: a ball around the scene.
             mis: as for :meth:`sample`.
         """
+        if not cls.distant:
+            d = uniform_sphere(v).to(at.p0.dtype)
+            drawn = cls.sample(at, at.p0 + d, u, mis)  # what arrives at a distance of 1
+            density = cls.emission_density(at, torch.ones_like(drawn.pdf), scope)
+            return EmittedRay(at.p0.expand_as(d), d, drawn.radiance, density, torch.ones_like(drawn.pdf))
         drawn = cls.sample(at, scope.centre[:, None].expand(3, u.shape[1]), u, mis)
         d = -drawn.wi
         pdf = drawn.pdf if cls.environment else torch.ones_like(drawn.pdf)
@@ -285,13 +292,15 @@ class Light(Emitter):
 
     @classmethod
     def emission_density(cls, at: Lights, pdf: Tensor, scope: Scope) -> Tensor:
-        """Return the density ``(N,)`` of rays under :meth:`emit`; here those of a distant light.
+        """Return the density ``(N,)`` of rays under :meth:`emit`: of a point by solid angle alone.
 
         Args:
             at: rows of the table, one a lane.
             pdf: density ``(N,)`` of their directions under :meth:`sample`; not read for lights without extent.
             scope: a ball around the scene.
         """
+        if not cls.distant:
+            return torch.full_like(pdf, 0.25 / math.pi)
         across = scope.density()
         return pdf * across if cls.environment else across.expand_as(pdf)
 

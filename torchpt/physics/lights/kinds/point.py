@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from torchpt import spec
-from torchpt.math.sampling import uniform_sphere
 from torchpt.math.vectors import dot, safe_reciprocal
-from torchpt.physics.lights.base import EmittedRay, Light, Row, Scope, Setting, bright
+from torchpt.physics.lights.base import Light, Row, Setting, bright
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.spec import Color, Moves
 
@@ -49,16 +48,3 @@ class Point(Light):
         infinite = torch.full_like(weight, torch.inf)
         target, radiance = at.p0.expand_as(wi), at.radiance.expand_as(wi)
         return LightSample(wi=wi, target=target, distant=None, radiance=radiance, pdf=infinite, weight=weight)
-
-    @classmethod
-    def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope, mis: bool) -> EmittedRay:
-        """See :meth:`Light.emit`."""
-        d = uniform_sphere(v).to(at.p0.dtype)
-        one = torch.ones_like(d[0])
-        density = cls.emission_density(at, one, scope)
-        return EmittedRay(at.p0.expand_as(d), d, at.radiance.expand_as(d), density, one)
-
-    @classmethod
-    def emission_density(cls, at: Lights, pdf: Tensor, scope: Scope) -> Tensor:
-        """See :meth:`Light.emission_density`: by solid angle alone."""
-        return torch.full_like(pdf, 0.25 / math.pi)
