@@ -752,24 +752,34 @@ class KernelsEngine:
         """
         rows, arena, n = self.kernels.state, paths.arena, self.calls.known(paths.count)
         floats, words = cast(Any, arena.floats), cast(Any, arena.words)
-        # the rows o, d and t of the splats' shadow rays, and of those to lights
+        pixel, transmittance = words[rows.first("splat_pixel"), :n], floats[rows.first("splat_transmittance"), :n]
+        transmittance[:] = 0.0
+        lanes = (pixel >= 0).nonzero()
+        lanes = lanes[0] if isinstance(lanes, tuple) else lanes[:, 0]  # of numpy, of torch
+        if not len(lanes):
+            return
+        # The rows o, d and t of the splats' shadow rays, and of those to lights, which the search reads.
         splat, shadow = (
-            [*range(rows.first(f"{name}_o"), rows.first(f"{name}_radiance"))] for name in ("splat", "shadow")
+            words[rows.first(f"{name}_o") : rows.first(f"{name}_radiance"), :n] for name in ("splat", "shadow")
         )
-        saved = words[shadow, :n]  # a copy, as rows are given by a list; the search reads the rows of shadow rays
-        words[shadow, :n] = words[splat, :n]
-        self.search.light(arena, paths.count)
-        words[shadow, :n] = saved
+        # Few lanes have a splat: theirs are searched in the first columns.
+        columns = slice(0, len(lanes))
+        saved = shadow[:, columns] + 0
+        shadow[:, columns] = splat[:, lanes]
+        self.search.light(arena, self.calls.lanes(len(lanes)))
+        shadow[:, columns] = saved
         if "transmittance" in rows:
-            floats[rows.first("splat_transmittance"), :n] = floats[rows.first("transmittance"), :n]
+            passed = floats[rows.first("transmittance"), columns]
         else:
-            floats[rows.first("splat_transmittance"), :n] = words[rows.first("blocked"), :n] == 0
-        transmittance, first = floats[rows.first("splat_transmittance"), :n], rows.first("splat_radiance")
-        pixel, value = words[rows.first("splat_pixel"), :n], floats[first : first + 3, :n] * transmittance
-        arrives, finite = (pixel >= 0) & (transmittance != 0), (abs(value) < LARGEST).all(0)
-        lane, counts = words[rows.first("lane"), :n], arrives & finite
+            passed = (words[rows.first("blocked"), columns] == 0) * 1.0
+        transmittance[lanes] = passed
+        first = rows.first("splat_radiance")
+        value = floats[first : first + 3][:, lanes] * transmittance[lanes]
+        arrives, finite = passed != 0, (abs(value) < LARGEST).all(0)
+        lane, counts = words[rows.first("lane"), :n][lanes], arrives & finite
         if self.keeps_splats:
-            senders, pixels, light = map(torch.as_tensor, (lane[counts], pixel[counts], value[:, counts]))
+            splats = lane[counts], pixel[lanes][counts], value[:, counts]
+            senders, pixels, light = map(torch.as_tensor, splats)
             self.splats.append(Splats(senders.long(), pixels.long(), light))
         self._lost.append(lane[arrives & ~finite])
 

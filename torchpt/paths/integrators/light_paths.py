@@ -157,10 +157,9 @@ class LightPaths(Integrator):
             scale = scale * reduced(None, area * arrival.others(reverse))
         radiance = state.throughput * value * (scale * weight_x * weight_y)
         radiance = torch.where(seen, radiance, 0.0)
-        o = offset_origin(context.world, at, w)
-        t_max = (largest(radiance.abs()) > 0).to(plan.dtype)
-        pixel = torch.where(seen, row * crop[2] + column, -1)
-        return Splat(pixel, Shadow(o=o, d=eye - o, t_max=t_max, radiance=radiance))
+        o, lit = offset_origin(context.world, at, w), ~(largest(radiance.abs()) == 0)  # a NaN is reported
+        pixel = torch.where(seen & lit, row * crop[2] + column, -1)
+        return Splat(pixel, Shadow(o=o, d=eye - o, t_max=lit.to(plan.dtype), radiance=radiance))
 
     def _leaving(
         self, context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface, arrival: Arrival
