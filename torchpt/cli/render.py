@@ -212,12 +212,9 @@ def scene_and_settings(job: Job) -> tuple[Any, Any]:
 
 
 def with_error_pilots(settings: Any) -> Any:
-    """Replace ``render.pilots: auto`` by true where the integrator allows it, so that the summary reports the error.
-
-    Integrators that splat do not: their samples do not belong to one pixel.
-    """
+    """Replace ``render.pilots: auto`` by true, so that the summary reports the error."""
     render = settings.render
-    with_pilots = render.pilots == "auto" and not settings.integrator.splats
+    with_pilots = render.pilots == "auto" and "variance" not in settings.film.aovs
     return replace(settings, render=render.but(pilots=True)) if with_pilots else settings
 
 

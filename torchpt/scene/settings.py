@@ -573,9 +573,12 @@ class Settings:
 
     @property
     def streams(self) -> int:
-        """Return the number of independent randomizations (streams) of a pixel: one, or more for the AOV ``variance``."""
-        spp = self.render.spp
-        return min(spp, 4 if spp >= MANY_SAMPLES else 2) if "variance" in self.film.aovs else 1
+        """Return the number of independent randomizations (streams) of a pixel: one, or more where their spread is asked for.
+
+        That is for the AOV ``variance``, and in place of error probes where samples light other pixels than their own.
+        """
+        spp, instead = self.render.spp, self.integrator.splats and self.render.pilots is True
+        return min(spp, 4 if spp >= MANY_SAMPLES else 2) if "variance" in self.film.aovs or instead else 1
 
     @property
     def light_choice(self) -> str:
@@ -721,9 +724,6 @@ def _check_pilots(settings: Settings, file: str | None) -> None:
             raise SceneError(key, value, expected, file)
         if variance:
             raise SceneError("film.aovs", list(film.aovs), f"no variance beside {key}", file)
-    if settings.integrator.splats and render.pilots is True:
-        expected = "auto or false where samples light other pixels than their own; film.aovs=[variance] tells the error"
-        raise SceneError("render.pilots", True, expected, file)
     if variance and render.pilots is True:
         expected = "auto or false where film.aovs asks for variance: every pixel is sampled by two streams then"
         raise SceneError("render.pilots", True, expected, file)
