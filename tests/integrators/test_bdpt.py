@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
@@ -13,13 +15,15 @@ from significance import t_limit
 
 import torchpt
 from torchpt.core.errors import NotBuiltError
-from torchpt.math.vectors import rows
+from torchpt.math.vectors import dot, rows
 from torchpt.paths.integrators.kinds.bdpt import STRATEGIES, Bdpt
 from torchpt.paths.integrators.weights import Arrival, behind, reduced, reverse_pdf
 from torchpt.paths.surface import surface_at
-from torchpt.physics.lights.emission import density_of_hit, emit, light_weight
+from torchpt.paths.wave import Wave
+from torchpt.physics.lights.emission import LightRay, density_of_hit, emit, light_weight
 from torchpt.physics.shapes import interact, offset_origin
-from torchpt.physics.shapes.geometry import Hit
+from torchpt.physics.shapes.geometry import Hit, Interaction
+from torchpt.physics.world import World
 from torchpt.scene.formats.description import settings
 from torchpt.scene.prepare import make_wave
 
@@ -152,6 +156,42 @@ def test_a_small_lamp_is_found_with_less_noise():
     assert float(b) < 0.2 * float(a)
 
 
+def test_normal_maps_let_no_light_through():
+    """A steep normal of the map lies on the side of camera and lamp alike, though the wall stands between them."""
+    slopes = torch.randn(8, 8, 2, generator=torch.Generator().manual_seed(3))
+    normals = torch.nn.functional.normalize(torch.cat((slopes, torch.ones(8, 8, 1)), -1), dim=-1)
+    relief = {"type": "image", "data": (0.5 * normals + 0.5).tolist()}
+    wall = {"type": "diffuse", "normal_map": relief}
+    scene = {
+        "camera": {"origin": [0, 0, 2], "target": [0, 0, 0], "fov": 40},
+        "film": {"width": 8, "height": 8},
+        "shapes": {"wall": {"type": "rectangle", "material": wall}},
+        "lights": {"behind": {"type": "point", "position": [0.3, 0.1, -0.3], "intensity": 2}},
+    }
+    assert not torchpt.render(torchpt.load(scene, device="cpu"), integrator="bdpt", spp=64, compile="off").any()
+
+
+def test_distant_light_falls_on_all_instances():
+    """One that stands far from the meshes, and one that is larger than they are."""
+    cube = {"type": "cube", "transform": [{"scale": 0.1}]}
+    far = {"type": "instance", "of": "cube", "transform": [{"scale": 0.5}, {"translate": [3, 0, 0]}]}
+    scene = torchpt.load(
+        {
+            "camera": {"origin": [3, 1, 3], "target": [3, 0, 0], "fov": 30},
+            "film": {"width": 16, "height": 16, "filter": "box"},
+            "shapes": {"cube": cube, "far": far},
+            "lights": {"sun": {"type": "directional", "direction": [-1, -2, -1.5]}},
+        },
+        device="cpu",
+    )
+    a, b = (
+        torchpt.render(scene, integrator={"type": "bdpt", "strategy": strategy, "max_depth": 2}, spp=256, compile="off")
+        for strategy in ("light", "light_paths")
+    )
+    assert float(a.mean()) > 0.01
+    assert float(b.mean()) == pytest.approx(float(a.mean()), rel=0.02)
+
+
 def test_a_checkpoint_goes_on_to_the_bit(tmp_path):
     scene, file = torchpt.load(GLASS, device="cpu"), str(tmp_path / "half.ckpt")
     whole = torchpt.render(scene, integrator="bdpt", spp=8)
@@ -175,104 +215,139 @@ def test_gradients_are_refused():
 # ---- Weights
 
 
-def lambert(scene: dict[str, Any]) -> torchpt.Scene:
-    return torchpt.load(scene, device="cpu")
+@dataclass(frozen=True)
+class ThreeEdges:
+    """Paths of three edges, N lanes: from a point on a lamp by surface points ``a`` and ``b`` to the camera.
+
+    ``ray`` goes to ``a`` along ``d0``, ``d1`` leads from ``a`` to ``b``, and ``view`` from ``b`` to the camera. ``density`` is
+    that of the camera, by area of the surface at ``b``, in square pixels; ``first`` and ``second`` are the models at ``a`` and
+    ``b``.
+    """
+
+    wave: Wave
+    ray: LightRay
+    a: Interaction
+    b: Interaction
+    d0: torch.Tensor
+    d1: torch.Tensor
+    view: torch.Tensor
+    density: torch.Tensor
+    first: int = 0
+    second: int = 0
+
+    def of(self, first: int, second: int) -> ThreeEdges:
+        """Return those whose surface points are of two models."""
+        key = self.wave.context.world.materials
+        models = [key.key[at.slot + 1].long() % len(key.models) for at in (self.a, self.b)]
+        index = ((models[0] == first) & (models[1] == second)).nonzero()[:, 0]
+        return replace(self.rows(index), first=first, second=second)
+
+    def rows(self, index: torch.Tensor) -> ThreeEdges:
+        names = ("ray", "a", "b", "d0", "d1", "view", "density")
+        return replace(self, **{name: rows(getattr(self, name), index) for name in names})
+
+
+def random_paths(wave: Wave, n: int) -> ThreeEdges:
+    """Return random paths that leave the lamp, whose second point reflects light to the camera."""
+    world, numbers = wave.context.world, torch.Generator().manual_seed(7)
+    assert world.emission is not None
+
+    def met(o: torch.Tensor, d: torch.Tensor) -> tuple[Interaction, torch.Tensor]:
+        t, prim, u, v = wave.accel.intersect(o, d, torch.full_like(o[0], math.inf))
+        return interact(world, o, d, Hit(t.double(), prim.clamp_min(0).long(), u.double(), v.double())), prim >= 0
+
+    u, v = (torch.rand(2, n, generator=numbers, dtype=torch.float64) for _ in range(2))
+    ray = emit(world.emission, None, u, v, 1e-5)
+    a, lit = met(ray.o, ray.d)
+    d1 = torch.nn.functional.normalize(torch.randn(3, n, generator=numbers, dtype=torch.float64), dim=0)
+    d1 = d1 * -torch.sign(dot(d1, a.ng) * dot(ray.d, a.ng))  # on the side that the lamp shines on
+    b, found = met(offset_origin(world, a, d1), d1)
+    to = wave.camera.origin() - b.p
+    view = torch.nn.functional.normalize(to, dim=0)
+    density = wave.camera.film_density(-view) * dot(view, b.ng).abs() / dot(to, to)
+    good = lit & found & (a.slot != b.slot) & (dot(view, b.ng) * dot(d1, b.ng) < 0)
+    return ThreeEdges(wave, ray, a, b, ray.d, d1, view, density).rows(good.nonzero()[:, 0])
+
+
+def weight_of_splat(paths: ThreeEdges) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the weight as a light path that is joined to the camera, and the density with which it is sampled at ``a``."""
+    wave, a, b = paths.wave, paths.a, paths.b
+    assert wave.light_paths is not None and wave.context.world.emission is not None
+    context, emission = wave.light_paths.context, wave.context.world.emission
+    kinds = context.world.materials.models
+    surface, cosine = surface_at(context.world, paths.first, paths.d0, a), Arrival.cosine_of(paths.d0, a)
+    share = light_weight(emission, paths.ray, a.p, surface.frame.n)
+    start = paths.ray.density
+    arrival = Arrival(1.0 / (start * share * cosine), paths.ray.met / start / cosine, cosine)
+    pdf = kinds[paths.first].pdf(surface.parameters, surface.wo, surface.frame.to_local(paths.d1))
+    back = reverse_pdf(context, paths.first, a, surface, -paths.d0, paths.d1)
+    dvc = behind(context, paths.first, a, surface, arrival, paths.d1, pdf, None, back)
+    cosine = Arrival.cosine_of(paths.d1, b)
+    arrival = Arrival(torch.zeros_like(dvc), dvc / cosine, cosine)
+    surface = surface_at(context.world, paths.second, paths.d1, b)
+    back = reverse_pdf(context, paths.second, b, surface, -paths.d1, paths.view)
+    return reduced(None, paths.density / PIXELS * arrival.others(back)), pdf
+
+
+def weights_of_camera_path(paths: ThreeEdges) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the weights as a camera path, with a light sample at its end and where it meets the lamp.
+
+    The third result is the density with which it is sampled at ``b`` and ``a``.
+    """
+    wave, a, b = paths.wave, paths.a, paths.b
+    context, emission = wave.context, wave.context.world.emission
+    assert emission is not None
+    kinds = context.world.materials.models
+    surface = surface_at(context.world, paths.second, -paths.view, b)
+    arrival = Arrival(PIXELS / paths.density, torch.zeros_like(paths.density), Arrival.cosine_of(paths.view, b))
+    pdf = kinds[paths.second].pdf(surface.parameters, surface.wo, surface.frame.to_local(-paths.d1))
+    back = reverse_pdf(context, paths.second, b, surface, paths.view, -paths.d1)
+    dvc = behind(context, paths.second, b, surface, arrival, -paths.d1, pdf, None, back)
+    cosine = Arrival.cosine_of(paths.d1, a)
+    arrival = Arrival(torch.zeros_like(dvc), dvc / cosine, cosine)
+    surface = surface_at(context.world, paths.first, -paths.d1, a)
+    share = light_weight(emission, paths.ray, a.p, surface.frame.n)
+    back = reverse_pdf(context, paths.first, a, surface, paths.d1, -paths.d0)
+    by_bsdf = kinds[paths.first].pdf(surface.parameters, surface.wo, surface.frame.to_local(-paths.d0))
+    # Of a light sample: over one by the BSDF alone, and over the light path.
+    ratio = by_bsdf * share
+    alone = 1.0 / (1.0 + ratio * ratio)
+    other = paths.ray.density * share * dot(paths.d0, a.ng).abs() * arrival.others(back)
+    by_sample = alone * reduced(alone, other)
+    # Where the BSDF's ray meets the lamp.
+    alone = torch.where(by_bsdf > 0, 1.0 / (1.0 + 1.0 / (ratio * ratio)), 0.0)
+    dvc = behind(context, paths.first, a, surface, arrival, -paths.d0, by_bsdf, None, back)
+    other = density_of_hit(emission, on_lamp(context.world, a.p, -paths.d0)) * dvc
+    return by_sample, alone * reduced(alone, other), torch.minimum(pdf, by_bsdf)
+
+
+def on_lamp(world: World, o: torch.Tensor, d: torch.Tensor) -> Interaction:
+    """Return the point of the lamp's first corner; its density is that of all its points."""
+    assert world.lights is not None and world.lights.row_of_prim is not None
+    zero = torch.zeros_like(o[0])
+    prim = torch.full_like(zero, int((world.lights.row_of_prim == 0).nonzero()[0, 0]), dtype=torch.int64)
+    return interact(world, o, d, Hit(zero + 1.0, prim, zero, zero))
+
+
+#: Pixels of the rooms: light paths for each sample.
+PIXELS = 16.0 * 16.0
 
 
 def test_weights_of_all_strategies_sum_to_one():
     """For random paths of three edges, with densities by hand."""
     lamp = {"type": "rectangle", "emission": 3, "transform": [{"scale": 0.5}, {"translate": [0.2, 1, -0.9]}]}
-    shapes = {"lamp": lamp, "ball": {"type": "sphere", "center": [0.4, 0.4, 0.2], "radius": 0.35, "material": "metal"}}
-    scene = torchpt.load(room(shapes=shapes), device="cpu")
-    wave = make_wave(scene, settings(scene.description, {"integrator": Bdpt()}), None, torch.float64)
-    light_wave = wave.light_paths
-    assert light_wave is not None
-    world, context, emission = wave.context.world, wave.context, wave.context.world.emission
-    assert emission is not None
-    n = 4096
-    numbers = torch.Generator().manual_seed(7)
-
-    def shot(o: torch.Tensor, d: torch.Tensor) -> tuple[Any, torch.Tensor]:
-        t, prim, u, v = wave.accel.intersect(o, d, torch.full_like(o[0], math.inf))
-        hit = Hit(t.double(), prim.long(), u.double(), v.double())
-        met = hit.prim >= 0
-        safe = Hit(hit.t, hit.prim.clamp_min(0), hit.u, hit.v)
-        return interact(world, o, d, safe), met
-
-    def model_of(at: Any) -> torch.Tensor:
-        return world.materials.key[at.slot + 1].long() % len(world.materials.models)
-
-    # A light path y0, y1, y2; then the same points as a camera path.
-    u, v = (torch.rand(2, n, generator=numbers, dtype=torch.float64) for _ in range(2))
-    ray = emit(emission, None, u, v, 1e-5)
-    one, met = shot(ray.o, ray.d)
-    turn = torch.nn.functional.normalize(torch.randn(3, n, generator=numbers, dtype=torch.float64), dim=0)
-    turn = turn * torch.sign((turn * one.ng).sum(0)) * -torch.sign((ray.d * one.ng).sum(0))
-    two, met_again = shot(offset_origin(world, one, turn), turn)
-    eye = wave.camera.origin()
-    view = torch.nn.functional.normalize(eye - two.p, dim=0)
-    models = [str(m) for m in world.materials.models]
-    checked = 0
-    for first in range(len(models)):
-        for second in range(len(models)):
-            kinds = world.materials.models[first], world.materials.models[second]
-            if kinds[0].transmits or kinds[1].transmits:
-                continue
-            lanes = met & met_again & (model_of(one) == first) & (model_of(two) == second)
-            lanes &= (one.slot != two.slot) & ((view * two.ng).sum(0) * (turn * two.ng).sum(0) < 0)
-            index = lanes.nonzero()[:, 0]
-            if len(index) < 8:
-                continue
-
-            def of(x: Any, index: torch.Tensor = index) -> Any:
-                return rows(x, index)
-
-            a, b, d0, d1, w = of(one), of(two), ray.d[:, index], turn[:, index], view[:, index]
-            start = of(ray)
-            pixels = 16.0 * 16.0
-            density = wave.camera.film_density(-w) / ((eye - b.p).square().sum(0)) * (w * b.ng).sum(0).abs()
-            # As a light path, joined to the camera.
-            lit = surface_at(world, first, d0, a)
-            cosine = Arrival.cosine_of(d0, a)
-            share = light_weight(emission, start, a.p, lit.frame.n)
-            arrival = Arrival(1.0 / (start.density * share * cosine), start.met / start.density / cosine, cosine)
-            pdf = kinds[0].pdf(lit.parameters, lit.wo, lit.frame.to_local(d1))
-            back = reverse_pdf(light_wave.context, first, a, lit, -d0, d1)
-            dvc = behind(light_wave.context, first, a, lit, arrival, d1, pdf, None, back)
-            reach = Arrival.cosine_of(d1, b)
-            end = Arrival(torch.zeros_like(dvc), dvc / reach, reach)
-            lit = surface_at(world, second, d1, b)
-            by_splat = reduced(None, density / pixels * end.others(reverse_pdf(context, second, b, lit, -d1, w)))
-            # As a camera path, from the same points.
-            seen = surface_at(world, second, -w, b)
-            at_eye = Arrival(pixels / density, torch.zeros_like(dvc), Arrival.cosine_of(w, b))
-            forth = kinds[1].pdf(seen.parameters, seen.wo, seen.frame.to_local(-d1))
-            back = reverse_pdf(context, second, b, seen, w, -d1)
-            dvc = behind(context, second, b, seen, at_eye, -d1, forth, None, back)
-            seen = surface_at(world, first, -d1, a)
-            cosine = Arrival.cosine_of(d1, a)
-            last = Arrival(torch.zeros_like(dvc), dvc / cosine, cosine)
-            # A light sample there, and a ray there that meets the lamp.
-            by_bsdf = kinds[0].pdf(seen.parameters, seen.wo, seen.frame.to_local(-d0))
-            ratio = by_bsdf * share
-            two_ways = 1.0 / (1.0 + ratio * ratio)
-            back = reverse_pdf(context, first, a, seen, d1, -d0)
-            other = start.density * share * (d0 * a.ng).sum(0).abs() * last.others(back)
-            by_sample = two_ways * reduced(two_ways, other)
-            behind_it = behind(context, first, a, seen, last, -d0, by_bsdf, None, back)
-            two_ways = torch.where(by_bsdf > 0, 1.0 / (1.0 + (1.0 / ratio) ** 2), 0.0)
-            lamp_at = interact(
-                world, a.p, -d0, Hit(torch.ones_like(ratio), _lamp(world, len(ratio)), start.p[0] * 0, start.p[0] * 0)
-            )
-            emitted = density_of_hit(emission, lamp_at)
-            by_hit = two_ways * reduced(two_ways, emitted * behind_it)
-            total = by_splat + by_sample + by_hit
-            good = (pdf > 0) & (by_bsdf > 0) & (forth > 0)
-            assert torch.allclose(total[good], torch.ones_like(total[good]), atol=1e-5), (first, second)
-            assert all(bool((weight[good] >= 0.0).all()) for weight in (by_splat, by_sample, by_hit))
-            checked += int(good.sum())
+    ball = {"type": "sphere", "center": [0.4, 0.4, 0.2], "radius": 0.35, "material": "metal"}
+    scene = torchpt.load(room(shapes={"lamp": lamp, "ball": ball}), device="cpu")
+    keys = {"integrator": Bdpt(light_paths=1.0)}
+    wave = make_wave(scene, settings(scene.description, keys), None, torch.float64)
+    paths, checked = random_paths(wave, 4096), 0
+    opaque = [k for k, kind in enumerate(wave.context.world.materials.models) if not kind.transmits]
+    for first, second in itertools.product(opaque, repeat=2):
+        some = paths.of(first, second)
+        (by_splat, pdf), (by_sample, by_hit, other_pdf) = weight_of_splat(some), weights_of_camera_path(some)
+        good = (pdf > 0) & (other_pdf > 0)
+        weights = torch.stack((by_splat, by_sample, by_hit))[:, good]
+        assert bool((weights >= 0.0).all())
+        torch.testing.assert_close(weights.sum(0), torch.ones_like(weights[0]), rtol=0.0, atol=1e-5)
+        checked += len(weights[0])
     assert checked > 500
-
-
-def _lamp(world: Any, n: int) -> torch.Tensor:
-    return torch.full((n,), int((world.lights.row_of_prim == 0).nonzero()[0, 0]))

@@ -29,7 +29,7 @@ from torchpt.physics.shapes.geometry import Geometry, Hit
 from torchpt.scene.names import Names
 from torchpt.scene.scene import Scene
 from torchpt.search import Accel
-from torchpt.search.bounds import primitive_bounds
+from torchpt.search.instances import bounding_ball
 
 __all__ = ["MissingLight", "find_missing_light"]
 
@@ -234,12 +234,10 @@ def _light_rays(search: _Search, lights: Lights, row: int, kind: str) -> tuple[T
     angle, fraction = GOLDEN_ANGLE * k, (k + 0.5) / LIGHT_RAYS
     axis = lights.normal[:, row : row + 1].double()
     if kind == "directional":
-        low, high = (box.double() for box in primitive_bounds(search.geometry()))
-        low, high = low.amin(1, keepdim=True), high.amax(1, keepdim=True)
-        reach = 0.5 * (high - low).norm()  # radius of the bounding sphere
+        centre, radius = bounding_ball(search.geometry())
         frame = Frame.about(axis)
         on_disk = fraction.sqrt() * (angle.cos() * frame.s + angle.sin() * frame.t)
-        o, d = 0.5 * (low + high) + reach * (on_disk - 2.0 * axis), axis.expand(3, LIGHT_RAYS)
+        o, d = centre[:, None] + radius * (on_disk - 2.0 * axis), axis.expand(3, LIGHT_RAYS)
     else:
         d = _fibonacci_sphere(k, LIGHT_RAYS)
         if kind == "spot":

@@ -40,7 +40,7 @@ from torchpt.physics.world import World
 from torchpt.scene import Scene
 from torchpt.scene.scene import live_scenes
 from torchpt.scene.settings import Settings
-from torchpt.search.bounds import primitive_bounds
+from torchpt.search.instances import bounding_ball
 from torchpt.spec import Moves
 from torchpt.spec.schema import ParsedParams
 
@@ -226,11 +226,7 @@ def _with_emission(scene: Scene, world: World, geometry: Geometry, *, own: bool)
     cache = scene_cache(scene)
     if own and cache.with_emission is not None and cache.with_emission[0] is world:
         return cache.with_emission[1]
-    low, high = (box.double() for box in primitive_bounds(geometry))
-    low, high = (
-        (low.amin(1), high.amax(1)) if low.shape[1] else (scene.space.shift * 0.0 - 1.0, scene.space.shift * 0.0 + 1.0)
-    )
-    emission = emission_of(world.lights, 0.5 * (low + high), 0.5 * (high - low).norm())
+    emission = emission_of(world.lights, *bounding_ball(geometry))
     found = replace(world, emission=emission)
     if own:
         cache.with_emission = world, found

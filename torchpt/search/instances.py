@@ -15,7 +15,7 @@ from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.base import Accel, Hits
 from torchpt.search.bounds import primitive_bounds
 
-__all__ = ["CopyTables", "Instanced"]
+__all__ = ["CopyTables", "Instanced", "bounding_ball"]
 
 
 # ---- Two levels: first the primitives, then the instances
@@ -70,6 +70,22 @@ def _triangles(geometry: Geometry, first: int, count: int) -> Geometry:
     """Return ``count`` triangles of a geometry, from the id ``first`` on."""
     columns = slice(first, first + count)
     return Geometry(geometry.p0[:, columns], geometry.p1[:, columns], geometry.p2[:, columns], (count, 0, 0, 0, 0))
+
+
+def bounding_ball(geometry: Geometry) -> tuple[Tensor, Tensor]:
+    """Return centre ``(3,)`` and radius ``()`` of a ball around all surfaces, instances included; float64.
+
+    Without surfaces it is the unit ball.
+    """
+    boxes = [primitive_bounds(geometry)]
+    if geometry.copies is not None:
+        tables = CopyTables(geometry)
+        boxes.append((tables.low, tables.high))
+    low, high = (torch.cat(sides, 1).double() for sides in zip(*boxes, strict=True))
+    if not low.shape[1]:
+        return low.new_zeros(3), low.new_ones(())
+    low, high = low.amin(1), high.amax(1)
+    return 0.5 * (low + high), 0.5 * (high - low).norm()
 
 
 class Instanced(Accel):

@@ -9,7 +9,7 @@ the BSDF with light that comes from where the path does, over the cosine of its 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -31,6 +31,16 @@ from torchpt.physics.shapes.interaction import OFFSET
 from torchpt.spec import Flag, Integer, Scalar
 
 __all__ = ["LightPaths"]
+
+
+@dataclass(frozen=True)
+class _View:
+    """Light at surface points, as they are seen from where it goes on to."""
+
+    surface: Surface
+    wi: Tensor  # (3, N) direction to the light, in the surface's frame
+    throughput: Tensor  # (3, N), with the factors of shading normals and one-sided surfaces
+    arrival: Arrival  # the numbers of MIS
 
 
 class LightPaths(Integrator):
@@ -102,33 +112,38 @@ class LightPaths(Integrator):
         kind = world.materials.models[model]
         at = interact(world, state.o, state.d, hit, follow_ray=context.follow_ray)
         surface = surface_at(world, model, state.d, at, context.pixel)
-        arrival = self._arrival(context, model, state, at, surface)
-        # Normals and sides are asked of the direction to the light alone, as in a camera path.
-        share = stages.shading_weight(world, model, at, surface, -state.d, surface.wo)
-        if share is not None:
-            state = replace(state, throughput=state.throughput * share)
-        splat = None if kind.smooth else self._splat(context, model, state, at, surface, arrival)
-        leaving = self._leaving(context, model, state, at, surface, arrival)
+        front = self._view(context, model, state, at, surface)
+        splat = None if kind.smooth else self._splat(context, model, state, at, front)
+        leaving = self._leaving(context, model, state, at, front)
         return VertexOutput(leaving=leaving, next_hit=None, shadow=None, at=at, surface=surface, splat=splat)
 
-    def _arrival(
-        self, context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface
-    ) -> Arrival:
-        """Return the numbers of MIS at a vertex; at the first one a light sample competes."""
-        cosine = Arrival.cosine_of(state.d, at)
-        dvc = state.extra["dvc"] / cosine
-        if context.start_salts is None:
-            return Arrival(torch.zeros_like(cosine), dvc, cosine)
-        emission = context.world.emission
-        assert emission is not None
-        ray = self._ray(context, state.key, context.start_salts)
-        n = None if context.world.materials.models[model].transmits else surface.frame.n
-        weight = light_weight(emission, ray, at.p, n)
-        return Arrival(safe_reciprocal(ray.density * weight * cosine), dvc, cosine)
+    def _view(self, context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface) -> _View:
+        """Return light at surface points, as ``surface`` is seen from where it goes on to.
 
-    def _splat(
-        self, context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface, arrival: Arrival
-    ) -> Splat:
+        Normals and sides are asked of the direction to the light alone, as in a camera path that comes from there.
+        """
+        world = context.world
+        wi = surface.frame.to_local(-state.d)
+        share = stages.shading_weight(world, model, at, surface, -state.d, wi)
+        throughput = state.throughput if share is None else state.throughput * share
+        cosine = Arrival.cosine_of(state.d, at)
+        dvcm, dvc = torch.zeros_like(cosine), state.extra["dvc"] / cosine
+        if context.start_salts is not None:  # at the first vertex a light sample competes
+            emission = world.emission
+            assert emission is not None
+            ray = self._ray(context, state.key, context.start_salts)
+            n = None if world.materials.models[model].transmits else surface.frame.n
+            dvcm = safe_reciprocal(ray.density * light_weight(emission, ray, at.p, n) * cosine)
+        return _View(surface, wi, throughput, Arrival(dvcm, dvc, cosine))
+
+    def _seen_from(
+        self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View, w: Tensor
+    ) -> _View:
+        """Return light at surface points as they are seen from unit directions ``w (3, N)``; ``front``: from the light."""
+        surface = seen_from(context, model, at, front.surface, w)
+        return front if surface is front.surface else self._view(context, model, state, at, surface)
+
+    def _splat(self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View) -> Splat:
         """Return the light that surface points send to the camera."""
         plan, camera, crop, filter = context.plan, context.camera, context.crop, context.filter
         assert camera is not None and crop is not None and filter is not None
@@ -142,9 +157,9 @@ class LightPaths(Integrator):
         density = camera.film_density(-w) / (self.fraction * float(crop[2] * crop[3]))
         if not camera.parallel:
             density = density * safe_reciprocal(square)
-        view = seen_from(context, model, at, surface, w)
-        wo, wi = view.frame.to_local(w), view.frame.to_local(-state.d)
-        value, reverse = kind.eval_pdf(view.parameters, wo, wi)
+        view = self._seen_from(context, model, state, at, front, w)
+        arrival, wo = view.arrival, view.surface.frame.to_local(w)
+        value, reverse = kind.eval_pdf(view.surface.parameters, wo, view.wi)
         u = draws.two(Dimension.PIXEL)
         (column, weight_x), (row, weight_y) = filter.splat(x, u[0].to(plan.dtype)), filter.splat(y, u[1].to(plan.dtype))
         column, row = column - crop[0], row - crop[1]
@@ -155,37 +170,35 @@ class LightPaths(Integrator):
         scale = area * state.extra["flux"] / arrival.cosine
         if self.weighted:
             scale = scale * reduced(None, area * arrival.others(reverse))
-        radiance = state.throughput * value * (scale * weight_x * weight_y)
+        radiance = view.throughput * value * (scale * weight_x * weight_y)
         radiance = torch.where(seen, radiance, 0.0)
         o, lit = offset_origin(context.world, at, w), ~(largest(radiance.abs()) == 0)  # a NaN is reported
         pixel = torch.where(seen & lit, row * crop[2] + column, -1)
         return Splat(pixel, Shadow(o=o, d=eye - o, t_max=lit.to(plan.dtype), radiance=radiance))
 
-    def _leaving(
-        self, context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface, arrival: Arrival
-    ) -> PathState:
+    def _leaving(self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View) -> PathState:
         """Return the paths with the rays that leave surface points: sampled as a camera path's, weighted by the adjoint."""
-        plan, kind = context.plan, context.world.materials.models[model]
+        plan, kind, surface = context.plan, context.world.materials.models[model], front.surface
         draws = Draws(plan.sampler, state.key, context.salts)
         lobe = draws.one(Dimension.LOBE).to(plan.dtype) if kind.lobed else None
         sample = kind.sample(surface.parameters, surface.wo, lobe, draws.two(Dimension.BSDF).to(plan.dtype))
         d, pdf = surface.frame.to_world(sample.wi), sample.pdf
-        cosine, sharp = dot(d, at.ng).abs(), torch.isinf(pdf) if kind.delta else None
-        turned = cosine / arrival.cosine
+        view = self._seen_from(context, model, state, at, front, d)
+        sharp = torch.isinf(pdf) if kind.delta else None
+        turned = dot(d, at.ng).abs() / view.arrival.cosine
         weight, reverse, least = sample.weight, None, pdf
         if kind.delta:
             # A delta lobe's weight is that of light from `wi`: with the cosines of both normals it becomes the adjoint.
             weight = weight * (turned * surface.wo[2].abs() * safe_reciprocal(sample.wi[2].abs()))
             if sample.eta is not None:
                 weight = weight * (sample.eta * sample.eta)
-        view = seen_from(context, model, at, surface, d)
         if not kind.smooth:
-            value, reverse = kind.eval_pdf(view.parameters, view.frame.to_local(d), view.frame.to_local(-state.d))
+            value, reverse = kind.eval_pdf(view.surface.parameters, view.surface.frame.to_local(d), view.wi)
             finite = pdf if sharp is None else torch.where(sharp, 0.0, pdf)
             rough = value * (turned * safe_reciprocal(finite))
             weight = rough if sharp is None else torch.where(sharp, weight, rough)
         if kind.delta and surface.perturbed_normal is not None:  # light along `d` would meet another normal
-            same = dot(view.frame.n, surface.frame.n) > 1.0 - 1e-4
+            same = dot(view.surface.frame.n, surface.frame.n) > 1.0 - 1e-4
             least = torch.where(torch.isinf(pdf) & ~same, 0.0, least)
         drawn = Drawn(
             o=offset_origin(context.world, at, d),
@@ -198,7 +211,8 @@ class LightPaths(Integrator):
             eta=None,  # flux is not scaled by refraction
         )
         without_shadowing = replace(surface, perturbed_normal=None)  # it is of the light's direction
+        state = replace(state, throughput=view.throughput)
         continuation = stages.continue_paths(plan, state, without_shadowing, drawn, draws, context.roulette)
         leaving = stages.next_ray(context, model, state, at, surface, drawn, continuation)
-        dvc = behind(context, model, at, surface, arrival, d, pdf, sample.eta, reverse)
+        dvc = behind(context, model, at, surface, view.arrival, d, pdf, sample.eta, reverse)
         return replace(leaving, extra={**state.extra, "dvcm": torch.zeros_like(dvc), "dvc": dvc})

@@ -91,7 +91,7 @@ def emission_of(lights: Lights, centre: Tensor, radius: Tensor) -> Emission:
     Args:
         lights: the table.
         centre: ``(3,)`` centre of a ball around all surfaces.
-        radius: ``()`` its radius, by which distant lights were given their power.
+        radius: ``()`` its radius.
     """
     dtype = lights.area.dtype
     chosen = None if len(lights.power) == 1 else Distribution1D.of(lights.power, dtype)
