@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -197,6 +198,14 @@ def test_a_checkpoint_goes_on_to_the_bit(tmp_path):
     whole = torchpt.render(scene, integrator="bdpt", spp=8)
     torchpt.render(scene, integrator="bdpt", spp=5, checkpoint=file)
     assert torch.equal(whole, torchpt.render(scene, integrator="bdpt", spp=8, checkpoint=file, resume=True))
+
+
+def test_splats_that_are_too_large_are_named():
+    """Sums of splats hold less than 2^55, the radiance of camera paths more."""
+    bright = {**GLASS, "lights": {"p": {**GLASS["lights"]["p"], "intensity": 1e30}}}
+    found = torchpt.render(torchpt.load(bright, device="cpu"), integrator="bdpt", spp=4, compile="off", full=True)
+    assert re.search(r"infinite splat at depth \d+ \(shape floor", found.nonfinite_first)
+    assert found.nonfinite_causes.keys() == {"infinite splat", "nan, not traced"}
 
 
 def test_a_scene_without_light_is_black():

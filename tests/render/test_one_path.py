@@ -146,6 +146,14 @@ def test_it_is_the_path_of_the_picture_however_light_is_found(integrator):
         assert not any(vertex.light for path in paths for vertex in path.vertices)
 
 
+def test_weights_are_those_among_light_paths_too():
+    scene = torchpt.load("cornell_box", "cpu")
+    paths = [one_path(scene, wishes(scene, type="bdpt"), pixel, 0) for pixel in pixels()]
+    for path in paths:
+        check_parts(path)
+    assert any(vertex.light and vertex.light.visible for path in paths for vertex in path.vertices)
+
+
 def test_samples_come_to_the_pixel():
     scene, spp = torchpt.load("cornell_box", "cpu"), 8
     wish = wishes(scene, spp=spp)

@@ -21,6 +21,7 @@ from torchpt.paths.nonfinite import SampleId
 from torchpt.paths.state import Emission, PathState, VertexOutput
 from torchpt.paths.walk import Observer, Population
 from torchpt.paths.wave import Wave
+from torchpt.physics.film.splats import LARGEST
 from torchpt.physics.samplers import Randomizations
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.physics.world import World
@@ -196,6 +197,7 @@ CAUSES = {
     "emission": "the contribution of an emitter that a path hit",
     "environment": "the contribution of the environment to a path that hit nothing",
     "light": "a light sample: its radiance, weight or contribution",
+    "splat": "a splat: the light that a surface sends to the camera; from 2^55 on it counts as infinite",
     "bsdf": "a value, pdf or weight of a BSDF",
     "throughput": "the throughput of a path: a product of weights, each of them finite",
     "ray": "the ray that leaves a surface",
@@ -259,6 +261,11 @@ def _find_causes(
     radiance = trace(wave, state, finder)
     if not finder.found_all:  # a walk that was ended early returns no radiance
         finder.check("sum", radiance, torch.arange(len(samples), device=x.device), depth=0, slot=None)
+    if wave.light_paths is not None and not finder.found_all:
+        rest = [lane for lane, cause in enumerate(finder.causes) if cause is None]
+        causes = _find_causes(trace, wave.light_paths, [samples[lane] for lane in rest], randomizations)
+        for lane, cause in zip(rest, causes, strict=True):
+            finder.causes[lane] = cause
     not_repeated = NonFiniteCause("not repeated", nan=False, depth=0)
     return [cause or not_repeated for cause in finder.causes]
 
@@ -362,6 +369,9 @@ def _checks_of_vertex(event: Scattering, world: World) -> Iterator[tuple[str, Te
         for cause, value in factors:
             yield where_spoiled(cause, torch.where(finite, 0.0, value))
     yield where_spoiled("light", light)
+    if output.splat is not None:
+        sent = output.splat.light.radiance
+        yield "splat", torch.where(sent.abs() >= LARGEST, torch.inf, sent)
     if drawn is None:
         yield where_spoiled("preview", preview)
         return

@@ -35,12 +35,16 @@ __all__ = ["LightPaths"]
 
 @dataclass(frozen=True)
 class _View:
-    """Light at surface points, as they are seen from where it goes on to."""
+    """Surface points as they are seen from where light goes on to, and the light path that arrived at them.
+
+    With a normal map the normal depends on where it is seen from.
+    """
 
     surface: Surface
     wi: Tensor  # (3, N) direction to the light, in the surface's frame
     throughput: Tensor  # (3, N), with the factors of shading normals and one-sided surfaces
     arrival: Arrival  # the numbers of MIS
+    ray: LightRay | None  # with which the path left its light; None behind the first vertex
 
 
 class LightPaths(Integrator):
@@ -52,8 +56,8 @@ class LightPaths(Integrator):
         "rr_depth": Integer(5, low=1, doc="roulette may end paths from this depth on"),
         "rr_prob": Scalar(None, above=0.0, high=1.0, words="null or a number", doc="chance to survive roulette"),
         "fraction": Scalar(1.0, above=0.0, high=1.0, doc="number of light paths for each camera path"),
-        "counted": Flag(True, doc="whether they bring anything"),
-        "weighted": Flag(True, doc="whether what they bring is weighted among all strategies"),
+        "counted": Flag(True, doc="whether light paths are traced"),
+        "weighted": Flag(True, doc="whether splats are weighted among all strategies"),
     }
     lit = False
     splats = True
@@ -112,15 +116,27 @@ class LightPaths(Integrator):
         kind = world.materials.models[model]
         at = interact(world, state.o, state.d, hit, follow_ray=context.follow_ray)
         surface = surface_at(world, model, state.d, at, context.pixel)
-        front = self._view(context, model, state, at, surface)
+        # At the first vertex: the ray with which the path left its light, drawn again.
+        ray = None if context.start_salts is None else self._ray(context, state.key, context.start_salts)
+        front = self._view(context, model, state, at, surface, ray)
         splat = None if kind.smooth else self._splat(context, model, state, at, front)
-        leaving = self._leaving(context, model, state, at, front)
-        return VertexOutput(leaving=leaving, next_hit=None, shadow=None, at=at, surface=surface, splat=splat)
+        leaving, drawn = self._leaving(context, model, state, at, front)
+        return VertexOutput(
+            leaving=leaving, next_hit=None, shadow=None, at=at, surface=surface, splat=splat, drawn=drawn
+        )
 
-    def _view(self, context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface) -> _View:
-        """Return light at surface points, as ``surface`` is seen from where it goes on to.
+    def _view(
+        self,
+        context: StageContext,
+        model: int,
+        state: PathState,
+        at: Interaction,
+        surface: Surface,
+        ray: LightRay | None,
+    ) -> _View:
+        """Return what ``surface`` does with the light that arrives, as it is seen from where the light goes on to.
 
-        Normals and sides are asked of the direction to the light alone, as in a camera path that comes from there.
+        As in a camera path that comes from there, normals and sides are asked of the direction to the light alone.
         """
         world = context.world
         wi = surface.frame.to_local(-state.d)
@@ -128,20 +144,19 @@ class LightPaths(Integrator):
         throughput = state.throughput if share is None else state.throughput * share
         cosine = Arrival.cosine_of(state.d, at)
         dvcm, dvc = torch.zeros_like(cosine), state.extra["dvc"] / cosine
-        if context.start_salts is not None:  # at the first vertex a light sample competes
+        if ray is not None:  # a light sample competes
             emission = world.emission
             assert emission is not None
-            ray = self._ray(context, state.key, context.start_salts)
             n = None if world.materials.models[model].transmits else surface.frame.n
             dvcm = safe_reciprocal(ray.density * light_weight(emission, ray, at.p, n) * cosine)
-        return _View(surface, wi, throughput, Arrival(dvcm, dvc, cosine))
+        return _View(surface, wi, throughput, Arrival(dvcm, dvc, cosine), ray)
 
     def _seen_from(
         self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View, w: Tensor
     ) -> _View:
-        """Return light at surface points as they are seen from unit directions ``w (3, N)``; ``front``: from the light."""
+        """Return the view from unit directions ``w (3, N)``; ``front``: that from the light."""
         surface = seen_from(context, model, at, front.surface, w)
-        return front if surface is front.surface else self._view(context, model, state, at, surface)
+        return front if surface is front.surface else self._view(context, model, state, at, surface, front.ray)
 
     def _splat(self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View) -> Splat:
         """Return the light that surface points send to the camera."""
@@ -176,7 +191,9 @@ class LightPaths(Integrator):
         pixel = torch.where(seen & lit, row * crop[2] + column, -1)
         return Splat(pixel, Shadow(o=o, d=eye - o, t_max=lit.to(plan.dtype), radiance=radiance))
 
-    def _leaving(self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View) -> PathState:
+    def _leaving(
+        self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View
+    ) -> tuple[PathState, Drawn]:
         """Return the paths with the rays that leave surface points: sampled as a camera path's, weighted by the adjoint."""
         plan, kind, surface = context.plan, context.world.materials.models[model], front.surface
         draws = Draws(plan.sampler, state.key, context.salts)
@@ -215,4 +232,4 @@ class LightPaths(Integrator):
         continuation = stages.continue_paths(plan, state, without_shadowing, drawn, draws, context.roulette)
         leaving = stages.next_ray(context, model, state, at, surface, drawn, continuation)
         dvc = behind(context, model, at, surface, view.arrival, d, pdf, sample.eta, reverse)
-        return replace(leaving, extra={**state.extra, "dvcm": torch.zeros_like(dvc), "dvc": dvc})
+        return replace(leaving, extra={**state.extra, "dvcm": torch.zeros_like(dvc), "dvc": dvc}), drawn

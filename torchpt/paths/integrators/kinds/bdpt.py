@@ -149,6 +149,8 @@ class Bdpt(PathIntegrator):
             other = density * dot(wi, at.ng).abs() * arrival.others(reverse)
             factor = self._scale("light", reduced(direct.weight, other), direct.weight)
             shadow = replace(shadow, radiance=shadow.radiance * factor)
+            if direct.weight is not None:
+                direct = replace(direct, weight=direct.weight * factor)
         leaving, next_hit, drawn, continuation = stages.scatter(context, model, state, at, surface)
         reverse = None if kind.smooth else reverse_pdf(context, model, at, surface, -state.d, drawn.d)
         dvc = behind(context, model, at, surface, arrival, drawn.d, drawn.pdf, drawn.eta, reverse)
