@@ -18,7 +18,7 @@ import torchpt
 from torchpt.core.errors import NotBuiltError
 from torchpt.math.vectors import dot, rows
 from torchpt.paths.integrators.kinds.bdpt import STRATEGIES, Bdpt
-from torchpt.paths.integrators.weights import Arrival, behind, reduced, reverse_pdf
+from torchpt.paths.integrators.weights import Arrival, leaving_dvc, reduced, reverse_pdf
 from torchpt.paths.surface import surface_at
 from torchpt.paths.wave import Wave
 from torchpt.physics.lights.emission import LightRay, density_of_hit, emit, light_weight
@@ -290,7 +290,7 @@ def weight_of_splat(paths: ThreeEdges) -> tuple[torch.Tensor, torch.Tensor]:
     arrival = Arrival(1.0 / (start * share * cosine), paths.ray.met / start / cosine, cosine)
     pdf = kinds[paths.first].pdf(surface.parameters, surface.wo, surface.frame.to_local(paths.d1))
     back = reverse_pdf(context, paths.first, a, surface, -paths.d0, paths.d1)
-    dvc = behind(context, paths.first, a, surface, arrival, paths.d1, pdf, None, back)
+    dvc = leaving_dvc(context, paths.first, a, surface, arrival, paths.d1, pdf, None, back)
     cosine = Arrival.cosine_of(paths.d1, b)
     arrival = Arrival(torch.zeros_like(dvc), dvc / cosine, cosine)
     surface = surface_at(context.world, paths.second, paths.d1, b)
@@ -311,7 +311,7 @@ def weights_of_camera_path(paths: ThreeEdges) -> tuple[torch.Tensor, torch.Tenso
     arrival = Arrival(PIXELS / paths.density, torch.zeros_like(paths.density), Arrival.cosine_of(paths.view, b))
     pdf = kinds[paths.second].pdf(surface.parameters, surface.wo, surface.frame.to_local(-paths.d1))
     back = reverse_pdf(context, paths.second, b, surface, paths.view, -paths.d1)
-    dvc = behind(context, paths.second, b, surface, arrival, -paths.d1, pdf, None, back)
+    dvc = leaving_dvc(context, paths.second, b, surface, arrival, -paths.d1, pdf, None, back)
     cosine = Arrival.cosine_of(paths.d1, a)
     arrival = Arrival(torch.zeros_like(dvc), dvc / cosine, cosine)
     surface = surface_at(context.world, paths.first, -paths.d1, a)
@@ -325,7 +325,7 @@ def weights_of_camera_path(paths: ThreeEdges) -> tuple[torch.Tensor, torch.Tenso
     by_sample = alone * reduced(alone, other)
     # Where the BSDF's ray meets the lamp.
     alone = torch.where(by_bsdf > 0, 1.0 / (1.0 + 1.0 / (ratio * ratio)), 0.0)
-    dvc = behind(context, paths.first, a, surface, arrival, -paths.d0, by_bsdf, None, back)
+    dvc = leaving_dvc(context, paths.first, a, surface, arrival, -paths.d0, by_bsdf, None, back)
     other = density_of_hit(emission, on_lamp(context.world, a.p, -paths.d0)) * dvc
     return by_sample, alone * reduced(alone, other), torch.minimum(pdf, by_bsdf)
 

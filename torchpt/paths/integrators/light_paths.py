@@ -18,7 +18,7 @@ from torch import Tensor
 from torchpt.math.vectors import dot, largest, safe_reciprocal
 from torchpt.paths import vertex as stages
 from torchpt.paths.integrators.base import Integrator, Limits
-from torchpt.paths.integrators.weights import FIELDS, Arrival, behind, reduced, seen_from
+from torchpt.paths.integrators.weights import FIELDS, Arrival, leaving_dvc, reduced, seen_from
 from torchpt.paths.state import Drawn, Field, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
 from torchpt.paths.surface import Surface, emission_map, opacity_map, surface_at
 from torchpt.paths.wave import camera_state
@@ -231,5 +231,5 @@ class LightPaths(Integrator):
         state = replace(state, throughput=view.throughput)
         continuation = stages.continue_paths(plan, state, without_shadowing, drawn, draws, context.roulette)
         leaving = stages.next_ray(context, model, state, at, surface, drawn, continuation)
-        dvc = behind(context, model, at, surface, view.arrival, d, pdf, sample.eta, reverse)
+        dvc = leaving_dvc(context, model, at, surface, view.arrival, d, pdf, sample.eta, reverse)
         return replace(leaving, extra={**state.extra, "dvcm": torch.zeros_like(dvc), "dvc": dvc}), drawn

@@ -26,7 +26,7 @@ from torchpt.paths.state import Field, StageContext
 from torchpt.paths.surface import Surface, surface_at
 from torchpt.physics.shapes.geometry import Interaction
 
-__all__ = ["FIELDS", "Arrival", "behind", "reduced", "reverse_pdf", "root_of_squares", "seen_from"]
+__all__ = ["FIELDS", "Arrival", "leaving_dvc", "reduced", "reverse_pdf", "root_of_squares", "seen_from"]
 
 #: The fields of a path that its weights need; see above.
 FIELDS = (Field("dvcm"), Field("dvc"))
@@ -100,7 +100,7 @@ def reverse_pdf(context: StageContext, model: int, at: Interaction, surface: Sur
     return pdf if kind.transmits else torch.where(back[2] > 0, pdf, 0.0)
 
 
-def behind(
+def leaving_dvc(
     context: StageContext,
     model: int,
     at: Interaction,

@@ -15,7 +15,7 @@ from torchpt.paths.integrators.base import LIGHT_CHOICE, STRICT, Integrator, Lim
 from torchpt.paths.integrators.kinds.path import Path
 from torchpt.paths.integrators.light_paths import LightPaths
 from torchpt.paths.integrators.path import PathIntegrator
-from torchpt.paths.integrators.weights import FIELDS, Arrival, behind, reduced, reverse_pdf
+from torchpt.paths.integrators.weights import FIELDS, Arrival, leaving_dvc, reduced, reverse_pdf
 from torchpt.paths.state import Emission, PathState, Plan, StageContext, VertexInput, VertexOutput
 from torchpt.physics.lights.emission import density_of_environment, density_of_hit, density_of_sample
 from torchpt.physics.shapes import interact
@@ -153,7 +153,7 @@ class Bdpt(PathIntegrator):
                 direct = replace(direct, weight=direct.weight * factor)
         leaving, next_hit, drawn, continuation = stages.scatter(context, model, state, at, surface)
         reverse = None if kind.smooth else reverse_pdf(context, model, at, surface, -state.d, drawn.d)
-        dvc = behind(context, model, at, surface, arrival, drawn.d, drawn.pdf, drawn.eta, reverse)
+        dvc = leaving_dvc(context, model, at, surface, arrival, drawn.d, drawn.pdf, drawn.eta, reverse)
         leaving = replace(leaving, extra={"dvcm": torch.zeros_like(dvc), "dvc": dvc})
         return VertexOutput(
             leaving=leaving,
