@@ -242,7 +242,12 @@ def test_a_path_that_is_not_finite_says_so():
         ),
         ((0, SIZE), 0, {}, "debug.pixel: expected a pixel"),
         ((0, 0), 1, {}, "debug.sample: expected a whole number from 0 to 0, as render.spp is 1, got 1"),
-        ((0, 0), 0, {"type": "aov"}, r"integrator.type: expected one that follows paths \(path, direct, bdpt\).*got 'aov'"),
+        (
+            (0, 0),
+            0,
+            {"type": "aov"},
+            r"integrator.type: expected one that follows paths \(path, direct, bdpt\).*got 'aov'",
+        ),
         ((0, 0), 0, {"type": "ibl"}, r"integrator.type: expected one that follows paths"),
     ],
 )
