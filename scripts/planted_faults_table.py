@@ -213,11 +213,11 @@ FAULTS = (
     ),
     Fault(
         "alpha_decoded",
-        "physics/textures/kinds/image.py",
+        "images/texels.py",
         "textures format",
-        "_decoded",
-        "values.shape[2] - (1 if values.shape[2] in (2, 4) else 0)",
-        "values.shape[2]",
+        "Texels.decoded",
+        "channels - (1 if channels in (2, 4) else 0)",
+        "channels",
         "wrong colour space: the alpha of a PNG is decoded as sRGB, so that half opaque leaves let too much light pass",
     ),
     # -- cameras

@@ -87,7 +87,7 @@ def test_hydras_words_lead_to_the_same_path(place: Path, capfd: Captured) -> Non
         (["debug.pixel=[1,1]", "out=a.png"], "out: no picture is rendered where debug.pixel is given"),
         (
             ["debug.pixel=[1,1]", "integrator=aov"],
-            "integrator.type: expected one that follows paths (path, direct) beside debug.pixel, got 'aov'",
+            "integrator.type: expected one that follows paths (path, direct, bdpt) beside debug.pixel, got 'aov'",
         ),
     ], 6),
 )  # fmt: skip

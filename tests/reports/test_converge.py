@@ -263,7 +263,7 @@ def test_a_reference_from_a_file_is_exact(there: Path) -> None:
         (["scene=s.yaml", "film.width=8", "reference=theirs.exr"], "theirs.exr: expected a picture of 8 x 6 pixels"),
         (["scene=s.yaml", "extra=[{name: a, seconds: 1, file: none.exr}]"], "none.exr: "),
         (["scene=s.yaml", "out=s.yaml"], "s.yaml: is a file; expected a folder"),
-        (["scene=[s.yaml,nope]"], "scene: expected one of clutter"),
+        (["scene=[s.yaml,nope]"], "scene: expected one of ajar_door"),
     ],
     ids=lambda value: " ".join(value)[:40] if isinstance(value, list) else "",
 )

@@ -213,7 +213,7 @@ def prepare_trace_request(scene: Scene, o: Tensor, d: Tensor, **options: Unpack[
     request = prepare_request(scene, full=False, **options)
     settings, sampler = request.settings, request.settings.sampler
     if not settings.integrator.light:
-        names_with_light = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
+        names_with_light = ", ".join(name for name, kind in INTEGRATORS.items() if kind.light and not kind.splats)
         raise SceneError(
             "integrator.type", settings.integrator.name, f"one of {names_with_light}: along rays there is light alone"
         )
