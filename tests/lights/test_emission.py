@@ -12,7 +12,6 @@ from torch import Tensor
 
 import torchpt
 from torchpt.math.vectors import rows
-from torchpt.paths.surface import emission_map, opacity_map
 from torchpt.paths.vertex import light_radiance
 from torchpt.physics import lights
 from torchpt.physics.lights.emission import density_of_sample, emit, light_weight
@@ -70,12 +69,7 @@ class Floor:
         u = numbers(seed)
         ray = emit(self.emission, u[4], u[:2], u[2:4], 0.0, mis=False)
         _, meets = self.met(ray.o, ray.d)
-        radiance = ray.radiance
-        if ray.at is not None:
-            radiance = radiance * emission_map(self.world, ray.at)
-            if self.world.textures.opacity is not None:
-                radiance = radiance * opacity_map(self.world, ray.at)
-        brought = torch.where(meets, radiance.mean(0) / ray.density.clamp_min(1e-30), 0.0)
+        brought = torch.where(meets, light_radiance(self.world, ray).mean(0) / ray.density.clamp_min(1e-30), 0.0)
         return brought.mean() / (2.0 * HALF / self.space.unit) ** 2
 
     def sampled(self, seed: int) -> Tensor:

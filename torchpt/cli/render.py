@@ -214,7 +214,7 @@ def scene_and_settings(job: Job) -> tuple[Any, Any]:
 def with_error_pilots(settings: Any) -> Any:
     """Replace ``render.pilots: auto`` by true, so that the summary reports the error."""
     render = settings.render
-    with_pilots = render.pilots == "auto" and "variance" not in settings.film.aovs
+    with_pilots = render.pilots == "auto"
     return replace(settings, render=render.but(pilots=True)) if with_pilots else settings
 
 

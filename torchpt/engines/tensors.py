@@ -234,8 +234,7 @@ class TensorsEngine:
         follow_ray = follows_ray(self.plan, self.world, paths.depth)
         salt = salts(paths.depth, paths.state.lane.device)
         search = partial(self.hits, depth=paths.depth + 1)
-        first = paths.depth == 1 and self.wave.integrator.starts_on_lights
-        start_salts = salts(0, paths.state.lane.device) if first else None
+        start_salts = self.wave.integrator.start_salts(paths.depth, paths.state.lane.device)
         return self.context.at(salt, follow_ray, roulette, search, start_salts)
 
     def _input(self, paths: Paths, index: Tensor) -> VertexInput:

@@ -35,6 +35,7 @@ from torchpt.physics import lights
 from torchpt.physics.bsdfs.records import BsdfSample
 from torchpt.physics.cameras import Camera
 from torchpt.physics.film import Filter
+from torchpt.physics.lights.emission import LightRay
 from torchpt.physics.lights.records import LightSample
 from torchpt.physics.samplers import Dimension, Draws
 from torchpt.physics.shapes import interact, offset_origin, reattach
@@ -49,6 +50,7 @@ __all__ = [
     "attach",
     "bounce",
     "continue_paths",
+    "emission_at",
     "emit",
     "escape",
     "generate",
@@ -59,6 +61,7 @@ __all__ = [
     "sample_bsdf",
     "sample_light",
     "scatter",
+    "scattered",
     "shade",
     "shading_weight",
 ]
@@ -150,8 +153,8 @@ def sample_light(context: StageContext, model: int, state: PathState, at: Intera
     return lights.sample(table, x, which, u.to(plan.dtype), offset=OFFSET, n=n, mis=plan.strategy == "mis")
 
 
-def light_radiance(world: World, light: LightSample) -> Tensor:
-    """Return the radiance ``(3, N)`` of light samples, textures of emission and opacity included."""
+def light_radiance(world: World, light: LightSample | LightRay) -> Tensor:
+    """Return the radiance ``(3, N)`` of light samples or of rays that leave lights, with textures of emission and opacity."""
     if light.at is None:  # no emissive surface has a texture
         return light.radiance
     factor = torch.ones_like(light.radiance)
@@ -400,9 +403,16 @@ def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, k
 
 def emit(context: StageContext, vertex: VertexInput) -> Emission:
     """Return the emission of the emitters that paths hit, weighted by MIS."""
+    state = vertex.state
+    return emission_at(
+        context, vertex, interact(context.world, state.o, state.d, vertex.hit, follow_ray=context.follow_ray)
+    )
+
+
+def emission_at(context: StageContext, vertex: VertexInput, at: Interaction) -> Emission:
+    """Return the emission of :func:`emit` at the points ``at`` that paths hit."""
     world, state = context.world, vertex.state
     assert world.lights is not None
-    at = interact(world, state.o, state.d, vertex.hit, follow_ray=context.follow_ray)
     # Where the light sampler depends on the point, its pdf is that at the vertex itself, which differs from the ray's origin.
     x = state.o if state.p is None else state.p
     radiance, pdf = lights.emitted(world.lights, x, at, state.d, state.n)
@@ -434,7 +444,19 @@ def bounce(context: StageContext, model: int, vertex: VertexInput) -> VertexOutp
     at = interact(world, state.o, state.d, hit, follow_ray=context.follow_ray)
     if hit.chance is not None:
         state = replace(state, throughput=state.throughput * hit.chance)
-    surface, direct, shadow = shade(context, model, state, at)
+    return scattered(context, model, state, at, *shade(context, model, state, at))
+
+
+def scattered(
+    context: StageContext,
+    model: int,
+    state: PathState,
+    at: Interaction,
+    surface: Surface,
+    direct: DirectLight | None,
+    shadow: Shadow | None,
+) -> VertexOutput:
+    """Sample the next ray, and return the outputs of a vertex of which :func:`shade` has returned the last three arguments."""
     leaving, next_hit, drawn, continuation = scatter(context, model, state, at, surface)
     return VertexOutput(
         leaving=leaving,

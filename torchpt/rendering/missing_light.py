@@ -29,7 +29,7 @@ from torchpt.physics.shapes.geometry import Geometry, Hit
 from torchpt.scene.names import Names
 from torchpt.scene.scene import Scene
 from torchpt.search import Accel
-from torchpt.search.instances import bounding_ball
+from torchpt.search.instances import bounding_sphere
 
 __all__ = ["MissingLight", "find_missing_light"]
 
@@ -234,7 +234,7 @@ def _light_rays(search: _Search, lights: Lights, row: int, kind: str) -> tuple[T
     angle, fraction = GOLDEN_ANGLE * k, (k + 0.5) / LIGHT_RAYS
     axis = lights.normal[:, row : row + 1].double()
     if kind == "directional":
-        centre, radius = bounding_ball(search.geometry())
+        centre, radius = bounding_sphere(search.geometry())
         frame = Frame.about(axis)
         on_disk = fraction.sqrt() * (angle.cos() * frame.s + angle.sin() * frame.t)
         o, d = centre[:, None] + radius * (on_disk - 2.0 * axis), axis.expand(3, LIGHT_RAYS)

@@ -40,7 +40,7 @@ from torchpt.physics.world import World
 from torchpt.scene import Scene
 from torchpt.scene.scene import live_scenes
 from torchpt.scene.settings import Settings
-from torchpt.search.instances import bounding_ball
+from torchpt.search.instances import bounding_sphere
 from torchpt.spec import Moves
 from torchpt.spec.schema import ParsedParams
 
@@ -226,7 +226,7 @@ def _with_emission(scene: Scene, world: World, geometry: Geometry, *, own: bool)
     cache = scene_cache(scene)
     if own and cache.with_emission is not None and cache.with_emission[0] is world:
         return cache.with_emission[1]
-    emission = emission_of(world.lights, *bounding_ball(geometry))
+    emission = emission_of(world.lights, *bounding_sphere(geometry))
     found = replace(world, emission=emission)
     if own:
         cache.with_emission = world, found

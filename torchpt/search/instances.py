@@ -15,7 +15,7 @@ from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.base import Accel, Hits
 from torchpt.search.bounds import primitive_bounds
 
-__all__ = ["CopyTables", "Instanced", "bounding_ball"]
+__all__ = ["CopyTables", "Instanced", "bounding_sphere"]
 
 
 # ---- Two levels: first the primitives, then the instances
@@ -72,7 +72,7 @@ def _triangles(geometry: Geometry, first: int, count: int) -> Geometry:
     return Geometry(geometry.p0[:, columns], geometry.p1[:, columns], geometry.p2[:, columns], (count, 0, 0, 0, 0))
 
 
-def bounding_ball(geometry: Geometry) -> tuple[Tensor, Tensor]:
+def bounding_sphere(geometry: Geometry) -> tuple[Tensor, Tensor]:
     """Return centre ``(3,)`` and radius ``()`` of a ball around all surfaces, instances included; float64.
 
     Without surfaces it is the unit ball.

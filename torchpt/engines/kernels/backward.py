@@ -38,7 +38,6 @@ from torchpt.paths import adjoint
 from torchpt.paths.adjoint import InputCotangents, Tape, VertexCotangents
 from torchpt.paths.integrators.path import follows_ray
 from torchpt.paths.state import EXTRA, PathState, Shadow, Splat, VertexInput
-from torchpt.paths.vertex import generate
 from torchpt.paths.walk import KEPT
 from torchpt.paths.wave import with_detached_geometry
 from torchpt.physics.samplers import salts
@@ -186,7 +185,7 @@ def rays_vjp(trace: Trace) -> Sinks:
     taped, gathers = kernels.tape.taped, _RecordedGathers(tracer, kernels)
 
     def rays() -> PathState:
-        return generate(taped.context.plan, taped.camera, taped.filter, x, y, key, salts)
+        return taped.generate(x, y, key, salts)
 
     sinks = Sinks()
     with tracer, recording_gathers(gathers):

@@ -272,8 +272,7 @@ def bounce_eagerly(
         state = path_state(rows.take(source, lanes, rows.state))
         vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
         device = state.t_max.device
-        first = depth == 1 and kernels.wave.integrator.starts_on_lights
-        start_salts = salts(0, device) if first else None
+        start_salts = kernels.wave.integrator.start_salts(depth, device)
         context = kernels.wave.context.at(salts(depth, device), roulette=roulette, start_salts=start_salts)
         output = kernels.wave.bounce(context, model, vertex)
         check_output(kernels.wave.integrator, output)

@@ -20,7 +20,8 @@ from torchpt.paths.roulette import DEEP, DEEP_CAP
 from torchpt.paths.state import Emission, Field, StageContext, Transmission, VertexInput, VertexOutput
 from torchpt.paths.vertex import STRATEGIES, Plan
 from torchpt.physics.lights import LIGHT_SAMPLERS
-from torchpt.spec import Choice, Flag, FrozenConfig, Scalar, Spec, parameters_of
+from torchpt.physics.samplers import salts
+from torchpt.spec import Choice, Flag, FrozenConfig, Integer, Scalar, Spec, parameters_of
 
 if TYPE_CHECKING:
     from typing import Self
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from torchpt.physics.world import World
 
 __all__ = [
+    "DEPTHS",
     "ENDLESS",
     "LIGHT_CHOICE",
     "SAMPLES",
@@ -49,6 +51,21 @@ __all__ = [
 ENDLESS = 1 << 15
 
 #: Parameters that several kinds of integrators share, for their ``parameters``.
+DEPTHS: dict[str, Spec] = {
+    "max_depth": Integer(
+        16,
+        low=-1,
+        doc="longest path in edges: 1 emission only, 2 direct light, -1 until roulette ends it",
+    ),
+    "rr_depth": Integer(5, low=1, doc="roulette may end paths from this depth on"),
+    "rr_prob": Scalar(
+        None,
+        above=0.0,
+        high=1.0,
+        words="null or a number, 0 < rr_prob <= 1",
+        doc="chance to survive roulette; null: by throughput",
+    ),
+}
 STRATEGY: dict[str, Spec] = {
     "strategy": Choice(
         "mis",
@@ -153,6 +170,10 @@ class Integrator(FrozenConfig):
     def light_walk(self) -> Integrator | None:
         """Return the integrator of light paths that are traced beside the samples, one for each; None: there are none."""
         return None
+
+    def start_salts(self, depth: int, device: torch.device) -> Tensor | None:
+        """Return the salts of depth 0 at vertex ``depth`` where its stage needs them; None elsewhere."""
+        return salts(0, device) if depth == 1 and self.starts_on_lights else None
 
     @property
     def splats_at_surfaces(self) -> bool:

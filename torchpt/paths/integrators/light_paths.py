@@ -17,10 +17,10 @@ from torch import Tensor
 
 from torchpt.math.vectors import dot, largest, safe_reciprocal
 from torchpt.paths import vertex as stages
-from torchpt.paths.integrators.base import Integrator, Limits
+from torchpt.paths.integrators.base import DEPTHS, Integrator, Limits
 from torchpt.paths.integrators.weights import FIELDS, Arrival, leaving_dvc, reduced, seen_from
 from torchpt.paths.state import Drawn, Field, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
-from torchpt.paths.surface import Surface, emission_map, opacity_map, surface_at
+from torchpt.paths.surface import Surface, surface_at
 from torchpt.paths.wave import camera_state
 from torchpt.physics import lights
 from torchpt.physics.lights.emission import LightRay, emit, light_weight
@@ -28,7 +28,7 @@ from torchpt.physics.samplers import Dimension, Draws
 from torchpt.physics.shapes import interact, offset_origin
 from torchpt.physics.shapes.geometry import Interaction
 from torchpt.physics.shapes.interaction import OFFSET
-from torchpt.spec import Flag, Integer, Scalar
+from torchpt.spec import Flag, Scalar
 
 __all__ = ["LightPaths"]
 
@@ -52,11 +52,8 @@ class LightPaths(Integrator):
 
     name = "light_paths"
     parameters: ClassVar = {
-        "max_depth": Integer(16, low=-1, doc="longest path in edges, from the light to the camera"),
-        "rr_depth": Integer(5, low=1, doc="roulette may end paths from this depth on"),
-        "rr_prob": Scalar(None, above=0.0, high=1.0, words="null or a number", doc="chance to survive roulette"),
+        **DEPTHS,
         "fraction": Scalar(1.0, above=0.0, high=1.0, doc="number of light paths for each camera path"),
-        "counted": Flag(True, doc="whether light paths are traced"),
         "weighted": Flag(True, doc="whether splats are weighted among all strategies"),
     }
     lit = False
@@ -68,7 +65,7 @@ class LightPaths(Integrator):
     @property
     def limits(self) -> Limits:
         """Return the depth limits: a vertex of depth k, joined to the camera, makes a path of k + 1 edges."""
-        return Limits(self.max_depth if self.counted else 0, self.rr_depth)
+        return Limits(self.max_depth, self.rr_depth)
 
     # -- the start
 
@@ -86,16 +83,8 @@ class LightPaths(Integrator):
     def generate(self, context: StageContext, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
         """Return the rays that leave the lights; arguments as for :meth:`Integrator.generate`."""
         world, ray = context.world, self._ray(context, key, salts)
-        radiance = ray.radiance
-        if ray.at is not None:
-            factor = torch.ones_like(radiance)
-            if world.textures.emission is not None:
-                factor = factor * emission_map(world, ray.at)
-            if world.textures.opacity is not None:
-                factor = factor * opacity_map(world, ray.at)
-            radiance = radiance * (factor if ray.bare is None else torch.where(ray.bare, 1.0, factor))
         inverse = safe_reciprocal(ray.density)
-        weight = radiance * inverse
+        weight = stages.light_radiance(world, ray) * inverse
         flux = largest(weight.abs())
         starts = flux > 0
         if self.fraction < 1.0:

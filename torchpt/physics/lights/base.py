@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = [
     "COLUMNS",
     "KINDS",
+    "BoundingSphere",
     "Cone",
     "EmittedRay",
     "Emitter",
@@ -37,7 +38,6 @@ __all__ = [
     "EnvironmentImage",
     "Light",
     "Row",
-    "Scope",
     "Setting",
     "bright",
     "lane_rows",
@@ -163,7 +163,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Scope:
+class BoundingSphere:
     """A ball around all surfaces of a scene, through which light of distant lights is sent.
 
     Attributes:
@@ -268,7 +268,7 @@ class Light(Emitter):
         raise NotImplementedError
 
     @classmethod
-    def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope, mis: bool) -> EmittedRay:
+    def emit(cls, at: Lights, u: Tensor, v: Tensor, sphere: BoundingSphere, mis: bool) -> EmittedRay:
         """Sample rays that leave the light.
 
         Here those of a distant light, whose directions :meth:`sample` draws, or of a point, evenly in all directions.
@@ -277,31 +277,31 @@ class Light(Emitter):
             at: rows of the table, one a lane.
             u: ``(2, N)`` in [0, 1), chooses the direction.
             v: ``(2, N)`` in [0, 1), chooses the point.
-            scope: a ball around the scene.
+            sphere: a ball around the scene.
             mis: as for :meth:`sample`.
         """
         if not cls.distant:
             d = uniform_sphere(v).to(at.p0.dtype)
             drawn = cls.sample(at, at.p0 + d, u, mis)  # what arrives at a distance of 1
-            density = cls.emission_density(at, torch.ones_like(drawn.pdf), scope)
+            density = cls.emission_density(at, torch.ones_like(drawn.pdf), sphere)
             return EmittedRay(at.p0.expand_as(d), d, drawn.radiance, density, torch.ones_like(drawn.pdf))
-        drawn = cls.sample(at, scope.centre[:, None].expand(3, u.shape[1]), u, mis)
+        drawn = cls.sample(at, sphere.centre[:, None].expand(3, u.shape[1]), u, mis)
         d = -drawn.wi
         pdf = drawn.pdf if cls.environment else torch.ones_like(drawn.pdf)
-        return EmittedRay(scope.origins(d, v), d, drawn.radiance, cls.emission_density(at, pdf, scope), pdf)
+        return EmittedRay(sphere.origins(d, v), d, drawn.radiance, cls.emission_density(at, pdf, sphere), pdf)
 
     @classmethod
-    def emission_density(cls, at: Lights, pdf: Tensor, scope: Scope) -> Tensor:
+    def emission_density(cls, at: Lights, pdf: Tensor, sphere: BoundingSphere) -> Tensor:
         """Return the density ``(N,)`` of rays under :meth:`emit`: of a point by solid angle alone.
 
         Args:
             at: rows of the table, one a lane.
             pdf: density ``(N,)`` of their directions under :meth:`sample`; not read for lights without extent.
-            scope: a ball around the scene.
+            sphere: a ball around the scene.
         """
         if not cls.distant:
             return torch.full_like(pdf, 0.25 / math.pi)
-        across = scope.density()
+        across = sphere.density()
         return pdf * across if cls.environment else across.expand_as(pdf)
 
 

@@ -18,10 +18,19 @@ from torch import Tensor
 from torchpt.math.sampling import Distribution1D, cosine_hemisphere
 from torchpt.math.vectors import Frame, dot, safe_reciprocal, take
 from torchpt.physics.lights import choice, solid_angle
-from torchpt.physics.lights.base import KINDS, Scope, lane_rows
+from torchpt.physics.lights.base import KINDS, BoundingSphere, lane_rows
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.lights.surface import Surface
-from torchpt.physics.lights.table import inverse_pdf, kind_indices, pick, surface_kinds, textured_point
+from torchpt.physics.lights.table import (
+    inverse_pdf,
+    kind_indices,
+    off_surface,
+    pick,
+    remapped,
+    sizes,
+    surface_kinds,
+    textured_point,
+)
 from torchpt.physics.shapes.geometry import Interaction
 
 __all__ = [
@@ -35,9 +44,6 @@ __all__ = [
     "light_weight",
 ]
 
-#: The largest float32 below 1.
-_BELOW_ONE = 1.0 - 2.0**-24
-
 
 @dataclass(frozen=True)
 class Emission:
@@ -46,12 +52,12 @@ class Emission:
     Attributes:
         lights: the table.
         choice: of a row, by power; None for a single row.
-        scope: a ball around the scene, through which light of distant lights is sent.
+        sphere: a ball around the scene, through which light of distant lights is sent.
     """
 
     lights: Lights
     choice: Distribution1D | None
-    scope: Scope
+    sphere: BoundingSphere
 
 
 @dataclass(frozen=True)
@@ -96,7 +102,7 @@ def emission_of(lights: Lights, centre: Tensor, radius: Tensor) -> Emission:
     dtype = lights.area.dtype
     chosen = None if len(lights.power) == 1 else Distribution1D.of(lights.power, dtype)
     # A little wider, so that rounding leaves no surface outside.
-    return Emission(lights, chosen, Scope(centre.to(dtype), (radius * (1.0 + 2.0**-12)).to(dtype)))
+    return Emission(lights, chosen, BoundingSphere(centre.to(dtype), (radius * (1.0 + 2.0**-12)).to(dtype)))
 
 
 def emit(emission: Emission, which: Tensor | None, u: Tensor, v: Tensor, offset: float, mis: bool = True) -> LightRay:
@@ -112,9 +118,8 @@ def emit(emission: Emission, which: Tensor | None, u: Tensor, v: Tensor, offset:
     """
     lights, row, probability = emission.lights, None, torch.ones_like(u[0])
     if emission.choice is not None and which is not None:
-        row, remapped = emission.choice.draw(which)
-        probability = take(emission.choice.pmf, row)
-        u = torch.stack((remapped.to(u.dtype).clamp_max(_BELOW_ONE), u[1]))
+        row, rest = emission.choice.draw(which)
+        probability, u = take(emission.choice.pmf, row), remapped(u, rest)
     at, number = lane_rows(lights, row), kind_indices(lights, row)
     surfaces = surface_kinds(lights)
     found = _leaving_surfaces(lights, at, row, number, surfaces, u, v, offset) if surfaces else None
@@ -122,7 +127,7 @@ def emit(emission: Emission, which: Tensor | None, u: Tensor, v: Tensor, offset:
     for k, name in enumerate(lights.kinds[len(surfaces) :], len(surfaces)):
         in_kinds = torch.ones_like(u[0], dtype=torch.bool) if number is None else number >= k
         bare = in_kinds if bare is None else bare
-        ray = KINDS[name].emit(at, u, v, emission.scope, mis)
+        ray = KINDS[name].emit(at, u, v, emission.sphere, mis)
         one = torch.ones_like(ray.density)
         met = one if KINDS[name].environment else torch.zeros_like(one)
         given = LightRay(row, ray.o, ray.d, ray.o, None, ray.radiance, ray.density, met, ray.pdf, None, None)
@@ -157,15 +162,11 @@ def _leaving_surfaces(
         uv = uv if found.uv is None else pick(number, k, found.uv, uv)
         in_object = in_object if found.own is None else found.own
     assert p is not None and normal is not None
-    bound = at.bound
-    for k, kind in kinds:
-        other = kind.bound(at, normal)
-        bound = bound if other is None else pick(number, k, other, bound)
     density = _surface_density(at, kinds, number, normal)
     one = torch.ones_like(p[0])
     return LightRay(
         row=row,
-        o=torch.addcmul(p, normal, bound * offset),
+        o=off_surface(at, kinds, number, p, normal, offset),
         d=Frame.about(normal).to_world(cosine_hemisphere(v)),
         p=p,
         normal=normal,
@@ -182,11 +183,7 @@ def _surface_density(
     at: Lights, kinds: list[tuple[int, type[Surface]]], number: Tensor | None, normal: Tensor
 ) -> Tensor:
     """Return the density ``(N,)`` of rays that leave surfaces at unit normals ``normal (3, N)``."""
-    area = at.area
-    for k, kind in kinds:
-        other = kind.size(at, normal)
-        area = area if other is None else pick(number, k, other, area)
-    return safe_reciprocal(area * math.pi)
+    return safe_reciprocal(sizes(at, kinds, number, normal) * math.pi)
 
 
 def _probability(emission: Emission, row: Tensor | None) -> Tensor | float:
@@ -204,7 +201,7 @@ def density_of_sample(emission: Emission, sample: LightSample) -> Tensor:
     for k, name in enumerate(lights.kinds[len(surfaces) :], len(surfaces)):
         kind = KINDS[name]
         pdf = sample.pdf / choice.environment(lights.choice) if kind.environment else sample.pdf
-        density = pick(number, k, kind.emission_density(at, pdf, emission.scope), density)
+        density = pick(number, k, kind.emission_density(at, pdf, emission.sphere), density)
     assert density is not None
     return (density * _probability(emission, row)).expand_as(sample.pdf)
 
@@ -227,7 +224,7 @@ def density_of_environment(emission: Emission, pdf: Tensor) -> Tensor:
     lights = emission.lights
     pdf = pdf / choice.environment(lights.choice)
     probability = 1.0 if emission.choice is None else emission.choice.pmf[-1]
-    return KINDS[lights.kinds[-1]].emission_density(lights, pdf, emission.scope) * probability
+    return KINDS[lights.kinds[-1]].emission_density(lights, pdf, emission.sphere) * probability
 
 
 def light_weight(emission: Emission, ray: LightRay, x: Tensor, n: Tensor | None) -> Tensor:

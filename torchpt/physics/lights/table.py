@@ -26,8 +26,11 @@ __all__ = [
     "environment_image",
     "inverse_pdf",
     "kind_indices",
+    "off_surface",
     "pick",
+    "remapped",
     "sample",
+    "sizes",
     "surface_kinds",
     "textured_point",
     "without_environment",
@@ -48,6 +51,11 @@ def kind_indices(lights: Lights, row: Tensor | None) -> Tensor | None:
         return None
     assert lights.kind is not None and row is not None
     return take(lights.kind, row)
+
+
+def remapped(u: Tensor, rest: Tensor) -> Tensor:
+    """Return ``u (2, N)`` with ``rest (N,)``, float64 in [0, 1], which the choice of a light has left, as its first row."""
+    return torch.stack((rest.to(u.dtype).clamp_max(_BELOW_ONE), u[1]))
 
 
 def pick(number: Tensor | None, k: int, a: Tensor, b: Tensor | None) -> Tensor:
@@ -79,8 +87,8 @@ def sample(
     row: Tensor | None = None
     probability: Tensor | float = 1.0
     if lights.choice is not None and which is not None:
-        row, probability, remapped = choice.draw(lights.choice, which, x, n)
-        u = torch.stack((remapped.to(u.dtype).clamp_max(_BELOW_ONE), u[1]))
+        row, probability, rest = choice.draw(lights.choice, which, x, n)
+        u = remapped(u, rest)
     at, number = lane_rows(lights, row), kind_indices(lights, row)
     surfaces = surface_kinds(lights)
     drawn = _on_surfaces(lights, at, row, number, x, u, offset, probability) if surfaces else None
@@ -145,10 +153,6 @@ def _on_surfaces(
     to = target - x
     square = dot(to, to)
     wi = to / square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
-    bound = at.bound
-    for k, kind in kinds:
-        other = kind.bound(at, normal)
-        bound = bound if other is None else pick(number, k, other, bound)
     inverse = inverse_pdf(at, kinds, number, x, normal, wi, square, angle)
     if lights.choice is not None:
         inverse = inverse / probability
@@ -156,7 +160,7 @@ def _on_surfaces(
     pdf = safe_reciprocal(inverse.detach())
     point = None if lights.prim is None else textured_point(lights, row, target, normal, uv, in_object)
     # Shadow rays end off the surface of the light, so that they do not hit it.
-    target = torch.addcmul(target, normal, bound * offset)
+    target = off_surface(at, kinds, number, target, normal, offset)
     radiance = at.radiance if at.opacity is None else at.radiance * at.opacity
     return LightSample(
         wi=wi,
@@ -184,17 +188,33 @@ def inverse_pdf(
 
     ``square (N,)`` is the squared distance, ``angle (N,)`` the solid angle of the light, 0 where it is sampled by area.
     """
-    area = at.area
-    for k, kind in kinds:
-        other = kind.size(at, normal)
-        area = area if other is None else pick(number, k, other, area)
-    inverse = flat_inverse_pdf(normal, area, wi, square)
+    inverse = flat_inverse_pdf(normal, sizes(at, kinds, number, normal), wi, square)
     if angle is not None:
         inverse = solid_angle.inverse_pdf(angle, inverse)
     for k, kind in kinds:
         other = kind.inverse_pdf(at, x, normal, wi, square, inverse)
         inverse = inverse if other is None else pick(number, k, other, inverse)
     return inverse
+
+
+def sizes(at: Lights, kinds: list[tuple[int, type[Surface]]], number: Tensor | None, normal: Tensor) -> Tensor:
+    """Return one over the density by area ``(N,)`` of :meth:`Surface.sample_area` at unit normals ``normal (3, N)``."""
+    area = at.area
+    for k, kind in kinds:
+        other = kind.size(at, normal)
+        area = area if other is None else pick(number, k, other, area)
+    return area
+
+
+def off_surface(
+    at: Lights, kinds: list[tuple[int, type[Surface]]], number: Tensor | None, p: Tensor, normal: Tensor, offset: float
+) -> Tensor:
+    """Return points ``p (3, N)`` moved off lights along their normals, by ``offset`` in units of ``Lights.bound``."""
+    bound = at.bound
+    for k, kind in kinds:
+        other = kind.bound(at, normal)
+        bound = bound if other is None else pick(number, k, other, bound)
+    return torch.addcmul(p, normal, bound * offset)
 
 
 def textured_point(

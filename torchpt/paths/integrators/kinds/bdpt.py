@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import dot, safe_reciprocal
 from torchpt.paths import vertex as stages
-from torchpt.paths.integrators.base import LIGHT_CHOICE, STRICT, Integrator, Limits
+from torchpt.paths.integrators.base import DEPTHS, LIGHT_CHOICE, STRICT, Integrator, Limits
 from torchpt.paths.integrators.kinds.path import Path
 from torchpt.paths.integrators.light_paths import LightPaths
 from torchpt.paths.integrators.path import PathIntegrator
@@ -36,7 +36,7 @@ class Bdpt(PathIntegrator):
 
     name = "bdpt"
     parameters: ClassVar = {
-        **{key: Path.parameters[key] for key in ("max_depth", "rr_depth", "rr_prob")},
+        **DEPTHS,
         "strategy": Choice(
             "mis",
             names=("mis", *STRATEGIES),
@@ -69,16 +69,16 @@ class Bdpt(PathIntegrator):
         strategy = "light" if alone else "mis"
         return Plan(sampler=sampler, strategy=strategy, rr_prob=self.rr_prob, dtype=dtype, tape=tape, attached=attached)
 
-    def _scale(self, strategy: str, reduced: Tensor, weight: Tensor | None) -> Tensor | float:
+    def _scale(self, strategy: str, among_all: Tensor, weight: Tensor | None) -> Tensor | float:
         """Return the factor on contributions of a strategy, which have its weight among those of ``path``.
 
         Args:
             strategy: one of :data:`STRATEGIES`.
-            reduced: factor ``(N,)`` by which the weight falls among all strategies.
+            among_all: factor ``(N,)`` by which the weight falls among all strategies.
             weight: the weight ``(N,)``; None: 1.
         """
         if self.strategy == "mis" or (self.weighted and self.strategy == strategy):
-            return reduced
+            return among_all
         if self.strategy != strategy:
             return 0.0
         return 1.0 if weight is None else safe_reciprocal(weight)
@@ -86,11 +86,10 @@ class Bdpt(PathIntegrator):
     def light_walk(self) -> Integrator:
         """Return the integrator of the light paths: :meth:`Integrator.light_walk`."""
         return LightPaths(
-            max_depth=self.max_depth,
+            max_depth=self.max_depth if self.strategy in ("mis", "light_paths") else 0,
             rr_depth=self.rr_depth,
             rr_prob=self.rr_prob,
             fraction=self.light_paths,
-            counted=self.strategy in ("mis", "light_paths"),
             weighted=self.strategy == "mis" or self.weighted,
         )
 
@@ -121,7 +120,7 @@ class Bdpt(PathIntegrator):
         state = vertex.state
         at = interact(context.world, state.o, state.d, vertex.hit, follow_ray=context.follow_ray)
         density = density_of_hit(context.world.emission, at)
-        return self._reduced(stages.emit(context, vertex), density * state.extra["dvc"])
+        return self._reduced(stages.emission_at(context, vertex, at), density * state.extra["dvc"])
 
     def escape(self, context: StageContext, vertex: VertexInput) -> Emission:
         """Return the radiance of the environment; see :meth:`Integrator.escape`."""
@@ -151,18 +150,10 @@ class Bdpt(PathIntegrator):
             shadow = replace(shadow, radiance=shadow.radiance * factor)
             if direct.weight is not None:
                 direct = replace(direct, weight=direct.weight * factor)
-        leaving, next_hit, drawn, continuation = stages.scatter(context, model, state, at, surface)
+        output = stages.scattered(context, model, state, at, surface, direct, shadow)
+        drawn = output.drawn
+        assert drawn is not None
         reverse = None if kind.smooth else reverse_pdf(context, model, at, surface, -state.d, drawn.d)
         dvc = leaving_dvc(context, model, at, surface, arrival, drawn.d, drawn.pdf, drawn.eta, reverse)
-        leaving = replace(leaving, extra={"dvcm": torch.zeros_like(dvc), "dvc": dvc})
-        return VertexOutput(
-            leaving=leaving,
-            next_hit=next_hit,
-            shadow=shadow,
-            at=at,
-            surface=surface,
-            direct=direct,
-            drawn=drawn,
-            carried=continuation.carried,
-            chance=continuation.chance,
-        )
+        leaving = replace(output.leaving, extra={"dvcm": torch.zeros_like(dvc), "dvc": dvc})
+        return replace(output, leaving=leaving)

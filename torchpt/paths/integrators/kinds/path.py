@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from torchpt.paths.integrators.base import LIGHT_CHOICE, SAMPLES, STRATEGY, Limits
+from torchpt.paths.integrators.base import DEPTHS, LIGHT_CHOICE, SAMPLES, STRATEGY, Limits
 from torchpt.paths.integrators.path import PathIntegrator
-from torchpt.spec import Integer, Refused, Scalar
+from torchpt.spec import Refused
 
 __all__ = ["Path"]
 
@@ -17,19 +17,7 @@ class Path(PathIntegrator):
 
     name = "path"
     parameters: ClassVar = {
-        "max_depth": Integer(
-            16,
-            low=-1,
-            doc="longest path in edges: 1 emission only, 2 direct light, -1 until roulette ends it",
-        ),
-        "rr_depth": Integer(5, low=1, doc="roulette may end paths from this depth on"),
-        "rr_prob": Scalar(
-            None,
-            above=0.0,
-            high=1.0,
-            words="null or a number, 0 < rr_prob <= 1",
-            doc="chance to survive roulette; null: by throughput",
-        ),
+        **DEPTHS,
         **STRATEGY,
         **LIGHT_CHOICE,
         **SAMPLES,

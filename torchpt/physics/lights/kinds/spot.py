@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchpt.math.sampling import uniform_cone
 from torchpt.math.vectors import Frame, azimuth, cross, dot, luminance, normalize
-from torchpt.physics.lights.base import Cone, EmittedRay, Light, Row, Scope, Setting, bright
+from torchpt.physics.lights.base import BoundingSphere, Cone, EmittedRay, Light, Row, Setting, bright
 from torchpt.physics.lights.kinds import point
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.spec import Angle, Color, Moves, Point, Refused
@@ -112,16 +112,16 @@ class Spot(Light):
         return replace(drawn, radiance=drawn.radiance * fraction)
 
     @classmethod
-    def emit(cls, at: Lights, u: Tensor, v: Tensor, scope: Scope, mis: bool) -> EmittedRay:
+    def emit(cls, at: Lights, u: Tensor, v: Tensor, sphere: BoundingSphere, mis: bool) -> EmittedRay:
         """See :meth:`Light.emit`: evenly within the cone."""
         axis = at.normal.expand(3, v.shape[1])
         d = Frame.about(axis).to_world(uniform_cone(v.to(axis.dtype), _width(at.e1[0])))
         fraction = falloff(-d, axis=at.normal, cutoff=at.e1[0], slope=at.e1[1])
         one = torch.ones_like(d[0])
-        density = cls.emission_density(at, one, scope)
+        density = cls.emission_density(at, one, sphere)
         return EmittedRay(at.p0.expand_as(d), d, at.radiance * fraction, density, one)
 
     @classmethod
-    def emission_density(cls, at: Lights, pdf: Tensor, scope: Scope) -> Tensor:
+    def emission_density(cls, at: Lights, pdf: Tensor, sphere: BoundingSphere) -> Tensor:
         """See :meth:`Light.emission_density`: by solid angle alone."""
         return (0.5 / math.pi) / _width(at.e1[0]).expand_as(pdf)
