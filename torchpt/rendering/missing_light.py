@@ -95,7 +95,7 @@ def _hint(integrator: Integrator) -> str:
 
 
 class _Search:
-    """The render's search structure for a few rays; an LBVH in place of brute force, whose kernels must be compiled."""
+    """Searches for a few rays of a render: by an LBVH in place of brute force, whose kernels must be compiled."""
 
     def __init__(self, wave: Wave, geometry: Callable[[], Geometry]) -> None:
         self._wave, self.geometry = wave, geometry
@@ -104,7 +104,7 @@ class _Search:
 
     @property
     def wave(self) -> Wave:
-        """The wave, with an ``accel`` that needs no compilation."""
+        """Return the wave, with an ``accel`` that needs no compilation."""
         if self._own is None:
             self._own = self._wave.accel
             if self._own.name == "brute":

@@ -73,9 +73,9 @@ def _triangles(geometry: Geometry, first: int, count: int) -> Geometry:
 
 
 def bounding_sphere(geometry: Geometry) -> tuple[Tensor, Tensor]:
-    """Return centre ``(3,)`` and radius ``()`` of a ball around all surfaces, instances included; float64.
+    """Return centre ``(3,)`` and radius ``()`` of a sphere around all surfaces, instances included; float64.
 
-    Without surfaces it is the unit ball.
+    Without surfaces it is the unit sphere.
     """
     boxes = [primitive_bounds(geometry)]
     if geometry.copies is not None:
