@@ -18,7 +18,14 @@ import torchpt
 from torchpt.core.errors import NotBuiltError
 from torchpt.math.vectors import dot, rows
 from torchpt.paths.integrators.kinds.bdpt import STRATEGIES, Bdpt
-from torchpt.paths.integrators.weights import Arrival, leaving_dvc, reduced, reverse_pdf
+from torchpt.paths.integrators.weights import (
+    Arrival,
+    leaving_dvc,
+    leaving_dvcm,
+    reduced,
+    reverse_pdf,
+    root_of_squares,
+)
 from torchpt.paths.surface import surface_at
 from torchpt.paths.wave import Wave
 from torchpt.physics.lights.emission import LightRay, density_of_hit, emit, light_weight
@@ -32,10 +39,13 @@ from torchpt.scene.prepare import make_wave
 SEEDS = 12
 
 
-def pictures(scene: torchpt.Scene, name: str, spp: int, compile: str = "on", **keys: Any) -> torch.Tensor:
+def pictures(
+    scene: torchpt.Scene, name: str, spp: int, compile: str = "on", first_seed: int = 1, **keys: Any
+) -> torch.Tensor:
     integrator = {"type": name, **keys}
+    seeds = range(first_seed, first_seed + SEEDS)
     return torch.stack(
-        [torchpt.render(scene, integrator=integrator, spp=spp, seed=k + 1, compile=compile) for k in range(SEEDS)]
+        [torchpt.render(scene, integrator=integrator, spp=spp, seed=seed, compile=compile) for seed in seeds]
     ).double()
 
 
@@ -54,11 +64,16 @@ def assert_same_means(a: torch.Tensor, b: torch.Tensor) -> None:
         assert float(z.square().mean()) < 2.0 or z.numel() < 2
 
 
-def test_the_mean_of_path_among_diffuse_walls():
+#: Connections with a light path for each sample.
+CONNECTED = {"connections": "one", "light_paths": 1.0}
+
+
+@pytest.mark.parametrize("keys", [{}, CONNECTED], ids=["t = 1", "connected"])
+def test_the_mean_of_path_among_diffuse_walls(keys):
     shapes = {name: ROOMS["thin lens"]["shapes"][name] for name in ("floor", "back", "left", "lamp")}
     lights = {"sky": {"type": "constant", "radiance": 0.2}, "point": {"type": "point", "position": [0.5, 1, 1]}}
     scene = torchpt.load({**ROOMS["thin lens"], "shapes": shapes, "lights": lights}, device="cpu")
-    assert_same_means(pictures(scene, "path", 128), pictures(scene, "bdpt", 128))
+    assert_same_means(pictures(scene, "path", 128), pictures(scene, "bdpt", 128, **keys))
 
 
 @pytest.mark.slow
@@ -68,17 +83,48 @@ def test_the_mean_of_path(name):
     assert_same_means(pictures(scene, "path", 1024), pictures(scene, "bdpt", 1024))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROOMS)
+def test_connections_leave_the_mean(name):
+    """Beside ``bdpt`` without them: rare bright samples of ``path`` hide what is missing."""
+    scene = torchpt.load(ROOMS[name], device="cpu")
+    assert_same_means(pictures(scene, "bdpt", 1024), pictures(scene, "bdpt", 1024, first_seed=1001, **CONNECTED))
+
+
 @pytest.mark.parametrize("name", few(ROOMS, 1))
 def test_strategies_add_up_to_the_picture(name):
     scene = torchpt.load(ROOMS[name], device="cpu")
     wish: dict[str, Any] = {"spp": 4, "compile": "off", "full": True}
-    whole = torchpt.render(scene, integrator="bdpt", **wish)
+    keys = {"type": "bdpt", "connections": "one"}
+    whole = torchpt.render(scene, integrator=keys, **wish)
     parts = [
-        torchpt.render(scene, integrator={"type": "bdpt", "strategy": strategy, "weighted": True}, **wish).image
+        torchpt.render(scene, integrator={**keys, "strategy": strategy, "weighted": True}, **wish).image
         for strategy in STRATEGIES
     ]
     assert torch.allclose(whole.image, sum(parts[1:], parts[0]), rtol=1e-5, atol=1e-6) and not whole.nonfinite_samples
-    assert parts[1].any() and parts[2].any()
+    assert parts[1].any() and parts[2].any() and parts[3].any()
+
+
+def test_connections_by_kernels_and_by_tensors():
+    """The same numbers but for rounding, for any threads; with a surface that is not opaque."""
+    shapes = {name: ROOMS["thin lens"]["shapes"][name] for name in ("floor", "lamp", "block")}
+    shapes["veil"] = {
+        "type": "rectangle",
+        "material": {"type": "diffuse", "opacity": 0.4},
+        "transform": [{"scale": 0.4}, {"translate": [0, 0.3, 0.2]}],
+    }
+    scene = torchpt.load({**ROOMS["thin lens"], "shapes": shapes}, device="cpu")
+    wish: dict[str, Any] = {"spp": 4, "integrator": {"type": "bdpt", **CONNECTED}}
+    of_tensors = torchpt.render(scene, compile="off", **wish)
+    of_kernels = torchpt.render(scene, compile="on", threads=1, **wish)
+    torch.testing.assert_close(of_kernels, of_tensors, rtol=1e-3, atol=1e-4)
+    assert torch.equal(torchpt.render(scene, compile="on", threads=2, **wish), of_kernels)
+
+
+@pytest.mark.parametrize("keys", [{"strategy": "connections"}, {"strategy": "connections", "connections": "one"}])
+def test_connections_alone_are_weighted(keys):
+    with pytest.raises(torchpt.SceneError, match="integrator.(connections|weighted): expected"):
+        torchpt.render(torchpt.load(ROOMS["thin lens"], device="cpu"), integrator={"type": "bdpt", **keys}, spp=1)
 
 
 @pytest.mark.slow
@@ -208,6 +254,15 @@ def test_splats_that_are_too_large_are_named():
     assert found.nonfinite_causes.keys() == {"infinite splat", "nan, not traced"}
 
 
+def test_connections_that_are_not_finite_are_named():
+    room = {**ROOMS["thin lens"], "lights": {"p": {"type": "point", "position": [0.5, 1.6, 0.6], "intensity": 1e37}}}
+    scene = torchpt.load(room, device="cpu")
+    keys = {"type": "bdpt", **CONNECTED, "strategy": "connections", "weighted": True}
+    found = torchpt.render(scene, integrator=keys, spp=4, compile="off", full=True)
+    assert re.search(r"infinite connection at depth \d+$", found.nonfinite_first)
+    assert found.nonfinite_causes.keys() <= {"infinite connection", "nan connection"}
+
+
 def test_a_scene_without_light_is_black():
     dark = {**GLASS, "lights": {}}
     assert not torchpt.render(torchpt.load(dark, device="cpu"), integrator="bdpt", spp=2, compile="off").any()
@@ -278,27 +333,60 @@ def random_paths(wave: Wave, n: int) -> ThreeEdges:
     return ThreeEdges(wave, ray, a, b, ray.d, d1, view, density).rows(good.nonzero()[:, 0])
 
 
-def weight_of_splat(paths: ThreeEdges) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the weight as a light path that is joined to the camera, and the density with which it is sampled at ``a``."""
+def by_area(density: torch.Tensor, d: torch.Tensor, o: Interaction, at: Interaction) -> torch.Tensor:
+    """Return densities by solid angle of directions ``d`` at ``o`` as densities by area at ``at``."""
+    way = at.p - o.p
+    return density * Arrival.cosine_of(d, at) / dot(way, way)
+
+
+def arrivals(paths: ThreeEdges) -> tuple[Arrival, Arrival]:
+    """Return the numbers of MIS of a light path at ``a``, and of a camera path at ``b``."""
     wave, a, b = paths.wave, paths.a, paths.b
-    assert wave.light_paths is not None and wave.context.world.emission is not None
-    context, emission = wave.light_paths.context, wave.context.world.emission
-    kinds = context.world.materials.models
-    surface, cosine = surface_at(context.world, paths.first, paths.d0, a), Arrival.cosine_of(paths.d0, a)
+    emission, start = wave.context.world.emission, paths.ray.density
+    assert emission is not None
+    surface, cosine = surface_at(wave.context.world, paths.first, paths.d0, a), Arrival.cosine_of(paths.d0, a)
     share = light_weight(emission, paths.ray, a.p, surface.frame.n)
-    start = paths.ray.density
-    arrival = Arrival(1.0 / (start * share * cosine), paths.ray.met / start / cosine, cosine)
+    of_light = Arrival(1.0 / (start * share * cosine), paths.ray.met / start / cosine, cosine)
+    nothing = torch.zeros_like(paths.density)
+    return of_light, Arrival(PIXELS / paths.density, nothing, Arrival.cosine_of(paths.view, b))
+
+
+def weight_of_connection(paths: ThreeEdges, number: float) -> torch.Tensor:
+    """Return the weight as a connection of ``b``, on a camera path, with ``a``, on a light path."""
+    context, a, b, (of_light, of_camera) = paths.wave.context, paths.a, paths.b, arrivals(paths)
+    at_a = surface_at(context.world, paths.first, paths.d0, a)
+    at_b = surface_at(context.world, paths.second, -paths.view, b)
+    kinds = context.world.materials.models
+    to_b = kinds[paths.first].pdf(at_a.parameters, at_a.wo, at_a.frame.to_local(paths.d1))
+    to_a = kinds[paths.second].pdf(at_b.parameters, at_b.wo, at_b.frame.to_local(-paths.d1))
+    to_lamp = reverse_pdf(context, paths.first, a, at_a, -paths.d0, paths.d1)
+    to_camera = reverse_pdf(context, paths.second, b, at_b, paths.view, -paths.d1)
+    ratio = root_of_squares(
+        by_area(to_a, paths.d1, b, a) * of_light.others(to_lamp),
+        by_area(to_b, paths.d1, a, b) * of_camera.others(to_camera),
+    )
+    return reduced(None, ratio / number)
+
+
+def weight_of_splat(paths: ThreeEdges, number: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the weight as a light path that is joined to the camera, and the density with which it is sampled at ``a``."""
+    wave, a, b, (arrival, _) = paths.wave, paths.a, paths.b, arrivals(paths)
+    assert wave.light_paths is not None
+    context = wave.light_paths.context
+    kinds = context.world.materials.models
+    surface = surface_at(context.world, paths.first, paths.d0, a)
     pdf = kinds[paths.first].pdf(surface.parameters, surface.wo, surface.frame.to_local(paths.d1))
     back = reverse_pdf(context, paths.first, a, surface, -paths.d0, paths.d1)
     dvc = leaving_dvc(context, paths.first, a, surface, arrival, paths.d1, pdf, None, back)
-    cosine = Arrival.cosine_of(paths.d1, b)
-    arrival = Arrival(torch.zeros_like(dvc), dvc / cosine, cosine)
+    cosine, way = Arrival.cosine_of(paths.d1, b), b.p - a.p
+    dvcm = leaving_dvcm(pdf, False, number) * dot(way, way) / cosine
+    arrival = Arrival(dvcm, dvc / cosine, cosine)
     surface = surface_at(context.world, paths.second, paths.d1, b)
     back = reverse_pdf(context, paths.second, b, surface, -paths.d1, paths.view)
     return reduced(None, paths.density / PIXELS * arrival.others(back)), pdf
 
 
-def weights_of_camera_path(paths: ThreeEdges) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def weights_of_camera_path(paths: ThreeEdges, number: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return the weights as a camera path, with a light sample at its end and where it meets the lamp.
 
     The third result is the density with which it is sampled at ``b`` and ``a``.
@@ -307,13 +395,13 @@ def weights_of_camera_path(paths: ThreeEdges) -> tuple[torch.Tensor, torch.Tenso
     context, emission = wave.context, wave.context.world.emission
     assert emission is not None
     kinds = context.world.materials.models
-    surface = surface_at(context.world, paths.second, -paths.view, b)
-    arrival = Arrival(PIXELS / paths.density, torch.zeros_like(paths.density), Arrival.cosine_of(paths.view, b))
+    surface, (_, arrival) = surface_at(context.world, paths.second, -paths.view, b), arrivals(paths)
     pdf = kinds[paths.second].pdf(surface.parameters, surface.wo, surface.frame.to_local(-paths.d1))
     back = reverse_pdf(context, paths.second, b, surface, paths.view, -paths.d1)
     dvc = leaving_dvc(context, paths.second, b, surface, arrival, -paths.d1, pdf, None, back)
-    cosine = Arrival.cosine_of(paths.d1, a)
-    arrival = Arrival(torch.zeros_like(dvc), dvc / cosine, cosine)
+    cosine, way = Arrival.cosine_of(paths.d1, a), b.p - a.p
+    dvcm = leaving_dvcm(pdf, False, number) * dot(way, way) / cosine
+    arrival = Arrival(dvcm, dvc / cosine, cosine)
     surface = surface_at(context.world, paths.first, -paths.d1, a)
     share = light_weight(emission, paths.ray, a.p, surface.frame.n)
     back = reverse_pdf(context, paths.first, a, surface, paths.d1, -paths.d0)
@@ -342,7 +430,14 @@ def on_lamp(world: World, o: torch.Tensor, d: torch.Tensor) -> Interaction:
 PIXELS = 16.0 * 16.0
 
 
-def test_weights_of_all_strategies_sum_to_one():
+def test_no_connection_takes_the_place_of_a_delta_lobe():
+    pdf = torch.tensor([2.0, math.inf])
+    assert leaving_dvcm(pdf, False, 0.5).tolist() == [0.25, 0.0]
+    assert leaving_dvcm(pdf, True, 0.5).tolist() == leaving_dvcm(pdf, False, 0.0).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("number", [0.0, 0.5])
+def test_weights_of_all_strategies_sum_to_one(number):
     """For random paths of three edges, with densities by hand."""
     lamp = {"type": "rectangle", "emission": 3, "transform": [{"scale": 0.5}, {"translate": [0.2, 1, -0.9]}]}
     ball = {"type": "sphere", "center": [0.4, 0.4, 0.2], "radius": 0.35, "material": "metal"}
@@ -353,9 +448,11 @@ def test_weights_of_all_strategies_sum_to_one():
     opaque = [k for k, kind in enumerate(wave.context.world.materials.models) if not kind.transmits]
     for first, second in itertools.product(opaque, repeat=2):
         some = paths.of(first, second)
-        (by_splat, pdf), (by_sample, by_hit, other_pdf) = weight_of_splat(some), weights_of_camera_path(some)
+        by_splat, pdf = weight_of_splat(some, number)
+        by_sample, by_hit, other_pdf = weights_of_camera_path(some, number)
+        connected = weight_of_connection(some, number) if number else torch.zeros_like(by_splat)
         good = (pdf > 0) & (other_pdf > 0)
-        weights = torch.stack((by_splat, by_sample, by_hit))[:, good]
+        weights = torch.stack((by_splat, by_sample, by_hit, connected))[:, good]
         assert bool((weights >= 0.0).all())
         torch.testing.assert_close(weights.sum(0), torch.ones_like(weights[0]), rtol=0.0, atol=1e-5)
         checked += len(weights[0])

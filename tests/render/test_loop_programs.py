@@ -256,9 +256,9 @@ def test_a_model_that_no_kernel_can_be_made_of(monkeypatch, capsys):
     asked: list[int] = []
     kept = chunk.bounce_eagerly
 
-    def noted(kernels: Any, model: int, *args: Any) -> int:
+    def noted(kernels: Any, store: Any, model: int, *args: Any) -> int:
         asked.append(model)
-        return kept(kernels, model, *args)
+        return kept(kernels, store, model, *args)
 
     capsys.readouterr()
     monkeypatch.setattr(chunk, "bounce_eagerly", noted)

@@ -83,7 +83,7 @@ def check_parts(path: Path) -> None:
     total, throughput = torch.zeros(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
     for depth, vertex in enumerate(path.vertices, 1):
         assert vertex.depth == depth
-        for part in (vertex.emission, vertex.light):
+        for part in (vertex.emission, vertex.light, vertex.connection):
             total += torch.tensor(part.contribution if part else (0.0,) * 3, dtype=torch.float64)
         if vertex.emission:
             product = throughput * torch.tensor(vertex.emission.radiance) * vertex.emission.mis_weight
@@ -106,6 +106,16 @@ def check_parts(path: Path) -> None:
 
 def doubles(values: tuple[float, ...]) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)
+
+
+def test_paths_that_are_connected_to_light_paths():
+    """Connections alone make no splats, so pixels hold their own samples; among all strategies the parts come to the whole."""
+    scene = torchpt.load("cornell_box", "cpu")
+    keys: dict[str, Any] = {"type": "bdpt", "connections": "one", "light_paths": 1.0}
+    alone = compared(scene, compiled=False, **keys, strategy="connections", weighted=True)
+    assert sum(vertex.connection is not None for path in alone for vertex in path.vertices) > 5
+    for pixel in pixels():
+        check_parts(one_path(scene, wishes(scene, **keys), pixel, 0))
 
 
 @pytest.mark.parametrize(

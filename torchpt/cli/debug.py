@@ -17,7 +17,14 @@ from torchpt.cli.render import Job, scene_and_settings
 from torchpt.cli.streams import flushed_stdout
 
 if TYPE_CHECKING:
-    from torchpt.rendering.one_path import BsdfSampleRecord, EmissionRecord, LightSampleRecord, Path, Vertex
+    from torchpt.rendering.one_path import (
+        BsdfSampleRecord,
+        ConnectionRecord,
+        EmissionRecord,
+        LightSampleRecord,
+        Path,
+        Vertex,
+    )
 
 __all__ = ["PathRequest", "debug", "lines"]
 
@@ -119,6 +126,8 @@ def _vertex_lines(vertex: Vertex) -> Iterator[str]:
         yield _labelled_line("emission" if vertex.position else "environment", _emission_text(vertex.emission))
     if vertex.light is not None:
         yield _labelled_line("light", _light_sample_text(vertex.light))
+    if vertex.connection is not None:
+        yield _labelled_line("connection", _connection_text(vertex.connection))
     if vertex.scattered is not None:
         yield from _bsdf_sample_lines(vertex.scattered)
     yield _labelled_line("radiance", _triple_text(vertex.radiance))
@@ -136,6 +145,13 @@ def _light_sample_text(light: LightSampleRecord) -> str:
         f"{light.light}: wi {_triple_text(light.wi)}, {_pdf_text(light.pdf)}, radiance/pdf {_triple_text(light.arriving)}, "
         f"bsdf {_triple_text(light.bsdf)}, MIS weight {_number_text(light.mis_weight)}, visible {visible}, "
         f"contribution {_triple_text(light.contribution)}"
+    )
+
+
+def _connection_text(record: ConnectionRecord) -> str:
+    return (
+        f"to {_triple_text(record.position)}, radiance {_triple_text(record.arriving)}, "
+        f"visible {_number_text(record.visible)}, contribution {_triple_text(record.contribution)}"
     )
 
 

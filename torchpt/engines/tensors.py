@@ -24,7 +24,8 @@ from torchpt.paths import layers as aov
 from torchpt.paths.integrators.base import check_fields, check_output
 from torchpt.paths.integrators.path import Ends, follows_ray, partition
 from torchpt.paths.layers import LAYERS
-from torchpt.paths.state import Emission, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
+from torchpt.paths.state import Emission, End, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
+from torchpt.paths.store import VertexStore, partner_of, vertex_of
 from torchpt.paths.transmission import non_opaque, opacity_at, origins_behind
 from torchpt.paths.walk import Counts, Observer, find_hits, walk
 from torchpt.paths.wave import PixelSet, RayCounts, Wave
@@ -74,6 +75,9 @@ class Paths:
         transmittance: ``(n,)`` of each of ``pending``, once they are traced.
         splats: splats from the vertex before, with the samples ``(n,)`` that they come from.
         splat_transmittance: ``(n,)`` of each of ``splats``, once their shadow rays are traced.
+        camera_ends: ends of connections at the vertex before, which are not made yet: for each BSDF model the first lane of its
+            paths, the samples ``(n,)``, and an end for each.
+        connections: samples ``(n,)``, shadow rays and their transmittance ``(n,)`` of connections that were made.
         emissions: lanes and emission at this vertex, if the engine keeps them.
         outputs: index of the BSDF model, samples ``(n,)`` and stage outputs of the vertex before, if the engine keeps them.
         passed: in a backward engine ``transmittance`` and ``splat_transmittance`` of the shadow rays that leave this vertex.
@@ -89,6 +93,8 @@ class Paths:
     transmittance: list[Tensor] = field(default_factory=list)
     splats: list[tuple[Tensor, Splat]] = field(default_factory=list)
     splat_transmittance: list[Tensor] = field(default_factory=list)
+    camera_ends: list[tuple[int, Tensor, End]] = field(default_factory=list)
+    connections: list[tuple[Tensor, Shadow, Tensor]] = field(default_factory=list)
     emissions: list[tuple[Tensor, Emission]] = field(default_factory=list)
     outputs: list[tuple[int, Tensor, VertexOutput]] = field(default_factory=list)
     passed: tuple[list[Tensor], list[Tensor]] = field(default_factory=lambda: ([], []))
@@ -109,6 +115,7 @@ class TensorsEngine:
         tally: counts rays and truncated paths.
         keeps: True: populations keep stage outputs (``Paths.emissions``, ``Paths.outputs``), for an observer.
         splats: a list to append splats to; None: splats are dropped.
+        store: where light paths keep vertices, and camera paths find them; None: paths are not connected.
 
     Attributes:
         radiance: ``(3, lanes)`` radiance of samples whose paths have ended, by sample.
@@ -122,8 +129,9 @@ class TensorsEngine:
         tally: RayCounts | None = None,
         keeps: bool = False,
         splats: list[Splats] | None = None,
+        store: VertexStore | None = None,
     ) -> None:
-        self.keeps = keeps
+        self.keeps, self.store = keeps, store
         self.wave, self.context, self.tally = wave, wave.context, RayCounts() if tally is None else tally
         self.plan, self.world = wave.context.plan, wave.context.world
         self.has_transmission = self.world.materials.opacity is not None or wave.integrator.has_own_transmit
@@ -235,10 +243,17 @@ class TensorsEngine:
         salt = salts(paths.depth, paths.state.lane.device)
         search = partial(self.hits, depth=paths.depth + 1)
         start_salts = self.wave.integrator.start_salts(paths.depth, paths.state.lane.device)
-        return self.context.at(salt, follow_ray, roulette, search, start_salts)
+        return self.context.at(salt, follow_ray, roulette, search, start_salts, paths.depth)
 
     def _input(self, paths: Paths, index: Tensor) -> VertexInput:
         return VertexInput(rows(paths.state, index), rows(paths.hits, index))
+
+    def _with_partner(self, vertex: VertexInput, depth: int) -> VertexInput:
+        """Return the input of the stage of surfaces, with the vertices that these may be connected to."""
+        if self.store is None or not self.wave.integrator.connects:
+            return vertex
+        values = self.store.read(vertex.state.lane, depth)
+        return vertex if values is None else replace(vertex, partner=partner_of(values))
 
     def scatter(self, paths: Paths, roulette: float) -> Paths:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -249,7 +264,8 @@ class TensorsEngine:
         after = Paths(paths.state, paths.depth + 1)
         start = 0  # the first lane, in the new population, of the paths of a model
         for model, index in paths.groups:
-            output = bounce(context, model, self._input(paths, index))
+            vertex = self._with_partner(self._input(paths, index), paths.depth)
+            output = bounce(context, model, vertex)
             check_output(self.wave.integrator, output)
             leaving.append(output.leaving)
             if output.next_hit is not None:
@@ -260,6 +276,10 @@ class TensorsEngine:
             if output.splat is not None:
                 after.splats.append((take(paths.state.lane, index), output.splat))
                 self.tally.rays += len(index)
+            if output.kept is not None and self.store is not None:
+                self.store.keep(vertex.state.lane, vertex, output.kept)
+            if output.end is not None:
+                after.camera_ends.append((start, vertex.state.lane, output.end))
             if self.keeps:
                 after.outputs.append((model, take(paths.state.lane, index), output))
             start += len(index)
@@ -269,6 +289,8 @@ class TensorsEngine:
 
     def occlude(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
+        if paths.camera_ends:
+            self._connect(paths)
         # The radiance of all lanes is put together of lanes with a shadow ray and of those between, which stay as they are.
         radiance = paths.state.radiance
         parts, done = [], 0
@@ -304,6 +326,28 @@ class TensorsEngine:
         if self.splats is not None:
             index = (arrives & finite).nonzero().squeeze(1)
             self.splats.append(Splats(take(lane, index), take(splat.pixel, index), take(value, index)))
+
+    def _connect(self, paths: Paths) -> None:
+        """Connect the vertices that ``paths`` have left to those that their light paths keep, and add the light."""
+        assert self.store is not None
+        depth, radiance = paths.depth - 1, paths.state.radiance
+        device = radiance.device
+        context = self.context.at(salts(depth, device), start_salts=salts(0, device), depth=depth)
+        for start, lane, ends in paths.camera_ends:
+            for model in range(len(self.world.materials.models)):
+                index = (ends.partner == model).nonzero().squeeze(1)
+                if not len(index):
+                    continue
+                sample, end = take(lane, index), rows(ends, index)
+                values = self.store.read(sample, depth)
+                assert values is not None
+                light = self.wave.integrator.connect(context, model, vertex_of(values), values["depth"], end)
+                transmittance = self.transmittance(light)
+                self.tally.rays += len(index)
+                radiance = radiance.index_add(1, start + index, light.radiance * transmittance)
+                paths.connections.append((sample, light, transmittance))
+        paths.state = replace(paths.state, radiance=radiance)
+        paths.camera_ends.clear()
 
     def path_radiance(self) -> Tensor:
         """Return the radiance ``(3, lanes)`` of all samples, once all paths ended; NaN where a splat is not finite."""
@@ -363,6 +407,7 @@ def trace(
     tally: RayCounts | None = None,
     observer: Observer[Paths] | None = None,
     splats: list[Splats] | None = None,
+    store: VertexStore | None = None,
 ) -> Tensor:
     """Return the radiance ``(3, N)`` along rays, not weighted by the filter.
 
@@ -372,8 +417,9 @@ def trace(
         tally: counts rays and truncated paths.
         observer: gets the callbacks of the walk; populations then keep stage outputs.
         splats: a list to append splats to; None: splats are dropped.
+        store: of the vertices of light paths, see :class:`TensorsEngine`.
     """
-    engine = TensorsEngine(wave, len(state.lane), tally, keeps=observer is not None, splats=splats)
+    engine = TensorsEngine(wave, len(state.lane), tally, keeps=observer is not None, splats=splats, store=store)
     if len(state.lane):
         walk(engine, engine.spawn(state), wave.integrator.limits, observer)
     return engine.path_radiance()
@@ -391,9 +437,10 @@ def weighted_radiance(
     tally: RayCounts | None = None,
     observer: Observer[Paths] | None = None,
     splats: list[Splats] | None = None,
+    store: VertexStore | None = None,
 ) -> Tensor:
     """Return the radiance ``(3, N)`` of camera rays times their filter weights; arguments as for :func:`trace`."""
-    samples = trace(wave, state, tally, observer, splats)
+    samples = trace(wave, state, tally, observer, splats, store)
     # other filters are importance sampled, with weight 1
     return samples * wave.weight(state) if wave.filter.signed else samples
 

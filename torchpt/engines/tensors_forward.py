@@ -19,6 +19,7 @@ from torchpt.core.memory import Budget, Span, fits_in_memory
 from torchpt.engines import tensors, work
 from torchpt.engines.work import TaskResult
 from torchpt.paths.nonfinite import NonFinite
+from torchpt.paths.store import VertexStore
 from torchpt.paths.wave import PixelSet, RayCounts, Wave, clamp_scale
 from torchpt.physics.film.splats import Splats
 
@@ -109,10 +110,13 @@ def _computed_piece(wave: Wave, pixel_set: PixelSet, span: Span) -> Piece:
     first_pixel, pixels, first_sample, samples = span
     if wave.integrator.light:
         splats: list[Splats] = []
-        radiance = tensors.weighted_radiance(wave, wave.rays(*span, pixel_set), piece.tally, splats=splats)
+        store = VertexStore(pixels * samples) if wave.integrator.connects else None
+        of_light: Tensor | float = 0.0
         if wave.light_paths is not None:  # their radiance is 0, or NaN where a splat is not finite
             starts = wave.light_paths.rays(*span, pixel_set)
-            radiance = radiance + tensors.trace(wave.light_paths, starts, piece.tally, splats=splats)
+            of_light = tensors.trace(wave.light_paths, starts, piece.tally, splats=splats, store=store)
+        radiance = tensors.weighted_radiance(wave, wave.rays(*span, pixel_set), piece.tally, splats=splats, store=store)
+        radiance = radiance + of_light
         radiance = radiance.view(3, samples, pixels)
         finite = torch.isfinite(radiance).all(0)
         if not bool(finite.all()):

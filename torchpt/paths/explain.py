@@ -18,7 +18,8 @@ from torch import Tensor
 from torchpt.core.tree import leaves
 from torchpt.math.vectors import take
 from torchpt.paths.nonfinite import SampleId
-from torchpt.paths.state import Emission, PathState, VertexOutput
+from torchpt.paths.state import Emission, PathState, Shadow, VertexOutput
+from torchpt.paths.store import VertexStore
 from torchpt.paths.walk import Observer, Population
 from torchpt.paths.wave import Wave
 from torchpt.physics.film.splats import LARGEST
@@ -29,6 +30,7 @@ from torchpt.physics.world import World
 __all__ = [
     "CAUSES",
     "CameraRay",
+    "Connection",
     "EmitterHit",
     "Event",
     "Explainer",
@@ -67,6 +69,11 @@ class ReadablePopulation(Population, Protocol):
     @property
     def transmittance(self) -> Sequence[Tensor]:
         """Return the transmittance ``(n,)`` of the shadow rays of the vertex before: of each output that has some, in order."""
+        ...
+
+    @property
+    def connections(self) -> Sequence[tuple[Tensor, Shadow, Tensor]]:
+        """Return, for connections of the vertex before: lanes in the wave, shadow rays and their transmittance ``(n,)``."""
         ...
 
 
@@ -136,9 +143,26 @@ class Scattering:
     transmittance: Tensor | None
 
 
-Event = CameraRay | Intersection | EmitterHit | Scattering
-#: Traces camera rays of a wave with an observer, and returns their radiance ``(3, N)``.
-Trace = Callable[[Wave, PathState, Observer[ReadablePopulation]], Tensor]
+@dataclass(frozen=True)
+class Connection:
+    """Connections of a vertex with vertices of light paths.
+
+    Attributes:
+        depth: number of the vertex.
+        lanes: ``(n,)``.
+        light: the rays to the other ends, and the light that goes through them.
+        transmittance: ``(n,)`` of these rays.
+    """
+
+    depth: int
+    lanes: Tensor
+    light: Shadow
+    transmittance: Tensor
+
+
+Event = CameraRay | Intersection | EmitterHit | Scattering | Connection
+#: Traces rays of a wave with an observer and the store of its light paths, and returns their radiance ``(3, N)``.
+Trace = Callable[[Wave, PathState, Observer[ReadablePopulation], VertexStore | None], Tensor]
 
 
 class Explainer(Observer[ReadablePopulation]):
@@ -179,13 +203,15 @@ class Explainer(Observer[ReadablePopulation]):
             self.record(EmitterHit(depth=paths.depth, lanes=take(paths.state.lane, index), slot=slot, light=light))
 
     def on_scattered(self, paths: ReadablePopulation) -> None:
-        """Record light and BSDF samples of the vertex that the paths leave; ``paths`` are at the next one already."""
+        """Record samples and connections of the vertex that the paths leave; ``paths`` are at the next one already."""
         transmittances = iter(paths.transmittance)
         for model, lanes, output in paths.outputs:
             transmittance = None if output.shadow is None else next(transmittances)
             self.record(
                 Scattering(depth=paths.depth - 1, lanes=lanes, model=model, output=output, transmittance=transmittance)
             )
+        for lanes, light, transmittance in paths.connections:
+            self.record(Connection(depth=paths.depth - 1, lanes=lanes, light=light, transmittance=transmittance))
 
 
 #: Names of causes, and their descriptions.
@@ -198,6 +224,7 @@ CAUSES = {
     "environment": "the contribution of the environment to a path that hit nothing",
     "light": "a light sample: its radiance, weight or contribution",
     "splat": "a splat: the light that a surface sends to the camera; from 2^55 on it counts as infinite",
+    "connection": "the light that goes through the connection of a camera path with a light path",
     "bsdf": "a value, pdf or weight of a BSDF",
     "throughput": "the throughput of a path: a product of weights, each of them finite",
     "ray": "the ray that leaves a surface",
@@ -233,7 +260,7 @@ def causes_of_samples(trace: Trace, wave: Wave, samples: Sequence[SampleId]) -> 
     """Return the cause of each sample that is not finite, by tracing it again with tensor operations.
 
     Args:
-        trace: traces camera rays with tensor operations.
+        trace: traces rays with tensor operations.
         wave: of the render.
         samples: the samples, in any order.
     """
@@ -256,16 +283,15 @@ def _find_causes(
         torch.tensor([getattr(sample, name) for sample in samples], device=wave.centre.device)
         for name in ("x", "y", "sample")
     )
-    state = wave.rays_of(x, y, index, randomizations)
-    finder.on_start(state)
-    radiance = trace(wave, state, finder)
-    if not finder.found_all:  # a walk that was ended early returns no radiance
-        finder.check("sum", radiance, torch.arange(len(samples), device=x.device), depth=0, slot=None)
-    if wave.light_paths is not None and not finder.found_all:
-        rest = [lane for lane, cause in enumerate(finder.causes) if cause is None]
-        causes = _find_causes(trace, wave.light_paths, [samples[lane] for lane in rest], randomizations)
-        for lane, cause in zip(rest, causes, strict=True):
-            finder.causes[lane] = cause
+    store = VertexStore(len(samples)) if wave.integrator.connects else None
+    for walked in (wave.light_paths, wave):  # what spoils a light path spoils connections with it too
+        if walked is None or finder.found_all:
+            continue
+        state = walked.rays_of(x, y, index, randomizations)
+        finder.on_start(state)
+        radiance = trace(walked, state, finder, store)
+        if not finder.found_all:  # a walk that was ended early returns no radiance
+            finder.check("sum", radiance, torch.arange(len(samples), device=x.device), depth=0, slot=None)
     not_repeated = NonFiniteCause("not repeated", nan=False, depth=0)
     return [cause or not_repeated for cause in finder.causes]
 
@@ -333,6 +359,8 @@ def _checks(event: Event, world: World) -> Iterator[tuple[str, Tensor]]:
     elif isinstance(event, EmitterHit):
         contribution = event.light.brought
         yield "environment" if event.slot is None else "emission", contribution
+    elif isinstance(event, Connection):
+        yield "connection", event.light.radiance
     else:
         yield from _checks_of_vertex(event, world)
 

@@ -34,7 +34,10 @@ __all__ = [
     "DirectLight",
     "Drawn",
     "Emission",
+    "End",
     "Field",
+    "Kept",
+    "Partner",
     "PathState",
     "Plan",
     "Shadow",
@@ -175,6 +178,7 @@ class StageContext:
         filter: the reconstruction filter; None as above.
         crop: ``(x, y, width, height)`` of the picture on the camera's film, in pixels; None for an integrator without splats.
         start_salts: salts of depth 0, at the first vertex of a path that started on a light; None elsewhere.
+        depth: number of the vertex, 1 at the first hit; in kernels a tensor ``(1,)`` int32. 0 where no vertex has been reached.
     """
 
     plan: Plan
@@ -189,6 +193,7 @@ class StageContext:
     filter: Filter | None = None
     start_salts: Tensor | None = None
     crop: tuple[int, int, int, int] | None = None
+    depth: int | Tensor = 0
 
     def at(
         self,
@@ -197,11 +202,35 @@ class StageContext:
         roulette: float | Tensor = 0.0,
         search: Callable[[PathState], Hit] = no_search,
         start_salts: Tensor | None = None,
+        depth: int | Tensor = 0,
     ) -> StageContext:
-        """Return the context of one vertex: a copy with its dimensions, bound of roulette and search."""
+        """Return the context of one vertex: a copy with its dimensions, bound of roulette, search and depth."""
         return replace(
-            self, salts=salts, follow_ray=follow_ray, roulette=roulette, search=search, start_salts=start_salts
+            self,
+            salts=salts,
+            follow_ray=follow_ray,
+            roulette=roulette,
+            search=search,
+            start_salts=start_salts,
+            depth=depth,
         )
+
+
+@dataclass(frozen=True)
+class Partner:
+    """Vertices of light paths that vertices of camera paths may be connected to, one for each.
+
+    Attributes:
+        p: ``(3, n)`` the points.
+        model: ``(n,)`` int64 index of the BSDF model there; -1: none.
+        depth: ``(n,)`` int64 number of the vertex on its light path.
+        count: ``(n,)`` int64 number of vertices of the light path, of which this one was chosen at random.
+    """
+
+    p: Tensor
+    model: Tensor
+    depth: Tensor
+    count: Tensor
 
 
 @dataclass(frozen=True)
@@ -211,10 +240,12 @@ class VertexInput:
     Attributes:
         state: the paths as they arrive at the vertex.
         hit: the nearest hits of their rays.
+        partner: vertices of light paths, for an integrator that connects paths; else None.
     """
 
     state: PathState
     hit: Hit
+    partner: Partner | None = None
 
 
 @dataclass(frozen=True)
@@ -307,6 +338,51 @@ class Splat:
 
 
 @dataclass(frozen=True)
+class Kept:
+    """Vertices of light paths, to be kept where camera paths may be connected to them.
+
+    Attributes:
+        where: for each block of the store (:mod:`torchpt.paths.store`) ``(n,)`` bool, True where the vertex replaces the one
+            before.
+        p: ``(3, n)`` the points.
+        model: index of their BSDF model; -1: they cannot be connected.
+        depth: number of the vertex, as in :class:`StageContext`: so many vertices the light path has by now.
+        dvcm: ``(n,)`` replaces the field of that name, which is one of the ray before.
+    """
+
+    where: tuple[Tensor, ...]
+    p: Tensor
+    model: int
+    depth: int | Tensor
+    dvcm: Tensor
+
+
+@dataclass(frozen=True)
+class End:
+    """Ends of connections: points of paths, and what they do with light that comes from the other end, or goes there.
+
+    Attributes:
+        p: ``(3, n)`` the points.
+        o: ``(3, n)`` origins of rays to the other end, moved off the surface.
+        value: ``(3, n)`` throughput of the path times the value of the BSDF, times the cosine of the geometric normal at a
+            light path's end, that of the shading normal at a camera path's.
+        pdf: ``(n,)`` density per solid angle with which the path would go on to the other end.
+        others: ``(n,)`` ratio of densities to strategies that end nearer to the path's start, over that of the path
+            (:mod:`torchpt.paths.integrators.weights`).
+        cosine: ``(n,)`` of the direction to the other end and the geometric normal.
+        partner: ``(n,)`` int64 index of the BSDF model of the other end; -1: they are not connected.
+    """
+
+    p: Tensor
+    o: Tensor
+    value: Tensor
+    pdf: Tensor
+    others: Tensor
+    cosine: Tensor
+    partner: Tensor
+
+
+@dataclass(frozen=True)
 class VertexOutput:
     """Outputs of a vertex on surfaces of one BSDF model.
 
@@ -316,6 +392,8 @@ class VertexOutput:
         shadow: shadow rays, which the engine traces to add their contributions; None where no light is sampled.
         at: the surface points.
         splat: radiance for other pixels; None: none. Only integrators that declare ``splats`` return it.
+        kept: what connections need of the vertex; None: it is not kept.
+        end: the camera path's end of a connection; None: the vertex has none.
         surface: the points with their materials; None where the stage did not resolve them.
         direct: the light sample; None where no light was sampled.
         drawn: the BSDF sample; None where paths end here.
@@ -333,3 +411,5 @@ class VertexOutput:
     carried: Tensor | None = None
     chance: Tensor | None = None
     splat: Splat | None = None
+    kept: Kept | None = None
+    end: End | None = None

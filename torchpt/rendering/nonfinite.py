@@ -14,6 +14,7 @@ from torch import Tensor
 from torchpt.engines.engine import weighted_radiance
 from torchpt.paths.nonfinite import NonFinite, SampleId
 from torchpt.paths.state import PathState
+from torchpt.paths.store import VertexStore
 from torchpt.paths.wave import Wave
 from torchpt.scene.names import Names
 from torchpt.scene.scene import Scene
@@ -56,9 +57,9 @@ def describe_sample(scene: Scene, wave: Wave, sample_id: SampleId) -> str:
     return f"{_sample_name(wave, sample_id)} is not finite: {_cause_phrase(scene, wave, cause)}"
 
 
-def _trace(wave: Wave, state: PathState, observer: Any) -> Tensor:
+def _trace(wave: Wave, state: PathState, observer: Any, store: VertexStore | None) -> Tensor:
     """Return the samples ``(3, n)`` of paths, which an observer watches."""
-    return weighted_radiance(wave, state, observer=observer)
+    return weighted_radiance(wave, state, observer=observer, store=store)
 
 
 def _sample_name(wave: Wave, sample_id: SampleId) -> str:

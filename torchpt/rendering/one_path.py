@@ -15,11 +15,12 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError
 from torchpt.core.threads import limited_threads
-from torchpt.engines.engine import weighted_radiance
-from torchpt.paths.explain import CameraRay, EmitterHit, Explainer, Intersection, Scattering
+from torchpt.engines.engine import trace, weighted_radiance
+from torchpt.paths.explain import CameraRay, Connection, EmitterHit, Explainer, Intersection, Scattering
 from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.paths.state import DirectLight, VertexOutput
+from torchpt.paths.store import VertexStore
 from torchpt.paths.wave import clamp_scale
 from torchpt.physics.shapes import interact
 from torchpt.scene import Scene
@@ -27,7 +28,7 @@ from torchpt.scene.names import Names
 from torchpt.scene.prepare import make_wave
 from torchpt.scene.settings import Settings
 
-__all__ = ["BsdfSampleRecord", "EmissionRecord", "LightSampleRecord", "Path", "Vertex", "one_path"]
+__all__ = ["BsdfSampleRecord", "ConnectionRecord", "EmissionRecord", "LightSampleRecord", "Path", "Vertex", "one_path"]
 
 #: Three numbers: a colour, a point or a direction.
 Triple = tuple[float, ...]
@@ -79,6 +80,23 @@ class LightSampleRecord:
 
 
 @dataclass(frozen=True)
+class ConnectionRecord:
+    """Connection of a vertex with one of a light path.
+
+    Attributes:
+        position: the other end.
+        arriving: radiance that it would bring if nothing were in the way: with both BSDFs and the MIS weight.
+        visible: transmittance of the ray between both, from 0 to 1.
+        contribution: radiance added to the sample.
+    """
+
+    position: Triple
+    arriving: Triple
+    visible: float
+    contribution: Triple
+
+
+@dataclass(frozen=True)
 class BsdfSampleRecord:
     """BSDF sample at a vertex.
 
@@ -116,6 +134,7 @@ class Vertex:
         wo: direction to the previous vertex.
         emission: emission of the hit or of the environment; None if there is none.
         light: light sample; None if none was taken.
+        connection: connection with a vertex of a light path; None if there is none, or no light goes through it.
         scattered: BSDF sample; None at the limit of depth.
         radiance: radiance that the path has gathered so far.
     """
@@ -132,6 +151,7 @@ class Vertex:
     wo: Triple
     emission: EmissionRecord | None = None
     light: LightSampleRecord | None = None
+    connection: ConnectionRecord | None = None
     scattered: BsdfSampleRecord | None = None
     radiance: Triple
 
@@ -191,9 +211,14 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         wave = make_wave(scene, settings, params=None, dtype=torch.float32)
         explainer = Explainer(wave.context.world)
         x, y, number = (torch.tensor([value], device=scene.device) for value in (*pixel, sample))
+        store = None
+        if wave.integrator.connects:
+            assert wave.light_paths is not None
+            store = VertexStore(lanes=1)
+            trace(wave.light_paths, wave.light_paths.rays_of(x, y, number), store=store)
         state = wave.rays_of(x, y, number)
         explainer.on_start(state)
-        radiance = weighted_radiance(wave, state, observer=explainer)
+        radiance = weighted_radiance(wave, state, observer=explainer, store=store)
         return _PathBuilder(scene, explainer).build(settings, pixel, sample, radiance)
 
 
@@ -241,10 +266,15 @@ class _PathBuilder:
             events = [event for event in later if event.depth == intersection.depth]
             emitter_hit = next((event for event in events if isinstance(event, EmitterHit)), None)
             scattering = next((event for event in events if isinstance(event, Scattering)), None)
-            yield self._vertex(intersection, emitter_hit, scattering)
+            connection = next((event for event in events if isinstance(event, Connection)), None)
+            yield self._vertex(intersection, emitter_hit, scattering, connection)
 
     def _vertex(
-        self, intersection: Intersection, emitter_hit: EmitterHit | None, scattering: Scattering | None
+        self,
+        intersection: Intersection,
+        emitter_hit: EmitterHit | None,
+        scattering: Scattering | None,
+        connection: Connection | None,
     ) -> Vertex:
         """Return the vertex of a ray, whose events these are."""
         radiance = intersection.state.radiance
@@ -256,6 +286,10 @@ class _PathBuilder:
             assert output.direct is not None and output.shadow is not None
             light = self._light_sample(output.direct, output.shadow.radiance, scattering.transmittance)
             radiance = torch.addcmul(output.leaving.radiance, output.shadow.radiance, scattering.transmittance)
+        connected = None
+        if connection is not None:
+            connected = self._connection(connection)
+            radiance = radiance + connection.light.radiance * connection.transmittance
         wo, escaped = _first_lane(-intersection.state.d), int(intersection.hit.prim) < 0
         emission = None if emitter_hit is None else self._emission(emitter_hit)
         if escaped:
@@ -276,6 +310,7 @@ class _PathBuilder:
             wo=wo,
             emission=emission,
             light=light,
+            connection=connected,
             scattered=None if output is None else _bsdf_sample(output),
             radiance=_first_lane(radiance),
         )
@@ -297,6 +332,15 @@ class _PathBuilder:
             _first_lane(light.brought),
         )
 
+    def _connection(self, connection: Connection) -> ConnectionRecord:
+        light, transmittance = connection.light, connection.transmittance
+        return ConnectionRecord(
+            position=self._scene_point(light.o + light.d),
+            arriving=_first_lane(light.radiance),
+            visible=float(transmittance),
+            contribution=_first_lane(light.radiance * transmittance),
+        )
+
     def _light_sample(self, direct: DirectLight, unoccluded: Tensor, transmittance: Tensor) -> LightSampleRecord:
         sample, reflected = direct.sample, direct.reflected
         return LightSampleRecord(
@@ -312,7 +356,7 @@ class _PathBuilder:
 
     def _why_ended(self) -> str:
         """Return why the path ended."""
-        last = next(event for event in reversed(self.events) if not isinstance(event, EmitterHit))
+        last = next(event for event in reversed(self.events) if not isinstance(event, EmitterHit | Connection))
         if isinstance(last, Intersection) and float(last.state.t_max) > 0.0:
             return "escaped" if int(last.hit.prim) < 0 else "max_depth"
         output = next(event.output for event in reversed(self.events) if isinstance(event, Scattering))

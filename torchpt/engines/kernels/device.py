@@ -47,7 +47,7 @@ from torchpt.engines.kernels.engine import (
     count_samples,
     film_words,
 )
-from torchpt.engines.kernels.layout import HIT, Layout, Rows
+from torchpt.engines.kernels.layout import HIT, Block, Layout, Rows
 from torchpt.engines.kernels.programs import Kernel, Kernels, NamedTensors, probed_kernels, records_of, trace_stage
 from torchpt.engines.kernels.stages import CHUNK_FIELDS
 from torchpt.engines.work import SampleRange, TaskResult
@@ -315,6 +315,15 @@ class DeviceMemory:
         held = self.floats if values.is_floating_point() else self.words
         held[first : first + len(values), start : start + values.shape[1]] = values
 
+    def scatter(self, first: int, lanes: Tensor, values: Tensor) -> None:
+        """See :meth:`torchpt.engines.kernels.layout.Memory.scatter`."""
+        held = self.floats if values.is_floating_point() else self.words
+        held[first : first + len(values), lanes] = values.to(held.dtype)
+
+    def below(self, row: int) -> Block:
+        """See :meth:`torchpt.engines.kernels.layout.Memory.below`."""
+        return Block(self.words[row:].data_ptr())
+
 
 class Count:
     """A number of lanes in the device's memory; always true, as the host does not know it.
@@ -382,6 +391,7 @@ class DeviceCalls:
         self._prepared: dict[int, Arguments] = {}  # by id of the kernel, which they refer to
         self._salts: dict[tuple[int, int], Tensor] = {}
         self._bounds: dict[float, Tensor] = {}
+        self._depths: dict[int, Tensor] = {}
         self._start_salts = self.cuda.to_device(salts(0, torch.device("cpu")))
         self._uniforms = {"place": self.place.data_ptr(), "start_salts": self._start_salts.data_ptr()}
 
@@ -460,7 +470,10 @@ class DeviceCalls:
         bound = self._bounds.get(roulette)
         if bound is None:
             bound = self._bounds[roulette] = self.cuda.to_device(torch.tensor([roulette]))
-        self._uniforms |= {"salts": known.data_ptr(), "roulette": bound.data_ptr()}
+        number = self._depths.get(depth)
+        if number is None:
+            number = self._depths[depth] = self.cuda.to_device(torch.tensor([depth], dtype=torch.int32))
+        self._uniforms |= {"salts": known.data_ptr(), "roulette": bound.data_ptr(), "depth": number.data_ptr()}
 
     def run(
         self,
@@ -547,15 +560,16 @@ class DeviceEngine(KernelsEngine):
 
     Args:
         kernels: of the render.
+        store: see :class:`KernelsEngine`.
 
     Attributes:
         device_calls: launches the kernels; the same object as ``calls``.
         spare: slots of the next wave.
     """
 
-    def __init__(self, kernels: KernelsOnDevice) -> None:
+    def __init__(self, kernels: KernelsOnDevice, store: Any = None) -> None:
         self.device_calls = DeviceCalls(kernels)
-        super().__init__(kernels, calls=self.device_calls)
+        super().__init__(kernels, calls=self.device_calls, store=store)
         self.spare = self.device_calls.memory(3)
         self._cuda = kernels.cuda
         self._look = LateCheck(kernels.cuda)
@@ -568,7 +582,7 @@ class DeviceEngine(KernelsEngine):
 
     def _make_light_paths(self, halt: threading.Event | None) -> DeviceEngine | None:
         light_paths = self.kernels.light_paths
-        return DeviceEngine(light_paths) if isinstance(light_paths, KernelsOnDevice) else None
+        return DeviceEngine(light_paths, self.store) if isinstance(light_paths, KernelsOnDevice) else None
 
     def _count_rays(self, lanes: Count, each: int = 1) -> None:
         self._rays += [(counter, each) for counter in lanes.counters] if each else []
@@ -583,13 +597,16 @@ class DeviceEngine(KernelsEngine):
 
     def launch(self, chunk: Chunk) -> None:
         """Launch all kernels that fill ``slots`` with the radiance of a chunk's samples, after :meth:`begin_wave`."""
+        light_paths = self.light_paths
+        assert light_paths is None or isinstance(light_paths, DeviceEngine)
+        if light_paths is not None:
+            self.clear_store(chunk)
+            light_paths.begin_wave(chunk)
+            light_paths.launch(chunk)
         walk(self, self.spawn(chunk), self.wave.integrator.limits)
         self.mark_lost()
-        if self.light_paths is not None:
-            assert isinstance(self.light_paths, DeviceEngine)
-            self.light_paths.begin_wave(chunk)
-            self.light_paths.launch(chunk)
-            self.take_over(self.light_paths, chunk)
+        if light_paths is not None:
+            self.take_over(light_paths, chunk)
 
     def sort(self, paths: Paths) -> Counts:
         """See :class:`torchpt.paths.walk.Engine`; all kinds of hits count as present until no paths are left."""

@@ -19,7 +19,7 @@ from __future__ import annotations
 import ctypes
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any, ClassVar, cast
 
@@ -29,12 +29,13 @@ from torch import Tensor
 
 from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD, WORD
-from torchpt.engines.kernels.layout import HIT, Memory, Rows, path_state, state_values
+from torchpt.engines.kernels.layout import CONNECTION, HIT, Memory, Rows, path_state, state_values
 from torchpt.engines.kernels.programs import Kernel, Kernels
 from torchpt.engines.kernels.stages import CHUNK_FIELDS
 from torchpt.paths.integrators.base import check_output
 from torchpt.paths.layers import LAYERS
-from torchpt.paths.state import Shadow, Splat, VertexInput, no_shadow
+from torchpt.paths.state import End, Shadow, Splat, VertexInput, no_shadow
+from torchpt.paths.store import BLOCKS, PARTNER, block_of, kept_values, partner_of, vertex_of
 from torchpt.paths.walk import Counts, Observer, walk
 from torchpt.paths.wave import PixelSet, RayCounts
 from torchpt.physics.film import Film
@@ -54,6 +55,7 @@ __all__ = [
     "LaneCount",
     "Paths",
     "bounce_eagerly",
+    "connect_eagerly",
     "count_samples",
     "film_words",
 ]
@@ -133,6 +135,7 @@ class Calls:
         self._prepared: dict[int, Arguments] = {}  # by id of the kernel, which they refer to
         self._salts: dict[tuple[int, int], Any] = {}  # by depth and step
         self._bounds: dict[float, np.ndarray] = {}  # of survival probabilities, as uniforms
+        self._depths: dict[int, np.ndarray] = {}  # numbers of vertices, likewise
         self._start_salts = salts(0, torch.device("cpu"))
         # Address of each uniform.
         self._uniforms = {"place": self.place.ctypes.data, "start_salts": self._start_salts.data_ptr()}
@@ -194,7 +197,14 @@ class Calls:
         bound = self._bounds.get(roulette)
         if bound is None:
             bound = self._bounds[roulette] = np.array([roulette], np.float32)
-        self._uniforms |= {"salts": vertex_salts.data_ptr(), "roulette": bound.ctypes.data}
+        number = self._depths.get(depth)
+        if number is None:
+            number = self._depths[depth] = np.array([depth], np.int32)
+        self._uniforms |= {
+            "salts": vertex_salts.data_ptr(),
+            "roulette": bound.ctypes.data,
+            "depth": number.ctypes.data,
+        }
 
     def run(
         self,
@@ -242,6 +252,7 @@ class Calls:
 
 def bounce_eagerly(
     kernels: Kernels,
+    store: Memory | None,
     model: int,
     roulette: float,
     source: Memory,
@@ -255,6 +266,7 @@ def bounce_eagerly(
 
     Args:
         kernels: of the render.
+        store: vertices of light paths; None: paths are not connected.
         model: index of the BSDF model.
         roulette: see :class:`torchpt.paths.state.StageContext`.
         source: the arena to read paths from.
@@ -273,9 +285,22 @@ def bounce_eagerly(
         vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
         device = state.t_max.device
         start_salts = kernels.wave.integrator.start_salts(depth, device)
-        context = kernels.wave.context.at(salts(depth, device), roulette=roulette, start_salts=start_salts)
+        context = kernels.wave.context.at(salts(depth, device), roulette=roulette, start_salts=start_salts, depth=depth)
+        integrator, sample = kernels.wave.integrator, state.lane
+        if integrator.connects:
+            assert store is not None and kernels.store is not None
+            partner = partner_of(kernels.store.take(store, sample, PARTNER, block_of(depth) * kernels.store.count))
+            vertex = replace(vertex, partner=partner)
         output = kernels.wave.bounce(context, model, vertex)
-        check_output(kernels.wave.integrator, output)
+        check_output(integrator, output)
+        if output.kept is not None:
+            assert store is not None and kernels.store is not None
+            kept = kept_values(vertex, output.kept)
+            for block, where in enumerate(output.kept.where):
+                first, index = block * kernels.store.count, where.nonzero().squeeze(1)
+                chosen = {name: value.index_select(-1, index) for name, value in kept.items()}
+                kernels.store.scatter(store, sample[index], chosen, first)
+                kernels.store.scatter(store, sample, {"count": kept["depth"]}, first)
         after, no_ray = output.leaving, no_shadow(output.leaving)
         shadow = no_ray if output.shadow is None else output.shadow
         splat = Splat(torch.full_like(after.lane, -1), no_ray) if output.splat is None else output.splat
@@ -284,8 +309,39 @@ def bounce_eagerly(
     values |= {f"shadow_{name}": value for name, value in _values_of_shadow(shadow).items()}
     values |= {f"splat_{name}": value for name, value in _values_of_shadow(splat.light).items()}
     values["splat_pixel"] = splat.pixel
+    if integrator.connects:
+        ended = {"end_partner": torch.full_like(after.lane, -1), "connection_t": torch.zeros_like(after.t_max)}
+        end = output.end
+        values |= ended if end is None else {**ended, **{f"end_{name}": value for name, value in vars(end).items()}}
     rows.put(target, start, values)
     return count * (int(output.shadow is not None) + int(output.splat is not None))
+
+
+def connect_eagerly(
+    kernels: Kernels, store: Memory, model: int, arena: Memory, places: Memory, count: int, depth: int
+) -> None:
+    """Run the stage of connections with tensor operations in place of its kernel.
+
+    Args:
+        kernels: of the render.
+        store: vertices of light paths.
+        model: index of the BSDF model of these.
+        arena: of the camera paths behind their vertex.
+        places: list of the lanes.
+        count: number of lanes.
+        depth: number of the camera paths' vertex.
+    """
+    rows, lanes, of_store = kernels.state, places.words[0, :count], kernels.store
+    assert of_store is not None
+    with torch.no_grad():
+        ends = rows.take(arena, lanes, tuple(name for name in CONNECTION if name.startswith("end_")))
+        sample = rows.take(arena, lanes, ("lane",))["lane"]
+        values = of_store.take(store, sample, of_store.names, block_of(depth) * of_store.count)
+        device = sample.device
+        context = kernels.wave.context.at(salts(depth, device), start_salts=salts(0, device), depth=depth)
+        end = End(**{name.removeprefix("end_"): value for name, value in ends.items()})
+        light = kernels.wave.integrator.connect(context, model, vertex_of(values), values["depth"], end)
+    rows.scatter(arena, lanes, {f"connection_{name}": value for name, value in _values_of_shadow(light).items()})
 
 
 def _values_of_shadow(light: Shadow) -> dict[str, Tensor]:
@@ -494,9 +550,11 @@ class KernelsEngine:
         kernels: of the render.
         halt: set to cancel the render; None: it cannot be cancelled.
         calls: runs the kernels; None: in the calling thread.
+        store: where light paths keep vertices for connections; None: memory of its own, if the integrator connects paths.
 
     Attributes:
         slots: radiance of the chunk's samples.
+        store: blocks of vertices of light paths (:mod:`torchpt.paths.store`), a column for each sample; None: there are none.
         shown: layers of the chunk's samples; None before `layers` was called.
         tally: counts of rays and truncated paths of the chunk.
         splats: splats of the chunk's samples, if ``keeps_splats``.
@@ -504,7 +562,9 @@ class KernelsEngine:
 
     keeps_splats: ClassVar[bool] = True
 
-    def __init__(self, kernels: Kernels, halt: threading.Event | None = None, calls: Any = None) -> None:
+    def __init__(
+        self, kernels: Kernels, halt: threading.Event | None = None, calls: Any = None, store: Memory | None = None
+    ) -> None:
         self.kernels, self.wave = kernels, kernels.wave
         self.calls: Calls = Calls(kernels, halt or threading.Event()) if calls is None else calls
         self.search = self._make_search()
@@ -514,12 +574,15 @@ class KernelsEngine:
         self.splats: list[Splats] = []
         self._lost: list[Any] = []  # samples with splats that are not finite
         self._rooms = [self._room() for _ in range(2)]  # memory of even and of odd vertices
+        if store is None and kernels.store is not None and self.wave.integrator.connects:
+            store = self.calls.memory(BLOCKS * kernels.store.count)
+        self.store = store
         self.light_paths = self._make_light_paths(halt)
 
     def _make_light_paths(self, halt: threading.Event | None) -> KernelsEngine | None:
         """Return the engine of the light paths that are traced beside the samples; None: there are none."""
         light_paths = self.kernels.light_paths
-        return None if light_paths is None else KernelsEngine(light_paths, halt)
+        return None if light_paths is None else KernelsEngine(light_paths, halt, store=self.store)
 
     def _make_search(self) -> ChunkSearch:
         return ChunkSearch(self.calls)
@@ -553,7 +616,7 @@ class KernelsEngine:
     def memories(self) -> list[Memory]:
         """Return all memory of the engine."""
         memories = [self.slots, *self.search.passed, self.search.transmitting]
-        memories += [] if self.shown is None else [self.shown]
+        memories += [memory for memory in (self.shown, self.store if self.wave.integrator.connects else None) if memory]
         return memories + [memory for room in self._rooms for memory in (room.arena, *room.lists)]
 
     def rebind(self, kernels: Kernels, halt: threading.Event) -> None:
@@ -568,14 +631,30 @@ class KernelsEngine:
     def trace(self, chunk: Chunk) -> RayCounts:
         """Fill ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other."""
         self.tally = RayCounts()
-        walk(self, self.spawn(chunk), self.wave.integrator.limits)
-        self.mark_lost()
         if self.light_paths is not None:
+            self.clear_store(chunk)
             tally = self.light_paths.trace(chunk)
             self.tally.rays += tally.rays
             self.tally.truncated += tally.truncated
+        walk(self, self.spawn(chunk), self.wave.integrator.limits)
+        self.mark_lost()
+        if self.light_paths is not None:
             self.take_over(self.light_paths, chunk)
         return self.tally
+
+    def clear_store(self, chunk: Chunk) -> None:
+        """Forget the vertices that light paths of the chunk before have kept."""
+        rows = self.kernels.store
+        if self.store is not None and rows is not None:
+            for block in range(BLOCKS):
+                self.store.words[block * rows.count + rows.first("count"), : chunk.pixels * chunk.samples] = 0
+
+    def _slots(self, depth: int) -> Any:
+        """Return the slots of kernels that read or write the store at vertex ``depth``; None: they do neither."""
+        if self.store is None or self.kernels.store is None:
+            return None
+        connects = self.wave.integrator.connects
+        return self.store.below(block_of(depth) * self.kernels.store.count) if connects else self.store
 
     def take_over(self, light_paths: KernelsEngine, chunk: Chunk) -> None:
         """Take over the splats of the light paths of a chunk, one path for each sample."""
@@ -724,14 +803,23 @@ class KernelsEngine:
             if model in kernels.eager:
                 lane_count, first_lane = calls.known(count), calls.known(start)
                 self.tally.rays += bounce_eagerly(
-                    kernels, model, roulette, paths.arena, after.arena, lanes, lane_count, first_lane, paths.depth
+                    kernels,
+                    self.store,
+                    model,
+                    roulette,
+                    paths.arena,
+                    after.arena,
+                    lanes,
+                    lane_count,
+                    first_lane,
+                    paths.depth,
                 )
                 continue
             if not kernels.fused:
                 calls.write_from(start)
             kernel = kernels.bounce(model, roulette, paths.depth)
             lanes = lanes if kernels.listed else None
-            calls.run(kernel, count, paths.arena, after.arena, lanes, lists=after.lists)
+            calls.run(kernel, count, paths.arena, after.arena, lanes, lists=after.lists, slots=self._slots(paths.depth))
             self._count_rays(count, kernel.program.shadows + int(kernels.fused))  # with the rays to the next vertex
         return after
 
@@ -741,6 +829,8 @@ class KernelsEngine:
         paths.shadows = "shadow_o" in rows
         if "splat_o" in rows:
             self._splat(paths)
+        if self.light_paths is not None and self.wave.integrator.connects:
+            self._connect(paths)
         if paths.shadows:
             self.search.light(paths.arena, paths.count)
 
@@ -753,24 +843,10 @@ class KernelsEngine:
         floats, words = cast(Any, arena.floats), cast(Any, arena.words)
         pixel, transmittance = words[rows.first("splat_pixel"), :n], floats[rows.first("splat_transmittance"), :n]
         transmittance[:] = 0.0
-        lanes = (pixel >= 0).nonzero()
-        lanes = lanes[0] if isinstance(lanes, tuple) else lanes[:, 0]  # of numpy, of torch
+        lanes = _nonzero(pixel >= 0)
         if not len(lanes):
             return
-        # The rows o, d and t of the splats' shadow rays, and of those to lights, which the search reads.
-        splat, shadow = (
-            words[rows.first(f"{name}_o") : rows.first(f"{name}_radiance"), :n] for name in ("splat", "shadow")
-        )
-        # Few lanes have a splat: theirs are searched in the first columns.
-        columns = slice(0, len(lanes))
-        saved = shadow[:, columns] + 0
-        shadow[:, columns] = splat[:, lanes]
-        self.search.light(arena, self.calls.lanes(len(lanes)))
-        shadow[:, columns] = saved
-        if "transmittance" in rows:
-            passed = floats[rows.first("transmittance"), columns]
-        else:
-            passed = (words[rows.first("blocked"), columns] == 0) * 1.0
+        passed = self._passed(paths, "splat", lanes, n)
         transmittance[lanes] = passed
         first = rows.first("splat_radiance")
         value = floats[first : first + 3][:, lanes] * transmittance[lanes]
@@ -781,6 +857,62 @@ class KernelsEngine:
             senders, pixels, light = map(torch.as_tensor, splats)
             self.splats.append(Splats(senders.long(), pixels.long(), light))
         self._lost.append(lane[arrives & ~finite])
+
+    def _connect(self, paths: Paths) -> None:
+        """Connect the vertices that ``paths`` have left to those that their light paths keep, and add the light.
+
+        On a device the number of lanes is waited for.
+        """
+        kernels, calls, rows, depth = self.kernels, self.calls, self.kernels.state, paths.depth - 1
+        calls.clear()
+        calls.run(kernels.list_ends(), paths.count, paths.arena, paths.arena, lists=paths.lists)
+        _, places = calls.counted()
+        for model, kind in enumerate(kernels.world.materials.models):
+            count, lanes = places[model], paths.lists[model]
+            if not count or kind.smooth:
+                continue
+            self._count_rays(count)
+            if model in kernels.eager:
+                assert self.store is not None
+                connect_eagerly(kernels, self.store, model, paths.arena, lanes, calls.known(count), depth)
+            else:
+                slots = self._slots(depth)
+                calls.run(kernels.connect(model), count, paths.arena, paths.arena, lanes, slots=slots)
+        n, floats = calls.known(paths.count), cast(Any, paths.arena.floats)
+        lanes = _nonzero(floats[rows.first("connection_t"), :n])
+        if len(lanes):
+            passed = self._passed(paths, "connection", lanes, n)
+            first, radiance = rows.first("connection_radiance"), rows.first("radiance")
+            floats[radiance : radiance + 3, lanes] += floats[first : first + 3][:, lanes] * passed
+
+    def _passed(self, paths: Paths, name: str, lanes: Any, n: int) -> Any:
+        """Return the transmittance of shadow rays other than those to lights.
+
+        Args:
+            paths: of ``n`` lanes.
+            name: of their rows: ``splat`` or ``connection``.
+            lanes: those that have such a ray.
+            n: number of lanes.
+        """
+        rows, arena = self.kernels.state, paths.arena
+        floats, words = cast(Any, arena.floats), cast(Any, arena.words)
+        # The rows o, d and t of these rays, and of those to lights, which the search reads.
+        ray, shadow = (words[rows.first(f"{k}_o") : rows.first(f"{k}_radiance"), :n] for k in (name, "shadow"))
+        # They are searched in the first columns.
+        columns = slice(0, len(lanes))
+        saved = shadow[:, columns] + 0
+        shadow[:, columns] = ray[:, lanes]
+        self.search.light(arena, self.calls.lanes(len(lanes)))
+        shadow[:, columns] = saved
+        if "transmittance" in rows:
+            return floats[rows.first("transmittance"), columns]
+        return (words[rows.first("blocked"), columns] == 0) * 1.0
+
+
+def _nonzero(values: Any) -> Any:
+    """Return the indices of values that are not 0, of an array of numpy or a tensor."""
+    found = values.nonzero()
+    return found[0] if isinstance(found, tuple) else found[:, 0]
 
 
 class _Layers(Observer[Paths]):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -33,10 +33,12 @@ if TYPE_CHECKING:
     from torchpt.paths.wave import Wave
 
 __all__ = [
+    "CONNECTION",
     "HIT",
     "PASS",
     "SHADOW",
     "SPLAT",
+    "Block",
     "Fields",
     "Layout",
     "Memory",
@@ -70,6 +72,20 @@ SPLAT: Fields = {
     "splat_radiance": ((3,), "f"),
     "splat_transmittance": ((), "f"),
 }
+#: Fields of a camera path's end of a connection, of the connection's shadow ray, and of the transmittance of that.
+CONNECTION: Fields = {
+    "end_p": ((3,), "f"),
+    "end_o": ((3,), "f"),
+    "end_value": ((3,), "f"),
+    "end_pdf": ((), "f"),
+    "end_others": ((), "f"),
+    "end_cosine": ((), "f"),
+    "end_partner": ((), "l"),
+    "connection_o": ((3,), "f"),
+    "connection_d": ((3,), "f"),
+    "connection_t": ((), "f"),
+    "connection_radiance": ((3,), "f"),
+}
 #: Fields of a ray in transit: the ray, the distance before its origin, and its lane in the arena of paths.
 PASS: Fields = {
     "pass_o": ((3,), "f"),
@@ -102,6 +118,13 @@ def state_values(state: PathState) -> dict[str, Tensor]:
     return {name: value for name, value in values.items() if value is not None} | extra
 
 
+@dataclass(frozen=True)
+class Block:
+    """Rows of a larger memory, as a kernel sees them."""
+
+    address: int
+
+
 class Memory:
     """Rows of 32-bit words, padded at the end since kernels write whole vectors.
 
@@ -115,6 +138,10 @@ class Memory:
         self.words = np.zeros((rows, CAPACITY), np.int32)
         self.floats = self.words.view(np.float32)
         self.address = self.words.ctypes.data
+
+    def below(self, row: int) -> Block:
+        """Return the memory from a row on."""
+        return Block(self.address + self.words.itemsize * self.words.shape[1] * row)
 
     def repeat(self, first: int, values: Tensor, times: int) -> None:
         """Write ``values (rows, n)`` to the rows from ``first`` on, ``times`` times side by side."""
@@ -131,6 +158,11 @@ class Memory:
         """Write ``values (rows, n)`` to the rows from ``first`` on, at lanes from ``start`` on."""
         memory = self.floats if values.is_floating_point() else self.words
         memory[first : first + len(values), start : start + values.shape[1]] = values.numpy()
+
+    def scatter(self, first: int, lanes: np.ndarray, values: Tensor) -> None:
+        """Write ``values (rows, n)`` to the rows from ``first`` on, at ``lanes (n,)``."""
+        memory = self.floats if values.is_floating_point() else self.words
+        memory[first : first + len(values), lanes] = values.numpy()
 
 
 class Rows:
@@ -158,6 +190,11 @@ class Rows:
     def state(self) -> tuple[str, ...]:
         """Return the names of the fields that belong to the path state."""
         return tuple(name for name in self._fields if name in _STATE or name.startswith(EXTRA))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of all fields."""
+        return tuple(self._fields)
 
     def first(self, name: str) -> int:
         """Return the first row of a field."""
@@ -188,13 +225,13 @@ class Rows:
             inputs[name] = tracer.lane(like, node)
         return inputs
 
-    def take(self, memory: Memory, lanes: np.ndarray, names: tuple[str, ...]) -> dict[str, Tensor]:
-        """Return fields of some lanes as tensors by name; names without rows are left out."""
+    def take(self, memory: Memory, lanes: Any, names: tuple[str, ...], first: int = 0) -> dict[str, Tensor]:
+        """Return fields of some lanes as tensors by name, from row ``first`` on; names without rows are left out."""
         values = {}
         for name in names:
             if name in self._fields:
                 shape, ty = self._fields[name]
-                value = memory.take(self._first[name], math.prod(shape), lanes, _DTYPES[ty])
+                value = memory.take(first + self._first[name], math.prod(shape), lanes, _DTYPES[ty])
                 values[name] = value.view(*shape, len(lanes))
         return values
 
@@ -204,6 +241,12 @@ class Rows:
             if name in self._fields and value is not None:
                 shape, _ = self._fields[name]
                 memory.put(self._first[name], start, value.reshape(math.prod(shape), -1))
+
+    def scatter(self, memory: Memory, lanes: Any, values: dict[str, Tensor], first: int = 0) -> None:
+        """Write fields of some lanes from tensors, from row ``first`` on."""
+        for name, value in values.items():
+            shape, _ = self._fields[name]
+            memory.scatter(first + self._first[name], lanes, value.reshape(math.prod(shape), -1))
 
     def nodes(self, tracer: Tracer, **fields: Tensor) -> list[tuple[int, int]]:
         """Return pairs of row and node for results by field; values that all lanes share are broadcast."""
@@ -235,6 +278,7 @@ class Layout:
     Attributes:
         state: rows of an arena of paths.
         passed: rows of an arena of rays in transit.
+        store: rows of a block of the store of vertices of light paths (:mod:`torchpt.paths.store`); None: there is none.
         models: number of BSDF models.
         has_environment: True: the scene has an environment light.
         has_emitters: True: a ray may hit an emitter.
@@ -259,6 +303,7 @@ class Layout:
         self.has_transmission = self.has_opacity or wave.integrator.has_own_transmit
         self.listed = not fused or self.models > 1 or self.has_environment
         self.state = Rows(_path_fields(self))
+        self.store = _store_rows(wave)
         self.passed = Rows({**PASS, "transmittance": ((), "f"), **_key_field(wave), **HIT})
 
     # Lists 0 .. models - 1 belong to the models. Counter 0 counts the lanes of an arena, counter k + 1 those of list k.
@@ -287,6 +332,18 @@ def _state_of_one_lane(rows: int) -> PathState:
         return camera_state(vector, vector, key)
 
 
+def _store_rows(wave: Wave) -> Rows | None:
+    """Return the rows of a block of the store, in a wave of camera paths or of light paths; None: it has no store."""
+    light_paths = wave.integrator if wave.integrator.connected else wave.integrator.light_walk()
+    if light_paths is None or not light_paths.connected:
+        return None
+    return Rows({
+        "count": ((), "l"), "depth": ((), "l"), "model": ((), "l"), "p": ((3,), "f"),
+        "o": ((3,), "f"), "d": ((3,), "f"), "throughput": ((3,), "f"), **_key_field(wave), **HIT,
+        **{EXTRA + field.name: ((), "l" if field.whole else "f") for field in light_paths.fields},
+    })  # fmt: skip
+
+
 def _path_fields(layout: Layout) -> Fields:
     """Return the fields of the arena: the path state of this scene, filter weight, hit, shadow ray, splat."""
     wave, world = layout.wave, layout.world
@@ -297,6 +354,8 @@ def _path_fields(layout: Layout) -> Fields:
     fields |= HIT
     if wave.integrator.splats_at_surfaces:
         fields |= SPLAT
+    if wave.integrator.connects:
+        fields |= CONNECTION
     shadows = world.lights is not None if wave.first_surface is None else wave.first_surface.shadows(world)
     if not layout.fused and (shadows or wave.integrator.splats_at_surfaces):
         fields |= SHADOW
@@ -345,6 +404,10 @@ class Trace:
     def start_salts(self) -> Tensor:
         """Return the salts of depth 0."""
         return self.uniform("start_salts", torch.zeros(len(Dimension), dtype=torch.int32))
+
+    def depth(self) -> Tensor:
+        """Return the number of the vertex."""
+        return self.uniform("depth", torch.ones(1, dtype=torch.int32))
 
     def roulette(self, bound: float | None) -> float | Tensor:
         """Return the upper bound of the survival probability; 0: no roulette at the vertex. None: an input ``(1,)``."""

@@ -32,6 +32,7 @@ from torchpt.engines.kernels import stages
 from torchpt.engines.kernels.layout import Layout, Trace
 from torchpt.engines.kernels.stages import kinds_of
 from torchpt.paths.roulette import DEEP
+from torchpt.paths.store import BLOCKS
 from torchpt.paths.transmission import non_opaque
 
 if TYPE_CHECKING:
@@ -393,11 +394,13 @@ class Kernels(Layout):
     def rows(self, layers: Mapping[str, Any]) -> int:
         """Return how many 32-bit numbers a thread allocates for each lane.
 
-        They are two arenas of paths, two sets of lists, the radiance of the samples, and the channels of layers
-        (:class:`torchpt.engines.kernels.engine.KernelsEngine`).
+        They are two arenas of paths, two sets of lists, the radiance of the samples, the channels of layers, and all that light
+        paths need (:class:`torchpt.engines.kernels.engine.KernelsEngine`).
         """
         channels = sum(len(layer.channels) for layer in layers.values())
         of_light = 0 if self.light_paths is None else self.light_paths.rows({})
+        if self.wave.integrator.connects and self.store is not None:
+            of_light += BLOCKS * self.store.count
         return 2 * self.state.count + 2 * (self.models + 2) + 3 + channels + of_light
 
     # -- vertices of paths
@@ -435,6 +438,16 @@ class Kernels(Layout):
     def terminate(self) -> Kernel:
         """See :func:`torchpt.engines.kernels.stages.terminate`."""
         return self._get(self.listed, stages.terminate)
+
+    # -- connections
+
+    def list_ends(self) -> Kernel:
+        """See :func:`torchpt.engines.kernels.stages.list_ends`."""
+        return self._get(False, stages.list_ends)
+
+    def connect(self, model: int) -> Kernel:
+        """See :func:`torchpt.engines.kernels.stages.connect`."""
+        return self._get(True, stages.connect, model)
 
     # -- the search by packets
 
@@ -509,6 +522,10 @@ class Kernels(Layout):
             yield True, stages.escape, ()
         for key in self.bounces():
             yield self.listed, stages.bounce, key
+        if self.wave.integrator.connects:
+            for model, kind in enumerate(self.world.materials.models):
+                if not kind.smooth and model not in self.eager:
+                    yield True, stages.connect, (model,)
 
     def bounces(self) -> Iterator[tuple[Any, ...]]:
         """Yield the arguments of the kernels of surfaces, about in the order of their use."""
@@ -590,7 +607,8 @@ def probed_kernels(wave: Wave, own: Sequence[int], packets: bool, make: Callable
         make: makes the kernels; True: fused.
     """
     opaque = wave.context.world.materials.opacity is None and not wave.integrator.has_own_transmit
-    kernels = make(packets and opaque and wave.first_surface is None and not wave.integrator.splats_at_surfaces)
+    sent = wave.integrator.splats_at_surfaces or wave.integrator.connects  # shadow rays other than those to lights
+    kernels = make(packets and opaque and wave.first_surface is None and not sent)
     eager = kernels.probe(own) if wave.integrator.light else {}
     if eager and kernels.fused:  # stages that run as tensor operations need searches between the stages
         kernels = make(False)

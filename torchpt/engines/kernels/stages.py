@@ -15,10 +15,11 @@ from torch import Tensor
 from torchpt.compiler.packet import KINDS
 from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 from torchpt.compiler.tracing import Tracer
-from torchpt.engines.kernels.layout import Trace, path_state
+from torchpt.engines.kernels.layout import CONNECTION, Trace, path_state
 from torchpt.paths import layers as aov
 from torchpt.paths.integrators.base import check_fields, check_output
-from torchpt.paths.state import PathState, Shadow, Splat, VertexInput, no_shadow
+from torchpt.paths.state import End, Kept, PathState, Shadow, Splat, VertexInput, VertexOutput, no_shadow
+from torchpt.paths.store import PARTNER, kept_values, partner_of, vertex_of
 from torchpt.paths.transmission import non_opaque, opacity_at, origins_behind
 from torchpt.paths.wave import camera_state
 from torchpt.physics.samplers import Dimension, Draws
@@ -34,11 +35,13 @@ __all__ = [
     "attenuate_shadow_rays",
     "begin_shadow_rays",
     "bounce",
+    "connect",
     "emit",
     "escape",
     "generate",
     "kinds_of",
     "layers",
+    "list_ends",
     "list_transmitting",
     "nearest",
     "occluded",
@@ -248,14 +251,26 @@ def bounce(trace: Trace, model: int, roulette: float | None, first: bool = False
     salts = trace.salts()
     state, passthrough = trace.state()
     hit = trace.hit()
+    integrator = layout.wave.integrator
+    partner = None
+    if integrator.connects:
+        assert layout.store is not None
+        partner = partner_of(layout.store.read(tracer, *PARTNER, place=trace.node(state.lane)))
     with tracer:
         start_salts = trace.start_salts() if first else None
-        context = layout.wave.context.at(salts, roulette=trace.roulette(roulette), start_salts=start_salts)
-        output = layout.wave.bounce(context, model, VertexInput(state, hit))
-        check_output(layout.wave.integrator, output)
+        depth = trace.depth() if layout.store is not None else 0
+        context = layout.wave.context.at(salts, roulette=trace.roulette(roulette), start_salts=start_salts, depth=depth)
+        vertex = VertexInput(state, hit, partner)
+        output = layout.wave.bounce(context, model, vertex)
+        check_output(integrator, output)
     after, shadow = output.leaving, output.shadow
     if not layout.fused:
-        return _with_shadow(trace, after, shadow, output.splat, passthrough)
+        sinks = _with_shadow(trace, after, shadow, output.splat, passthrough)
+        if output.kept is not None:
+            _keep(trace, sinks, vertex, output.kept)
+        if integrator.connects:
+            _write_end(trace, sinks, output)
+        return sinks
     sinks = Sinks(shadows=int(shadow is not None))
     if shadow is not None:
         blocked = occluded(tracer, shadow.o, shadow.d, shadow.t_max)
@@ -316,6 +331,74 @@ def _with_shadow(
         shadow_radiance=shadow.radiance,
     )
     return sinks
+
+
+# ---- Kernels of connections: vertices of light paths in the store, and those of camera paths that are connected to them
+#
+# The store is the slots of these kernels: a column for each sample, and the rows of its blocks below each other. Kernels of
+# camera paths see one block of it. ``bounce`` of light paths keeps vertices, and that of camera paths writes their ends of
+# connections; ``list_ends`` lists these by the model of the other end, and ``connect`` makes the connections.
+
+
+def _keep(trace: Trace, sinks: Sinks, vertex: VertexInput, kept: Kept) -> None:
+    """Store vertices of light paths in the blocks that they were chosen for; ``count`` in all blocks."""
+    tracer, rows = trace.tracer, trace.layout.store
+    assert rows is not None
+    with tracer:
+        values = kept_values(vertex, kept)
+    place = trace.node(vertex.state.lane)
+    pairs, count = rows.nodes(tracer, **values), rows.nodes(tracer, count=values["depth"])
+    for block, where in enumerate(kept.where):
+        first = block * rows.count
+        chosen = tuple((first + row, node) for row, node in pairs)
+        sinks.scatter.append(Scatter(trace.node(where), place, chosen, slots=True))
+        every = tuple((first + row, node) for row, node in count)
+        sinks.scatter.append(Scatter(_ALL_LANES, place, every, slots=True))
+
+
+def _write_end(trace: Trace, sinks: Sinks, output: VertexOutput) -> None:
+    """Write the camera paths' ends of connections, and shadow rays of length 0 for those that are not made."""
+    tracer, rows, state, end = trace.tracer, trace.layout.state, output.leaving, output.end
+    with tracer:
+        nothing, no_ray = torch.zeros_like(state.t_max), torch.zeros_like(state.o)
+        if end is None:
+            no_partner = torch.full_like(state.lane, -1)
+            end = End(no_ray, no_ray, no_ray, nothing, nothing, nothing, no_partner)
+    values = {f"end_{name}": value for name, value in vars(end).items()}
+    values |= {"connection_o": no_ray, "connection_d": no_ray, "connection_t": nothing, "connection_radiance": no_ray}
+    sinks.write += rows.nodes(tracer, **values)
+
+
+def list_ends(trace: Trace) -> Sinks:
+    """Append lanes to the lists of the BSDF models that their connections end at."""
+    tracer, layout = trace.tracer, trace.layout
+    partner = layout.state.read(tracer, "end_partner")["end_partner"]
+    with tracer:
+        masks = [partner == model for model in range(layout.models)]
+    return Sinks(appends=[AppendIndex(trace.node(mask), list=k, counter=k + 1) for k, mask in enumerate(masks)])
+
+
+def connect(trace: Trace, model: int) -> Sinks:
+    """Write the shadow rays of connections with vertices of light paths on BSDF model ``model``, by its index."""
+    tracer, layout, wave = trace.tracer, trace.layout, trace.layout.wave
+    rows, store = layout.state, layout.store
+    assert store is not None
+    salts, start_salts = trace.salts(), trace.start_salts()
+    lane, place = rows.read(tracer, "lane")["lane"], trace.place()
+    ends = rows.read(tracer, *(name for name in CONNECTION if name.startswith("end_")))
+    end = End(**{name.removeprefix("end_"): value for name, value in ends.items()})
+    values = store.read(tracer, *store.names, place=trace.node(lane))
+    with tracer:
+        context = wave.context.at(salts, start_salts=start_salts, depth=trace.depth())
+        light = wave.integrator.connect(context, model, vertex_of(values), values["depth"], end)
+    written = rows.nodes(
+        tracer,
+        connection_o=light.o,
+        connection_d=light.d,
+        connection_t=light.t_max,
+        connection_radiance=light.radiance,
+    )
+    return Sinks(scatter=[Scatter(_ALL_LANES, trace.node(place), tuple(written))])
 
 
 # ---- Kernels of transmission: rays that pass surfaces and media

@@ -17,7 +17,7 @@ from torchpt.core.errors import SceneError
 from torchpt.paths import transmission
 from torchpt.paths import vertex as stages
 from torchpt.paths.roulette import DEEP, DEEP_CAP
-from torchpt.paths.state import Emission, Field, StageContext, Transmission, VertexInput, VertexOutput
+from torchpt.paths.state import Emission, End, Field, Shadow, StageContext, Transmission, VertexInput, VertexOutput
 from torchpt.paths.vertex import STRATEGIES, Plan
 from torchpt.physics.lights import LIGHT_SAMPLERS
 from torchpt.physics.samplers import salts
@@ -129,6 +129,7 @@ class Integrator(FrozenConfig):
         fields: fields of its own in the path state.
         splats: True: samples add radiance to pixels other than their own, by its stages or by those of its light paths.
         starts_on_lights: True: its paths start on lights, and the stage of the first vertex differs from that of others.
+        connected: True: its paths are light paths, and keep vertices for connections.
         strategy: how light is found, one of :data:`torchpt.paths.state.STRATEGIES`. This value and those below are for kinds
             without a parameter of the name.
         rr_prob: constant survival probability of roulette; None: by throughput.
@@ -144,6 +145,7 @@ class Integrator(FrozenConfig):
     fields: ClassVar[Sequence[Field]] = ()
     splats: ClassVar[bool] = False
     starts_on_lights: ClassVar[bool] = False
+    connected: bool = False
 
     strategy: str = "mis"
     rr_prob: float | None = None
@@ -174,6 +176,11 @@ class Integrator(FrozenConfig):
     def start_salts(self, depth: int, device: torch.device) -> Tensor | None:
         """Return the salts of depth 0 at vertex ``depth`` where its stage needs them; None elsewhere."""
         return salts(0, device) if depth == 1 and self.starts_on_lights else None
+
+    @property
+    def connects(self) -> bool:
+        """Return True if vertices of its paths are connected to those that its light paths keep."""
+        return False
 
     @property
     def splats_at_surfaces(self) -> bool:
@@ -210,6 +217,18 @@ class Integrator(FrozenConfig):
     def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
         """Return the outputs of a vertex on surfaces of BSDF model ``model``. A stage."""
         return stages.bounce(context, model, vertex)
+
+    def connect(self, context: StageContext, model: int, vertex: VertexInput, depth: Tensor, end: End) -> Shadow:
+        """Return the light that goes through connections of camera paths with light paths. A stage.
+
+        Args:
+            context: of the vertex of the camera paths, with the salts of depth 0.
+            model: index of the BSDF model of the light paths' vertices.
+            vertex: the light paths' vertices, as they were kept.
+            depth: their numbers ``(n,)``, 1 at the first hit.
+            end: the camera paths' ends.
+        """
+        raise NotImplementedError(f"{self.name} declares connections, and has no stage for them")
 
     def transmit(self, context: StageContext, vertex: VertexInput) -> Transmission:
         """Return which rays pass their hit, and which a medium scatters before it.

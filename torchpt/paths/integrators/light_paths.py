@@ -1,6 +1,7 @@
-"""Light paths: paths that start on the lights, and whose vertices are joined to the camera (light tracing).
+"""Light paths: paths that start on the lights, and whose vertices are joined to the camera (light tracing), or kept.
 
-A light path carries flux. At each vertex the light that it sends to the camera is a splat, on whatever pixel sees the vertex.
+A light path carries flux. At each vertex the light that it sends to the camera is a splat, on whatever pixel sees the vertex;
+camera paths may be connected to vertices that are kept (:mod:`torchpt.paths.store`).
 The adjoint of a BSDF differs from the BSDF where light is refracted (``eta^2``) and where shading normals are not those of the
 geometry (Veach, *Robust Monte Carlo Methods for Light Transport Simulation*, 1997, sections 5.2 and 5.3): values are those of
 the BSDF with light that comes from where the path does, over the cosine of its arrival, so that both are in them.
@@ -18,8 +19,28 @@ from torch import Tensor
 from torchpt.math.vectors import dot, largest, safe_reciprocal
 from torchpt.paths import vertex as stages
 from torchpt.paths.integrators.base import DEPTHS, Integrator, Limits
-from torchpt.paths.integrators.weights import FIELDS, Arrival, leaving_dvc, reduced, seen_from
-from torchpt.paths.state import Drawn, Field, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
+from torchpt.paths.integrators.weights import (
+    FIELDS,
+    Arrival,
+    leaving_dvc,
+    leaving_dvcm,
+    reduced,
+    reverse_pdf,
+    seen_from,
+)
+from torchpt.paths.state import (
+    Drawn,
+    End,
+    Field,
+    Kept,
+    PathState,
+    Shadow,
+    Splat,
+    StageContext,
+    VertexInput,
+    VertexOutput,
+)
+from torchpt.paths.store import BLOCKS
 from torchpt.paths.surface import Surface, surface_at
 from torchpt.paths.wave import camera_state
 from torchpt.physics import lights
@@ -55,6 +76,9 @@ class LightPaths(Integrator):
         **DEPTHS,
         "fraction": Scalar(1.0, above=0.0, high=1.0, doc="number of light paths for each camera path"),
         "weighted": Flag(True, doc="whether splats are weighted among all strategies"),
+        "joined": Flag(True, doc="whether vertices are joined to the camera"),
+        "connected": Flag(False, doc="whether vertices are kept for connections"),
+        "number": Scalar(0.0, low=0.0, doc="number of connections of two vertices for each sample, in weights"),
     }
     lit = False
     splats = True
@@ -108,10 +132,69 @@ class LightPaths(Integrator):
         # At the first vertex: the ray with which the path left its light, drawn again.
         ray = None if context.start_salts is None else self._ray(context, state.key, context.start_salts)
         front = self._view(context, model, state, at, surface, ray)
-        splat = None if kind.smooth else self._splat(context, model, state, at, front)
+        splat = self._splat(context, model, state, at, front) if self.joined and not kind.smooth else None
         leaving, drawn = self._leaving(context, model, state, at, front)
         return VertexOutput(
-            leaving=leaving, next_hit=None, shadow=None, at=at, surface=surface, splat=splat, drawn=drawn
+            leaving=leaving,
+            next_hit=None,
+            shadow=None,
+            at=at,
+            surface=surface,
+            splat=splat,
+            drawn=drawn,
+            kept=self._kept(context, model, state, at, front) if self.connected else None,
+        )
+
+    def _kept(self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View) -> Kept:
+        """Return vertices for connections, each kept in a block with the chance 1/k at vertex k."""
+        u = Draws(context.plan.sampler, state.key, context.salts).two(Dimension.LIGHT)  # drawn at depth 0 alone
+        where: list[Tensor] = []
+        for number in u:
+            rest = number
+            for _ in range(BLOCKS // 2):
+                rest = rest * context.depth  # its whole part is one of 0 .. k - 1, its fraction a random number again
+                where.append(rest < 1.0)
+                rest = rest - rest.floor()
+        smooth = context.world.materials.models[model].smooth
+        return Kept(tuple(where), at.p, -1 if smooth else model, context.depth, front.arrival.dvcm)
+
+    def end(self, context: StageContext, model: int, vertex: VertexInput, depth: Tensor, p: Tensor) -> End:
+        """Return the light paths' ends of connections.
+
+        Args:
+            context: of the stage, with the salts of depth 0.
+            model: index of the BSDF model at the vertices.
+            vertex: the vertices as they were kept.
+            depth: their numbers ``(n,)``.
+            p: the other ends ``(3, n)``.
+        """
+        world, state = context.world, vertex.state
+        kind = world.materials.models[model]
+        at = interact(world, state.o, state.d, vertex.hit)
+        surface = surface_at(world, model, state.d, at, context.pixel)
+        dvcm = state.extra["dvcm"]
+        to = p - at.p
+        w = to * safe_reciprocal(dot(to, to).sqrt())
+        view = self._view(context, model, state, at, seen_from(context, model, at, surface, w), None, dvcm)
+        if surface.perturbed_normal is not None:  # the density of a light sample depends on the normal
+            assert context.start_salts is not None
+            ray = self._ray(context, state.key, context.start_salts)
+            first = self._view(context, model, state, at, view.surface, ray).arrival.dvcm
+            view = replace(view, arrival=replace(view.arrival, dvcm=torch.where(depth == 1, first, dvcm)))
+        wo = view.surface.frame.to_local(w)
+        value, reverse = kind.eval_pdf(view.surface.parameters, wo, view.wi)
+        cosine = dot(w, at.ng).abs()
+        value = view.throughput * value * (cosine * state.extra["flux"] / view.arrival.cosine)
+        if not kind.transmits:
+            value = torch.where(wo[2] > 0, value, 0.0)
+        return End(
+            p=at.p,
+            o=offset_origin(world, at, w),
+            value=value,
+            pdf=reverse_pdf(context, model, at, view.surface, w, -state.d),
+            others=view.arrival.others(reverse),
+            cosine=cosine,
+            partner=torch.full_like(depth, model),
         )
 
     def _view(
@@ -122,17 +205,25 @@ class LightPaths(Integrator):
         at: Interaction,
         surface: Surface,
         ray: LightRay | None,
+        dvcm: Tensor | None = None,
     ) -> _View:
         """Return what ``surface`` does with the light that arrives, as it is seen from where the light goes on to.
 
-        As in a camera path that comes from there, normals and sides are asked of the direction to the light alone.
+        As in a camera path that comes from there, normals and sides are asked of the direction to the light alone. ``dvcm``:
+        of the arrival, where it is known.
         """
         world = context.world
         wi = surface.frame.to_local(-state.d)
         share = stages.shading_weight(world, model, at, surface, -state.d, wi)
         throughput = state.throughput if share is None else state.throughput * share
         cosine = Arrival.cosine_of(state.d, at)
-        dvcm, dvc = torch.zeros_like(cosine), state.extra["dvc"] / cosine
+        dvc = state.extra["dvc"] / cosine
+        if dvcm is not None:
+            return _View(surface, wi, throughput, Arrival(dvcm, dvc, cosine), ray)
+        dvcm = torch.zeros_like(cosine)
+        if ray is None and self.number:  # a connection competes
+            way = at.p - state.o
+            dvcm = state.extra["dvcm"] * dot(way, way) / cosine
         if ray is not None:  # a light sample competes
             emission = world.emission
             assert emission is not None
@@ -221,4 +312,5 @@ class LightPaths(Integrator):
         continuation = stages.continue_paths(plan, state, without_shadowing, drawn, draws, context.roulette)
         leaving = stages.next_ray(context, model, state, at, surface, drawn, continuation)
         dvc = leaving_dvc(context, model, at, surface, view.arrival, d, pdf, sample.eta, reverse)
-        return replace(leaving, extra={**state.extra, "dvcm": torch.zeros_like(dvc), "dvc": dvc}), drawn
+        dvcm = leaving_dvcm(pdf, kind.smooth, self.number)
+        return replace(leaving, extra={**state.extra, "dvcm": dvcm, "dvc": dvc}), drawn

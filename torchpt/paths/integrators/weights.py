@@ -1,13 +1,14 @@
 """MIS weights over the strategies of bidirectional paths, by numbers that are carried along a path.
 
-A path of camera, surfaces and light may be found in several ways: a camera path meets the light, a light sample ends it, or a
-light path is joined to the camera. Each has a density, and the power heuristic weights a sample of one of them by::
+A path of camera, surfaces and light may be found in several ways: a camera path meets the light, a light sample ends it, a
+light path is joined to the camera, or two inner vertices are connected. Each has a density (with several samples, times their
+number), and the power heuristic weights a sample of one of them by::
 
     1 / (1 + sum of (p_other / p_own)^2)
 
 ``p_other / p_own`` is a product over the vertices of the path. ``dvcm`` and ``dvc`` are the parts of it that are known at a
-vertex: ``dvcm`` of the strategy that joins the vertex before, ``dvc`` of all those before it, where the density with which the
-BSDF samples the way back is still missing (Georgiev, *Implementing Vertex Connection and Merging*, 2012; van Antwerpen,
+vertex: ``dvcm`` of the strategy that joins the edge to the vertex, ``dvc`` of all those before it, where the density with which
+the BSDF samples the way back is still missing (Georgiev, *Implementing Vertex Connection and Merging*, 2012; van Antwerpen,
 *Recursive MIS Computation for Streaming BDPT on the GPU*, 2011). Both are kept as the root of a sum of squares, so that float32
 holds them.
 
@@ -26,7 +27,7 @@ from torchpt.paths.state import Field, StageContext
 from torchpt.paths.surface import Surface, surface_at
 from torchpt.physics.shapes.geometry import Interaction
 
-__all__ = ["FIELDS", "Arrival", "leaving_dvc", "reduced", "reverse_pdf", "root_of_squares", "seen_from"]
+__all__ = ["FIELDS", "Arrival", "leaving_dvc", "leaving_dvcm", "reduced", "reverse_pdf", "root_of_squares", "seen_from"]
 
 #: The fields of a path that its weights need; see above.
 FIELDS = (Field("dvcm"), Field("dvc"))
@@ -98,6 +99,21 @@ def reverse_pdf(context: StageContext, model: int, at: Interaction, surface: Sur
     back, forth = other.frame.to_local(wi), other.frame.to_local(wo)
     pdf = kind.pdf(other.parameters, back, forth)
     return pdf if kind.transmits else torch.where(back[2] > 0, pdf, 0.0)
+
+
+def leaving_dvcm(pdf: Tensor, smooth: bool, number: float) -> Tensor:
+    """Return ``dvcm (N,)`` of the rays that leave a vertex: of a connection of this vertex with the next one.
+
+    It lacks the factor by which the density of the ray becomes one of points, which is known at the next vertex.
+
+    Args:
+        pdf: density ``(N,)`` of the rays; inf for a delta lobe, which no connection can replace.
+        smooth: whether the surface has delta lobes alone.
+        number: number of connections for each sample; 0: there are none.
+    """
+    if smooth or not number:
+        return torch.zeros_like(pdf)
+    return (number * safe_reciprocal(pdf)).clamp_max(_MOST)  # 0 for a delta lobe
 
 
 def leaving_dvc(

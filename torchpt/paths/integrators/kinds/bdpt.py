@@ -1,4 +1,4 @@
-"""Bidirectional path tracing: the strategies of ``path``, and light paths whose vertices are joined to the camera."""
+"""Bidirectional path tracing: the strategies of ``path``, and light paths joined to the camera and to camera paths."""
 
 from __future__ import annotations
 
@@ -9,16 +9,35 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import dot, safe_reciprocal
+from torchpt.math.vectors import dot, largest, safe_reciprocal
 from torchpt.paths import vertex as stages
-from torchpt.paths.integrators.base import DEPTHS, LIGHT_CHOICE, STRICT, Integrator, Limits
+from torchpt.paths.integrators.base import DEPTHS, LIGHT_CHOICE, STRICT, Limits
 from torchpt.paths.integrators.kinds.path import Path
 from torchpt.paths.integrators.light_paths import LightPaths
 from torchpt.paths.integrators.path import PathIntegrator
-from torchpt.paths.integrators.weights import FIELDS, Arrival, leaving_dvc, reduced, reverse_pdf
-from torchpt.paths.state import Emission, PathState, Plan, StageContext, VertexInput, VertexOutput
+from torchpt.paths.integrators.weights import (
+    FIELDS,
+    Arrival,
+    leaving_dvc,
+    leaving_dvcm,
+    reduced,
+    reverse_pdf,
+    root_of_squares,
+)
+from torchpt.paths.state import (
+    Emission,
+    End,
+    Partner,
+    PathState,
+    Plan,
+    Shadow,
+    StageContext,
+    VertexInput,
+    VertexOutput,
+)
+from torchpt.paths.surface import Surface
 from torchpt.physics.lights.emission import density_of_environment, density_of_hit, density_of_sample
-from torchpt.physics.shapes import interact
+from torchpt.physics.shapes import interact, offset_origin
 from torchpt.physics.shapes.geometry import Interaction
 from torchpt.spec import Choice, Flag, Refused, Scalar
 
@@ -27,12 +46,17 @@ if TYPE_CHECKING:
 
 __all__ = ["STRATEGIES", "Bdpt"]
 
-#: Ways to find light: a camera path meets it, a light sample ends a camera path, a light path is joined to the camera.
-STRATEGIES = ("bsdf", "light", "light_paths")
+#: Ways to find light: a camera path meets it, a light sample ends a camera path, a light path is joined to the camera, or to a
+#: camera path.
+STRATEGIES = ("bsdf", "light", "light_paths", "connections")
+
+
+#: Number of connections that a pair of vertices counts for in weights: one of a light path's vertices stands for all of them.
+SHARE = 0.5
 
 
 class Bdpt(PathIntegrator):
-    """Bidirectional path tracing: camera paths with light samples, and light paths joined to the camera."""
+    """Bidirectional path tracing: camera paths with light samples, and light paths joined to the camera and to camera paths."""
 
     name = "bdpt"
     parameters: ClassVar = {
@@ -40,10 +64,16 @@ class Bdpt(PathIntegrator):
         "strategy": Choice(
             "mis",
             names=("mis", *STRATEGIES),
-            doc="how light is found: all ways weighted; or by camera paths that meet it, light samples or light paths alone",
+            doc="how light is found: all ways weighted; or by camera paths that meet it, light samples, light paths joined to "
+            "the camera, or connections alone",
         ),
         "weighted": Flag(False, doc="whether one strategy alone keeps its weight among all"),
         "light_paths": Scalar(0.5, above=0.0, high=1.0, doc="number of light paths for each camera path"),
+        "connections": Choice(
+            "none",
+            names=("none", "one"),
+            doc="whether each vertex of a camera path is connected to one of the light path",
+        ),
         **LIGHT_CHOICE,
         **STRICT,
     }
@@ -61,6 +91,11 @@ class Bdpt(PathIntegrator):
         Path.check(values, given)
         if values["weighted"] and values["strategy"] == "mis":
             raise Refused("one strategy alone beside weighted", "mis", ("strategy",))
+        if values["strategy"] == "connections" and values["connections"] == "none":
+            raise Refused("one beside strategy=connections", "none", ("connections",))
+        if values["strategy"] == "connections" and not values["weighted"]:
+            # A path of k edges has k - 2 connections, each of which finds it.
+            raise Refused("true beside strategy=connections", False, ("weighted",))
 
     def plan(self, sampler: Points, dtype: torch.dtype, *, tape: bool = False, attached: bool = False) -> Plan:
         """Return the static configuration of the stages; see :meth:`Integrator.plan`."""
@@ -83,14 +118,27 @@ class Bdpt(PathIntegrator):
             return 0.0
         return 1.0 if weight is None else safe_reciprocal(weight)
 
-    def light_walk(self) -> Integrator:
+    @property
+    def connects(self) -> bool:
+        """Return True if vertices of camera paths are connected to those of light paths."""
+        return self.connections != "none" and self.strategy in ("mis", "connections")
+
+    @property
+    def _number(self) -> float:
+        """Return the number of connections of two vertices for each sample, which weights count with."""
+        return SHARE * self.light_paths if self.connections != "none" else 0.0
+
+    def light_walk(self) -> LightPaths:
         """Return the integrator of the light paths: :meth:`Integrator.light_walk`."""
         return LightPaths(
-            max_depth=self.max_depth if self.strategy in ("mis", "light_paths") else 0,
+            max_depth=self.max_depth if self.strategy in ("mis", "light_paths", "connections") else 0,
             rr_depth=self.rr_depth,
             rr_prob=self.rr_prob,
             fraction=self.light_paths,
             weighted=self.strategy == "mis" or self.weighted,
+            joined=self.strategy != "connections",
+            connected=self.connects,
+            number=self._number,
         )
 
     def generate(self, context: StageContext, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
@@ -109,9 +157,13 @@ class Bdpt(PathIntegrator):
         at = interact(context.world, state.o, state.d, vertex.hit, follow_ray=context.follow_ray)
         cosine = Arrival.cosine_of(state.d, at)
         dvcm = state.extra["dvcm"] / cosine
-        if not camera.parallel:
+        if self._number or not camera.parallel:
             way = at.p - state.o
-            dvcm = dvcm * dot(way, way)
+            square = dot(way, way)
+            if camera.parallel:  # the camera's density is that of points already
+                first = torch.as_tensor(context.depth == 1)
+                square = torch.where(first, 1.0, square)
+            dvcm = dvcm * square
         return Arrival(dvcm, state.extra["dvc"] / cosine, cosine), at
 
     def emit(self, context: StageContext, vertex: VertexInput) -> Emission:
@@ -155,5 +207,55 @@ class Bdpt(PathIntegrator):
         assert drawn is not None
         reverse = None if kind.smooth else reverse_pdf(context, model, at, surface, -state.d, drawn.d)
         dvc = leaving_dvc(context, model, at, surface, arrival, drawn.d, drawn.pdf, drawn.eta, reverse)
-        leaving = replace(output.leaving, extra={"dvcm": torch.zeros_like(dvc), "dvc": dvc})
-        return replace(output, leaving=leaving)
+        dvcm = leaving_dvcm(drawn.pdf, kind.smooth, self._number)
+        leaving, end = replace(output.leaving, extra={"dvcm": dvcm, "dvc": dvc}), None
+        if vertex.partner is not None and not kind.smooth:
+            end = self._end(context, model, state, at, surface, arrival, vertex.partner)
+        return replace(output, leaving=leaving, end=end)
+
+    # -- connections
+
+    def _end(
+        self,
+        context: StageContext,
+        model: int,
+        state: PathState,
+        at: Interaction,
+        surface: Surface,
+        arrival: Arrival,
+        partner: Partner,
+    ) -> End:
+        """Return the camera paths' ends of connections with ``partner``."""
+        to = partner.p - at.p
+        w = to * safe_reciprocal(dot(to, to).sqrt())
+        wi = surface.frame.to_local(w)
+        value, pdf = context.world.materials.models[model].eval_pdf(surface.parameters, surface.wo, wi)
+        # One of the path's vertices stands for all, and a light path for those samples that have none.
+        scale = partner.count.to(pdf.dtype) / self.light_paths
+        share = stages.shading_weight(context.world, model, at, surface, w, wi)
+        value = state.throughput * value * (scale if share is None else scale * share)
+        joined = (partner.count > 0) & (partner.model >= 0) & ~(largest(value.abs()) == 0)  # a NaN is reported
+        if not self.limits.endless:
+            joined = joined & (partner.depth + context.depth + 1 <= self.limits.last)
+        return End(
+            p=at.p,
+            o=offset_origin(context.world, at, w),
+            value=value,
+            pdf=pdf,
+            others=arrival.others(reverse_pdf(context, model, at, surface, -state.d, w)),
+            cosine=dot(w, at.ng).abs(),
+            partner=torch.where(joined, partner.model, -1),
+        )
+
+    def connect(self, context: StageContext, model: int, vertex: VertexInput, depth: Tensor, end: End) -> Shadow:
+        """Return the light of connections: see :meth:`Integrator.connect`."""
+        other = self.light_walk().end(context, model, vertex, depth, end.p)
+        way = other.p - end.p
+        inverse = safe_reciprocal(dot(way, way))
+        # Densities by area at either end, with which the path from the other end would have come there.
+        at_light, at_camera = end.pdf * other.cosine * inverse, other.pdf * end.cosine * inverse
+        ratio = root_of_squares(at_light * other.others, at_camera * end.others) / self._number
+        radiance = end.value * other.value * (inverse * reduced(None, ratio))
+        lit = ~(largest(radiance.abs()) == 0)  # a NaN is reported
+        t_max = lit.to(radiance.dtype) * (1.0 - stages.SHORTEN)
+        return Shadow(o=end.o, d=other.o - end.o, t_max=t_max, radiance=radiance)

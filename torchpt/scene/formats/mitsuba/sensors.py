@@ -272,6 +272,10 @@ def _like_bdpt(p: Properties, importer: Importer) -> Block:
     return {**_like_path(p, importer), "type": "bdpt"}
 
 
+def _bdpt(p: Properties, importer: Importer) -> Block:
+    return {**_like_bdpt(p, importer), "light_paths": 1.0, "connections": "one"}
+
+
 _LAYERS = {"albedo": "albedo", "depth": "depth", "position": "position", "uv": "uv", "sh_normal": "normal"}
 
 
@@ -298,8 +302,9 @@ INTEGRATORS: dict[str, Plugin] = {
     "direct": exact("direct", _direct, "hide_emitters is left out, with a warning"),
     "aov": exact("aovs", _aov),
     **dict.fromkeys(("volpath", "volpathmis", "volpath_simple", "prbvolpath"), nearest("path", _like_path, _MEDIA)),
+    "bdpt": nearest("bdpt", _bdpt, "each vertex of a camera path is connected to one of its light path"),
     **dict.fromkeys(
-        ("bdpt", "ppm", "sppm", "photonmapper", "ptracer"),
+        ("ppm", "sppm", "photonmapper", "ptracer"),
         nearest("bdpt", _like_bdpt, "light paths are joined to the camera alone, and no photons are kept"),
     ),
     **dict.fromkeys(
