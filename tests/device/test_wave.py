@@ -104,6 +104,7 @@ def test_ptx_of_scenes_gives_the_bits_of_the_cpu(name, device):
             {"integrator": {"type": "path", "max_depth": 0}},
             {"render": {"pilots": False}},
             {"sampler": "stratified"},
+            {"integrator": {"type": "bdpt"}},
             {"integrator": {"type": "bdpt", "connections": "one"}},
         ],
         3,

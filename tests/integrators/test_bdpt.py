@@ -106,19 +106,30 @@ def test_strategies_add_up_to_the_picture(name):
 
 
 def test_connections_by_kernels_and_by_tensors():
-    """The same numbers but for rounding, for any threads; with a surface that is not opaque."""
-    shapes = {name: ROOMS["thin lens"]["shapes"][name] for name in ("floor", "lamp", "block")}
+    """The same numbers but for rounding, for any threads; with a surface that is not opaque, and rays side by side."""
+    room = ROOMS["parallel rays"]
+    shapes = {name: room["shapes"][name] for name in ("floor", "lamp")}
     shapes["veil"] = {
         "type": "rectangle",
         "material": {"type": "diffuse", "opacity": 0.4},
         "transform": [{"scale": 0.4}, {"translate": [0, 0.3, 0.2]}],
     }
-    scene = torchpt.load({**ROOMS["thin lens"], "shapes": shapes}, device="cpu")
-    wish: dict[str, Any] = {"spp": 4, "integrator": {"type": "bdpt", **CONNECTED}}
-    of_tensors = torchpt.render(scene, compile="off", **wish)
-    of_kernels = torchpt.render(scene, compile="on", threads=1, **wish)
-    torch.testing.assert_close(of_kernels, of_tensors, rtol=1e-3, atol=1e-4)
-    assert torch.equal(torchpt.render(scene, compile="on", threads=2, **wish), of_kernels)
+    scene = torchpt.load({**room, "shapes": shapes}, device="cpu")
+    # A strategy alone has the weight that connections leave it, and makes none.
+    for keys in ({}, {"strategy": "light", "weighted": True}):
+        wish: dict[str, Any] = {"spp": 4, "integrator": {"type": "bdpt", **CONNECTED, **keys}}
+        of_tensors = torchpt.render(scene, compile="off", **wish)
+        of_kernels = torchpt.render(scene, compile="on", threads=1, **wish)
+        torch.testing.assert_close(of_kernels, of_tensors, rtol=1e-3, atol=1e-4)
+        assert of_kernels.any() and torch.equal(torchpt.render(scene, compile="on", threads=2, **wish), of_kernels)
+
+
+def test_paths_of_two_edges_are_not_connected():
+    scene = torchpt.load(ROOMS["thin lens"], device="cpu")
+    wish: dict[str, Any] = {"spp": 4, "compile": "off"}
+    plain = torchpt.render(scene, integrator={"type": "bdpt", "max_depth": 2}, **wish)
+    keys = {"type": "bdpt", "max_depth": 2, "connections": "one"}
+    assert torch.equal(torchpt.render(scene, integrator=keys, **wish), plain)
 
 
 @pytest.mark.parametrize("keys", [{"strategy": "connections"}, {"strategy": "connections", "connections": "one"}])

@@ -275,6 +275,17 @@ def test_a_model_that_no_kernel_can_be_made_of(monkeypatch, capsys):
     assert "eager" not in rendered(torchpt.load(room(), "cpu")).summary()
 
 
+def test_paths_are_connected_on_a_model_that_no_kernel_can_be_made_of():
+    """On a film so small that some blocks of the store get a single vertex."""
+    scene = torchpt.load(room("odd"), "cpu", bsdfs={"odd": Odd()})
+    bdpt = {"type": "bdpt", "connections": "one", "light_paths": 1.0}
+    keys = {"integrator": bdpt, "film": {"width": 2, "height": 2}}
+    eager = rendered(scene, render={"compile": "off"}, **keys)
+    found = rendered(scene, **keys)
+    assert found.eager and found.rays == eager.rays
+    torch.testing.assert_close(found.image, eager.image, rtol=1e-3, atol=1e-5)
+
+
 def test_a_module_is_compiled_and_its_weights_are_read_anew(work):
     torch.manual_seed(0)
     model = Neural()

@@ -116,6 +116,8 @@ def test_paths_that_are_connected_to_light_paths():
     assert sum(vertex.connection is not None for path in alone for vertex in path.vertices) > 5
     for pixel in pixels():
         check_parts(one_path(scene, wishes(scene, **keys), pixel, 0))
+    dark = torchpt.load({**SKY, "lights": {}}, "cpu")
+    assert one_path(dark, wishes(dark, **keys), (5, 5), 0).value == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ class TensorsBackward(TensorsEngine):
     def _taped_context(self, depth: int, device: torch.device, roulette: float = 0.0) -> StageContext:
         """Return the taped stage context of a vertex."""
         follow_ray = follows_ray(self.plan, self.taped.context.world, depth)
-        return self.taped.context.at(salts(depth, device), follow_ray=follow_ray, roulette=roulette)
+        return self.taped.context.at(salts(depth, device), follow_ray=follow_ray, roulette=roulette, depth=depth)
 
     def _bounce(
         self,

@@ -178,7 +178,7 @@ class StageContext:
         filter: the reconstruction filter; None as above.
         crop: ``(x, y, width, height)`` of the picture on the camera's film, in pixels; None for an integrator without splats.
         start_salts: salts of depth 0, at the first vertex of a path that started on a light; None elsewhere.
-        depth: number of the vertex, 1 at the first hit; in kernels a tensor ``(1,)`` int32. 0 where no vertex has been reached.
+        depth: number of the vertex, 1 at the first hit; in kernels a tensor ``(1,)`` int32. 0 in stages before a vertex.
     """
 
     plan: Plan
@@ -346,7 +346,8 @@ class Kept:
             before.
         p: ``(3, n)`` the points.
         model: index of their BSDF model; -1: they cannot be connected.
-        depth: number of the vertex, as in :class:`StageContext`: so many vertices the light path has by now.
+        depth: number of the vertex, as in :class:`StageContext`.
+        count: number of vertices that the light path could have kept by now.
         dvcm: ``(n,)`` replaces the field of that name, which is one of the ray before.
     """
 
@@ -354,6 +355,7 @@ class Kept:
     p: Tensor
     model: int
     depth: int | Tensor
+    count: int | Tensor
     dvcm: Tensor
 
 
@@ -370,7 +372,8 @@ class End:
         others: ``(n,)`` ratio of densities to strategies that end nearer to the path's start, over that of the path
             (:mod:`torchpt.paths.integrators.weights`).
         cosine: ``(n,)`` of the direction to the other end and the geometric normal.
-        partner: ``(n,)`` int64 index of the BSDF model of the other end; -1: they are not connected.
+        partner: ``(n,)`` int64 index of the BSDF model of the other end; -1: they are not connected. -1 in ends of light paths,
+            of which nobody asks it.
     """
 
     p: Tensor

@@ -38,14 +38,14 @@ def block_of(depth: int) -> int:
 
 
 def kept_values(vertex: VertexInput, kept: Kept) -> dict[str, Tensor]:
-    """Return what a block holds of vertices, by row; without ``count``."""
+    """Return what a block holds of vertices, by row, and ``count``, which all blocks hold."""
     state, hit = vertex.state, vertex.hit
     like = hit.prim
 
     def whole(value: int | Tensor) -> Tensor:
         return torch.zeros_like(like) + value
 
-    values = {"model": whole(kept.model), "depth": whole(kept.depth), "p": kept.p}
+    values = {"model": whole(kept.model), "depth": whole(kept.depth), "count": whole(kept.count), "p": kept.p}
     values |= {name: getattr(state, name) for name in _STATE}
     values |= {EXTRA + name: value for name, value in state.extra.items()} | {f"{EXTRA}dvcm": kept.dvcm}
     return values | {name: getattr(hit, name) for name in _HIT}
@@ -79,6 +79,7 @@ class VertexStore:
     def keep(self, lane: Tensor, vertex: VertexInput, kept: Kept) -> None:
         """Keep vertices of the samples ``lane (n,)`` in the blocks that they were chosen for."""
         values = kept_values(vertex, kept)
+        count = values.pop("count")
         if self._count is None:
             self._count = torch.zeros(self._lanes, dtype=torch.int64, device=lane.device)
             for block in self._blocks:
@@ -86,7 +87,7 @@ class VertexStore:
                     name: torch.zeros(*x.shape[:-1], self._lanes, dtype=x.dtype, device=x.device)
                     for name, x in values.items()
                 }
-        self._count[lane] = values["depth"]
+        self._count[lane] = count
         for block, where in zip(self._blocks, kept.where, strict=True):
             index = where.nonzero().squeeze(1)
             for name, value in values.items():

@@ -212,8 +212,7 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         explainer = Explainer(wave.context.world)
         x, y, number = (torch.tensor([value], device=scene.device) for value in (*pixel, sample))
         store = None
-        if wave.integrator.connects:
-            assert wave.light_paths is not None
+        if wave.integrator.connects and wave.light_paths is not None:
             store = VertexStore(lanes=1)
             trace(wave.light_paths, wave.light_paths.rays_of(x, y, number), store=store)
         state = wave.rays_of(x, y, number)

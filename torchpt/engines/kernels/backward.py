@@ -139,7 +139,7 @@ def bounce_vjp(trace: Trace, model: int, roulette: float | None, follow_ray: boo
 
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
-        context = kernels.taped.at(salts, follow_ray=follow_ray, roulette=trace.roulette(roulette))
+        context = kernels.taped.at(salts, follow_ray=follow_ray, roulette=trace.roulette(roulette), depth=trace.depth())
         vertex = VertexInput(state, hit)
         input_cotangents = adjoint.bounce_vjp(
             integrator.bounce, context, model, vertex, next_hit, transmittance, cotangents, gathers.leaves, of_splat
@@ -154,7 +154,7 @@ def emit_vjp(trace: Trace, follow_ray: bool) -> Sinks:
     state, hit, rows = _inputs(trace)
     gathers = _RecordedGathers(tracer, kernels)
     with tracer, recording_gathers(gathers):
-        context = kernels.taped.at(salts, follow_ray=follow_ray)
+        context = kernels.taped.at(salts, follow_ray=follow_ray, depth=trace.depth())
         stage, vertex = trace.layout.wave.integrator.emit, VertexInput(state, hit)
         input_cotangents = adjoint.emission_vjp(stage, context, vertex, rows["radiance"], gathers.leaves)
     return _stores(trace, gathers, state, input_cotangents, added=rows)
@@ -169,7 +169,7 @@ def escape_vjp(trace: Trace) -> Sinks:
     with tracer, recording_gathers(gathers):
         stage, vertex = trace.layout.wave.integrator.escape, VertexInput(state, hit)
         input_cotangents = adjoint.emission_vjp(
-            stage, kernels.taped.at(salts), vertex, rows["radiance"], gathers.leaves
+            stage, kernels.taped.at(salts, depth=trace.depth()), vertex, rows["radiance"], gathers.leaves
         )
     return _stores(trace, gathers, state, input_cotangents, added=rows)
 
@@ -593,7 +593,7 @@ class KernelsBackward(KernelsEngine):
                 cotangents = VertexCotangents(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
                 next_hit = Hit(*(rows[name] for name in HIT)) if plan.attached else None
                 _, model, roulette, follow_ray = key
-                context = kernels.taped.at(salt, follow_ray=follow_ray, roulette=roulette)
+                context = kernels.taped.at(salt, follow_ray=follow_ray, roulette=roulette, depth=paths.depth)
                 input_cotangents = adjoint.bounce_vjp(
                     integrator.bounce,
                     context,
@@ -609,7 +609,11 @@ class KernelsBackward(KernelsEngine):
                 stage_name, *follow_ray = key  # the environment does not depend on `follow_ray`
                 stage = integrator.emit if stage_name == "emit" else integrator.escape
                 input_cotangents = adjoint.emission_vjp(
-                    stage, kernels.taped.at(salt, *follow_ray), vertex, rows["radiance"], self._tables
+                    stage,
+                    kernels.taped.at(salt, *follow_ray, depth=paths.depth),
+                    vertex,
+                    rows["radiance"],
+                    self._tables,
                 )
         for name, cotangent, like in input_cotangents.of_rays(state, attached=plan.attached):
             first = kernels.slots.first(name)

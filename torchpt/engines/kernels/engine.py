@@ -296,11 +296,12 @@ def bounce_eagerly(
         if output.kept is not None:
             assert store is not None and kernels.store is not None
             kept = kept_values(vertex, output.kept)
+            counts = {"count": kept.pop("count")}
             for block, where in enumerate(output.kept.where):
                 first, index = block * kernels.store.count, where.nonzero().squeeze(1)
                 chosen = {name: value.index_select(-1, index) for name, value in kept.items()}
                 kernels.store.scatter(store, sample[index], chosen, first)
-                kernels.store.scatter(store, sample, {"count": kept["depth"]}, first)
+                kernels.store.scatter(store, sample, counts, first)
         after, no_ray = output.leaving, no_shadow(output.leaving)
         shadow = no_ray if output.shadow is None else output.shadow
         splat = Splat(torch.full_like(after.lane, -1), no_ray) if output.splat is None else output.splat

@@ -152,7 +152,8 @@ class Memory:
     def take(self, first: int, rows: int, lanes: np.ndarray, dtype: torch.dtype) -> Tensor:
         """Return ``(rows, n)``: the values at ``lanes (n,)`` of the rows from ``first`` on."""
         memory = self.floats if dtype.is_floating_point else self.words
-        return torch.from_numpy(memory[first : first + rows, lanes]).to(dtype)
+        # A tensor of one element would be a plain index to numpy.
+        return torch.from_numpy(memory[first : first + rows, np.asarray(lanes)]).to(dtype)
 
     def put(self, first: int, start: int, values: Tensor) -> None:
         """Write ``values (rows, n)`` to the rows from ``first`` on, at lanes from ``start`` on."""
@@ -162,7 +163,7 @@ class Memory:
     def scatter(self, first: int, lanes: np.ndarray, values: Tensor) -> None:
         """Write ``values (rows, n)`` to the rows from ``first`` on, at ``lanes (n,)``."""
         memory = self.floats if values.is_floating_point() else self.words
-        memory[first : first + len(values), lanes] = values.numpy()
+        memory[first : first + len(values), np.asarray(lanes)] = values.numpy()
 
 
 class Rows:

@@ -215,7 +215,7 @@ def sort_lanes(trace: Trace, shadow: bool) -> Sinks:
 def emit(trace: Trace) -> Sinks:
     """Add the emission of emitters that were hit to the radiance of the paths, in place in the arena: these paths go on."""
     tracer, layout = trace.tracer, trace.layout
-    context = layout.wave.context.at(trace.salts())
+    context = layout.wave.context.at(trace.salts(), depth=trace.depth())
     state, _ = trace.state()
     hit = trace.hit()
     place = trace.place()
@@ -229,7 +229,7 @@ def escape(trace: Trace) -> Sinks:
     """Add the radiance of the environment, and end these paths."""
     state, passthrough = trace.state()
     hit, wave = trace.hit(), trace.layout.wave
-    context = wave.context.at(trace.salts())
+    context = wave.context.at(trace.salts(), depth=trace.depth())
     with trace.tracer:
         radiance = state.radiance + wave.integrator.escape(context, VertexInput(state, hit)).brought
     return Sinks(scatter=[trace.ended(_ALL_LANES, state.lane, radiance, passthrough)])
@@ -258,8 +258,9 @@ def bounce(trace: Trace, model: int, roulette: float | None, first: bool = False
         partner = partner_of(layout.store.read(tracer, *PARTNER, place=trace.node(state.lane)))
     with tracer:
         start_salts = trace.start_salts() if first else None
-        depth = trace.depth() if layout.store is not None else 0
-        context = layout.wave.context.at(salts, roulette=trace.roulette(roulette), start_salts=start_salts, depth=depth)
+        context = layout.wave.context.at(
+            salts, roulette=trace.roulette(roulette), start_salts=start_salts, depth=trace.depth()
+        )
         vertex = VertexInput(state, hit, partner)
         output = layout.wave.bounce(context, model, vertex)
         check_output(integrator, output)
@@ -346,8 +347,8 @@ def _keep(trace: Trace, sinks: Sinks, vertex: VertexInput, kept: Kept) -> None:
     assert rows is not None
     with tracer:
         values = kept_values(vertex, kept)
-    place = trace.node(vertex.state.lane)
-    pairs, count = rows.nodes(tracer, **values), rows.nodes(tracer, count=values["depth"])
+    place, counts = trace.node(vertex.state.lane), values.pop("count")
+    pairs, count = rows.nodes(tracer, **values), rows.nodes(tracer, count=counts)
     for block, where in enumerate(kept.where):
         first = block * rows.count
         chosen = tuple((first + row, node) for row, node in pairs)

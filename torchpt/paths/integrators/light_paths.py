@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import dot, largest, safe_reciprocal
 from torchpt.paths import vertex as stages
-from torchpt.paths.integrators.base import DEPTHS, Integrator, Limits
+from torchpt.paths.integrators.base import DEPTHS, ENDLESS, Integrator, Limits
 from torchpt.paths.integrators.weights import (
     FIELDS,
     Arrival,
@@ -146,17 +146,25 @@ class LightPaths(Integrator):
         )
 
     def _kept(self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View) -> Kept:
-        """Return vertices for connections, each kept in a block with the chance 1/k at vertex k."""
-        u = Draws(context.plan.sampler, state.key, context.salts).two(Dimension.LIGHT)  # drawn at depth 0 alone
+        """Return vertices for connections, each kept in a block with the chance 1/k at vertex k.
+
+        Two blocks share a number of 24 bits: the chance of the second is 1/k within 0.1 % up to vertex 200, 2 % at vertex 1000.
+        """
+        # Light is sampled at depth 0 alone. Some samplers draw the same there and at vertex 1, which is kept in any case.
+        u = Draws(context.plan.sampler, state.key, context.salts).two(Dimension.LIGHT)
+        # The last vertex has no path left to be connected to.
+        most = ENDLESS if self.limits.endless else self.limits.last - 2
+        depth = context.depth
+        count = torch.clamp(depth, max=most) if isinstance(depth, Tensor) else min(depth, most)
         where: list[Tensor] = []
         for number in u:
             rest = number
             for _ in range(BLOCKS // 2):
-                rest = rest * context.depth  # its whole part is one of 0 .. k - 1, its fraction a random number again
-                where.append(rest < 1.0)
+                rest = rest * depth  # its whole part is one of 0 .. k - 1, its fraction a random number again
+                where.append((rest < 1.0) & (depth <= most))
                 rest = rest - rest.floor()
         smooth = context.world.materials.models[model].smooth
-        return Kept(tuple(where), at.p, -1 if smooth else model, context.depth, front.arrival.dvcm)
+        return Kept(tuple(where), at.p, -1 if smooth else model, depth, count, front.arrival.dvcm)
 
     def end(self, context: StageContext, model: int, vertex: VertexInput, depth: Tensor, p: Tensor) -> End:
         """Return the light paths' ends of connections.
@@ -194,7 +202,7 @@ class LightPaths(Integrator):
             pdf=reverse_pdf(context, model, at, view.surface, w, -state.d),
             others=view.arrival.others(reverse),
             cosine=cosine,
-            partner=torch.full_like(depth, model),
+            partner=torch.full_like(depth, -1),
         )
 
     def _view(

@@ -121,7 +121,8 @@ class Bdpt(PathIntegrator):
     @property
     def connects(self) -> bool:
         """Return True if vertices of camera paths are connected to those of light paths."""
-        return self.connections != "none" and self.strategy in ("mis", "connections")
+        # A path with a connection has three edges at least.
+        return self.connections != "none" and self.strategy in ("mis", "connections") and not 0 <= self.max_depth < 3
 
     @property
     def _number(self) -> float:
@@ -161,7 +162,8 @@ class Bdpt(PathIntegrator):
             way = at.p - state.o
             square = dot(way, way)
             if camera.parallel:  # the camera's density is that of points already
-                first = torch.as_tensor(context.depth == 1)
+                depth = context.depth
+                first = depth == 1 if isinstance(depth, torch.Tensor) else torch.full_like(square, depth == 1).bool()
                 square = torch.where(first, 1.0, square)
             dvcm = dvcm * square
         return Arrival(dvcm, state.extra["dvc"] / cosine, cosine), at
