@@ -82,8 +82,9 @@ ROWS = {
     ),
     "direct": Row(accepted={"strategy": "uniform", "strict": True}, refused={**LIT, "strategy": "bdpt"}),
     "bdpt": Row(
-        accepted={"max_depth": 3, "rr_depth": 2, "rr_prob": 0.8, "light_paths": 0.5},
+        accepted={"max_depth": 3, "rr_depth": 2, "rr_prob": 0.8, "light_paths": 0.5, "connections": "one"},
         refused={
+            "connections": "all",
             "max_depth": -2,
             "rr_depth": 0,
             "rr_prob": 1.01,

@@ -36,13 +36,13 @@ __all__ = [
     "Emission",
     "End",
     "Field",
-    "Kept",
     "Partner",
     "PathState",
     "Plan",
     "Shadow",
     "Splat",
     "StageContext",
+    "StoredVertex",
     "Transmission",
     "VertexInput",
     "VertexOutput",
@@ -338,7 +338,7 @@ class Splat:
 
 
 @dataclass(frozen=True)
-class Kept:
+class StoredVertex:
     """Vertices of light paths, to be kept where camera paths may be connected to them.
 
     Attributes:
@@ -414,5 +414,5 @@ class VertexOutput:
     carried: Tensor | None = None
     chance: Tensor | None = None
     splat: Splat | None = None
-    kept: Kept | None = None
+    kept: StoredVertex | None = None
     end: End | None = None

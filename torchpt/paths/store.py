@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.paths.state import EXTRA, Kept, Partner, VertexInput
+from torchpt.paths.state import EXTRA, Partner, StoredVertex, VertexInput
 from torchpt.paths.wave import camera_state
 from torchpt.physics.shapes.geometry import Hit
 
@@ -37,7 +37,7 @@ def block_of(depth: int) -> int:
     return depth % BLOCKS
 
 
-def kept_values(vertex: VertexInput, kept: Kept) -> dict[str, Tensor]:
+def kept_values(vertex: VertexInput, kept: StoredVertex) -> dict[str, Tensor]:
     """Return what a block holds of vertices, by row, and ``count``, which all blocks hold."""
     state, hit = vertex.state, vertex.hit
     like = hit.prim
@@ -76,7 +76,7 @@ class VertexStore:
         self._blocks: list[dict[str, Tensor]] = [{} for _ in range(BLOCKS)]
         self._count: Tensor | None = None
 
-    def keep(self, lane: Tensor, vertex: VertexInput, kept: Kept) -> None:
+    def keep(self, lane: Tensor, vertex: VertexInput, kept: StoredVertex) -> None:
         """Keep vertices of the samples ``lane (n,)`` in the blocks that they were chosen for."""
         values = kept_values(vertex, kept)
         count = values.pop("count")

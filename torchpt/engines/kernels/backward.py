@@ -445,8 +445,8 @@ class KernelsBackward(KernelsEngine):
 
     keeps_splats = False  # their VJP needs the vertices, not the splats
 
-    def __init__(self, kernels: VjpKernels, calls: Any = None) -> None:
-        super().__init__(kernels, calls=calls)
+    def __init__(self, kernels: VjpKernels, calls: Any = None, store: Memory | None = None) -> None:
+        super().__init__(kernels, calls=calls, store=store)
         self.back = kernels
         self._levels: list[Paths] = []  # memory of the vertices of a walk that are kept
         self._sample_slots = self.calls.memory(kernels.slots.count)

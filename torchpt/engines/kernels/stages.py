@@ -18,7 +18,7 @@ from torchpt.compiler.tracing import Tracer
 from torchpt.engines.kernels.layout import CONNECTION, Trace, path_state
 from torchpt.paths import layers as aov
 from torchpt.paths.integrators.base import check_fields, check_output
-from torchpt.paths.state import End, Kept, PathState, Shadow, Splat, VertexInput, VertexOutput, no_shadow
+from torchpt.paths.state import End, PathState, Shadow, Splat, StoredVertex, VertexInput, VertexOutput, no_shadow
 from torchpt.paths.store import PARTNER, kept_values, partner_of, vertex_of
 from torchpt.paths.transmission import non_opaque, opacity_at, origins_behind
 from torchpt.paths.wave import camera_state
@@ -341,7 +341,7 @@ def _with_shadow(
 # connections; ``list_ends`` lists these by the model of the other end, and ``connect`` makes the connections.
 
 
-def _keep(trace: Trace, sinks: Sinks, vertex: VertexInput, kept: Kept) -> None:
+def _keep(trace: Trace, sinks: Sinks, vertex: VertexInput, kept: StoredVertex) -> None:
     """Store vertices of light paths in the blocks that they were chosen for; ``count`` in all blocks."""
     tracer, rows = trace.tracer, trace.layout.store
     assert rows is not None

@@ -32,11 +32,11 @@ from torchpt.paths.state import (
     Drawn,
     End,
     Field,
-    Kept,
     PathState,
     Shadow,
     Splat,
     StageContext,
+    StoredVertex,
     VertexInput,
     VertexOutput,
 )
@@ -145,7 +145,7 @@ class LightPaths(Integrator):
             kept=self._kept(context, model, state, at, front) if self.connected else None,
         )
 
-    def _kept(self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View) -> Kept:
+    def _kept(self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View) -> StoredVertex:
         """Return vertices for connections, each kept in a block with the chance 1/k at vertex k.
 
         Two blocks share a number of 24 bits: the chance of the second is 1/k within 0.1 % up to vertex 200, 2 % at vertex 1000.
@@ -164,7 +164,7 @@ class LightPaths(Integrator):
                 where.append((rest < 1.0) & (depth <= most))
                 rest = rest - rest.floor()
         smooth = context.world.materials.models[model].smooth
-        return Kept(tuple(where), at.p, -1 if smooth else model, depth, count, front.arrival.dvcm)
+        return StoredVertex(tuple(where), at.p, -1 if smooth else model, depth, count, front.arrival.dvcm)
 
     def end(self, context: StageContext, model: int, vertex: VertexInput, depth: Tensor, p: Tensor) -> End:
         """Return the light paths' ends of connections.
