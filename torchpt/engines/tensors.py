@@ -333,19 +333,25 @@ class TensorsEngine:
         depth, radiance = paths.depth - 1, paths.state.radiance
         device = radiance.device
         context = self.context.at(salts(depth, device), start_salts=salts(0, device), depth=depth)
-        for start, lane, ends in paths.camera_ends:
-            for model in range(len(self.world.materials.models)):
-                index = (ends.partner == model).nonzero().squeeze(1)
-                if not len(index):
-                    continue
-                sample, end = take(lane, index), rows(ends, index)
-                values = self.store.read(sample, depth)
-                assert values is not None
-                light = self.wave.integrator.connect(context, model, vertex_of(values), values["depth"], end)
-                transmittance = self.transmittance(light)
-                self.tally.rays += len(index)
-                radiance = radiance.index_add(1, start + index, light.radiance * transmittance)
-                paths.connections.append((sample, light, transmittance))
+        ends = concatenate_lanes([end for _, _, end in paths.camera_ends])
+        samples = torch.cat([sample for _, sample, _ in paths.camera_ends])
+        lanes = torch.cat([
+            torch.arange(start, start + len(sample), device=device) for start, sample, _ in paths.camera_ends
+        ])  # fmt: skip
+        for model, kind in enumerate(self.world.materials.models):
+            if kind.smooth:
+                continue
+            index = (ends.partner == model).nonzero().squeeze(1)
+            if not len(index):
+                continue
+            sample, end = take(samples, index), rows(ends, index)
+            values = self.store.read(sample, depth)
+            assert values is not None
+            light = self.wave.integrator.connect(context, model, vertex_of(values), values["depth"], end)
+            transmittance = self.transmittance(light)
+            self.tally.rays += len(index)
+            radiance = radiance.index_add(1, take(lanes, index), light.radiance * transmittance)
+            paths.connections.append((sample, light, transmittance))
         paths.state = replace(paths.state, radiance=radiance)
         paths.camera_ends.clear()
 

@@ -366,8 +366,7 @@ def _write_end(trace: Trace, sinks: Sinks, output: VertexOutput) -> None:
             no_partner = torch.full_like(state.lane, -1)
             end = End(no_ray, no_ray, no_ray, nothing, nothing, nothing, no_partner)
     values = {f"end_{name}": value for name, value in vars(end).items()}
-    values |= {"connection_o": no_ray, "connection_d": no_ray, "connection_t": nothing, "connection_radiance": no_ray}
-    sinks.write += rows.nodes(tracer, **values)
+    sinks.write += rows.nodes(tracer, **values, connection_t=nothing)
 
 
 def list_ends(trace: Trace) -> Sinks:
