@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.scene.settings import BLOCKS, TYPED_BLOCKS, UNTYPED_BLOCKS
-from torchpt.spec import Choice, Spec, parameters_of, unsupported
+from torchpt.spec import Choice, Spec, parameters_of
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: Key that the example command in a file's first line sets, where it is not the first key with a default.
@@ -81,16 +81,11 @@ def block(rows: Rows, indent: str = "") -> str:
     return "".join(f"{indent}{line:{wide}}{f'  # {says}' if says else ''}".rstrip() + "\n" for line, says in lines)
 
 
-def later(group: str) -> Rows:
-    """Return the keys that are reserved but not implemented."""
-    return [(key, "null", "not built yet") for key in unsupported.KEYS.get(group, {})]
-
-
 def typed(group: str, kind: str | None) -> str:
     """Return the file of a type, or of all types of a group."""
     table, default = TYPED_BLOCKS[group]
     head = first_line(group, kind, parameters_of(table[kind or default]))
-    return head + block(rows_of(table, kind) + later(group))
+    return head + block(rows_of(table, kind))
 
 
 def plain(group: str, record: Any) -> str:
@@ -104,7 +99,7 @@ def plain(group: str, record: Any) -> str:
             rows = []
         else:
             rows.append((key, "null", comment(spec)))
-    return text + block(rows + later(group))
+    return text + block(rows)
 
 
 def written() -> dict[str, str]:

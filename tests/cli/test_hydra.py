@@ -15,7 +15,7 @@ from torchpt.cli.main import GROUPS, main
 from torchpt.cli.render import Job
 from torchpt.core.files import configs
 from torchpt.scene.settings import TYPED_BLOCKS
-from torchpt.spec import parameters_of, unsupported
+from torchpt.spec import parameters_of
 
 from .conftest import Renderer
 
@@ -44,8 +44,7 @@ def test_a_types_file_holds_its_own_keys_and_no_values() -> None:
     """Said without the script: every key of a file is read by its type, and every key of its type is there."""
     for group in ("integrator", "sampler"):
         table, _ = TYPED_BLOCKS[group]
-        later = set(unsupported.KEYS.get(group, ()))
-        keys = {name: set(parameters_of(table[name])) | later for name in table}
+        keys = {name: set(parameters_of(table[name])) for name in table}
         for name, own in {**keys, "default": set().union(*keys.values())}.items():
             block = yaml.safe_load((configs() / group / f"{name}.yaml").read_text())
             assert block.pop("type") == (None if name == "default" else name)

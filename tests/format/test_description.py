@@ -189,20 +189,6 @@ def test_a_misspelt_scene_gets_a_suggestion(
     assert f"(did you mean {suggested.format(tmp_path)}?)" in str(caught.value)
 
 
-LATER: dict[str, tuple[dict[str, Any], str]] = {
-    "integrator": (scene(integrator={"type": "vcm"}), "integrator.type"),
-}
-
-
-@pytest.mark.parametrize("name", LATER)
-def test_what_is_not_built_says_so(name: str) -> None:
-    source, key = LATER[name]
-    with pytest.raises(NotBuiltError) as caught:
-        read_description(source)
-    assert caught.value.key == key
-    assert "not built yet" in str(caught.value) and "\n" not in str(caught.value)
-
-
 def test_values_that_ask_for_nothing_are_no_error() -> None:
     nothing = {"adaptive": False}, {"resume": False, "time_limit": None}
     found = read_description(

@@ -81,6 +81,22 @@ ROWS = {
         smooth={"max_depth": 4},
     ),
     "direct": Row(accepted={"strategy": "uniform", "strict": True}, refused={**LIT, "strategy": "bdpt"}),
+    "vcm": Row(
+        accepted={"max_depth": 3, "rr_depth": 2, "light_paths": 0.5, "radius": 0.05, "alpha": 0.5},
+        refused={
+            "connections": "all",
+            "max_depth": -2,
+            "rr_depth": 0,
+            "rr_prob": 1.01,
+            "strategy": "uniform",
+            "weighted": 1,
+            "light_paths": 0,
+            "radius": 0,
+            "alpha": 0,
+            "light_choice": "nearest",
+            "strict": 1,
+        },
+    ),
     "bdpt": Row(
         accepted={"max_depth": 3, "rr_depth": 2, "rr_prob": 0.8, "light_paths": 0.5, "connections": "one"},
         refused={

@@ -444,7 +444,7 @@ NEAREST: dict[str, tuple[str, str, str]] = {
     ),
     "timed_sunsky": (lamp('<emitter type="timed_sunsky"/>'), "diffuse", 'emitter "timed_sunsky" becomes sky'),
     "collimated": (lamp('<emitter type="collimated"/>'), "diffuse", 'emitter "collimated" is left out'),
-    "sppm": (ball('<bsdf type="diffuse"/>').replace('type="path"', 'type="sppm"'), "diffuse", "becomes bdpt"),
+    "sppm": (ball('<bsdf type="diffuse"/>').replace('type="path"', 'type="sppm"'), "diffuse", "becomes vcm"),
 }
 
 

@@ -257,8 +257,8 @@ def test_a_picture_that_differs_is_found(monkeypatch):
     """A hundredth more light in one block of sixteen is seen."""
     scene, kept = loaded("cornell_box"), KernelsEngine.trace
 
-    def brighter(self: KernelsEngine, chunk: Chunk) -> Any:
-        tally = kept(self, chunk)
+    def brighter(self: KernelsEngine, chunk: Chunk, traced: Any) -> Any:
+        tally = kept(self, chunk, traced)
         places = np.arange(chunk.pixels * chunk.samples) % chunk.pixels + chunk.first_pixel
         self.slots.floats[:, : len(places)][:, (places % 32 < 8) & (places < 8 * 32)] *= 1.01
         return tally

@@ -53,8 +53,8 @@ def broken(monkeypatch) -> set[tuple[int, int]]:
     chosen: set[tuple[int, int]] = set()
     kept = KernelsEngine.trace
 
-    def spoiled(self: KernelsEngine, chunk: Chunk) -> RayCounts:
-        tally = kept(self, chunk)
+    def spoiled(self: KernelsEngine, chunk: Chunk, traced: Any) -> RayCounts:
+        tally = kept(self, chunk, traced)
         for number, (pixel, sample) in enumerate(sorted(chosen)):
             s, p = sample - chunk.first_sample, pixel - chunk.first_pixel
             if 0 <= s < chunk.samples and 0 <= p < chunk.pixels:
@@ -133,10 +133,10 @@ def test_an_error_in_a_task_ends_the_render(monkeypatch, threads):
     whole, before = rendered(scene, 4, film, threads=threads), set(threading.enumerate())  # the pool keeps its threads
     kept = KernelsEngine.trace
 
-    def fails(self: KernelsEngine, chunk: Chunk) -> RayCounts:
+    def fails(self: KernelsEngine, chunk: Chunk, traced: Any) -> RayCounts:
         if chunk.first_pixel > 1000:
             raise RuntimeError("out of order")
-        return kept(self, chunk)
+        return kept(self, chunk, traced)
 
     with monkeypatch.context() as patched:
         patched.setattr(KernelsEngine, "trace", fails)

@@ -256,9 +256,9 @@ def test_a_model_that_no_kernel_can_be_made_of(monkeypatch, capsys):
     asked: list[int] = []
     kept = chunk.bounce_eagerly
 
-    def noted(kernels: Any, store: Any, model: int, *args: Any) -> int:
+    def noted(kernels: Any, context: Any, store: Any, model: int, *args: Any) -> int:
         asked.append(model)
-        return kept(kernels, store, model, *args)
+        return kept(kernels, context, store, model, *args)
 
     capsys.readouterr()
     monkeypatch.setattr(chunk, "bounce_eagerly", noted)
@@ -275,11 +275,12 @@ def test_a_model_that_no_kernel_can_be_made_of(monkeypatch, capsys):
     assert "eager" not in rendered(torchpt.load(room(), "cpu")).summary()
 
 
-def test_paths_are_connected_on_a_model_that_no_kernel_can_be_made_of():
+@pytest.mark.parametrize("name", ["bdpt", "vcm"])
+def test_paths_are_connected_and_merged_on_a_model_that_no_kernel_can_be_made_of(name: str):
     """On a film so small that some blocks of the store get a single vertex."""
     scene = torchpt.load(room("odd"), "cpu", bsdfs={"odd": Odd()})
-    bdpt = {"type": "bdpt", "connections": "one", "light_paths": 1.0}
-    keys = {"integrator": bdpt, "film": {"width": 2, "height": 2}}
+    both = {"type": name, "connections": "one", "light_paths": 1.0}
+    keys = {"integrator": both, "film": {"width": 2, "height": 2}}
     eager = rendered(scene, render={"compile": "off"}, **keys)
     found = rendered(scene, **keys)
     assert found.eager and found.rays == eager.rays

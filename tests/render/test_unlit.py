@@ -43,7 +43,7 @@ def test_a_light_inside_of_glass_is_named(light, accel):
     found = shot(room({"p": light}, bulb=BULB), accel=accel)
     assert found.relmse is None and found.relmse_interval is None and not bool(found.image.any())
     inside = f"a {light['type']} light inside bulb (dielectric) cannot be found by integrator path"
-    inside += " (bdpt finds it where it is not seen through glass or in a mirror)"
+    inside += " (bdpt finds it where it is not seen through glass or in a mirror, vcm there too)"
     assert found.relmse_unknown == f"lights.p: {inside}" == found.summary()["relmse_unknown"]
     assert found.summary()["relmse"] is None and "relmse" not in found.header()
 

@@ -75,12 +75,14 @@ def unknown_key_error(key: str, words: Iterable[str] = ()) -> str:
         return f"{key}: unknown key{did_you_mean(key, known)}; known: {', '.join(known)}"
     every = [f"{group}.{known}" for group in GROUPS for known in known_keys(group)]
     in_some_group = next((known for known in every if known.endswith(f".{key}")), None)
-    hint = (
-        f" (did you mean {in_some_group}?)"
-        if in_some_group
-        else did_you_mean(key, [*every, *GROUPS, "scene", "out"])
-        or did_you_mean(group, SCENE_BLOCKS, lambda block: f"{block}.{name}" if name else block)
-    )
+    of_command = did_you_mean(key, [*every, *GROUPS, "scene", "out"])
+    of_scene = did_you_mean(group, SCENE_BLOCKS, lambda block: f"{block}.{name}" if name else block)
+    if in_some_group:
+        hint = f" (did you mean {in_some_group}?)"
+    elif name and not did_you_mean(group, GROUPS):  # the last part may be a key of both
+        hint = of_scene or of_command
+    else:
+        hint = of_command or of_scene
     ours = ", ".join(f"{group}.*" for group in GROUPS)
     _version, *blocks = SCENE_BLOCKS  # nobody overrides the version of the format
     return f"{key}: unknown key{hint}; known: scene, out, {ours}, and the scene's own: {', '.join(blocks)}"

@@ -24,7 +24,8 @@ from torchpt.paths import layers as aov
 from torchpt.paths.integrators.base import check_fields, check_output
 from torchpt.paths.integrators.path import Ends, follows_ray, partition
 from torchpt.paths.layers import LAYERS
-from torchpt.paths.state import Emission, End, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
+from torchpt.paths.photons import PhotonMap
+from torchpt.paths.state import Emission, End, PathState, Photon, Shadow, Splat, StageContext, VertexInput, VertexOutput
 from torchpt.paths.store import VertexStore, partner_of, vertex_of
 from torchpt.paths.transmission import non_opaque, opacity_at, origins_behind
 from torchpt.paths.walk import Counts, Observer, find_hits, walk
@@ -116,8 +117,10 @@ class TensorsEngine:
         keeps: True: populations keep stage outputs (``Paths.emissions``, ``Paths.outputs``), for an observer.
         splats: a list to append splats to; None: splats are dropped.
         store: where light paths keep vertices, and camera paths find them; None: paths are not connected.
+        photons: of the sample, for camera paths that are merged with them; None: they are not.
 
     Attributes:
+        sent: samples ``(n,)`` of light paths, and what they send to be merged with camera paths.
         radiance: ``(3, lanes)`` radiance of samples whose paths have ended, by sample.
         lost: ``(lanes,)`` bool, True for samples with a splat that is not finite; None: the integrator has no splats.
     """
@@ -130,8 +133,10 @@ class TensorsEngine:
         keeps: bool = False,
         splats: list[Splats] | None = None,
         store: VertexStore | None = None,
+        photons: PhotonMap | None = None,
     ) -> None:
-        self.keeps, self.store = keeps, store
+        self.keeps, self.store, self.photons = keeps, store, photons
+        self.sent: list[tuple[Tensor, Photon]] = []
         self.wave, self.context, self.tally = wave, wave.context, RayCounts() if tally is None else tally
         self.plan, self.world = wave.context.plan, wave.context.world
         self.has_transmission = self.world.materials.opacity is not None or wave.integrator.has_own_transmit
@@ -248,12 +253,16 @@ class TensorsEngine:
     def _input(self, paths: Paths, index: Tensor) -> VertexInput:
         return VertexInput(rows(paths.state, index), rows(paths.hits, index))
 
-    def _with_partner(self, vertex: VertexInput, depth: int) -> VertexInput:
-        """Return the input of the stage of surfaces, with the vertices that these may be connected to."""
-        if self.store is None or not self.wave.integrator.connects:
-            return vertex
-        values = self.store.read(vertex.state.lane, depth)
-        return vertex if values is None else replace(vertex, partner=partner_of(values))
+    def _with_light_paths(self, vertex: VertexInput, depth: int) -> VertexInput:
+        """Return the input of the stage of surfaces, with what these may be connected to and merged with."""
+        state = vertex.state
+        if self.store is not None and self.wave.integrator.connects:
+            values = self.store.read(state.lane, depth)
+            vertex = vertex if values is None else replace(vertex, partner=partner_of(values))
+        if self.photons is not None and self.wave.integrator.merges:
+            p = state.o + state.d * vertex.hit.t
+            vertex = replace(vertex, photon=self.photons.photons(p, state.key, depth))
+        return vertex
 
     def scatter(self, paths: Paths, roulette: float) -> Paths:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -264,7 +273,7 @@ class TensorsEngine:
         after = Paths(paths.state, paths.depth + 1)
         start = 0  # the first lane, in the new population, of the paths of a model
         for model, index in paths.groups:
-            vertex = self._with_partner(self._input(paths, index), paths.depth)
+            vertex = self._with_light_paths(self._input(paths, index), paths.depth)
             output = bounce(context, model, vertex)
             check_output(self.wave.integrator, output)
             leaving.append(output.leaving)
@@ -278,6 +287,8 @@ class TensorsEngine:
                 self.tally.rays += len(index)
             if output.kept is not None and self.store is not None:
                 self.store.keep(vertex.state.lane, vertex, output.kept)
+            if output.photon is not None:
+                self.sent.append((vertex.state.lane, output.photon))
             if output.end is not None:
                 after.camera_ends.append((start, vertex.state.lane, output.end))
             if self.keeps:
@@ -414,6 +425,8 @@ def trace(
     observer: Observer[Paths] | None = None,
     splats: list[Splats] | None = None,
     store: VertexStore | None = None,
+    photons: PhotonMap | None = None,
+    sent: list[tuple[Tensor, Photon]] | None = None,
 ) -> Tensor:
     """Return the radiance ``(3, N)`` along rays, not weighted by the filter.
 
@@ -424,10 +437,15 @@ def trace(
         observer: gets the callbacks of the walk; populations then keep stage outputs.
         splats: a list to append splats to; None: splats are dropped.
         store: of the vertices of light paths, see :class:`TensorsEngine`.
+        photons: likewise.
+        sent: a list to append to what light paths send, see :class:`TensorsEngine`.
     """
-    engine = TensorsEngine(wave, len(state.lane), tally, keeps=observer is not None, splats=splats, store=store)
+    keeps = observer is not None
+    engine = TensorsEngine(wave, len(state.lane), tally, keeps, splats, store, photons)
     if len(state.lane):
         walk(engine, engine.spawn(state), wave.integrator.limits, observer)
+    if sent is not None:
+        sent += engine.sent
     return engine.path_radiance()
 
 
@@ -444,9 +462,10 @@ def weighted_radiance(
     observer: Observer[Paths] | None = None,
     splats: list[Splats] | None = None,
     store: VertexStore | None = None,
+    photons: PhotonMap | None = None,
 ) -> Tensor:
     """Return the radiance ``(3, N)`` of camera rays times their filter weights; arguments as for :func:`trace`."""
-    samples = trace(wave, state, tally, observer, splats, store)
+    samples = trace(wave, state, tally, observer, splats, store, photons)
     # other filters are importance sampled, with weight 1
     return samples * wave.weight(state) if wave.filter.signed else samples
 

@@ -38,6 +38,7 @@ __all__ = [
     "Field",
     "Partner",
     "PathState",
+    "Photon",
     "Plan",
     "Shadow",
     "Splat",
@@ -179,6 +180,7 @@ class StageContext:
         crop: ``(x, y, width, height)`` of the picture on the camera's film, in pixels; None for an integrator without splats.
         start_salts: salts of depth 0, at the first vertex of a path that started on a light; None elsewhere.
         depth: number of the vertex, 1 at the first hit; in kernels a tensor ``(1,)`` int32. 0 in stages before a vertex.
+        merging: ``(1,)`` ratio of densities of a merge, with which weights count; None for an integrator without merges.
     """
 
     plan: Plan
@@ -194,6 +196,7 @@ class StageContext:
     start_salts: Tensor | None = None
     crop: tuple[int, int, int, int] | None = None
     depth: int | Tensor = 0
+    merging: Tensor | None = None
 
     def at(
         self,
@@ -234,6 +237,28 @@ class Partner:
 
 
 @dataclass(frozen=True)
+class Photon:
+    """Light paths as they arrive at surfaces.
+
+    Attributes:
+        p: ``(3, n)`` the points.
+        d: ``(3, n)`` unit directions of arrival.
+        value: ``(3, n)`` flux. At a vertex of a camera path: that of all photons nearby, for which this one stands, over area
+            and number of light paths; 0 where there is none.
+        dvcm: ``(n,)`` of the arrival, see :mod:`torchpt.paths.integrators.weights`.
+        dvc: ``(n,)`` likewise.
+        depth: ``(n,)`` int64 number of the vertex on its light path.
+    """
+
+    p: Tensor
+    d: Tensor
+    value: Tensor
+    dvcm: Tensor
+    dvc: Tensor
+    depth: Tensor
+
+
+@dataclass(frozen=True)
 class VertexInput:
     """Inputs of a stage that differ from lane to lane.
 
@@ -241,11 +266,13 @@ class VertexInput:
         state: the paths as they arrive at the vertex.
         hit: the nearest hits of their rays.
         partner: vertices of light paths, for an integrator that connects paths; else None.
+        photon: light paths that arrive nearby, for an integrator that merges paths; else None.
     """
 
     state: PathState
     hit: Hit
     partner: Partner | None = None
+    photon: Photon | None = None
 
 
 @dataclass(frozen=True)
@@ -397,6 +424,7 @@ class VertexOutput:
         splat: radiance for other pixels; None: none. Only integrators that declare ``splats`` return it.
         kept: what connections need of the vertex; None: it is not kept.
         end: the camera path's end of a connection; None: the vertex has none.
+        photon: light paths as they arrive, to be merged with camera paths; None: they are not.
         surface: the points with their materials; None where the stage did not resolve them.
         direct: the light sample; None where no light was sampled.
         drawn: the BSDF sample; None where paths end here.
@@ -416,3 +444,4 @@ class VertexOutput:
     splat: Splat | None = None
     kept: StoredVertex | None = None
     end: End | None = None
+    photon: Photon | None = None

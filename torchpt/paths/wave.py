@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import take
 from torchpt.paths.integrators.base import Integrator
+from torchpt.paths.photons import merging_of
 from torchpt.paths.state import PathState, StageContext, VertexInput, VertexOutput
 from torchpt.physics import lights
 from torchpt.physics.cameras import Camera
@@ -180,6 +181,23 @@ class Wave:
         """Return the first rays of paths, see :meth:`Integrator.generate`."""
         context = replace(self.context, camera=self.camera, filter=self.filter)
         return self.integrator.generate(context, x, y, key, salts)
+
+    @property
+    def light_path_count(self) -> float:
+        """Return the number of light paths of a sample of all pixels."""
+        return float(getattr(self.integrator.light_walk(), "fraction", 0.0)) * self.crop[2] * self.crop[3]
+
+    def at_sample(self, sample: int) -> Wave:
+        """Return the wave of sample ``sample`` of each pixel: weights count with merges within its radius."""
+        radius = self.integrator.radius_at(sample)
+        if radius is None:
+            return self
+        number = merging_of(radius, self.light_path_count)
+        merging = torch.full((1,), number, dtype=self.context.plan.dtype, device=self.centre.device)
+        light_paths = self.light_paths
+        if light_paths is not None:
+            light_paths = replace(light_paths, context=replace(light_paths.context, merging=merging))
+        return replace(self, context=replace(self.context, merging=merging), light_paths=light_paths)
 
     def with_rays(self, rays: Rays) -> Wave:
         """Return the wave whose paths start with ``rays``, a picture of one row; samples have no filter weights."""

@@ -200,6 +200,8 @@ def _why_unreachable(search: _Search, names: Names, lights: Lights, row: int, ki
     cannot_be_found = f"cannot be found by integrator {integrator.name}"
     if not isinstance(integrator, PathIntegrator):
         return ""
+    if integrator.merges:  # merges find it where a surface that is not all deltas is lit
+        return ""
     if integrator.strategy in ("bsdf", "uniform"):
         return f"a {kind} light {cannot_be_found} with strategy {integrator.strategy}"
     models = world.materials.models
@@ -221,8 +223,9 @@ def _why_unreachable(search: _Search, names: Names, lights: Lights, row: int, ki
     shape, material = names.shape(int(slot[transmitting[0]]))
     where = f"a {kind} light {'inside' if len(hit_models) == LIGHT_RAYS else 'behind'} {shape} ({material})"
     if integrator.light_walk() is not None:
-        return f"{where} cannot be found by integrator {integrator.name} where it is seen through glass or in a mirror"
-    return f"{where} {cannot_be_found} (bdpt finds it where it is not seen through glass or in a mirror)"
+        seen = "where it is seen through glass or in a mirror"
+        return f"{where} cannot be found by integrator {integrator.name} {seen} (vcm finds it there)"
+    return f"{where} {cannot_be_found} (bdpt finds it where it is not seen through glass or in a mirror, vcm there too)"
 
 
 def _light_rays(search: _Search, lights: Lights, row: int, kind: str) -> tuple[Tensor, Tensor]:

@@ -204,8 +204,14 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
     if not 0 <= sample < spp:
         raise SceneError("debug.sample", sample, f"a whole number from 0 to {spp - 1}, as render.spp is {spp}")
     if not isinstance(settings.integrator, PathIntegrator):
-        names = ", ".join(name for name in INTEGRATORS if issubclass(INTEGRATORS[name], PathIntegrator))
+        kinds = {name: INTEGRATORS[name] for name in INTEGRATORS}
+        names = ", ".join(
+            name for name, kind in kinds.items() if issubclass(kind, PathIntegrator) and not kind().merges
+        )
         expected = f"one that follows paths ({names}) beside debug.pixel"
+        raise SceneError("integrator.type", settings.integrator.name, expected)
+    if settings.integrator.merges:
+        expected = "bdpt beside debug.pixel: merges take light from the paths of all pixels"
         raise SceneError("integrator.type", settings.integrator.name, expected)
     with torch.no_grad(), limited_threads(settings.render.threads):
         wave = make_wave(scene, settings, params=None, dtype=torch.float32)

@@ -120,6 +120,9 @@ class Run:
             lambda: f"a scene of {scene.size_phrase}",
             lambda: make_wave(scene, settings, params, dtype, like=like, rays=rays),
         )
+        if self.distributed is not None and self.wave.integrator.merges:
+            expected = "one without merges beside ranks, each of which traces light paths for its own pixels alone"
+            raise SceneError("integrator.type", settings.integrator.name, expected)
         peak_built = peak_before if limit is None else meter.peak()
         _, _, self.width, self.height = self.wave.crop
         self.params, self.dtype = params, dtype
@@ -228,6 +231,7 @@ class Run:
             or self.stop_rules.has_other_rules
             or self.probes is not None
             or self.distributed is not None
+            or self.wave.integrator.merges  # light paths of all pixels come first
         )
         if self.tasks is None or works_between_passes or self.settings.render.max_memory is not None:
             return None

@@ -658,6 +658,12 @@ def _notes(scene_report: SceneReport, main: str) -> list[str]:
             "Denoised pictures are guesses: their bias falls with samples by no known law. So their curves have no slope, no "
             "efficiency, and no time to an error beyond their runs."
         )
+    merged = [line.label for line in scene_report.lines if line.settings.get("integrator", {}).get("type") == "vcm"]
+    if merged:
+        notes.append(
+            f"Pictures of vcm are consistent, not unbiased ({', '.join(merged)}): merges blur light within a radius that falls "
+            "with samples, and so does the bias that the test may find."
+        )
     if drowned:
         notes.append(
             f"Some steps have errors below the noise of the reference and are left out of curves: {', '.join(drowned)}."

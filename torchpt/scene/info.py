@@ -86,6 +86,8 @@ def describe(
         built_rows["origin_moved_to"] = built.centre.tolist()
     if built.unit != 1.0:
         built_rows["unit_of_length"] = built.unit
+    if settings.integrator.merges:
+        built_rows["merges"] = "consistent, not unbiased: bias falls with the radius, from sample to sample"
     return {
         "scene": {
             "file": description.file,

@@ -44,6 +44,8 @@ CODE_OF_LLVM = 60_000_000
 CODE_OF_MODEL = 3_000_000
 #: Bytes of a pixel while the picture is computed from the films: plain, with error probes, adaptive, with the AOV variance.
 PICTURE_BYTES, PROBES_BYTES, ADAPTIVE_BYTES, VARIANCE_BYTES = 64, 225, 160, 160
+#: Bytes of the photons of a pixel while their map is made: 200 each, of five vertices of a light path.
+PHOTONS_BYTES = 1000
 #: Bytes of a pixel of the finished pictures.
 FINISHED_BYTES = 80
 #: Bytes of a film that is allocated without looking at free memory.
@@ -109,6 +111,8 @@ def memory_estimate(settings: Settings, device: torch.device, mode: str, models:
     # Bytes of a pixel, as in `Film.bytes_of`: of each layer two float64 a channel (first samples, sums) and a count.
     films = Film.bytes_of(1, settings.streams, splats=settings.integrator.splats)
     films += sum(16 * count + 8 for count in channels)
+    if settings.integrator.merges:
+        films += PHOTONS_BYTES
     picture = PICTURE_BYTES
     if "variance" in settings.film.aovs:
         picture = VARIANCE_BYTES

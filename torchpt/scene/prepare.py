@@ -8,6 +8,7 @@ Renders, gradients and ``torchpt info`` begin with :func:`make_wave`; only rende
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -28,6 +29,7 @@ from torchpt.images.denoiser import GUIDES
 from torchpt.math.vectors import dot, normalize
 from torchpt.native import device_checks
 from torchpt.paths.integrators.base import Integrator
+from torchpt.paths.integrators.kinds.vcm import Vcm
 from torchpt.paths.layers import LAYERS, SurfaceLayer
 from torchpt.paths.state import Plan, StageContext
 from torchpt.paths.wave import Rays, Wave
@@ -190,8 +192,45 @@ def make_wave(
         centre=scene.space.shift,
         first_surface=_first_surface(scene, integrator, world, own=own) if like is None else like.first_surface,
     )
-    wave = replace(wave, light_paths=_light_paths(wave))
+    wave = _with_radius(replace(wave, light_paths=_light_paths(wave))).at_sample(0)
     return wave if rays is None else wave.with_rays(_lane_rays(scene, *rays, dtype))
+
+
+#: Camera rays, along each side of the picture, whose hits tell how wide pixels are where surfaces are seen.
+_PILOT_SIDE = 32
+#: Radius of merges that nobody gave, in pixels.
+_RADIUS_IN_PIXELS = 2.0
+
+
+def _with_radius(wave: Wave) -> Wave:
+    """Return the wave with the radius of merges, where its integrator merges and nobody gave one: two pixels wide.
+
+    The width of a pixel is the median over camera rays on a grid of the picture, at the surfaces that they hit. The radius has
+    two digits, so that other processors round to the same.
+    """
+    integrator = wave.integrator
+    if not isinstance(integrator, Vcm) or integrator.radius is not None:
+        return wave
+    x0, y0, width, height = wave.crop
+    dtype, device = wave.context.plan.dtype, wave.centre.device
+    across = (torch.arange(_PILOT_SIDE, device=device, dtype=dtype) + 0.5) / _PILOT_SIDE
+    x, y = torch.meshgrid(x0 + across * width, y0 + across * height, indexing="ij")
+    x, y = x.reshape(-1), y.reshape(-1)
+    with torch.no_grad():
+        lens = torch.full((2, len(x)), 0.5, dtype=dtype, device=device) if wave.camera.lens else None
+        o, d = wave.camera.rays(x, y, lens)
+        _, beside = wave.camera.rays(x + 1.0, y, lens)
+        o = o.expand_as(d).contiguous()
+        t, prim, *_ = wave.accel.intersect(o, d.contiguous(), torch.full_like(x, math.inf))
+        if wave.camera.parallel:
+            origin, _ = wave.camera.rays(x + 1.0, y, lens)
+            wide = (origin.expand_as(d) - o).square().sum(0).sqrt()
+        else:
+            wide = (beside - d).square().sum(0).sqrt() * t
+        wide = wide[(prim >= 0) & torch.isfinite(wide)]
+    median = float(wide.double().median()) if len(wide) else 0.0
+    radius = float(f"{_RADIUS_IN_PIXELS * median:.1e}") or 1.0  # any, where nothing is seen
+    return replace(wave, integrator=integrator.but(radius=radius))
 
 
 #: Xor mask that gives light paths a seed of their own, any constant below 2^63.
@@ -407,6 +446,8 @@ def uses_kernels(settings: Settings, device: torch.device, dtype: torch.dtype) -
         missing = f"kernels compute in float32; this render is in {str(dtype).removeprefix('torch.')}"
     elif reason := engine.why_no_kernels(device):
         missing = f"{reason}; this scene is on {device}"
+    elif device.type != "cpu" and settings.integrator.merging_counts:
+        missing = f"integrator {settings.integrator.name} has kernels on a CPU alone; this scene is on {device}"
     if settings.render.compile == "on":
         if missing:
             raise SceneError("render.compile", "on", f"auto or off ({missing})")

@@ -21,7 +21,7 @@ import numpy as np
 
 from torchpt.core.errors import NotBuiltError, SceneError, did_you_mean
 from torchpt.core.tree import NOT_FINGERPRINTED
-from torchpt.spec import Map, Refused, unsupported
+from torchpt.spec import Map, Refused
 from torchpt.spec.parameters import REQUIRED, Spec, spec_of
 from torchpt.spec.reading import as_refused
 
@@ -40,7 +40,6 @@ __all__ = [
     "parameters_of",
     "read_params",
     "read_typed",
-    "refuse_not_built",
     "refuse_unused_keys",
     "scene_error",
 ]
@@ -314,29 +313,6 @@ def scene_error(error: Refused, key: str, value: Any, file: str | None) -> Scene
     return kind(dotted(key, *error.at), shown, error.expected, file)
 
 
-def refuse_not_built(
-    raw: Mapping[str, Any], unsupported_keys: Mapping[str, object], key: str, available: str, file: str | None
-) -> dict[str, Any]:
-    """Return the mapping without the keys that the format knows and this version does not support.
-
-    Args:
-        raw: the mapping as written.
-        unsupported_keys: such keys, each with its neutral value, which changes nothing.
-        key: dotted key of the mapping.
-        available: the supported keys, for errors.
-        file: scene file, for errors.
-
-    Raises:
-        NotBuiltError: such a key with a value that is neither null nor its neutral value.
-    """
-    for name, neutral in unsupported_keys.items():
-        value = raw.get(name)
-        is_comparable = type(value) in (int, float, bool) and isinstance(value, bool) == isinstance(neutral, bool)
-        if value is not None and not (is_comparable and value == neutral):
-            raise NotBuiltError(dotted(key, name), value, available, file)
-    return {name: value for name, value in raw.items() if name not in unsupported_keys}
-
-
 # ---- Reading of blocks: the kind that ``type`` names, and the values of its parameters
 
 
@@ -380,7 +356,7 @@ def read_typed(
     """Read a mapping whose ``type`` names a kind of a table.
 
     Args:
-        what: name of the table for errors, e.g. ``light``; the key in :data:`torchpt.spec.unsupported.TYPES` too.
+        what: name of the table for errors, e.g. ``light``.
         table: the kinds.
         raw: the mapping as written.
         key: its dotted key.
@@ -390,20 +366,14 @@ def read_typed(
 
     Raises:
         SceneError: no mapping, an unknown type, an unknown key, a bad value.
-        NotBuiltError: a type or key that the format knows and this version does not support.
     """
-    not_built = unsupported.TYPES.get(what, {})
-    types = ", ".join([*table, *not_built])
+    types = ", ".join(table)
     if not isinstance(raw, Mapping):
         raise SceneError(key, raw, f"a mapping with a type of {types}", file)
     name = raw.get("type", default or None)
-    if not isinstance(name, str) or (name not in table and name not in not_built):
-        hint = did_you_mean(name, [*table, *not_built])
+    if not isinstance(name, str) or name not in table:
+        hint = did_you_mean(name, [*table])
         raise SceneError(dotted(key, "type"), name, f"a known {what} type{hint}: {types}", file)
-    words = f"{what} type {name}"
-    if name in not_built:
-        check_keys(raw, ("type", *not_built[name]), key=key, what=words, file=file)
-        raise NotBuiltError(dotted(key, "type"), name, ", ".join(table), file)
     kind = table[name]
 
     def read() -> ParsedParams:
@@ -425,12 +395,8 @@ def _read_kind(
     """Read a mapping whose kind is known; arguments as of :func:`read_typed`, ``name``: the ``type``."""
     words = f"{what} type {name}"
     names = list(parameters_of(kind))
-    unsupported_keys = {**unsupported.KEYS.get(what, {}), **unsupported.KEYS.get(name, {})}
-    check_keys(
-        {k: v for k, v in raw.items() if k not in unsupported_keys}, ("type", *names), key=key, what=words, file=file
-    )
-    supported = refuse_not_built(raw, unsupported_keys, key=key, available=", ".join(names), file=file)
-    values = {name: value for name, value in supported.items() if name != "type"}
+    check_keys(raw, ("type", *names), key=key, what=words, file=file)
+    values = {name: value for name, value in raw.items() if name != "type"}
     return read_params(kind, values, key=key, file=file, words=words, texture=texture)
 
 

@@ -29,12 +29,14 @@ from torch import Tensor
 
 from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD, WORD
-from torchpt.engines.kernels.layout import CONNECTION, HIT, Memory, Rows, path_state, state_values
+from torchpt.engines.kernels.layout import CONNECTION, HIT, PHOTON, Memory, Rows, path_state, state_values
 from torchpt.engines.kernels.programs import Kernel, Kernels
 from torchpt.engines.kernels.stages import CHUNK_FIELDS
 from torchpt.paths.integrators.base import check_output
 from torchpt.paths.layers import LAYERS
-from torchpt.paths.state import End, Shadow, Splat, VertexInput, no_shadow
+from torchpt.paths.photons import PHOTON as PHOTONS
+from torchpt.paths.photons import PhotonMap, photon_of
+from torchpt.paths.state import End, Shadow, Splat, StageContext, VertexInput, no_shadow
 from torchpt.paths.store import BLOCKS, PARTNER, block_of, kept_values, partner_of, vertex_of
 from torchpt.paths.walk import Counts, Observer, walk
 from torchpt.paths.wave import PixelSet, RayCounts
@@ -54,6 +56,8 @@ __all__ = [
     "KernelsEngine",
     "LaneCount",
     "Paths",
+    "SentPhotons",
+    "TracedLight",
     "bounce_eagerly",
     "connect_eagerly",
     "count_samples",
@@ -138,7 +142,12 @@ class Calls:
         self._depths: dict[int, np.ndarray] = {}  # numbers of vertices, likewise
         self._start_salts = salts(0, torch.device("cpu"))
         # Address of each uniform.
-        self._uniforms = {"place": self.place.ctypes.data, "start_salts": self._start_salts.data_ptr()}
+        self._merging = np.ones(1, np.float32)
+        self._uniforms = {
+            "place": self.place.ctypes.data,
+            "start_salts": self._start_salts.data_ptr(),
+            "merging": self._merging.ctypes.data,
+        }
 
     def unbind(self) -> None:
         """Drop all references to the render and its kernels."""
@@ -181,6 +190,10 @@ class Calls:
     def known(self, count: LaneCount) -> int:
         """Return a count as an int."""
         return count
+
+    def set_merging(self, merging: float) -> None:
+        """Set the ratio of densities of a merge."""
+        self._merging[:] = merging
 
     def set_chunk(self, numbers: np.ndarray) -> None:
         """Set the chunk: int32 numbers, see :data:`torchpt.engines.kernels.stages.CHUNK_FIELDS`."""
@@ -252,6 +265,7 @@ class Calls:
 
 def bounce_eagerly(
     kernels: Kernels,
+    context: StageContext,
     store: Memory | None,
     model: int,
     roulette: float,
@@ -266,6 +280,7 @@ def bounce_eagerly(
 
     Args:
         kernels: of the render.
+        context: of the chunk.
         store: vertices of light paths; None: paths are not connected.
         model: index of the BSDF model.
         roulette: see :class:`torchpt.paths.state.StageContext`.
@@ -285,12 +300,15 @@ def bounce_eagerly(
         vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
         device = state.t_max.device
         start_salts = kernels.wave.integrator.start_salts(depth, device)
-        context = kernels.wave.context.at(salts(depth, device), roulette=roulette, start_salts=start_salts, depth=depth)
+        context = context.at(salts(depth, device), roulette=roulette, start_salts=start_salts, depth=depth)
         integrator, sample = kernels.wave.integrator, state.lane
         if integrator.connects:
             assert store is not None and kernels.store is not None
             partner = partner_of(kernels.store.take(store, sample, PARTNER, block_of(depth) * kernels.store.count))
             vertex = replace(vertex, partner=partner)
+        if integrator.merges:
+            near = rows.take(source, lanes, tuple(PHOTON))
+            vertex = replace(vertex, photon=photon_of({k.removeprefix("photon_"): x for k, x in near.items()}))
         output = kernels.wave.bounce(context, model, vertex)
         check_output(integrator, output)
         if output.kept is not None:
@@ -314,17 +332,29 @@ def bounce_eagerly(
         ended = {"end_partner": torch.full_like(after.lane, -1), "connection_t": torch.zeros_like(after.t_max)}
         end = output.end
         values |= ended if end is None else {**ended, **{f"end_{name}": value for name, value in vars(end).items()}}
+    if integrator.sends_photons:
+        values["photon_depth"] = torch.zeros_like(after.lane)
+        if output.photon is not None:
+            values |= {f"photon_{name}": value for name, value in vars(output.photon).items()}
     rows.put(target, start, values)
     return count * (int(output.shadow is not None) + int(output.splat is not None))
 
 
 def connect_eagerly(
-    kernels: Kernels, store: Memory, model: int, arena: Memory, places: Memory, count: int, depth: int
+    kernels: Kernels,
+    context: StageContext,
+    store: Memory,
+    model: int,
+    arena: Memory,
+    places: Memory,
+    count: int,
+    depth: int,
 ) -> None:
     """Run the stage of connections with tensor operations in place of its kernel.
 
     Args:
         kernels: of the render.
+        context: of the chunk.
         store: vertices of light paths.
         model: index of the BSDF model of these.
         arena: of the camera paths behind their vertex.
@@ -339,7 +369,7 @@ def connect_eagerly(
         sample = rows.take(arena, lanes, ("lane",))["lane"]
         values = of_store.take(store, sample, of_store.names, block_of(depth) * of_store.count)
         device = sample.device
-        context = kernels.wave.context.at(salts(depth, device), start_salts=salts(0, device), depth=depth)
+        context = context.at(salts(depth, device), start_salts=salts(0, device), depth=depth)
         end = End(**{name.removeprefix("end_"): value for name, value in ends.items()})
         light = kernels.wave.integrator.connect(context, model, vertex_of(values), values["depth"], end)
     rows.scatter(arena, lanes, {f"connection_{name}": value for name, value in _values_of_shadow(light).items()})
@@ -483,6 +513,27 @@ class Chunk:
     pixel_set: PixelSet | None = None
 
 
+@dataclass(frozen=True)
+class SentPhotons:
+    """What the light paths of some pixels leave for the camera paths of the same sample, but for their splats.
+
+    Attributes:
+        parts: index of the pixel, and fields, of photons.
+        lost: ``(n,)`` pixels whose light path has a splat that is not finite.
+    """
+
+    parts: list[tuple[np.ndarray, dict[str, np.ndarray]]]
+    lost: np.ndarray
+
+
+@dataclass(frozen=True)
+class TracedLight:
+    """What the light paths of one sample of all pixels leave: photons, and pixels that are lost as in :class:`SentPhotons`."""
+
+    photons: PhotonMap
+    lost: np.ndarray
+
+
 # Chunks are added to films by the kernels :func:`torchpt.engines.kernels.stages.accumulate`, a sample at a time.
 
 
@@ -554,6 +605,9 @@ class KernelsEngine:
         store: where light paths keep vertices for connections; None: memory of its own, if the integrator connects paths.
 
     Attributes:
+        traced: what the light paths of the sample have left, where camera paths are merged with photons; else None.
+        sent: samples, and fields by name, of photons that the chunk's light paths send.
+        context: of the chunk's stages, for those that run by tensor operations.
         slots: radiance of the chunk's samples.
         store: blocks of vertices of light paths (:mod:`torchpt.paths.store`), a column for each sample; None: there are none.
         shown: layers of the chunk's samples; None before `layers` was called.
@@ -573,6 +627,9 @@ class KernelsEngine:
         self.shown: Memory | None = None
         self.tally = RayCounts()
         self.splats: list[Splats] = []
+        self.traced: TracedLight | None = None
+        self.sent: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+        self.context = kernels.wave.context
         self._lost: list[Any] = []  # samples with splats that are not finite
         self._rooms = [self._room() for _ in range(2)]  # memory of even and of odd vertices
         if store is None and kernels.store is not None and self.wave.integrator.connects:
@@ -610,8 +667,8 @@ class KernelsEngine:
         size = sum(memory.words.nbytes for memory in self.memories())
         size += 0 if self.light_paths is None else self.light_paths.unbind()
         self.calls.unbind()
-        self.splats, self._lost = [], []
-        del self.kernels, self.wave, self.search.kernels
+        self.splats, self._lost, self.sent, self.traced = [], [], [], None
+        del self.kernels, self.wave, self.search.kernels, self.context
         return size
 
     def memories(self) -> list[Memory]:
@@ -622,26 +679,59 @@ class KernelsEngine:
 
     def rebind(self, kernels: Kernels, halt: threading.Event) -> None:
         """Reuse the memory for another render of the same structure, after `unbind`."""
-        self.kernels, self.wave = kernels, kernels.wave
+        self.kernels, self.wave, self.context = kernels, kernels.wave, kernels.wave.context
         self.calls.rebind(kernels, halt)
         self.search.kernels = kernels
         if self.light_paths is not None:
             assert kernels.light_paths is not None
             self.light_paths.rebind(kernels.light_paths, halt)
 
-    def trace(self, chunk: Chunk) -> RayCounts:
-        """Fill ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other."""
-        self.tally = RayCounts()
-        if self.light_paths is not None:
+    def trace(self, chunk: Chunk, traced: TracedLight | None = None) -> RayCounts:
+        """Fill ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other.
+
+        ``traced``: what the light paths of the sample have left, where an integrator merges paths; their splats and rays are
+        counted already.
+        """
+        self.tally, self.traced = RayCounts(), traced
+        self.set_sample(chunk)
+        light_paths = self.light_paths if traced is None or self.wave.integrator.connects else None
+        if light_paths is not None:
             self.clear_store(chunk)
-            tally = self.light_paths.trace(chunk)
+            tally = light_paths.trace(chunk)
             self.tally.rays += tally.rays
             self.tally.truncated += tally.truncated
         walk(self, self.spawn(chunk), self.wave.integrator.limits)
         self.mark_lost()
-        if self.light_paths is not None:
-            self.take_over(self.light_paths, chunk)
+        if traced is not None:
+            lost = traced.lost - chunk.first_pixel
+            self.slots.floats[:3, lost[(lost >= 0) & (lost < chunk.pixels)]] = np.nan
+            self.splats = []
+        elif light_paths is not None:
+            self.take_over(light_paths, chunk)
         return self.tally
+
+    def send(self, chunk: Chunk) -> tuple[RayCounts, list[Splats], SentPhotons]:
+        """Trace the light paths of a chunk of one sample alone; return counts of rays, their splats, and photons."""
+        self.set_sample(chunk)
+        assert self.light_paths is not None
+        if self.store is not None:
+            self.clear_store(chunk)
+        tally, count = self.light_paths.trace(chunk), chunk.pixels
+        lost = np.nonzero(~np.isfinite(self.light_paths.slots.floats[:3, :count]).all(0))[0]
+        parts = [(lane.astype(np.int64) + chunk.first_pixel, values) for lane, values in self.light_paths.sent]
+        return tally, self.light_paths.splats, SentPhotons(parts, lost + chunk.first_pixel)
+
+    def set_sample(self, chunk: Chunk) -> None:
+        """Set what depends on the chunk's sample, where an integrator merges paths: a chunk has one sample then."""
+        wave = self.wave.at_sample(chunk.first_sample)
+        merging = wave.context.merging
+        if wave.integrator.radius_at(chunk.first_sample) is None or merging is None:
+            return
+        self.context = wave.context
+        self.calls.set_merging(float(merging))
+        if self.light_paths is not None and wave.light_paths is not None:
+            self.light_paths.context = wave.light_paths.context
+            self.light_paths.calls.set_merging(float(merging))
 
     def clear_store(self, chunk: Chunk) -> None:
         """Forget the vertices that light paths of the chunk before have kept."""
@@ -697,7 +787,7 @@ class KernelsEngine:
         """Return the population of a chunk's camera rays, with their first hits if the search is part of the stages."""
         self.start(chunk)
         kernels, calls, start_rays = self.kernels, self.calls, self.wave.start_rays
-        self.splats, self._lost = [], []
+        self.splats, self._lost, self.sent = [], [], []
         count, pixels = chunk.pixels * chunk.samples, None if chunk.pixel_set is None else chunk.pixel_set.indices
         if start_rays is not None:  # the user's rays, in place of camera rays
             pixels = start_rays.number
@@ -801,10 +891,13 @@ class KernelsEngine:
             if not count:
                 continue
             lanes = paths.lists[model]
+            if self.traced is not None and not kernels.world.materials.models[model].smooth:
+                self._find_photons(paths, lanes.words[0, :count])
             if model in kernels.eager:
                 lane_count, first_lane = calls.known(count), calls.known(start)
                 self.tally.rays += bounce_eagerly(
                     kernels,
+                    self.context,
                     self.store,
                     model,
                     roulette,
@@ -832,8 +925,40 @@ class KernelsEngine:
             self._splat(paths)
         if self.light_paths is not None and self.wave.integrator.connects:
             self._connect(paths)
+        if self.wave.integrator.sends_photons:
+            self._send(paths)
         if paths.shadows:
             self.search.light(paths.arena, paths.count)
+
+    def _find_photons(self, paths: Paths, lanes: np.ndarray) -> None:
+        """Write the photons that vertices of the camera paths ``lanes`` are merged with to their rows."""
+        assert self.traced is not None
+        rows, arena = self.kernels.state, paths.arena
+        o, d, t, first, key = (rows.first(name) for name in ("o", "d", "t", "photon_p", "key"))
+        floats, words = cast(Any, arena.floats), cast(Any, arena.words)
+        p = floats[o : o + 3, lanes] + floats[d : d + 3, lanes] * floats[t, lanes]
+        keys = words[key : key + self.wave.sampler.points.rows, lanes]
+        found = self.traced.photons.near(p, keys, paths.depth)
+        floats[first : first + 3, lanes] = p
+        for name, values in found.items():
+            first, memory = rows.first(f"photon_{name}"), words if name == "depth" else floats
+            memory[first : first + (len(values) if values.ndim > 1 else 1), lanes] = values
+
+    def _send(self, paths: Paths) -> None:
+        """Keep the photons that light paths have sent from the vertex that ``paths`` have left."""
+        rows, arena = self.kernels.state, paths.arena
+        floats, words = cast(Any, arena.floats), cast(Any, arena.words)
+        depth = words[rows.first("photon_depth"), : paths.count]
+        lanes = np.nonzero(depth > 0)[0]
+        if not len(lanes):
+            return
+        values = {"depth": depth[lanes]}
+        for name, count in PHOTONS.items():
+            if name != "depth":
+                first = rows.first(f"photon_{name}")
+                found = floats[first : first + count][:, lanes]
+                values[name] = found if count > 1 else found[0]
+        self.sent.append((words[rows.first("lane"), lanes], values))
 
     def _splat(self, paths: Paths) -> None:
         """Record splats that reach the film. One that is not finite is left out and makes its sample NaN.
@@ -875,7 +1000,7 @@ class KernelsEngine:
             self._count_rays(count)
             if model in kernels.eager:
                 assert self.store is not None
-                connect_eagerly(kernels, self.store, model, paths.arena, lanes, calls.known(count), depth)
+                connect_eagerly(kernels, self.context, self.store, model, paths.arena, lanes, calls.known(count), depth)
             else:
                 slots = self._slots(depth)
                 calls.run(kernels.connect(model), count, paths.arena, paths.arena, lanes, slots=slots)

@@ -23,6 +23,7 @@ from torchpt.compiler.sinks import AppendIndex, Scatter, Sinks
 from torchpt.compiler.tracing import Tracer
 from torchpt.core.autograd import outside_transforms
 from torchpt.core.threads import outside_inference_mode
+from torchpt.paths import photons
 from torchpt.paths.state import EXTRA, PathState
 from torchpt.paths.wave import camera_state
 from torchpt.physics.samplers import Dimension
@@ -36,6 +37,7 @@ __all__ = [
     "CONNECTION",
     "HIT",
     "PASS",
+    "PHOTON",
     "SHADOW",
     "SPLAT",
     "Block",
@@ -85,6 +87,11 @@ CONNECTION: Fields = {
     "connection_d": ((3,), "f"),
     "connection_t": ((), "f"),
     "connection_radiance": ((3,), "f"),
+}
+#: Fields of photons: those that a light path sends, with depth 0 where it sends none, or that a camera path is merged with.
+PHOTON: Fields = {
+    f"photon_{name}": (() if rows == 1 else (rows,), "l" if name == "depth" else "f")
+    for name, rows in photons.PHOTON.items()
 }
 #: Fields of a ray in transit: the ray, the distance before its origin, and its lane in the arena of paths.
 PASS: Fields = {
@@ -357,6 +364,8 @@ def _path_fields(layout: Layout) -> Fields:
         fields |= SPLAT
     if wave.integrator.connects:
         fields |= CONNECTION
+    if wave.integrator.merges or wave.integrator.sends_photons:
+        fields |= PHOTON
     shadows = world.lights is not None if wave.first_surface is None else wave.first_surface.shadows(world)
     if not layout.fused and (shadows or wave.integrator.splats_at_surfaces):
         fields |= SHADOW
@@ -409,6 +418,11 @@ class Trace:
     def depth(self) -> Tensor:
         """Return the number of the vertex."""
         return self.uniform("depth", torch.ones(1, dtype=torch.int32))
+
+    def merging(self) -> Tensor | None:
+        """Return the ratio of densities of a merge ``(1,)``; None for an integrator without merges."""
+        counts = self.layout.wave.context.merging is not None
+        return self.uniform("merging", torch.ones(1)) if counts else None
 
     def roulette(self, bound: float | None) -> float | Tensor:
         """Return the upper bound of the survival probability; 0: no roulette at the vertex. None: an input ``(1,)``."""

@@ -355,7 +355,7 @@ class Kernels(Layout):
         # The crop is None without splats, which only stages of an integrator's own add.
         own = None
         if wave.integrator.has_own_stages:  # splats choose a pixel within the filter's radius
-            own = fingerprint(wave.integrator), wave.context.crop, wave.filter.radius
+            own = fingerprint(wave.integrator.as_traced()), wave.context.crop, wave.filter.radius
         parts = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first_surface, own, self._leaves.tensors)
         self.structure = (self._of_world, *map(signature, parts), by_kernels, fused, signature(self.tree))
         self._use(caches or (KernelCaches() if before is None else before.caches))
@@ -607,7 +607,9 @@ def probed_kernels(wave: Wave, own: Sequence[int], packets: bool, make: Callable
         make: makes the kernels; True: fused.
     """
     opaque = wave.context.world.materials.opacity is None and not wave.integrator.has_own_transmit
-    sent = wave.integrator.splats_at_surfaces or wave.integrator.connects  # shadow rays other than those to lights
+    integrator = wave.integrator
+    # Shadow rays other than those to lights, or photons.
+    sent = integrator.splats_at_surfaces or integrator.connects or integrator.merges or integrator.sends_photons
     kernels = make(packets and opaque and wave.first_surface is None and not sent)
     eager = kernels.probe(own) if wave.integrator.light else {}
     if eager and kernels.fused:  # stages that run as tensor operations need searches between the stages

@@ -15,9 +15,10 @@ from torch import Tensor
 from torchpt.compiler.packet import KINDS
 from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 from torchpt.compiler.tracing import Tracer
-from torchpt.engines.kernels.layout import CONNECTION, Trace, path_state
+from torchpt.engines.kernels.layout import CONNECTION, PHOTON, Trace, path_state
 from torchpt.paths import layers as aov
 from torchpt.paths.integrators.base import check_fields, check_output
+from torchpt.paths.photons import photon_of
 from torchpt.paths.state import End, PathState, Shadow, Splat, StoredVertex, VertexInput, VertexOutput, no_shadow
 from torchpt.paths.store import PARTNER, kept_values, partner_of, vertex_of
 from torchpt.paths.transmission import non_opaque, opacity_at, origins_behind
@@ -256,12 +257,17 @@ def bounce(trace: Trace, model: int, roulette: float | None, first: bool = False
     if integrator.connects:
         assert layout.store is not None
         partner = partner_of(layout.store.read(tracer, *PARTNER, place=trace.node(state.lane)))
+    photon = None
+    if integrator.merges:
+        near = layout.state.read(tracer, *PHOTON)
+        photon = photon_of({name.removeprefix("photon_"): value for name, value in near.items()})
     with tracer:
         start_salts = trace.start_salts() if first else None
         context = layout.wave.context.at(
             salts, roulette=trace.roulette(roulette), start_salts=start_salts, depth=trace.depth()
         )
-        vertex = VertexInput(state, hit, partner)
+        context = replace(context, merging=trace.merging())
+        vertex = VertexInput(state, hit, partner, photon)
         output = layout.wave.bounce(context, model, vertex)
         check_output(integrator, output)
     after, shadow = output.leaving, output.shadow
@@ -271,6 +277,8 @@ def bounce(trace: Trace, model: int, roulette: float | None, first: bool = False
             _keep(trace, sinks, vertex, output.kept)
         if integrator.connects:
             _write_end(trace, sinks, output)
+        if integrator.sends_photons:
+            _write_photon(trace, sinks, output)
         return sinks
     sinks = Sinks(shadows=int(shadow is not None))
     if shadow is not None:
@@ -369,6 +377,17 @@ def _write_end(trace: Trace, sinks: Sinks, output: VertexOutput) -> None:
     sinks.write += rows.nodes(tracer, **values, connection_t=nothing)
 
 
+def _write_photon(trace: Trace, sinks: Sinks, output: VertexOutput) -> None:
+    """Write the photons that light paths send; depth 0: none."""
+    tracer, rows, photon = trace.tracer, trace.layout.state, output.photon
+    if photon is None:
+        with tracer:
+            depth = torch.zeros_like(output.leaving.lane)
+        sinks.write += rows.nodes(tracer, photon_depth=depth)
+    else:
+        sinks.write += rows.nodes(tracer, **{f"photon_{name}": value for name, value in vars(photon).items()})
+
+
 def list_ends(trace: Trace) -> Sinks:
     """Append lanes to the lists of the BSDF models that their connections end at."""
     tracer, layout = trace.tracer, trace.layout
@@ -390,6 +409,7 @@ def connect(trace: Trace, model: int) -> Sinks:
     values = store.read(tracer, *store.names, place=trace.node(lane))
     with tracer:
         context = wave.context.at(salts, start_salts=start_salts, depth=trace.depth())
+        context = replace(context, merging=trace.merging())
         light = wave.integrator.connect(context, model, vertex_of(values), values["depth"], end)
     written = rows.nodes(
         tracer,

@@ -11,6 +11,7 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -26,14 +27,18 @@ from torchpt.engines.kernels.engine import (
     Chunk,
     Halted,
     KernelsEngine,
+    SentPhotons,
+    TracedLight,
     count_samples,
     film_words,
 )
 from torchpt.engines.kernels.programs import Kernels
 from torchpt.engines.work import TASKS, Block, TaskResult
 from torchpt.paths.nonfinite import NonFinite
+from torchpt.paths.photons import PhotonMap
 from torchpt.paths.wave import PixelSet, RayCounts, clamp_scale
 from torchpt.physics.film import Film
+from torchpt.physics.film.splats import Splats
 
 __all__ = ["KernelsForward", "keep_worker", "reuse_worker"]
 
@@ -126,6 +131,7 @@ class KernelsForward:
             min_lanes=VECTORS.width,
         )
         self._workers: list[KernelsEngine] = []
+        self._traced: TracedLight | None = None  # what the light paths of the sample have left
         self._halt = threading.Event()
 
     @property
@@ -149,7 +155,55 @@ class KernelsForward:
             True if all samples were rendered.
         """
         self.kernels.prefetch(self.budget.threads)
-        return self.take(self.blocks(spans, self.budget.threads * TASKS), each)
+        integrator, tasks = self.kernels.wave.integrator, self.budget.threads * TASKS
+        if integrator.radius_at(0) is None:
+            return self.take(self.blocks(spans, tasks), each)
+        for pixel_set, first, count in spans:
+            for sample in range(
+                first, first + count
+            ):  # the light paths of a sample of all pixels, then its camera paths
+                blocks = self.blocks([(pixel_set, sample, 1)], 2 * self.budget.threads)
+                self._traced = self._trace_light(blocks, sample, each) if integrator.merges else None
+                if self._halt.is_set() or not self.take(blocks, each):
+                    return False
+        return True
+
+    def _trace_light(
+        self, blocks: list[Block], sample: int, each: Callable[[TaskResult | None], bool]
+    ) -> TracedLight | None:
+        """Trace the light paths of one sample of all pixels, and return what they leave; None if the render was ended."""
+        wave = self.kernels.wave
+        parts: list[Any] = []
+        lost = [np.zeros(0, np.int64)]
+
+        def on_result(result: tuple[TaskResult, SentPhotons] | None) -> bool:
+            if result is None:
+                return each(None)
+            counts, sent = result
+            parts.extend(sent.parts)
+            lost.append(sent.lost)
+            return each(counts)
+
+        if wave.light_paths is not None:
+            map_in_order(blocks, self._light_task, self.budget.threads, on_result, self._halt)
+        radius = wave.integrator.radius_at(sample)
+        assert radius is not None
+        if self._halt.is_set():
+            return None
+        return TracedLight(PhotonMap.of(parts, radius, wave.light_path_count), np.concatenate(lost))
+
+    def _light_task(self, block: Block) -> tuple[TaskResult, SentPhotons]:
+        """Trace the light paths of a block of one sample; called on any thread."""
+        pixel_set, start, size, first, _ = block
+        counts, sent = TaskResult(RayCounts()), SentPhotons([], np.zeros(0, np.int64))
+        with suppress(Halted):
+            worker = self._take_worker()
+            chunk = Chunk(start, size, first, 1, pixel_set)
+            tally, splats, sent = worker.send(chunk)
+            counts.tally.rays, counts.tally.truncated = tally.rays, tally.truncated
+            self._add_splats(splats, chunk, pixel_set.film, counts)
+            self._workers.append(worker)
+        return counts, sent
 
     def blocks(self, spans: Sequence[tuple[PixelSet, int, int]], tasks: int) -> list[Block]:
         """Split the samples of pixel sets into blocks of pixels: ``tasks`` for each set, unless blocks get too small."""
@@ -266,14 +320,14 @@ class KernelsForward:
             self.kernels.accumulate(film.channels, clamp=False)
         if light:
             self.kernels.accumulate(channels=3, clamp=self.clamp is not None)
-            tally = worker.trace(chunk)
+            tally = worker.trace(chunk, self._traced)
             result.tally.truncated += tally.truncated
             rays += tally.rays
         # From here on a failure would leave half a chunk in the films, so running out of memory ends the render.
         with explain_out_of_memory("the sums of a film"):
             if light:
                 self._add_radiance(worker, chunk, pixel_set, result)
-                self._add_splats(worker, chunk, pixel_set.film, result)
+                self._add_splats(worker.splats, chunk, pixel_set.film, result)
             if names:
                 self._add_layers(worker, chunk, pixel_set)
         result.tally.rays += rays
@@ -299,10 +353,10 @@ class KernelsForward:
         sum_before, sum_after = result.light
         result.light = sum_before + before, sum_after + after
 
-    def _add_splats(self, worker: KernelsEngine, chunk: Chunk, film: Film, result: TaskResult) -> None:
+    def _add_splats(self, found: Sequence[Splats], chunk: Chunk, film: Film, result: TaskResult) -> None:
         """Add the splats of a chunk's samples to the film."""
         before = after = 0.0
-        for splats in worker.splats:
+        for splats in found:
             assert film.splats is not None
             value = splats.value
             if self.clamp is not None:

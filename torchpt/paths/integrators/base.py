@@ -130,6 +130,7 @@ class Integrator(FrozenConfig):
         splats: True: samples add radiance to pixels other than their own, by its stages or by those of its light paths.
         starts_on_lights: True: its paths start on lights, and the stage of the first vertex differs from that of others.
         connected: True: its paths are light paths, and keep vertices for connections.
+        sends_photons: True: its paths are light paths, and their vertices are merged with those of camera paths.
         strategy: how light is found, one of :data:`torchpt.paths.state.STRATEGIES`. This value and those below are for kinds
             without a parameter of the name.
         rr_prob: constant survival probability of roulette; None: by throughput.
@@ -146,6 +147,7 @@ class Integrator(FrozenConfig):
     splats: ClassVar[bool] = False
     starts_on_lights: ClassVar[bool] = False
     connected: bool = False
+    sends_photons: bool = False
 
     strategy: str = "mis"
     rr_prob: float | None = None
@@ -181,6 +183,24 @@ class Integrator(FrozenConfig):
     def connects(self) -> bool:
         """Return True if vertices of its paths are connected to those that its light paths keep."""
         return False
+
+    @property
+    def merging_counts(self) -> bool:
+        """Return True if weights count with merges of camera paths and light paths."""
+        return False
+
+    @property
+    def merges(self) -> bool:
+        """Return True if vertices of its paths are merged with the photons that its light paths send."""
+        return False
+
+    def radius_at(self, sample: int) -> float | None:
+        """Return the radius with which sample ``sample`` of each pixel counts merges; None: it does not."""
+        return None
+
+    def as_traced(self) -> Self:
+        """Return a copy without the values that its stages do not read: compiled stages are shared by what it has."""
+        return self
 
     @property
     def splats_at_surfaces(self) -> bool:

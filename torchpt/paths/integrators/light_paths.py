@@ -33,6 +33,7 @@ from torchpt.paths.state import (
     End,
     Field,
     PathState,
+    Photon,
     Shadow,
     Splat,
     StageContext,
@@ -79,6 +80,8 @@ class LightPaths(Integrator):
         "joined": Flag(True, doc="whether vertices are joined to the camera"),
         "connected": Flag(False, doc="whether vertices are kept for connections"),
         "number": Scalar(0.0, low=0.0, doc="number of connections of two vertices for each sample, in weights"),
+        "merging": Flag(False, doc="whether weights count with merges"),
+        "sends_photons": Flag(False, doc="whether vertices are photons, which camera paths are merged with"),
     }
     lit = False
     splats = True
@@ -143,6 +146,19 @@ class LightPaths(Integrator):
             splat=splat,
             drawn=drawn,
             kept=self._kept(context, model, state, at, front) if self.connected else None,
+            photon=self._photon(context, state, at, front) if self.sends_photons and not kind.smooth else None,
+        )
+
+    def _photon(self, context: StageContext, state: PathState, at: Interaction, front: _View) -> Photon:
+        """Return the paths as they arrive. What shading normals take away is left to the camera paths that they merge with."""
+        depth = context.depth
+        return Photon(
+            p=at.p,
+            d=state.d,
+            value=state.throughput * state.extra["flux"],
+            dvcm=front.arrival.dvcm,
+            dvc=front.arrival.dvc,
+            depth=torch.zeros_like(state.lane) + depth,
         )
 
     def _kept(self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View) -> StoredVertex:
@@ -226,8 +242,9 @@ class LightPaths(Integrator):
         throughput = state.throughput if share is None else state.throughput * share
         cosine = Arrival.cosine_of(state.d, at)
         dvc = state.extra["dvc"] / cosine
+        merging = None if world.materials.models[model].smooth else context.merging
         if dvcm is not None:
-            return _View(surface, wi, throughput, Arrival(dvcm, dvc, cosine), ray)
+            return _View(surface, wi, throughput, Arrival(dvcm, dvc, cosine, merging), ray)
         dvcm = torch.zeros_like(cosine)
         if ray is None and self.number:  # a connection competes
             way = at.p - state.o
@@ -237,7 +254,7 @@ class LightPaths(Integrator):
             assert emission is not None
             n = None if world.materials.models[model].transmits else surface.frame.n
             dvcm = safe_reciprocal(ray.density * light_weight(emission, ray, at.p, n) * cosine)
-        return _View(surface, wi, throughput, Arrival(dvcm, dvc, cosine), ray)
+        return _View(surface, wi, throughput, Arrival(dvcm, dvc, cosine, merging), ray)
 
     def _seen_from(
         self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View, w: Tensor

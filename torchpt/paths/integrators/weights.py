@@ -1,8 +1,9 @@
 """MIS weights over the strategies of bidirectional paths, by numbers that are carried along a path.
 
 A path of camera, surfaces and light may be found in several ways: a camera path meets the light, a light sample ends it, a
-light path is joined to the camera, or two inner vertices are connected. Each has a density (with several samples, times their
-number), and the power heuristic weights a sample of one of them by::
+light path is joined to the camera, two inner vertices are connected, or a camera path and a light path that arrive at nearly
+the same point are merged there. Each has a density (with several samples, times their number), and the power heuristic weights
+a sample of one of them by::
 
     1 / (1 + sum of (p_other / p_own)^2)
 
@@ -39,11 +40,15 @@ _LEAST_COSINE = 1e-7
 
 @dataclass(frozen=True)
 class Arrival:
-    """``dvcm`` and ``dvc`` at a vertex, with the cosine at which the path arrives; ``(N,)`` each."""
+    """``dvcm`` and ``dvc`` at a vertex, with the cosine at which the path arrives; ``(N,)`` each.
+
+    ``merging``: ``(1,)`` ratio of densities of a merge at this vertex; None: the vertex is not merged.
+    """
 
     dvcm: Tensor
     dvc: Tensor
     cosine: Tensor
+    merging: Tensor | None = None
 
     @staticmethod
     def cosine_of(d: Tensor, at: Interaction) -> Tensor:
@@ -51,7 +56,12 @@ class Arrival:
         return dot(d, at.ng).abs().clamp_min(_LEAST_COSINE)
 
     def others(self, reverse: Tensor) -> Tensor:
-        """Return ``p_other / p_own`` of all strategies before the vertex, where ``reverse (N,)`` samples the way back."""
+        """Return ``p_other / p_own`` of all strategies up to the vertex, where ``reverse (N,)`` samples the way back."""
+        before = self.before(reverse)
+        return before if self.merging is None else root_of_squares(before, self.merging)
+
+    def before(self, reverse: Tensor) -> Tensor:
+        """Return the same without a merge at the vertex itself."""
         return root_of_squares(self.dvcm, self.dvc * reverse)
 
 

@@ -32,6 +32,7 @@ class Dimension(IntEnum):
     #: 2D: the first number chooses an edge of the scene and the point on it, the second one of the two silhouette lines of a
     #: cone or cylinder.
     EDGE = 11
+    MERGE = 12  # 1D, choice among the photons near a vertex; a hash, not of the sampler's points
 
 
 #: Stride between the dimensions of two vertices: more than there are, so that a new dimension does not change the others.

@@ -29,6 +29,7 @@ from torchpt.paths.state import (
     End,
     Partner,
     PathState,
+    Photon,
     Plan,
     Shadow,
     StageContext,
@@ -131,14 +132,16 @@ class Bdpt(PathIntegrator):
     def light_walk(self) -> LightPaths:
         """Return the integrator of the light paths: :meth:`Integrator.light_walk`."""
         return LightPaths(
-            max_depth=self.max_depth if self.strategy in ("mis", "light_paths", "connections") else 0,
+            max_depth=0 if self.strategy in ("bsdf", "light") else self.max_depth,
             rr_depth=self.rr_depth,
             rr_prob=self.rr_prob,
             fraction=self.light_paths,
             weighted=self.strategy == "mis" or self.weighted,
-            joined=self.strategy != "connections",
+            joined=self.strategy in ("mis", "light_paths"),
             connected=self.connects,
             number=self._number,
+            merging=self.merging_counts,
+            sends_photons=self.merges,
         )
 
     def generate(self, context: StageContext, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
@@ -150,8 +153,8 @@ class Bdpt(PathIntegrator):
         dvcm = self.light_paths * float(crop[2] * crop[3]) * safe_reciprocal(camera.film_density(state.d))
         return replace(state, extra={"dvcm": dvcm, "dvc": torch.zeros_like(dvcm)})
 
-    def _arrival(self, context: StageContext, vertex: VertexInput) -> tuple[Arrival, Interaction]:
-        """Return the numbers of MIS at a vertex, and the surface points."""
+    def _arrival(self, context: StageContext, model: int, vertex: VertexInput) -> tuple[Arrival, Interaction]:
+        """Return the numbers of MIS at a vertex on surfaces of one BSDF model, and the surface points."""
         state, camera = vertex.state, context.camera
         assert camera is not None
         at = interact(context.world, state.o, state.d, vertex.hit, follow_ray=context.follow_ray)
@@ -165,7 +168,8 @@ class Bdpt(PathIntegrator):
                 first = depth == 1 if isinstance(depth, torch.Tensor) else torch.full_like(square, depth == 1).bool()
                 square = torch.where(first, 1.0, square)
             dvcm = dvcm * square
-        return Arrival(dvcm, state.extra["dvc"] / cosine, cosine), at
+        merging = None if context.world.materials.models[model].smooth else context.merging
+        return Arrival(dvcm, state.extra["dvc"] / cosine, cosine, merging), at
 
     def emit(self, context: StageContext, vertex: VertexInput) -> Emission:
         """Return the emission of emitters that paths hit; see :meth:`Integrator.emit`."""
@@ -191,7 +195,7 @@ class Bdpt(PathIntegrator):
         """Return the outputs of a vertex: as of ``path``, with weights in which light paths take part."""
         world, state = context.world, vertex.state
         kind = world.materials.models[model]
-        arrival, at = self._arrival(context, vertex)
+        arrival, at = self._arrival(context, model, vertex)
         surface, direct, shadow = stages.shade(context, model, state, at)
         if direct is not None and shadow is not None:
             assert world.emission is not None
@@ -212,7 +216,23 @@ class Bdpt(PathIntegrator):
         leaving, end = replace(output.leaving, extra={"dvcm": dvcm, "dvc": dvc}), None
         if vertex.partner is not None and not kind.smooth:
             end = self._end(context, model, state, at, surface, arrival, vertex.partner)
+        if vertex.photon is not None and not kind.smooth:
+            merged = self._merged(context, model, state, at, surface, arrival, vertex.photon)
+            leaving = replace(leaving, radiance=leaving.radiance + merged)
         return replace(output, leaving=leaving, end=end)
+
+    def _merged(
+        self,
+        context: StageContext,
+        model: int,
+        state: PathState,
+        at: Interaction,
+        surface: Surface,
+        arrival: Arrival,
+        photon: Photon,
+    ) -> Tensor:
+        """Return the light ``(3, n)`` of merges with ``photon``; an integrator that merges defines it."""
+        raise NotImplementedError(f"{self.name} declares merges, and has no stage for them")
 
     # -- connections
 

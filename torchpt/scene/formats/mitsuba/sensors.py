@@ -276,6 +276,10 @@ def _bdpt(p: Properties, importer: Importer) -> Block:
     return {**_like_bdpt(p, importer), "light_paths": 1.0, "connections": "one"}
 
 
+def _vcm(p: Properties, importer: Importer) -> Block:
+    return {**_like_path(p, importer), "type": "vcm"}
+
+
 _LAYERS = {"albedo": "albedo", "depth": "depth", "position": "position", "uv": "uv", "sh_normal": "normal"}
 
 
@@ -303,9 +307,10 @@ INTEGRATORS: dict[str, Plugin] = {
     "aov": exact("aovs", _aov),
     **dict.fromkeys(("volpath", "volpathmis", "volpath_simple", "prbvolpath"), nearest("path", _like_path, _MEDIA)),
     "bdpt": nearest("bdpt", _bdpt, "each vertex of a camera path is connected to one of its light path"),
+    "ptracer": nearest("bdpt", _like_bdpt, "camera paths and light samples count too"),
     **dict.fromkeys(
-        ("ppm", "sppm", "photonmapper", "ptracer"),
-        nearest("bdpt", _like_bdpt, "light paths are joined to the camera alone, and no photons are kept"),
+        ("ppm", "sppm", "photonmapper"),
+        nearest("vcm", _vcm, "photons are merged where nothing else finds their light, within a radius of its own"),
     ),
     **dict.fromkeys(
         (
