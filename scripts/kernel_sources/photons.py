@@ -98,7 +98,7 @@ def _scan(points, starts, cells, x, y, z, radius, inverse, most, sums, kept):
 
 @kernel("photons", FLOATS, INT, INTS, INT, INT, FLOATS, FLOATS, INTS, INT, FLOATS, FLOATS)
 def near(p, count, keys, rows, salt, points, data, starts, cells, numbers, found):
-    """Write to ``found (9, count)`` the data of one photon within the radius of each point, chosen by its flux.
+    """Write to ``found (9, count)`` the data of one photon within the radius of each point, drawn by its weight.
 
     Args:
         p: points ``(3, count)``.
@@ -118,7 +118,7 @@ def near(p, count, keys, rows, salt, points, data, starts, cells, numbers, found
     sums, kept = carray(stack_memory(KEPT, np.float64), (KEPT,)), carray(stack_memory(KEPT, np.int64), (KEPT,))
     for lane in range(count):
         x, y, z = item(p, lane), item(p, count + lane), item(p, 2 * count + lane)
-        total, chosen, near = _scan(points, starts, cells, x, y, z, radius, inverse, math.inf, sums, kept)
+        total, chosen, visited = _scan(points, starts, cells, x, y, z, radius, inverse, math.inf, sums, kept)
         if not total > 0.0:
             for row in range(9):
                 put(found, row * count + lane, np.float32(0.0))
@@ -127,10 +127,10 @@ def near(p, count, keys, rows, salt, points, data, starts, cells, numbers, found
         for row in range(rows):
             hashed = _mix(np.uint32(hashed ^ np.uint32(np.int64(item(keys, row * count + lane)) & 0xFFFFFFFF)))
         part = np.float64(np.int64(hashed)) * (total / 4294967296.0)
-        if near > KEPT:
+        if visited > KEPT:
             _, chosen, _ = _scan(points, starts, cells, x, y, z, radius, inverse, part, sums, kept)
         else:
-            for k in range(near):
+            for k in range(visited):
                 if sums[k] > part:
                     chosen = kept[k]
                     break

@@ -74,6 +74,18 @@ class Row:
 
 
 LIT = {"light_choice": "nearest", "clamp": 0, "strict": 1}
+#: Of integrators with light paths.
+BIDIRECTIONAL: dict[str, Any] = {
+    "connections": "all",
+    "max_depth": -2,
+    "rr_depth": 0,
+    "rr_prob": 1.01,
+    "strategy": "uniform",
+    "weighted": 1,
+    "light_paths": 0,
+    "light_choice": "nearest",
+    "strict": 1,
+}
 ROWS = {
     "path": Row(
         accepted={"max_depth": 3, "rr_depth": 2, "rr_prob": 0.8, "strategy": "light", "clamp": 2.0},
@@ -83,33 +95,11 @@ ROWS = {
     "direct": Row(accepted={"strategy": "uniform", "strict": True}, refused={**LIT, "strategy": "bdpt"}),
     "vcm": Row(
         accepted={"max_depth": 3, "rr_depth": 2, "light_paths": 0.5, "radius": 0.05, "alpha": 0.5},
-        refused={
-            "connections": "all",
-            "max_depth": -2,
-            "rr_depth": 0,
-            "rr_prob": 1.01,
-            "strategy": "uniform",
-            "weighted": 1,
-            "light_paths": 0,
-            "radius": 0,
-            "alpha": 0,
-            "light_choice": "nearest",
-            "strict": 1,
-        },
+        refused={**BIDIRECTIONAL, "radius": 0, "alpha": 0},
     ),
     "bdpt": Row(
         accepted={"max_depth": 3, "rr_depth": 2, "rr_prob": 0.8, "light_paths": 0.5, "connections": "one"},
-        refused={
-            "connections": "all",
-            "max_depth": -2,
-            "rr_depth": 0,
-            "rr_prob": 1.01,
-            "strategy": "uniform",
-            "weighted": 1,
-            "light_paths": 0,
-            "light_choice": "nearest",
-            "strict": 1,
-        },
+        refused=BIDIRECTIONAL,
     ),
     "ibl": Row(accepted={"light_choice": "power", "clamp": 1.0}, refused=LIT),
     "aov": Row(gradient=None),

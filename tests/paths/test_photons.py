@@ -7,20 +7,28 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
-from torchpt.paths.photons import PHOTON, PhotonMap
+from torchpt.paths.photons import FIELDS, PHOTON_ROWS, LightOfSample, PhotonMap, SentLight
+from torchpt.physics.film.splats import Splats
+
+#: The first row of each field.
+FIRST = dict(zip(FIELDS, np.cumsum([0, *FIELDS.values()]).tolist(), strict=False))
+VALUE = slice(FIRST["value"], FIRST["value"] + 3)
 
 
-def photons(count: int, side: float, seed: int = 1) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def photons(count: int, side: float, seed: int = 1) -> SentLight:
     rng = np.random.default_rng(seed)
-    values: dict[str, Any] = {name: rng.random((rows, count), np.float32) for name, rows in PHOTON.items()}
-    values["p"] = (values["p"] - 0.5) * side
-    values["dvcm"], values["dvc"] = (
-        np.arange(count, dtype=np.float32)[None] * 1e-12,
-        0 * values["dvc"],
-    )  # found by merges alone
-    values["depth"] = rng.integers(1, 5, (1, count)).astype(np.int64)
-    return np.arange(count), {name: value if len(value) > 1 else value[0] for name, value in values.items()}
+    p, data = (rng.random((rows, count), np.float32) for rows in (3, PHOTON_ROWS))
+    # Found by merges alone.
+    data[FIRST["dvcm"]], data[FIRST["dvc"]] = np.arange(count, dtype=np.float32) * 1e-12, 0.0
+    data[FIRST["depth"]] = rng.integers(1, 5, count)
+    return sent((p - 0.5) * np.float32(side), data)
+
+
+def sent(p: np.ndarray, data: np.ndarray, first_pixel: int = 0, lost: tuple[int, ...] = (), **keys: Any) -> SentLight:
+    lanes = np.arange(p.shape[1])
+    return SentLight.of(first_pixel, [(lanes, p, data)], keys.get("splats", []), np.array(lost, np.int64))
 
 
 @pytest.mark.parametrize(
@@ -28,44 +36,55 @@ def photons(count: int, side: float, seed: int = 1) -> tuple[np.ndarray, dict[st
 )
 def test_the_sum_of_photons_within_the_radius(count, side, radius):
     """The value of the chosen photon, times the sum of fluxes over its own, beside all pairs."""
-    pixel, values = photons(count, side)
-    found = PhotonMap.of([(pixel, values)], radius, paths=10.0)
+    light = photons(count, side)
+    found = PhotonMap.of([light], radius, paths=10.0)
     rng = np.random.default_rng(2)
     p = ((rng.random((3, 500)) - 0.5) * side).astype(np.float32)
     near = found.near(p, rng.integers(-(2**31), 2**31, (2, 500)).astype(np.int32), depth=3)
-    distance = ((p[:, :, None].astype(np.float64) - values["p"][:, None, :]) ** 2).sum(0)
-    flux = values["value"].max(0)
+    distance = ((p[:, :, None].astype(np.float64) - light.p[:, None, :]) ** 2).sum(0)
+    flux = light.data[VALUE].max(0)
     total = ((distance < radius**2) * flux).sum(1)
     sure = abs(distance / radius**2 - 1.0).min(1) > 1e-4
-    np.testing.assert_allclose(
-        near["value"].max(0)[sure] * math.pi * radius**2 * 10.0, total[sure], rtol=1e-5, atol=0.0
-    )
-    assert (total > 0).any() and ((near["depth"] > 0) == (total > 0))[sure].all()
+    np.testing.assert_allclose(near[VALUE].max(0)[sure] * math.pi * radius**2 * 10.0, total[sure], rtol=1e-5, atol=0.0)
+    assert (total > 0).any() and ((near[FIRST["depth"]] > 0) == (total > 0))[sure].all()
 
 
 def test_photons_are_chosen_by_their_flux():
-    pixel, values = photons(4, 0.0)
-    found = PhotonMap.of([(pixel, values)], 1.0, paths=1.0)
+    light = photons(4, 0.0)
+    found = PhotonMap.of([light], 1.0, paths=1.0)
     keys = np.random.default_rng(3).integers(-(2**31), 2**31, (1, 40000)).astype(np.int32)
     near = found.near(np.zeros((3, 40000), np.float32), keys, depth=1)
-    flux = values["value"].max(0)
-    chosen = (near["dvcm"][:, None] == values["dvcm"]).mean(0)
+    flux = light.data[VALUE].max(0)
+    chosen = (near[FIRST["dvcm"]][:, None] == light.data[FIRST["dvcm"]]).mean(0)
     assert chosen.sum() == pytest.approx(1.0)
     expected = flux / flux.sum()
     assert (abs(chosen - expected) < 5.0 * np.sqrt(expected * (1.0 - expected) / 40000)).all()
 
 
 def test_the_order_of_parts_changes_nothing():
-    pixel, values = photons(1000, 1.0)
-    halves = [
-        (pixel[part], {name: value[..., part] for name, value in values.items()})
-        for part in (slice(0, 400), slice(400, None))
-    ]
-    a, b = PhotonMap.of(halves, 0.1, 1.0), PhotonMap.of(halves[::-1], 0.1, 1.0)
+    light = photons(1000, 1.0)
+    halves = [sent(light.p[:, part], light.data[:, part], part.start) for part in (slice(0, 400), slice(400, 1000))]
+    whole, a, b = (PhotonMap.of(parts, 0.1, 1.0) for parts in ([light], halves, halves[::-1]))
     for name in ("points", "data", "starts"):
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
+        assert np.array_equal(getattr(a, name), getattr(whole, name)), name
 
 
 def test_a_map_without_photons():
     near = PhotonMap.of([], 0.1, 1.0).near(np.zeros((3, 5), np.float32), np.zeros((1, 5), np.int32), depth=1)
-    assert not near["value"].any() and not near["depth"].any()
+    assert not near.any()
+
+
+@pytest.mark.parametrize("field", ["p", "value", "dvcm"])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_photons_that_are_not_finite_make_their_pixels_lost(field, bad):
+    light = photons(10, 1.0)
+    (light.p[0] if field == "p" else light.data[FIRST[field]])[3] = bad
+    splats = Splats(torch.tensor([2, 7]), torch.tensor([0, 1]), torch.ones(3, 2))
+    part = sent(light.p, light.data, first_pixel=100, lost=(7,), splats=[splats])
+    assert part.lost.tolist() == [103, 107] and part.pixel.tolist() == [100 + k for k in range(10) if k != 3]
+    found = LightOfSample.of([part, sent(light.p[:, :2], light.data[:, :2])], 0.1, 10.0)
+    of_others, lost = found.of_pixels(104, 3)
+    assert not of_others and not len(lost)
+    (of_pixels,), lost = found.of_pixels(102, 6)
+    assert lost.tolist() == [1, 5] and of_pixels.lane.tolist() == [0, 5] and of_pixels.pixel.tolist() == [0, 1]

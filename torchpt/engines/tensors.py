@@ -118,9 +118,9 @@ class TensorsEngine:
         splats: a list to append splats to; None: splats are dropped.
         store: where light paths keep vertices, and camera paths find them; None: paths are not connected.
         photons: of the sample, for camera paths that are merged with them; None: they are not.
+        sent: a list to append the photons of light paths to, with lanes ``(n,)`` and points ``(3, n)``; None: they are dropped.
 
     Attributes:
-        sent: samples ``(n,)`` of light paths, and what they send to be merged with camera paths.
         radiance: ``(3, lanes)`` radiance of samples whose paths have ended, by sample.
         lost: ``(lanes,)`` bool, True for samples with a splat that is not finite; None: the integrator has no splats.
     """
@@ -134,9 +134,9 @@ class TensorsEngine:
         splats: list[Splats] | None = None,
         store: VertexStore | None = None,
         photons: PhotonMap | None = None,
+        sent: list[tuple[Tensor, Tensor, Photon]] | None = None,
     ) -> None:
-        self.keeps, self.store, self.photons = keeps, store, photons
-        self.sent: list[tuple[Tensor, Photon]] = []
+        self.keeps, self.store, self.photons, self.sent = keeps, store, photons, sent
         self.wave, self.context, self.tally = wave, wave.context, RayCounts() if tally is None else tally
         self.plan, self.world = wave.context.plan, wave.context.world
         self.has_transmission = self.world.materials.opacity is not None or wave.integrator.has_own_transmit
@@ -287,8 +287,8 @@ class TensorsEngine:
                 self.tally.rays += len(index)
             if output.kept is not None and self.store is not None:
                 self.store.keep(vertex.state.lane, vertex, output.kept)
-            if output.photon is not None:
-                self.sent.append((vertex.state.lane, output.photon))
+            if output.photon is not None and self.sent is not None:
+                self.sent.append((vertex.state.lane, output.at.p, output.photon))
             if output.end is not None:
                 after.camera_ends.append((start, vertex.state.lane, output.end))
             if self.keeps:
@@ -426,7 +426,7 @@ def trace(
     splats: list[Splats] | None = None,
     store: VertexStore | None = None,
     photons: PhotonMap | None = None,
-    sent: list[tuple[Tensor, Photon]] | None = None,
+    sent: list[tuple[Tensor, Tensor, Photon]] | None = None,
 ) -> Tensor:
     """Return the radiance ``(3, N)`` along rays, not weighted by the filter.
 
@@ -438,14 +438,12 @@ def trace(
         splats: a list to append splats to; None: splats are dropped.
         store: of the vertices of light paths, see :class:`TensorsEngine`.
         photons: likewise.
-        sent: a list to append to what light paths send, see :class:`TensorsEngine`.
+        sent: likewise.
     """
     keeps = observer is not None
-    engine = TensorsEngine(wave, len(state.lane), tally, keeps, splats, store, photons)
+    engine = TensorsEngine(wave, len(state.lane), tally, keeps, splats, store, photons, sent)
     if len(state.lane):
         walk(engine, engine.spawn(state), wave.integrator.limits, observer)
-    if sent is not None:
-        sent += engine.sent
     return engine.path_radiance()
 
 

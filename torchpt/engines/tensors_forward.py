@@ -6,12 +6,12 @@ if an allocation fails, so that it can be rendered again with fewer lanes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,11 +20,10 @@ from torchpt.core.memory import Budget, Span, fits_in_memory
 from torchpt.engines import tensors, work
 from torchpt.engines.work import TaskResult
 from torchpt.paths.nonfinite import NonFinite
-from torchpt.paths.photons import PHOTON, PhotonMap
+from torchpt.paths.photons import LightOfSample, SentLight, data_of
 from torchpt.paths.state import Photon
 from torchpt.paths.store import VertexStore
 from torchpt.paths.wave import PixelSet, RayCounts, Wave, clamp_scale
-from torchpt.physics.film import Film
 from torchpt.physics.film.splats import Splats
 
 __all__ = ["TensorsForward"]
@@ -54,50 +53,52 @@ class TensorsForward:
     def run(self, spans: Sequence[work.SampleRange], each: Callable[[TaskResult | None], bool]) -> bool:
         """See :class:`torchpt.engines.engine.Forward`."""
         for pixel_set, first, count in spans:
-            if self.wave.integrator.radius_at(0) is None:
-                if not self._run(self.wave, pixel_set, first, count, each):
+            if not self.wave.integrator.merging_counts:
+                if not self._run(
+                    partial(self._render_piece, self.wave, pixel_set, None), pixel_set, first, count, each
+                ):
                     return False
                 continue
             for sample in range(first, first + count):
-                wave = self.wave.at_sample(sample)
-                traced = self._trace_light_paths(wave, pixel_set, sample) if wave.integrator.merges else None
-                if not self._run(wave, pixel_set, sample, 1, each, traced):
+                wave, sent, traced = self.wave.at_sample(sample), list[SentLight](), None
+                if wave.integrator.merges:
+                    if wave.light_paths is not None:
+                        piece = partial(self._trace_light, wave.light_paths, pixel_set, sent)
+                        if not self._run(piece, pixel_set, sample, 1, each):
+                            return False
+                    radius = wave.integrator.radius_at(sample)
+                    assert radius is not None
+                    traced = LightOfSample.of(sent, radius, wave.light_path_count)
+                if not self._run(partial(self._render_piece, wave, pixel_set, traced), pixel_set, sample, 1, each):
                     return False
         return True
 
     def _run(
         self,
-        wave: Wave,
+        piece: Callable[[Span], None],
         pixel_set: PixelSet,
         first: int,
         count: int,
         each: Callable[[TaskResult | None], bool],
-        traced: _LightPaths | None = None,
     ) -> bool:
-        """Render samples of a pixel set in pieces; ``traced``: the light paths, if they came before."""
+        """Call ``piece`` for samples of a pixel set; return False if ``each`` has ended the render."""
         pixels = pixel_set.film.width * pixel_set.film.height
-        piece = partial(self._render_piece, wave, pixel_set, traced)
         return not any(each(self._result) for _ in self.budget.run_in_chunks(piece, pixels, first, count))
 
-    def _trace_light_paths(self, wave: Wave, pixel_set: PixelSet, sample: int) -> _LightPaths:
-        """Trace the light paths of one sample of all pixels, and return what they leave."""
-        traced, radius = _LightPaths(), wave.integrator.radius_at(sample)
-        assert radius is not None
-        if wave.light_paths is not None:
-            pixels = pixel_set.film.width * pixel_set.film.height
-            for _ in self.budget.run_in_chunks(partial(traced.trace, wave.light_paths, pixel_set), pixels, sample, 1):
-                pass
-        traced.end(radius, wave.light_path_count)
-        return traced
+    def _trace_light(self, wave: Wave, pixel_set: PixelSet, sent: list[SentLight], span: Span) -> None:
+        """Trace the light paths of a piece of one sample, and append what they leave; if it raises, nothing was added."""
+        first_pixel, *_ = span
+        tally, splats, found = RayCounts(), list[Splats](), list[tuple[Tensor, Tensor, Photon]]()
+        radiance = tensors.trace(wave, wave.rays(*span, pixel_set), tally, splats=splats, sent=found)
+        photons = [(lane.cpu().numpy(), p.float().cpu().numpy(), data_of(photon)) for lane, p, photon in found]
+        lost = (~torch.isfinite(radiance).all(0)).nonzero().squeeze(1).cpu().numpy()
+        sent.append(SentLight.of(first_pixel, photons, splats, lost))
+        self._result = TaskResult(tally)
 
-    def _render_piece(self, wave: Wave, pixel_set: PixelSet, traced: _LightPaths | None, span: Span) -> None:
+    def _render_piece(self, wave: Wave, pixel_set: PixelSet, traced: LightOfSample | None, span: Span) -> None:
         """Render a piece and add it to the films; if it raises, nothing was added."""
         _, pixels, _, samples = span
         piece = _computed_piece(wave, pixel_set, traced, span)
-        if traced is not None:  # counted with the first piece
-            piece.tally.rays += traced.tally.rays
-            piece.tally.truncated += traced.tally.truncated
-            traced.tally = RayCounts()
         self._result = TaskResult(piece.tally, pixels * samples, piece.lost, piece.light)
         piece.write()
 
@@ -142,68 +143,28 @@ class Piece:
             sums.index_copy_(2, index, value)
 
 
-class _LightPaths:
-    """What the light paths of one sample of all pixels leave, but for their splats, which are in the film.
-
-    Attributes:
-        tally: counts of their rays.
-        photons: their photons.
-    """
-
-    def __init__(self) -> None:
-        self.tally = RayCounts()
-        self.photons: PhotonMap | None = None
-        self._parts: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
-        self._radiance: list[Tensor] = []
-
-    def trace(self, wave: Wave, pixel_set: PixelSet, span: Span) -> None:
-        """Trace the paths of a piece of one sample; if it raises, nothing was added."""
-        first_pixel, _, sample, _ = span
-        piece, splats, sent = Piece(), list[Splats](), list[tuple[Tensor, Photon]]()
-        radiance = tensors.trace(wave, wave.rays(*span, pixel_set), piece.tally, splats=splats, sent=sent)
-        parts = [
-            ((lane + first_pixel).cpu().numpy(), {name: getattr(photon, name).cpu().numpy() for name in PHOTON})
-            for lane, photon in sent
-        ]
-        _add_splats(piece, pixel_set.film, splats, lambda lane: sample + lane * 0)
-        piece.write()
-        self._parts += parts
-        self._radiance.append(radiance)
-        self.tally.rays += piece.tally.rays
-        self.tally.truncated += piece.tally.truncated
-
-    def end(self, radius: float, paths: float) -> None:
-        """Sort the photons, once all paths are traced; arguments as for :meth:`PhotonMap.of`."""
-        self.photons = PhotonMap.of(self._parts, radius, paths)
-        self._parts.clear()
-        if self._radiance:
-            self._radiance = [torch.cat(self._radiance, 1)]
-
-    def radiance(self, first_pixel: int, pixels: int) -> Tensor | float:
-        """Return the radiance of the paths of some pixels ``(3, pixels)``: 0, or NaN where a splat is not finite."""
-        return self._radiance[0][:, first_pixel : first_pixel + pixels] if self._radiance else 0.0
-
-
-def _computed_piece(wave: Wave, pixel_set: PixelSet, traced: _LightPaths | None, span: Span) -> Piece:
-    """Compute a piece: the samples ``span`` of a pixel set; ``traced``: the light paths, if they came before."""
+def _computed_piece(wave: Wave, pixel_set: PixelSet, traced: LightOfSample | None, span: Span) -> Piece:
+    """Compute a piece: the samples ``span`` of a pixel set; ``traced``: the light of their sample, if it came before."""
     piece = Piece()
     first_pixel, pixels, first_sample, samples = span
     if wave.integrator.light:
         splats: list[Splats] = []
         store = VertexStore(pixels * samples) if wave.integrator.connects else None
         of_light: Tensor | float = 0.0
-        if traced is not None:
-            of_light = traced.radiance(first_pixel, pixels)
-            if (
-                store is not None and wave.light_paths is not None
-            ):  # again, for the vertices that paths are connected to
-                tensors.trace(wave.light_paths, wave.light_paths.rays(*span, pixel_set), piece.tally, store=store)
-        elif wave.light_paths is not None:  # their radiance is 0, or NaN where a splat is not finite
-            starts = wave.light_paths.rays(*span, pixel_set)
-            of_light = tensors.trace(wave.light_paths, starts, piece.tally, splats=splats, store=store)
+        if wave.light_paths is not None and (traced is None or store is not None):
+            # Their radiance is 0, or NaN where a splat is not finite. Light of the sample that came before was counted there,
+            # and its paths are traced again for the vertices that camera paths are connected to.
+            starts, counts = wave.light_paths.rays(*span, pixel_set), RayCounts()
+            own = splats if traced is None else None
+            of_light = tensors.trace(wave.light_paths, starts, counts, splats=own, store=store)
+            piece.tally.rays += counts.rays
+            piece.tally.truncated += counts.truncated if traced is None else 0
         rays, photons = wave.rays(*span, pixel_set), None if traced is None else traced.photons
         radiance = tensors.weighted_radiance(wave, rays, piece.tally, splats=splats, store=store, photons=photons)
         radiance = radiance + of_light
+        if traced is not None:
+            splats, lost = traced.of_pixels(first_pixel, pixels)
+            radiance[:, torch.from_numpy(lost).to(radiance.device)] = math.nan
         radiance = radiance.view(3, samples, pixels)
         finite = torch.isfinite(radiance).all(0)
         if not bool(finite.all()):
@@ -217,21 +178,18 @@ def _computed_piece(wave: Wave, pixel_set: PixelSet, traced: _LightPaths | None,
             before, after = torch.stack((before, _sum_of_light(radiance, splats))).tolist()  # one transfer
             piece.light = before, after
         piece.writes += pixel_set.film.writes_of_add(radiance, first_pixel, first_sample)
-        # lanes run over the pixels of a sample, then over samples
-        _add_splats(piece, pixel_set.film, splats, lambda lane: first_sample + lane // pixels)
+        if pixel_set.film.splats is not None and splats:
+            lane, pixel, value = (
+                torch.cat([getattr(x, name) for x in splats], -1) for name in ("lane", "pixel", "value")
+            )
+            # lanes run over the pixels of a sample, then over samples
+            stream = pixel_set.film.randomization_of(first_sample + lane // pixels)
+            piece.splats.append(pixel_set.film.splats.writes_of_add(stream, pixel, value))
     if pixel_set.layers:  # AOVs, by camera rays of their own
         piece.tally.rays += pixels * samples
         for name, values in tensors.layers(wave, tuple(pixel_set.layers), *span, pixel_set).items():
             piece.writes += pixel_set.layers[name].writes_of_add(values, first_pixel, first_sample)
     return piece
-
-
-def _add_splats(piece: Piece, film: Film, splats: Sequence[Splats], sample_of: Callable[[Tensor], Tensor]) -> None:
-    """Add splats to a piece; ``sample_of`` returns the samples of lanes."""
-    if film.splats is None or not splats:
-        return
-    lane, pixel, value = (torch.cat([getattr(x, name) for x in splats], -1) for name in ("lane", "pixel", "value"))
-    piece.splats.append(film.splats.writes_of_add(film.randomization_of(sample_of(lane)), pixel, value))
 
 
 def _sum_of_light(radiance: Tensor, splats: Sequence[Splats]) -> Tensor:

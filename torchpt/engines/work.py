@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from torchpt.paths.nonfinite import NonFinite
+from torchpt.paths.photons import SentLight
 from torchpt.paths.wave import PixelSet, RayCounts
 
 __all__ = ["TASKS", "Block", "SampleRange", "TaskResult"]
@@ -33,6 +34,7 @@ class TaskResult:
         light: sums of radiance before and after the firefly clamp, from which the summary reports the light that was lost;
             zeros without a clamp.
         unfinished: blocks that ran out of memory, to be rendered again.
+        sent: what light paths leave for the camera paths of their sample; None: the task has traced camera paths.
     """
 
     tally: RayCounts
@@ -40,3 +42,4 @@ class TaskResult:
     lost: NonFinite = field(default_factory=NonFinite)
     light: tuple[float, float] = (0.0, 0.0)
     unfinished: list[Block] = field(default_factory=list)
+    sent: SentLight | None = None

@@ -230,8 +230,11 @@ CAUSES = {
     "ray": "the ray that leaves a surface",
     "preview": "the shading of the first surface, of integrators that stop there",
     "sum": "the sum of contributions, or its product with the filter weight, each of them finite",
+    "merge": "the light of a merge with light paths of other pixels, which is not traced again",
     "not repeated": "none: traced again by tensor operations, the sample is finite",
 }
+#: Causes of samples that are finite as they are traced again.
+_NOT_SEEN = ("merge", "not repeated")
 
 
 @dataclass(frozen=True)
@@ -253,7 +256,7 @@ class NonFiniteCause:
     @property
     def name(self) -> str:
         """Return the name under which samples are counted."""
-        return self.cause if self.cause == "not repeated" else f"{'nan' if self.nan else 'infinite'} {self.cause}"
+        return self.cause if self.cause in _NOT_SEEN else f"{'nan' if self.nan else 'infinite'} {self.cause}"
 
 
 def causes_of_samples(trace: Trace, wave: Wave, samples: Sequence[SampleId]) -> list[NonFiniteCause]:
@@ -265,10 +268,15 @@ def causes_of_samples(trace: Trace, wave: Wave, samples: Sequence[SampleId]) -> 
         samples: the samples, in any order.
     """
     found: dict[SampleId, NonFiniteCause] = {}
-    # Samples of the picture and of error probes have other randomizations: each group is traced as one wave.
-    for first, count in sorted({(sample.first_randomization, sample.randomizations) for sample in samples}):
-        group = [sample for sample in samples if (sample.first_randomization, sample.randomizations) == (first, count)]
-        causes = _find_causes(trace, wave, group, Randomizations(first=first, count=count))
+
+    def group_of(sample: SampleId) -> tuple[int, int, int]:
+        """Return what samples share that are traced as one wave: randomizations, which error probes have others of; radius."""
+        number = sample.sample if wave.integrator.merging_counts else 0
+        return sample.first_randomization, sample.randomizations, number
+
+    for first, count, number in sorted(set(map(group_of, samples))):
+        group = [sample for sample in samples if group_of(sample) == (first, count, number)]
+        causes = _find_causes(trace, wave.at_sample(number), group, Randomizations(first=first, count=count))
         found |= zip(group, causes, strict=True)
     return [found[sample] for sample in samples]
 
@@ -292,8 +300,8 @@ def _find_causes(
         radiance = trace(walked, state, finder, store)
         if not finder.found_all:  # a walk that was ended early returns no radiance
             finder.check("sum", radiance, torch.arange(len(samples), device=x.device), depth=0, slot=None)
-    not_repeated = NonFiniteCause("not repeated", nan=False, depth=0)
-    return [cause or not_repeated for cause in finder.causes]
+    other = NonFiniteCause("merge" if wave.integrator.merges else "not repeated", nan=False, depth=0)
+    return [cause or other for cause in finder.causes]
 
 
 class _CauseFinder(Explainer):

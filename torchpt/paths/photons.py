@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -22,9 +21,21 @@ from torch import Tensor
 
 from torchpt.native.kernels import kernel
 from torchpt.paths.state import Photon
+from torchpt.physics.film.splats import Splats
 from torchpt.physics.samplers.dimensions import Dimension, salt
 
-__all__ = ["MERGE_SHARE", "PHOTON", "PhotonMap", "merging_of", "photon_of"]
+__all__ = [
+    "FIELDS",
+    "MERGE_SHARE",
+    "PHOTON_ROWS",
+    "LightOfSample",
+    "PhotonMap",
+    "SentLight",
+    "data_of",
+    "merging_of",
+    "photon_of",
+    "values_of",
+]
 
 #: For how many photons one within the radius counts in weights: below 1, so that merges are left to light that other strategies
 #: hardly find. Any number gives the same mean in the limit; a small one has less bias and less variance where others find it.
@@ -33,11 +44,9 @@ MERGE_SHARE = 0.3
 _REVERSE = 1.0 / math.pi
 #: Least chance of photons to be chosen, relative to those of their flux that nothing else finds.
 _LEAST_CHANCE = 0.01
-#: Fields of a photon, and their rows.
-PHOTON = {"p": 3, "d": 3, "value": 3, "dvcm": 1, "dvc": 1, "depth": 1}
-_DATA = ("d", "value", "dvcm", "dvc", "depth")
-#: Rows of the table of all fields but the points.
-_ROWS = sum(PHOTON[name] for name in _DATA)
+#: Fields of :class:`Photon` and their rows, which are the rows of *data* of photons, float32, in this order.
+FIELDS = {"d": 3, "value": 3, "dvcm": 1, "dvc": 1, "depth": 1}
+PHOTON_ROWS = sum(FIELDS.values())
 
 
 def merging_of(radius: float, paths: float) -> float:
@@ -45,18 +54,108 @@ def merging_of(radius: float, paths: float) -> float:
     return MERGE_SHARE * math.pi * radius * radius * paths
 
 
+def values_of(photon: Photon) -> dict[str, Tensor]:
+    """Return the values of photons by name of :data:`FIELDS`: ``(3, n)`` or ``(n,)``."""
+    values = {name: getattr(photon, name) for name in FIELDS}
+    return values | {"depth": photon.depth.to(photon.dvcm.dtype)}
+
+
 def photon_of(values: Mapping[str, Tensor]) -> Photon:
-    """Return photons from tensors by field."""
-    return Photon(**{name: values[name] for name in PHOTON})
+    """Return photons from their values by name."""
+    photon = Photon(**{name: values[name] for name in FIELDS})
+    return replace(photon, depth=photon.depth.to(torch.int64))
+
+
+def data_of(photon: Photon) -> np.ndarray:
+    """Return the data of photons ``(9, n)``, on the host."""
+    rows = [value.float().view(-1, value.shape[-1]) for value in values_of(photon).values()]
+    return torch.cat(rows).cpu().numpy()
+
+
+@dataclass(frozen=True)
+class SentLight:
+    """What the light paths of some pixels leave for the camera paths of the same sample.
+
+    Attributes:
+        pixel: ``(n,)`` int64 index of the pixel that each photon belongs to.
+        p: ``(3, n)`` float32 the points.
+        data: ``(9, n)`` the other rows of photons, all finite.
+        splats: their splats; ``lane`` is the index of the pixel.
+        lost: ``(m,)`` int64 pixels whose light path has a splat or a photon that is not finite, each once.
+    """
+
+    pixel: np.ndarray
+    p: np.ndarray
+    data: np.ndarray
+    splats: list[Splats]
+    lost: np.ndarray
+
+    @staticmethod
+    def of(
+        first_pixel: int,
+        photons: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+        splats: Sequence[Splats],
+        lost: np.ndarray,
+    ) -> SentLight:
+        """Return what the light paths of consecutive pixels leave.
+
+        Args:
+            first_pixel: index of the first one.
+            photons: lanes ``(n,)``, points and data of photons.
+            splats: splats by lane.
+            lost: lanes ``(m,)`` with a splat that is not finite.
+        """
+        lanes, points, data = zip(*photons, strict=True) if photons else ((), (), ())
+        pixel = np.concatenate([np.zeros(0, np.int64), *lanes]) + first_pixel
+        p = np.concatenate([np.zeros((3, 0), np.float32), *points], 1)
+        rows = np.concatenate([np.zeros((PHOTON_ROWS, 0), np.float32), *data], 1)
+        finite = np.isfinite(p).all(0) & np.isfinite(rows).all(0)
+        lost = np.union1d(lost + first_pixel, pixel[~finite])
+        of_pixels = [Splats(x.lane + first_pixel, x.pixel, x.value) for x in splats]
+        if not finite.all():
+            pixel, p, rows = pixel[finite], p[:, finite], rows[:, finite]
+        return SentLight(pixel, p, rows, of_pixels, lost)
+
+
+@dataclass(frozen=True)
+class LightOfSample:
+    """What the light paths of one sample of all pixels leave for its camera paths.
+
+    Attributes:
+        photons: the photons.
+        splats: the splats, as in :class:`SentLight`.
+        lost: likewise.
+    """
+
+    photons: PhotonMap
+    splats: list[Splats]
+    lost: np.ndarray
+
+    @staticmethod
+    def of(sent: Sequence[SentLight], radius: float, paths: float) -> LightOfSample:
+        """Return what is sent by all pixels, in any order; other arguments as for :meth:`PhotonMap.of`."""
+        splats = [splats for part in sent for splats in part.splats]
+        lost = np.concatenate([np.zeros(0, np.int64), *(part.lost for part in sent)])
+        return LightOfSample(PhotonMap.of(sent, radius, paths), splats, lost)
+
+    def of_pixels(self, first: int, count: int) -> tuple[list[Splats], np.ndarray]:
+        """Return splats and lost ones of the light paths of ``count`` pixels, with their numbers counted from the first."""
+        found = []
+        for splats in self.splats:
+            index = ((splats.lane >= first) & (splats.lane < first + count)).nonzero().squeeze(1)
+            if len(index):
+                found.append(Splats(splats.lane[index] - first, splats.pixel[index], splats.value[:, index]))
+        lost = self.lost - first
+        return found, lost[(lost >= 0) & (lost < count)]
 
 
 def _importance(data: np.ndarray, merging: float) -> np.ndarray:
-    """Return what the chances of photons to be chosen are proportional to ``(n,)``, from rows of :data:`_DATA`."""
-    _, _, _, *value, dvcm, dvc, _ = data.astype(np.float64)
-    others = np.hypot(dvcm, dvc * _REVERSE) / merging
-    found = abs(np.array(value)).max(0) * np.maximum(1.0 / (1.0 + others * others), _LEAST_CHANCE)
-    # The splats of a light path tell that it is not finite.
-    return np.where(found < np.finfo(np.float32).max, found, 0.0)
+    """Return what the chances of photons to be chosen are proportional to ``(n,)``, from their data."""
+    dvcm, dvc = data[6:8]
+    with np.errstate(over="ignore"):  # to a weight of 0
+        others = np.hypot(dvcm, dvc * np.float32(_REVERSE)) / np.float32(merging)
+        weight = 1.0 / (1.0 + others * others)
+    return abs(data[3:6]).max(0) * np.maximum(weight, np.float32(_LEAST_CHANCE))
 
 
 @dataclass(frozen=True)
@@ -65,7 +164,7 @@ class PhotonMap:
 
     Attributes:
         points: ``(n, 4)`` float32: point, and what the chance to be chosen is proportional to, sorted by cell.
-        data: ``(n, 9)`` float32: the other fields of :data:`PHOTON`.
+        data: ``(n, 9)`` float32: the other rows.
         starts: ``(cells + 1,)`` int32: the first photon of each cell.
         radius: of merges.
         scale: of the value of all photons within the radius: one over area and number of light paths.
@@ -78,31 +177,23 @@ class PhotonMap:
     scale: float
 
     @staticmethod
-    def of(parts: Sequence[tuple[np.ndarray, Mapping[str, np.ndarray]]], radius: float, paths: float) -> PhotonMap:
+    def of(sent: Sequence[SentLight], radius: float, paths: float) -> PhotonMap:
         """Return the map of photons.
 
         Args:
-            parts: the index of the pixel ``(n,)`` of photons, and their fields ``(n,)`` or ``(rows, n)``, in any order.
+            sent: the photons, in any order.
             radius: of merges.
             paths: number of light paths.
         """
-        pixel = np.concatenate([np.asarray(pixels, np.int64) for pixels, _ in parts] or [np.zeros(0, np.int64)])
-
-        def rows(names: Sequence[str]) -> np.ndarray:
-            """Return the rows of fields of all parts, one below the other ``(rows, n)``."""
-            blocks = [
-                np.concatenate([np.atleast_2d(values[name]) for name in names], dtype=np.float32) for _, values in parts
-            ]
-            return np.concatenate(blocks, 1) if blocks else np.zeros((sum(PHOTON[k] for k in names), 0), np.float32)
-
-        p, data = rows(("p",)), rows(_DATA)
+        pixel = np.concatenate([np.zeros(0, np.int64), *(part.pixel for part in sent)])
+        p = np.concatenate([np.zeros((3, 0), np.float32), *(part.p for part in sent)], 1)
+        data = np.concatenate([np.zeros((PHOTON_ROWS, 0), np.float32), *(part.data for part in sent)], 1)
         count = len(pixel)
         cells = 1 << max(int(2 * count).bit_length() - 1, 4)
         cell = np.empty(count, np.int32)
-        columns = np.ascontiguousarray(p)
         inverse = np.float32(0.5) / np.float32(radius)  # rounded as in `near`
-        kernel("photons", "cells_of")(columns, count, np.array([inverse], np.float32), cells, cell)
-        depth = data[_ROWS - 1].astype(np.int64)
+        kernel("photons", "cells_of")(np.ascontiguousarray(p), count, np.array([inverse], np.float32), cells, cell)
+        depth = data[PHOTON_ROWS - 1].astype(np.int64)
         # Unique: a light path has one vertex of each depth.
         pixels, depths = int(pixel.max(initial=0)) + 1, int(depth.max(initial=0)) + 1
         order = np.argsort((cell.astype(np.int64) * pixels + pixel) * depths + depth)
@@ -114,8 +205,8 @@ class PhotonMap:
         scale = 1.0 / (math.pi * radius * radius * paths)
         return PhotonMap(points, np.ascontiguousarray(data.T[order]), starts, radius, scale)
 
-    def near(self, p: np.ndarray, key: np.ndarray, depth: int) -> dict[str, np.ndarray]:
-        """Return a photon near each vertex: fields of :class:`Photon` by name, without ``p``; ``value`` 0 where there is none.
+    def near(self, p: np.ndarray, key: np.ndarray, depth: int) -> np.ndarray:
+        """Return the data ``(9, n)`` of a photon near each vertex, with the value of all those there; 0 where there is none.
 
         Args:
             p: the points ``(3, n)`` float32.
@@ -124,22 +215,15 @@ class PhotonMap:
         """
         count = p.shape[1]
         p, key = np.ascontiguousarray(p, np.float32), np.ascontiguousarray(key, np.int32)
-        found = np.empty((_ROWS, count), np.float32)
+        found = np.empty((PHOTON_ROWS, count), np.float32)
         kernel("photons", "near")(
             p, count, key, len(key), salt(Dimension.MERGE, depth), self.points.reshape(-1), self.data.reshape(-1), self.starts,
             len(self.starts) - 1, np.array([self.radius, self.scale], np.float32), found,
         )  # fmt: skip
-        values, first = {}, 0
-        for name in _DATA:
-            rows = found[first : first + PHOTON[name]]
-            values[name] = rows if len(rows) > 1 else rows[0]
-            first += PHOTON[name]
-        values["depth"] = values["depth"].astype(np.int64)
-        return values
+        return found
 
     def photons(self, p: Tensor, key: Tensor, depth: int) -> Photon:
         """Return a photon near each vertex; arguments as for :meth:`near`, tensors of any device and dtype."""
-        found: dict[str, Any] = self.near(p.detach().float().cpu().numpy(), key.cpu().numpy(), depth)
-        values = {name: torch.from_numpy(value).to(p.device) for name, value in found.items()}
-        values = {name: value.to(p.dtype) if value.is_floating_point() else value for name, value in values.items()}
-        return Photon(p=p, **values)
+        rows = torch.from_numpy(self.near(p.detach().float().cpu().numpy(), key.cpu().numpy(), depth)).to(p)
+        parts = zip(FIELDS, rows.split(list(FIELDS.values())), strict=True)
+        return photon_of({name: part if len(part) > 1 else part[0] for name, part in parts})

@@ -241,7 +241,6 @@ class Photon:
     """Light paths as they arrive at surfaces.
 
     Attributes:
-        p: ``(3, n)`` the points.
         d: ``(3, n)`` unit directions of arrival.
         value: ``(3, n)`` flux. At a vertex of a camera path: that of all photons nearby, for which this one stands, over area
             and number of light paths; 0 where there is none.
@@ -250,7 +249,6 @@ class Photon:
         depth: ``(n,)`` int64 number of the vertex on its light path.
     """
 
-    p: Tensor
     d: Tensor
     value: Tensor
     dvcm: Tensor
@@ -424,7 +422,7 @@ class VertexOutput:
         splat: radiance for other pixels; None: none. Only integrators that declare ``splats`` return it.
         kept: what connections need of the vertex; None: it is not kept.
         end: the camera path's end of a connection; None: the vertex has none.
-        photon: light paths as they arrive, to be merged with camera paths; None: they are not.
+        photon: light paths as they arrive at ``at``, to be merged with camera paths; None: they are not.
         surface: the points with their materials; None where the stage did not resolve them.
         direct: the light sample; None where no light was sampled.
         drawn: the BSDF sample; None where paths end here.

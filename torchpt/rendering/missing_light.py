@@ -223,8 +223,8 @@ def _why_unreachable(search: _Search, names: Names, lights: Lights, row: int, ki
     shape, material = names.shape(int(slot[transmitting[0]]))
     where = f"a {kind} light {'inside' if len(hit_models) == LIGHT_RAYS else 'behind'} {shape} ({material})"
     if integrator.light_walk() is not None:
-        seen = "where it is seen through glass or in a mirror"
-        return f"{where} cannot be found by integrator {integrator.name} {seen} (vcm finds it there)"
+        hint = "" if integrator.merging_counts else " (vcm finds it there)"
+        return f"{where} {cannot_be_found} where it is seen through glass or in a mirror{hint}"
     return f"{where} {cannot_be_found} (bdpt finds it where it is not seen through glass or in a mirror, vcm there too)"
 
 

@@ -214,7 +214,7 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         expected = "bdpt beside debug.pixel: merges take light from the paths of all pixels"
         raise SceneError("integrator.type", settings.integrator.name, expected)
     with torch.no_grad(), limited_threads(settings.render.threads):
-        wave = make_wave(scene, settings, params=None, dtype=torch.float32)
+        wave = make_wave(scene, settings, params=None, dtype=torch.float32).at_sample(sample)
         explainer = Explainer(wave.context.world)
         x, y, number = (torch.tensor([value], device=scene.device) for value in (*pixel, sample))
         store = None

@@ -231,7 +231,7 @@ class Run:
             or self.stop_rules.has_other_rules
             or self.probes is not None
             or self.distributed is not None
-            or self.wave.integrator.merges  # light paths of all pixels come first
+            or self.wave.integrator.merging_counts  # samples come one by one, each with a radius of its own
         )
         if self.tasks is None or works_between_passes or self.settings.render.max_memory is not None:
             return None

@@ -44,8 +44,8 @@ CODE_OF_LLVM = 60_000_000
 CODE_OF_MODEL = 3_000_000
 #: Bytes of a pixel while the picture is computed from the films: plain, with error probes, adaptive, with the AOV variance.
 PICTURE_BYTES, PROBES_BYTES, ADAPTIVE_BYTES, VARIANCE_BYTES = 64, 225, 160, 160
-#: Bytes of the photons of a pixel while their map is made: 200 each, of five vertices of a light path.
-PHOTONS_BYTES = 1000
+#: Bytes of the photons of a light path while their map is made: 280 each, at five vertices.
+PHOTONS_BYTES = 1400
 #: Bytes of a pixel of the finished pictures.
 FINISHED_BYTES = 80
 #: Bytes of a film that is allocated without looking at free memory.
@@ -71,16 +71,19 @@ class MemoryEstimate:
         code: code that the render loads.
         waves: a wave of the fewest lanes that a render uses.
         picture: the pictures, which are computed at the end, when the wave is gone.
+        photons: those of a sample of all pixels, beside waves.
     """
 
     films: int
     code: int
     waves: int
     picture: int
+    photons: int = 0
 
     def least(self, held: int) -> int:
         """Return the smallest memory limit with which the render can run, ``held`` bytes included, with a margin."""
-        return int(SLACK * (held + self.films + self.code + max(self.waves, self.picture))) + SPARE
+        largest = max(self.waves + self.photons, self.picture)
+        return int(SLACK * (held + self.films + self.code + largest)) + SPARE
 
     def backward_bytes(self, held: int) -> int:
         """Return the smallest limit of a backward pass, which has neither films nor a picture; ``held`` as in :meth:`least`."""
@@ -92,7 +95,7 @@ class MemoryEstimate:
         ``picture`` is taken off too, for the pictures of progress that are computed beside a wave. What is left may be less
         than ``waves``, as :meth:`least` counts the larger of both: the render then has waves of the fewest lanes.
         """
-        return limit - held - self.films - self.code - self.picture
+        return limit - held - self.films - self.code - self.photons - self.picture
 
 
 def memory_estimate(settings: Settings, device: torch.device, mode: str, models: int, rows: int = 0) -> MemoryEstimate:
@@ -111,8 +114,6 @@ def memory_estimate(settings: Settings, device: torch.device, mode: str, models:
     # Bytes of a pixel, as in `Film.bytes_of`: of each layer two float64 a channel (first samples, sums) and a count.
     films = Film.bytes_of(1, settings.streams, splats=settings.integrator.splats)
     films += sum(16 * count + 8 for count in channels)
-    if settings.integrator.merges:
-        films += PHOTONS_BYTES
     picture = PICTURE_BYTES
     if "variance" in settings.film.aovs:
         picture = VARIANCE_BYTES
@@ -126,7 +127,9 @@ def memory_estimate(settings: Settings, device: torch.device, mode: str, models:
         code = 0
     # Kernels have `rows` numbers of 4 bytes a lane. Tensor operations get twice their measured bytes in the first, small wave.
     waves = FEWEST_OF_KERNELS * 4 * rows if mode == "compiled" else FIRST_WAVE_LANES * 2 * BYTES_PER_LANE
-    return MemoryEstimate(films=pixels * films, code=code, waves=waves, picture=pixels * picture)
+    light_paths = settings.integrator.light_walk() if settings.integrator.merges else None
+    photons = 0 if light_paths is None else int(PHOTONS_BYTES * pixels * light_paths.fraction)
+    return MemoryEstimate(films=pixels * films, code=code, waves=waves, picture=pixels * picture, photons=photons)
 
 
 def check_film(

@@ -30,6 +30,7 @@ from torchpt.math.vectors import dot, normalize
 from torchpt.native import device_checks
 from torchpt.paths.integrators.base import Integrator
 from torchpt.paths.integrators.kinds.vcm import Vcm
+from torchpt.paths.integrators.path import partition
 from torchpt.paths.layers import LAYERS, SurfaceLayer
 from torchpt.paths.state import Plan, StageContext
 from torchpt.paths.wave import Rays, Wave
@@ -37,7 +38,7 @@ from torchpt.physics.cameras import Camera
 from torchpt.physics.film import Filter
 from torchpt.physics.lights.emission import emission_of
 from torchpt.physics.samplers import ADAPTIVE, Points, Sampler
-from torchpt.physics.shapes.geometry import Geometry
+from torchpt.physics.shapes.geometry import Geometry, Hit
 from torchpt.physics.world import World
 from torchpt.scene import Scene
 from torchpt.scene.scene import live_scenes
@@ -205,8 +206,9 @@ _RADIUS_IN_PIXELS = 2.0
 def _with_radius(wave: Wave) -> Wave:
     """Return the wave with the radius of merges, where its integrator merges and nobody gave one: two pixels wide.
 
-    The width of a pixel is the median over camera rays on a grid of the picture, at the surfaces that they hit. The radius has
-    two digits, so that other processors round to the same.
+    The width of a pixel is the median over camera rays on a grid of the picture, at the surfaces that they hit; where some of
+    these scatter light, of those alone. Where nothing is hit, that of pixels which show all of the scene. The radius has two
+    digits, so that other processors round to the same.
     """
     integrator = wave.integrator
     if not isinstance(integrator, Vcm) or integrator.radius is not None:
@@ -219,17 +221,23 @@ def _with_radius(wave: Wave) -> Wave:
     with torch.no_grad():
         lens = torch.full((2, len(x)), 0.5, dtype=dtype, device=device) if wave.camera.lens else None
         o, d = wave.camera.rays(x, y, lens)
-        _, beside = wave.camera.rays(x + 1.0, y, lens)
+        next_o, next_d = wave.camera.rays(x + 1.0, y, lens)
         o = o.expand_as(d).contiguous()
-        t, prim, *_ = wave.accel.intersect(o, d.contiguous(), torch.full_like(x, math.inf))
-        if wave.camera.parallel:
-            origin, _ = wave.camera.rays(x + 1.0, y, lens)
-            wide = (origin.expand_as(d) - o).square().sum(0).sqrt()
-        else:
-            wide = (beside - d).square().sum(0).sqrt() * t
-        wide = wide[(prim >= 0) & torch.isfinite(wide)]
-    median = float(wide.double().median()) if len(wide) else 0.0
-    radius = float(f"{_RADIUS_IN_PIXELS * median:.1e}") or 1.0  # any, where nothing is seen
+        hit = Hit(*wave.accel.intersect(o, d.contiguous(), torch.full_like(x, math.inf)))
+        wide = (
+            (next_o - o).square().sum(0).sqrt() if wave.camera.parallel else (next_d - d).square().sum(0).sqrt() * hit.t
+        )
+        seen = (hit.prim >= 0) & torch.isfinite(wide)
+        models, merged = wave.context.world.materials.models, torch.zeros_like(seen)
+        for model, lanes in partition(wave.context.world, hit)[1]:
+            merged[lanes] = not models[model].smooth
+        wide = wide[seen & merged if bool((seen & merged).any()) else seen]
+    width_of_pixel, emission = 0.0, wave.context.world.emission
+    if len(wide):
+        width_of_pixel = float(wide.double().median())
+    elif emission is not None:
+        width_of_pixel = 2.0 * float(emission.sphere.radius) / max(width, height)
+    radius = float(f"{_RADIUS_IN_PIXELS * width_of_pixel:.1e}") or 1.0  # any, where nothing emits
     return replace(wave, integrator=integrator.but(radius=radius))
 
 

@@ -650,7 +650,6 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
 
     Raises:
         SceneError: an unknown block or key, a key that the chosen type does not have, a bad value.
-        NotBuiltError: a setting that this version does not support.
     """
     if isinstance(overrides.get("film"), tuple | list):
         overrides = {**overrides, "film": film_keys(overrides["film"])}

@@ -47,13 +47,10 @@ class Refused(ValueError):
         expected: phrase of what is accepted.
         value: the element that is wrong; ``...``: the whole value.
         at: keys and indices that lead to that element.
-        not_built: True where the format knows the value and this version does not support it.
     """
 
-    def __init__(
-        self, expected: str, value: Any = ..., at: tuple[str | int, ...] = (), *, not_built: bool = False
-    ) -> None:
-        self.expected, self.value, self.at, self.not_built = expected, value, at, not_built
+    def __init__(self, expected: str, value: Any = ..., at: tuple[str | int, ...] = ()) -> None:
+        self.expected, self.value, self.at = expected, value, at
         super().__init__(expected)
 
 

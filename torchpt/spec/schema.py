@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from torchpt.core.errors import NotBuiltError, SceneError, did_you_mean
+from torchpt.core.errors import SceneError, did_you_mean
 from torchpt.core.tree import NOT_FINGERPRINTED
 from torchpt.spec import Map, Refused
 from torchpt.spec.parameters import REQUIRED, Spec, spec_of
@@ -309,8 +309,7 @@ def check_keys(raw: Mapping[str, Any], known: Iterable[str], key: str, what: str
 def scene_error(error: Refused, key: str, value: Any, file: str | None) -> SceneError:
     """Return the scene error for a refused value at ``key``."""
     shown = value if error.value is ... else error.value
-    kind = NotBuiltError if error.not_built else SceneError
-    return kind(dotted(key, *error.at), shown, error.expected, file)
+    return SceneError(dotted(key, *error.at), shown, error.expected, file)
 
 
 # ---- Reading of blocks: the kind that ``type`` names, and the values of its parameters

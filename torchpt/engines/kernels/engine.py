@@ -19,7 +19,7 @@ from __future__ import annotations
 import ctypes
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, ClassVar, cast
 
@@ -29,21 +29,19 @@ from torch import Tensor
 
 from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD, WORD
-from torchpt.engines.kernels.layout import CONNECTION, HIT, PHOTON, Memory, Rows, path_state, state_values
+from torchpt.engines.kernels.eagerly import bounce_eagerly, connect_eagerly
+from torchpt.engines.kernels.layout import Memory, Rows
 from torchpt.engines.kernels.programs import Kernel, Kernels
 from torchpt.engines.kernels.stages import CHUNK_FIELDS
-from torchpt.paths.integrators.base import check_output
 from torchpt.paths.layers import LAYERS
-from torchpt.paths.photons import PHOTON as PHOTONS
-from torchpt.paths.photons import PhotonMap, photon_of
-from torchpt.paths.state import End, Shadow, Splat, StageContext, VertexInput, no_shadow
-from torchpt.paths.store import BLOCKS, PARTNER, block_of, kept_values, partner_of, vertex_of
+from torchpt.paths.photons import PHOTON_ROWS, LightOfSample, SentLight
+from torchpt.paths.state import StageContext
+from torchpt.paths.store import BLOCKS, block_of
 from torchpt.paths.walk import Counts, Observer, walk
 from torchpt.paths.wave import PixelSet, RayCounts
 from torchpt.physics.film import Film
 from torchpt.physics.film.splats import LARGEST, Splats
 from torchpt.physics.samplers import salts
-from torchpt.physics.shapes.geometry import Hit
 from torchpt.search import Accel
 
 __all__ = [
@@ -56,10 +54,6 @@ __all__ = [
     "KernelsEngine",
     "LaneCount",
     "Paths",
-    "SentPhotons",
-    "TracedLight",
-    "bounce_eagerly",
-    "connect_eagerly",
     "count_samples",
     "film_words",
 ]
@@ -260,126 +254,6 @@ class Calls:
         return arguments
 
 
-# ---- A vertex by tensor operations on lanes of an arena, for models that cannot be compiled
-
-
-def bounce_eagerly(
-    kernels: Kernels,
-    context: StageContext,
-    store: Memory | None,
-    model: int,
-    roulette: float,
-    source: Memory,
-    target: Memory,
-    places: Memory,
-    count: int,
-    start: int,
-    depth: int,
-) -> int:
-    """Run the stage of surfaces with tensor operations in place of its kernel.
-
-    Args:
-        kernels: of the render.
-        context: of the chunk.
-        store: vertices of light paths; None: paths are not connected.
-        model: index of the BSDF model.
-        roulette: see :class:`torchpt.paths.state.StageContext`.
-        source: the arena to read paths from.
-        target: the arena to write them to.
-        places: list of the lanes.
-        count: number of lanes.
-        start: first lane in ``target``.
-        depth: number of the vertex.
-
-    Returns:
-        The number of shadow rays, those of splats included.
-    """
-    rows, lanes = kernels.state, places.words[0, :count]
-    with torch.no_grad():
-        state = path_state(rows.take(source, lanes, rows.state))
-        vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
-        device = state.t_max.device
-        start_salts = kernels.wave.integrator.start_salts(depth, device)
-        context = context.at(salts(depth, device), roulette=roulette, start_salts=start_salts, depth=depth)
-        integrator, sample = kernels.wave.integrator, state.lane
-        if integrator.connects:
-            assert store is not None and kernels.store is not None
-            partner = partner_of(kernels.store.take(store, sample, PARTNER, block_of(depth) * kernels.store.count))
-            vertex = replace(vertex, partner=partner)
-        if integrator.merges:
-            near = rows.take(source, lanes, tuple(PHOTON))
-            vertex = replace(vertex, photon=photon_of({k.removeprefix("photon_"): x for k, x in near.items()}))
-        output = kernels.wave.bounce(context, model, vertex)
-        check_output(integrator, output)
-        if output.kept is not None:
-            assert store is not None and kernels.store is not None
-            kept = kept_values(vertex, output.kept)
-            counts = {"count": kept.pop("count")}
-            for block, where in enumerate(output.kept.where):
-                first, index = block * kernels.store.count, where.nonzero().squeeze(1)
-                chosen = {name: value.index_select(-1, index) for name, value in kept.items()}
-                kernels.store.scatter(store, sample[index], chosen, first)
-                kernels.store.scatter(store, sample, counts, first)
-        after, no_ray = output.leaving, no_shadow(output.leaving)
-        shadow = no_ray if output.shadow is None else output.shadow
-        splat = Splat(torch.full_like(after.lane, -1), no_ray) if output.splat is None else output.splat
-    values: dict[str, Tensor | None] = {**state_values(after)}
-    values |= rows.take(source, lanes, ("weight",))
-    values |= {f"shadow_{name}": value for name, value in _values_of_shadow(shadow).items()}
-    values |= {f"splat_{name}": value for name, value in _values_of_shadow(splat.light).items()}
-    values["splat_pixel"] = splat.pixel
-    if integrator.connects:
-        ended = {"end_partner": torch.full_like(after.lane, -1), "connection_t": torch.zeros_like(after.t_max)}
-        end = output.end
-        values |= ended if end is None else {**ended, **{f"end_{name}": value for name, value in vars(end).items()}}
-    if integrator.sends_photons:
-        values["photon_depth"] = torch.zeros_like(after.lane)
-        if output.photon is not None:
-            values |= {f"photon_{name}": value for name, value in vars(output.photon).items()}
-    rows.put(target, start, values)
-    return count * (int(output.shadow is not None) + int(output.splat is not None))
-
-
-def connect_eagerly(
-    kernels: Kernels,
-    context: StageContext,
-    store: Memory,
-    model: int,
-    arena: Memory,
-    places: Memory,
-    count: int,
-    depth: int,
-) -> None:
-    """Run the stage of connections with tensor operations in place of its kernel.
-
-    Args:
-        kernels: of the render.
-        context: of the chunk.
-        store: vertices of light paths.
-        model: index of the BSDF model of these.
-        arena: of the camera paths behind their vertex.
-        places: list of the lanes.
-        count: number of lanes.
-        depth: number of the camera paths' vertex.
-    """
-    rows, lanes, of_store = kernels.state, places.words[0, :count], kernels.store
-    assert of_store is not None
-    with torch.no_grad():
-        ends = rows.take(arena, lanes, tuple(name for name in CONNECTION if name.startswith("end_")))
-        sample = rows.take(arena, lanes, ("lane",))["lane"]
-        values = of_store.take(store, sample, of_store.names, block_of(depth) * of_store.count)
-        device = sample.device
-        context = context.at(salts(depth, device), start_salts=salts(0, device), depth=depth)
-        end = End(**{name.removeprefix("end_"): value for name, value in ends.items()})
-        light = kernels.wave.integrator.connect(context, model, vertex_of(values), values["depth"], end)
-    rows.scatter(arena, lanes, {f"connection_{name}": value for name, value in _values_of_shadow(light).items()})
-
-
-def _values_of_shadow(light: Shadow) -> dict[str, Tensor]:
-    """Return the tensors of shadow rays by the ends of their rows' names."""
-    return {"o": light.o, "d": light.d, "t": light.t_max, "radiance": light.radiance}
-
-
 # ---- Searches between stages: by packet kernels, or by the acceleration structure
 #
 # Rays that hit surfaces that are not opaque move to an arena of their own and are searched again from behind the surface, until
@@ -513,27 +387,6 @@ class Chunk:
     pixel_set: PixelSet | None = None
 
 
-@dataclass(frozen=True)
-class SentPhotons:
-    """What the light paths of some pixels leave for the camera paths of the same sample, but for their splats.
-
-    Attributes:
-        parts: index of the pixel, and fields, of photons.
-        lost: ``(n,)`` pixels whose light path has a splat that is not finite.
-    """
-
-    parts: list[tuple[np.ndarray, dict[str, np.ndarray]]]
-    lost: np.ndarray
-
-
-@dataclass(frozen=True)
-class TracedLight:
-    """What the light paths of one sample of all pixels leave: photons, and pixels that are lost as in :class:`SentPhotons`."""
-
-    photons: PhotonMap
-    lost: np.ndarray
-
-
 # Chunks are added to films by the kernels :func:`torchpt.engines.kernels.stages.accumulate`, a sample at a time.
 
 
@@ -605,8 +458,8 @@ class KernelsEngine:
         store: where light paths keep vertices for connections; None: memory of its own, if the integrator connects paths.
 
     Attributes:
-        traced: what the light paths of the sample have left, where camera paths are merged with photons; else None.
-        sent: samples, and fields by name, of photons that the chunk's light paths send.
+        traced: what the light paths of the sample have left, while camera paths are merged with photons; else None.
+        sent: lanes ``(n,)``, points ``(3, n)`` and data of photons that the chunk's light paths send; None: they are dropped.
         context: of the chunk's stages, for those that run by tensor operations.
         slots: radiance of the chunk's samples.
         store: blocks of vertices of light paths (:mod:`torchpt.paths.store`), a column for each sample; None: there are none.
@@ -627,8 +480,8 @@ class KernelsEngine:
         self.shown: Memory | None = None
         self.tally = RayCounts()
         self.splats: list[Splats] = []
-        self.traced: TracedLight | None = None
-        self.sent: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+        self.traced: LightOfSample | None = None
+        self.sent: list[tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None
         self.context = kernels.wave.context
         self._lost: list[Any] = []  # samples with splats that are not finite
         self._rooms = [self._room() for _ in range(2)]  # memory of even and of odd vertices
@@ -667,7 +520,7 @@ class KernelsEngine:
         size = sum(memory.words.nbytes for memory in self.memories())
         size += 0 if self.light_paths is None else self.light_paths.unbind()
         self.calls.unbind()
-        self.splats, self._lost, self.sent, self.traced = [], [], [], None
+        self.splats, self._lost, self.sent, self.traced = [], [], None, None
         del self.kernels, self.wave, self.search.kernels, self.context
         return size
 
@@ -686,11 +539,11 @@ class KernelsEngine:
             assert kernels.light_paths is not None
             self.light_paths.rebind(kernels.light_paths, halt)
 
-    def trace(self, chunk: Chunk, traced: TracedLight | None = None) -> RayCounts:
+    def trace(self, chunk: Chunk, traced: LightOfSample | None = None) -> RayCounts:
         """Fill ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other.
 
-        ``traced``: what the light paths of the sample have left, where an integrator merges paths; their splats and rays are
-        counted already.
+        ``traced``: what the light paths of the sample have left, where an integrator merges paths. Paths that were truncated
+        there were counted then; they are traced again for the vertices that camera paths are connected to.
         """
         self.tally, self.traced = RayCounts(), traced
         self.set_sample(chunk)
@@ -699,35 +552,37 @@ class KernelsEngine:
             self.clear_store(chunk)
             tally = light_paths.trace(chunk)
             self.tally.rays += tally.rays
-            self.tally.truncated += tally.truncated
+            self.tally.truncated += tally.truncated if traced is None else 0
         walk(self, self.spawn(chunk), self.wave.integrator.limits)
         self.mark_lost()
         if traced is not None:
-            lost = traced.lost - chunk.first_pixel
-            self.slots.floats[:3, lost[(lost >= 0) & (lost < chunk.pixels)]] = np.nan
-            self.splats = []
+            self.splats, lost = traced.of_pixels(chunk.first_pixel, chunk.pixels)
+            self.slots.floats[:3, lost] = np.nan
+            self.traced = None
         elif light_paths is not None:
             self.take_over(light_paths, chunk)
         return self.tally
 
-    def send(self, chunk: Chunk) -> tuple[RayCounts, list[Splats], SentPhotons]:
-        """Trace the light paths of a chunk of one sample alone; return counts of rays, their splats, and photons."""
+    def send(self, chunk: Chunk) -> tuple[RayCounts, SentLight]:
+        """Trace the light paths of a chunk of one sample alone; return counts of rays, and what the paths leave."""
         self.set_sample(chunk)
-        assert self.light_paths is not None
-        if self.store is not None:
-            self.clear_store(chunk)
-        tally, count = self.light_paths.trace(chunk), chunk.pixels
-        lost = np.nonzero(~np.isfinite(self.light_paths.slots.floats[:3, :count]).all(0))[0]
-        parts = [(lane.astype(np.int64) + chunk.first_pixel, values) for lane, values in self.light_paths.sent]
-        return tally, self.light_paths.splats, SentPhotons(parts, lost + chunk.first_pixel)
+        engine = self.light_paths
+        assert engine is not None
+        self.clear_store(chunk)
+        engine.sent = []
+        tally = engine.trace(chunk)
+        lost = np.nonzero(~np.isfinite(engine.slots.floats[:3, : chunk.pixels]).all(0))[0]
+        sent = SentLight.of(chunk.first_pixel, engine.sent, engine.splats, lost)
+        engine.sent = None
+        return tally, sent
 
     def set_sample(self, chunk: Chunk) -> None:
         """Set what depends on the chunk's sample, where an integrator merges paths: a chunk has one sample then."""
-        wave = self.wave.at_sample(chunk.first_sample)
-        merging = wave.context.merging
-        if wave.integrator.radius_at(chunk.first_sample) is None or merging is None:
+        if not self.wave.integrator.merging_counts:
             return
-        self.context = wave.context
+        wave = self.wave.at_sample(chunk.first_sample)
+        self.context, merging = wave.context, wave.context.merging
+        assert merging is not None
         self.calls.set_merging(float(merging))
         if self.light_paths is not None and wave.light_paths is not None:
             self.light_paths.context = wave.light_paths.context
@@ -787,7 +642,7 @@ class KernelsEngine:
         """Return the population of a chunk's camera rays, with their first hits if the search is part of the stages."""
         self.start(chunk)
         kernels, calls, start_rays = self.kernels, self.calls, self.wave.start_rays
-        self.splats, self._lost, self.sent = [], [], []
+        self.splats, self._lost = [], []
         count, pixels = chunk.pixels * chunk.samples, None if chunk.pixel_set is None else chunk.pixel_set.indices
         if start_rays is not None:  # the user's rays, in place of camera rays
             pixels = start_rays.number
@@ -894,20 +749,10 @@ class KernelsEngine:
             if self.traced is not None and not kernels.world.materials.models[model].smooth:
                 self._find_photons(paths, lanes.words[0, :count])
             if model in kernels.eager:
-                lane_count, first_lane = calls.known(count), calls.known(start)
-                self.tally.rays += bounce_eagerly(
-                    kernels,
-                    self.context,
-                    self.store,
-                    model,
-                    roulette,
-                    paths.arena,
-                    after.arena,
-                    lanes,
-                    lane_count,
-                    first_lane,
-                    paths.depth,
-                )
+                start_salts = self.wave.integrator.start_salts(paths.depth, torch.device("cpu"))
+                context = self._context_at(paths.depth, start_salts, roulette)
+                arenas, known = (paths.arena, after.arena), (calls.known(count), calls.known(start))
+                self.tally.rays += bounce_eagerly(kernels, context, self.store, model, *arenas, lanes, *known)
                 continue
             if not kernels.fused:
                 calls.write_from(start)
@@ -916,6 +761,11 @@ class KernelsEngine:
             calls.run(kernel, count, paths.arena, after.arena, lanes, lists=after.lists, slots=self._slots(paths.depth))
             self._count_rays(count, kernel.program.shadows + int(kernels.fused))  # with the rays to the next vertex
         return after
+
+    def _context_at(self, depth: int, start_salts: Tensor | None, roulette: float = 0.0) -> StageContext:
+        """Return the context of a vertex, for stages by tensor operations."""
+        of_vertex = salts(depth, torch.device("cpu"))
+        return self.context.at(of_vertex, roulette=roulette, start_salts=start_salts, depth=depth)
 
     def occlude(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`. The kernel ``sort_lanes`` adds the contributions later."""
@@ -934,31 +784,22 @@ class KernelsEngine:
         """Write the photons that vertices of the camera paths ``lanes`` are merged with to their rows."""
         assert self.traced is not None
         rows, arena = self.kernels.state, paths.arena
-        o, d, t, first, key = (rows.first(name) for name in ("o", "d", "t", "photon_p", "key"))
+        o, d, t, first, key = (rows.first(name) for name in ("o", "d", "t", "photon_d", "key"))
         floats, words = cast(Any, arena.floats), cast(Any, arena.words)
         p = floats[o : o + 3, lanes] + floats[d : d + 3, lanes] * floats[t, lanes]
         keys = words[key : key + self.wave.sampler.points.rows, lanes]
-        found = self.traced.photons.near(p, keys, paths.depth)
-        floats[first : first + 3, lanes] = p
-        for name, values in found.items():
-            first, memory = rows.first(f"photon_{name}"), words if name == "depth" else floats
-            memory[first : first + (len(values) if values.ndim > 1 else 1), lanes] = values
+        floats[first : first + PHOTON_ROWS, lanes] = self.traced.photons.near(p, keys, paths.depth)
 
     def _send(self, paths: Paths) -> None:
         """Keep the photons that light paths have sent from the vertex that ``paths`` have left."""
         rows, arena = self.kernels.state, paths.arena
-        floats, words = cast(Any, arena.floats), cast(Any, arena.words)
-        depth = words[rows.first("photon_depth"), : paths.count]
-        lanes = np.nonzero(depth > 0)[0]
-        if not len(lanes):
+        if self.sent is None:
             return
-        values = {"depth": depth[lanes]}
-        for name, count in PHOTONS.items():
-            if name != "depth":
-                first = rows.first(f"photon_{name}")
-                found = floats[first : first + count][:, lanes]
-                values[name] = found if count > 1 else found[0]
-        self.sent.append((words[rows.first("lane"), lanes], values))
+        floats, words = cast(Any, arena.floats), cast(Any, arena.words)
+        lanes = np.nonzero(floats[rows.first("photon_depth"), : paths.count])[0]
+        p, data = rows.first("photon_p"), rows.first("photon_d")
+        found = floats[p : p + 3, lanes], floats[data : data + PHOTON_ROWS, lanes]
+        self.sent.append((words[rows.first("lane"), lanes], *found))
 
     def _splat(self, paths: Paths) -> None:
         """Record splats that reach the film. One that is not finite is left out and makes its sample NaN.
@@ -1000,7 +841,8 @@ class KernelsEngine:
             self._count_rays(count)
             if model in kernels.eager:
                 assert self.store is not None
-                connect_eagerly(kernels, self.context, self.store, model, paths.arena, lanes, calls.known(count), depth)
+                context, known = self._context_at(depth, salts(0, torch.device("cpu"))), calls.known(count)
+                connect_eagerly(kernels, context, self.store, model, paths.arena, lanes, known)
             else:
                 slots = self._slots(depth)
                 calls.run(kernels.connect(model), count, paths.arena, paths.arena, lanes, slots=slots)

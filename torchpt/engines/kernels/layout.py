@@ -24,7 +24,7 @@ from torchpt.compiler.tracing import Tracer
 from torchpt.core.autograd import outside_transforms
 from torchpt.core.threads import outside_inference_mode
 from torchpt.paths import photons
-from torchpt.paths.state import EXTRA, PathState
+from torchpt.paths.state import EXTRA, PathState, VertexOutput
 from torchpt.paths.wave import camera_state
 from torchpt.physics.samplers import Dimension
 from torchpt.physics.shapes.geometry import Hit
@@ -47,6 +47,7 @@ __all__ = [
     "Rows",
     "Trace",
     "path_state",
+    "photon_values",
     "state_values",
 ]
 
@@ -88,11 +89,9 @@ CONNECTION: Fields = {
     "connection_t": ((), "f"),
     "connection_radiance": ((3,), "f"),
 }
-#: Fields of photons: those that a light path sends, with depth 0 where it sends none, or that a camera path is merged with.
-PHOTON: Fields = {
-    f"photon_{name}": (() if rows == 1 else (rows,), "l" if name == "depth" else "f")
-    for name, rows in photons.PHOTON.items()
-}
+#: Fields of photons, the rows of their data: those that a light path sends, with depth 0 where it sends none, or that a camera
+#: path is merged with.
+PHOTON: Fields = {f"photon_{name}": (() if rows == 1 else (rows,), "f") for name, rows in photons.FIELDS.items()}
 #: Fields of a ray in transit: the ray, the distance before its origin, and its lane in the arena of paths.
 PASS: Fields = {
     "pass_o": ((3,), "f"),
@@ -123,6 +122,15 @@ def state_values(state: PathState) -> dict[str, Tensor]:
     values = {name: getattr(state, name) for name in _STATE}
     extra = {EXTRA + name: value for name, value in state.extra.items()}
     return {name: value for name, value in values.items() if value is not None} | extra
+
+
+def photon_values(output: VertexOutput) -> dict[str, Tensor]:
+    """Return the tensors of the photons that a stage of light paths has sent, by row name; depth 0: none."""
+    if output.photon is None:
+        return {"photon_depth": torch.zeros_like(output.leaving.t_max)}
+    return {"photon_p": output.at.p} | {
+        f"photon_{name}": value for name, value in photons.values_of(output.photon).items()
+    }
 
 
 @dataclass(frozen=True)
@@ -366,6 +374,8 @@ def _path_fields(layout: Layout) -> Fields:
         fields |= CONNECTION
     if wave.integrator.merges or wave.integrator.sends_photons:
         fields |= PHOTON
+    if wave.integrator.sends_photons:
+        fields["photon_p"] = ((3,), "f")
     shadows = world.lights is not None if wave.first_surface is None else wave.first_surface.shadows(world)
     if not layout.fused and (shadows or wave.integrator.splats_at_surfaces):
         fields |= SHADOW

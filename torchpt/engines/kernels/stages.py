@@ -15,7 +15,7 @@ from torch import Tensor
 from torchpt.compiler.packet import KINDS
 from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 from torchpt.compiler.tracing import Tracer
-from torchpt.engines.kernels.layout import CONNECTION, PHOTON, Trace, path_state
+from torchpt.engines.kernels.layout import CONNECTION, PHOTON, Trace, path_state, photon_values
 from torchpt.paths import layers as aov
 from torchpt.paths.integrators.base import check_fields, check_output
 from torchpt.paths.photons import photon_of
@@ -260,7 +260,8 @@ def bounce(trace: Trace, model: int, roulette: float | None, first: bool = False
     photon = None
     if integrator.merges:
         near = layout.state.read(tracer, *PHOTON)
-        photon = photon_of({name.removeprefix("photon_"): value for name, value in near.items()})
+        with tracer:
+            photon = photon_of({name.removeprefix("photon_"): value for name, value in near.items()})
     with tracer:
         start_salts = trace.start_salts() if first else None
         context = layout.wave.context.at(
@@ -278,7 +279,9 @@ def bounce(trace: Trace, model: int, roulette: float | None, first: bool = False
         if integrator.connects:
             _write_end(trace, sinks, output)
         if integrator.sends_photons:
-            _write_photon(trace, sinks, output)
+            with tracer:
+                values = photon_values(output)
+            sinks.write += layout.state.nodes(tracer, **values)
         return sinks
     sinks = Sinks(shadows=int(shadow is not None))
     if shadow is not None:
@@ -375,17 +378,6 @@ def _write_end(trace: Trace, sinks: Sinks, output: VertexOutput) -> None:
             end = End(no_ray, no_ray, no_ray, nothing, nothing, nothing, no_partner)
     values = {f"end_{name}": value for name, value in vars(end).items()}
     sinks.write += rows.nodes(tracer, **values, connection_t=nothing)
-
-
-def _write_photon(trace: Trace, sinks: Sinks, output: VertexOutput) -> None:
-    """Write the photons that light paths send; depth 0: none."""
-    tracer, rows, photon = trace.tracer, trace.layout.state, output.photon
-    if photon is None:
-        with tracer:
-            depth = torch.zeros_like(output.leaving.lane)
-        sinks.write += rows.nodes(tracer, photon_depth=depth)
-    else:
-        sinks.write += rows.nodes(tracer, **{f"photon_{name}": value for name, value in vars(photon).items()})
 
 
 def list_ends(trace: Trace) -> Sinks:

@@ -11,7 +11,6 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -27,15 +26,13 @@ from torchpt.engines.kernels.engine import (
     Chunk,
     Halted,
     KernelsEngine,
-    SentPhotons,
-    TracedLight,
     count_samples,
     film_words,
 )
 from torchpt.engines.kernels.programs import Kernels
 from torchpt.engines.work import TASKS, Block, TaskResult
 from torchpt.paths.nonfinite import NonFinite
-from torchpt.paths.photons import PhotonMap
+from torchpt.paths.photons import LightOfSample, SentLight
 from torchpt.paths.wave import PixelSet, RayCounts, clamp_scale
 from torchpt.physics.film import Film
 from torchpt.physics.film.splats import Splats
@@ -131,7 +128,7 @@ class KernelsForward:
             min_lanes=VECTORS.width,
         )
         self._workers: list[KernelsEngine] = []
-        self._traced: TracedLight | None = None  # what the light paths of the sample have left
+        self._traced: LightOfSample | None = None  # what the light paths of the sample have left
         self._halt = threading.Event()
 
     @property
@@ -155,55 +152,54 @@ class KernelsForward:
             True if all samples were rendered.
         """
         self.kernels.prefetch(self.budget.threads)
-        integrator, tasks = self.kernels.wave.integrator, self.budget.threads * TASKS
-        if integrator.radius_at(0) is None:
-            return self.take(self.blocks(spans, tasks), each)
+        integrator = self.kernels.wave.integrator
+        if not integrator.merging_counts:
+            return self.take(self.blocks(spans, self.budget.threads * TASKS), each)
         for pixel_set, first, count in spans:
-            for sample in range(
-                first, first + count
-            ):  # the light paths of a sample of all pixels, then its camera paths
+            for sample in range(first, first + count):
                 blocks = self.blocks([(pixel_set, sample, 1)], 2 * self.budget.threads)
-                self._traced = self._trace_light(blocks, sample, each) if integrator.merges else None
+                self._traced = None  # before memory is taken for the next one
+                if integrator.merges:
+                    self._traced = self._trace_light(blocks, sample, each)
                 if self._halt.is_set() or not self.take(blocks, each):
                     return False
+        self._traced = None
         return True
 
     def _trace_light(
         self, blocks: list[Block], sample: int, each: Callable[[TaskResult | None], bool]
-    ) -> TracedLight | None:
+    ) -> LightOfSample | None:
         """Trace the light paths of one sample of all pixels, and return what they leave; None if the render was ended."""
         wave = self.kernels.wave
-        parts: list[Any] = []
-        lost = [np.zeros(0, np.int64)]
+        sent: list[SentLight] = []
 
-        def on_result(result: tuple[TaskResult, SentPhotons] | None) -> bool:
-            if result is None:
-                return each(None)
-            counts, sent = result
-            parts.extend(sent.parts)
-            lost.append(sent.lost)
-            return each(counts)
+        def on_result(result: TaskResult | None) -> bool:
+            if result is not None and result.sent is not None:
+                sent.append(result.sent)
+            return each(result)
 
-        if wave.light_paths is not None:
-            map_in_order(blocks, self._light_task, self.budget.threads, on_result, self._halt)
+        if wave.light_paths is not None and not self.take(blocks, on_result, self._light_task):
+            return None
         radius = wave.integrator.radius_at(sample)
         assert radius is not None
-        if self._halt.is_set():
-            return None
-        return TracedLight(PhotonMap.of(parts, radius, wave.light_path_count), np.concatenate(lost))
+        return LightOfSample.of(sent, radius, wave.light_path_count)
 
-    def _light_task(self, block: Block) -> tuple[TaskResult, SentPhotons]:
+    def _light_task(self, block: Block) -> TaskResult:
         """Trace the light paths of a block of one sample; called on any thread."""
         pixel_set, start, size, first, _ = block
-        counts, sent = TaskResult(RayCounts()), SentPhotons([], np.zeros(0, np.int64))
-        with suppress(Halted):
+        result = TaskResult(RayCounts())
+        try:
             worker = self._take_worker()
-            chunk = Chunk(start, size, first, 1, pixel_set)
-            tally, splats, sent = worker.send(chunk)
-            counts.tally.rays, counts.tally.truncated = tally.rays, tally.truncated
-            self._add_splats(splats, chunk, pixel_set.film, counts)
+            tally, result.sent = worker.send(Chunk(start, size, first, 1, pixel_set))
+            result.tally.rays, result.tally.truncated = tally.rays, tally.truncated
             self._workers.append(worker)
-        return counts, sent
+        except Halted:
+            pass
+        except Exception as error:
+            if not is_out_of_memory(error):
+                raise
+            result.unfinished = [block]
+        return result
 
     def blocks(self, spans: Sequence[tuple[PixelSet, int, int]], tasks: int) -> list[Block]:
         """Split the samples of pixel sets into blocks of pixels: ``tasks`` for each set, unless blocks get too small."""
@@ -213,10 +209,15 @@ class KernelsForward:
             for start, size in self._cut(pixel_set, count, tasks)
         ]
 
-    def take(self, blocks: list[Block], each: Callable[[TaskResult | None], bool]) -> bool:
-        """Render blocks; ``each`` and the returned value as for :meth:`run`."""
+    def take(
+        self,
+        blocks: list[Block],
+        each: Callable[[TaskResult | None], bool],
+        task: Callable[[Block], TaskResult] | None = None,
+    ) -> bool:
+        """Run ``task`` (None: :meth:`task`) for blocks; ``each`` and the returned value as for :meth:`run`."""
         while blocks and not self._halt.is_set():
-            blocks = self._round(blocks, each)
+            blocks = self._round(blocks, each, task or self.task)
             if blocks:
                 blocks = self._smaller(blocks)
         return not self._halt.is_set()
@@ -225,8 +226,10 @@ class KernelsForward:
         """Render blocks that ran out of memory again, with fewer threads or lanes; else as :meth:`take`."""
         return self.take(self._smaller(blocks), each)
 
-    def _round(self, blocks: list[Block], each: Callable[[TaskResult | None], bool]) -> list[Block]:
-        """Render blocks on threads; return the blocks that ran out of memory."""
+    def _round(
+        self, blocks: list[Block], each: Callable[[TaskResult | None], bool], task: Callable[[Block], TaskResult]
+    ) -> list[Block]:
+        """Run a task for blocks on threads; return the blocks that ran out of memory."""
         unfinished: list[Block] = []
 
         def on_result(result: TaskResult | None) -> bool:
@@ -235,7 +238,7 @@ class KernelsForward:
             return each(result)
 
         is_small = len(blocks) == 1 and all(size * count <= LANES for _, _, size, _, count in blocks)  # a single chunk
-        map_in_order(blocks, self.task, self.budget.threads, on_result, self._halt, here=is_small)
+        map_in_order(blocks, task, self.budget.threads, on_result, self._halt, here=is_small)
         return unfinished
 
     def _smaller(self, blocks: list[Block]) -> list[Block]:

@@ -146,20 +146,14 @@ class LightPaths(Integrator):
             splat=splat,
             drawn=drawn,
             kept=self._kept(context, model, state, at, front) if self.connected else None,
-            photon=self._photon(context, state, at, front) if self.sends_photons and not kind.smooth else None,
+            photon=self._photon(context, state, front) if self.sends_photons and not kind.smooth else None,
         )
 
-    def _photon(self, context: StageContext, state: PathState, at: Interaction, front: _View) -> Photon:
+    def _photon(self, context: StageContext, state: PathState, front: _View) -> Photon:
         """Return the paths as they arrive. What shading normals take away is left to the camera paths that they merge with."""
-        depth = context.depth
-        return Photon(
-            p=at.p,
-            d=state.d,
-            value=state.throughput * state.extra["flux"],
-            dvcm=front.arrival.dvcm,
-            dvc=front.arrival.dvc,
-            depth=torch.zeros_like(state.lane) + depth,
-        )
+        value = state.throughput * state.extra["flux"]
+        depth = torch.zeros_like(state.lane) + context.depth
+        return Photon(state.d, value, front.arrival.dvcm, front.arrival.dvc, depth)
 
     def _kept(self, context: StageContext, model: int, state: PathState, at: Interaction, front: _View) -> StoredVertex:
         """Return vertices for connections, each kept in a block with the chance 1/k at vertex k.

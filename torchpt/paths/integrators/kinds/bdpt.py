@@ -14,6 +14,7 @@ from torchpt.paths import vertex as stages
 from torchpt.paths.integrators.base import DEPTHS, LIGHT_CHOICE, STRICT, Limits
 from torchpt.paths.integrators.kinds.path import Path
 from torchpt.paths.integrators.light_paths import LightPaths
+from torchpt.paths.integrators.merging import merged_light
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.paths.integrators.weights import (
     FIELDS,
@@ -29,7 +30,6 @@ from torchpt.paths.state import (
     End,
     Partner,
     PathState,
-    Photon,
     Plan,
     Shadow,
     StageContext,
@@ -217,22 +217,11 @@ class Bdpt(PathIntegrator):
         if vertex.partner is not None and not kind.smooth:
             end = self._end(context, model, state, at, surface, arrival, vertex.partner)
         if vertex.photon is not None and not kind.smooth:
-            merged = self._merged(context, model, state, at, surface, arrival, vertex.photon)
+            merged = merged_light(
+                context, model, vertex.photon, self.limits, state=state, at=at, surface=surface, arrival=arrival
+            )
             leaving = replace(leaving, radiance=leaving.radiance + merged)
         return replace(output, leaving=leaving, end=end)
-
-    def _merged(
-        self,
-        context: StageContext,
-        model: int,
-        state: PathState,
-        at: Interaction,
-        surface: Surface,
-        arrival: Arrival,
-        photon: Photon,
-    ) -> Tensor:
-        """Return the light ``(3, n)`` of merges with ``photon``; an integrator that merges defines it."""
-        raise NotImplementedError(f"{self.name} declares merges, and has no stage for them")
 
     # -- connections
 

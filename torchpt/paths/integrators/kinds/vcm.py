@@ -6,25 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import torch
-from torch import Tensor
-
-from torchpt.math.vectors import dot, safe_reciprocal
-from torchpt.paths import vertex as stages
 from torchpt.paths.integrators.kinds.bdpt import STRATEGIES, Bdpt
-from torchpt.paths.integrators.weights import Arrival, reduced, reverse_pdf, root_of_squares
-from torchpt.paths.state import PathState, Photon, StageContext
-from torchpt.paths.surface import Surface
-from torchpt.physics.shapes.geometry import Interaction
 from torchpt.spec import Choice, Refused, Scalar
 
 if TYPE_CHECKING:
     from typing import Self
 
 __all__ = ["Vcm"]
-
-#: Least cosine of a photon's arrival that is divided by.
-_LEAST_COSINE = 1e-3
 
 
 class Vcm(Bdpt):
@@ -83,7 +71,7 @@ class Vcm(Bdpt):
         """See :class:`Integrator`: the squared radius falls by ``(k + alpha) / (k + 1)`` behind the k-th sample."""
         if not self.merging_counts:
             return None
-        assert self.radius is not None  # set by the wave
+        assert self.radius is not None  # the scene's `make_wave` sets it
         n = sample + 1
         log = math.lgamma(n + self.alpha) - math.lgamma(1.0 + self.alpha) - math.lgamma(n + 1.0)
         return self.radius * math.exp(0.5 * log)
@@ -91,30 +79,3 @@ class Vcm(Bdpt):
     def as_traced(self) -> Self:
         """Return a copy with the default radius, which stages know as the context's ``merging``."""
         return self.but(radius=None, alpha=0.75)
-
-    def _merged(
-        self,
-        context: StageContext,
-        model: int,
-        state: PathState,
-        at: Interaction,
-        surface: Surface,
-        arrival: Arrival,
-        photon: Photon,
-    ) -> Tensor:
-        """Return the light ``(3, n)`` of merges with ``photon``."""
-        assert context.merging is not None
-        w = -photon.d
-        wi = surface.frame.to_local(w)
-        value, pdf = context.world.materials.models[model].eval_pdf(surface.parameters, surface.wo, wi)
-        share = stages.shading_weight(context.world, model, at, surface, w, wi)
-        reverse = reverse_pdf(context, model, at, surface, -state.d, w)
-        # The density of photons is that by area of the surface, which the value of the BSDF has a cosine for.
-        scale = safe_reciprocal(dot(w, at.ng).abs().clamp_min(_LEAST_COSINE))
-        ratio = root_of_squares(arrival.before(reverse), root_of_squares(photon.dvcm, photon.dvc * pdf))
-        scale = scale * reduced(None, ratio * safe_reciprocal(context.merging))
-        found = photon.depth > 0
-        if not self.limits.endless:
-            found = found & (photon.depth + context.depth <= self.limits.last)
-        light = state.throughput * value * photon.value * (scale if share is None else scale * share)
-        return torch.where(found, light, 0.0)
