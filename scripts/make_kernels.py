@@ -23,7 +23,17 @@ from torchpt.native.kernels import FOLDER, read_module
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ROOT / "scripts" / "kernel_sources"
-MODULES = ("tree_packet", "tree_instances", "tree_build", "tree_refit", "light_tree", "sums", "obj_text", "photons")
+MODULES = (
+    "tree_packet",
+    "tree_instances",
+    "tree_build",
+    "tree_refit",
+    "light_tree",
+    "sums",
+    "obj_text",
+    "photons",
+    "splats",
+)
 
 
 def main(arguments: list[str] | None = None) -> int:

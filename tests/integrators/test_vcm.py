@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from few_lanes import few_lanes
 from light_rooms import ROOMS
 from same_means import assert_same_means, pictures
 
 import torchpt
 from torchpt.core.errors import NotBuiltError, SceneError
 from torchpt.engines import tensors_forward
+from torchpt.engines.kernels.engine import KernelsEngine
 from torchpt.paths import photons
 from torchpt.paths.integrators.kinds.bdpt import STRATEGIES
 from torchpt.paths.integrators.kinds.vcm import Vcm
+from torchpt.paths.photons import SentLight
+from torchpt.rendering.api import render_scene
 from torchpt.rendering.one_path import one_path
 from torchpt.rendering.run import Run
 from torchpt.scene.formats.description import settings
@@ -147,10 +152,59 @@ def test_what_is_refused():
         picture.sum().backward()
 
 
+@pytest.mark.parametrize("compiled", [True, False], ids=["kernels", "tensors"])
+def test_a_picture_that_is_stopped_within_a_sample(compiled):
+    """Splats come with the pixels that sent them: those of a part of the pixels do not brighten the whole picture."""
+    scene = torchpt.load(LAMP, device="cpu")
+    keys, film = {"type": "vcm", "radius": 1e-3, "light_paths": 1}, {"width": 64, "height": 48, "filter": "box"}
+    render: dict[str, Any] = {"spp": 2, "compile": "on" if compiled else "off", "threads": 1}
+    wish = settings(scene.description, {"integrator": keys, "film": film, "render": render})
+    with few_lanes(512):
+        whole = render_scene(scene, wish)
+        part = render_scene(scene, wish, on_progress=lambda state: 0 < state.done)
+    assert 0.5 < part.image.sum() / whole.image.sum() < 1.5 and part.spp == 0
+
+
+def test_light_paths_are_traced_again_where_memory_ran_out(monkeypatch):
+    scene = torchpt.load(ROOMS["thin lens"], device="cpu")
+    wish: dict[str, Any] = {"integrator": {"type": "vcm", "radius": 0.2}, "spp": 2, "threads": 2, "compile": "on"}
+    whole, send, calls = torchpt.render(scene, full=True, **wish), KernelsEngine.send, [0]
+
+    def failing(self: KernelsEngine, chunk: Any) -> Any:
+        calls[0] += 1
+        found = send(self, chunk)
+        if calls[0] in (1, 2, 4):
+            raise MemoryError
+        return found
+
+    monkeypatch.setattr(KernelsEngine, "send", failing)
+    found = torchpt.render(scene, full=True, **wish)
+    assert calls[0] > 4 and torch.equal(found.image, whole.image) and found.rays == whole.rays
+
+
+@pytest.mark.parametrize("compiled", [True, False], ids=["kernels", "tensors"])
+def test_photons_that_are_not_finite_are_counted(compiled, monkeypatch):
+    """And the cause is named: traced again, camera paths are merged with nothing."""
+    kept = SentLight.of
+
+    def spoiled(first_pixel: int, pixels: int, sent: Any, *args: Any) -> SentLight:
+        for lane, _, data in sent:
+            data[3, (lane + first_pixel) == 70] = math.inf
+        return kept(first_pixel, pixels, sent, *args)
+
+    monkeypatch.setattr(SentLight, "of", spoiled)
+    keys = {"type": "vcm", "radius": 0.2}
+    scene = torchpt.load(ROOMS["thin lens"], device="cpu")
+    found = torchpt.render(scene, integrator=keys, spp=1, compile="on" if compiled else "off", full=True)
+    assert found.nonfinite_samples == 1 and found.nonfinite_causes == {"merge": 1}
+
+
 def test_pictures_of_a_batch():
     """Light paths of all pixels come first, so that the tasks of a picture cannot be mixed with those of others."""
     scene = torchpt.load({**LAMP, "film": {"width": 8, "height": 6}}, device="cpu")
-    wish: dict[str, Any] = {"integrator": "vcm", "spp": 2}
-    alone = torch.stack([torchpt.render(scene, seed=seed, **wish) for seed in (7, 8)])
-    batch = torchpt.render_batch([scene, scene], seed=[7, 8], **wish)
-    assert torch.equal(torch.as_tensor(batch).reshape(alone.shape), alone) and alone.any()
+    for keys in ({}, {"strategy": "bsdf", "weighted": True}):
+        wish: dict[str, Any] = {"integrator": {"type": "vcm", "radius": 0.3, "alpha": 0.1, **keys}, "spp": 4}
+        alone = torch.stack([torchpt.render(scene, seed=seed, **wish) for seed in (7, 8)])
+        batch = torchpt.render_batch([scene, scene], seed=[7, 8], **wish)
+        assert torch.equal(torch.as_tensor(batch).reshape(alone.shape), alone)
+        assert alone.any() == (not keys)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -116,10 +117,13 @@ def wait_for(there):
     assert there()
 
 
-def test_quick_code_is_replaced(empty):
+def test_quick_code_is_replaced(empty, monkeypatch):
+    replace, read = cpu._replace, threading.Event()
+    monkeypatch.setattr(cpu, "_replace", lambda *args: read.wait(60) and replace(*args))
     assert cpu.begin(IR)
     function = cpu.compile_ir(IR)
     quick, call = function.code, function.call
+    read.set()  # the final code may be there already
     call(0, 0)
     wait_for(lambda: function.call is not call)
     function.call(0, 0)

@@ -28,7 +28,11 @@ def photons(count: int, side: float, seed: int = 1) -> SentLight:
 
 def sent(p: np.ndarray, data: np.ndarray, first_pixel: int = 0, lost: tuple[int, ...] = (), **keys: Any) -> SentLight:
     lanes = np.arange(p.shape[1])
-    return SentLight.of(first_pixel, [(lanes, p, data)], keys.get("splats", []), np.array(lost, np.int64))
+    return SentLight.of(first_pixel, len(lanes), [(lanes, p, data)], keys.get("splats", []), np.array(lost, np.int64))
+
+
+def rows_of(photons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return photons.T[:3], photons.T[3:]
 
 
 @pytest.mark.parametrize(
@@ -41,8 +45,8 @@ def test_the_sum_of_photons_within_the_radius(count, side, radius):
     rng = np.random.default_rng(2)
     p = ((rng.random((3, 500)) - 0.5) * side).astype(np.float32)
     near = found.near(p, rng.integers(-(2**31), 2**31, (2, 500)).astype(np.int32), depth=3)
-    distance = ((p[:, :, None].astype(np.float64) - light.p[:, None, :]) ** 2).sum(0)
-    flux = light.data[VALUE].max(0)
+    distance = ((p[:, :, None].astype(np.float64) - light.photons.T[:3, None, :]) ** 2).sum(0)
+    flux = light.photons[:, 3:].T[VALUE].max(0)
     total = ((distance < radius**2) * flux).sum(1)
     sure = abs(distance / radius**2 - 1.0).min(1) > 1e-4
     np.testing.assert_allclose(near[VALUE].max(0)[sure] * math.pi * radius**2 * 10.0, total[sure], rtol=1e-5, atol=0.0)
@@ -54,8 +58,8 @@ def test_photons_are_chosen_by_their_flux():
     found = PhotonMap.of([light], 1.0, paths=1.0)
     keys = np.random.default_rng(3).integers(-(2**31), 2**31, (1, 40000)).astype(np.int32)
     near = found.near(np.zeros((3, 40000), np.float32), keys, depth=1)
-    flux = light.data[VALUE].max(0)
-    chosen = (near[FIRST["dvcm"]][:, None] == light.data[FIRST["dvcm"]]).mean(0)
+    flux = light.photons[:, 3:].T[VALUE].max(0)
+    chosen = (near[FIRST["dvcm"]][:, None] == light.photons[:, 3 + FIRST["dvcm"]]).mean(0)
     assert chosen.sum() == pytest.approx(1.0)
     expected = flux / flux.sum()
     assert (abs(chosen - expected) < 5.0 * np.sqrt(expected * (1.0 - expected) / 40000)).all()
@@ -63,7 +67,7 @@ def test_photons_are_chosen_by_their_flux():
 
 def test_the_order_of_parts_changes_nothing():
     light = photons(1000, 1.0)
-    halves = [sent(light.p[:, part], light.data[:, part], part.start) for part in (slice(0, 400), slice(400, 1000))]
+    halves = [sent(*rows_of(light.photons[part]), part.start) for part in (slice(0, 400), slice(400, 1000))]
     whole, a, b = (PhotonMap.of(parts, 0.1, 1.0) for parts in ([light], halves, halves[::-1]))
     for name in ("points", "data", "starts"):
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
@@ -79,12 +83,14 @@ def test_a_map_without_photons():
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_photons_that_are_not_finite_make_their_pixels_lost(field, bad):
     light = photons(10, 1.0)
-    (light.p[0] if field == "p" else light.data[FIRST[field]])[3] = bad
+    light.photons[3, 0 if field == "p" else 3 + FIRST[field]] = bad
     splats = Splats(torch.tensor([2, 7]), torch.tensor([0, 1]), torch.ones(3, 2))
-    part = sent(light.p, light.data, first_pixel=100, lost=(7,), splats=[splats])
+    part = sent(*rows_of(light.photons), first_pixel=100, lost=(7,), splats=[splats])
     assert part.lost.tolist() == [103, 107] and part.pixel.tolist() == [100 + k for k in range(10) if k != 3]
-    found = LightOfSample.of([part, sent(light.p[:, :2], light.data[:, :2])], 0.1, 10.0)
-    of_others, lost = found.of_pixels(104, 3)
-    assert not of_others and not len(lost)
+    found = LightOfSample.of([part, sent(*rows_of(light.photons[:2]))], 0.1, 10.0)
+    (of_others,), lost = found.of_pixels(104, 3)
+    assert not len(of_others.lane) and not len(lost) and not found.of_pixels(50, 50)[0]
     (of_pixels,), lost = found.of_pixels(102, 6)
     assert lost.tolist() == [1, 5] and of_pixels.lane.tolist() == [0, 5] and of_pixels.pixel.tolist() == [0, 1]
+    (of_all,), lost = found.of_pixels(99, 20)
+    assert lost.tolist() == [4, 8] and of_all.lane.tolist() == [3, 8]

@@ -87,12 +87,12 @@ class TensorsForward:
 
     def _trace_light(self, wave: Wave, pixel_set: PixelSet, sent: list[SentLight], span: Span) -> None:
         """Trace the light paths of a piece of one sample, and append what they leave; if it raises, nothing was added."""
-        first_pixel, *_ = span
+        first_pixel, pixels, *_ = span
         tally, splats, found = RayCounts(), list[Splats](), list[tuple[Tensor, Tensor, Photon]]()
         radiance = tensors.trace(wave, wave.rays(*span, pixel_set), tally, splats=splats, sent=found)
         photons = [(lane.cpu().numpy(), p.float().cpu().numpy(), data_of(photon)) for lane, p, photon in found]
         lost = (~torch.isfinite(radiance).all(0)).nonzero().squeeze(1).cpu().numpy()
-        sent.append(SentLight.of(first_pixel, photons, splats, lost))
+        sent.append(SentLight.of(first_pixel, pixels, photons, splats, lost))
         self._result = TaskResult(tally)
 
     def _render_piece(self, wave: Wave, pixel_set: PixelSet, traced: LightOfSample | None, span: Span) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,6 +31,7 @@ __all__ = [
     "PHOTON_ROWS",
     "LightOfSample",
     "PhotonMap",
+    "PhotonRows",
     "SentLight",
     "data_of",
     "merging_of",
@@ -47,6 +49,10 @@ _LEAST_CHANCE = 0.01
 #: Fields of :class:`Photon` and their rows, which are the rows of *data* of photons, float32, in this order.
 FIELDS = {"d": 3, "value": 3, "dvcm": 1, "dvc": 1, "depth": 1}
 PHOTON_ROWS = sum(FIELDS.values())
+#: Photons that kernels read beyond the last one.
+_PADDING = 16
+#: No photons.
+_NONE = np.zeros((0, 3 + PHOTON_ROWS), np.float32)
 
 
 def merging_of(radius: float, paths: float) -> float:
@@ -77,22 +83,25 @@ class SentLight:
     """What the light paths of some pixels leave for the camera paths of the same sample.
 
     Attributes:
+        first_pixel: index of the first one.
+        pixels: their number.
         pixel: ``(n,)`` int64 index of the pixel that each photon belongs to.
-        p: ``(3, n)`` float32 the points.
-        data: ``(9, n)`` the other rows of photons, all finite.
+        photons: ``(n, 12)`` float32 the points and the data of photons, all finite.
         splats: their splats; ``lane`` is the index of the pixel.
         lost: ``(m,)`` int64 pixels whose light path has a splat or a photon that is not finite, each once.
     """
 
+    first_pixel: int
+    pixels: int
     pixel: np.ndarray
-    p: np.ndarray
-    data: np.ndarray
+    photons: np.ndarray
     splats: list[Splats]
     lost: np.ndarray
 
     @staticmethod
     def of(
         first_pixel: int,
+        pixels: int,
         photons: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
         splats: Sequence[Splats],
         lost: np.ndarray,
@@ -101,20 +110,23 @@ class SentLight:
 
         Args:
             first_pixel: index of the first one.
+            pixels: their number.
             photons: lanes ``(n,)``, points and data of photons.
             splats: splats by lane.
             lost: lanes ``(m,)`` with a splat that is not finite.
         """
         lanes, points, data = zip(*photons, strict=True) if photons else ((), (), ())
         pixel = np.concatenate([np.zeros(0, np.int64), *lanes]) + first_pixel
-        p = np.concatenate([np.zeros((3, 0), np.float32), *points], 1)
-        rows = np.concatenate([np.zeros((PHOTON_ROWS, 0), np.float32), *data], 1)
-        finite = np.isfinite(p).all(0) & np.isfinite(rows).all(0)
+        found = np.empty((len(pixel), 3 + PHOTON_ROWS), np.float32)
+        if photons:
+            np.concatenate(points, 1, out=found.T[:3])
+            np.concatenate(data, 1, out=found.T[3:])
+        finite = np.isfinite(found).all(1)
         lost = np.union1d(lost + first_pixel, pixel[~finite])
         of_pixels = [Splats(x.lane + first_pixel, x.pixel, x.value) for x in splats]
         if not finite.all():
-            pixel, p, rows = pixel[finite], p[:, finite], rows[:, finite]
-        return SentLight(pixel, p, rows, of_pixels, lost)
+            pixel, found = pixel[finite], found[finite]
+        return SentLight(first_pixel, pixels, pixel, found, of_pixels, lost)
 
 
 @dataclass(frozen=True)
@@ -123,30 +135,33 @@ class LightOfSample:
 
     Attributes:
         photons: the photons.
-        splats: the splats, as in :class:`SentLight`.
-        lost: likewise.
+        sent: what else they leave.
     """
 
     photons: PhotonMap
-    splats: list[Splats]
-    lost: np.ndarray
+    sent: Sequence[SentLight]
 
     @staticmethod
     def of(sent: Sequence[SentLight], radius: float, paths: float) -> LightOfSample:
         """Return what is sent by all pixels, in any order; other arguments as for :meth:`PhotonMap.of`."""
-        splats = [splats for part in sent for splats in part.splats]
-        lost = np.concatenate([np.zeros(0, np.int64), *(part.lost for part in sent)])
-        return LightOfSample(PhotonMap.of(sent, radius, paths), splats, lost)
+        return LightOfSample(
+            PhotonMap.of(sent, radius, paths), [replace(x, pixel=x.pixel[:0], photons=_NONE) for x in sent]
+        )
 
     def of_pixels(self, first: int, count: int) -> tuple[list[Splats], np.ndarray]:
         """Return splats and lost ones of the light paths of ``count`` pixels, with their numbers counted from the first."""
-        found = []
-        for splats in self.splats:
-            index = ((splats.lane >= first) & (splats.lane < first + count)).nonzero().squeeze(1)
-            if len(index):
-                found.append(Splats(splats.lane[index] - first, splats.pixel[index], splats.value[:, index]))
-        lost = self.lost - first
-        return found, lost[(lost >= 0) & (lost < count)]
+        found, lost = [], [np.zeros(0, np.int64)]
+        for sent in self.sent:
+            if sent.first_pixel >= first + count or sent.first_pixel + sent.pixels <= first:
+                continue
+            lost.append(sent.lost[(sent.lost >= first) & (sent.lost < first + count)] - first)
+            for splats in sent.splats:
+                if first <= sent.first_pixel and sent.first_pixel + sent.pixels <= first + count:
+                    found.append(Splats(splats.lane - first, splats.pixel, splats.value))
+                else:
+                    index = ((splats.lane >= first) & (splats.lane < first + count)).nonzero().squeeze(1)
+                    found.append(Splats(splats.lane[index] - first, splats.pixel[index], splats.value[:, index]))
+        return found, np.concatenate(lost)
 
 
 def _importance(data: np.ndarray, merging: float) -> np.ndarray:
@@ -158,12 +173,23 @@ def _importance(data: np.ndarray, merging: float) -> np.ndarray:
     return abs(data[3:6]).max(0) * np.maximum(weight, np.float32(_LEAST_CHANCE))
 
 
+class PhotonRows(NamedTuple):
+    """First rows of fields of paths: their rays, the distance to the hit, the sampler's keys; and of the data of photons."""
+
+    o: int
+    d: int
+    t: int
+    key: int
+    key_rows: int
+    found: int
+
+
 @dataclass(frozen=True)
 class PhotonMap:
     """The photons of one sample of each pixel.
 
     Attributes:
-        points: ``(n, 4)`` float32: point, and what the chance to be chosen is proportional to, sorted by cell.
+        points: ``(4, n + ...)`` float32: point, and what the chance to be chosen is proportional to, sorted by cell; padded.
         data: ``(n, 9)`` float32: the other rows.
         starts: ``(cells + 1,)`` int32: the first photon of each cell.
         radius: of merges.
@@ -186,41 +212,53 @@ class PhotonMap:
             paths: number of light paths.
         """
         pixel = np.concatenate([np.zeros(0, np.int64), *(part.pixel for part in sent)])
-        p = np.concatenate([np.zeros((3, 0), np.float32), *(part.p for part in sent)], 1)
-        data = np.concatenate([np.zeros((PHOTON_ROWS, 0), np.float32), *(part.data for part in sent)], 1)
+        photons = np.concatenate([_NONE, *(part.photons for part in sent)])
         count = len(pixel)
-        cells = 1 << max(int(2 * count).bit_length() - 1, 4)
-        cell = np.empty(count, np.int32)
+        cells = 1 << max(int(2 * count).bit_length() - 1, 6)
+        depth = photons[:, -1].astype(np.int64)
+        rank = pixel * (int(depth.max(initial=0)) + 1) + depth  # unique: a light path has one vertex of each depth
+        starts, cell, order = np.zeros(cells + 1, np.int32), np.empty(count, np.int32), np.empty(count, np.int32)
+        points, by_cell = np.zeros((4, count + _PADDING), np.float32), np.empty((count, PHOTON_ROWS), np.float32)
         inverse = np.float32(0.5) / np.float32(radius)  # rounded as in `near`
-        kernel("photons", "cells_of")(np.ascontiguousarray(p), count, np.array([inverse], np.float32), cells, cell)
-        depth = data[PHOTON_ROWS - 1].astype(np.int64)
-        # Unique: a light path has one vertex of each depth.
-        pixels, depths = int(pixel.max(initial=0)) + 1, int(depth.max(initial=0)) + 1
-        order = np.argsort((cell.astype(np.int64) * pixels + pixel) * depths + depth)
-        points = np.empty((count, 4), np.float32)
-        points[:, :3] = p.T[order]
-        points[:, 3] = _importance(data, merging_of(radius, paths))[order]
-        starts = np.zeros(cells + 1, np.int32)
-        np.cumsum(np.bincount(cell, minlength=cells), out=starts[1:])
+        kernel("photons", "build")(
+            photons.reshape(-1), _importance(photons[:, 3:].T, merging_of(radius, paths)), rank, count,
+            np.array([inverse], np.float32), cells, starts, cell, order, points.reshape(-1), points.shape[1],
+            by_cell.reshape(-1),
+        )  # fmt: skip
         scale = 1.0 / (math.pi * radius * radius * paths)
-        return PhotonMap(points, np.ascontiguousarray(data.T[order]), starts, radius, scale)
+        return PhotonMap(points, by_cell, starts, radius, scale)
+
+    def write_near(self, words: np.ndarray, rows: PhotonRows, lanes: np.ndarray, depth: int) -> None:
+        """Write the data of a photon near each vertex, with the value of all those there; 0 where there is none.
+
+        Args:
+            words: ``(rows, n)`` int32, the paths: a column a lane, with floats as their bits.
+            rows: where the fields of the paths are, and the data goes to.
+            lanes: ``(k,)`` int32 the lanes to look at.
+            depth: number of the vertices.
+        """
+        floats = words.view(np.float32)
+        kernel("photons", "near")(
+            floats.reshape(-1), words.reshape(-1), words.shape[1], lanes, len(lanes), np.array(rows, np.int32),
+            salt(Dimension.MERGE, depth), self.points.reshape(-1), self.points.shape[1], self.data.reshape(-1), self.starts,
+            len(self.starts) - 1, np.array([self.radius, self.scale], np.float32),
+        )  # fmt: skip
 
     def near(self, p: np.ndarray, key: np.ndarray, depth: int) -> np.ndarray:
-        """Return the data ``(9, n)`` of a photon near each vertex, with the value of all those there; 0 where there is none.
+        """Return the data ``(9, n)`` of a photon near each vertex, as :meth:`write_near` writes it.
 
         Args:
             p: the points ``(3, n)`` float32.
             key: the sampler's keys ``(rows, n)`` int32.
             depth: number of the vertices.
         """
-        count = p.shape[1]
-        p, key = np.ascontiguousarray(p, np.float32), np.ascontiguousarray(key, np.int32)
-        found = np.empty((PHOTON_ROWS, count), np.float32)
-        kernel("photons", "near")(
-            p, count, key, len(key), salt(Dimension.MERGE, depth), self.points.reshape(-1), self.data.reshape(-1), self.starts,
-            len(self.starts) - 1, np.array([self.radius, self.scale], np.float32), found,
-        )  # fmt: skip
-        return found
+        # As rays of length 0.
+        count, key_rows = p.shape[1], len(key)
+        words = np.zeros((7 + key_rows + PHOTON_ROWS, count), np.int32)
+        words[:3], words[7 : 7 + key_rows] = p.astype(np.float32).view(np.int32), key
+        rows = PhotonRows(o=0, d=3, t=6, key=7, key_rows=key_rows, found=7 + key_rows)
+        self.write_near(words, rows, np.arange(count, dtype=np.int32), depth)
+        return words[rows.found :].view(np.float32)
 
     def photons(self, p: Tensor, key: Tensor, depth: int) -> Photon:
         """Return a photon near each vertex; arguments as for :meth:`near`, tensors of any device and dtype."""

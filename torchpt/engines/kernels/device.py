@@ -47,6 +47,7 @@ from torchpt.engines.kernels.engine import (
     count_samples,
     film_words,
 )
+from torchpt.engines.kernels.joins import Joins, TensorJoins
 from torchpt.engines.kernels.layout import HIT, Block, Layout, Rows
 from torchpt.engines.kernels.programs import Kernel, Kernels, NamedTensors, probed_kernels, records_of, trace_stage
 from torchpt.engines.kernels.stages import CHUNK_FIELDS
@@ -579,6 +580,9 @@ class DeviceEngine(KernelsEngine):
 
     def _make_search(self) -> ChunkSearch:
         return DeviceSearch(self.calls)
+
+    def _make_joins(self) -> Joins:
+        return TensorJoins(self.search)
 
     def _make_light_paths(self, halt: threading.Event | None) -> DeviceEngine | None:
         light_paths = self.kernels.light_paths

@@ -30,17 +30,18 @@ from torch import Tensor
 from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD, WORD
 from torchpt.engines.kernels.eagerly import bounce_eagerly, connect_eagerly
+from torchpt.engines.kernels.joins import HostJoins, Joins
 from torchpt.engines.kernels.layout import Memory, Rows
 from torchpt.engines.kernels.programs import Kernel, Kernels
 from torchpt.engines.kernels.stages import CHUNK_FIELDS
 from torchpt.paths.layers import LAYERS
-from torchpt.paths.photons import PHOTON_ROWS, LightOfSample, SentLight
+from torchpt.paths.photons import PHOTON_ROWS, LightOfSample, PhotonRows, SentLight
 from torchpt.paths.state import StageContext
 from torchpt.paths.store import BLOCKS, block_of
 from torchpt.paths.walk import Counts, Observer, walk
 from torchpt.paths.wave import PixelSet, RayCounts
 from torchpt.physics.film import Film
-from torchpt.physics.film.splats import LARGEST, Splats
+from torchpt.physics.film.splats import Splats
 from torchpt.physics.samplers import salts
 from torchpt.search import Accel
 
@@ -476,6 +477,7 @@ class KernelsEngine:
         self.kernels, self.wave = kernels, kernels.wave
         self.calls: Calls = Calls(kernels, halt or threading.Event()) if calls is None else calls
         self.search = self._make_search()
+        self.joins = self._make_joins()
         self.slots = self.calls.slots
         self.shown: Memory | None = None
         self.tally = RayCounts()
@@ -497,6 +499,9 @@ class KernelsEngine:
 
     def _make_search(self) -> ChunkSearch:
         return ChunkSearch(self.calls)
+
+    def _make_joins(self) -> Joins:
+        return HostJoins(self.search)
 
     def _room(self) -> Paths:
         """Return new memory for the paths of a vertex."""
@@ -572,7 +577,7 @@ class KernelsEngine:
         engine.sent = []
         tally = engine.trace(chunk)
         lost = np.nonzero(~np.isfinite(engine.slots.floats[:3, : chunk.pixels]).all(0))[0]
-        sent = SentLight.of(chunk.first_pixel, engine.sent, engine.splats, lost)
+        sent = SentLight.of(chunk.first_pixel, chunk.pixels, engine.sent, engine.splats, lost)
         engine.sent = None
         return tally, sent
 
@@ -777,18 +782,16 @@ class KernelsEngine:
             self._connect(paths)
         if self.wave.integrator.sends_photons:
             self._send(paths)
-        if paths.shadows:
+        if paths.shadows and self.wave.integrator.lit:  # light paths have shadow rays to the camera alone
             self.search.light(paths.arena, paths.count)
 
     def _find_photons(self, paths: Paths, lanes: np.ndarray) -> None:
         """Write the photons that vertices of the camera paths ``lanes`` are merged with to their rows."""
         assert self.traced is not None
         rows, arena = self.kernels.state, paths.arena
-        o, d, t, first, key = (rows.first(name) for name in ("o", "d", "t", "photon_d", "key"))
-        floats, words = cast(Any, arena.floats), cast(Any, arena.words)
-        p = floats[o : o + 3, lanes] + floats[d : d + 3, lanes] * floats[t, lanes]
-        keys = words[key : key + self.wave.sampler.points.rows, lanes]
-        floats[first : first + PHOTON_ROWS, lanes] = self.traced.photons.near(p, keys, paths.depth)
+        o, d, t, found, key = (rows.first(name) for name in ("o", "d", "t", "photon_d", "key"))
+        photon_rows = PhotonRows(o, d, t, key, self.wave.sampler.points.rows, found)
+        self.traced.photons.write_near(arena.words, photon_rows, lanes, paths.depth)
 
     def _send(self, paths: Paths) -> None:
         """Keep the photons that light paths have sent from the vertex that ``paths`` have left."""
@@ -802,35 +805,17 @@ class KernelsEngine:
         self.sent.append((words[rows.first("lane"), lanes], *found))
 
     def _splat(self, paths: Paths) -> None:
-        """Record splats that reach the film. One that is not finite is left out and makes its sample NaN.
-
-        Memory is arrays of numpy, or on a device tensors; there the number of lanes is waited for.
-        """
-        rows, arena, n = self.kernels.state, paths.arena, self.calls.known(paths.count)
-        floats, words = cast(Any, arena.floats), cast(Any, arena.words)
-        pixel, transmittance = words[rows.first("splat_pixel"), :n], floats[rows.first("splat_transmittance"), :n]
-        transmittance[:] = 0.0
-        lanes = _nonzero(pixel >= 0)
-        if not len(lanes):
-            return
-        passed = self._passed(paths, "splat", lanes, n)
-        transmittance[lanes] = passed
-        first = rows.first("splat_radiance")
-        value = floats[first : first + 3][:, lanes] * transmittance[lanes]
-        arrives, finite = passed != 0, (abs(value) < LARGEST).all(0)
-        lane, counts = words[rows.first("lane"), :n][lanes], arrives & finite
-        if self.keeps_splats:
-            splats = lane[counts], pixel[lanes][counts], value[:, counts]
-            senders, pixels, light = map(torch.as_tensor, splats)
-            self.splats.append(Splats(senders.long(), pixels.long(), light))
-        self._lost.append(lane[arrives & ~finite])
+        """Record splats that reach the film. One that is not finite is left out and makes its sample NaN."""
+        found = self.joins.splats(paths.arena, paths.count)
+        if found is not None:
+            splats, lost = found
+            if self.keeps_splats:
+                self.splats.append(splats)
+            self._lost.append(lost)
 
     def _connect(self, paths: Paths) -> None:
-        """Connect the vertices that ``paths`` have left to those that their light paths keep, and add the light.
-
-        On a device the number of lanes is waited for.
-        """
-        kernels, calls, rows, depth = self.kernels, self.calls, self.kernels.state, paths.depth - 1
+        """Connect the vertices that ``paths`` have left to those that their light paths keep, and add the light."""
+        kernels, calls, depth = self.kernels, self.calls, paths.depth - 1
         calls.clear()
         calls.run(kernels.list_ends(), paths.count, paths.arena, paths.arena, lists=paths.lists)
         _, places = calls.counted()
@@ -846,41 +831,7 @@ class KernelsEngine:
             else:
                 slots = self._slots(depth)
                 calls.run(kernels.connect(model), count, paths.arena, paths.arena, lanes, slots=slots)
-        n, floats = calls.known(paths.count), cast(Any, paths.arena.floats)
-        lanes = _nonzero(floats[rows.first("connection_t"), :n])
-        if len(lanes):
-            passed = self._passed(paths, "connection", lanes, n)
-            first, radiance = rows.first("connection_radiance"), rows.first("radiance")
-            floats[radiance : radiance + 3, lanes] += floats[first : first + 3][:, lanes] * passed
-
-    def _passed(self, paths: Paths, name: str, lanes: Any, n: int) -> Any:
-        """Return the transmittance of shadow rays other than those to lights.
-
-        Args:
-            paths: of ``n`` lanes.
-            name: of their rows: ``splat`` or ``connection``.
-            lanes: those that have such a ray.
-            n: number of lanes.
-        """
-        rows, arena = self.kernels.state, paths.arena
-        floats, words = cast(Any, arena.floats), cast(Any, arena.words)
-        # The rows o, d and t of these rays, and of those to lights, which the search reads.
-        ray, shadow = (words[rows.first(f"{k}_o") : rows.first(f"{k}_radiance"), :n] for k in (name, "shadow"))
-        # They are searched in the first columns.
-        columns = slice(0, len(lanes))
-        saved = shadow[:, columns] + 0
-        shadow[:, columns] = ray[:, lanes]
-        self.search.light(arena, self.calls.lanes(len(lanes)))
-        shadow[:, columns] = saved
-        if "transmittance" in rows:
-            return floats[rows.first("transmittance"), columns]
-        return (words[rows.first("blocked"), columns] == 0) * 1.0
-
-
-def _nonzero(values: Any) -> Any:
-    """Return the indices of values that are not 0, of an array of numpy or a tensor."""
-    found = values.nonzero()
-    return found[0] if isinstance(found, tuple) else found[:, 0]
+        self.joins.connect(paths.arena, paths.count)
 
 
 class _Layers(Observer[Paths]):

@@ -157,7 +157,7 @@ class KernelsForward:
             return self.take(self.blocks(spans, self.budget.threads * TASKS), each)
         for pixel_set, first, count in spans:
             for sample in range(first, first + count):
-                blocks = self.blocks([(pixel_set, sample, 1)], 2 * self.budget.threads)
+                blocks = self.blocks([(pixel_set, sample, 1)], self.budget.threads)
                 self._traced = None  # before memory is taken for the next one
                 if integrator.merges:
                     self._traced = self._trace_light(blocks, sample, each)

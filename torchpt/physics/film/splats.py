@@ -7,11 +7,14 @@ integers (fixed point): integer addition gives the same bits in any order.
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from torchpt.native.kernels import kernel
 
 __all__ = ["LARGEST", "SplatSums", "Splats"]
 
@@ -71,12 +74,10 @@ class SplatSums:
         """
         # By numpy: torch would start a team of threads for each thread that renders.
         index, sums = randomization.numpy() * self._pixels + pixel.numpy(), self._sums.numpy()
-        limbs = [limb.astype(np.int64) for limb in _limbs(value.numpy().astype(np.float64), np.trunc)]
+        values, add = value.numpy().astype(np.float64), kernel("splats", "add")
         with self._lock:
             self._count(len(index))
-            for sums_of_limb, limb in zip(sums, limbs, strict=True):
-                for row, values in zip(sums_of_limb, limb, strict=True):  # one row a channel
-                    np.add.at(row, index, values)
+            add(sums.reshape(-1), sums.shape[2], index, len(index), values.reshape(-1))
 
     def writes_of_add(self, randomization: Tensor, pixel: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the changes that :meth:`add` would make, on any device; arguments as there.
@@ -91,7 +92,7 @@ class SplatSums:
         with self._lock:
             self._count(len(pixel))
             values = self._sums[..., index]
-        for values_of_limb, limb in zip(values, _limbs(value.double(), torch.trunc), strict=True):
+        for values_of_limb, limb in zip(values, _limbs(value.double()), strict=True):
             values_of_limb.index_add_(1, index_of_splat, limb.to(torch.int64))
         return self._sums, index, values
 
@@ -134,12 +135,9 @@ class SplatSums:
         self._since_carry = 0
 
 
-def _limbs(value, truncate):
-    """Yield three integers, in float64, in units of 1, 2**-36 and 2**-72 that add up to ``value``.
-
-    ``value`` is a float64 array of numpy with ``np.trunc`` as ``truncate``, or a tensor with ``torch.trunc``.
-    """
+def _limbs(value: Tensor) -> Iterator[Tensor]:
+    """Yield three integers, in float64, in units of 1, 2**-36 and 2**-72 that add up to ``value``, float64."""
     for _ in range(3):
-        limb = truncate(value)
+        limb = value.trunc()
         yield limb
         value = (value - limb) * 2.0**FRACTION_BITS
