@@ -65,6 +65,22 @@ def test_no_code_where_the_process_ends(monkeypatch, executable):
     assert again is not None and again.result(60) == compile_job(job())
 
 
+def test_a_compiler_that_is_closed_as_it_starts_does_not_end_its_thread(monkeypatch):
+    """As the program exits, and between tests: the next job is done all the same."""
+    closed = []
+
+    def setting(self, name, value):
+        object.__setattr__(self, name, value)
+        if name == "process" and value is not None and not closed:
+            closed.append(value)
+            self.close()
+
+    monkeypatch.setattr(compilers._Compiler, "__setattr__", setting)
+    futures = [compilers.submit(job(IR.replace("kernel", f"kernel{k}")), 2) for k in range(2)]
+    codes = [future.result(60) for future in futures]
+    assert closed and codes.count(None) == 1
+
+
 def test_processes_end_when_nothing_is_left(monkeypatch):
     monkeypatch.setattr(compilers, "IDLE", 0.05)
     future = compilers.submit(job(), 2)

@@ -66,17 +66,18 @@ class _Compiler:
         Raises:
             OSError: the process cannot be started, or has died.
         """
-        if self.process is None:
+        process = self.process
+        if process is None:
             # The paths of this process, so that llvmlite is the same.
             environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-            self.process = subprocess.Popen(
+            process = self.process = subprocess.Popen(
                 [sys.executable, codegen.__file__],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 env=environment,
             )
-        into, out = self.process.stdin, self.process.stdout
+        into, out = process.stdin, process.stdout  # another thread may call `close` at any time
         assert into is not None and out is not None
         into.write(json.dumps(job).encode() + b"\n")
         into.flush()
