@@ -77,7 +77,7 @@ def test_a_compiler_that_is_closed_as_it_starts_does_not_end_its_thread(monkeypa
 
     monkeypatch.setattr(compilers._Compiler, "__setattr__", setting)
     futures = [compilers.submit(job(IR.replace("kernel", f"kernel{k}")), 2) for k in range(2)]
-    codes = [future.result(60) for future in futures]
+    codes = [future.result(60) for future in futures if future is not None]
     assert closed and codes.count(None) == 1
 
 
