@@ -22,7 +22,7 @@ RAY = 7
 @kernel("splats", INTS, INT, INT, INT, INT, INT, INT, INTS, INTS)
 def begin_rays(
     words: Any, stride: int, count: int, row: int, least: int, ray: int, shadow: int, lanes: Any, saved: Any
-) -> int:
+) -> Any:
     """List the lanes that have a ray, and copy these side by side to the rows of those to lights.
 
     Args:
@@ -90,7 +90,7 @@ def end_splats(
     pixels: Any,
     values: Any,
     lost: Any,
-) -> int:
+) -> Any:
     """Collect the splats that arrive, after the search of their rays.
 
     Args:
