@@ -3,7 +3,7 @@
     python scripts/bench_bidirectional.py caustics cornell_box [--seconds 16] [--seeds 5] [--width 128] [--ways path bdpt vcm]
 
 A scene is a name or a file. Each way renders pictures for about so many seconds, box filter, and the table shows its squared
-error times its seconds, over those of ``path``: of all pixels (each over the square of the reference and 0.01, without the
+error times its seconds, over those of the first way: of all pixels (each over the square of the reference and 0.01, without the
 largest 0.1 %), and the median of blocks of 8 x 8 pixels. The reference is a long render of another seed: by ``bdpt`` with all
 its strategies, or what ``--reference`` says; a light that only one way finds counts as an error of the others. Mitsuba's ways
 need the extra `bench`, and LLVM where ``DRJIT_LIBLLVM_PATH`` says. Other work on the machine disturbs it.
@@ -72,7 +72,7 @@ def compare(name: str, arguments: argparse.Namespace) -> None:
             ways |= others(scene, film, arguments, Path(folder))
         reference, spp, _ = timed(ways[arguments.reference], 90_001, arguments.reference_seconds)
         print(f"\n{name}, {reference.shape[1]} x {reference.shape[0]}; reference: {arguments.reference}, {spp} samples")
-        print(f"{'':18s} samples  seconds  error, block   over path")
+        print(f"{'':18s} samples  seconds  error, block   over the first")
         first: tuple[float, float] | None = None
         for way in arguments.ways:
             shoot = ways[way]

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
+
+import torchpt
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "guides" / "extending.md").read_text(encoding="utf-8")
@@ -94,3 +99,19 @@ def test_they_work_where_they_are_put(tmp_path: Path) -> None:
     words = [sys.executable, "-W", "ignore", "-c", USES, str(tmp_path), packages]
     done = subprocess.run(words, capture_output=True, text=True, timeout=240, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_an_integrator_without_lights_has_shadow_rays_in_both_engines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_ao.py").write_text(FILES["torchpt/paths/integrators/kinds/ao.py"], encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    own: Any = importlib.import_module("own_ao")
+    balls = {f"ball{k}": {"type": "sphere", "center": [0.7 * k, 0, 0], "radius": 0.5} for k in range(2)}
+    scene = torchpt.load(
+        {"camera": {"origin": [0, 0, 4], "target": [0, 0, 0], "fov": 40}, "shapes": balls}, device="cpu"
+    )
+    wish: dict[str, Any] = {"film": {"width": 16, "height": 16}, "spp": 16, "integrator": own.AmbientOcclusion()}
+    eager, compiled = (torchpt.render(scene, compile=mode, **wish) for mode in ("off", "on"))
+    torch.testing.assert_close(compiled, eager, rtol=1e-4, atol=1e-4)
+    assert 0.1 < float(eager.max()) and float(eager[eager > 0].min()) < 0.9

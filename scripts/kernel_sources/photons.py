@@ -9,6 +9,7 @@ from numba.np.numpy_support import carray
 
 from kernel_sources.jit import FLOATS, INT, INTS, LONGS, inner, kernel
 from kernel_sources.simd import bits, item, lane_numbers, load, prefetch, put, splat, stack_memory, trailing_zeros
+from torchpt.paths.photons import FIRST, PHOTON_ROWS
 
 __all__ = ["build", "near"]
 
@@ -19,6 +20,8 @@ LANES = 16
 #: Vertices that are looked at together, so that the memory of all is asked for before it is read.
 GROUP = 16
 CORNERS, COORDINATES = 8 * GROUP, 3 * GROUP
+#: Rows of a photon's data, and with its point; the first of its value.
+ROWS, WIDTH, VALUE = PHOTON_ROWS, 3 + PHOTON_ROWS, FIRST["value"]
 #: Told apart, so that coordinates in another order have another cell.
 SALT_X, SALT_Y, SALT_Z = 0x0, 0x51ED270B, 0x2545F491
 
@@ -91,7 +94,11 @@ def build(photons, chance, rank, count, inverse, cells, starts, cell, order, poi
     """
     scale, mask = item(inverse, 0), np.uint32(cells - 1)
     for k in range(count):
-        x, y, z = item(photons, 12 * k) * scale, item(photons, 12 * k + 1) * scale, item(photons, 12 * k + 2) * scale
+        x, y, z = (
+            item(photons, WIDTH * k) * scale,
+            item(photons, WIDTH * k + 1) * scale,
+            item(photons, WIDTH * k + 2) * scale,
+        )
         number = np.int64(_cell(_floor(x), _floor(y), _floor(z), mask))
         put(cell, k, np.int32(number))
         put(starts, number + 1, item(starts, number + 1) + np.int32(1))
@@ -114,10 +121,10 @@ def build(photons, chance, rank, count, inverse, cells, starts, cell, order, poi
     for place in range(count):
         k = np.int64(item(order, place))
         for row in range(3):
-            put(points, row * size + place, item(photons, 12 * k + row))
+            put(points, row * size + place, item(photons, WIDTH * k + row))
         put(points, 3 * size + place, item(chance, k))
-        for row in range(9):
-            put(sorted_data, 9 * place + row, item(photons, 12 * k + 3 + row))
+        for row in range(ROWS):
+            put(sorted_data, ROWS * place + row, item(photons, WIDTH * k + 3 + row))
 
 
 @inner(forceinline=True)
@@ -261,16 +268,16 @@ def near(floats, words, stride, lanes, count, rows, salt, points, size, data, st
                         break
             put(begins, first, chosen)
             put(place, 3 * number, np.float32(total / np.float64(item(points, 3 * size + chosen))) * scale)
-            prefetch(data, 9 * chosen)
-            prefetch(data, 9 * chosen + 8)
+            prefetch(data, ROWS * chosen)
+            prefetch(data, ROWS * chosen + ROWS - 1)
         for number in range(group):
             lane, chosen, factor = (
                 np.int64(item(lanes, start + number)),
                 item(begins, 8 * number),
                 item(place, 3 * number),
             )
-            for row in range(9):
+            for row in range(ROWS):
                 value = np.float32(0.0)
                 if chosen >= 0:
-                    value = item(data, 9 * chosen + row) * (factor if 3 <= row < 6 else np.float32(1.0))
+                    value = item(data, ROWS * chosen + row) * (factor if VALUE <= row < VALUE + 3 else np.float32(1.0))
                 put(floats, found + row * stride + lane, value)

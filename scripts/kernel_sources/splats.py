@@ -12,16 +12,18 @@ import numpy as np
 
 from kernel_sources.jit import DOUBLES, FLOATS, INT, INTS, LONGS, inner, kernel
 from kernel_sources.simd import item, put
+from torchpt.engines.kernels.joins import RAY_ROWS
+from torchpt.physics.film.splats import FRACTION_BITS
 
 __all__ = ["add", "add_connections", "begin_rays", "end_splats"]
 
-#: Rows of a ray: o, d and t.
-RAY = 7
+#: Unit of a limb in those of the next.
+UNIT = 2.0**FRACTION_BITS
 
 
-@kernel("splats", INTS, INT, INT, INT, INT, INT, INT, INTS, INTS)
+@kernel("splats", INTS, INT, INT, INT, INT, INT, INT, INT, INTS, INTS)
 def begin_rays(
-    words: Any, stride: int, count: int, row: int, least: int, ray: int, shadow: int, lanes: Any, saved: Any
+    words: Any, stride: int, count: int, row: int, mask: int, least: int, ray: int, shadow: int, lanes: Any, saved: Any
 ) -> Any:
     """List the lanes that have a ray, and copy these side by side to the rows of those to lights.
 
@@ -29,12 +31,13 @@ def begin_rays(
         words: the arena.
         stride: of its rows.
         count: number of lanes.
-        row: that tells which lanes have a ray: those with a word of more than ``least`` there.
-        least: see ``row``.
+        row: that tells which lanes have a ray: those with more than ``least`` in the bits ``mask`` of their word there.
+        mask: see ``row``.
+        least: likewise.
         ray: the first row of the rays.
         shadow: the first row of those to lights.
-        lanes: the list, with room for ``count + 1``.
-        saved: ``(RAY, count)`` what was in these.
+        lanes: the list, with room for ``count``.
+        saved: ``(RAY_ROWS, count)`` what was in these.
 
     Returns:
         The number of rays.
@@ -42,8 +45,8 @@ def begin_rays(
     n = np.int64(0)
     for k in range(count):  # without a branch
         put(lanes, n, np.int32(k))
-        n += np.int64(item(words, row * stride + k) > least)
-    for r in range(RAY):
+        n += np.int64((np.int64(item(words, row * stride + k)) & mask) > least)
+    for r in range(RAY_ROWS):
         for k in range(n):
             place = (shadow + r) * stride + k
             put(saved, r * n + k, item(words, place))
@@ -54,7 +57,7 @@ def begin_rays(
 @inner(forceinline=True)
 def _restore(words, stride, shadow, count, saved):
     """Write back what :func:`begin_rays` has saved."""
-    for r in range(RAY):
+    for r in range(RAY_ROWS):
         for k in range(count):
             put(words, (shadow + r) * stride + k, item(saved, r * count + k))
 
@@ -186,4 +189,4 @@ def add(sums: Any, size: int, index: Any, count: int, values: Any) -> None:
                 whole = np.int64(value)
                 at = (3 * limb + channel) * size + place
                 put(sums, at, item(sums, at) + whole)
-                value = (value - np.float64(whole)) * 68719476736.0  # 2 ** FRACTION_BITS
+                value = (value - np.float64(whole)) * UNIT

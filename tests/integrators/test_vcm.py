@@ -74,6 +74,24 @@ def test_kernels_and_tensors_agree_for_any_threads_and_pieces(keys, monkeypatch)
     assert lanes
 
 
+def test_chunks_and_threads_change_no_bit():
+    """Nor where paths are connected, and only some samples have a light path."""
+    scene = torchpt.load(ROOMS["thin lens"], device="cpu")
+    keys = {"type": "vcm", "radius": 0.2, "connections": "one", "light_paths": 0.5}
+    wish: dict[str, Any] = {
+        "spp": 2,
+        "integrator": keys,
+        "compile": "on",
+        "full": True,
+        "film": {"width": 40, "height": 30},
+    }
+    whole = torchpt.render(scene, threads=1, **wish)
+    for lanes, threads in ((None, 2), (96, 1), (160, 3)):
+        with few_lanes(lanes):
+            found = torchpt.render(scene, threads=threads, **wish)
+        assert torch.equal(found.image, whole.image) and found.rays == whole.rays, (lanes, threads)
+
+
 @pytest.mark.parametrize("room", ["thin lens", pytest.param("parallel rays", marks=pytest.mark.slow)])
 def test_the_mean_of_bdpt_where_merges_count_most(room, monkeypatch):
     """With a radius that blurs little, and weights that leave most of the light to merges."""

@@ -81,6 +81,18 @@ def test_a_compiler_that_is_closed_as_it_starts_does_not_end_its_thread(monkeypa
     assert closed and codes.count(None) == 1
 
 
+def test_a_job_that_fails_in_any_way_is_left_to_the_caller(monkeypatch):
+    def failing(self, job):
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(compilers._Compiler, "_compile", failing)
+        futures = [compilers.submit(job(IR.replace("kernel", f"kernel{k}")), 2) for k in range(3)]
+        assert [future.result(60) for future in futures if future is not None] == [None] * 3
+    again = compilers.submit(job(), 2)
+    assert again is not None and again.result(60) == compile_job(job())
+
+
 def test_processes_end_when_nothing_is_left(monkeypatch):
     monkeypatch.setattr(compilers, "IDLE", 0.05)
     future = compilers.submit(job(), 2)

@@ -60,15 +60,11 @@ class TensorsForward:
                     return False
                 continue
             for sample in range(first, first + count):
-                wave, sent, traced = self.wave.at_sample(sample), list[SentLight](), None
+                wave, traced = self.wave.at_sample(sample), None
                 if wave.integrator.merges:
-                    if wave.light_paths is not None:
-                        piece = partial(self._trace_light, wave.light_paths, pixel_set, sent)
-                        if not self._run(piece, pixel_set, sample, 1, each):
-                            return False
-                    radius = wave.integrator.radius_at(sample)
-                    assert radius is not None
-                    traced = LightOfSample.of(sent, radius, wave.light_path_count)
+                    traced = self._light_of_sample(wave, pixel_set, sample, each)
+                    if traced is None:
+                        return False
                 if not self._run(partial(self._render_piece, wave, pixel_set, traced), pixel_set, sample, 1, each):
                     return False
         return True
@@ -84,6 +80,19 @@ class TensorsForward:
         """Call ``piece`` for samples of a pixel set; return False if ``each`` has ended the render."""
         pixels = pixel_set.film.width * pixel_set.film.height
         return not any(each(self._result) for _ in self.budget.run_in_chunks(piece, pixels, first, count))
+
+    def _light_of_sample(
+        self, wave: Wave, pixel_set: PixelSet, sample: int, each: Callable[[TaskResult | None], bool]
+    ) -> LightOfSample | None:
+        """Return what the light paths of one sample of all pixels leave; None if the render was ended."""
+        sent: list[SentLight] = []
+        if wave.light_paths is not None:
+            piece = partial(self._trace_light, wave.light_paths, pixel_set, sent)
+            if not self._run(piece, pixel_set, sample, 1, each):
+                return None
+        radius = wave.integrator.radius_at(sample)
+        assert radius is not None
+        return LightOfSample.of(sent, radius, wave.light_path_count)
 
     def _trace_light(self, wave: Wave, pixel_set: PixelSet, sent: list[SentLight], span: Span) -> None:
         """Trace the light paths of a piece of one sample, and append what they leave; if it raises, nothing was added."""

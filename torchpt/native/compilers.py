@@ -52,11 +52,11 @@ class _Compiler:
                         _compilers.discard(self)
                         break
                 continue
+            code = None
             try:
                 code = self._compile(job)
-            except (OSError, ValueError):  # ValueError: the pipes were closed, as this process exits
+            except Exception:  # the process has died, memory ran out, or the pipes were closed as this process exits
                 self.close()
-                code = None
             future.set_result(code)
         self.close()
 

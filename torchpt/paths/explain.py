@@ -230,7 +230,7 @@ CAUSES = {
     "ray": "the ray that leaves a surface",
     "preview": "the shading of the first surface, of integrators that stop there",
     "sum": "the sum of contributions, or its product with the filter weight, each of them finite",
-    "merge": "the light of a merge with light paths of other pixels, which is not traced again",
+    "merge": "a photon of its light path, or the light of a merge: neither is looked at again",
     "not repeated": "none: traced again by tensor operations, the sample is finite",
 }
 #: Causes of samples that are finite as they are traced again.

@@ -27,12 +27,14 @@ from torchpt.physics.samplers.dimensions import Dimension, salt
 
 __all__ = [
     "FIELDS",
+    "FIRST",
     "MERGE_SHARE",
     "PHOTON_ROWS",
     "LightOfSample",
     "PhotonMap",
     "PhotonRows",
     "SentLight",
+    "SentPhotons",
     "data_of",
     "merging_of",
     "photon_of",
@@ -49,6 +51,8 @@ _LEAST_CHANCE = 0.01
 #: Fields of :class:`Photon` and their rows, which are the rows of *data* of photons, float32, in this order.
 FIELDS = {"d": 3, "value": 3, "dvcm": 1, "dvc": 1, "depth": 1}
 PHOTON_ROWS = sum(FIELDS.values())
+#: The first row of each.
+FIRST = {name: sum(list(FIELDS.values())[:k]) for k, name in enumerate(FIELDS)}
 #: Photons that kernels read beyond the last one.
 _PADDING = 16
 #: No photons.
@@ -79,24 +83,35 @@ def data_of(photon: Photon) -> np.ndarray:
 
 
 @dataclass(frozen=True)
+class SentPhotons:
+    """Photons of the light paths of some pixels.
+
+    Attributes:
+        pixel: ``(n,)`` int64 index of the pixel that each belongs to.
+        rows: ``(n, 12)`` float32 their points and data, all finite.
+    """
+
+    pixel: np.ndarray
+    rows: np.ndarray
+
+
+@dataclass(frozen=True)
 class SentLight:
     """What the light paths of some pixels leave for the camera paths of the same sample.
 
     Attributes:
         first_pixel: index of the first one.
         pixels: their number.
-        pixel: ``(n,)`` int64 index of the pixel that each photon belongs to.
-        photons: ``(n, 12)`` float32 the points and the data of photons, all finite.
         splats: their splats; ``lane`` is the index of the pixel.
         lost: ``(m,)`` int64 pixels whose light path has a splat or a photon that is not finite, each once.
+        photons: their photons; None once they are in a map.
     """
 
     first_pixel: int
     pixels: int
-    pixel: np.ndarray
-    photons: np.ndarray
     splats: list[Splats]
     lost: np.ndarray
+    photons: SentPhotons | None
 
     @staticmethod
     def of(
@@ -126,7 +141,7 @@ class SentLight:
         of_pixels = [Splats(x.lane + first_pixel, x.pixel, x.value) for x in splats]
         if not finite.all():
             pixel, found = pixel[finite], found[finite]
-        return SentLight(first_pixel, pixels, pixel, found, of_pixels, lost)
+        return SentLight(first_pixel, pixels, of_pixels, lost, SentPhotons(pixel, found))
 
 
 @dataclass(frozen=True)
@@ -144,9 +159,8 @@ class LightOfSample:
     @staticmethod
     def of(sent: Sequence[SentLight], radius: float, paths: float) -> LightOfSample:
         """Return what is sent by all pixels, in any order; other arguments as for :meth:`PhotonMap.of`."""
-        return LightOfSample(
-            PhotonMap.of(sent, radius, paths), [replace(x, pixel=x.pixel[:0], photons=_NONE) for x in sent]
-        )
+        photons = PhotonMap.of([x.photons for x in sent if x.photons is not None], radius, paths)
+        return LightOfSample(photons, [replace(x, photons=None) for x in sent])
 
     def of_pixels(self, first: int, count: int) -> tuple[list[Splats], np.ndarray]:
         """Return splats and lost ones of the light paths of ``count`` pixels, with their numbers counted from the first."""
@@ -166,11 +180,12 @@ class LightOfSample:
 
 def _importance(data: np.ndarray, merging: float) -> np.ndarray:
     """Return what the chances of photons to be chosen are proportional to ``(n,)``, from their data."""
-    dvcm, dvc = data[6:8]
+    dvcm, dvc, value = data[FIRST["dvcm"]], data[FIRST["dvc"]], data[FIRST["value"] : FIRST["value"] + 3]
+    least = float(np.finfo(np.float32).tiny)
     with np.errstate(over="ignore"):  # to a weight of 0
-        others = np.hypot(dvcm, dvc * np.float32(_REVERSE)) / np.float32(merging)
+        others = np.hypot(dvcm, dvc * np.float32(_REVERSE)) / np.float32(max(merging, least))
         weight = 1.0 / (1.0 + others * others)
-    return abs(data[3:6]).max(0) * np.maximum(weight, np.float32(_LEAST_CHANCE))
+    return abs(value).max(0) * np.maximum(weight, np.float32(_LEAST_CHANCE))
 
 
 class PhotonRows(NamedTuple):
@@ -203,7 +218,7 @@ class PhotonMap:
     scale: float
 
     @staticmethod
-    def of(sent: Sequence[SentLight], radius: float, paths: float) -> PhotonMap:
+    def of(sent: Sequence[SentPhotons], radius: float, paths: float) -> PhotonMap:
         """Return the map of photons.
 
         Args:
@@ -212,10 +227,10 @@ class PhotonMap:
             paths: number of light paths.
         """
         pixel = np.concatenate([np.zeros(0, np.int64), *(part.pixel for part in sent)])
-        photons = np.concatenate([_NONE, *(part.photons for part in sent)])
+        photons = np.concatenate([_NONE, *(part.rows for part in sent)])
         count = len(pixel)
         cells = 1 << max(int(2 * count).bit_length() - 1, 6)
-        depth = photons[:, -1].astype(np.int64)
+        depth = photons[:, 3 + FIRST["depth"]].astype(np.int64)
         rank = pixel * (int(depth.max(initial=0)) + 1) + depth  # unique: a light path has one vertex of each depth
         starts, cell, order = np.zeros(cells + 1, np.int32), np.empty(count, np.int32), np.empty(count, np.int32)
         points, by_cell = np.zeros((4, count + _PADDING), np.float32), np.empty((count, PHOTON_ROWS), np.float32)
@@ -237,6 +252,7 @@ class PhotonMap:
             lanes: ``(k,)`` int32 the lanes to look at.
             depth: number of the vertices.
         """
+        assert words.flags.c_contiguous  # else its rows would be copied
         floats = words.view(np.float32)
         kernel("photons", "near")(
             floats.reshape(-1), words.reshape(-1), words.shape[1], lanes, len(lanes), np.array(rows, np.int32),

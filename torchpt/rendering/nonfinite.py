@@ -72,7 +72,7 @@ def _sample_name(wave: Wave, sample_id: SampleId) -> str:
 def _cause_phrase(scene: Scene, wave: Wave, cause: NonFiniteCause) -> str:
     """Return a cause with its depth, and the shape and material where it is one's."""
     if cause.cause == "merge":
-        return "the light of a merge with light paths of other pixels"
+        return "a photon of its light path, or the light of a merge"
     if cause.cause == "not repeated":
         return "traced again by tensor operations it is finite"
     depth = f" at depth {cause.depth}" if cause.depth else ""

@@ -754,7 +754,7 @@ class KernelsEngine:
             if self.traced is not None and not kernels.world.materials.models[model].smooth:
                 self._find_photons(paths, lanes.words[0, :count])
             if model in kernels.eager:
-                start_salts = self.wave.integrator.start_salts(paths.depth, torch.device("cpu"))
+                start_salts = self.wave.integrator.start_salts(paths.depth, self.wave.centre.device)
                 context = self._context_at(paths.depth, start_salts, roulette)
                 arenas, known = (paths.arena, after.arena), (calls.known(count), calls.known(start))
                 self.tally.rays += bounce_eagerly(kernels, context, self.store, model, *arenas, lanes, *known)
@@ -769,20 +769,20 @@ class KernelsEngine:
 
     def _context_at(self, depth: int, start_salts: Tensor | None, roulette: float = 0.0) -> StageContext:
         """Return the context of a vertex, for stages by tensor operations."""
-        of_vertex = salts(depth, torch.device("cpu"))
+        of_vertex = salts(depth, self.wave.centre.device)
         return self.context.at(of_vertex, roulette=roulette, start_salts=start_salts, depth=depth)
 
     def occlude(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`. The kernel ``sort_lanes`` adds the contributions later."""
         rows = self.kernels.state
-        paths.shadows = "shadow_o" in rows
+        paths.shadows = self.kernels.has_shadows and "shadow_o" in rows
         if "splat_o" in rows:
             self._splat(paths)
         if self.light_paths is not None and self.wave.integrator.connects:
             self._connect(paths)
         if self.wave.integrator.sends_photons:
             self._send(paths)
-        if paths.shadows and self.wave.integrator.lit:  # light paths have shadow rays to the camera alone
+        if paths.shadows:
             self.search.light(paths.arena, paths.count)
 
     def _find_photons(self, paths: Paths, lanes: np.ndarray) -> None:
@@ -809,9 +809,9 @@ class KernelsEngine:
         found = self.joins.splats(paths.arena, paths.count)
         if found is not None:
             splats, lost = found
+            self._lost.append(lost)
             if self.keeps_splats:
                 self.splats.append(splats)
-            self._lost.append(lost)
 
     def _connect(self, paths: Paths) -> None:
         """Connect the vertices that ``paths`` have left to those that their light paths keep, and add the light."""
@@ -826,7 +826,7 @@ class KernelsEngine:
             self._count_rays(count)
             if model in kernels.eager:
                 assert self.store is not None
-                context, known = self._context_at(depth, salts(0, torch.device("cpu"))), calls.known(count)
+                context, known = self._context_at(depth, salts(0, self.wave.centre.device)), calls.known(count)
                 connect_eagerly(kernels, context, self.store, model, paths.arena, lanes, known)
             else:
                 slots = self._slots(depth)

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     from torchpt.engines.kernels.engine import ChunkSearch, LaneCount
     from torchpt.engines.kernels.layout import Memory
 
-__all__ = ["HostJoins", "Joins", "TensorJoins"]
+__all__ = ["RAY_ROWS", "HostJoins", "Joins", "TensorJoins"]
+
+#: Rows of a ray: o, d and t.
+RAY_ROWS = 7
 
 
 class Joins(Protocol):
@@ -55,7 +58,7 @@ class HostJoins:
     def splats(self, arena: Memory, count: int) -> tuple[Splats, np.ndarray] | None:
         """See :class:`Joins`."""
         rows, words, stride = self.search.kernels.state, arena.words, arena.words.shape[1]
-        began = self._begin(arena, count, rows.first("splat_pixel"), -1, "splat")
+        began = self._begin(arena, count, rows.first("splat_pixel"), -1, -1, "splat")
         if began is None:
             words[rows.first("splat_transmittance"), :count] = 0
             return None
@@ -73,7 +76,7 @@ class HostJoins:
     def connect(self, arena: Memory, count: int) -> None:
         """See :class:`Joins`."""
         rows, words, stride = self.search.kernels.state, arena.words, arena.words.shape[1]
-        began = self._begin(arena, count, rows.first("connection_t"), 0, "connection")
+        began = self._begin(arena, count, rows.first("connection_t"), _MAGNITUDE, 0, "connection")
         if began is not None:
             lanes, saved, n = began
             kernel("splats", "add_connections")(
@@ -82,16 +85,21 @@ class HostJoins:
             )  # fmt: skip
 
     def _begin(
-        self, arena: Memory, count: int, row: int, least: int, name: str
+        self, arena: Memory, count: int, row: int, mask: int, least: int, name: str
     ) -> tuple[np.ndarray, np.ndarray, int] | None:
-        """Search the rays of lanes with a word above ``least`` in ``row``; return the lanes, what was in the rows, the number.
+        """Search the rays of the lanes with more than ``least`` in the bits ``mask`` of ``row``.
 
-        ``name``: of the rays' rows, ``splat`` or ``connection``. None: there are no rays.
+        ``name``: of the rays' rows, ``splat`` or ``connection``.
+
+        Returns:
+            The lanes, what was in the rows of rays to lights, and the number of rays; None: there are none.
         """
         rows, words = self.search.kernels.state, arena.words
-        lanes, saved = np.empty(count + 1, np.int32), np.empty(7 * count, np.int32)
+        assert words.flags.c_contiguous  # else its rows would be copied
+        lanes, saved = np.empty(count, np.int32), np.empty(RAY_ROWS * count, np.int32)
         n = kernel("splats", "begin_rays")(
-            words.reshape(-1), words.shape[1], count, row, least, rows.first(f"{name}_o"), rows.first("shadow_o"), lanes, saved
+            words.reshape(-1), words.shape[1], count, row, mask, least, rows.first(f"{name}_o"), rows.first("shadow_o"),
+            lanes, saved,
         )  # fmt: skip
         if not n:
             return None
@@ -105,6 +113,8 @@ class HostJoins:
         return rows.first("transmittance" if partly else "blocked"), int(partly)
 
 
+#: Bits of the magnitude of a float32.
+_MAGNITUDE = 0x7FFFFFFF
 _LARGEST = np.array([LARGEST], np.float32)
 
 

@@ -300,6 +300,7 @@ class Layout:
         has_emitters: True: a ray may hit an emitter.
         has_opacity: True: some surface is not opaque.
         has_transmission: True: rays may pass surfaces, or the integrator has its own ``transmit``.
+        has_shadows: True: stages of surfaces return shadow rays, those of splats aside.
         listed: True: kernels read lanes by lists. False: all lanes of the arena are on the only model.
         numbers: tensors of the sampler.
         tree: the search of a tree by kernels; None: they intersect each ray with every primitive.
@@ -317,6 +318,8 @@ class Layout:
         self.has_emitters = table is not None and table.row_of_prim is not None
         self.has_opacity = self.world.materials.opacity is not None
         self.has_transmission = self.has_opacity or wave.integrator.has_own_transmit
+        first = wave.first_surface
+        self.has_shadows = self.world.lights is not None if first is None else first.shadows(self.world)
         self.listed = not fused or self.models > 1 or self.has_environment
         self.state = Rows(_path_fields(self))
         self.store = _store_rows(wave)
@@ -362,7 +365,7 @@ def _store_rows(wave: Wave) -> Rows | None:
 
 def _path_fields(layout: Layout) -> Fields:
     """Return the fields of the arena: the path state of this scene, filter weight, hit, shadow ray, splat."""
-    wave, world = layout.wave, layout.world
+    wave = layout.wave
     state = wave.with_optional_fields(_state_of_one_lane(wave.sampler.points.rows))
     fields: Fields = {name: (tuple(x.shape[:-1]), DTYPES[x.dtype]) for name, x in state_values(state).items()}
     if wave.filter.signed:
@@ -376,8 +379,7 @@ def _path_fields(layout: Layout) -> Fields:
         fields |= PHOTON
     if wave.integrator.sends_photons:
         fields["photon_p"] = ((3,), "f")
-    shadows = world.lights is not None if wave.first_surface is None else wave.first_surface.shadows(world)
-    if not layout.fused and (shadows or wave.integrator.splats_at_surfaces):
+    if not layout.fused and (layout.has_shadows or wave.integrator.splats_at_surfaces):
         fields |= SHADOW
         if layout.has_opacity:
             fields["transmittance"] = ((), "f")

@@ -157,17 +157,18 @@ class KernelsForward:
             return self.take(self.blocks(spans, self.budget.threads * TASKS), each)
         for pixel_set, first, count in spans:
             for sample in range(first, first + count):
-                blocks = self.blocks([(pixel_set, sample, 1)], self.budget.threads)
                 self._traced = None  # before memory is taken for the next one
                 if integrator.merges:
-                    self._traced = self._trace_light(blocks, sample, each)
-                if self._halt.is_set() or not self.take(blocks, each):
+                    self._traced = self._trace_light(pixel_set, sample, each)
+                if self._halt.is_set() or not self.take(
+                    self.blocks([(pixel_set, sample, 1)], self.budget.threads), each
+                ):
                     return False
         self._traced = None
         return True
 
     def _trace_light(
-        self, blocks: list[Block], sample: int, each: Callable[[TaskResult | None], bool]
+        self, pixel_set: PixelSet, sample: int, each: Callable[[TaskResult | None], bool]
     ) -> LightOfSample | None:
         """Trace the light paths of one sample of all pixels, and return what they leave; None if the render was ended."""
         wave = self.kernels.wave
@@ -178,11 +179,18 @@ class KernelsForward:
                 sent.append(result.sent)
             return each(result)
 
+        blocks = self.blocks([(pixel_set, sample, 1)], self.budget.threads)
         if wave.light_paths is not None and not self.take(blocks, on_result, self._light_task):
             return None
         radius = wave.integrator.radius_at(sample)
         assert radius is not None
-        return LightOfSample.of(sent, radius, wave.light_path_count)
+        while True:
+            try:
+                return LightOfSample.of(sent, radius, wave.light_path_count)
+            except Exception as error:
+                if not is_out_of_memory(error):
+                    raise
+                self._smaller([])
 
     def _light_task(self, block: Block) -> TaskResult:
         """Trace the light paths of a block of one sample; called on any thread."""

@@ -58,6 +58,8 @@ class SplatSums:
         # Limbs, highest first; channels; sums of randomization k at pixel p at k * pixels + p.
         self._sums = torch.zeros(3, 3, randomizations * pixels, dtype=torch.int64, device=device)
         self._lock = threading.Lock()
+        if device.type == "cpu":
+            kernel("splats", "add")  # compiled before samples are added
 
     @staticmethod
     def bytes_of(pixels: int, randomizations: int) -> int:
@@ -71,13 +73,18 @@ class SplatSums:
             randomization: ``(k,)`` int64 index of the randomization of each splat's sample.
             pixel: ``(k,)`` int64 index of the target pixel.
             value: ``(3, k)``, each less than :data:`LARGEST`.
+
+        Raises:
+            IndexError: a pixel is not one of the picture.
         """
         # By numpy: torch would start a team of threads for each thread that renders.
-        index, sums = randomization.numpy() * self._pixels + pixel.numpy(), self._sums.numpy()
-        values, add = value.numpy().astype(np.float64), kernel("splats", "add")
+        pixels, sums, values = pixel.numpy(), self._sums.numpy(), value.numpy().astype(np.float64, order="C")
+        if len(pixels) and not 0 <= pixels.min() <= pixels.max() < self._pixels:
+            raise IndexError(f"splats at pixels {pixels.min()} to {pixels.max()} of a picture of {self._pixels} pixels")
+        index = randomization.numpy() * self._pixels + pixels
         with self._lock:
             self._count(len(index))
-            add(sums.reshape(-1), sums.shape[2], index, len(index), values.reshape(-1))
+            kernel("splats", "add")(sums.reshape(-1), sums.shape[2], index, len(index), values.reshape(-1))
 
     def writes_of_add(self, randomization: Tensor, pixel: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the changes that :meth:`add` would make, on any device; arguments as there.
