@@ -6,6 +6,8 @@ of a chunk there is neither an operator of torch nor a barrier between threads.
 ======================  =====================================================================================
 ``threads.py``          tasks on threads, and adding samples to the film: start here
 ``engine.py``           the engine of one thread: kernel calls, ray searches, and the stages of a walk
+``eagerly.py``          a vertex by tensor operations, for BSDF models that cannot be compiled
+``joins.py``            splats and connections: their shadow rays, and what they bring
 ``programs.py``         the kernels of a render, compiled on first use, and shared between renders
 ``stages.py``           the functions that trace kernels: camera rays, search, emission, bounce, layers, film
 ``layout.py``           rows of the path state in memory; loads, stores and lists that kernels share
