@@ -192,7 +192,7 @@ def run_bounce(
         state, hit = rows(state, index), rows(hit, index)
     here, there = arena(kernels, **_fields(state, hit)), arena(kernels)
     worker.calls.clear()
-    worker.calls.set_dimensions(depth)
+    worker.calls.set_dimensions(depth, roulette=float(roulette))
     worker.slots.words[:] = 0
     lists = [Memory(1) for _ in range(kernels.models + 2)]
     places = _listed(index) if kernels.listed else None

@@ -35,6 +35,7 @@ from torchpt.compiler.sinks import Sinks
 from torchpt.engines.kernels import engine as calls
 from torchpt.engines.kernels import programs
 from torchpt.engines.kernels.programs import Kernel
+from torchpt.scene.formats.description import settings
 
 __all__ = [
     "LANES",
@@ -62,8 +63,13 @@ WISH: dict[str, Any] = {"spp": 1, "threads": 1, "compile": "on"}
 
 def call_forward(scene: torchpt.Scene) -> None:
     """Render a picture, and layers."""
-    torchpt.render(scene, film={"width": 64, "height": 64}, **WISH)
+    torchpt.render(scene, film={"width": 64, "height": 64}, **_paths(scene), **WISH)
     torchpt.render(scene, film={"width": 24, "height": 24, "aovs": LAYERS}, integrator="aov", **WISH)
+
+
+def _paths(scene: torchpt.Scene) -> dict[str, Any]:
+    """Return the integrator `path` for scenes of `bdpt`, whose store these probes do not map and which has no gradients."""
+    return {"integrator": "path"} if settings(scene.description, {}).integrator.name == "bdpt" else {}
 
 
 def call_backward(scene: torchpt.Scene) -> None:
@@ -77,7 +83,7 @@ def call_backward(scene: torchpt.Scene) -> None:
     given = {name: value.clone().requires_grad_() for name, value in named.items()}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # which edges a gradient leaves out does not matter here
-        image = torchpt.render(scene, params=given, film={"width": 32, "height": 32}, **WISH)
+        image = torchpt.render(scene, params=given, film={"width": 32, "height": 32}, **_paths(scene), **WISH)
         torch.autograd.grad(image.mean(), list(given.values()), allow_unused=True)
 
 
@@ -263,8 +269,10 @@ class DeviceProbes:
                 memory.add(words, constant=True)
         _add_tables(memory, kernel.tables)
         memory.add(own.place, constant=True)
-        for salts in own._salts.values():
+        for salts in (*own._salts.values(), own._start_salts):
             memory.add(salts.numpy(), constant=True)
+        for numbers in (*own._bounds.values(), *own._depths.values(), own._merging):
+            memory.add(numbers, constant=True)
         if own.kernels.search is not None:
             accel = own.kernels.wave.accel
             memory.add(np.ctypeslib.as_array(own.kernels.search), constant=True)

@@ -54,6 +54,8 @@ def agreeing(name: str | Mapping[str, Any], side: int, samples: int, **wishes: A
     """The kernels that were compared, after all of them were found to agree with the eager stages."""
     scene = loaded(name) if isinstance(name, Mapping) else scene_of(name)
     wish = {"film": film_of(side), "render": {"spp": samples, "seed": 7}, **wishes}
+    if settings(scene.description, wish).integrator.name == "bdpt":  # whose stages weigh in light paths
+        wish["integrator"] = "path"
     found = compare(scene, wish, side * side, samples)
     assert sum(found.values.values()) > 20 / ALLOWED  # so that the lane of one decision may differ
     assert found.share() <= ALLOWED, found.worst()
