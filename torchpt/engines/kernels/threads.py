@@ -160,9 +160,8 @@ class KernelsForward:
                 self._traced = None  # before memory is taken for the next one
                 if integrator.merges:
                     self._traced = self._trace_light(pixel_set, sample, each)
-                if self._halt.is_set() or not self.take(
-                    self.blocks([(pixel_set, sample, 1)], self.budget.threads), each
-                ):
+                blocks = self.blocks([(pixel_set, sample, 1)], self.budget.threads)
+                if self._halt.is_set() or not self.take(blocks, each):
                     return False
         self._traced = None
         return True
@@ -194,20 +193,13 @@ class KernelsForward:
 
     def _light_task(self, block: Block) -> TaskResult:
         """Trace the light paths of a block of one sample; called on any thread."""
-        pixel_set, start, size, first, _ = block
-        result = TaskResult(RayCounts())
-        try:
-            worker = self._take_worker()
+
+        def send(worker: KernelsEngine, result: TaskResult) -> None:
+            pixel_set, start, size, first, _ = block
             tally, result.sent = worker.send(Chunk(start, size, first, 1, pixel_set))
             result.tally.rays, result.tally.truncated = tally.rays, tally.truncated
-            self._workers.append(worker)
-        except Halted:
-            pass
-        except Exception as error:
-            if not is_out_of_memory(error):
-                raise
-            result.unfinished = [block]
-        return result
+
+        return self._attempt(block, send)
 
     def blocks(self, spans: Sequence[tuple[PixelSet, int, int]], tasks: int) -> list[Block]:
         """Split the samples of pixel sets into blocks of pixels: ``tasks`` for each set, unless blocks get too small."""
@@ -289,26 +281,34 @@ class KernelsForward:
 
     def task(self, block: Block) -> TaskResult:
         """Render a block; called on any thread."""
-        pixel_set, start, size, first, count = block
-        result = TaskResult(RayCounts())
-        sample = first
-        try:
-            worker = self._take_worker()
+
+        def render(worker: KernelsEngine, result: TaskResult) -> None:
+            pixel_set, start, size, first, count = block
             samples_per_chunk = max(self.budget.lanes // size, 1)
-            while sample < first + count:
+            for sample in range(first, first + count, samples_per_chunk):
                 chunk = Chunk(start, size, sample, min(samples_per_chunk, first + count - sample), pixel_set)
                 self._render_chunk(worker, chunk, pixel_set, result)
-                sample += chunk.samples
                 result.samples += size * chunk.samples
                 if self.strict and result.lost.count:
                     break
+
+        return self._attempt(block, render)
+
+    def _attempt(self, block: Block, work: Callable[[KernelsEngine, TaskResult], None]) -> TaskResult:
+        """Do the work of a block with an engine; what is left of it when memory runs out is unfinished."""
+        pixel_set, start, size, first, count = block
+        result = TaskResult(RayCounts())
+        try:
+            worker = self._take_worker()
+            work(worker, result)
             self._workers.append(worker)
         except Halted:
             pass  # samples added so far count
         except Exception as error:
             if not is_out_of_memory(error):
                 raise
-            result.unfinished = [(pixel_set, start, size, sample, first + count - sample)]
+            done = result.samples // size
+            result.unfinished = [(pixel_set, start, size, first + done, count - done)]
         return result
 
     def _take_worker(self) -> KernelsEngine:
