@@ -9,19 +9,17 @@ from numba.np.numpy_support import carray
 
 from kernel_sources.jit import FLOATS, INT, INTS, LONGS, inner, kernel
 from kernel_sources.simd import bits, item, lane_numbers, load, prefetch, put, splat, stack_memory, trailing_zeros
-from torchpt.paths.photons import FIRST, PHOTON_ROWS
+from torchpt.paths.photons import FIRST_ROW, PHOTON_ROWS, TESTED
 
 __all__ = ["build", "near"]
 
 #: Photons of a vertex that are kept in memory while one of them is chosen; of more they are visited twice.
 KEPT = 256
-#: Photons that are tested at a time.
-LANES = 16
 #: Vertices that are looked at together, so that the memory of all is asked for before it is read.
 GROUP = 16
 CORNERS, COORDINATES = 8 * GROUP, 3 * GROUP
 #: Rows of a photon's data, and with its point; the first of its value.
-ROWS, WIDTH, VALUE = PHOTON_ROWS, 3 + PHOTON_ROWS, FIRST["value"]
+ROWS, WIDTH, VALUE = PHOTON_ROWS, 3 + PHOTON_ROWS, FIRST_ROW["value"]
 #: Told apart, so that coordinates in another order have another cell.
 SALT_X, SALT_Y, SALT_Z = 0x0, 0x51ED270B, 0x2545F491
 
@@ -177,17 +175,17 @@ def _scan(points, row, x, y, z, radius, most, sums, kept, begins, ends, first):
         The sum; the last photon that was added, -1: none; and the number of those in ``kept``, with the sums up to each in
         ``sums``, unless there are more than ``KEPT``.
     """
-    px, py, pz, square = splat(x, LANES), splat(y, LANES), splat(z, LANES), splat(radius * radius, LANES)
-    numbers_of_lanes, total, last, count = lane_numbers(LANES), 0.0, np.int64(-1), np.int64(0)
+    px, py, pz, square = splat(x, TESTED), splat(y, TESTED), splat(z, TESTED), splat(radius * radius, TESTED)
+    numbers_of_lanes, total, last, count = lane_numbers(TESTED), 0.0, np.int64(-1), np.int64(0)
     for corner in range(first, first + 8):
         end = item(ends, corner)
-        for k in range(item(begins, corner), end, LANES):
+        for k in range(item(begins, corner), end, TESTED):
             dx, dy, dz = (
-                load(points, k, LANES) - px,
-                load(points, row + k, LANES) - py,
-                load(points, 2 * row + k, LANES) - pz,
+                load(points, k, TESTED) - px,
+                load(points, row + k, TESTED) - py,
+                load(points, 2 * row + k, TESTED) - pz,
             )
-            inside = (dx * dx + dy * dy + dz * dz < square) & (numbers_of_lanes < splat(np.int32(end - k), LANES))
+            inside = (dx * dx + dy * dy + dz * dz < square) & (numbers_of_lanes < splat(np.int32(end - k), TESTED))
             left = bits(inside)
             while left != 0:
                 photon = k + trailing_zeros(left)

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from torchpt.paths.photons import FIRST, PHOTON_ROWS, LightOfSample, PhotonMap, SentLight, SentPhotons
+from torchpt.paths.photons import FIRST_ROW, PHOTON_ROWS, LightOfSample, PhotonMap, SentLight, SentPhotons
 from torchpt.physics.film.splats import Splats
 
-VALUE = slice(FIRST["value"], FIRST["value"] + 3)
+VALUE = slice(FIRST_ROW["value"], FIRST_ROW["value"] + 3)
 
 
 def photons(count: int, side: float, seed: int = 1) -> SentPhotons:
     rng = np.random.default_rng(seed)
     p, data = (rng.random((rows, count), np.float32) for rows in (3, PHOTON_ROWS))
     # Found by merges alone.
-    data[FIRST["dvcm"]], data[FIRST["dvc"]] = np.arange(count, dtype=np.float32) * 1e-12, 0.0
-    data[FIRST["depth"]] = rng.integers(1, 5, count)
+    data[FIRST_ROW["dvcm"]], data[FIRST_ROW["dvc"]] = np.arange(count, dtype=np.float32) * 1e-12, 0.0
+    data[FIRST_ROW["depth"]] = rng.integers(1, 5, count)
     p = (p - 0.5) * np.float32(side)
     return SentPhotons(np.arange(count), np.ascontiguousarray(np.concatenate((p, data)).T))
 
@@ -47,7 +47,7 @@ def test_the_sum_of_photons_within_the_radius(count, side, radius):
     total = ((distance < radius**2) * flux).sum(1)
     sure = abs(distance / radius**2 - 1.0).min(1) > 1e-4
     np.testing.assert_allclose(near[VALUE].max(0)[sure] * math.pi * radius**2 * 10.0, total[sure], rtol=1e-5, atol=0.0)
-    assert (total > 0).any() and ((near[FIRST["depth"]] > 0) == (total > 0))[sure].all()
+    assert (total > 0).any() and ((near[FIRST_ROW["depth"]] > 0) == (total > 0))[sure].all()
 
 
 def test_photons_are_chosen_by_their_flux():
@@ -56,7 +56,7 @@ def test_photons_are_chosen_by_their_flux():
     keys = np.random.default_rng(3).integers(-(2**31), 2**31, (1, 40000)).astype(np.int32)
     near = found.near(np.zeros((3, 40000), np.float32), keys, depth=1)
     flux = light.rows.T[3:][VALUE].max(0)
-    chosen = (near[FIRST["dvcm"]][:, None] == light.rows[:, 3 + FIRST["dvcm"]]).mean(0)
+    chosen = (near[FIRST_ROW["dvcm"]][:, None] == light.rows[:, 3 + FIRST_ROW["dvcm"]]).mean(0)
     assert chosen.sum() == pytest.approx(1.0)
     expected = flux / flux.sum()
     assert (abs(chosen - expected) < 5.0 * np.sqrt(expected * (1.0 - expected) / 40000)).all()
@@ -83,7 +83,7 @@ def test_many_photons_at_one_place():
     keys = np.random.default_rng(3).integers(-(2**31), 2**31, (1, 4000)).astype(np.int32)
     near = found.near(np.zeros((3, 4000), np.float32), keys, depth=1)
     np.testing.assert_allclose(near[VALUE].max(0) * math.pi, light.rows.T[3:][VALUE].max(0).sum(), rtol=1e-5)
-    mean, flux = near[FIRST["dvcm"]].mean() * 1e12, light.rows.T[3:][VALUE].max(0).astype(np.float64)
+    mean, flux = near[FIRST_ROW["dvcm"]].mean() * 1e12, light.rows.T[3:][VALUE].max(0).astype(np.float64)
     expected = (flux * np.arange(2000)).sum() / flux.sum()
     assert abs(mean - expected) < 5.0 * 577.0 / math.sqrt(4000)
 
@@ -92,7 +92,7 @@ def test_many_photons_at_one_place():
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_photons_that_are_not_finite_make_their_pixels_lost(field, bad):
     rows = photons(10, 1.0).rows
-    rows[3, 0 if field == "p" else 3 + FIRST[field]] = bad
+    rows[3, 0 if field == "p" else 3 + FIRST_ROW[field]] = bad
     splats = Splats(torch.tensor([2, 7]), torch.tensor([0, 1]), torch.ones(3, 2))
     part = sent(rows, first_pixel=100, lost=(7,), splats=(splats,))
     assert part.lost.tolist() == [103, 107] and part.photons is not None

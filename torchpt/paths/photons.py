@@ -27,9 +27,10 @@ from torchpt.physics.samplers.dimensions import Dimension, salt
 
 __all__ = [
     "FIELDS",
-    "FIRST",
+    "FIRST_ROW",
     "MERGE_SHARE",
     "PHOTON_ROWS",
+    "TESTED",
     "LightOfSample",
     "PhotonMap",
     "PhotonRows",
@@ -52,9 +53,9 @@ _LEAST_CHANCE = 0.01
 FIELDS = {"d": 3, "value": 3, "dvcm": 1, "dvc": 1, "depth": 1}
 PHOTON_ROWS = sum(FIELDS.values())
 #: The first row of each.
-FIRST = {name: sum(list(FIELDS.values())[:k]) for k, name in enumerate(FIELDS)}
-#: Photons that kernels read beyond the last one.
-_PADDING = 16
+FIRST_ROW = {name: sum(list(FIELDS.values())[:k]) for k, name in enumerate(FIELDS)}
+#: Photons that a kernel tests at a time, and so reads beyond the last one.
+TESTED = 16
 #: No photons.
 _NONE = np.zeros((0, 3 + PHOTON_ROWS), np.float32)
 
@@ -97,7 +98,7 @@ class SentPhotons:
 
 @dataclass(frozen=True)
 class SentLight:
-    """What the light paths of some pixels leave for the camera paths of the same sample.
+    """Splats and photons of the light paths of some pixels, for the camera paths of the same sample.
 
     Attributes:
         first_pixel: index of the first one.
@@ -121,7 +122,7 @@ class SentLight:
         splats: Sequence[Splats],
         lost: np.ndarray,
     ) -> SentLight:
-        """Return what the light paths of consecutive pixels leave.
+        """Return the light of consecutive pixels.
 
         Args:
             first_pixel: index of the first one.
@@ -146,11 +147,11 @@ class SentLight:
 
 @dataclass(frozen=True)
 class LightOfSample:
-    """What the light paths of one sample of all pixels leave for its camera paths.
+    """Splats and photons of the light paths of one sample of all pixels, for its camera paths.
 
     Attributes:
         photons: the photons.
-        sent: what else they leave.
+        sent: the splats and lost pixels, by parts.
     """
 
     photons: PhotonMap
@@ -158,12 +159,12 @@ class LightOfSample:
 
     @staticmethod
     def of(sent: Sequence[SentLight], radius: float, paths: float) -> LightOfSample:
-        """Return what is sent by all pixels, in any order; other arguments as for :meth:`PhotonMap.of`."""
+        """Return the light of all pixels, from parts in any order; other arguments as for :meth:`PhotonMap.of`."""
         photons = PhotonMap.of([x.photons for x in sent if x.photons is not None], radius, paths)
         return LightOfSample(photons, [replace(x, photons=None) for x in sent])
 
     def of_pixels(self, first: int, count: int) -> tuple[list[Splats], np.ndarray]:
-        """Return splats and lost ones of the light paths of ``count`` pixels, with their numbers counted from the first."""
+        """Return the splats and the lost pixels of ``count`` pixels, which are counted from the ``first``."""
         found, lost = [], [np.zeros(0, np.int64)]
         for sent in self.sent:
             if sent.first_pixel >= first + count or sent.first_pixel + sent.pixels <= first:
@@ -180,7 +181,11 @@ class LightOfSample:
 
 def _importance(data: np.ndarray, merging: float) -> np.ndarray:
     """Return what the chances of photons to be chosen are proportional to ``(n,)``, from their data."""
-    dvcm, dvc, value = data[FIRST["dvcm"]], data[FIRST["dvc"]], data[FIRST["value"] : FIRST["value"] + 3]
+    dvcm, dvc, value = (
+        data[FIRST_ROW["dvcm"]],
+        data[FIRST_ROW["dvc"]],
+        data[FIRST_ROW["value"] : FIRST_ROW["value"] + 3],
+    )
     least = float(np.finfo(np.float32).tiny)
     with np.errstate(over="ignore"):  # to a weight of 0
         others = np.hypot(dvcm, dvc * np.float32(_REVERSE)) / np.float32(max(merging, least))
@@ -230,10 +235,10 @@ class PhotonMap:
         photons = np.concatenate([_NONE, *(part.rows for part in sent)])
         count = len(pixel)
         cells = 1 << max(int(2 * count).bit_length() - 1, 6)
-        depth = photons[:, 3 + FIRST["depth"]].astype(np.int64)
+        depth = photons[:, 3 + FIRST_ROW["depth"]].astype(np.int64)
         rank = pixel * (int(depth.max(initial=0)) + 1) + depth  # unique: a light path has one vertex of each depth
         starts, cell, order = np.zeros(cells + 1, np.int32), np.empty(count, np.int32), np.empty(count, np.int32)
-        points, by_cell = np.zeros((4, count + _PADDING), np.float32), np.empty((count, PHOTON_ROWS), np.float32)
+        points, by_cell = np.zeros((4, count + TESTED), np.float32), np.empty((count, PHOTON_ROWS), np.float32)
         inverse = np.float32(0.5) / np.float32(radius)  # rounded as in `near`
         kernel("photons", "build")(
             photons.reshape(-1), _importance(photons[:, 3:].T, merging_of(radius, paths)), rank, count,

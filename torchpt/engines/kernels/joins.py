@@ -23,10 +23,13 @@ __all__ = ["RAY_ROWS", "HostJoins", "Joins", "TensorJoins"]
 
 #: Rows of a ray: o, d and t.
 RAY_ROWS = 7
+#: Bits of the magnitude of a float32.
+_MAGNITUDE = 0x7FFFFFFF
+_LARGEST = np.array([LARGEST], np.float32)
 
 
 class Joins(Protocol):
-    """What joins paths to other pixels and to light paths."""
+    """Joins of paths to other pixels, and to light paths."""
 
     def splats(self, arena: Memory, count: LaneCount) -> tuple[Splats, Any] | None:
         """Search the rays of splats, and set their transmittance, 0 where there is none.
@@ -57,16 +60,16 @@ class HostJoins:
 
     def splats(self, arena: Memory, count: int) -> tuple[Splats, np.ndarray] | None:
         """See :class:`Joins`."""
-        rows, words, stride = self.search.kernels.state, arena.words, arena.words.shape[1]
+        rows, words, stride = self.search.kernels.state, arena.address, arena.words.shape[1]
         began = self._begin(arena, count, rows.first("splat_pixel"), -1, -1, "splat")
         if began is None:
-            words[rows.first("splat_transmittance"), :count] = 0
+            arena.floats[rows.first("splat_transmittance"), :count] = 0.0
             return None
         lanes, saved, n = began
-        samples, pixels, lost = (np.empty(n + 1, np.int32) for _ in range(3))
+        samples, pixels, lost = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n + 1, np.int32)
         values = np.empty((3, n), np.float32)
         found = kernel("splats", "end_splats")(
-            words.reshape(-1), arena.floats.reshape(-1), stride, count, n, rows.first("shadow_o"), *self._result(),
+            words, words, stride, count, n, rows.first("shadow_o"), *self._result(),
             rows.first("lane"), rows.first("splat_pixel"), rows.first("splat_radiance"), rows.first("splat_transmittance"),
             lanes, saved, _LARGEST, samples, pixels, values, lost,
         )  # fmt: skip
@@ -75,12 +78,12 @@ class HostJoins:
 
     def connect(self, arena: Memory, count: int) -> None:
         """See :class:`Joins`."""
-        rows, words, stride = self.search.kernels.state, arena.words, arena.words.shape[1]
+        rows, words, stride = self.search.kernels.state, arena.address, arena.words.shape[1]
         began = self._begin(arena, count, rows.first("connection_t"), _MAGNITUDE, 0, "connection")
         if began is not None:
             lanes, saved, n = began
             kernel("splats", "add_connections")(
-                words.reshape(-1), arena.floats.reshape(-1), stride, n, rows.first("shadow_o"), *self._result(),
+                words, words, stride, n, rows.first("shadow_o"), *self._result(),
                 rows.first("connection_radiance"), rows.first("radiance"), lanes, saved,
             )  # fmt: skip
 
@@ -94,12 +97,10 @@ class HostJoins:
         Returns:
             The lanes, what was in the rows of rays to lights, and the number of rays; None: there are none.
         """
-        rows, words = self.search.kernels.state, arena.words
-        assert words.flags.c_contiguous  # else its rows would be copied
+        rows, stride = self.search.kernels.state, arena.words.shape[1]
         lanes, saved = np.empty(count, np.int32), np.empty(RAY_ROWS * count, np.int32)
         n = kernel("splats", "begin_rays")(
-            words.reshape(-1), words.shape[1], count, row, mask, least, rows.first(f"{name}_o"), rows.first("shadow_o"),
-            lanes, saved,
+            arena.address, stride, count, row, mask, least, rows.first(f"{name}_o"), rows.first("shadow_o"), lanes, saved,
         )  # fmt: skip
         if not n:
             return None
@@ -111,11 +112,6 @@ class HostJoins:
         rows = self.search.kernels.state
         partly = "transmittance" in rows
         return rows.first("transmittance" if partly else "blocked"), int(partly)
-
-
-#: Bits of the magnitude of a float32.
-_MAGNITUDE = 0x7FFFFFFF
-_LARGEST = np.array([LARGEST], np.float32)
 
 
 class TensorJoins:
