@@ -310,8 +310,9 @@ class LightPaths(Integrator):
                 weight = weight * (sample.eta * sample.eta)
         if not kind.smooth:
             value, reverse = kind.eval_pdf(view.surface.parameters, view.surface.frame.to_local(d), view.wi)
-            finite = pdf if sharp is None else torch.where(sharp, 0.0, pdf)
-            rough = value * (turned * safe_reciprocal(finite))
+            # A failed sample has density 0 though its direction may have a value.
+            usable = pdf > 0 if sharp is None else (pdf > 0) & ~sharp
+            rough = torch.where(usable, value * (turned / torch.where(usable, pdf, 1.0)), 0.0)
             weight = rough if sharp is None else torch.where(sharp, weight, rough)
         if kind.delta and surface.perturbed_normal is not None:  # light along `d` would meet another normal
             same = dot(view.surface.frame.n, surface.frame.n) > 1.0 - 1e-4
