@@ -9,6 +9,7 @@ import torch
 
 import torchpt
 from torchpt.gradients.edges.film import Worth, film_places, slopes
+from torchpt.physics.cameras import Camera
 from torchpt.scene.formats.description import settings
 
 PLACE = {"origin": [1, 2, 3], "target": [0, 0.5, 0], "up": [0, 1, 0.2]}
@@ -17,7 +18,15 @@ CAMERAS: dict[str, dict[str, Any]] = {
     "of height": {"fov": 50, "fov_axis": "y"},
     "off its axis": {"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.1, "pixel_aspect": 1.3},
     "orthographic": {"type": "orthographic", "width": 3},
+    "lens": {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 2, "principal_point_offset_x": 0.1},
+    "lens of blades": {"type": "thinlens", "aperture_radius": 0.2, "focus_distance": 5, "blades": 5},
 }
+
+
+def lens_of(camera: Camera) -> torch.Tensor | None:
+    """Return 50 samples of a lens."""
+    u = torch.rand(2, 50, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    return u if camera.lens else None
 
 
 def scene_of(camera: dict[str, Any], **film: Any) -> torchpt.Scene:
@@ -32,10 +41,11 @@ def test_points_of_rays_lie_where_the_rays_do(name: str) -> None:
     camera = scene.camera(settings(scene.description).film, scene.params, torch.float64)
     generator = torch.Generator().manual_seed(1)
     s = torch.rand(2, 50, generator=generator, dtype=torch.float64) * torch.tensor([[24.0], [16.0]])
-    o, d = camera.rays(s[0], s[1], None)
+    lens = lens_of(camera)
+    o, d = camera.rays(s[0], s[1], lens)
     far = torch.rand(50, generator=generator, dtype=torch.float64) + 0.1
-    torch.testing.assert_close(film_places(camera, o + d * far), s, rtol=0, atol=1e-5)  # axes are float32
-    behind = camera.film_of(o - d * far)
+    torch.testing.assert_close(film_places(camera, o + d * far, lens), s, rtol=0, atol=1e-5)  # axes are float32
+    behind = camera.film_of(o - d * far, lens)
     assert behind is not None and bool((torch.minimum(behind[2], behind[3]) < 0).all())
 
 
@@ -64,18 +74,13 @@ def test_worth_is_what_samples_bring(filter: str) -> None:
     assert float((worth.at(s)[0] * function(s[0], s[1])).sum().real * area) == pytest.approx(summed, rel=2e-3)
 
 
-def test_a_lens_has_no_edges() -> None:
-    scene = scene_of({"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2})
-    camera = scene.camera(settings(scene.description).film, scene.params, torch.float64)
-    assert camera.film_of(torch.zeros(3, 1, dtype=torch.float64)) is None
-
-
 @pytest.mark.parametrize("name", CAMERAS)
 def test_slopes_are_derivatives_of_places(name: str) -> None:
     scene = scene_of(CAMERAS[name])
     made = scene.camera(settings(scene.description).film, scene.params, torch.float64)
     p = 2 * torch.randn(3, 50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)  # some behind
-    s, found = slopes(made, p)
-    expected = torch.autograd.functional.jacobian(lambda q: film_places(made, q).sum(1), p)
-    torch.testing.assert_close(s, film_places(made, p))
+    lens = lens_of(made)
+    s, found = slopes(made, p, lens)
+    expected = torch.autograd.functional.jacobian(lambda q: film_places(made, q, lens).sum(1), p)
+    torch.testing.assert_close(s, film_places(made, p, lens))
     torch.testing.assert_close(found, expected)

@@ -65,7 +65,7 @@ def test_the_mean_of_path_among_diffuse_walls(keys):
 @pytest.mark.parametrize("name", ROOMS)
 def test_the_mean_of_path(name):
     scene = torchpt.load(ROOMS[name], device="cpu")
-    # Of lights without extent, some light comes to `path` through glass in rare bright samples: twelve seeds do not show its
+    # Of lights without extent, some light comes to `path` through glass in rare bright samples: few seeds do not show its
     # variance.
     seeds, spp = (48, 4096) if name == "lights without extent" else (SEEDS, 1024)
     assert_same_means(pictures(scene, "path", spp, seeds=seeds), pictures(scene, "bdpt", 1024, seeds=seeds))

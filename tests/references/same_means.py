@@ -12,7 +12,7 @@ import torchpt
 __all__ = ["SEEDS", "assert_same_means", "means", "pictures"]
 
 #: Seeds of each integrator, unless told.
-SEEDS = 12
+SEEDS = 16
 
 
 def pictures(

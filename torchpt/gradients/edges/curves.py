@@ -15,9 +15,11 @@ from torchpt.core.tree import map_leaves
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.math.vectors import cross, dot, take
 from torchpt.paths.integrators.path import PathIntegrator
+from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Copy, Part
 from torchpt.physics.shapes.geometry import KINDS
 from torchpt.physics.shapes.quadrics import Form
+from torchpt.physics.textures import Node
 from torchpt.scene import Scene
 from torchpt.scene.prepare import scene_cache
 from torchpt.scene.settings import Settings
@@ -470,15 +472,13 @@ def left_out(scene: Scene, settings: Settings) -> list[str]:
 
 def _found(scene: Scene, settings: Settings) -> Iterator[str]:
     built, camera = scene.built, scene.description.camera.kind
-    if camera.lens:
-        yield "those that a lens blurs"
-    elif scene.camera(settings.film, scene.params, torch.float64).film_of(_point(scene.device)) is None:
+    if scene.camera(settings.film, scene.params, torch.float64).film_of(_point(scene.device)) is None:
         yield f"those that a camera of kind {camera.name} sees"
     materials = [owner.material for owner in (*built.parts, *built.copies)]
     if any(part.model.delta for material in materials for part in material.with_inner()):
         yield "those seen in mirrors and clear glass, and of light that these send on"
-    if any(material.opacity != 1.0 for material in materials):
-        yield "those of surfaces that are not opaque"
+    if any(_has_opacity_texture(part) for material in materials for part in material.with_inner()):
+        yield "those within textures of opacity"
     nodes = [node for material in materials for node in material.textures()]
     if any(getattr(node, "nearest", False) and not node.filtered for node in nodes):
         yield "those within textures that are not interpolated"
@@ -488,6 +488,11 @@ def _found(scene: Scene, settings: Settings) -> Iterator[str]:
         yield "the rims of spots that do not fade out"
     if not isinstance(settings.integrator, PathIntegrator):
         yield f"edges of shadows where the integrator is {settings.integrator.name}"
+
+
+def _has_opacity_texture(material: ResolvedMaterial) -> bool:
+    sheer = any(inner.model.sheer for inner in material.inner)  # its weight is an opacity
+    return isinstance(material.opacity, Node) or (sheer and isinstance(material.values["weight"], Node))
 
 
 def _point(device: torch.device) -> Tensor:

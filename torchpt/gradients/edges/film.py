@@ -61,22 +61,24 @@ class Worth:
         return first, weights
 
 
-def film_places(camera: Camera, p: Tensor) -> Tensor:
-    """Return places ``(2, N)`` of points ``(3, N)`` on the film; any for those behind the camera."""
-    seen = camera.film_of(p)
+def film_places(camera: Camera, p: Tensor, lens: Tensor | None) -> Tensor:
+    """Return places ``(2, N)`` of points ``(3, N)`` on the film; any for those behind the camera.
+
+    ``lens``: ``(2, N)`` samples of the lens, as for :meth:`torchpt.physics.cameras.Camera.film_of`.
+    """
+    seen = camera.film_of(p, lens)
     assert seen is not None
     return seen[:2] / torch.where(seen[2] > 0, seen[2], 1.0)
 
 
-def slopes(camera: Camera, p: Tensor) -> tuple[Tensor, Tensor]:
+def slopes(camera: Camera, p: Tensor, lens: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return places ``(2, N)`` of points on the film and how they change with them ``(2, 3, N)``, detached."""
     # Homogeneous places are affine in the points.
     corners = torch.cat((torch.zeros_like(p[:, :1]), torch.eye(3, dtype=p.dtype, device=p.device)), 1)
-    at, seen = camera.film_of(corners), camera.film_of(p)
-    assert at is not None and seen is not None
-    slope = (at[:3, 1:] - at[:3, :1]).detach()
+    at, seen = [camera.film_of(corners[:, k : k + 1], lens) for k in range(4)], camera.film_of(p, lens)
+    assert at[0] is not None and seen is not None
+    slope = torch.stack([(end - at[0])[:3].detach() for end in at[1:] if end is not None], 1)  # (3, 3, 1 or N)
     h = torch.where(seen[2] > 0, seen[2], 1.0).detach()
     s = seen[:2].detach() / h
     turned = torch.where(seen[2] > 0, s, 0.0)
-    rows = [(slope[k, :, None] - slope[2, :, None] * turned[k]) / h for k in range(2)]
-    return s, torch.stack(rows)
+    return s, torch.stack([(slope[k] - slope[2] * turned[k]) / h for k in range(2)])

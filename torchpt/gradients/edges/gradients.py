@@ -21,7 +21,7 @@ from torchpt.gradients.edges.film import Worth
 from torchpt.gradients.edges.guide import Round, first_round
 from torchpt.gradients.edges.horizons import Horizons, horizons_of
 from torchpt.gradients.edges.occluders import occluders_of
-from torchpt.gradients.edges.primary import Look, pieces_of, primary_of
+from torchpt.gradients.edges.primary import Look, primary_of
 from torchpt.gradients.edges.receivers import MovingFrame
 from torchpt.gradients.edges.segments import Segments, SegmentSampler, smooth_of
 from torchpt.gradients.edges.shadows import Shadows, sources_of
@@ -153,10 +153,10 @@ class Boundary:
             # Elsewhere a curve that stands still may have what moves behind it, but the film has it where it was.
             moves = None if self._camera_moves else moving_primitives(self.scene, self.leaves)
             poses = self.scene.merged(self.params)
-            pieces = pieces_of(self.scene, self.still, poses, self.worth.bounds(), self._cuts, moves)
-        if pieces is None:
+            bounds = self.worth.bounds()
+            primary = primary_of(self.scene, self.still, poses, self.traced, bounds, self._cuts, moves)
+        if primary is None:
             return
-        primary = primary_of(self.still, pieces, self.traced)
         for first, count in self._chunks(total):
             yield primary.samples(first, count, total, self.worth, look, held)
 

@@ -112,7 +112,7 @@ class Horizons:
         spot = self._spot(prim, uv, x, omega)
         n = spot.n.double() * side
         o, d = x + n * self.frame.rounding(prim, x), normalize(omega + n * _TILT)
-        y = met(traced, o, d)
+        y = met(traced, o, d, traced.of_paths(number, Use.BEHIND))
         r = torch.where(y.hit.prim >= 0, y.hit.t.double(), 1.0)
         moves = self.frame.moving(prim) | self.frame.moving(y.hit.prim)
         prefixes = []

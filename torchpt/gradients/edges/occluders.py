@@ -46,17 +46,23 @@ class EdgePoints:
         lane: ``(N,)`` of those that were asked for: where there is no outline there is no point.
         held: the points.
         mate: the other face at each; -1: there is none.
+        cut: ``(N,)`` bool: the two cut there.
         p: where they are ``(3, N)``.
         along: how ``p`` changes with the curve's parameter.
-        density: of the draw in that parameter, over the part with which the curve counts.
+        bent: ``(N,)`` bool: the curve is the outline of a round surface.
+        density: of the draw in that parameter.
+        part: with which the curve counts, where others lie on it.
     """
 
     lane: Tensor
     held: Held
     mate: Tensor
+    cut: Tensor
     p: Tensor
     along: Tensor
+    bent: Tensor
     density: Tensor
+    part: Tensor
 
 
 @dataclass(frozen=True)
@@ -85,16 +91,18 @@ class Occluders:
     outlines: Distribution1D
     creases: Distribution1D
 
-    def outline_points(self, u: Tensor, coin: Tensor, view: View) -> EdgePoints:
+    def outline_points(self, u: Tensor, coin: Tensor, view: View, *, creases: bool = False) -> EdgePoints:
         """Return points of outlines as they are seen from ``view``.
 
         Args:
             u: ``(N,)`` in [0, 1), which curves and where on them.
             coin: ``(N,)`` in [0, 1): which of two lines.
             view: ``N`` places or directions.
+            creases: True: points of creases too, on both sides of which faces are seen, and of curves where surfaces cut.
         """
-        index, rest = self.outlines.draw(u)
-        chance = take(self.outlines.pmf, index)
+        choice = self.creases if creases else self.outlines
+        index, rest = choice.draw(u)
+        chance = take(choice.pmf, index)
         curves, form = rows(self.curves, index), take(self.form, index)
         some = torch.ones_like(form, dtype=torch.bool)
         for number in range(len(self.forms) + 1):
@@ -115,10 +123,11 @@ class Occluders:
         held, p, along = curves.moving(self.bodies, curves.low + rest * span)
         across = cross(along, view.toward(p))
         one, two = (dot(across, self.bodies.points(rows(other, index)) - p) for other in self.others)
-        some &= ~take(self.folded, index) | (one * two >= 0)
+        some &= ~take(self.folded, index) | (one * two >= 0) | creases
         some &= dot(across, across) > 0
-        lane, density = torch.arange(len(index), device=index.device), chance / (span * take(self.part, index))
-        return rows(EdgePoints(lane, held, curves.mate, p, along, density), some.nonzero().squeeze(1))
+        lane, part = torch.arange(len(index), device=index.device), take(self.part, index)
+        drawn = EdgePoints(lane, held, curves.mate, curves.cut, p, along, form >= 0, chance / span, part)
+        return rows(drawn, some.nonzero().squeeze(1))
 
 
 def occluders_of(

@@ -17,6 +17,7 @@ from torchpt.gradients.edges.curves import (
     folds_of,
     generator,
     joined,
+    marked_primitives,
     plain_of,
     round_outline,
     rounds_of,
@@ -24,6 +25,7 @@ from torchpt.gradients.edges.curves import (
 from torchpt.gradients.edges.cuts import Crossing, Cuts, crossing_of
 from torchpt.gradients.edges.film import Worth, film_places, slopes
 from torchpt.gradients.edges.guide import Round
+from torchpt.gradients.edges.occluders import Occluders, occluders_of
 from torchpt.gradients.edges.traced import Traced, Use
 from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import cross, dot, rows, take
@@ -62,29 +64,30 @@ def step_of(bodies: Bodies) -> float:
     return _STEP * width * narrow
 
 
-def steps_at(bodies: Bodies, faces: tuple[Tensor, Tensor], s: Tensor) -> Tensor:
+def steps_at(bodies: Bodies, faces: tuple[Tensor, Tensor], s: Tensor, lens: Tensor | None = None) -> Tensor:
     """Return steps ``(N,)`` in pixels: shorter where a ray a whole step beside an edge would pass a narrow face.
 
     Args:
         bodies: detached.
         faces: the two faces of each edge ``(N,)``; -1: there is none.
         s: places of the edges on the film ``(2, N)``.
+        lens: samples of the lens ``(2, N)``; None: there is none.
     """
     whole = step_of(bodies)
     room = torch.full_like(s[0], whole / _SHARE)
     for prim in faces:
         some = is_flat(bodies, prim).nonzero().squeeze(1)
         if len(some):
-            corners = outline_of(bodies, prim[some])
+            corners = outline_of(bodies, prim[some], rows(lens, some))
             away = torch.stack([distance_to(s[:, some], a, b) for a, b in corners])
             # The nearest is the edge itself.
             room[some] = torch.minimum(room[some], away.sort(0).values[1])
     return (_SHARE * room).clamp(_LEAST * whole, whole)
 
 
-def outline_of(bodies: Bodies, prim: Tensor) -> list[tuple[Tensor, Tensor]]:
+def outline_of(bodies: Bodies, prim: Tensor, lens: Tensor | None) -> list[tuple[Tensor, Tensor]]:
     """Return the sides of parallelograms ``(N,)`` on the film, from and to ``(2, N)``; a triangle's last has no length."""
-    places = [film_places(bodies.camera, corner) for corner in bodies.corners(prim)]
+    places = [film_places(bodies.camera, corner, lens) for corner in bodies.corners(prim)]
     return list(zip(places, [*places[1:], places[0]], strict=True))
 
 
@@ -108,27 +111,25 @@ def distance_to(s: Tensor, a: Tensor, b: Tensor) -> Tensor:
 # surfaces are taken to stay together; where only one of them moves the derivative is the mean of those to both sides.
 
 
-def share_of(bodies: Bodies, held: Held, mate: Tensor, s: Tensor, prim: Tensor, near: Tensor, step: Tensor) -> Tensor:
+def share_of(bodies: Bodies, place: EdgePlace, prim: Tensor, near: Tensor, step: Tensor) -> Tensor:
     """Return the parts ``(N,)`` with which places of edges count.
 
     Args:
         bodies: detached.
-        held: the places.
-        mate: the other faces of the edges ``(N,)``; -1: there is none.
-        s: on the film ``(2, N)``.
+        place: the places.
         prim: what is seen on both sides ``(2, N)``.
         near: whether at the edge's own distance ``(2, N)``.
         step: how far beside the edges that is ``(N,)``, in pixels.
     """
-    own = prim == held.prim
+    own = prim == place.held.prim
     other = torch.where(own[0], prim[1], prim[0])
     both = near.all(0) & own.any(0) & ~own.all(0)
-    flat = both & (other >= 0) & (mate < 0)
+    flat = both & (other >= 0) & (place.mate < 0)
     flat = flat & is_flat(bodies, other)
     safe = torch.where(flat, other, 0)
     if not bool(flat.any()):
-        return torch.ones_like(s[0])
-    away = torch.stack([distance_to(s, a, b) for a, b in outline_of(bodies, safe)]).amin(0)
+        return torch.ones_like(step)
+    away = torch.stack([distance_to(place.s, a, b) for a, b in outline_of(bodies, safe, place.lens)]).amin(0)
     return torch.where(flat & (away < 0.5 * step), 0.5, 1.0)
 
 
@@ -275,7 +276,7 @@ def _arcs(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) ->
     front = (torch.minimum(first[2], last[2]) > 0) & (torch.minimum(first[3], last[3]) > 0)
     behind = (torch.maximum(first[2], last[2]) <= 0) | (torch.maximum(first[3], last[3]) <= 0)
     length = torch.where(front, _apart(first, last), across)
-    a, b = (film_places(bodies.camera, cut.moving(bodies, t)[1]) for t in (cut.low, cut.high))
+    a, b = (film_places(bodies.camera, cut.moving(bodies, t)[1], None) for t in (cut.low, cut.high))
     near = torch.minimum(a, b) - length, torch.maximum(a, b) + length  # no arc leaves its chord by more than that
     outside = (near[0][0] > x1) | (near[1][0] < x0) | (near[0][1] > y1) | (near[1][1] < y0)
     weight = torch.where(behind | (front & outside), 0.0, length.clamp_max(across)) * take(importance, many)
@@ -314,6 +315,7 @@ class Along:
 
     held: Held
     weight: Tensor  # (2, N)
+    lens: Tensor | None = None
     crossing: Crossing | None = None
     beside: tuple[Tensor, Tensor, Tensor] | None = None
 
@@ -321,13 +323,118 @@ class Along:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
         p = bodies.points(self.held)
         p = p if self.crossing is None else self.crossing.moved(bodies, p)
-        total = (film_places(bodies.camera, p) * self.weight).sum()
+        total = (film_places(bodies.camera, p, self.lens) * self.weight).sum()
         if self.beside is None:
             return total
         origin, away, weight = self.beside
         # What is infinitely far moves along with the camera.
         at = torch.where(torch.isfinite(origin), origin, bodies.camera.origin()) + away
-        return total - (film_places(bodies.camera, at) * weight).sum()
+        return total - (film_places(bodies.camera, at, None) * weight).sum()  # no camera with a lens holds anything
+
+
+@dataclass(frozen=True)
+class EdgePlace:
+    """Places of edges, N lanes.
+
+    Attributes:
+        held: the points.
+        mate: the other face of each edge ``(N,)``; -1: there is none.
+        cut: ``(N,)`` bool: two surfaces cut there.
+        p: where they are ``(3, N)``.
+        along: how ``p`` changes with the curve's parameter ``(3, N)``.
+        density: ``(N,)`` of the draw in that parameter.
+        lens: ``(2, N)`` samples of the lens; None: there is none.
+        s: ``(2, N)`` places on the film.
+        normal: ``(2, N)`` across the curve there, as long as ``s`` changes with the curve's parameter.
+    """
+
+    held: Held
+    mate: Tensor
+    cut: Tensor
+    p: Tensor
+    along: Tensor
+    density: Tensor
+    lens: Tensor | None
+    s: Tensor
+    normal: Tensor
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Draws places of what the camera may see from one point, by length on the film.
+
+    Attributes:
+        bodies: detached.
+        pieces: what the camera may see.
+        choice: among them.
+    """
+
+    bodies: Bodies
+    pieces: Pieces
+    choice: Distribution1D
+
+    def draw(self, u: Tensor, coin: Tensor, lens: Tensor | None) -> tuple[Tensor, EdgePlace]:
+        """Return lanes that got a place ``(n,)``, and the places.
+
+        Args:
+            u: ``(N,)`` in [0, 1), which curves and where on them.
+            coin: ``(N,)`` in [0, 1): which of two lines.
+            lens: ``(2, N)`` samples of the lens.
+        """
+        index, rest = self.choice.draw(u)
+        pieces = rows(self.pieces, index)
+        t, density = pieces.place(rest)
+        held, p, along = pieces.curves.moving(self.bodies, t)
+        density = density * take(self.choice.pmf, index)
+        lane = torch.arange(len(u), device=u.device)
+        curves = pieces.curves
+        return lane, _on_film(self.bodies, held, curves.mate, curves.cut, p, along, density, None)
+
+
+@dataclass(frozen=True)
+class SeenThroughLens:
+    """Draws places of edges as points of a lens see them.
+
+    Attributes:
+        occluders: all edges.
+        moves: ``(P,)`` bool: primitives that move; None: the camera does, and so all that it sees.
+    """
+
+    occluders: Occluders
+    moves: Tensor | None
+
+    def draw(self, u: Tensor, coin: Tensor, lens: Tensor | None) -> tuple[Tensor, EdgePlace]:
+        """See :meth:`Seen.draw`."""
+        bodies = self.occluders.bodies
+        o, _ = bodies.camera.rays(torch.zeros_like(u), torch.zeros_like(u), lens)
+        drawn = self.occluders.outline_points(u, coin, View(o, torch.ones_like(u)), creases=True)
+        if self.moves is not None:
+            move = take(self.moves, drawn.held.prim)
+            move = move | ((drawn.mate >= 0) & take(self.moves, drawn.mate.clamp_min(0)))
+            drawn = rows(drawn, move.nonzero().squeeze(1))
+        seen = bodies.camera.film_of(drawn.p, rows(lens, drawn.lane))
+        assert seen is not None
+        drawn = rows(drawn, (seen[2] > 0).nonzero().squeeze(1))
+        lens = rows(lens, drawn.lane)
+        return drawn.lane, _on_film(
+            bodies, drawn.held, drawn.mate, drawn.cut, drawn.p, drawn.along, drawn.density, lens
+        )
+
+
+def _on_film(
+    bodies: Bodies,
+    held: Held,
+    mate: Tensor,
+    cut: Tensor,
+    p: Tensor,
+    along: Tensor,
+    density: Tensor,
+    lens: Tensor | None,
+) -> EdgePlace:
+    s, jacobian = slopes(bodies.camera, p, lens)
+    slope = (jacobian * along).sum(1)
+    normal = torch.stack((slope[1], -slope[0]))
+    return EdgePlace(held, mate, cut, p, along, density, lens, s, normal)
 
 
 @dataclass(frozen=True)
@@ -336,14 +443,12 @@ class Primary:
 
     Attributes:
         bodies: detached.
-        pieces: what the camera may see.
-        choice: among them.
+        source: draws places of edges.
         traced: what sees, and draws.
     """
 
     bodies: Bodies
-    pieces: Pieces
-    choice: Distribution1D
+    source: Seen | SeenThroughLens
     traced: Traced
 
     @torch.no_grad()
@@ -352,80 +457,90 @@ class Primary:
 
         ``over``: they count as they move over what is seen on both sides, which is held in place.
         """
-        number, _, u, _ = self.traced.edges(Round(0, total), first, count, Use.PRIMARY)
-        index, rest = self.choice.draw(u)
-        chance = take(self.choice.pmf, index)
-        pieces = rows(self.pieces, index)
-        t, density = pieces.place(rest)
-        held, p, along = pieces.curves.moving(self.bodies, t)
-        s, jacobian = slopes(self.bodies.camera, p)
-        slope = (jacobian * along).sum(1)
-        normal = torch.stack((slope[1], -slope[0]))
-        length = (normal * normal).sum(0).sqrt()
-        value = worth.at(s)
+        number, key, u, coin = self.traced.edges(Round(0, total), first, count, Use.PRIMARY)
+        lane, place = self.source.draw(u, coin, self.traced.lens(key))
+        length = (place.normal * place.normal).sum(0).sqrt()
+        value = worth.at(place.s)
         index = ((length > 0) & (value != 0).any(0)).nonzero().squeeze(1)
-        s, p, normal, length = (take(x, index) for x in (s, p, normal, length))
-        unit = normal / length
-        mate = take(pieces.curves.mate, index)
-        step = steps_at(self.bodies, (take(held.prim, index), mate), s)
-        o, d = self._beside(s, unit, step)
-        share = self._share(rows(held, index), mate, p, s, step, o, d)
-        if bool(pieces.curves.cut.any()):
-            share = share * self._visible_nearby(rows(held, index), mate, take(pieces.curves.cut, index), p, s)
+        lane, place, length, value = rows((lane, place, length, value), index)
+        unit = place.normal / length
+        step = steps_at(self.bodies, (place.held.prim, place.mate), place.s, place.lens)
+        o, d = self._beside(place, unit, step)
+        share = self._share(place, step, o, d)
+        if bool(place.cut.any()):
+            share = share * self._visible_nearby(place)
         seen = (share > 0).nonzero().squeeze(1)
-        both = torch.cat((seen, seen + len(index)))
-        o, d, index = take(o, both), take(d, both), take(index, seen)
-        values = look(o, d, take(number, index).repeat(2)) if len(index) else torch.zeros(len(value), 0).to(value)
-        jump = values[:, : len(index)] - values[:, len(index) :]
-        worthy = (take(value, index) * jump).sum(0) * take(share, seen)
-        chance, normal = take(chance * density, index) * total, take(normal, seen)
+        both = torch.cat((seen, seen + len(lane)))
+        lane, place, value, share, o, d = *rows((lane, place, value, share), seen), take(o, both), take(d, both)
+        n = len(seen)
+        values = look(o, d, take(number, lane).repeat(2)) if n else torch.zeros(len(value), 0).to(value)
+        jump = values[:, :n] - values[:, n:]
+        worthy = (value * jump).sum(0) * share
+        chance = place.density * total
         beside = None
         if over:
-            each = (take(value, index).repeat(1, 2) * values).sum(0) * (take(share, seen) / chance).repeat(2)
-            each = torch.cat((each[: len(index)], -each[len(index) :]))
+            each = (value.repeat(1, 2) * values).sum(0) * (share / chance).repeat(2)
+            each = torch.cat((each[:n], -each[n:]))
             t, prim = self.traced.nearest(o, d)
             met = prim >= 0
-            beside = torch.where(met, o, torch.inf), torch.where(met, t, 1.0) * d, normal.repeat(1, 2) * each
-        held, mate, cut = rows((held, pieces.curves.mate, pieces.curves.cut), index)
-        return Along(held, normal * (worthy / chance), crossing_of(self.bodies, cut, held, mate), beside)
+            beside = torch.where(met, o, torch.inf), torch.where(met, t, 1.0) * d, place.normal.repeat(1, 2) * each
+        crossing = crossing_of(self.bodies, place.cut, place.held, place.mate)
+        return Along(place.held, place.normal * (worthy / chance), place.lens, crossing, beside)
 
-    def _beside(self, s: Tensor, unit: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+    def _beside(self, place: EdgePlace, unit: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """Return rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""
-        places = torch.cat((s - unit * step, s + unit * step), 1)
-        o, d = self.bodies.camera.rays(places[0], places[1], None)
+        places = torch.cat((place.s - unit * step, place.s + unit * step), 1)
+        lens = None if place.lens is None else place.lens.repeat(1, 2)
+        o, d = self.bodies.camera.rays(places[0], places[1], lens)
         return o.expand_as(d), d
 
-    def _share(self, held: Held, mate: Tensor, p: Tensor, s: Tensor, step: Tensor, o: Tensor, d: Tensor) -> Tensor:
+    def _share(self, place: EdgePlace, step: Tensor, o: Tensor, d: Tensor) -> Tensor:
         """Return how much of each edge counts ``(N,)``: nothing where it is hidden, a part where others lie on it."""
-        n = p.shape[1]
+        n = place.p.shape[1]
         t, prim = self.traced.nearest(o, d)
-        away = p - o[:, :n]
+        away = place.p - o[:, :n]
         reach = (away * d[:, :n]).sum(0)
         t, prim = t.view(2, n), prim.view(2, n)
-        own = (prim == held.prim) | (prim == mate)  # a round surface comes forward quickly behind its outline
+        own = (prim == place.held.prim) | (
+            prim == place.mate
+        )  # a round surface comes forward quickly behind its outline
         seen = (t > reach * torch.where(own, _OWN, _BEFORE)).all(0)
-        if self.traced.wave.context.world.materials.opacity is not None:
+        if self.traced.has_opacity:
             seen = torch.ones_like(seen)  # what hides may let pass
         near = (t - reach).abs() < reach * 2.0**-8
-        return torch.where(seen, share_of(self.bodies, held, mate, s, prim, near, step), 0.0)
+        return torch.where(seen, share_of(self.bodies, place, prim, near, step), 0.0)
 
-    def _visible_nearby(self, held: Held, mate: Tensor, cut: Tensor, p: Tensor, s: Tensor) -> Tensor:
+    def _visible_nearby(self, place: EdgePlace) -> Tensor:
         """Return a mask ``(N,)`` of edges that are not hidden close to them, by a surface that cuts through theirs.
 
         A step beside an edge tells this too late: behind its outline a round surface comes forward by the root of the step, so
         that a ray beside an outline below a floor meets what stands out of the floor.
         """
-        o, d = self.bodies.camera.rays(s[0], s[1], None)
+        o, d = self.bodies.camera.rays(place.s[0], place.s[1], place.lens)
         o = o.expand_as(d)
         t, prim = self.traced.nearest(o, d)
-        reach = ((p - o) * d).sum(0)
-        outline = ~cut & ((prim == held.prim) | (prim == mate))  # which the ray may meet a little before, or miss
+        reach = ((place.p - o) * d).sum(0)
+        # An outline may be met a little before, or missed.
+        outline = ~place.cut & ((prim == place.held.prim) | (prim == place.mate))
         seen = (t > reach * _NEAR) | outline
-        if self.traced.wave.context.world.materials.opacity is not None:
-            seen = torch.ones_like(seen)
-        return seen
+        return torch.ones_like(seen) if self.traced.has_opacity else seen
 
 
-def primary_of(bodies: Bodies, pieces: Pieces, traced: Traced) -> Primary:
-    """Return the estimator over ``pieces``."""
-    return Primary(bodies, pieces, Distribution1D.of(pieces.weight, torch.float64, even=0.0), traced)
+def primary_of(
+    scene: Scene,
+    bodies: Bodies,
+    poses: dict[str, Tensor],
+    traced: Traced,
+    bounds: Bounds,
+    cuts: Cuts | None,
+    moves: Tensor | None,
+) -> Primary | None:
+    """Return the estimator; None where the camera sees no edge that moves. Arguments are as for :func:`pieces_of`."""
+    if bodies.camera.lens:
+        every = marked_primitives(scene, lambda _: True) if moves is None else moves
+        occluders = occluders_of(scene, bodies, poses, every, cuts, lights_move=False)
+        return None if occluders is None else Primary(bodies, SeenThroughLens(occluders, moves), traced)
+    pieces = pieces_of(scene, bodies, poses, bounds, cuts, moves)
+    if pieces is None:
+        return None
+    return Primary(bodies, Seen(bodies, pieces, Distribution1D.of(pieces.weight, torch.float64, even=0.0)), traced)

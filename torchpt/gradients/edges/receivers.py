@@ -24,7 +24,7 @@ from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.film import Worth, film_places, slopes
-from torchpt.gradients.edges.traced import Traced
+from torchpt.gradients.edges.traced import Passing, Traced
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.vectors import cross, dot, largest, rows, take
 from torchpt.paths.roulette import russian_roulette, survival_probability
@@ -38,6 +38,8 @@ _ROUNDING = 2.0**-18
 _MAX_VERTICES = 32
 #: From this vertex on roulette plays.
 _ROULETTE = 3
+#: Random numbers of rays to the camera are as of vertices behind those of all paths.
+_TO_CAMERA = 1 << 12
 #: What ends so close to a point, against the way to it, ends at it: of the point's own primitive, and of others.
 _NEAR, _NEAREST = 2.0**-10, 2.0**-14
 #: Pixels beside the film that are looked at, for wide filters.
@@ -106,6 +108,7 @@ class Prefix:
         lane: ``(M,)`` the receivers.
         weight: ``(3, M)`` worth of the light that arrives at them, by area.
         place: ``(2, M)`` of the paths on the film.
+        lens: ``(2, M)`` samples of the lens that they pass; None: there is none.
         vertices: those behind the camera, first that which it sees; the last is the receiver.
     """
 
@@ -113,6 +116,7 @@ class Prefix:
     lane: Tensor
     weight: Tensor
     place: Tensor
+    lens: Tensor | None
     vertices: tuple[PathVertex, ...]
 
     @property
@@ -122,7 +126,7 @@ class Prefix:
 
     def taken(self, index: Tensor) -> Prefix:
         """Return some of the lanes."""
-        return Prefix(self.frame, *rows((self.lane, self.weight, self.place, self.vertices), index))
+        return Prefix(self.frame, *rows((self.lane, self.weight, self.place, self.lens, self.vertices), index))
 
     def moves(self) -> Tensor:
         """Return a mask ``(M,)`` of the paths that move."""
@@ -147,7 +151,7 @@ class Prefix:
         first, *others = self.vertices
         x = bodies.points(first.held)
         if not self.frame.holds_first:
-            o, d = bodies.camera.rays(self.place[0], self.place[1], None)
+            o, d = bodies.camera.rays(self.place[0], self.place[1], self.lens)
             x = o + d * (dot(first.n, x - o) / dot(first.n, d))
         before = first.p
         for vertex in others:
@@ -188,17 +192,17 @@ def prefixes_of(
     carried = torch.ones_like(wi)
     vertices = [_vertex(frame, spot)]
     for k in range(1, longest + 1):
-        index, place, wo = _seen(frame, spot)
+        index, place, lens, wo = _seen(frame, spot, Passing(take(key, lane), _TO_CAMERA + k))
         if len(index):
             seen = spot.taken(index)
             back = take(wi, index).to(spot.p)
             own = None if side is None else take(side, index)
             sent = seen.sent(wo.to(spot.p), back, own).double()
-            _, jacobian = slopes(frame.bodies.camera, seen.p.double())
+            _, jacobian = slopes(frame.bodies.camera, seen.p.double(), lens)
             area = dot(cross(jacobian[0], jacobian[1]), seen.n.double()).abs()
             weight = frame.worth.at(place) * sent * take(carried, index) * area
             chain = tuple(rows(vertex, index) for vertex in reversed(vertices))
-            prefix = Prefix(frame, take(lane, index), weight, place, chain)
+            prefix = Prefix(frame, take(lane, index), weight, place, lens, chain)
             counts = (weight != 0).any(0)
             if moves is not None:
                 counts &= prefix.moves() | take(moves, prefix.lane)
@@ -216,7 +220,7 @@ def prefixes_of(
             chance = survival_probability(None, 1.0, largest(carried.abs()), None)
             alive, carried = russian_roulette(chance, draws, alive, carried)
         on = alive.nonzero().squeeze(1)
-        spot = met(frame.traced, take(o, on), take(d, on))
+        spot = met(frame.traced, take(o, on), take(d, on), Passing(take(key, take(lane, on)), k + 1))
         some = (spot.hit.prim >= 0).nonzero().squeeze(1)
         kept = take(on, some)
         if not len(kept):
@@ -256,22 +260,27 @@ def _vertex(frame: MovingFrame, spot: Spot) -> PathVertex:
     return PathVertex(spot.held(frame.bodies), spot.p.double(), spot.n.double())
 
 
-def _seen(frame: MovingFrame, spot: Spot) -> tuple[Tensor, Tensor, Tensor]:
-    """Return which points the camera sees ``(n,)``, their places on the film, and directions to the camera."""
+def _seen(frame: MovingFrame, spot: Spot, passing: Passing) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+    """Return which points the camera sees ``(n,)``, their places on the film and on the lens, and directions to the camera.
+
+    ``passing``: decides which surfaces between them rays pass by their opacity; its numbers choose points on the lens too.
+    """
     camera, x = frame.bodies.camera, spot.p.double()
-    seen = camera.film_of(x)
+    lens = frame.traced.lens(passing.key, passing.depth)
+    seen = camera.film_of(x, lens)
     assert seen is not None
-    s = film_places(camera, x)
+    s = film_places(camera, x, lens)
     width, height = camera.resolution
     good = (seen[2] > 0) & (seen[3] > 0) & (s > -_MARGIN).all(0) & (s[0] < width + _MARGIN) & (s[1] < height + _MARGIN)
     index = good.nonzero().squeeze(1)
-    s, x = take(s, index), take(x, index)
-    o, d = camera.rays(s[0], s[1], None)
+    s, x, lens = rows((s, x, lens), index)
+    o, d = camera.rays(s[0], s[1], lens)
     o = o.expand_as(d)
     away = x - o
-    t, prim = frame.traced.nearest(o, d)
     reach = dot(away, d)
+    passing = replace(passing, key=take(passing.key, index), stop=reach * (1.0 - _NEAR))
+    t, prim = frame.traced.nearest(o, d, passing)
     off = (t - reach).abs() / reach
     visible = ((prim == take(spot.hit.prim, index)) & (off < _NEAR)) | (off < _NEAREST)
     some = visible.nonzero().squeeze(1)
-    return take(index, some), take(s, some), -take(d, some)
+    return take(index, some), take(s, some), rows(lens, some), -take(d, some)

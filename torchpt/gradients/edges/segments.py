@@ -34,7 +34,7 @@ from torchpt.gradients.edges.cuts import Crossing, crossing_of
 from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.occluders import Occluders
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, one_of_each, prefixes_of
-from torchpt.gradients.edges.traced import Use
+from torchpt.gradients.edges.traced import Passing, Use
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.sampling import Distribution1D, uniform_sphere, uniform_triangle
 from torchpt.math.vectors import Frame, concatenate_lanes, cross, dot, normalize, rows, take
@@ -370,17 +370,18 @@ class Segments:
         coins = torch.stack((coin, draws.one(Dimension.LOBE).double()))
         even = torch.cat((u[None], draws.two(Dimension.BSDF).double()))
         u, scale = turn.draw(even)
-        rays, spot, lane = self._receivers(self.sampler.draw(u[0], u[1:], aim, coins))
+        rays, spot, lane = self._receivers(self.sampler.draw(u[0], u[1:], aim, coins), key)
         found = self._samples(rays, spot, *rows((number, key, scale), lane)) if len(lane) else None
         if turn.lesson is not None and found is not None:
             brought = torch.zeros_like(scale).index_add_(0, found.number - number[0], found.brought(self.frame))
             turn.lesson.append((even, brought / scale))
         return found
 
-    def _receivers(self, rays: SegmentRays) -> tuple[SegmentRays, Spot, Tensor]:
+    def _receivers(self, rays: SegmentRays, key: Tensor) -> tuple[SegmentRays, Spot, Tensor]:
         """Return the rays that meet a receiver, the receivers, and which lanes these are."""
         tiny = self.frame.rounding(rays.held.prim)
-        spot = met(self.frame.traced, rays.e + (rays.omega + rays.out) * (4.0 * tiny), rays.omega)
+        begin = rays.e + (rays.omega + rays.out) * (4.0 * tiny)
+        spot = met(self.frame.traced, begin, rays.omega, Passing(key, depth=1))
         p, hits = spot.p.double(), spot.hit.prim >= 0
         away = p - rays.e
         r = dot(away, away).sqrt()
@@ -409,14 +410,17 @@ class Segments:
         step = r * _STEP + tiny
         weight = rays.weight * scale / rays.density
         counts = (r > 16.0 * tiny) & (weight > 0) & torch.isfinite(weight)
-        seen = [met(self.frame.traced, o, way + rays.m * (step * sign)) for sign in _SIGNS]
+        # The ray to the receiver has decided which surfaces before the edge it passes; paths behind it decide about the others.
+        free = r - self._ahead(rays, rays.curvature > 0, r, step)
+        passing = self.frame.traced.of_paths(number, Use.BEHIND, free)
+        seen = [met(self.frame.traced, o, way + rays.m * (step * sign), passing) for sign in _SIGNS]
         for y in seen:
             counts &= self._ends_at(rays, y, r, step)
         lane = counts.nonzero().squeeze(1)
         if not len(lane):
             return None
         rays, receiver, number, key = rows(rays, lane), receiver.taken(lane), take(number, lane), take(key, lane)
-        seen, o, r, weight = [y.taken(lane) for y in seen], take(o, lane), take(r, lane), take(weight, lane)
+        seen, free, r, weight = [y.taken(lane) for y in seen], take(free, lane), take(r, lane), take(weight, lane)
         moves = self.frame.moving(rays.held.prim) | self.frame.moving(rays.mate)
         for y in seen:
             moves = moves | self.frame.moving(y.hit.prim)
@@ -426,7 +430,7 @@ class Segments:
         for prefix in one_of_each(found, self.frame.traced.draws(key).one(Dimension.ROULETTE).double()):
             depth = self.depth if self.depth < 0 else self.depth - prefix.count
             scale = prefix.weight * take(weight, prefix.lane)
-            light = self._reflected(seen, o, number, prefix.lane, depth)
+            light = self._reflected(seen, free, number, prefix.lane, depth)
             prefixes.append((prefix, (scale[:, None] * light).sum(0)))
         if not prefixes:
             return None
@@ -436,10 +440,17 @@ class Segments:
 
     def _ends_at(self, rays: SegmentRays, y: Spot, r: Tensor, step: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of rays beside edges that do not end before these, but for what touches there."""
-        own = (rays.curvature > 0) & (y.hit.prim == rays.held.prim)  # a round surface comes forward quickly
-        ahead = torch.where(own, 12.0 * (step / rays.curvature.clamp_min(1e-3)).sqrt(), r * _NEAR)
+        own = (rays.curvature > 0) & (y.hit.prim == rays.held.prim)
+        ahead = self._ahead(rays, own, r, step)
         touches = dot(y.n.double(), rays.e - y.p.double()).abs() < 6.0 * step
         return (y.hit.prim < 0) | (y.hit.t.double() > r - ahead) | touches
+
+    def _ahead(self, rays: SegmentRays, own: Tensor, r: Tensor, step: Tensor) -> Tensor:
+        """Return how far before edges ``(N,)`` what ends there ends at them; ``own``: at their own round surfaces.
+
+        These come forward quickly.
+        """
+        return torch.where(own, 12.0 * (step / rays.curvature.clamp_min(1e-3)).sqrt(), r * _NEAR)
 
     def _side(self, sign: float, y: Spot, r: Tensor) -> Side:
         """Return what receivers see beside the edge; nothing is as far as the edge."""
@@ -447,14 +458,23 @@ class Segments:
         share, moves = self.frame.share(y.hit.prim, reach), self.frame.moving(y.hit.prim)
         return Side(sign, y.held(self.frame.bodies), reach, share, moves)
 
-    def _reflected(self, seen: list[Spot], o: Tensor, number: Tensor, lane: Tensor, depth: int) -> Tensor:
-        """Return the light ``(3, 2, M)`` that what was met reflects in lanes ``(M,)``, by paths of so many vertices."""
+    def _reflected(self, seen: list[Spot], free: Tensor, number: Tensor, lane: Tensor, depth: int) -> Tensor:
+        """Return the light ``(3, 2, M)`` that what was met reflects in lanes ``(M,)``, by paths of so many vertices.
+
+        ``free``: distances before which surfaces that are not opaque let everything pass.
+        """
         found = torch.zeros(3, len(seen) * len(lane), dtype=torch.float64, device=lane.device)
         met_some = torch.cat([take(y.hit.prim, lane) for y in seen]) >= 0
         some = met_some.nonzero().squeeze(1)
         if len(some):
-            mine, d = torch.cat([lane] * len(seen)), torch.cat([take(y.d, lane) for y in seen], 1)
-            rays = take(o, take(mine, some)), take(d, some).double(), take(number, take(mine, some)), Use.BEHIND
-            radiance = self.frame.traced.radiance
-            found[:, some] = radiance(*rays, depth) - radiance(*rays, 1)  # without light of sources themselves
+            traced, mine = self.frame.traced, torch.cat([lane] * len(seen))
+            o, d = (
+                torch.cat([take(t, lane) for t in sides], 1) for sides in zip(*((y.o, y.d) for y in seen), strict=True)
+            )
+            if traced.has_opacity:
+                t = torch.cat([torch.minimum(free, y.hit.t.double() * (1.0 - _NEAR))[lane] for y in seen])
+                o = o.double() + d.double() * t.clamp_min(0.0)
+            rays = take(o, some), take(d, some).double(), take(number, take(mine, some)), Use.BEHIND
+            radiance = traced.radiance(*rays, depth)
+            found[:, some] = radiance - traced.radiance(*rays, 1)  # without light of sources themselves
         return found.view(3, len(seen), -1)

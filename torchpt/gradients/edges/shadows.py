@@ -13,7 +13,7 @@ from torchpt.gradients.edges.curves import View
 from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.occluders import EdgePoints, Occluders
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
-from torchpt.gradients.edges.traced import Use
+from torchpt.gradients.edges.traced import Passing, Use
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.sampling import Distribution1D, concentric_disk, uniform_sphere, uniform_triangle
 from torchpt.math.vectors import cross, dot, luminance, rows, take
@@ -284,7 +284,7 @@ class Shadows:
         u, scale = turn.draw(even)
         beam = self.sources.draw(u[1:])
         passed = self.occluders.outline_points(u[0], coin, beam.view)
-        beam, passed, spot, outward = self._past(rows(beam, passed.lane), passed)
+        beam, passed, spot, outward = self._past(rows(beam, passed.lane), passed, take(key, passed.lane))
         if not len(passed.lane):
             return None
         cast = self._cast(take(key, passed.lane), beam, passed, spot, outward, take(scale, passed.lane))
@@ -295,8 +295,11 @@ class Shadows:
             turn.lesson.append((even, brought / scale))
         return cast
 
-    def _past(self, beam: Beam, passed: EdgePoints) -> tuple[Beam, EdgePoints, Spot, Tensor]:
-        """Trace rays past edges: return what they meet, and unit vectors ``(3, N)`` across the edge to the lit side."""
+    def _past(self, beam: Beam, passed: EdgePoints, key: Tensor) -> tuple[Beam, EdgePoints, Spot, Tensor]:
+        """Trace rays past edges: return what they meet, and unit vectors ``(3, N)`` across the edge to the lit side.
+
+        The rays to both sides pass the same surfaces by their opacity, but for the edge's own.
+        """
         traced = self.frame.traced
         toward = beam.view.toward(passed.p)
         w = torch.as_tensor(beam.view.w, device=toward.device).expand(toward.shape[1])
@@ -307,17 +310,22 @@ class Shadows:
         aside = aside / dot(aside, aside).sqrt()
         step = aside * (dot(way, way).sqrt() * _STEP)
         n = len(passed.lane)
-        t, prim = traced.nearest(torch.cat((o, o), 1), torch.cat((way + step, way - step), 1))
+        passing = Passing(torch.cat((key, key), 1), depth=1)
+        t, prim = traced.nearest(torch.cat((o, o), 1), torch.cat((way + step, way - step), 1), passing)
         t, prim = t.view(2, n), prim.view(2, n)
         own = (prim == passed.held.prim) | ((prim == passed.mate) & (passed.mate >= 0))
         hidden = t < torch.where(own, 1.0 - _OWN, 1.0 - _NEAR)
-        near = (t < 1.0 + _NEAR) & ~hidden
-        far = (t > 1.0 + _NEAR) & (prim >= 0)
+        # Rays that pass the front of a round surface may stop at its back.
+        reach = torch.where(own & passed.bent, 1.0 + _OWN, 1.0 + _NEAR)
+        near = (t < reach) & ~hidden
+        far = (t > reach) & (prim >= 0)
         good = (near[0] & far[1]) | (near[1] & far[0])
         index = good.nonzero().squeeze(1)
         side = torch.where(take(far[0], index), 1.0, -1.0)
         outward = take(aside, index) * side
-        spot = met(traced, take(o, index), take(way, index) + take(step, index) * side)
+        spot = met(
+            traced, take(o, index), take(way, index) + take(step, index) * side, Passing(take(key, index), depth=1)
+        )
         some = (spot.hit.prim >= 0).nonzero().squeeze(1)
         index = take(index, some)
         return rows(beam, index), rows(passed, index), spot.taken(some), take(outward, some)
@@ -336,7 +344,7 @@ class Shadows:
             return (v - leaving * (dot(n, v) / slope)) * stretch
 
         along, across = follow(passed.along), follow(outward)
-        brought = self.sources.brought(beam, x) * (dot(n, wi).abs() * scale / passed.density)
+        brought = self.sources.brought(beam, x) * (dot(n, wi).abs() * scale * passed.part / passed.density)
         edge = cross(n, along)
         edge = edge * -torch.sign(dot(edge, across))
         moves = self.frame.moving(passed.held.prim) | self.frame.moving(passed.mate)

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from itertools import count
 
 import torch
 from torch import Tensor
 
 from torchpt.compiler.graph import Unsupported
+from torchpt.core.tree import map_leaves
 from torchpt.engines.engine import Kernels, forward_kernels, trace
 from torchpt.gradients.edges.guide import Round
+from torchpt.math.vectors import dot, rows, take
 from torchpt.paths.state import T_MAX, PathState
+from torchpt.paths.transmission import non_opaque, opacity_at, origins_behind
 from torchpt.paths.wave import PixelSet, Rays, Wave, clamp_scale
 from torchpt.physics.film import Film
 from torchpt.physics.samplers import Dimension, Draws, Sampler, salts
+from torchpt.physics.shapes.geometry import Hit
 from torchpt.scene import Scene
 from torchpt.scene.prepare import kernels_of, make_wave, uses_kernels
 from torchpt.scene.settings import SAMPLERS, Settings
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["Along", "Traced", "Use", "traced_of"]
+__all__ = ["Along", "Passing", "Traced", "Use", "traced_of"]
 
 
 # ---- Radiance along rays for those who ask again and again, such as edges: one sample a ray, without a render around it
@@ -82,6 +87,23 @@ class Use(IntEnum):
 
 
 @dataclass(frozen=True)
+class Passing:
+    """Decides which surfaces N rays pass by their opacity; in a scene where all are opaque nothing of it is read.
+
+    Attributes:
+        key: of the sampler ``(rows, N)``.
+        depth: vertex that rays reach: the same key and depth as of a path pass the same surfaces.
+        free: ``(N,)`` distances before which rays pass all surfaces that are not opaque; None: nowhere.
+        stop: ``(N,)`` distances from which on rays pass none; None: they may everywhere.
+    """
+
+    key: Tensor
+    depth: int
+    free: Tensor | None = None
+    stop: Tensor | None = None
+
+
+@dataclass(frozen=True)
 class Traced:
     """A render's wave whose rays are given one by one, what traces them, and the random numbers of edges.
 
@@ -96,6 +118,11 @@ class Traced:
     def dtype(self) -> torch.dtype:
         """Return the dtype of the lanes."""
         return self.wave.context.plan.dtype
+
+    @property
+    def has_opacity(self) -> bool:
+        """Return True where some surfaces let rays pass."""
+        return self.wave.context.world.materials.opacity is not None
 
     def key(self, number: Tensor, use: Use) -> Tensor:
         """Return the sampler's keys of samples ``(N,)`` int64; those of different uses share no numbers."""
@@ -120,10 +147,63 @@ class Traced:
         key = self.key(number, use)
         return number, key, *self.edge(local, key, turn.count)
 
-    def nearest(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """Return how far rays ``(3, N)`` go, in units of ``d``, and the primitives that they meet; -1 for none."""
-        t, prim, _, _ = self.wave.accel.intersect(o, d, torch.full_like(d[0], T_MAX, dtype=torch.float32))
-        return t.double(), prim.long()
+    def lens(self, key: Tensor, depth: int = 0) -> Tensor | None:
+        """Return samples of the lens ``(2, N)`` float64; None without a lens. ``depth``: as for :meth:`draws`."""
+        return self.draws(key, depth).two(Dimension.LENS).double() if self.wave.camera.lens else None
+
+    def of_paths(self, number: Tensor, use: Use, free: Tensor | None = None) -> Passing:
+        """Return what decides in :meth:`radiance` which surfaces rays pass; ``free`` as of :class:`Passing`."""
+        return Passing(self.key(number, use), depth=1, free=free)
+
+    def nearest(self, o: Tensor, d: Tensor, passing: Passing | None = None) -> tuple[Tensor, Tensor]:
+        """Return how far rays ``(3, N)`` go, in units of ``d``, and the primitives that they meet; -1 for none.
+
+        ``passing``: decides which surfaces rays pass by their opacity; None: they pass none.
+        """
+        hit = self.intersect(o, d, passing)
+        return hit.t.double(), hit.prim
+
+    def intersect(self, o: Tensor, d: Tensor, passing: Passing | None = None) -> Hit:
+        """Return the hits of rays ``(3, N)``, distances in units of ``d``; ``passing``: as for :meth:`nearest`."""
+        t, prim, u, v = self.wave.accel.intersect(o, d, torch.full_like(d[0], T_MAX, dtype=torch.float32))
+        hit = Hit(t, prim.long(), u, v)
+        if passing is None or not self.has_opacity:
+            return hit
+        o, d, free, stop = o.to(self.dtype), d.to(self.dtype), passing.free, passing.stop
+        if free is not None:
+            hit = self._behind(o, d, hit, lambda lane, at, _: at.t < take(free, lane))
+
+        def passes(lane: Tensor, at: Hit, step: int) -> Tensor:
+            opacity = opacity_at(self.wave.context.world, take(o, lane), take(d, lane), at, miss=1.0)
+            draws = Draws(self.wave.context.plan.sampler, take(passing.key, lane), salts(passing.depth, d.device, step))
+            on = draws.one(Dimension.OPACITY) >= opacity
+            return on if stop is None else on & (at.t < take(stop, lane))
+
+        return self._behind(o, d, hit, passes)
+
+    def _behind(self, o: Tensor, d: Tensor, hit: Hit, passes: Callable[[Tensor, Hit, int], Tensor]) -> Hit:
+        """Return the hits of rays behind the surfaces that ``passes`` lets them pass.
+
+        Args:
+            o: origins ``(3, N)``.
+            d: directions ``(3, N)``.
+            hit: the first hits.
+            passes: gets lanes ``(n,)``, their hits, and how many surfaces they have passed; returns a mask ``(n,)``.
+        """
+        world = self.wave.context.world
+        lane = torch.arange(d.shape[1], device=d.device)
+        for step in count():
+            prim = take(hit.prim, lane)
+            lane = take(lane, ((prim >= 0) & non_opaque(world, prim)).nonzero().squeeze(1))
+            lane = take(lane, passes(lane, rows(hit, lane), step).nonzero().squeeze(1))
+            if not len(lane):
+                break
+            start, way = take(o, lane), take(d, lane)
+            behind = origins_behind(world, start, way, rows(hit, lane))
+            on = self.intersect(behind, way)
+            on = replace(on, t=on.t + (dot(behind - start, way) / dot(way, way)).to(on.t))
+            hit = map_leaves(lambda old, new, lane=lane: old.index_copy(0, lane, new), hit, on)
+        return hit
 
     def given(self, o: Tensor, d: Tensor, number: Tensor) -> Wave:
         """Return the wave along rays ``(3, N)``, ``d`` of any length, with the random numbers of samples ``number (N,)``."""

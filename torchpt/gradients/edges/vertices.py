@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
-from torchpt.gradients.edges.traced import Traced
+from torchpt.gradients.edges.traced import Passing, Traced
 from torchpt.math.vectors import cross, dot, rows, take
 from torchpt.paths.integrators.path import partition
 from torchpt.paths.surface import surface_at
@@ -129,13 +129,20 @@ class Spot:
         return o, d, weight
 
 
-def met(traced: Traced, o: Tensor, d: Tensor) -> Spot:
-    """Return where rays ``(3, N)`` meet surfaces; ``d`` of any length."""
+def met(traced: Traced, o: Tensor, d: Tensor, passing: Passing | None = None) -> Spot:
+    """Return where rays ``(3, N)`` meet surfaces.
+
+    Args:
+        traced: what sees.
+        o: origins.
+        d: directions, of any length.
+        passing: decides which surfaces rays pass by their opacity; its distances are in the lanes' unit of length. None: none.
+    """
     world, dtype = traced.wave.context.world, traced.dtype
     d = (d / (d * d).sum(0).sqrt()).to(dtype)
     o = o.to(dtype)
-    t, prim, u, v = traced.wave.accel.intersect(o, d, torch.full_like(d[0], torch.inf))
-    hit = Hit(t.to(dtype), prim.long(), u.to(dtype), v.to(dtype))
+    hit = traced.intersect(o, d, passing)
+    hit = Hit(hit.t.to(dtype), hit.prim, hit.u.to(dtype), hit.v.to(dtype))
     p, n = torch.zeros_like(d), torch.zeros_like(d)
     some = (hit.prim >= 0).nonzero().squeeze(1)
     at = interact(world, take(o, some), take(d, some), rows(hit, some))

@@ -131,12 +131,15 @@ class Camera(ABC):
         """
         raise NotImplementedError
 
-    def film_of(self, p: Tensor) -> Tensor | None:
+    def film_of(self, p: Tensor, u: Tensor | None = None) -> Tensor | None:
         """Return homogeneous film coordinates ``x h``, ``y h``, ``h`` and the depth of points ``p (3, N)``, as ``(4, N)``.
 
         They are affine in ``p``, so lines stay lines. ``x, y`` are in pixels as for :meth:`rays`; points with ``h`` or depth
-        not positive lie behind the camera. None: the camera has no such map (a lens blurs), and edges in its picture are not
-        differentiated.
+        not positive lie behind the camera. None: the camera has no such map, and edges in its picture are not differentiated.
+
+        Args:
+            p: points ``(3, N)``.
+            u: ``(2, N)`` in [0, 1), samples the lens as in :meth:`rays`; None: its middle, or a camera without a lens.
         """
         return None
 

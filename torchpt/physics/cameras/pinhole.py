@@ -144,9 +144,9 @@ class Pinhole(Camera):
         """See :meth:`Camera.film_density`; a lens changes nothing, as its rays meet in a plane."""
         return self.area_scale(self.project_homogeneous(d)[2])
 
-    def film_of(self, p: Tensor) -> Tensor | None:
-        """Return homogeneous film coordinates, as :meth:`Camera.film_of`; None with a lens."""
-        return None if self.lens else self.project_homogeneous(p - self.origin())
+    def film_of(self, p: Tensor, u: Tensor | None = None) -> Tensor:
+        """See :meth:`Camera.film_of`."""
+        return self.project_homogeneous(p - self.origin())
 
     def project_homogeneous(self, away: Tensor) -> Tensor:
         """Return :meth:`film_of` for points at offsets ``away (3, N)`` from the camera's origin."""

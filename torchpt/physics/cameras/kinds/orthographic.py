@@ -51,7 +51,7 @@ class Orthographic(Camera):
         side = self.film[0] / self.width  # pixels per unit of length
         return (side * side).expand_as(d[0])
 
-    def film_of(self, p: Tensor) -> Tensor:
+    def film_of(self, p: Tensor, u: Tensor | None = None) -> Tensor:
         """See :meth:`Camera.film_of`."""
         right, up, depth = self.covectors() @ (p - self.origin())  # components along the axes of the picture
         width, height = self.film[0], self.film[1]

@@ -65,12 +65,26 @@ class ThinLens(Pinhole):
         """Return points ``(2, N)`` on a lens of radius 1: to the left in the picture, and up."""
         return concentric_disk(u) if self.blades == 0 else uniform_polygon(u, self.blades)
 
+    def film_of(self, p: Tensor, u: Tensor | None = None) -> Tensor:
+        """See :meth:`Camera.film_of`: from each point of the lens, a pinhole whose film is moved so as to keep the focus."""
+        if u is None:
+            return super().film_of(p)
+        on_lens = self._on_lens(u)
+        seen = self.project_homogeneous(p - (self.origin() + on_lens))
+        x, y, _, _ = self.project_homogeneous(on_lens)
+        depth, far = seen[2], self.focus_distance
+        return torch.stack((seen[0] + x * (depth / far), seen[1] + y * (depth / far), depth, depth))
+
+    def _on_lens(self, u: Tensor) -> Tensor:
+        """Return points of the lens ``(3, N)``, from the camera's origin."""
+        left, high = self._lens(u) * self.aperture_radius
+        right, up, _ = self.axes()
+        return up * high - right * left
+
     def connect(self, p: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """See :meth:`Camera.connect`."""
         assert u is not None
-        left, high = self._lens(u) * self.aperture_radius
-        right, up, _ = self.axes()
-        on_lens = up * high - right * left  # from the camera's origin
+        on_lens = self._on_lens(u)
         away = p - (self.origin() + on_lens)
         depth = self.project_homogeneous(away)[2]
         ahead = depth > 0
