@@ -5,7 +5,9 @@ of a chunk there is neither an operator of torch nor a barrier between threads.
 
 ======================  =====================================================================================
 ``threads.py``          tasks on threads, and adding samples to the film: start here
-``engine.py``           the engine of one thread: kernel calls, ray searches, and the stages of a walk
+``engine.py``           the engine of one thread: the stages of a walk
+``calls.py``            calls of kernels by one thread: counters, arguments
+``searches.py``         searches of rays between stages, and behind surfaces that they pass
 ``eagerly.py``          a vertex by tensor operations, for BSDF models that cannot be compiled
 ``joins.py``            splats and connections: their shadow rays, and what they bring
 ``programs.py``         the kernels of a render, compiled on first use, and shared between renders

@@ -36,20 +36,13 @@ from torchpt.compiler.sinks import Sinks
 from torchpt.compiler.target import Target
 from torchpt.core.memory import Budget, Span, explain_out_of_memory, fits_in_memory
 from torchpt.core.tree import moved
+from torchpt.engines.kernels.calls import Arguments, LaneCount
 from torchpt.engines.kernels.driver import Cuda, HostCopy, cuda_of
-from torchpt.engines.kernels.engine import (
-    Arguments,
-    Chunk,
-    ChunkSearch,
-    KernelsEngine,
-    LaneCount,
-    Paths,
-    count_samples,
-    film_words,
-)
+from torchpt.engines.kernels.engine import Chunk, KernelsEngine, Paths, count_samples, film_words
 from torchpt.engines.kernels.joins import Joins, TensorJoins
 from torchpt.engines.kernels.layout import HIT, Block, Layout, Rows
 from torchpt.engines.kernels.programs import Kernel, Kernels, NamedTensors, probed_kernels, records_of, trace_stage
+from torchpt.engines.kernels.searches import ChunkSearch
 from torchpt.engines.kernels.stages import CHUNK_FIELDS
 from torchpt.engines.work import SampleRange, TaskResult
 from torchpt.paths.nonfinite import NonFinite
@@ -366,7 +359,7 @@ class LateCheck:
 
 
 class DeviceCalls:
-    """Launches kernels on a device; as :class:`torchpt.engines.kernels.engine.Calls`.
+    """Launches kernels on a device; as :class:`torchpt.engines.kernels.calls.Calls`.
 
     Args:
         kernels: of the render.
@@ -422,7 +415,7 @@ class DeviceCalls:
         return Count(value, ((len(self.blocks) - 1, self._row, column),))
 
     def counted(self) -> tuple[Count, list[Count]]:
-        """See :meth:`torchpt.engines.kernels.engine.Calls.counted`."""
+        """See :meth:`torchpt.engines.kernels.calls.Calls.counted`."""
         return self._count(0), [self._count(1 + k) for k in range(self.kernels.models + 2)]
 
     def lanes(self, count: int) -> Count:
@@ -438,7 +431,7 @@ class DeviceCalls:
         return 0 if self._look.ended(step, count) else count
 
     def running_sums(self, counts: Sequence[Count]) -> tuple[list[Any], Any]:
-        """See :meth:`torchpt.engines.kernels.engine.Calls.running_sums`; with the search in the stages nothing needs them."""
+        """See :meth:`torchpt.engines.kernels.calls.Calls.running_sums`; with the search in the stages nothing needs them."""
         if self.kernels.fused:
             return [None] * len(counts), None
         if len(counts) == 1:
@@ -449,7 +442,7 @@ class DeviceCalls:
         return [Count(starts[k : k + 1], ()) for k in range(len(counts))], Count(sums[-1:], every)
 
     def write_from(self, start: Count) -> None:
-        """See :meth:`torchpt.engines.kernels.engine.Calls.write_from`: the kernel reads ``start`` as counter 0."""
+        """See :meth:`torchpt.engines.kernels.calls.Calls.write_from`: the kernel reads ``start`` as counter 0."""
         # The tensor may be freed before the kernel runs: torch's allocator reuses memory in the order of the stream.
         self._counters = start.address
 
@@ -460,11 +453,11 @@ class DeviceCalls:
     # -- arguments that kernels share
 
     def set_chunk(self, numbers: np.ndarray) -> None:
-        """See :meth:`torchpt.engines.kernels.engine.Calls.set_chunk`."""
+        """See :meth:`torchpt.engines.kernels.calls.Calls.set_chunk`."""
         self.place.copy_(self.cuda.to_device(torch.from_numpy(numbers)))
 
     def set_dimensions(self, depth: int, step: int = 0, roulette: float = 0.0) -> None:
-        """See :meth:`torchpt.engines.kernels.engine.Calls.set_dimensions`."""
+        """See :meth:`torchpt.engines.kernels.calls.Calls.set_dimensions`."""
         known = self._salts.get((depth, step))
         if known is None:
             known = self._salts[depth, step] = self.cuda.to_device(salts(depth, torch.device("cpu"), step))
@@ -486,7 +479,7 @@ class DeviceCalls:
         lists: list[Any] | None = None,
         slots: Any = None,
     ) -> None:
-        """Launch a kernel, see :meth:`torchpt.engines.kernels.engine.Calls.run`."""
+        """Launch a kernel, see :meth:`torchpt.engines.kernels.calls.Calls.run`."""
         arguments = self._prepared.get(id(kernel))
         if arguments is None:
             arguments = self._prepared[id(kernel)] = self._arguments(kernel)

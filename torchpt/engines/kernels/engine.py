@@ -9,31 +9,28 @@ rays, lists lanes and ends paths. A path that ends writes its radiance to the *s
 
 The methods of :class:`KernelsEngine` are the stages that :func:`torchpt.paths.walk.walk` calls in their order along a path.
 A stage is a list of *steps*: kernel calls that name the kernel, the memory that it reads and writes, and where its lanes are
-counted. :class:`Calls` runs a step at once, in the calling thread: a count is an int, and steps without lanes are left out.
-On a device (:mod:`~torchpt.engines.kernels.device`) all steps are launched, and counts stay in memory, where kernels read
-them.
+counted. :class:`~torchpt.engines.kernels.calls.Calls` runs a step at once, in the calling thread: a count is an int, and
+steps without lanes are left out. On a device (:mod:`~torchpt.engines.kernels.device`) all steps are launched, and counts stay
+in memory, where kernels read them.
 """
 
 from __future__ import annotations
 
-import ctypes
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 from typing import Any, ClassVar, cast
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from torchpt.compiler.form import CAPACITY, VECTORS
-from torchpt.compiler.kernel import HEAD, WORD
+from torchpt.engines.kernels.calls import Calls, LaneCount
 from torchpt.engines.kernels.eagerly import bounce_eagerly, connect_eagerly
 from torchpt.engines.kernels.joins import HostJoins, Joins
-from torchpt.engines.kernels.layout import Memory, Rows
+from torchpt.engines.kernels.layout import Memory
 from torchpt.engines.kernels.programs import Kernel, Kernels
-from torchpt.engines.kernels.stages import CHUNK_FIELDS
+from torchpt.engines.kernels.searches import ChunkSearch
 from torchpt.paths.layers import LAYERS
 from torchpt.paths.photons import PHOTON_ROWS, LightOfSample, PhotonRows, SentLight
 from torchpt.paths.state import StageContext
@@ -43,335 +40,15 @@ from torchpt.paths.wave import PixelSet, RayCounts
 from torchpt.physics.film import Film
 from torchpt.physics.film.splats import Splats
 from torchpt.physics.samplers import salts
-from torchpt.search import Accel
 
 __all__ = [
     "LANES",
-    "Arguments",
-    "Calls",
     "Chunk",
-    "ChunkSearch",
-    "Halted",
     "KernelsEngine",
-    "LaneCount",
     "Paths",
     "count_samples",
     "film_words",
 ]
-
-
-# ---- Kernel calls of one thread: counters, and arguments that are prepared once
-
-
-#: A number of lanes: an int, or on a device a :class:`torchpt.engines.kernels.device.Count`, which is always true.
-LaneCount = Any
-
-
-class Halted(Exception):
-    """Raised where a kernel is called after the render was cancelled."""
-
-
-class Arguments:
-    """The argument block of a kernel, with the words that stay the same filled in.
-
-    Args:
-        kernel: the kernel.
-        row: elements of a row of the arenas.
-        search: address of the argument of searches; 0: none.
-
-    Attributes:
-        words: a ctypes array of int64, see :func:`torchpt.compiler.kernel.argument_words`.
-        tensors: index of the first word of the tensors.
-        function: what runs the kernel, for the caller to set.
-    """
-
-    __slots__ = ("_lists", "_uniforms", "function", "kernel", "tensors", "words")
-
-    def __init__(self, kernel: Kernel, row: int, search: int = 0) -> None:
-        program, first_list = kernel.program, len(HEAD) + len(kernel.program.uniforms)
-        self.kernel = kernel
-        self.function: Any = None
-        self._uniforms = tuple((len(HEAD) + k, name) for k, name in enumerate(program.uniforms))
-        self.tensors = first_list + program.lists
-        self._lists = range(first_list, self.tensors)
-        self.words: Any = (ctypes.c_int64 * (self.tensors + 2 * (program.tensors + program.results)))()
-        self.words[WORD["stride"]], self.words[WORD["tables"]] = row, kernel.tables.address
-        self.words[WORD["search"]] = search
-
-    def set(
-        self, source: Any, target: Any, places: Any, slots: Any, uniforms: Mapping[str, int], lists: list[Any] | None
-    ) -> None:
-        """Set the words that differ from call to call: addresses of memory, and of each uniform by name."""
-        words = self.words
-        words[0], words[1], words[3] = source.address, target.address, slots.address  # of HEAD: src, dst, slots
-        if places is not None:
-            words[2] = places.address
-        for word, name in self._uniforms:
-            words[word] = uniforms[name]
-        if lists is not None:
-            for word, memory in zip(self._lists, lists, strict=False):
-                words[word] = memory.address
-
-
-class Calls:
-    """Calls the kernels of a render from one thread.
-
-    Args:
-        kernels: of the render.
-        halt: set to cancel the render.
-
-    Attributes:
-        counters: int64: number of lanes in the arena, then in each list (:class:`torchpt.engines.kernels.layout.Layout`).
-        place: pixels and samples of the chunk, see :data:`torchpt.engines.kernels.stages.CHUNK_FIELDS`.
-        slots: radiance of the chunk's samples, three rows.
-    """
-
-    def __init__(self, kernels: Kernels, halt: threading.Event) -> None:
-        self.kernels, self._halt = kernels, halt
-        self.counters = np.zeros(kernels.models + 6, np.int64)
-        self.place = np.zeros(len(CHUNK_FIELDS), np.int32)
-        self.slots = Memory(3)
-        self._prepared: dict[int, Arguments] = {}  # by id of the kernel, which they refer to
-        self._salts: dict[tuple[int, int], Any] = {}  # by depth and step
-        self._bounds: dict[float, np.ndarray] = {}  # of survival probabilities, as uniforms
-        self._depths: dict[int, np.ndarray] = {}  # numbers of vertices, likewise
-        self._start_salts = salts(0, torch.device("cpu"))
-        # Address of each uniform.
-        self._merging = np.ones(1, np.float32)
-        self._uniforms = {
-            "place": self.place.ctypes.data,
-            "start_salts": self._start_salts.data_ptr(),
-            "merging": self._merging.ctypes.data,
-        }
-
-    def unbind(self) -> None:
-        """Drop all references to the render and its kernels."""
-        del self.kernels, self._halt
-        self._prepared.clear()
-
-    def rebind(self, kernels: Kernels, halt: threading.Event) -> None:
-        """Use the kernels of another render of the same structure, which has the same memory layout."""
-        self.kernels, self._halt = kernels, halt
-
-    def memory(self, rows: int) -> Memory:
-        """Return new memory for kernels."""
-        return Memory(rows)
-
-    def clear(self) -> None:
-        """Set all counters to 0."""
-        self.counters[:] = 0
-
-    def counted(self) -> tuple[LaneCount, list[LaneCount]]:
-        """Return how many lanes are in the arena, and how many in each list: one a model, on emitters, without a hit."""
-        return int(self.counters[0]), self.counters[1 : self.kernels.models + 3].tolist()
-
-    def lanes(self, count: int) -> LaneCount:
-        """Return a known number of lanes as a count."""
-        return count
-
-    def left(self, step: int) -> LaneCount:
-        """Return how many rays the last kernel left in transit, as counter 0 says; ``step``: number of that kernel, from 0."""
-        return int(self.counters[0])
-
-    def running_sums(self, counts: Sequence[LaneCount]) -> tuple[list[LaneCount], LaneCount]:
-        """Return for each count the sum of those before it, and the sum of all."""
-        sums = [0, *accumulate(counts)]
-        return sums[:-1], sums[-1]
-
-    def write_from(self, start: LaneCount) -> None:
-        """Set the first index that a kernel with a ``shift`` writes to, see :class:`torchpt.compiler.sinks.Sinks`."""
-        self.counters[0] = start
-
-    def known(self, count: LaneCount) -> int:
-        """Return a count as an int."""
-        return count
-
-    def set_merging(self, merging: float) -> None:
-        """Set the ratio of densities of a merge."""
-        self._merging[:] = merging
-
-    def set_chunk(self, numbers: np.ndarray) -> None:
-        """Set the chunk: int32 numbers, see :data:`torchpt.engines.kernels.stages.CHUNK_FIELDS`."""
-        self.place[:] = numbers
-
-    def set_dimensions(self, depth: int, step: int = 0, roulette: float = 0.0) -> None:
-        """Set the random dimensions of kernels to those of a vertex, and of a step of transmission before it.
-
-        ``roulette``: upper bound of the survival probability, for kernels that have it as an input.
-        """
-        vertex_salts = self._salts.get((depth, step))
-        if vertex_salts is None:
-            vertex_salts = self._salts[depth, step] = salts(depth, torch.device("cpu"), step)
-        bound = self._bounds.get(roulette)
-        if bound is None:
-            bound = self._bounds[roulette] = np.array([roulette], np.float32)
-        number = self._depths.get(depth)
-        if number is None:
-            number = self._depths[depth] = np.array([depth], np.int32)
-        self._uniforms |= {
-            "salts": vertex_salts.data_ptr(),
-            "roulette": bound.ctypes.data,
-            "depth": number.ctypes.data,
-        }
-
-    def run(
-        self,
-        kernel: Kernel,
-        count: LaneCount,
-        source: Memory,
-        target: Memory,
-        places: Memory | None = None,
-        lists: list[Memory] | None = None,
-        slots: Memory | None = None,
-    ) -> None:
-        """Run a kernel: one step.
-
-        Args:
-            kernel: of the render.
-            count: number of lanes.
-            source: the arena that it reads.
-            target: the arena that it writes.
-            places: list of lanes, if the kernel reads lanes by a list.
-            lists: lists that it appends lanes to.
-            slots: memory for results by sample; None: the radiance of the samples.
-
-        Raises:
-            Halted: the render was cancelled.
-        """
-        if self._halt.is_set():
-            raise Halted
-        arguments = self._prepared.get(id(kernel))
-        if arguments is None:
-            arguments = self._prepared[id(kernel)] = self._prepare(kernel)
-        arguments.set(source, target, places, slots or self.slots, self._uniforms, lists)
-        arguments.function(count)
-
-    def _prepare(self, kernel: Kernel) -> Arguments:
-        search = self.kernels.search
-        arguments = Arguments(kernel, CAPACITY, 0 if search is None else ctypes.addressof(search))
-        arguments.words[WORD["counters"]] = self.counters.ctypes.data
-        function, address = kernel.program.function, ctypes.addressof(arguments.words)
-        arguments.function = lambda count: function.call(address, count)  # quick code may be replaced
-        return arguments
-
-
-# ---- Searches between stages: by packet kernels, or by the acceleration structure
-#
-# Rays that hit surfaces that are not opaque move to an arena of their own and are searched again from behind the surface, until
-# each is stopped or hits nothing.
-
-
-class ChunkSearch:
-    """Searches the rays of one thread's chunks.
-
-    Args:
-        calls: of the thread.
-
-    Attributes:
-        passed: two arenas for rays in transit, which move from one to the other; none if rays pass nothing.
-        transmitting: list of the lanes that the stage ``transmit`` runs for.
-    """
-
-    def __init__(self, calls: Calls) -> None:
-        self.calls, self.kernels = calls, calls.kernels
-        arenas = 2 if self.kernels.has_transmission else 0
-        self.passed = [calls.memory(self.kernels.passed.count) for _ in range(arenas)]
-        self.transmitting = calls.memory(1)
-
-    def nearest(self, arena: Memory, count: LaneCount) -> None:
-        """Find the nearest hits, opaque or not, of the arena's rays, and write them to the arena."""
-        self._trace(arena, self.kernels.state, "o", "d", "t_max", count)
-
-    def transmit(self, arena: Memory, count: LaneCount, depth: int, step: int) -> LaneCount:
-        """Take one step through surfaces or media that rays may pass.
-
-        Args:
-            arena: of the paths; hits of rays that stop are written to it.
-            count: number of paths at step 0; then number of rays in transit.
-            depth: number of the vertex that the rays come to.
-            step: from 0.
-
-        Returns:
-            The number of rays still in transit.
-        """
-        kernels, calls = self.kernels, self.calls
-        calls.set_dimensions(depth, step)
-        source, target = self.passed[step % 2], self.passed[1 - step % 2]
-        if step == 0:
-            calls.clear()
-            calls.run(kernels.list_transmitting(), count, arena, arena, lists=[self.transmitting])
-            transmitting = calls.left(0)
-            if not transmitting:
-                return 0
-            calls.clear()
-            calls.run(kernels.transmit(again=False), transmitting, arena, target, self.transmitting, slots=arena)
-        else:
-            calls.clear()
-            calls.run(kernels.transmit(again=True), count, source, target, slots=arena)
-        left = calls.left(step + 1)
-        if left:
-            self._trace(target, kernels.passed, "pass_o", "pass_d", "pass_t", left)
-        return left
-
-    def light(self, arena: Memory, count: LaneCount) -> None:
-        """Trace the arena's shadow rays, and write to it whether they are blocked, or their transmittance."""
-        kernels, calls = self.kernels, self.calls
-        if not kernels.by_kernels:
-            self._occluded_outside(arena, count)
-        elif not kernels.has_opacity:
-            calls.run(kernels.search_occluded(), count, arena, arena)
-        if not kernels.has_opacity:
-            return
-        source, target = self.passed
-        calls.clear()
-        calls.run(kernels.begin_shadow_rays(), count, arena, source, slots=arena)
-        step = 0
-        while left := calls.left(step):
-            self._trace(source, kernels.passed, "pass_o", "pass_d", "pass_t", left)
-            calls.clear()
-            calls.run(kernels.attenuate_shadow_rays(), left, source, target, slots=arena)
-            source, target = target, source
-            step += 1
-
-    def _trace(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: LaneCount) -> None:
-        """Find the nearest hit, opaque or not, of each ray in the rows ``o, d, t_max``."""
-        if self.kernels.by_kernels:
-            kernel = self.kernels.search_nearest(passed=rows is self.kernels.passed)
-            self.calls.run(kernel, count, memory, memory)
-        else:
-            self._nearest_outside(memory, rows, o, d, t_max, count)
-
-    # -- searches by the acceleration structure, outside of kernels
-
-    def _nearest_outside(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: LaneCount) -> None:
-        accel: Accel = self.kernels.wave.accel
-        floats, words = memory.floats, memory.words
-        accel.nearest(
-            _row(floats, rows, o, 3),
-            _row(floats, rows, d, 3),
-            _row(floats, rows, t_max, 1)[0],
-            count,
-            _row(floats, rows, "t", 1)[0],
-            _row(words, rows, "prim", 1)[0],
-            _row(floats, rows, "u", 1)[0],
-            _row(floats, rows, "v", 1)[0],
-        )
-
-    def _occluded_outside(self, arena: Memory, count: LaneCount) -> None:
-        kernels, rows = self.kernels, self.kernels.state
-        o, d, t_max = (_row(arena.floats, rows, f"shadow_{name}", n) for name, n in (("o", 3), ("d", 3), ("t", 1)))
-        blocked = _row(arena.words, rows, "blocked", 1)[0]
-        kernels.wave.accel.blocked(o, d, t_max[0], count, blocked, kernels.non_opaque)
-
-
-def _row(memory: np.ndarray, rows: Rows, name: str, count: int) -> np.ndarray:
-    """Return the ``count`` rows of a field."""
-    first = rows.first(name)
-    return memory[first : first + count]
-
-
-# ---- The engine of one thread
-
 
 #: Greatest number of lanes of a chunk.
 LANES = CAPACITY - VECTORS.width

@@ -6,18 +6,17 @@ is put back.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.engines.kernels.calls import LaneCount
+from torchpt.engines.kernels.layout import Memory
+from torchpt.engines.kernels.searches import ChunkSearch
 from torchpt.native.kernels import kernel
 from torchpt.physics.film.splats import LARGEST, Splats
-
-if TYPE_CHECKING:
-    from torchpt.engines.kernels.engine import ChunkSearch, LaneCount
-    from torchpt.engines.kernels.layout import Memory
 
 __all__ = ["RAY_ROWS", "HostJoins", "Joins", "TensorJoins"]
 

@@ -418,7 +418,7 @@ def connect(trace: Trace, model: int) -> Sinks:
 # Rays of paths: ``list_transmitting`` lists the lanes whose hit may let them pass. ``transmit`` stops some of them and moves
 # the others behind the surface, first from the arena of the paths, then (``again``) from the arena of the rays in transit,
 # until the walk has none left. Shadow rays: ``begin_shadow_rays`` and ``attenuate_shadow_rays`` multiply their transmittance
-# surface by surface; the loop around them is in :mod:`torchpt.engines.kernels.engine`.
+# surface by surface; the loop around them is in :mod:`torchpt.engines.kernels.searches`.
 
 
 def list_transmitting(trace: Trace) -> Sinks:

@@ -20,15 +20,8 @@ from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD, WORD
 from torchpt.core.memory import Budget, explain_out_of_memory, is_out_of_memory, on_low_memory
 from torchpt.core.threads import map_in_order
-from torchpt.engines.kernels.engine import (
-    LANES,
-    Arguments,
-    Chunk,
-    Halted,
-    KernelsEngine,
-    count_samples,
-    film_words,
-)
+from torchpt.engines.kernels.calls import Arguments, Halted
+from torchpt.engines.kernels.engine import LANES, Chunk, KernelsEngine, count_samples, film_words
 from torchpt.engines.kernels.programs import Kernels
 from torchpt.engines.work import TASKS, Block, TaskResult
 from torchpt.paths.nonfinite import NonFinite
