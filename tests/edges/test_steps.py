@@ -33,8 +33,8 @@ def test_steps_are_shorter_beside_narrow_faces() -> None:
     s = seen[:2] / seen[2]
     wide, sliver = (torch.full((20,), face) for face in (0, 1))
     whole = step_of(bodies)
-    assert bool((steps_at(bodies, (wide, torch.full_like(wide, -1)), s) == whole).all())
-    found = steps_at(bodies, (wide, sliver), s)
+    assert bool((steps_at(bodies, (wide, torch.full_like(wide, -1)), s, None) == whole).all())
+    found = steps_at(bodies, (wide, sliver), s, None)
     pixel = float(seen[0, 1] / seen[2, 1] - seen[0, 0] / seen[2, 0]) / float(x[1] - x[0])  # of a unit of the world
     room = 0.5 * (1 - x) * width * abs(pixel)
     assert bool((found <= torch.maximum(0.26 * room, torch.tensor(whole / 64))).all())

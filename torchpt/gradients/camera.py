@@ -73,7 +73,9 @@ def film_space_applies(scene: Scene, settings: Settings, wanted: Iterable[str]) 
     """
     moving = [name for name in wanted if scene.spec(name).moves is Moves.SURFACES]
     only_camera = bool(moving) and all(name.startswith("camera.") for name in moving)
-    if not only_camera or any(owner.material.opacity != 1.0 for owner in (*scene.built.parts, *scene.built.copies)):
+    materials = [owner.material for owner in (*scene.built.parts, *scene.built.copies)]
+    parts = [part for material in materials for part in material.with_inner()]
+    if not only_camera or any(part.opacity != 1.0 or part.model.sheer for part in parts):
         return False
     return scene.description.camera.kind.projects and isinstance(settings.integrator, PathIntegrator)
 

@@ -75,9 +75,11 @@ def slopes(camera: Camera, p: Tensor, lens: Tensor | None) -> tuple[Tensor, Tens
     """Return places ``(2, N)`` of points on the film and how they change with them ``(2, 3, N)``, detached."""
     # Homogeneous places are affine in the points.
     corners = torch.cat((torch.zeros_like(p[:, :1]), torch.eye(3, dtype=p.dtype, device=p.device)), 1)
-    at, seen = [camera.film_of(corners[:, k : k + 1], lens) for k in range(4)], camera.film_of(p, lens)
-    assert at[0] is not None and seen is not None
-    slope = torch.stack([(end - at[0])[:3].detach() for end in at[1:] if end is not None], 1)  # (3, 3, 1 or N)
+    many, seen = 1 if lens is None else p.shape[1], camera.film_of(p, lens)
+    at = camera.film_of(corners.repeat_interleave(many, 1), None if lens is None else lens.repeat(1, 4))
+    assert at is not None and seen is not None
+    ends = at[:3].detach().view(3, 4, many)
+    slope = ends[:, 1:] - ends[:, :1]
     h = torch.where(seen[2] > 0, seen[2], 1.0).detach()
     s = seen[:2].detach() / h
     turned = torch.where(seen[2] > 0, s, 0.0)

@@ -26,6 +26,7 @@ from torchpt.gradients.edges.traced import Use
 from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.sampling import Distribution1D, uniform_triangle
 from torchpt.math.vectors import cross, dot, normalize, take
+from torchpt.paths.transmission import opacity_at
 from torchpt.physics.samplers import Dimension
 from torchpt.physics.shapes import interact
 from torchpt.physics.shapes.geometry import Hit
@@ -110,6 +111,9 @@ class Horizons:
         across, along = normalize(cross(e1, e2)), normalize(e1)
         omega = along * torch.cos(angle) + cross(across, along) * torch.sin(angle)
         spot = self._spot(prim, uv, x, omega)
+        if traced.has_opacity:  # no ray has stopped at these points
+            world = traced.wave.context.world
+            weight = weight * opacity_at(world, spot.o, spot.d, spot.hit, miss=1.0).double()
         n = spot.n.double() * side
         o, d = x + n * self.frame.rounding(prim, x), normalize(omega + n * _TILT)
         y = met(traced, o, d, traced.of_paths(number, Use.BEHIND))

@@ -49,6 +49,7 @@ class EdgePoints:
         cut: ``(N,)`` bool: the two cut there.
         p: where they are ``(3, N)``.
         along: how ``p`` changes with the curve's parameter.
+        outline: ``(N,)`` bool: no crease, as seen from there.
         bent: ``(N,)`` bool: the curve is the outline of a round surface.
         density: of the draw in that parameter.
         part: with which the curve counts, where others lie on it.
@@ -60,6 +61,7 @@ class EdgePoints:
     cut: Tensor
     p: Tensor
     along: Tensor
+    outline: Tensor
     bent: Tensor
     density: Tensor
     part: Tensor
@@ -78,6 +80,7 @@ class Occluders:
         form: ``(K,)`` -1 where the curve is known, 0 for outlines of spheres and ellipsoids, from 1 on of ``forms``.
         forms: of cylinders and cones.
         outlines: choice of a curve, by length and the share of directions from which it is an outline.
+        seen: choice of a curve that moves, by length and by how much radiance may jump there; None: none moves.
         creases: choice of a curve, by length and the angle between its faces.
     """
 
@@ -89,18 +92,18 @@ class Occluders:
     form: Tensor
     forms: list[Form]
     outlines: Distribution1D
+    seen: Distribution1D | None
     creases: Distribution1D
 
-    def outline_points(self, u: Tensor, coin: Tensor, view: View, *, creases: bool = False) -> EdgePoints:
-        """Return points of outlines as they are seen from ``view``.
+    def points(self, choice: Distribution1D, u: Tensor, coin: Tensor, view: View) -> EdgePoints:
+        """Return points of curves, those of round surfaces as they are seen from ``view``.
 
         Args:
+            choice: :attr:`outlines` or :attr:`seen`.
             u: ``(N,)`` in [0, 1), which curves and where on them.
             coin: ``(N,)`` in [0, 1): which of two lines.
             view: ``N`` places or directions.
-            creases: True: points of creases too, on both sides of which faces are seen, and of curves where surfaces cut.
         """
-        choice = self.creases if creases else self.outlines
         index, rest = choice.draw(u)
         chance = take(choice.pmf, index)
         curves, form = rows(self.curves, index), take(self.form, index)
@@ -123,10 +126,10 @@ class Occluders:
         held, p, along = curves.moving(self.bodies, curves.low + rest * span)
         across = cross(along, view.toward(p))
         one, two = (dot(across, self.bodies.points(rows(other, index)) - p) for other in self.others)
-        some &= ~take(self.folded, index) | (one * two >= 0) | creases
+        outline = ~take(self.folded, index) | (one * two >= 0)
         some &= dot(across, across) > 0
         lane, part = torch.arange(len(index), device=index.device), take(self.part, index)
-        drawn = EdgePoints(lane, held, curves.mate, curves.cut, p, along, form >= 0, chance / span, part)
+        drawn = EdgePoints(lane, held, curves.mate, curves.cut, p, along, outline, form >= 0, chance / span, part)
         return rows(drawn, some.nonzero().squeeze(1))
 
 
@@ -146,7 +149,7 @@ def occluders_of(
     curves: list[Curves] = []
     firsts: list[Held] = []
     seconds: list[Held] = []
-    columns: list[Tensor] = []  # of each part: length, weights as outline and as crease, folded, form
+    columns: list[Tensor] = []  # of each part: length, weights as outline, as crease and for the camera, folded, form
 
     def add(part: Curves, length: Tensor, others: tuple[Held, Held], *column: Tensor | float) -> None:
         curves.append(part)
@@ -161,29 +164,32 @@ def occluders_of(
         outline = torch.where(folds.border, 1.0, (torch.acos(cosine) / math.pi).clamp_min(_LEAST_OUTLINE))
         crease = torch.where(folds.bend > 0, folds.bend.clamp(_LEAST_CREASE, 1.0), 0.0)
         crease = torch.where(folds.border, 1.0, crease)
-        add(folds.curves, dot(along, along).sqrt(), folds.others, outline, crease, ~folds.border, -1.0)
+        jumps = (folds.bend > 0) | folds.border
+        seen = torch.maximum(torch.where(jumps, outline, 0.0), folds.crease)
+        add(folds.curves, dot(along, along).sqrt(), folds.others, outline, crease, seen, ~folds.border, -1.0)
     fixed = plain_of(scene, bodies)
     if fixed is not None:
         _, _, along = fixed.moving(bodies, fixed.low)
         own = Held(fixed.prim, fixed.a)
-        add(fixed, dot(along, along).sqrt() * (fixed.high - fixed.low), (own, own), 1.0, 1.0, 0.0, -1.0)
+        add(fixed, dot(along, along).sqrt() * (fixed.high - fixed.low), (own, own), 1.0, 1.0, 1.0, 0.0, -1.0)
     if cuts is not None:  # which hide nothing that the surfaces do not
         own = Held(cuts[0].prim, cuts[0].a)
-        add(cuts[0], cuts[1], (own, own), 0.0, 1.0, 0.0, -1.0)
+        add(cuts[0], cuts[1], (own, own), 0.0, 1.0, 1.0, 0.0, -1.0)
     forms: list[Form] = []
     for rounds in rounds_of(scene, bodies):
         if rounds.form is not None:
             forms.append(rounds.form)
         zero = torch.zeros(3, len(rounds.prim), dtype=torch.float64, device=scene.device)
         own, number = Held(rounds.prim, zero), 0.0 if rounds.form is None else float(len(forms))
-        add(straight(rounds.prim, zero, zero), _outline_length(bodies, rounds), (own, own), 1.0, 1.0, 0.0, number)
+        add(straight(rounds.prim, zero, zero), _outline_length(bodies, rounds), (own, own), 1.0, 1.0, 1.0, 0.0, number)
     if not curves:
         return None
     every = joined(curves)
-    length, outline, crease, folded, form = torch.cat(columns, 1)
+    length, outline, crease, seen, folded, form = torch.cat(columns, 1)
     if not bool((length > 0).any()):
         return None
     moving = every.move(moves)
+    seen = length * seen * moving
     known = ((form < 0) & (crease > 0)).nonzero().squeeze(1)
     return Occluders(
         bodies,
@@ -194,6 +200,7 @@ def occluders_of(
         form.long(),
         forms,
         Distribution1D.of(length * outline * torch.where(moving | lights_move, 1.0, _STATIC), torch.float64, even=0.0),
+        Distribution1D.of(seen, torch.float64, even=0.0) if bool((seen > 0).any()) else None,
         Distribution1D.of(length * crease * torch.where(moving, 1.0, _STATIC), torch.float64, even=0.0),
     )
 

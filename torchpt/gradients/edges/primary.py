@@ -26,7 +26,7 @@ from torchpt.gradients.edges.cuts import Crossing, Cuts, crossing_of
 from torchpt.gradients.edges.film import Worth, film_places, slopes
 from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.occluders import Occluders, occluders_of
-from torchpt.gradients.edges.traced import Traced, Use
+from torchpt.gradients.edges.traced import Passing, Traced, Use
 from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import cross, dot, rows, take
 from torchpt.scene import Scene
@@ -64,7 +64,7 @@ def step_of(bodies: Bodies) -> float:
     return _STEP * width * narrow
 
 
-def steps_at(bodies: Bodies, faces: tuple[Tensor, Tensor], s: Tensor, lens: Tensor | None = None) -> Tensor:
+def steps_at(bodies: Bodies, faces: tuple[Tensor, Tensor], s: Tensor, lens: Tensor | None) -> Tensor:
     """Return steps ``(N,)`` in pixels: shorter where a ray a whole step beside an edge would pass a narrow face.
 
     Args:
@@ -111,12 +111,13 @@ def distance_to(s: Tensor, a: Tensor, b: Tensor) -> Tensor:
 # surfaces are taken to stay together; where only one of them moves the derivative is the mean of those to both sides.
 
 
-def share_of(bodies: Bodies, place: EdgePlace, prim: Tensor, near: Tensor, step: Tensor) -> Tensor:
+def share_of(bodies: Bodies, place: EdgePlace, s: Tensor, prim: Tensor, near: Tensor, step: Tensor) -> Tensor:
     """Return the parts ``(N,)`` with which places of edges count.
 
     Args:
         bodies: detached.
         place: the places.
+        s: on the film ``(2, N)``.
         prim: what is seen on both sides ``(2, N)``.
         near: whether at the edge's own distance ``(2, N)``.
         step: how far beside the edges that is ``(N,)``, in pixels.
@@ -129,7 +130,7 @@ def share_of(bodies: Bodies, place: EdgePlace, prim: Tensor, near: Tensor, step:
     safe = torch.where(flat, other, 0)
     if not bool(flat.any()):
         return torch.ones_like(step)
-    away = torch.stack([distance_to(place.s, a, b) for a, b in outline_of(bodies, safe, place.lens)]).amin(0)
+    away = torch.stack([distance_to(s, a, b) for a, b in outline_of(bodies, safe, place.lens)]).amin(0)
     return torch.where(flat & (away < 0.5 * step), 0.5, 1.0)
 
 
@@ -315,7 +316,7 @@ class Along:
 
     held: Held
     weight: Tensor  # (2, N)
-    lens: Tensor | None = None
+    lens: Tensor | None
     crossing: Crossing | None = None
     beside: tuple[Tensor, Tensor, Tensor] | None = None
 
@@ -337,6 +338,7 @@ class EdgePlace:
     """Places of edges, N lanes.
 
     Attributes:
+        lane: ``(N,)`` of those that were asked for.
         held: the points.
         mate: the other face of each edge ``(N,)``; -1: there is none.
         cut: ``(N,)`` bool: two surfaces cut there.
@@ -344,10 +346,9 @@ class EdgePlace:
         along: how ``p`` changes with the curve's parameter ``(3, N)``.
         density: ``(N,)`` of the draw in that parameter.
         lens: ``(2, N)`` samples of the lens; None: there is none.
-        s: ``(2, N)`` places on the film.
-        normal: ``(2, N)`` across the curve there, as long as ``s`` changes with the curve's parameter.
     """
 
+    lane: Tensor
     held: Held
     mate: Tensor
     cut: Tensor
@@ -355,8 +356,6 @@ class EdgePlace:
     along: Tensor
     density: Tensor
     lens: Tensor | None
-    s: Tensor
-    normal: Tensor
 
 
 @dataclass(frozen=True)
@@ -373,22 +372,14 @@ class Seen:
     pieces: Pieces
     choice: Distribution1D
 
-    def draw(self, u: Tensor, coin: Tensor, lens: Tensor | None) -> tuple[Tensor, EdgePlace]:
-        """Return lanes that got a place ``(n,)``, and the places.
-
-        Args:
-            u: ``(N,)`` in [0, 1), which curves and where on them.
-            coin: ``(N,)`` in [0, 1): which of two lines.
-            lens: ``(2, N)`` samples of the lens.
-        """
+    def draw(self, u: Tensor, coin: Tensor, lens: Tensor | None) -> EdgePlace:
+        """Return a place for each lane; ``u (N,)`` in [0, 1): which curve and where on it. The others are not needed."""
         index, rest = self.choice.draw(u)
         pieces = rows(self.pieces, index)
         t, density = pieces.place(rest)
         held, p, along = pieces.curves.moving(self.bodies, t)
-        density = density * take(self.choice.pmf, index)
-        lane = torch.arange(len(u), device=u.device)
-        curves = pieces.curves
-        return lane, _on_film(self.bodies, held, curves.mate, curves.cut, p, along, density, None)
+        lane, density = torch.arange(len(u), device=u.device), density * take(self.choice.pmf, index)
+        return EdgePlace(lane, held, pieces.curves.mate, pieces.curves.cut, p, along, density, None)
 
 
 @dataclass(frozen=True)
@@ -397,44 +388,28 @@ class SeenThroughLens:
 
     Attributes:
         occluders: all edges.
-        moves: ``(P,)`` bool: primitives that move; None: the camera does, and so all that it sees.
+        choice: among them.
     """
 
     occluders: Occluders
-    moves: Tensor | None
+    choice: Distribution1D
 
-    def draw(self, u: Tensor, coin: Tensor, lens: Tensor | None) -> tuple[Tensor, EdgePlace]:
-        """See :meth:`Seen.draw`."""
-        bodies = self.occluders.bodies
-        o, _ = bodies.camera.rays(torch.zeros_like(u), torch.zeros_like(u), lens)
-        drawn = self.occluders.outline_points(u, coin, View(o, torch.ones_like(u)), creases=True)
-        if self.moves is not None:
-            move = take(self.moves, drawn.held.prim)
-            move = move | ((drawn.mate >= 0) & take(self.moves, drawn.mate.clamp_min(0)))
-            drawn = rows(drawn, move.nonzero().squeeze(1))
-        seen = bodies.camera.film_of(drawn.p, rows(lens, drawn.lane))
+    def draw(self, u: Tensor, coin: Tensor, lens: Tensor | None) -> EdgePlace:
+        """Return places of some lanes.
+
+        Args:
+            u: ``(N,)`` in [0, 1), which curve and where on it.
+            coin: ``(N,)`` in [0, 1): which of two lines.
+            lens: ``(2, N)`` samples of the lens.
+        """
+        camera = self.occluders.bodies.camera
+        o, _ = camera.rays(torch.zeros_like(u), torch.zeros_like(u), lens)
+        drawn = self.occluders.points(self.choice, u, coin, View(o, torch.ones_like(u)))
+        seen = camera.film_of(drawn.p, rows(lens, drawn.lane))
         assert seen is not None
         drawn = rows(drawn, (seen[2] > 0).nonzero().squeeze(1))
         lens = rows(lens, drawn.lane)
-        return drawn.lane, _on_film(
-            bodies, drawn.held, drawn.mate, drawn.cut, drawn.p, drawn.along, drawn.density, lens
-        )
-
-
-def _on_film(
-    bodies: Bodies,
-    held: Held,
-    mate: Tensor,
-    cut: Tensor,
-    p: Tensor,
-    along: Tensor,
-    density: Tensor,
-    lens: Tensor | None,
-) -> EdgePlace:
-    s, jacobian = slopes(bodies.camera, p, lens)
-    slope = (jacobian * along).sum(1)
-    normal = torch.stack((slope[1], -slope[0]))
-    return EdgePlace(held, mate, cut, p, along, density, lens, s, normal)
+        return EdgePlace(drawn.lane, drawn.held, drawn.mate, drawn.cut, drawn.p, drawn.along, drawn.density, lens)
 
 
 @dataclass(frozen=True)
@@ -444,11 +419,13 @@ class Primary:
     Attributes:
         bodies: detached.
         source: draws places of edges.
+        cuts: True: surfaces cut somewhere.
         traced: what sees, and draws.
     """
 
     bodies: Bodies
     source: Seen | SeenThroughLens
+    cuts: bool
     traced: Traced
 
     @torch.no_grad()
@@ -458,22 +435,24 @@ class Primary:
         ``over``: they count as they move over what is seen on both sides, which is held in place.
         """
         number, key, u, coin = self.traced.edges(Round(0, total), first, count, Use.PRIMARY)
-        lane, place = self.source.draw(u, coin, self.traced.lens(key))
-        length = (place.normal * place.normal).sum(0).sqrt()
-        value = worth.at(place.s)
+        place = self.source.draw(u, coin, self.traced.lens(key))
+        s, jacobian = slopes(self.bodies.camera, place.p, place.lens)
+        slope = (jacobian * place.along).sum(1)
+        normal = torch.stack((slope[1], -slope[0]))  # as long as `s` changes with the curve's parameter
+        length, value = (normal * normal).sum(0).sqrt(), worth.at(s)
         index = ((length > 0) & (value != 0).any(0)).nonzero().squeeze(1)
-        lane, place, length, value = rows((lane, place, length, value), index)
-        unit = place.normal / length
-        step = steps_at(self.bodies, (place.held.prim, place.mate), place.s, place.lens)
-        o, d = self._beside(place, unit, step)
-        share = self._share(place, step, o, d)
-        if bool(place.cut.any()):
-            share = share * self._visible_nearby(place)
+        place, s, normal, length, value = rows((place, s, normal, length, value), index)
+        step = steps_at(self.bodies, (place.held.prim, place.mate), s, place.lens)
+        o, d = self._beside(place, s, normal / length, step)
+        key = take(key, place.lane)
+        share = self._share(place, s, step, o, d, key)
+        if self.cuts:
+            share = share * self._visible_nearby(place, s, key)
         seen = (share > 0).nonzero().squeeze(1)
-        both = torch.cat((seen, seen + len(lane)))
-        lane, place, value, share, o, d = *rows((lane, place, value, share), seen), take(o, both), take(d, both)
+        both = torch.cat((seen, seen + len(index)))
+        place, normal, value, share, o, d = *rows((place, normal, value, share), seen), take(o, both), take(d, both)
         n = len(seen)
-        values = look(o, d, take(number, lane).repeat(2)) if n else torch.zeros(len(value), 0).to(value)
+        values = look(o, d, take(number, place.lane).repeat(2)) if n else torch.zeros(len(value), 0).to(value)
         jump = values[:, :n] - values[:, n:]
         worthy = (value * jump).sum(0) * share
         chance = place.density * total
@@ -483,47 +462,48 @@ class Primary:
             each = torch.cat((each[:n], -each[n:]))
             t, prim = self.traced.nearest(o, d)
             met = prim >= 0
-            beside = torch.where(met, o, torch.inf), torch.where(met, t, 1.0) * d, place.normal.repeat(1, 2) * each
+            beside = torch.where(met, o, torch.inf), torch.where(met, t, 1.0) * d, normal.repeat(1, 2) * each
         crossing = crossing_of(self.bodies, place.cut, place.held, place.mate)
-        return Along(place.held, place.normal * (worthy / chance), place.lens, crossing, beside)
+        return Along(place.held, normal * (worthy / chance), place.lens, crossing, beside)
 
-    def _beside(self, place: EdgePlace, unit: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+    def _beside(self, place: EdgePlace, s: Tensor, unit: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """Return rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""
-        places = torch.cat((place.s - unit * step, place.s + unit * step), 1)
+        places = torch.cat((s - unit * step, s + unit * step), 1)
         lens = None if place.lens is None else place.lens.repeat(1, 2)
         o, d = self.bodies.camera.rays(places[0], places[1], lens)
         return o.expand_as(d), d
 
-    def _share(self, place: EdgePlace, step: Tensor, o: Tensor, d: Tensor) -> Tensor:
+    def _share(self, place: EdgePlace, s: Tensor, step: Tensor, o: Tensor, d: Tensor, key: Tensor) -> Tensor:
         """Return how much of each edge counts ``(N,)``: nothing where it is hidden, a part where others lie on it."""
         n = place.p.shape[1]
-        t, prim = self.traced.nearest(o, d)
         away = place.p - o[:, :n]
         reach = (away * d[:, :n]).sum(0)
+        t, prim = self.traced.nearest(o, d, _ending_at(reach.repeat(2), _BEFORE, key.repeat(1, 2)))
         t, prim = t.view(2, n), prim.view(2, n)
-        own = (prim == place.held.prim) | (
-            prim == place.mate
-        )  # a round surface comes forward quickly behind its outline
+        # A round surface comes forward quickly behind its outline.
+        own = (prim == place.held.prim) | (prim == place.mate)
         seen = (t > reach * torch.where(own, _OWN, _BEFORE)).all(0)
-        if self.traced.has_opacity:
-            seen = torch.ones_like(seen)  # what hides may let pass
         near = (t - reach).abs() < reach * 2.0**-8
-        return torch.where(seen, share_of(self.bodies, place, prim, near, step), 0.0)
+        return torch.where(seen, share_of(self.bodies, place, s, prim, near, step), 0.0)
 
-    def _visible_nearby(self, place: EdgePlace) -> Tensor:
+    def _visible_nearby(self, place: EdgePlace, s: Tensor, key: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of edges that are not hidden close to them, by a surface that cuts through theirs.
 
         A step beside an edge tells this too late: behind its outline a round surface comes forward by the root of the step, so
         that a ray beside an outline below a floor meets what stands out of the floor.
         """
-        o, d = self.bodies.camera.rays(place.s[0], place.s[1], place.lens)
+        o, d = self.bodies.camera.rays(s[0], s[1], place.lens)
         o = o.expand_as(d)
-        t, prim = self.traced.nearest(o, d)
         reach = ((place.p - o) * d).sum(0)
+        t, prim = self.traced.nearest(o, d, _ending_at(reach, _NEAR, key))
         # An outline may be met a little before, or missed.
         outline = ~place.cut & ((prim == place.held.prim) | (prim == place.mate))
-        seen = (t > reach * _NEAR) | outline
-        return torch.ones_like(seen) if self.traced.has_opacity else seen
+        return (t > reach * _NEAR) | outline
+
+
+def _ending_at(reach: Tensor, near: float, key: Tensor) -> Passing:
+    """Return what lets rays pass all that is not opaque before places ``reach (N,)`` away, and nothing from there on."""
+    return Passing(key, depth=1, free=reach * near, stop=torch.zeros_like(reach))
 
 
 def primary_of(
@@ -539,8 +519,11 @@ def primary_of(
     if bodies.camera.lens:
         every = marked_primitives(scene, lambda _: True) if moves is None else moves
         occluders = occluders_of(scene, bodies, poses, every, cuts, lights_move=False)
-        return None if occluders is None else Primary(bodies, SeenThroughLens(occluders, moves), traced)
+        if occluders is None or occluders.seen is None:
+            return None
+        return Primary(bodies, SeenThroughLens(occluders, occluders.seen), cuts is not None, traced)
     pieces = pieces_of(scene, bodies, poses, bounds, cuts, moves)
     if pieces is None:
         return None
-    return Primary(bodies, Seen(bodies, pieces, Distribution1D.of(pieces.weight, torch.float64, even=0.0)), traced)
+    choice = Distribution1D.of(pieces.weight, torch.float64, even=0.0)
+    return Primary(bodies, Seen(bodies, pieces, choice), cuts is not None, traced)

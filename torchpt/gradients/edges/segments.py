@@ -113,7 +113,7 @@ class Smooth:
 
 @dataclass(frozen=True)
 class CurveSample:
-    """CurveSample curves and random numbers of N rays.
+    """Curves and random numbers of N rays.
 
     Attributes:
         index: of the curves ``(N,)``.

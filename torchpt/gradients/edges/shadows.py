@@ -283,7 +283,8 @@ class Shadows:
         even = torch.cat((u[None], self.sources.numbers(traced.draws(key))))
         u, scale = turn.draw(even)
         beam = self.sources.draw(u[1:])
-        passed = self.occluders.outline_points(u[0], coin, beam.view)
+        passed = self.occluders.points(self.occluders.outlines, u[0], coin, beam.view)
+        passed = rows(passed, passed.outline.nonzero().squeeze(1))
         beam, passed, spot, outward = self._past(rows(beam, passed.lane), passed, take(key, passed.lane))
         if not len(passed.lane):
             return None
@@ -298,7 +299,8 @@ class Shadows:
     def _past(self, beam: Beam, passed: EdgePoints, key: Tensor) -> tuple[Beam, EdgePoints, Spot, Tensor]:
         """Trace rays past edges: return what they meet, and unit vectors ``(3, N)`` across the edge to the lit side.
 
-        The rays to both sides pass the same surfaces by their opacity, but for the edge's own.
+        Before the edge the rays to both sides pass the same surfaces by their opacity. Behind it the lit one decides anew, by
+        numbers of its own: those that stopped the other one at the edge are used up.
         """
         traced = self.frame.traced
         toward = beam.view.toward(passed.p)
@@ -318,14 +320,14 @@ class Shadows:
         # Rays that pass the front of a round surface may stop at its back.
         reach = torch.where(own & passed.bent, 1.0 + _OWN, 1.0 + _NEAR)
         near = (t < reach) & ~hidden
-        far = (t > reach) & (prim >= 0)
+        far = t > reach
         good = (near[0] & far[1]) | (near[1] & far[0])
         index = good.nonzero().squeeze(1)
         side = torch.where(take(far[0], index), 1.0, -1.0)
         outward = take(aside, index) * side
-        spot = met(
-            traced, take(o, index), take(way, index) + take(step, index) * side, Passing(take(key, index), depth=1)
-        )
+        lit = take(way, index) + take(step, index) * side
+        free = dot(lit, lit).sqrt() * torch.where(side > 0, take(reach[0], index), take(reach[1], index))
+        spot = met(traced, take(o, index), lit, Passing(take(key, index), depth=0, free=free))
         some = (spot.hit.prim >= 0).nonzero().squeeze(1)
         index = take(index, some)
         return rows(beam, index), rows(passed, index), spot.taken(some), take(outward, some)
