@@ -66,6 +66,26 @@ def test_a_lens_of_no_radius_is_a_pinhole(shape: str) -> None:
     assert error < 0.1 * abs(float(found[0].mean()))
 
 
+@pytest.mark.parametrize(("name", "step"), [("aperture_radius", 0.03), ("focus_distance", 0.1)])
+def test_blur_by_the_lens_itself(name: str, step: float) -> None:
+    """A lamp out of focus takes light from its middle as the lens grows: as central differences say."""
+    lamp = {"type": "disk", "emission": 1, "transform": [{"scale": 0.4}]}
+    camera = {**PLACE, "type": "thinlens", "aperture_radius": 0.3, "focus_distance": 3}
+    described = {"camera": camera, "film": FILM, "integrator": {"max_depth": 1}, "shapes": {"lamp": lamp}}
+    scene = torchpt.load(described, "cpu")
+    base = scene.params[f"camera.{name}"].double()
+
+    def middle(value: torch.Tensor, **wish: Any) -> torch.Tensor:
+        picture = torchpt.render(scene, params={f"camera.{name}": value}, **wish)
+        return picture.double()[3:5, 3:5].sum()
+
+    leaf = base.clone().requires_grad_()
+    middle(leaf, spp=16, edge_spp=2048).backward()
+    low, high = (float(middle(base + sign * step, spp=1 << 14)) for sign in (-1, 1))
+    assert leaf.grad is not None
+    assert float(leaf.grad) == pytest.approx((high - low) / (2 * step), rel=0.04)
+
+
 def test_a_disk_out_of_focus_brightens_what_it_grows_over() -> None:
     """However a lens blurs a lamp, all its light falls on a film that is wide enough: the gradient by size is known."""
     disk = {"type": "disk", "emission": 1, "material": {"type": "diffuse", "reflectance": 0}}

@@ -39,6 +39,13 @@ def drawn(shape: dict[str, Any]) -> tuple[SegmentRays, float]:
 SHAPES: dict[str, tuple[dict[str, Any], float]] = {
     "cube": ({"type": "cube", "transform": [{"scale": [0.5, 1.0, 1.5]}]}, 4 * (1 + 2 + 3)),
     "rectangle": ({"type": "rectangle"}, 8.0),
+    "turned rectangle": (
+        {
+            "type": "rectangle",
+            "transform": [{"rotate": {"axis": [1, 2, 0.5], "angle": 37}}, {"translate": [0.3, 0.7, 0.2]}],
+        },
+        8.0,
+    ),
     "disk": ({"type": "disk", "transform": [{"scale": 0.5}]}, math.pi),
     # two triangles that meet at an angle, in one mesh, and apart
     "roof": (

@@ -296,6 +296,15 @@ PANE = {
     "material": FROSTED,
     "transform": [{"scale": 0.7}, turned([1, 0, 0], -20), moved(0.1, 0.8, 0.9)],
 }
+LENS = {"type": "thinlens", "origin": [0.8, 1.6, 4.2], "target": [0, 0.6, 0], "fov": 40}
+LENS |= {"aperture_radius": 0.2, "focus_distance": 3.5}
+VEIL = {**ORANGE, "opacity": 0.5}
+#: Between the lamp and the floor, and before the camera.
+CURTAIN = {
+    "type": "rectangle",
+    "material": {**diffuse(0.3, 0.6, 0.3), "opacity": 0.4},
+    "transform": [{"scale": 0.6}, turned([0, 1, 0], 20), moved(0.3, 0.7, 0.2)],
+}
 
 
 def grid(count: int, height: Callable[[Tensor, Tensor], Tensor], **more: Any) -> dict[str, Any]:
@@ -479,4 +488,21 @@ PAIRS: dict[str, Pair] = {
         depth=3,
         files={"sky.exr": sky},
     ),
+    # The camera has a lens.
+    "ball_through_lens": Pair(
+        {**with_shapes(TABLE, ball={**BALL, "material": ORANGE}), "camera": LENS}, "shapes.ball.to_world", Z, 0.02
+    ),
+    "block_in_corner_through_lens": Pair(
+        {**with_shapes(CORNER, block=HANGING), "camera": LENS}, "shapes.block.to_world", X, 0.02, depth=3
+    ),
+    "lens_moved": Pair({**with_shapes(TABLE, box=BOX), "camera": LENS}, "camera.to_world", X, 0.01),
+    # Surfaces that are not opaque.
+    "veiled_ball": Pair(with_shapes(TABLE, ball={**BALL, "material": VEIL}), "shapes.ball.to_world", Z, 0.02),
+    "veiled_block_in_corner": Pair(
+        with_shapes(CORNER, block={**HANGING, "material": VEIL}), "shapes.block.to_world", X, 0.02, depth=3
+    ),
+    "block_behind_curtain": Pair(
+        with_shapes(CORNER, curtain=CURTAIN, block=HANGING), "shapes.block.to_world", Y, 0.02, depth=3
+    ),
+    "curtain_in_corner": Pair(with_shapes(CORNER, curtain=CURTAIN), "shapes.curtain.to_world", X, 0.02, depth=4),
 }

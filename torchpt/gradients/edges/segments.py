@@ -50,6 +50,8 @@ _STEP = 2.0**-16
 _NEAR = 2.0**-10
 #: Faces at an angle below this have no directions from which both lie to one side.
 _PLAIN = 1e-6
+#: Points of faces that are closer to the edge, against their distance from its point, lie on it but for rounding.
+_OFF = 1e-6
 #: Part of the directions that are drawn toward points of surfaces shaded smooth, where there are any.
 _TOWARD = 0.5
 
@@ -213,11 +215,12 @@ class SegmentSampler:
         return SegmentRays(held, part.mate, part.cut, e, zero, zero[0], omega, density, target, aimed, m, weight)
 
     def _across(self, face: Held, e: Tensor, tangent: Tensor) -> Tensor:
-        """Return unit vectors in faces ``(3, N)``, across their edges."""
-        away = self.occluders.bodies.points(face) - e
-        away = away - tangent * dot(tangent, away)
+        """Return unit vectors in faces ``(3, N)``, across their edges; any across these where the point lies on the edge."""
+        whole = self.occluders.bodies.points(face) - e
+        away = whole - tangent * dot(tangent, whole)
         length = dot(away, away).sqrt()
-        return torch.where(length > 0, away / torch.where(length > 0, length, 1.0), Frame.about(tangent).s)
+        off = length > _OFF * dot(whole, whole).sqrt()
+        return torch.where(off, away / torch.where(off, length, 1.0), Frame.about(tangent).s)
 
     def _rounds(self, sample: CurveSample, form: Form | None) -> SegmentRays:
         """Draw points of round surfaces, evenly in their own space, and directions along the surfaces."""
