@@ -441,8 +441,8 @@ FAULTS = (
         "gradients/edges/primary.py",
         "edges render",
         "Primary.samples",
-        "values[:, : len(index)] - values[:, len(index) :]",
-        "values[:, len(index) :] - values[:, : len(index)]",
+        "values[:, :n] - values[:, n:]",
+        "values[:, n:] - values[:, :n]",
         "wrong sign: an optimizer moves outlines away from where they belong",
     ),
     # -- scenes

@@ -32,7 +32,7 @@ def painted() -> dict[str, Any]:
 
 
 #: Shapes, and the entry of the first row of their pose that is changed: 0 is their width, 3 their place.
-SHAPES = {
+SHAPES: dict[str, tuple[dict[str, Any], int]] = {
     "box": (BOX, 0),
     "ball": ({"type": "sphere", "radius": 0.6}, 0),
     "cone": ({"type": "cone", "apex": [0, 0.5, 0], "height": -1, "slope": 0.5}, 0),
@@ -56,8 +56,9 @@ def by_pose(camera: dict[str, Any], shape: dict[str, Any], entry: int, seed: int
 @pytest.mark.parametrize("shape", few(SHAPES, 2))
 def test_a_lens_of_no_radius_is_a_pinhole(shape: str) -> None:
     lens = {"type": "thinlens", "aperture_radius": 0.0, "focus_distance": 4}
+    described, entry = SHAPES[shape]
     found = [
-        torch.stack([by_pose(camera, *SHAPES[shape], seed) for seed in range(4)])
+        torch.stack([by_pose(camera, described, entry, seed) for seed in range(4)])
         for camera in ({"type": "perspective"}, lens)
     ]
     error = math.sqrt(sum(float(each.var()) / len(each) for each in found))

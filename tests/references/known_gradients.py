@@ -504,5 +504,7 @@ PAIRS: dict[str, Pair] = {
     "block_behind_curtain": Pair(
         with_shapes(CORNER, curtain=CURTAIN, block=HANGING), "shapes.block.to_world", Y, 0.02, depth=3
     ),
-    "curtain_in_corner": Pair(with_shapes(CORNER, curtain=CURTAIN), "shapes.curtain.to_world", X, 0.02, depth=4),
+    "curtain_in_corner": Pair(
+        with_shapes(CORNER, curtain=CURTAIN), "shapes.curtain.to_world", X, 0.02, depth=4, spp=512
+    ),
 }
