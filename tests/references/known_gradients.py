@@ -469,6 +469,7 @@ PAIRS: dict[str, Pair] = {
         {(5, 1): 1.0, (10, 0): 0.5},
         0.02,
         depth=4,
+        spp=256,
     ),
     "block_over_metal": Pair(
         with_shapes(CORNER, floor={**FLOOR, "material": SHINY}, block=HANGING),
