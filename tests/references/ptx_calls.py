@@ -32,8 +32,7 @@ from torchpt.compiler.kernel import HEAD, kernel_ir
 from torchpt.compiler.program import Tables, TracedStage, bind_tables
 from torchpt.compiler.ptx import ptx_target
 from torchpt.compiler.sinks import Sinks
-from torchpt.engines.kernels import engine as calls
-from torchpt.engines.kernels import programs
+from torchpt.engines.kernels import calls, programs
 from torchpt.engines.kernels.programs import Kernel
 from torchpt.scene.formats.description import settings
 

@@ -28,7 +28,7 @@ from torchpt.math.vectors import concatenate_lanes, cross, dot, rows, take
 from torchpt.physics.shapes.quadrics import Form
 from torchpt.scene import Scene
 
-__all__ = ["EdgePoints", "Occluders", "occluders_of"]
+__all__ = ["EdgePoints", "Occluders", "OutlinePoints", "occluders_of"]
 
 #: Least weight of an edge between faces that almost lie in one plane, as an outline, against a border of the same length.
 _LEAST_OUTLINE = 0.01
@@ -40,7 +40,7 @@ _STATIC = 0.3
 
 @dataclass(frozen=True)
 class EdgePoints:
-    """Points of curves that light passes, N lanes.
+    """Points of curves, N lanes.
 
     Attributes:
         lane: ``(N,)`` of those that were asked for: where there is no outline there is no point.
@@ -49,10 +49,7 @@ class EdgePoints:
         cut: ``(N,)`` bool: the two cut there.
         p: where they are ``(3, N)``.
         along: how ``p`` changes with the curve's parameter.
-        outline: ``(N,)`` bool: no crease, as seen from there.
-        bent: ``(N,)`` bool: the curve is the outline of a round surface.
         density: of the draw in that parameter.
-        part: with which the curve counts, where others lie on it.
     """
 
     lane: Tensor
@@ -61,9 +58,21 @@ class EdgePoints:
     cut: Tensor
     p: Tensor
     along: Tensor
+    density: Tensor
+
+
+@dataclass(frozen=True)
+class OutlinePoints(EdgePoints):
+    """Points of curves that are seen from somewhere, N lanes.
+
+    Attributes:
+        outline: ``(N,)`` bool: no crease, as seen from there.
+        bent: ``(N,)`` bool: the curve is the outline of a round surface.
+        part: with which the curve counts, where others lie on it.
+    """
+
     outline: Tensor
     bent: Tensor
-    density: Tensor
     part: Tensor
 
 
@@ -95,7 +104,7 @@ class Occluders:
     seen: Distribution1D | None
     creases: Distribution1D
 
-    def points(self, choice: Distribution1D, u: Tensor, coin: Tensor, view: View) -> EdgePoints:
+    def points(self, choice: Distribution1D, u: Tensor, coin: Tensor, view: View) -> OutlinePoints:
         """Return points of curves, those of round surfaces as they are seen from ``view``.
 
         Args:
@@ -129,7 +138,7 @@ class Occluders:
         outline = ~take(self.folded, index) | (one * two >= 0)
         some &= dot(across, across) > 0
         lane, part = torch.arange(len(index), device=index.device), take(self.part, index)
-        drawn = EdgePoints(lane, held, curves.mate, curves.cut, p, along, outline, form >= 0, chance / span, part)
+        drawn = OutlinePoints(lane, held, curves.mate, curves.cut, p, along, chance / span, outline, form >= 0, part)
         return rows(drawn, some.nonzero().squeeze(1))
 
 

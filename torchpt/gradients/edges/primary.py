@@ -25,7 +25,7 @@ from torchpt.gradients.edges.curves import (
 from torchpt.gradients.edges.cuts import Crossing, Cuts, crossing_of
 from torchpt.gradients.edges.film import Worth, film_places, slopes
 from torchpt.gradients.edges.guide import Round
-from torchpt.gradients.edges.occluders import Occluders, occluders_of
+from torchpt.gradients.edges.occluders import EdgePoints, Occluders, occluders_of
 from torchpt.gradients.edges.traced import Passing, Traced, Use
 from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import cross, dot, rows, take
@@ -111,13 +111,16 @@ def distance_to(s: Tensor, a: Tensor, b: Tensor) -> Tensor:
 # surfaces are taken to stay together; where only one of them moves the derivative is the mean of those to both sides.
 
 
-def share_of(bodies: Bodies, place: EdgePlace, s: Tensor, prim: Tensor, near: Tensor, step: Tensor) -> Tensor:
+def share_of(
+    bodies: Bodies, place: EdgePoints, s: Tensor, lens: Tensor | None, prim: Tensor, near: Tensor, step: Tensor
+) -> Tensor:
     """Return the parts ``(N,)`` with which places of edges count.
 
     Args:
         bodies: detached.
         place: the places.
         s: on the film ``(2, N)``.
+        lens: samples of the lens ``(2, N)``; None: there is none.
         prim: what is seen on both sides ``(2, N)``.
         near: whether at the edge's own distance ``(2, N)``.
         step: how far beside the edges that is ``(N,)``, in pixels.
@@ -130,7 +133,7 @@ def share_of(bodies: Bodies, place: EdgePlace, s: Tensor, prim: Tensor, near: Te
     safe = torch.where(flat, other, 0)
     if not bool(flat.any()):
         return torch.ones_like(step)
-    away = torch.stack([distance_to(s, a, b) for a, b in outline_of(bodies, safe, place.lens)]).amin(0)
+    away = torch.stack([distance_to(s, a, b) for a, b in outline_of(bodies, safe, lens)]).amin(0)
     return torch.where(flat & (away < 0.5 * step), 0.5, 1.0)
 
 
@@ -334,31 +337,6 @@ class Along:
 
 
 @dataclass(frozen=True)
-class EdgePlace:
-    """Places of edges, N lanes.
-
-    Attributes:
-        lane: ``(N,)`` of those that were asked for.
-        held: the points.
-        mate: the other face of each edge ``(N,)``; -1: there is none.
-        cut: ``(N,)`` bool: two surfaces cut there.
-        p: where they are ``(3, N)``.
-        along: how ``p`` changes with the curve's parameter ``(3, N)``.
-        density: ``(N,)`` of the draw in that parameter.
-        lens: ``(2, N)`` samples of the lens; None: there is none.
-    """
-
-    lane: Tensor
-    held: Held
-    mate: Tensor
-    cut: Tensor
-    p: Tensor
-    along: Tensor
-    density: Tensor
-    lens: Tensor | None
-
-
-@dataclass(frozen=True)
 class Seen:
     """Draws places of what the camera may see from one point, by length on the film.
 
@@ -372,14 +350,14 @@ class Seen:
     pieces: Pieces
     choice: Distribution1D
 
-    def draw(self, u: Tensor, coin: Tensor, lens: Tensor | None) -> EdgePlace:
-        """Return a place for each lane; ``u (N,)`` in [0, 1): which curve and where on it. The others are not needed."""
+    def draw(self, u: Tensor, coin: Tensor, lens: Tensor | None) -> EdgePoints:
+        """Return a point for each lane; ``u (N,)`` in [0, 1): which curve and where on it. The others are not needed."""
         index, rest = self.choice.draw(u)
         pieces = rows(self.pieces, index)
         t, density = pieces.place(rest)
         held, p, along = pieces.curves.moving(self.bodies, t)
         lane, density = torch.arange(len(u), device=u.device), density * take(self.choice.pmf, index)
-        return EdgePlace(lane, held, pieces.curves.mate, pieces.curves.cut, p, along, density, None)
+        return EdgePoints(lane, held, pieces.curves.mate, pieces.curves.cut, p, along, density)
 
 
 @dataclass(frozen=True)
@@ -394,8 +372,8 @@ class SeenThroughLens:
     occluders: Occluders
     choice: Distribution1D
 
-    def draw(self, u: Tensor, coin: Tensor, lens: Tensor | None) -> EdgePlace:
-        """Return places of some lanes.
+    def draw(self, u: Tensor, coin: Tensor, lens: Tensor | None) -> EdgePoints:
+        """Return points for some lanes.
 
         Args:
             u: ``(N,)`` in [0, 1), which curve and where on it.
@@ -407,9 +385,7 @@ class SeenThroughLens:
         drawn = self.occluders.points(self.choice, u, coin, View(o, torch.ones_like(u)))
         seen = camera.film_of(drawn.p, rows(lens, drawn.lane))
         assert seen is not None
-        drawn = rows(drawn, (seen[2] > 0).nonzero().squeeze(1))
-        lens = rows(lens, drawn.lane)
-        return EdgePlace(drawn.lane, drawn.held, drawn.mate, drawn.cut, drawn.p, drawn.along, drawn.density, lens)
+        return rows(drawn, (seen[2] > 0).nonzero().squeeze(1))
 
 
 @dataclass(frozen=True)
@@ -435,22 +411,25 @@ class Primary:
         ``over``: they count as they move over what is seen on both sides, which is held in place.
         """
         number, key, u, coin = self.traced.edges(Round(0, total), first, count, Use.PRIMARY)
-        place = self.source.draw(u, coin, self.traced.lens(key))
-        s, jacobian = slopes(self.bodies.camera, place.p, place.lens)
+        lens = self.traced.lens(key)
+        place = self.source.draw(u, coin, lens)
+        lens = rows(lens, place.lane)
+        s, jacobian = slopes(self.bodies.camera, place.p, lens)
         slope = (jacobian * place.along).sum(1)
         normal = torch.stack((slope[1], -slope[0]))  # as long as `s` changes with the curve's parameter
         length, value = (normal * normal).sum(0).sqrt(), worth.at(s)
         index = ((length > 0) & (value != 0).any(0)).nonzero().squeeze(1)
-        place, s, normal, length, value = rows((place, s, normal, length, value), index)
-        step = steps_at(self.bodies, (place.held.prim, place.mate), s, place.lens)
-        o, d = self._beside(place, s, normal / length, step)
+        place, lens, s, normal, length, value = rows((place, lens, s, normal, length, value), index)
+        step = steps_at(self.bodies, (place.held.prim, place.mate), s, lens)
+        o, d = self._beside(s, lens, normal / length, step)
         key = take(key, place.lane)
-        share = self._share(place, s, step, o, d, key)
+        share = self._share(place, s, lens, step, o, d, key)
         if self.cuts:
-            share = share * self._visible_nearby(place, s, key)
+            share = share * self._visible_nearby(place, s, lens, key)
         seen = (share > 0).nonzero().squeeze(1)
         both = torch.cat((seen, seen + len(index)))
-        place, normal, value, share, o, d = *rows((place, normal, value, share), seen), take(o, both), take(d, both)
+        place, lens, normal, value, share = rows((place, lens, normal, value, share), seen)
+        o, d = take(o, both), take(d, both)
         n = len(seen)
         values = look(o, d, take(number, place.lane).repeat(2)) if n else torch.zeros(len(value), 0).to(value)
         jump = values[:, :n] - values[:, n:]
@@ -464,16 +443,18 @@ class Primary:
             met = prim >= 0
             beside = torch.where(met, o, torch.inf), torch.where(met, t, 1.0) * d, normal.repeat(1, 2) * each
         crossing = crossing_of(self.bodies, place.cut, place.held, place.mate)
-        return Along(place.held, normal * (worthy / chance), place.lens, crossing, beside)
+        return Along(place.held, normal * (worthy / chance), lens, crossing, beside)
 
-    def _beside(self, place: EdgePlace, s: Tensor, unit: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+    def _beside(self, s: Tensor, lens: Tensor | None, unit: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """Return rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""
         places = torch.cat((s - unit * step, s + unit * step), 1)
-        lens = None if place.lens is None else place.lens.repeat(1, 2)
+        lens = None if lens is None else lens.repeat(1, 2)
         o, d = self.bodies.camera.rays(places[0], places[1], lens)
         return o.expand_as(d), d
 
-    def _share(self, place: EdgePlace, s: Tensor, step: Tensor, o: Tensor, d: Tensor, key: Tensor) -> Tensor:
+    def _share(
+        self, place: EdgePoints, s: Tensor, lens: Tensor | None, step: Tensor, o: Tensor, d: Tensor, key: Tensor
+    ) -> Tensor:
         """Return how much of each edge counts ``(N,)``: nothing where it is hidden, a part where others lie on it."""
         n = place.p.shape[1]
         away = place.p - o[:, :n]
@@ -484,15 +465,15 @@ class Primary:
         own = (prim == place.held.prim) | (prim == place.mate)
         seen = (t > reach * torch.where(own, _OWN, _BEFORE)).all(0)
         near = (t - reach).abs() < reach * 2.0**-8
-        return torch.where(seen, share_of(self.bodies, place, s, prim, near, step), 0.0)
+        return torch.where(seen, share_of(self.bodies, place, s, lens, prim, near, step), 0.0)
 
-    def _visible_nearby(self, place: EdgePlace, s: Tensor, key: Tensor) -> Tensor:
+    def _visible_nearby(self, place: EdgePoints, s: Tensor, lens: Tensor | None, key: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of edges that are not hidden close to them, by a surface that cuts through theirs.
 
         A step beside an edge tells this too late: behind its outline a round surface comes forward by the root of the step, so
         that a ray beside an outline below a floor meets what stands out of the floor.
         """
-        o, d = self.bodies.camera.rays(s[0], s[1], place.lens)
+        o, d = self.bodies.camera.rays(s[0], s[1], lens)
         o = o.expand_as(d)
         reach = ((place.p - o) * d).sum(0)
         t, prim = self.traced.nearest(o, d, _ending_at(reach, _NEAR, key))

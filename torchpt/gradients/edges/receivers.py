@@ -38,7 +38,7 @@ _ROUNDING = 2.0**-18
 _MAX_VERTICES = 32
 #: From this vertex on roulette plays.
 _ROULETTE = 3
-#: Random numbers of rays to the camera are as of vertices behind those of all paths.
+#: Random numbers of rays to the camera are as of vertices that prefixes do not have.
 _TO_CAMERA = 1 << 12
 #: What ends so close to a point, against the way to it, ends at it: of the point's own primitive, and of others.
 _NEAR, _NEAREST = 2.0**-10, 2.0**-14

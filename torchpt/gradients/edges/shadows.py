@@ -11,7 +11,7 @@ from torch import Tensor
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import View
 from torchpt.gradients.edges.guide import Round
-from torchpt.gradients.edges.occluders import EdgePoints, Occluders
+from torchpt.gradients.edges.occluders import Occluders, OutlinePoints
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
 from torchpt.gradients.edges.traced import Passing, Use
 from torchpt.gradients.edges.vertices import Spot, met
@@ -296,7 +296,7 @@ class Shadows:
             turn.lesson.append((even, brought / scale))
         return cast
 
-    def _past(self, beam: Beam, passed: EdgePoints, key: Tensor) -> tuple[Beam, EdgePoints, Spot, Tensor]:
+    def _past(self, beam: Beam, passed: OutlinePoints, key: Tensor) -> tuple[Beam, OutlinePoints, Spot, Tensor]:
         """Trace rays past edges: return what they meet, and unit vectors ``(3, N)`` across the edge to the lit side.
 
         Before the edge the rays to both sides pass the same surfaces by their opacity. Behind it the lit one decides anew, by
@@ -333,7 +333,7 @@ class Shadows:
         return rows(beam, index), rows(passed, index), spot.taken(some), take(outward, some)
 
     def _cast(
-        self, key: Tensor, beam: Beam, passed: EdgePoints, spot: Spot, outward: Tensor, scale: Tensor
+        self, key: Tensor, beam: Beam, passed: OutlinePoints, spot: Spot, outward: Tensor, scale: Tensor
     ) -> Cast | None:
         x, n = spot.p.double(), spot.n.double()
         toward = beam.view.toward(x)
