@@ -3,10 +3,13 @@
     python scripts/bench_bidirectional.py caustics cornell_box [--seconds 16] [--seeds 5] [--width 128] [--ways path bdpt vcm]
 
 A scene is a name or a file. Each way renders pictures for about so many seconds, box filter, and the table shows its squared
-error times its seconds, over those of the first way: of all pixels (each over the square of the reference and 0.01, without the
-largest 0.1 %), and the median of blocks of 8 x 8 pixels. The reference is a long render of another seed: by ``bdpt`` with all
-its strategies, or what ``--reference`` says; a light that only one way finds counts as an error of the others. Mitsuba's ways
-need the extra `bench`, and LLVM where ``DRJIT_LIBLLVM_PATH`` says. Other work on the machine disturbs it.
+error times its seconds, over those of the first way. A pixel's error counts over the square of the reference and 0.01. The
+columns: the mean of a picture without its largest 0.1 %; that of the mean of all pictures (which counts more of the pixels that
+are rarely bright, the more pictures there are); and the median of its blocks of 8 x 8 pixels.
+
+The reference is a long render of another seed: by ``bdpt`` with all its strategies, or what ``--reference`` says; a light that
+only one way finds counts as an error of the others. Mitsuba's ways need the extra `bench`, and LLVM where
+``DRJIT_LIBLLVM_PATH`` says. Other work on the machine disturbs it.
 """
 
 from __future__ import annotations
@@ -72,8 +75,8 @@ def compare(name: str, arguments: argparse.Namespace) -> None:
             ways |= others(scene, film, arguments, Path(folder))
         reference, spp, _ = timed(ways[arguments.reference], 90_001, arguments.reference_seconds)
         print(f"\n{name}, {reference.shape[1]} x {reference.shape[0]}; reference: {arguments.reference}, {spp} samples")
-        print(f"{'':18s} samples  seconds  error, block   over the first")
-        first: tuple[float, float] | None = None
+        print(f"{'':18s} samples  seconds  error of each, of their mean, block   over the first")
+        first: tuple[float, ...] | None = None
         for way in arguments.ways:
             shoot = ways[way]
             found, seconds, spp = [], [], 0
@@ -81,13 +84,12 @@ def compare(name: str, arguments: argparse.Namespace) -> None:
                 picture, spp, took = timed(shoot, seed, arguments.seconds, spp)
                 found.append(picture)
                 seconds.append(took)
-            every, block = (x * sum(seconds) / len(seconds) for x in errors(found, reference))
-            first = first or (every, block)
-            print(
-                f"{way:18s}{spp:8d}{sum(seconds) / len(seconds):9.1f}  {every:.3g}, {block:.3g}"
-                f"   {every / first[0]:.3g}, {block / first[1]:.3g}",
-                flush=True,
-            )
+            took = sum(seconds) / len(seconds)
+            costs = tuple(x * took for x in errors(found, reference))
+            first = first or costs
+            ratios = (x / y for x, y in zip(costs, first, strict=True))
+            values, over = (", ".join(f"{x:.3g}" for x in row) for row in (costs, ratios))
+            print(f"{way:18s}{spp:8d}{took:9.1f}  {values}   {over}", flush=True)
 
 
 def timed(shoot: Shoot, seed: int, seconds: float, spp: int = 0) -> tuple[Tensor, int, float]:
@@ -110,14 +112,20 @@ def timed(shoot: Shoot, seed: int, seconds: float, spp: int = 0) -> tuple[Tensor
     return picture, spp, time.perf_counter() - start
 
 
-def errors(pictures: list[Tensor], reference: Tensor) -> tuple[float, float]:
-    """Return the relative squared error of pictures: trimmed mean of all pixels, and median of blocks."""
-    error = torch.stack([relative((x - reference).square(), reference).mean(-1) for x in pictures]).mean(0)
-    pixels = error.reshape(-1).sort().values
-    trimmed = pixels[: len(pixels) - len(pixels) // 1000].mean()
+def errors(pictures: list[Tensor], reference: Tensor) -> tuple[float, float, float]:
+    """Return the relative squared error of pictures: trimmed mean of each and of their mean, and the median of its blocks."""
+    of_each = torch.stack([relative((x - reference).square(), reference).mean(-1) for x in pictures])
+    error = of_each.mean(0)
+    each = torch.stack([trimmed_mean(x) for x in of_each]).mean()
     height, width = (side - side % BLOCK for side in error.shape)
     blocks = error[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK).mean((1, 3))
-    return float(trimmed), float(blocks.median())
+    return float(each), float(trimmed_mean(error)), float(blocks.median())
+
+
+def trimmed_mean(pixels: Tensor) -> Tensor:
+    """Return the mean of pixels without the largest 0.1 %."""
+    ordered = pixels.reshape(-1).sort().values
+    return ordered[: len(ordered) - len(ordered) // 1000].mean()
 
 
 def own(scene: Scene, film: dict[str, Any], keys: dict[str, Any], arguments: argparse.Namespace) -> Shoot:

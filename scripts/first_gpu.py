@@ -36,8 +36,8 @@ from torchpt.compiler.program import bind_tables
 from torchpt.compiler.ptx import ptx_target
 from torchpt.compiler.target import Target
 from torchpt.core.errors import TorchptError
-from torchpt.engines.kernels.device import MAX_LANES, DeviceForward, device_forward
 from torchpt.engines.kernels.device_backward import device_backward
+from torchpt.engines.kernels.device_forward import MAX_LANES, DeviceForward, device_forward
 from torchpt.engines.kernels.driver import Cuda, cuda_of
 from torchpt.gradients import replay
 from torchpt.native import device_checks

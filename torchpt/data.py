@@ -26,7 +26,8 @@ from torchpt.core.errors import SceneError
 from torchpt.core.threads import TaskQueue, limited_threads, outside_inference_mode
 from torchpt.rendering import Rendering
 from torchpt.rendering.batches import Picture, naming_errors, render_pictures, request_of, task_counts
-from torchpt.rendering.requests import RenderRequest, execute_request, template_of
+from torchpt.rendering.execution import execute_request
+from torchpt.rendering.requests import RenderRequest, template_of
 from torchpt.scene import Scene, load
 from torchpt.scene.prepare import make_wave
 from torchpt.scene.settings import BatchOptions, RenderOptions, base_seed, film_keys

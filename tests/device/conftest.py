@@ -10,8 +10,8 @@ import pytest
 from simulated_driver import PtxDriver, SimulatedCuda, shuffled_lanes, simulated_target
 
 from torchpt.compiler.ptx import ptx_target
-from torchpt.engines.kernels.device import DeviceForward, device_forward
 from torchpt.engines.kernels.device_backward import device_backward
+from torchpt.engines.kernels.device_forward import DeviceForward, device_forward
 from torchpt.gradients import replay
 from torchpt.paths.wave import Wave
 from torchpt.rendering import run

@@ -19,8 +19,8 @@ from torch import Tensor
 
 import torchpt
 from torchpt.core.errors import SceneError
-from torchpt.engines.kernels import device as device_module
 from torchpt.engines.kernels import device_backward as backward_module
+from torchpt.engines.kernels import device_forward as forward_module
 from torchpt.engines.kernels import driver as driver_module
 from torchpt.native import device_checks
 from torchpt.native.device_checks import CheckResult
@@ -60,9 +60,9 @@ def card(monkeypatch) -> Iterator[_Card]:
     monkeypatch.setattr(torch._ops.OpOverload, "__call__", called)
     monkeypatch.setattr(SimulatedTensor, "data_ptr", lambda self: self.inner.data_ptr())
     monkeypatch.setattr(driver_module, "library", SimulatedDriver)
-    for module in (device_module, backward_module):
+    for module in (forward_module, backward_module):
         monkeypatch.setattr(module, "cuda_of", lambda device: card)
-    monkeypatch.setattr(device_module.device_forward, "__defaults__", (None, None, simulated_target, 2048))
+    monkeypatch.setattr(forward_module.device_forward, "__defaults__", (None, None, simulated_target, 2048))
     monkeypatch.setattr(backward_module.device_backward, "__defaults__", (None, None, simulated_target))
     with simulated_cuda(rounds=True):  # numbers of pictures may come from no operator that CUDA may round differently
         yield card

@@ -19,7 +19,8 @@ from tree_machine import search_on_machine
 
 import torchpt
 from torchpt.core.tree import moved
-from torchpt.engines.kernels import device as device_module
+from torchpt.engines.kernels import device_forward as forward_module
+from torchpt.engines.kernels import device_search
 from torchpt.rendering.api import Rendering, render_scene
 from torchpt.scene import Scene
 from torchpt.scene.formats.description import settings
@@ -64,7 +65,7 @@ def test_the_search_of_a_device_is_that_of_the_host():
         with simulated_cuda():
             accel = build(moved(g, torch.device("cuda:0")))
             assert accel.name == "torch"
-            host = device_module._host_search(accel)
+            host = device_search._host_search(accel)
         assert isinstance(host, WideBvh if g is plain else InstancedWideBvh)
         of_device, of_host = (
             searched_trees(host),
@@ -95,14 +96,14 @@ def rendered(scene: Scene, film: dict[str, Any], depth: int, **render: Any) -> R
 def trees(monkeypatch) -> list[Any]:
     """The searches by kernels that renders copied to the device."""
     copied: list[Any] = []
-    plain = device_module.search_on_device
+    plain = forward_module.search_on_device
 
     def noted(*given: Any) -> Any:
         found = plain(*given)
         copied.append(None if found is None else found.tree)
         return found
 
-    monkeypatch.setattr(device_module, "search_on_device", noted)
+    monkeypatch.setattr(forward_module, "search_on_device", noted)
     return copied
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import torchpt
 from torchpt.core.errors import RenderError
-from torchpt.engines.kernels import device as device_module
+from torchpt.engines.kernels import device_forward as forward_module
 from torchpt.engines.kernels.device import DeviceCalls, DeviceMemory
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.physics.bsdfs import Parameters
@@ -212,7 +212,7 @@ def test_waves_shrink_where_memory_runs_out(device, monkeypatch):
     monkeypatch.setattr(DeviceMemory, "__init__", bounded)
     device(2048)
     assert_same(rendered(scene), of_cpu)
-    monkeypatch.setattr(device_module, "MIN_LANES", 2048)
+    monkeypatch.setattr(forward_module, "MIN_LANES", 2048)
     with pytest.raises(RenderError, match="not enough memory for a wave of the fewest lanes"):
         rendered(scene)
 

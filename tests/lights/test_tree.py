@@ -113,7 +113,7 @@ def test_what_is_drawn_is_what_is_told(case):
             # What brings light can be drawn.
             assert not ((brought(lights, x, n) > 0) & (p == 0)).any()
         y, m = x.repeat(1, 100), None if normal is None else normal.repeat(1, 100)
-        row, drawn, _ = tree.sample(built, y, m, tree.from_digits(uniform(2, 4000)))
+        row, drawn, _ = tree.sample(built, y, m, tree.from_digits(*uniform(2, 4000)))
         assert (drawn > 0).all()
         assert torch.equal(tree.probability(built, row, y, m), drawn)
         if case not in ("all dark", "lopsided"):
@@ -124,7 +124,7 @@ def test_what_is_drawn_is_what_is_told(case):
 def test_the_tensor_form_is_the_kernels_reference(case):
     lights = emitters(case)
     built, (x, n) = tree.build(**lights), points(500)
-    u = tree.from_digits(uniform(2, 500))
+    u = tree.from_digits(*uniform(2, 500))
     for normal in (n, None):
         row, p, _ = tree.sample(built, x, normal, u)
         same, q, _ = tree.sample.function(built, x, normal, u)
@@ -140,7 +140,7 @@ def test_the_tensor_form_is_the_kernels_reference(case):
 def test_lanes_may_have_a_row_already(case):
     lights = emitters(case)
     built, (x, n) = tree.build(**lights), points(500)
-    u, given = tree.from_digits(uniform(2, 500)), torch.randint(-5, len(lights["intensity"]), (500,), generator=G)
+    u, given = tree.from_digits(*uniform(2, 500)), torch.randint(-5, len(lights["intensity"]), (500,), generator=G)
     given = given.clamp_min(-1)
     drawn, p, rest = tree.sample(built, x, n, u)
     row, q, remapped = tree.sample(built, x, n, u, given)
@@ -174,7 +174,7 @@ def test_frequencies_are_the_probabilities(case):
             built,
             x[:, k : k + 1].expand(3, n_draws),
             n[:, k : k + 1].expand(3, n_draws),
-            tree.from_digits(uniform(2, n_draws)),
+            tree.from_digits(*uniform(2, n_draws)),
         )
         counts = torch.bincount(row, minlength=count).double()
         assert not counts[p == 0].any()
@@ -197,7 +197,7 @@ def test_the_estimate_of_all_lights_together_is_unbiased(case):
     p, f = table(built, count, x, n)[0], brought(lights, x, n)[0]
     total, square = f.sum(), torch.where(f > 0, f * f / torch.where(p > 0, p, 1.0), 0.0).sum()
     row, drawn, _ = tree.sample(
-        built, x.expand(3, n_draws), n.expand(3, n_draws), tree.from_digits(uniform(2, n_draws))
+        built, x.expand(3, n_draws), n.expand(3, n_draws), tree.from_digits(*uniform(2, n_draws))
     )
     mean = (f[row] / drawn.double()).mean()
     error = ((square - total**2).clamp_min(0) / n_draws).sqrt()
@@ -266,7 +266,7 @@ def test_rounding_hides_no_light_at_the_horizon():
 
 def test_place_and_threads_do_not_matter():
     built, (x, n) = tree.build(**emitters("mixed")), points(5003)
-    u, before = tree.from_digits(uniform(2, 5003)), torch.get_num_threads()
+    u, before = tree.from_digits(*uniform(2, 5003)), torch.get_num_threads()
     try:
         torch.set_num_threads(1)
         row, p, _ = tree.sample(built, x, n, u)
@@ -289,5 +289,5 @@ def test_a_lane_without_a_place_draws_some_light():
 
 
 def test_two_numbers_are_one_of_48_bits():
-    u = tree.from_digits(torch.tensor([[0.5, 1 - 2**-24], [0.25, 1 - 2**-24]]))
+    u = tree.from_digits(*torch.tensor([[0.5, 1 - 2**-24], [0.25, 1 - 2**-24]]))
     assert u.tolist() == [0.5 + 2**-26, 1 - 2**-48]

@@ -187,7 +187,7 @@ def forward_device(wave: Wave, own: Sequence[int], by_kernels: bool, before: Ker
     Raises:
         RenderError: kernels cannot run on the device.
     """
-    from torchpt.engines.kernels.device import device_forward
+    from torchpt.engines.kernels.device_forward import device_forward
 
     return device_forward(wave, own, by_kernels, before)
 

@@ -9,7 +9,7 @@
 ``edges/``          boundary terms of silhouettes and shadow edges that move
 ==================  ==========================================================================================
 
-``rendering/requests.py`` calls :func:`gradients` when autograd goes back through a picture. A cotangent is the derivative of
+``rendering/derivatives.py`` calls :func:`gradients` when autograd goes back through a picture. A cotangent is the derivative of
 the loss with respect to a value; gradient sums collect those of parameters, in the order of samples.
 
 May import: ``scene`` and what lies below.

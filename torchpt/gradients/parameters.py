@@ -4,7 +4,7 @@
 with respect to the tensors of the world; their gradient sums are pulled back to the parameters once, at the end. Those tensors,
 cut from the tape of the parameters, are the leaves; their detached twins are the primals.
 
-``rendering/requests.py`` makes a :class:`SceneTape` for each backward pass, through :func:`torchpt.gradients.gradients`.
+``rendering/derivatives.py`` makes a :class:`SceneTape` for each backward pass, through :func:`torchpt.gradients.gradients`.
 """
 
 from __future__ import annotations

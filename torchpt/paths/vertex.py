@@ -149,7 +149,7 @@ def sample_light(context: StageContext, model: int, state: PathState, at: Intera
     if table.choice is not None:  # more than one light
         # The number that chooses the light is used again for the point on it, so that both are stratified together. It has
         # 24 bits, and the other number appends 24 more.
-        which = lights.from_digits(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS))))
+        which = lights.from_digits(u[0], draws.one(Dimension.LIGHT_DIGITS))
     return lights.sample(table, x, which, u.to(plan.dtype), offset=OFFSET, n=n, mis=plan.strategy == "mis")
 
 

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.rendering import Progress, Rendering, render_scene
+from torchpt.rendering.execution import execute_request
 from torchpt.rendering.graphs import as_custom_op, with_graph_break
-from torchpt.rendering.requests import execute_request, prepare_request, prepare_trace_request
+from torchpt.rendering.requests import prepare_request, prepare_trace_request
 from torchpt.scene import Scene
 from torchpt.scene.settings import FILTERS, CommonOptions, Params, SeedOfCall, Settings, TraceOptions
 from torchpt.spec.arguments import check_names, expand_signature

@@ -7,7 +7,8 @@ from typing import Any, Unpack
 import torch
 
 from torchpt.rendering.api import render
-from torchpt.rendering.requests import execute_request, template_of
+from torchpt.rendering.execution import execute_request
+from torchpt.rendering.requests import template_of
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
 from torchpt.scene.settings import CommonOptions, Params, RendererOptions, SeedOfCall, Settings

@@ -19,16 +19,9 @@ from torchpt.compiler.ptx import ptx_target
 from torchpt.compiler.target import Target
 from torchpt.core.memory import Span
 from torchpt.engines.kernels.backward import KernelsBackward, VjpKernels
-from torchpt.engines.kernels.device import (
-    Count,
-    DeviceEngine,
-    DeviceMemory,
-    KernelsOnDevice,
-    LateCheck,
-    SearchWords,
-    on_host,
-    search_on_device,
-)
+from torchpt.engines.kernels.device import Count, DeviceEngine, DeviceMemory, LateCheck
+from torchpt.engines.kernels.device_kernels import KernelsOnDevice, on_host
+from torchpt.engines.kernels.device_search import SearchWords, search_on_device
 from torchpt.engines.kernels.device_sums import SegmentSums, Terms, WaveSums
 from torchpt.engines.kernels.driver import Cuda, cuda_of
 from torchpt.engines.kernels.engine import Chunk, Paths
@@ -57,7 +50,7 @@ class DeviceVjpKernels(KernelsOnDevice, VjpKernels):
         tape: the wave and its differentiated tensors, on the device.
         cotangent: see :class:`~torchpt.engines.kernels.backward.VjpKernels`.
         cuda: the device.
-        target: see :class:`~torchpt.engines.kernels.device.KernelsOnDevice`.
+        target: see :class:`~torchpt.engines.kernels.device_kernels.KernelsOnDevice`.
         search: see there.
     """
 
@@ -109,7 +102,7 @@ def device_backward(
         cotangent: see :class:`DeviceVjpKernels`.
         by_kernels: True: rays are searched by kernels where these can; False: by the wave's acceleration structure.
         lanes: of a wave.
-        before: see :func:`~torchpt.engines.kernels.device.search_on_device`.
+        before: see :func:`~torchpt.engines.kernels.device_search.search_on_device`.
         cuda: the device; None: that of the wave.
         target: returns the target of a row length.
 

@@ -177,6 +177,11 @@ class KernelCache:
         """Return True if a kernel was stored."""
         return bool(self._entries)
 
+    def program(self, key: Any) -> Program | None:
+        """Return the program of a stage's latest kernel; None if there is none, or its trace depends on values of tensors."""
+        entry = self._entries.get(key)
+        return None if entry is None or entry.program.guards else entry.program
+
     def find(self, key: Any, program: Program, leaves: NamedTensors) -> tuple[Kernel | None, Sequence[LaidOut | None]]:
         """Return the cached kernel of a stage, if it was made of the same program and tensors, and tables to make another of.
 
@@ -572,7 +577,9 @@ class Kernels(Layout):
         return kernel
 
     def _program(self, key: tuple[Any, ...], listed: bool, build: Callable[[Trace], Sinks]) -> Program:
-        return program_of(key, self.structure, self._leaves, self, build, listed)
+        # The cache is of one structure, whose key is long to hash.
+        known = self.kernel_cache.program(key)
+        return known or program_of(key, self.structure, self._leaves, self, build, listed)
 
     def _bind(self, program: Program, kept: Sequence[LaidOut | None]) -> Tables:
         """Bind a program to the tables of this render; ``kept``: see :func:`torchpt.compiler.program.bind_tables`."""

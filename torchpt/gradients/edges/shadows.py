@@ -72,7 +72,7 @@ class Sources:
     def numbers(self, draws: Draws) -> Tensor:
         """Return the numbers ``(2, N)`` float64 of points on lights."""
         u = draws.two(Dimension.LIGHT)
-        return torch.stack((from_digits(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS)))), u[1].double()))
+        return torch.stack((from_digits(u[0], draws.one(Dimension.LIGHT_DIGITS)), u[1].double()))
 
     def draw(self, u: Tensor) -> Beam:
         """Draw points on lights by numbers ``(2, N)``."""

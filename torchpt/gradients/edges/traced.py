@@ -151,9 +151,12 @@ class Traced:
         """Return samples of the lens ``(2, N)`` float64; None without a lens. ``depth``: as for :meth:`draws`."""
         return self.draws(key, depth).two(Dimension.LENS).double() if self.wave.camera.lens else None
 
-    def of_paths(self, number: Tensor, use: Use, free: Tensor | None = None) -> Passing:
-        """Return what decides in :meth:`radiance` which surfaces rays pass; ``free`` as of :class:`Passing`."""
-        return Passing(self.key(number, use), depth=1, free=free)
+    def of_paths(self, number: Tensor, use: Use, free: Tensor | None = None) -> Passing | None:
+        """Return what decides in :meth:`radiance` which surfaces rays pass; None where all are opaque.
+
+        ``free``: as of :class:`Passing`.
+        """
+        return Passing(self.key(number, use), depth=1, free=free) if self.has_opacity else None
 
     def nearest(self, o: Tensor, d: Tensor, passing: Passing | None = None) -> tuple[Tensor, Tensor]:
         """Return how far rays ``(3, N)`` go, in units of ``d``, and the primitives that they meet; -1 for none.

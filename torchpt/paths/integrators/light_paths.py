@@ -103,7 +103,7 @@ class LightPaths(Integrator):
         draws, which = Draws(context.plan.sampler, key, salts), None
         u, v = draws.two(Dimension.LIGHT), draws.two(Dimension.BSDF)
         if emission.choice is not None:
-            which = lights.from_digits(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS))))
+            which = lights.from_digits(u[0], draws.one(Dimension.LIGHT_DIGITS))
         u, v = u.to(context.plan.dtype), v.to(context.plan.dtype)
         return emit(emission, which, u, v, OFFSET, mis=self.weighted)
 

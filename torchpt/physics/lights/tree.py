@@ -158,12 +158,12 @@ def _flat(
     return LightTree(*tensors, count=torch.tensor(len(lights), dtype=torch.int64, device=device), levels=1)
 
 
-def from_digits(u: Tensor) -> Tensor:
-    """Return ``u (2, N)`` in [0, 1) as one number ``(N,)`` float64 of 48 bits: the second continues the digits of the first.
+def from_digits(high: Tensor, low: Tensor) -> Tensor:
+    """Return two numbers ``(N,)`` in [0, 1) as one ``(N,)`` float64 of 48 bits: ``low`` continues the digits of ``high``.
 
     Numbers of samplers have 24 bits, too few for lights of lower probability.
     """
-    return torch.add(u[0].double(), u[1].double(), alpha=2.0**-24)
+    return torch.add(high.double(), low.double(), alpha=2.0**-24)
 
 
 @dispatched

@@ -36,7 +36,8 @@ from torchpt.rendering.batches.inputs import (
     scenes_of,
     values_of,
 )
-from torchpt.rendering.requests import RenderRequest, execute_request, prepare_request
+from torchpt.rendering.execution import execute_request
+from torchpt.rendering.requests import RenderRequest, prepare_request
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
 from torchpt.scene.settings import BatchOptions, CommonOptions, Params, RenderOptions
