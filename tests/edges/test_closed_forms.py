@@ -163,7 +163,7 @@ def test_what_is_left_out_is_named() -> None:
     blend = {"type": "blend", "a": {"type": "null"}, "b": {"type": "diffuse"}, "weight": board}
     assert "textures of opacity" in told(materials={"black": blend})
     squares = {"black": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}
-    assert "not interpolated" in told(materials=squares)
+    assert "not interpolated" in told(materials=squares)  # it is a sphere
     lens = {"type": "thinlens", "origin": [0, 0, 5], "target": [0, 0, 0], "aperture_radius": 0.1, "focus_distance": 5}
     assert told(camera=lens) == ""
     spot = {"type": "spot", "position": [0, 3, 0], "target": [0, 0, 0], "cutoff_angle": 20, "beam_width": 20}

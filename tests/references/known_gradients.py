@@ -306,6 +306,16 @@ CURTAIN = {
     "transform": [{"scale": 0.6}, turned([0, 1, 0], 20), moved(0.3, 0.7, 0.2)],
 }
 
+SQUARES = {
+    "type": "diffuse",
+    "reflectance": {"type": "checkerboard", "color0": [0.9, 0.8, 0.7], "color1": 0.05, "scale": 2.5},
+}
+BOARD = {
+    "type": "rectangle",
+    "material": SQUARES,
+    "transform": [{"scale": 0.5}, turned([0, 1, 0], 50), moved(-0.6, 0.6, -0.5)],
+}
+
 
 def grid(count: int, height: Callable[[Tensor, Tensor], Tensor], **more: Any) -> dict[str, Any]:
     """Return a mesh of ``count`` x ``count`` vertices over a square, of heights by x and z."""
@@ -489,6 +499,16 @@ PAIRS: dict[str, Pair] = {
         depth=3,
         files={"sky.exr": sky},
     ),
+    # Textures that are not interpolated.
+    "camera_over_squares": Pair(
+        with_shapes(
+            CORNER, floor={**FLOOR, "material": SQUARES, "uvs": [[0, 0], [3, 0], [3, 3], [0, 3]]}, block=HANGING
+        ),
+        "camera.to_world",
+        X,
+        0.01,
+    ),
+    "board_in_corner": Pair(with_shapes(CORNER, board=BOARD), "shapes.board.to_world", X, 0.02, depth=3),
     # The camera has a lens.
     "ball_through_lens": Pair(
         {**with_shapes(TABLE, ball={**BALL, "material": ORANGE}), "camera": LENS}, "shapes.ball.to_world", Z, 0.02

@@ -202,6 +202,33 @@ def test_after_a_fork():
     assert done.stdout.split() == ["0"], done.stderr
 
 
+VEILED = {
+    "camera": {"origin": [0, 0, 3], "target": [0, 0, 0]},
+    "shapes": {"it": {"type": "rectangle", "material": {"type": "diffuse", "opacity": 0.5}}},
+    "lights": {"sky": {"type": "constant"}},
+}
+
+
+@pytest.mark.parametrize("name", ["cornell_box", "cornell_transmissive", "a veil"])
+@pytest.mark.parametrize("integrator", ["path", "bdpt"])
+def test_rows_are_the_memory_of_a_lane(name: str, integrator: str):
+    """Threads and lanes are chosen by what an engine is said to allocate."""
+    from lanewise import prepared
+
+    from torchpt.rendering import kernels_of
+
+    scene = torchpt.load(VEILED if name == "a veil" else name, "cpu")
+    connections = {"connections": "one"} if integrator == "bdpt" else {}
+    wish = {"film": film_of(8), "render": {"spp": 1}, "integrator": {"type": integrator, **connections}}
+    wave, _ = prepared(scene, wish)
+    with torch.no_grad():
+        kernels = kernels_of(scene, wave)
+    engine = KernelsEngine(kernels)
+    engines = [engine] if engine.light_paths is None else [engine, engine.light_paths]
+    memories = {id(memory): memory for each in engines for memory in each.memories()}
+    assert sum(memory.words.shape[0] for memory in memories.values()) == kernels.rows({})
+
+
 def test_a_worker_is_used_again_as_if_new():
     """What a chunk leaves in arenas, lists and slots does not show in the next."""
     scene = torchpt.load(showcase("lattice", "glass"), "cpu")

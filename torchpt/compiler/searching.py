@@ -1,4 +1,4 @@
-"""What kernels ask of a ray search: functions to call, and for kernels that only search a loop over lanes of its own."""
+"""Ray searches as kernels ask for them: functions to call, and for kernels that only search a loop over lanes of its own."""
 
 from __future__ import annotations
 

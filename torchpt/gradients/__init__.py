@@ -36,7 +36,10 @@ from torchpt.scene.memory_estimate import mark_loaded, memory_estimate
 from torchpt.scene.prepare import is_small
 from torchpt.scene.settings import Settings
 
-__all__ = ["attached", "film_space_applies", "gradients"]
+__all__ = ["WITHOUT_LIGHT_PATHS", "attached", "film_space_applies", "gradients"]
+
+#: What is accepted in place of an integrator with light paths, which have no gradients.
+WITHOUT_LIGHT_PATHS = "one without light paths where gradients are asked for, such as path"
 
 
 def gradients(
@@ -79,8 +82,7 @@ def gradients(
         expected = "one without a transmit of its own, where geometry is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)
     if integrator.light_walk() is not None:
-        expected = "one without light paths where gradients are asked for, such as path"
-        raise NotBuiltError("integrator.type", integrator.name, expected)
+        raise NotBuiltError("integrator.type", integrator.name, WITHOUT_LIGHT_PATHS)
     if (attached or film_space) and integrator.splats:
         expected = "one whose samples light their own pixels alone, where geometry or the camera is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)

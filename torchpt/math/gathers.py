@@ -20,7 +20,7 @@ _local = threading.local()
 
 
 class GatherRecorder(Protocol):
-    """What takes look-ups over."""
+    """The operators that take look-ups over."""
 
     def take(self, table: Tensor, index: Tensor) -> Tensor | None:
         """Return columns ``index (N,)`` of a table ``(..., M)`` that requires gradients; None if it is not recorded."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt import gradients
 from torchpt.core.autograd import Backward, custom_vjp
-from torchpt.core.errors import EdgeWarning, RenderError, SceneError, warn_caller
+from torchpt.core.errors import EdgeWarning, NotBuiltError, RenderError, SceneError, warn_caller
 from torchpt.gradients import edges
 from torchpt.gradients.second import hessian_products, jvp
 from torchpt.paths.integrators import KINDS as INTEGRATORS
@@ -62,11 +62,12 @@ def differentiable_rendering(
 
 def _check_differentiable(settings: Settings) -> None:
     """Raise SceneError for settings of which pictures have no gradients."""
-    if not settings.integrator.light:
-        names_with_light = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
-        raise SceneError(
-            "integrator.type", settings.integrator.name, f"one of {names_with_light} where gradients are wanted"
-        )
+    integrator = settings.integrator
+    if not integrator.light:
+        others = ", ".join(name for name, kind in INTEGRATORS.items() if kind.light and not kind.splats)
+        raise SceneError("integrator.type", integrator.name, f"one of {others} where gradients are wanted")
+    if integrator.light_walk() is not None:
+        raise NotBuiltError("integrator.type", integrator.name, gradients.WITHOUT_LIGHT_PATHS)
     if settings.render.checkpoint is not None:
         raise SceneError("render.checkpoint", settings.render.checkpoint, "null where gradients are wanted")
 
@@ -155,8 +156,8 @@ class _Derivatives:
         self, tangents: Sequence[Tensor | None], cotangents: tuple[Tensor, ...] | None, *tensors: Tensor
     ) -> list[Tensor | None]:
         """Return JVPs and products with the Hessian, as :data:`torchpt.core.autograd.Second` asks for them."""
-        settings = self._settings(self._request.call.spp_grad or self.spp)
-        return second_derivatives(self._request, self.spp, settings, self._names, tangents, cotangents, tensors)
+        request = self._request
+        return second_derivatives(request, self.spp, self._settings(), self._names, tangents, cotangents, tensors)
 
     def of_layers(self) -> edges.Asked:
         """Return what the backward pass of layers is to do."""

@@ -71,9 +71,11 @@ def _constant(
 ) -> Rendering:
     """Return a rendering without gradients; parameters and rays may be wrapped by transforms of ``torch.func``."""
     params, made, settings = request.params, list[Rendering](), request.settings
+    spp: list[int] = []  # of the picture
 
     def forward(*tensors: Tensor) -> tuple[Tensor]:
         made.append(render(dict(zip(params, tensors, strict=False)), tensors[len(params) :]))
+        spp.append(max(made[-1].spp, 1))
         return (made[-1].image,)
 
     def second(
@@ -81,7 +83,7 @@ def _constant(
     ) -> list[Tensor | None]:
         from torchpt.rendering.derivatives import second_derivatives
 
-        return second_derivatives(request, max(made[-1].spp, 1), settings, list(params), tangents, cotangents, given)
+        return second_derivatives(request, spp[-1], settings, list(params), tangents, cotangents, given)
 
     def backward(*_: Any) -> Sequence[Tensor | None]:
         # Autograd gets here from a JVP alone: parameters of a constant do not require gradients.
@@ -91,4 +93,6 @@ def _constant(
         )
 
     (image,) = custom_vjp(forward, backward, (*params.values(), *(request.rays or ())), (), second)
-    return replace(made[-1], image=image)
+    rendering = made[-1]
+    made.clear()  # autograd keeps the closure alive: it must not hold pictures
+    return replace(rendering, image=image)

@@ -120,8 +120,9 @@ def _share_of_dark_pixels(search: _Search, black: Tensor) -> float:
     With direct light only, shadows are black and their error is known: each sample evaluated a light.
     """
     pixels, integrator = black.nonzero()[:, 0], search.integrator
-    count = len(pixels)
-    if not count or not integrator.light or 0 <= integrator.limits.max_depth <= 2:
+    count, light_walk = len(pixels), integrator.light_walk()
+    depths = [walk.limits.max_depth for walk in (integrator, light_walk) if walk is not None]
+    if not count or not integrator.light or all(0 <= depth <= 2 for depth in depths):
         return 0.0
     wave = search.wave
     chosen = (
@@ -181,7 +182,7 @@ def _fibonacci_sphere(k: Tensor, count: int) -> Tensor:
 
 def _delta_lights(lights: Lights) -> list[tuple[int, str]]:
     """Return row in the table of lights and kind of each delta light with power."""
-    # `lights.kind` is None where all lights are of one kind.
+    # `lights.kind` is None for a single light.
     kinds = [lights.kinds[0]] if lights.kind is None else [lights.kinds[k] for k in lights.kind.tolist()]
     intensities = lights.radiance.abs().amax(0).tolist()
     return [

@@ -109,7 +109,7 @@ class RenderRequest:
 
 @dataclass(frozen=True)
 class RequestTemplate:
-    """What the requests of one scene and options share, checked: all but parameters and seed.
+    """The part that requests of one scene and options share, checked: all but parameters and seed.
 
     Attributes:
         settings: the complete settings, with the seed of the options or of the scene file.
@@ -227,6 +227,7 @@ def prepare_trace_request(scene: Scene, o: Tensor, d: Tensor, **options: Unpack[
     )
     params = {name: value for name, value in request.params.items() if not name.startswith("camera.")}
     request = replace(request, settings=settings, params=params, rays=(o, d))
+    # Again: without the camera's parameters more of the scene's own count.
     return request.with_versions() if request.needs_gradients else request
 
 

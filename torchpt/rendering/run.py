@@ -560,7 +560,7 @@ class Run:
         # Between two passes that ranks share, not every rank reports, but ranks have to stop together: within a pass.
         is_between_shared_passes = self.distributed is not None and self.sharing_ranks == 1 and not paths
         if not is_between_shared_passes:
-            self.stopped_by_caller = stop_requested and self.done < self.requested_paths()
+            self.stopped_by_caller = stop_requested and done < self.requested_paths()
         return self.stopped_by_caller
 
     def _expected_paths(self) -> int:

@@ -37,7 +37,7 @@ __all__ = ["DistributedRender", "render_fingerprint"]
 
 
 class _PassCounts(NamedTuple):
-    """What one rank reports after a pass, as numbers: counts of this pass, and two flags (0 or 1).
+    """The report of one rank after a pass, as numbers: counts of this pass, and two flags (0 or 1).
 
     Attributes:
         paths: paths traced.
@@ -109,9 +109,10 @@ class DistributedRender:
         for part in self.group.gather(run.clamp_sums) if run.integrator.clamp is not None else ():
             clamp_sums = clamp_sums + part
         run.clamp_sums = clamp_sums
+        # A rank that asks for a stop at its last tasks does not know whether others have any left.
         stopped = any(rank.stopped for rank in counts)
         run.stopped_by_caller = stopped and run.done < run.requested_paths()
-        return not stopped
+        return not run.stopped_by_caller
 
     def join(self) -> None:
         """Make films whole on every rank."""

@@ -71,7 +71,7 @@ SCENE_VALUE = SceneValue.OWN
 
 @dataclass(frozen=True)
 class InPython:
-    """What differs from the spec in calls of Python, as further metadata of an argument.
+    """The differences from the spec in calls of Python, as further metadata of an argument.
 
     Attributes:
         default: default of the argument.

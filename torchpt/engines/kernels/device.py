@@ -318,13 +318,11 @@ class DeviceEngine(KernelsEngine):
 
     Attributes:
         device_calls: launches the kernels; the same object as ``calls``.
-        spare: slots of the next wave.
     """
 
     def __init__(self, kernels: KernelsOnDevice, store: Any = None) -> None:
         self.device_calls = DeviceCalls(kernels)
         super().__init__(kernels, calls=self.device_calls, store=store)
-        self.spare = self.device_calls.memory(3)
         self._cuda = kernels.cuda
         self._look = LateCheck(kernels.cuda)
         #: Factors of counters in the sums of rays and of truncated paths: block, row, column and factor.

@@ -113,6 +113,7 @@ class DeviceForward:
         self.kernels = make(lanes)
         self._seconds = 0.0  # of kernels that were replaced
         self._made: DeviceEngine | None = None
+        self._spare: Any = None  # slots of the next wave
         self._clamped: Any = None
 
     @property
@@ -126,7 +127,7 @@ class DeviceForward:
 
     def release_workers(self, keeps: bool) -> None:
         """Release the memory of waves; torch's allocator keeps it for the next render."""
-        self._made = self._clamped = None
+        self._made = self._spare = self._clamped = None
 
     def run(self, spans: Sequence[SampleRange], each: Callable[[TaskResult | None], bool]) -> bool:
         """See :class:`torchpt.engines.engine.Forward`. The host is one wave behind the device."""
@@ -160,6 +161,7 @@ class DeviceForward:
 
     def _make_engine(self) -> None:
         self._made = DeviceEngine(self.kernels)
+        self._spare = self._made.device_calls.memory(3)
 
     def _launch(self, behind: deque[_Launched], pixel_set: PixelSet, span: Span) -> None:
         """Launch the kernels of a wave and append it to ``behind``.
@@ -179,7 +181,7 @@ class DeviceForward:
         light = None
         if self.wave.integrator.light:
             # Slots of the wave before are read until it is finished.
-            calls.slots, engine.spare = engine.spare, calls.slots
+            calls.slots, self._spare = self._spare, calls.slots
             engine.slots = calls.slots
             engine.launch(chunk)
         with explain_out_of_memory("the sums of a film"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -32,13 +32,13 @@ class SearchWords:
             :func:`torchpt.search.instance_rays.instance_tables`.
         tables: tensors whose addresses are the first words.
         tree: see :class:`~torchpt.engines.kernels.layout.Layout`.
-        host: the search of the host that the tables were copied from.
+        host: the search of the host that was built for the tables; None: they are the scene's own.
     """
 
     words: Tensor
     tables: tuple[Tensor, ...]
     tree: TreeSearch | None
-    host: Accel
+    host: Accel | None
 
 
 def _host_search(accel: Accel, before: SearchWords | None = None) -> Accel | None:
@@ -74,7 +74,9 @@ def search_on_device(
     if device not in found:
         earlier = None if before is None else before.search
         host = _host_search(accel, earlier if isinstance(earlier, SearchWords) else None)
-        found[device] = None if host is None else _copied(host, device)
+        words = None if host is None else _copied(host, device)
+        # The cache must not hold its own keys.
+        found[device] = replace(words, host=None) if words is not None and host is accel else words
     return found[device]
 
 

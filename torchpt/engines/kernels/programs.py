@@ -334,7 +334,6 @@ class Kernels(Layout):
 
     Attributes:
         eager: models whose stage cannot be compiled, with the reason; they run as tensor operations.
-        seconds: seconds spent on making kernels.
         structure: key that is equal for renders that can share kernels and memory of threads.
         caches: those of the scene.
         kernel_cache: shared by renders of the same structure.
@@ -367,7 +366,7 @@ class Kernels(Layout):
         self._made: dict[tuple[Any, ...], Kernel] = {}
         self._lock = threading.Lock()
         self.search, self.non_opaque = self._search_inputs()
-        self.seconds = 0.0
+        self._seconds = 0.0
         self.eager: dict[int, str] = {}
         self.light_paths: Kernels | None = None
 
@@ -386,6 +385,11 @@ class Kernels(Layout):
         prims = torch.arange(sum(self.world.geometry.counts))
         return None, non_opaque(self.world, prims).to(torch.uint8).numpy()
 
+    @property
+    def seconds(self) -> float:
+        """Return the seconds spent on making kernels, those of light paths included."""
+        return self._seconds + (0.0 if self.light_paths is None else self.light_paths.seconds)
+
     def probe(self, models: Iterable[int]) -> dict[int, str]:
         """Compile the stages of BSDF models, by index; return those that cannot be compiled, with the reasons."""
         reasons = {}
@@ -399,14 +403,16 @@ class Kernels(Layout):
     def rows(self, layers: Mapping[str, Any]) -> int:
         """Return how many 32-bit numbers a thread allocates for each lane.
 
-        They are two arenas of paths, two sets of lists, the radiance of the samples, the channels of layers, and all that light
-        paths need (:class:`torchpt.engines.kernels.engine.KernelsEngine`).
+        They are two arenas of paths, two sets of lists, the radiance of the samples, the channels of layers, what searches take
+        (:class:`torchpt.engines.kernels.searches.ChunkSearch`), and all that light paths and connections need
+        (:class:`torchpt.engines.kernels.engine.KernelsEngine`).
         """
         channels = sum(len(layer.channels) for layer in layers.values())
         of_light = 0 if self.light_paths is None else self.light_paths.rows({})
         if self.wave.integrator.connects and self.store is not None:
             of_light += BLOCKS * self.store.count
-        return 2 * self.state.count + 2 * (self.models + 2) + 3 + channels + of_light
+        of_searches = 1 + (2 * self.passed.count if self.has_transmission else 0)
+        return 2 * self.state.count + 2 * (self.models + 2) + 3 + channels + of_searches + of_light
 
     # -- vertices of paths
 
@@ -511,7 +517,7 @@ class Kernels(Layout):
             trace = partial(trace_stage, self._leaves, self, traced, listed)
             with suppress(Unsupported):  # the call of the kernel will say so
                 cache.prefetch(((build.__name__, *arguments), self.structure), self._leaves.tensors, trace)
-        self.seconds += time.perf_counter() - start
+        self._seconds += time.perf_counter() - start
 
     def large_kernels(self) -> Iterator[tuple[bool, Callable[..., Sinks], tuple[Any, ...]]]:
         """Yield the arguments of :meth:`_get` for the kernels that take long to compile, about in the order of their use."""
@@ -536,7 +542,8 @@ class Kernels(Layout):
         """Yield the arguments of the kernels of surfaces, about in the order of their use."""
         limits = self.wave.integrator.limits
         if self.wave.integrator.starts_on_lights:
-            yield from ((model, self.bound(limits.roulette(1)), True) for model in range(self.models))
+            bound = self.bound(limits.roulette(1))
+            yield from ((model, bound, True) for model in range(self.models) if model not in self.eager)
         depths = range(1, min(limits.last, DEEP + 2))
         for bound in dict.fromkeys(self.bound(limits.roulette(depth)) for depth in depths):
             for model in range(self.models):
@@ -557,7 +564,7 @@ class Kernels(Layout):
             if kernel is None:
                 start = time.perf_counter()
                 kernel = self._made[key] = self._make(key, listed, build, arguments)
-                self.seconds += time.perf_counter() - start
+                self._seconds += time.perf_counter() - start
             return kernel
 
     def _make(

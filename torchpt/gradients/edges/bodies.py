@@ -1,4 +1,4 @@
-"""What can be hit, the camera and the lights as float64 tensors whose derivatives edges need, and points held on them.
+"""Surfaces, the camera and the lights as float64 tensors whose derivatives edges need, and points held on them.
 
 A point of a primitive is affine in three numbers of its own: ``p0 + a0 e1 + a1 e2 + a2 e3``; of a sphere the axes are those of
 the world times its radius. So curves of primitives are written in these numbers, and a point that is held on its surface is

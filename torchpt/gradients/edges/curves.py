@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchpt.core.tree import map_leaves
 from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.seams import jumps_elsewhere, lies_on_seams, seams_within
 from torchpt.math.vectors import cross, dot, take
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
@@ -44,6 +45,7 @@ __all__ = [
     "rims",
     "round_outline",
     "rounds_of",
+    "seams_of",
     "smooth_faces",
     "straight",
     "without_gradient",
@@ -282,6 +284,8 @@ def generator(bodies: Bodies, prim: Tensor, form: Form, view: View, side: Tensor
 
 #: Faces whose unit normals differ by less make no crease.
 _FLAT = 1e-6
+#: Weight of lines along which textures jump, and least weight of creases there.
+SEAM = 0.25
 #: Least weight of a crease at which shading or texture coordinates may jump: most creases jump less than outlines.
 _CREASE = 0.05
 #: Points that are closer, against the size of all, are one.
@@ -300,6 +304,7 @@ class Folds:
     crease: Tensor  # (N,) from 0 to 1: how much radiance may jump where both faces are seen, beside an outline
     normals: tuple[Tensor, Tensor]  # (3, N) unit, of the two faces
     bend: Tensor  # (N,) distance of the normals; 0 where the faces lie in one plane
+    seam: Tensor  # (N,) bool: a texture jumps there
 
 
 @dataclass(frozen=True)
@@ -374,12 +379,8 @@ def folds_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Iterator
             continue
         edges = _topology(scene, part)
         turned = bool(torch.linalg.det(poses[f"{part.name}.to_world"][:3, :3].double()) < 0)
-        firsts = [starts[part.name]]
-        if bodies.copies is not None:
-            mine = [k for k, copy in enumerate(scene.built.copies, 1) if copy.of == part.name]
-            firsts += bodies.copies.start[mine].tolist()
         every = torch.arange(len(edges.border), device=scene.device)
-        for first in firsts:
+        for owner, first in _owners(scene, part, starts[part.name], bodies):
             curves, others = mesh_edges(edges, every, first, turned)
             normals = (_normal(bodies, others[0].prim), _normal(bodies, others[1].prim))
             apart = normals[0] - normals[1]
@@ -390,7 +391,20 @@ def folds_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Iterator
             crease = torch.where(jumps & (bend > 0), (0.5 * bend).clamp(_CREASE, 1.0), 0.25 * bend * bend)
             if part.uvs is not None:
                 crease = torch.where(edges.split, crease.clamp_min(_CREASE), crease)
-            yield Folds(curves, others, edges.border, torch.where(edges.border, 0.0, crease), normals, bend)
+            seam = ~edges.border & lies_on_seams(
+                scene, owner, part, poses, edges.face[0], (edges.first[0], edges.last[0])
+            )
+            crease = torch.where(seam, crease.clamp_min(SEAM), crease)
+            yield Folds(curves, others, edges.border, torch.where(edges.border, 0.0, crease), normals, bend, seam)
+
+
+def _owners(scene: Scene, part: Part, start: int, bodies: Bodies) -> list[tuple[Part | Copy, int]]:
+    """Return a part and its copies, with the ids of their first primitives; ``start``: that of the part."""
+    found: list[tuple[Part | Copy, int]] = [(part, start)]
+    if bodies.copies is not None:
+        starts = bodies.copies.start.tolist()
+        found += [(copy, starts[k]) for k, copy in enumerate(scene.built.copies, 1) if copy.of == part.name]
+    return found
 
 
 def _normal(bodies: Bodies, prim: Tensor) -> Tensor:
@@ -444,6 +458,25 @@ def plain_of(scene: Scene, bodies: Bodies) -> Curves | None:
     return joined(found) if found else None
 
 
+def seams_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Curves | None:
+    """Return the lines within flat surfaces along which textures jump; None where there are none.
+
+    Args:
+        scene: whose.
+        bodies: detached.
+        poses: the parameters.
+    """
+    parts = scene.built.parts
+    found = [
+        straight(prim + first, begin, end)
+        for part, start in zip(parts, _starts(parts, bodies), strict=True)
+        for owner, first in _owners(scene, part, start, bodies)
+        for prim, begin, end in seams_within(scene, owner, part, poses)
+    ]
+    found = [curves for curves in found if len(curves.prim)]
+    return joined(found) if found else None
+
+
 def rounds_of(scene: Scene, bodies: Bodies) -> list[Rounds]:
     """Return the surfaces that have outlines."""
     parts, found = scene.built.parts, []
@@ -479,9 +512,8 @@ def _found(scene: Scene, settings: Settings) -> Iterator[str]:
         yield "those seen in mirrors and clear glass, and of light that these send on"
     if any(_has_opacity_texture(part) for material in materials for part in material.with_inner()):
         yield "those within textures of opacity"
-    nodes = [node for material in materials for node in material.textures()]
-    if any(getattr(node, "nearest", False) and not node.filtered for node in nodes):
-        yield "those within textures that are not interpolated"
+    if jumps_elsewhere(scene):
+        yield "those within textures that are not interpolated, on round surfaces or of very many texels"
     if any(part.quadric is not None and not known(part.quadric.form) for part in built.parts):
         yield "outlines of quadrics of kinds of your own"
     if any(source.kind == "spot" and _sharp(scene, source.name) for source in built.sources):

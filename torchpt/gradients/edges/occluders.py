@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import (
+    SEAM,
     Curves,
     Rounds,
     View,
@@ -20,6 +21,7 @@ from torchpt.gradients.edges.curves import (
     plain_of,
     round_outline,
     rounds_of,
+    seams_of,
     straight,
 )
 from torchpt.gradients.edges.cuts import Cuts
@@ -172,6 +174,7 @@ def occluders_of(
         # Of directions around an edge this share has both faces on one side, whichever way the normals point.
         outline = torch.where(folds.border, 1.0, (torch.acos(cosine) / math.pi).clamp_min(_LEAST_OUTLINE))
         crease = torch.where(folds.bend > 0, folds.bend.clamp(_LEAST_CREASE, 1.0), 0.0)
+        crease = torch.where(folds.seam, crease.clamp_min(SEAM), crease)
         crease = torch.where(folds.border, 1.0, crease)
         jumps = (folds.bend > 0) | folds.border
         seen = torch.maximum(torch.where(jumps, outline, 0.0), folds.crease)
@@ -184,6 +187,11 @@ def occluders_of(
     if cuts is not None:  # which hide nothing that the surfaces do not
         own = Held(cuts[0].prim, cuts[0].a)
         add(cuts[0], cuts[1], (own, own), 0.0, 1.0, 1.0, 0.0, -1.0)
+    seams = seams_of(scene, bodies, poses)
+    if seams is not None:
+        _, _, along = seams.moving(bodies, seams.low)
+        own = Held(seams.prim, seams.a)
+        add(seams, dot(along, along).sqrt(), (own, own), 0.0, SEAM, SEAM, 0.0, -1.0)
     forms: list[Form] = []
     for rounds in rounds_of(scene, bodies):
         if rounds.form is not None:

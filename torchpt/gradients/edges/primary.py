@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import (
+    SEAM,
     Curves,
     Folds,
     View,
@@ -21,6 +22,7 @@ from torchpt.gradients.edges.curves import (
     plain_of,
     round_outline,
     rounds_of,
+    seams_of,
 )
 from torchpt.gradients.edges.cuts import Crossing, Cuts, crossing_of
 from torchpt.gradients.edges.film import Worth, film_places, slopes
@@ -199,6 +201,9 @@ def pieces_of(
         for mine, cut in ((cuts[0].round, _arcs), (~cuts[0].round, _lines)):
             some = rows(cuts[0], mine.nonzero().squeeze(1))
             found.append(cut(bodies, some, torch.ones_like(some.low), bounds))
+    seams = seams_of(scene, bodies, poses)
+    if seams is not None:
+        found.append(_lines(bodies, seams, torch.full_like(seams.low, SEAM), bounds))
     for rounds in rounds_of(scene, bodies):
         if rounds.form is None:
             curves, some = round_outline(bodies, rounds.prim, view)

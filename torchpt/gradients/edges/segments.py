@@ -275,7 +275,7 @@ _SIGNS = (1.0, -1.0)
 
 @dataclass(frozen=True)
 class Side:
-    """What receivers see beside the edge, N lanes.
+    """The view of receivers beside the edge, N lanes.
 
     Attributes:
         sign: of the side.

@@ -77,7 +77,7 @@ class Along:
 
 
 class Use(IntEnum):
-    """What samples of edges draw numbers for; to the sampler, which sample of a pixel it is."""
+    """Uses of random numbers by samples of edges; to the sampler, which sample of a pixel it is."""
 
     PRIMARY = 0  # edges that the camera sees, and the paths of rays beside them
     LIGHTS = 1  # edges of shadows of lights, and the way on to the camera

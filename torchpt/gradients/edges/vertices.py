@@ -1,4 +1,4 @@
-"""What surfaces make of light that edges send them: the same materials as a render's, forward only, from any to any direction.
+"""Scattering of light that edges send to surfaces: the same materials as a render's, forward only, from any to any direction.
 
 Light is followed from its source toward the camera. What a forward path weighs by the shading normal on the side of the light
 and by area on the other is weighed alike here: a factor of ``cos_s / cos_g`` at each vertex (Veach, *Robust Monte Carlo

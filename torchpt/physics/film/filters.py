@@ -206,7 +206,7 @@ class _FilterKey:
 
 
 class _Tables(NamedTuple):
-    """What sampling a profile takes.
+    """Tables for sampling a profile.
 
     Attributes:
         inverse_cdf: offsets in pixels ``(_CELLS + 1,)`` float32, the inverse CDF of the profile's magnitude at equal steps.

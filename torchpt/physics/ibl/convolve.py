@@ -248,7 +248,7 @@ class _LobeSums:
 
 
 class _RowSamples(NamedTuple):
-    """What S samples of a lobe at longitude 0 read of the pyramid, each ``(S,)``."""
+    """Texels of the pyramid that S samples of a lobe at longitude 0 read, each ``(S,)``."""
 
     column: Tensor  # fractional, in columns of the sample's level, from the left edge
     width: Tensor  # int32 number of columns of that level

@@ -29,7 +29,7 @@ class Lights:
 
     choice: Distribution1D | TreeSampler | None  # the light sampler; None for a single row
     kinds: tuple[str, ...]  # kinds of the rows, in their order: of SURFACES, then of KINDS
-    kind: Tensor | None  # (K,) index into `kinds`; None for a single kind
+    kind: Tensor | None  # (K,) index into `kinds`; None for a single row
     p0: Tensor  # (3, K) corner or centre of the primitive, as in LaneGeometry; position of a point or spot light
     e1: Tensor  # (3, K) first edge of the primitive, p0 + u e1 + v e2
     e2: Tensor  # (3, K) second edge

@@ -29,7 +29,7 @@ Integers = NDArray[np.int64]
 
 @dataclass
 class Statements:
-    """What an OBJ file says.
+    """The contents of an OBJ file.
 
     Attributes:
         positions: ``(n, 3)``.

@@ -87,7 +87,10 @@ class Bdpt(PathIntegrator):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """Refuse values by which paths would never end; arguments as for :meth:`torchpt.spec.FrozenConfig.check`."""
+        """Refuse values that contradict each other, or by which paths would never end.
+
+        Arguments as for :meth:`torchpt.spec.FrozenConfig.check`.
+        """
         Path.check(values, given)
         if values["weighted"] and values["strategy"] == "mis":
             raise Refused("one strategy alone beside weighted", "mis", ("strategy",))
@@ -204,7 +207,11 @@ class Bdpt(PathIntegrator):
             density = density_of_sample(world.emission, direct.sample) * direct.sample.weight
             other = density * dot(wi, at.ng).abs() * arrival.others(reverse)
             factor = self._scale("light", reduced(direct.weight, other), direct.weight)
-            shadow = replace(shadow, radiance=shadow.radiance * factor)
+            if isinstance(factor, float) and factor == 0.0:  # not traced, and no 0 times infinity
+                none = torch.zeros_like(shadow.radiance)
+                shadow = replace(shadow, radiance=none, t_max=none[0])
+            else:
+                shadow = replace(shadow, radiance=shadow.radiance * factor)
             if direct.weight is not None:
                 direct = replace(direct, weight=direct.weight * factor)
         output = stages.scattered(context, model, state, at, surface, direct, shadow)

@@ -50,7 +50,10 @@ class Vcm(Bdpt):
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
-        """Refuse values by which paths would never end; arguments as for :meth:`torchpt.spec.FrozenConfig.check`."""
+        """Refuse values that contradict each other, or by which paths would never end.
+
+        Arguments as for :meth:`torchpt.spec.FrozenConfig.check`.
+        """
         super().check(values, given)
         if values["strategy"] == "merging" and not values["weighted"]:
             # A path of k edges has k - 1 vertices, each of which may be merged.

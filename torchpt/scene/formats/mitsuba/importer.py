@@ -54,7 +54,7 @@ _UNKNOWN = left_out("it is unknown")
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What the keys ``import`` and ``scene_params`` say.
+    """Values of the keys ``import`` and ``scene_params``.
 
     Attributes:
         strict: an error in place of every warning.

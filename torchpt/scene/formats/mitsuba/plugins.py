@@ -1,4 +1,4 @@
-"""What an entry of the tables of plugins says: what becomes of a plugin, how near that is, and the function that does it."""
+"""Entries of the tables of plugins: what becomes of a plugin, how near that is, and the function that does it."""
 
 from __future__ import annotations
 
