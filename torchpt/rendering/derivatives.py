@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -143,7 +142,7 @@ class _Derivatives:
             differentiates_rays=differentiates_rays,
         )
         if self._edges:
-            width, height = self._film_size()
+            _, _, width, height = request.settings.film.window
             on_film = cotangent.T.reshape(height, width, 3)
             of_edges = edges.add_gradients(
                 scene, self._settings(1), given, wanted, call.dtype, on_film, self._edge_spp(), film_space, call.ranks
@@ -170,19 +169,14 @@ class _Derivatives:
         settings, spp = self._request.settings, spp or self._request.call.spp_grad or self.spp
         return replace(settings, render=settings.render.but(seed=self._seed, spp=spp))
 
-    def _film_size(self) -> tuple[int, int]:
-        """Return the width and the height of the picture."""
-        film = self._request.settings.film
-        _, _, width, height = film.crop or (0, 0, film.width, film.height)
-        return width, height
-
     def _edge_spp(self) -> float:
         """Return the samples a pixel for visibility edges; 0: none."""
         call = self._request.call
         if not call.edges:
             return 0
+        _, _, width, height = self._request.settings.film.window
         return call.edge_spp or edges.samples_for(
-            self._request.scene, self._wanted, call.spp_grad or self.spp, math.prod(self._film_size())
+            self._request.scene, self._wanted, call.spp_grad or self.spp, width * height
         )
 
 
@@ -221,7 +215,7 @@ def second_derivatives(
     given = {name: tangent for name, tangent in zip(names, tangents, strict=False) if tangent is not None}
     forward = replace(settings, render=settings.render.but(spp=spp))
     pixels = jvp(scene, forward, params, given, dtype)
-    _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
+    _, _, width, height = settings.film.window
     image = pixels.T.reshape(height, width, 3).to(torch.float32)
     if cotangents is None:
         return [image]

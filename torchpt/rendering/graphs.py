@@ -181,7 +181,7 @@ class _OperatorCall(NamedTuple):
         """Return an uninitialized picture of the right size, dtype and device."""
         blocks = {name: self.options.get(name) for name in BLOCKS if name != "render"}
         film = settings(self.scene.description, blocks).film
-        _, _, width, height = film.crop or (0, 0, film.width, film.height)
+        _, _, width, height = film.window
         return torch.empty(height, width, 3, dtype=self.options["dtype"], device=self.scene.device)
 
 

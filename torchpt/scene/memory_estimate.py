@@ -108,7 +108,7 @@ def memory_estimate(settings: Settings, device: torch.device, mode: str, models:
         models: number of BSDF models.
         rows: 32-bit numbers per lane in the workspace of a thread of kernels.
     """
-    _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
+    _, _, width, height = settings.film.window
     pixels = width * height
     channels = [len(layer.channels) for layer in surface_layers(settings).values()]
     # Bytes of a pixel, as in `Film.bytes_of`: of each layer two float64 a channel (first samples, sums) and a count.

@@ -177,7 +177,7 @@ def make_wave(
     points = points_of(settings.sampler)
     plan = integrator.plan(points, dtype, tape=tape, attached=attached)
     camera = _camera(scene, settings, params, dtype)
-    crop = film.crop or (0, 0, film.width, film.height)  # x y width height
+    crop = film.window
     context = _context(plan, world, camera, crop, integrator)
     wave = Wave(
         context=context if rays is None else replace(context, pixel=None),  # rays have no width
@@ -435,7 +435,7 @@ QUICK_NUMBERS = 1 << 25
 def is_small(scene: Scene, settings: Settings) -> bool:
     """Return True for a render whose tensors are so small that torch is faster in one thread."""
     film = settings.film
-    _, _, width, height = film.crop or (0, 0, film.width, film.height)
+    _, _, width, height = film.window
     return width * height * settings.render.spp <= SMALL_SAMPLES and scene.numbers <= SMALL_NUMBERS
 
 

@@ -157,6 +157,11 @@ class Film(FrozenConfig):
         ),
     }
 
+    @property
+    def window(self) -> tuple[int, int, int, int]:
+        """Return the part that is rendered, x, y, width and height in pixels: the crop, or all."""
+        return self.crop or (0, 0, self.width, self.height)
+
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
         """Refuse a film of too many pixels, and a crop that reaches beyond it; see :class:`FrozenConfig`."""

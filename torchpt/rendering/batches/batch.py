@@ -286,7 +286,7 @@ def _pictures(
                 params = {} if param_sets is None else param_sets[s]
                 request = _request_by(scene, camera, params, spp(s, c), seeds(s, c), options, full=full)
                 film = request.settings.film
-                _, _, *size = film.crop or (0, 0, film.width, film.height)
+                _, _, *size = film.window
                 film_facts = {"width": size} | ({"aovs": list(film.aovs), "denoise": film.denoise} if full else {})
                 first_facts = first_facts or film_facts
                 for key, value in film_facts.items():
@@ -382,7 +382,7 @@ def render_pictures(
 def _check_memory(request: RenderRequest, total: int | None) -> None:
     """Raise if the pictures of a batch alone need more than ``render.max_memory``."""
     limit, film = request.settings.render.max_memory, request.settings.film
-    _, _, width, height = film.crop or (0, 0, film.width, film.height)
+    _, _, width, height = film.window
     bytes_each = torch.finfo(request.call.dtype).bits // 8
     picture_bytes = 2 * 3 * width * height * bytes_each * (total or 1)  # single pictures, and the stacked ones
     if limit is not None:
