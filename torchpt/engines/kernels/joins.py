@@ -18,10 +18,10 @@ from torchpt.engines.kernels.searches import ChunkSearch
 from torchpt.native.kernels import kernel
 from torchpt.physics.film.splats import LARGEST, Splats
 
-__all__ = ["HostJoins", "Joins", "TensorJoins"]
+__all__ = ["RAY_ROWS", "HostJoins", "Joins", "TensorJoins"]
 
 #: Rows of a ray: o, d and t.
-_RAY_ROWS = 7
+RAY_ROWS = 7
 #: Bits of the magnitude of a float32.
 _MAGNITUDE = 0x7FFFFFFF
 _LARGEST = np.array([LARGEST], np.float32)
@@ -97,7 +97,7 @@ class HostJoins:
             The lanes, what was in the rows of rays to lights, and the number of rays; None: there are none.
         """
         rows, stride = self.search.kernels.state, arena.words.shape[1]
-        lanes, saved = np.empty(count, np.int32), np.empty(_RAY_ROWS * count, np.int32)
+        lanes, saved = np.empty(count, np.int32), np.empty(RAY_ROWS * count, np.int32)
         n = kernel("splats", "begin_rays")(
             arena.address, stride, count, row, mask, least, rows.first(f"{name}_o"), rows.first("shadow_o"), lanes, saved,
         )  # fmt: skip
