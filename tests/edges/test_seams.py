@@ -11,6 +11,9 @@ import torch
 from few import few
 
 import torchpt
+from torchpt.gradients.edges.bodies import bodies_of
+from torchpt.gradients.edges.curves import seams_of
+from torchpt.scene.formats.description import settings
 
 #: The pattern's colours, side of a square, and where a corner of it lies.
 BRIGHT, DARK, SIDE, CORNER = 1.0, 0.2, 0.8, (0.43, 0.2)
@@ -98,6 +101,19 @@ def test_textures_move_over_the_picture(kind: str, texture: str, moving: str, tm
     mean, error = torch.tensor(found).mean(), torch.tensor(found).std() / math.sqrt(len(found))
     assert abs(float(mean) - sign * expected()) < 4.5 * float(error)
     assert float(error) < 0.1 * abs(expected())
+
+
+def test_a_line_of_two_textures_counts_once() -> None:
+    def lines(**textures: float) -> int:
+        boards = {name: {"type": "checkerboard", "scale": scale} for name, scale in textures.items()}
+        scene = torchpt.load(described(surface("two triangles", {"type": "principled", **boards})), "cpu")
+        bodies = bodies_of(scene, settings(scene.description, {}).film, {})
+        found = seams_of(scene, bodies, scene.merged(None))
+        return 0 if found is None else len(found.prim)
+
+    assert lines(base_color=4) == 2 * 2 * 7 and lines(roughness=3) == 2 * 2 * 5
+    assert lines(base_color=4, roughness=2) == lines(base_color=4)
+    assert lines(base_color=4, roughness=3) == lines(base_color=4) + lines(roughness=3) - 2 * 2  # the middle is shared
 
 
 def test_a_camera_over_squares_turns_back() -> None:

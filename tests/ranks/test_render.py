@@ -20,6 +20,8 @@ from forks import in_ranks
 
 import torchpt
 from torchpt.core.errors import LostRankError, OtherRankError, RenderError, SceneError, TorchptError
+from torchpt.rendering import render_scene
+from torchpt.scene.formats.description import settings
 
 FILM = {"width": 24, "height": 16, "filter": "box"}
 CASES: dict[str, dict[str, Any]] = {
@@ -57,6 +59,22 @@ def facts(scene: torchpt.Scene, wishes: dict[str, Any], group: Any = None) -> di
 
 def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
     return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
+
+
+def test_a_stop_that_comes_too_late_stops_nothing(box: torchpt.Scene, tmp_path: Path) -> None:
+    """A rank that is asked to stop at its last samples has a whole picture, with its error, as one process has."""
+
+    def work(group: Any) -> dict[str, Any]:
+        wish = {"film": FILM, "render": {"spp": 32, "threads": 1, "pilots": True}}
+        wishes = settings(box.description, wish)
+        found = render_scene(box, wishes, lambda state: state.done >= state.total, ranks=group)
+        return {"image": found.image.numpy().copy()} | {name: getattr(found, name) for name in NUMBERS}
+
+    alone = work(None)
+    assert alone["complete"] and alone["spp"] == 32
+    for found in in_ranks(2, work, tmp_path):
+        assert not isinstance(found, Exception), found
+        assert same(found, alone), {name: (found[name], alone[name]) for name in NUMBERS}
 
 
 @pytest.mark.parametrize("size", few([2, 3], 1))

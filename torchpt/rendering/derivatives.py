@@ -20,7 +20,7 @@ from torchpt.rendering.requests import RenderRequest
 from torchpt.scene.settings import Settings
 from torchpt.scene.versions import AFTER
 
-__all__ = ["RenderWithoutGradients", "differentiable_rendering", "second_derivatives"]
+__all__ = ["differentiable_rendering", "second_derivatives"]
 
 #: Flips bits of a seed, so that backward passes by default draw other numbers than forward passes. (The multiplier of drand48.)
 _BACKWARD_SEED = 0x5DEECE66D

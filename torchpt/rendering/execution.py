@@ -41,7 +41,7 @@ def execute_request(
             return rendered.pop()
         with nullcontext() if call.ranks is None else call.ranks.together():
             scene.check(params)
-        pair = _rays_or_none(rays)
+        pair = (rays[0], rays[1]) if rays else None
         return reuse_rendering(
             lambda: render_scene(scene, settings, params=params, dtype=call.dtype, ranks=call.ranks, rays=pair)
         )
@@ -59,11 +59,6 @@ def execute_request(
     if rendering.relmse_unknown:
         warn_caller(f"the picture's error is not known: {rendering.relmse_unknown}", NoLightWarning)
     return rendering
-
-
-def _rays_or_none(rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor] | None:
-    """Return origins and directions of rays; None for none."""
-    return (rays[0], rays[1]) if rays else None
 
 
 def _constant(

@@ -26,6 +26,7 @@ from torchpt.scene.prepare import scene_cache
 from torchpt.scene.settings import Settings
 
 __all__ = [
+    "SEAM",
     "Curves",
     "Edges",
     "Folds",
@@ -467,13 +468,13 @@ def seams_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Curves |
         poses: the parameters.
     """
     parts = scene.built.parts
-    found = [
-        straight(prim + first, begin, end)
-        for part, start in zip(parts, _starts(parts, bodies), strict=True)
-        for owner, first in _owners(scene, part, start, bodies)
-        for prim, begin, end in seams_within(scene, owner, part, poses)
-    ]
-    found = [curves for curves in found if len(curves.prim)]
+    found = []
+    for part, start in zip(parts, _starts(parts, bodies), strict=True):
+        for owner, first in _owners(scene, part, start, bodies):
+            seams = seams_within(scene, owner, part, poses)
+            if seams is not None:
+                prim, begin, end = seams
+                found.append(straight(prim + first, begin, end))
     return joined(found) if found else None
 
 

@@ -6,7 +6,7 @@ They hide nothing. As a surface or the camera moves they move over the picture, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -29,6 +29,8 @@ _FLAT = ("triangle", "rectangle")
 MOST = 1 << 17
 #: Texels: what is closer to the border of one lies on it.
 _ON = 1e-6
+#: Lines whose ends are the same after rounding to one over this are one.
+_SAME = 2.0**20
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,10 @@ def _counts(lines: _Lines) -> tuple[Tensor, Tensor]:
 
 def seams_within(
     scene: Scene, owner: Part | Copy, part: Part, params: Mapping[str, Tensor]
-) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yield primitives of a part ``(N,)``, and where lines within them begin and end ``(3, N)``, in their own numbers.
+) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Return primitives of a part ``(N,)``, and where lines within them begin and end ``(3, N)``, in their own numbers.
+
+    A line of several textures is there once. None: there are no lines.
 
     Args:
         scene: the scene.
@@ -91,13 +95,20 @@ def seams_within(
         part: the part.
         params: the parameters.
     """
+    found = []
     for lines in _lines_of(scene, owner, part, params):
         first, count = _counts(lines)
         prim = torch.arange(len(count), device=count.device).repeat_interleave(count)
         before = count.cumsum(0) - count
         line = take(first, prim) + (torch.arange(len(prim), device=prim.device) - take(before, prim)).double()
-        begin, end = _across(take(lines.at, prim) - line)
-        yield prim, begin, end
+        found.append(torch.cat((prim[None].double(), *_across(take(lines.at, prim) - line))))
+    if not sum(part.shape[1] for part in found):
+        return None
+    every = torch.cat(found, 1)  # (7, N)
+    _, same = torch.unique(torch.round(every * _SAME), dim=1, return_inverse=True)
+    one = torch.full((int(same.max()) + 1,), len(same), device=same.device)
+    every = every[:, one.scatter_reduce(0, same, torch.arange(len(same), device=same.device), "amin")]
+    return every[0].long(), every[1:4], every[4:]
 
 
 def _across(beside: Tensor) -> tuple[Tensor, Tensor]:
