@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from torchpt import cameras, data, extend, ibl, losses, metrics, nn, ranks
     from torchpt.images import read_header, read_image, read_layers, write_image
     from torchpt.images.denoiser import denoise
+    from torchpt.math.guiding import EdgeGuide
     from torchpt.physics.bsdfs import Bsdf
     from torchpt.rendering import Rendering
     from torchpt.rendering.api import render, trace
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AssetError",
     "Bsdf",
+    "EdgeGuide",
     "EdgeWarning",
     "EnergyWarning",
     "GradientEstimate",
@@ -82,6 +84,7 @@ __all__ = [
 # public name -> module that defines it
 _LAZY_NAMES = {
     "Bsdf": "torchpt.physics.bsdfs",
+    "EdgeGuide": "torchpt.math.guiding",
     "GradientEstimate": "torchpt.rendering.estimates",
     "Renderer": "torchpt.rendering.renderer",
     "Rendering": "torchpt.rendering",

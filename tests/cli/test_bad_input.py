@@ -57,7 +57,7 @@ CASES = [
     (["render", S, "film=3"], "film: expected the name of a file"),
     (["render", S, "film="], "film: expected the name of a file"),
     (["render", S, "film=null"], "film: expected the name of a file"),
-    (["render", S, "integrator=bogus"], "integrator: expected one of aov, default, direct, ibl, path, got 'bogus'"),
+    (["render", S, "integrator=bogus"], "integrator: expected one of aov, bdpt, default, direct, ibl, path, vcm, got 'bogus'"),
     (["render", S, "film=../scene/cornell_box"], "expected the name of a file in configs/film"),
     (["render", S, "+scene@film=cornell_box"], "expected key=value"),
     (["render", S, "integrator.type=bogus"], "integrator.type"),

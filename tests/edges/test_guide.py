@@ -13,9 +13,9 @@ from torch import Tensor
 
 import torchpt
 from torchpt.gradients.edges import gradients as gradients_module
-from torchpt.gradients.edges import guide as guiding
 from torchpt.gradients.edges.gradients import boundary_of, samples_for
-from torchpt.gradients.edges.guide import Guide, first_round, guide_of
+from torchpt.math import guiding
+from torchpt.math.guiding import EdgeGuide, Guide, Lesson, Memory, Round, guide_of, rounds
 from torchpt.scene.formats.description import settings
 
 COUNT = 20_000
@@ -33,11 +33,26 @@ BROUGHT: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
+def lesson(name: str, seed: int = 1, guide: Guide | None = None, count: int = COUNT) -> Lesson:
+    """What numbers bring that are drawn evenly, or by a guide."""
+    u = numbers(seed, count=count)
+    u, inverse = (u, torch.ones_like(u[0])) if guide is None else guide.draw(u)
+    return Lesson(u, inverse, BROUGHT[name](u))
+
+
 def taught(name: str) -> Guide:
-    u = numbers(1)
-    found = guide_of(u, BROUGHT[name](u))
+    found = guide_of(lesson(name))
     assert found is not None
     return found
+
+
+def taught_again(name: str) -> Guide:
+    """A guide that learns of samples that another one drew."""
+    memory = Memory()
+    for seed in range(20, 24):
+        memory.add(lesson(name, seed, memory.guide, count=2000))
+    assert memory.guide is not None
+    return memory.guide
 
 
 @pytest.mark.parametrize("name", BROUGHT)
@@ -59,9 +74,10 @@ def test_boxes_fill_the_cube_and_densities_are_those_of_the_draw(name: str):
     assert (share - guide.choice.pmf).abs().max() < 5 * (0.25 / COUNT) ** 0.5
 
 
+@pytest.mark.parametrize("teach", [taught, taught_again])
 @pytest.mark.parametrize("name", BROUGHT)
-def test_guided_means_are_right_and_vary_less(name: str):
-    guide = taught(name)
+def test_guided_means_are_right_and_vary_less(name: str, teach: Callable[[str], Guide]):
+    guide = teach(name)
     even = BROUGHT[name](numbers(3, count=400_000))
     drawn, inverse = guide.draw(numbers(4, count=400_000))
     guided = BROUGHT[name](drawn) * inverse
@@ -71,48 +87,127 @@ def test_guided_means_are_right_and_vary_less(name: str):
 
 
 def test_nothing_is_learned_of_nothing():
-    assert guide_of(numbers(5), torch.zeros(COUNT)) is None
+    nothing = Lesson(numbers(5), torch.ones(COUNT, dtype=torch.float64), torch.zeros(COUNT))
+    assert guide_of(nothing) is None
+    memory = Memory()
+    memory.add(nothing)
+    assert memory.guide is None
+    memory.add(lesson("corner"))
+    known = memory.guide
+    memory.add(nothing)
+    assert memory.guide is known is not None
+
+
+def test_a_memory_forgets_and_does_not_mind_how_much_a_lesson_brings(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(guiding, "_KEPT", 3 * COUNT)
+    memory, other = Memory(), Memory()
+    for seed in range(4):
+        own = lesson("corner", seed) if seed else lesson("peak", seed)
+        memory.add(own)
+        other.add(replace(own, brought=own.brought * 10.0**-seed))
+        assert memory.guide is not None and other.guide is not None
+        torch.testing.assert_close(memory.guide.choice.pmf, other.guide.choice.pmf)
+    assert memory._kept is not None and memory._kept.u.shape == (3, 3 * COUNT)
+    assert torch.equal(memory._kept.u, torch.cat([lesson("corner", seed).u for seed in (1, 2, 3)], 1))
+    # Numbers of other dimensions are those of another scene.
+    u = numbers(7, dimensions=2)
+    memory.add(Lesson(u, torch.ones_like(u[0]), u[0]))
+    assert memory.guide is not None and len(memory.guide.low) == 2
+
+
+def even(turns: list[Round], u: Tensor) -> float:
+    return sum(float(turn.draw(u)[1].mean()) * turn.count for turn in turns)
 
 
 def test_rounds_share_the_samples_and_the_estimate():
-    assert first_round(4000) is None
-    first = first_round(80_000)
-    assert first is not None and first.lesson == []
-    then = first.then(80_000)
+    assert [(turn.count, turn.memory) for turn in rounds(4000)] == [(4000, None)]
+    first, then = rounds(80_000)
+    assert first.memory is not None and then.memory is None
     assert then.first == first.count and then.count == 80_000 - first.count
     assert first.share + then.share == pytest.approx(1) and then.guide is None
-    u = numbers(6)
-    total = sum(float(turn.draw(u)[1].mean()) * turn.count for turn in (first, replace(then, guide=taught("corner"))))
-    assert total == pytest.approx(1, rel=0.02)
+    assert even([first, replace(then, guide=taught("corner"))], numbers(6)) == pytest.approx(1, rel=0.02)
 
 
-@pytest.mark.parametrize("case", ["ball_on_floor_radius", "block_in_corner"])
-def test_gradients_of_edges_keep_their_mean_and_vary_less(case: str, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("total", [100, 1000, 80_000])
+def test_a_memory_learns_of_every_call(total: int):
+    memory, found = Memory(), list[Round]()
+    for turn in rounds(total, memory):
+        found.append(turn)
+        u, weight = turn.draw(numbers(8, count=turn.count))
+        turn.teach(u, weight, BROUGHT["corner"](u) * weight)
+    assert found[0].guide is None and all(turn.guide is not None for turn in found[1:])
+    known = memory.guide
+    later = list(rounds(total, memory))
+    assert [turn.guide for turn in later] == [known] * len(later) and known is not None
+    assert [turn.count for turn in later] == [turn.count for turn in found]
+    assert sum(turn.count for turn in later) == total and later[0].memory is memory
+    assert all(turn.share == pytest.approx(turn.count / total) for turn in later)
+
+
+def moved(case: str, seeds: int, spp: float, guide: EdgeGuide | None = None) -> Tensor:
+    """What moving edges of shadows and in reflected light add to a known gradient, one seed after the other."""
     pair = known.PAIRS[case]
     scene, parameter = known.loaded(pair), pair.parameter
-    given = settings(scene.description, {})
+    given, pose = settings(scene.description, {}), scene.params[parameter]
     cotangent = known.weights().float().permute(2, 0, 1)
-    seeds, spp = 12, 24
+    found = []
+    for seed in range(seeds):
+        own = replace(given, render=given.render.but(seed=seed))
+        edges = boundary_of(scene, own, {parameter: pose}, [parameter], torch.float32, cotangent, guide=guide)
+        assert edges is not None
+        (value,) = edges.gradients(edges.shadows(spp), [parameter])
+        assert value is not None
+        found.append((value * pair.along(pose)).sum().double())
+    return torch.stack(found)
 
-    def gradients() -> Tensor:
-        found = []
-        for seed in range(seeds):
-            own = replace(given, render=given.render.but(seed=seed))
-            pose = scene.params[parameter]
-            edges = boundary_of(scene, own, {parameter: pose}, [parameter], torch.float32, cotangent)
-            assert edges is not None
-            (value,) = edges.gradients(edges.shadows(spp), [parameter])
-            assert value is not None
-            found.append((value * pair.along(pose)).sum().double())
-        return torch.stack(found)
 
-    guided = gradients()
-    monkeypatch.setattr(guiding, "_LEAST_FIRST", 1 << 30)
-    even = gradients()
-    error = float(((even.var() + guided.var()) / seeds).sqrt())
+def assert_less_varied(guided: Tensor, even: Tensor) -> None:
+    error = float((even.var() / len(even) + guided.var() / len(guided)).sqrt())
     assert abs(float(even.mean() - guided.mean())) < 4 * error
     assert guided.var() < even.var()
+
+
+@pytest.mark.parametrize("case", [pytest.param("ball_on_floor_radius", marks=pytest.mark.slow), "block_in_corner"])
+def test_gradients_of_edges_keep_their_mean_and_vary_less(case: str, monkeypatch: pytest.MonkeyPatch):
+    guided = moved(case, 12, 24)
+    monkeypatch.setattr(guiding, "_LEAST_FIRST", 1 << 30)
+    even = moved(case, 12, 24)
+    assert_less_varied(guided, even)
     assert not torch.equal(guided, even)
+
+
+@pytest.mark.parametrize("case", ["block_in_corner", pytest.param("lamp_pose_room_indirect", marks=pytest.mark.slow)])
+def test_what_is_kept_from_call_to_call_changes_no_mean_and_varies_less(case: str):
+    guide = EdgeGuide()
+    alone, kept = moved(case, 12, 2), moved(case, 14, 2, guide)[2:]
+    assert_less_varied(kept, alone)
+    assert "Segments" in repr(guide)
+
+
+def test_a_run_with_a_new_guide_repeats():
+    pair = known.PAIRS["block_in_corner"]
+    scene, parameter = known.loaded(pair), pair.parameter
+
+    def run(guide: torchpt.EdgeGuide | None) -> list[Tensor]:
+        found = []
+        for seed in range(3):
+            leaf = scene.params[parameter].clone().requires_grad_()
+            torchpt.render(scene, params={parameter: leaf}, spp=4, seed=seed, edge_guide=guide).mean().backward()
+            assert leaf.grad is not None
+            found.append(leaf.grad)
+        return found
+
+    first = run(torchpt.EdgeGuide())
+    assert all(map(torch.equal, first, run(torchpt.EdgeGuide())))
+    assert not torch.equal(first[2], run(None)[2])
+
+
+def test_an_edge_guide_is_one():
+    scene = known.loaded(known.PAIRS["block_in_corner"])
+    with pytest.raises(torchpt.SceneError, match=r"edge_guide: expected a torchpt.EdgeGuide, got 3"):
+        torchpt.render(scene, edge_guide=3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="edge_guide"):  # pictures of a batch are made side by side
+        torchpt.render_batch([scene], edge_guide=EdgeGuide())  # pyright: ignore[reportCallIssue]
 
 
 class Rank:

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from torchpt.gradients.edges.gradients import Boundary, boundary_of, moving_primitives
-from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.primary import pieces_of
 from torchpt.gradients.edges.shadows import Shadows
+from torchpt.math.guiding import Round
 from torchpt.scene.formats.description import settings
 
 #: The pose of a block that moves.

@@ -65,7 +65,7 @@ def test_signatures_spell_every_argument_out(function: Any, own: tuple[str, ...]
 def test_signatures_are_as_they_were_written_by_hand() -> None:
     shown = inspect.signature(torchpt.render).parameters
     assert str(shown["spp"]) == "spp: int | None = None" and str(shown["edges"]) == "edges: bool = True"
-    assert shown["dtype"].default is torch.float32 and shown["adjoint"].default is None and len(shown) == 25
+    assert shown["dtype"].default is torch.float32 and shown["adjoint"].default is None and len(shown) == 26
 
 
 def test_help_says_what_each_argument_is() -> None:
@@ -79,7 +79,7 @@ def test_help_says_what_each_argument_is() -> None:
 
 
 def test_the_block_of_scene_files_has_the_settings_among_them() -> None:
-    own = {"params", "full", "dtype", "adjoint", "seed_grad", "spp_grad", "edges", "edge_spp", "ranks"}
+    own = {"params", "full", "dtype", "adjoint", "seed_grad", "spp_grad", "edges", "edge_spp", "ranks", "edge_guide"}
     assert {*arguments_of(RenderOptions)} - own == {*parameters_of(Render), *BLOCKS} - {"preview", "render"}
 
 

@@ -79,6 +79,20 @@ def test_layers_by_name(scene: torchpt.Scene) -> None:
         full["variance"]
 
 
+@pytest.mark.parametrize("compiled", ["on", "off"])
+@pytest.mark.parametrize(
+    "integrator",
+    [{"type": "path", "max_depth": 0}, {"type": "path", "max_depth": 1}, {"type": "bdpt", "strategy": "light_paths"}],
+)
+def test_layers_do_not_depend_on_how_far_paths_go(
+    scene: torchpt.Scene, integrator: dict[str, Any], compiled: str
+) -> None:
+    options: dict[str, Any] = {"film": film("albedo", "depth"), "compile": compiled, "spp": 4, "full": True}
+    full, usual = torchpt.render(scene, integrator=integrator, **options), torchpt.render(scene, **options)
+    assert usual["albedo"].any()
+    assert all(torch.equal(full[name], usual[name]) for name in ("albedo", "depth"))
+
+
 def test_variance_and_error(scene: torchpt.Scene) -> None:
     spread = torchpt.render(scene, film=film("variance"), full=True)
     assert spread.variance is not None and spread.variance.shape == (16, 24, 3)

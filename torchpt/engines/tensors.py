@@ -21,7 +21,7 @@ from torch import Tensor
 from torchpt.core.tree import map_leaves
 from torchpt.math.vectors import concatenate_lanes, rows, take
 from torchpt.paths import layers as aov
-from torchpt.paths.integrators.base import check_fields, check_output
+from torchpt.paths.integrators.base import TO_FIRST_SURFACE, check_fields, check_output
 from torchpt.paths.integrators.path import Ends, follows_ray, partition
 from torchpt.paths.layers import LAYERS
 from torchpt.paths.photons import PhotonMap
@@ -511,7 +511,7 @@ def seen(wave: Wave, names: tuple[str, ...], state: PathState, follow_ray: bool 
     They are not weighted by the filter. ``follow_ray``: True: points are intersected anew along their rays, for derivatives.
     """
     engine, observer = TensorsEngine(wave, len(state.lane)), _Layers(wave, names, follow_ray=follow_ray)
-    walk(engine, engine.spawn(state), wave.integrator.limits, observer)
+    walk(engine, engine.spawn(state), TO_FIRST_SURFACE, observer)
     return observer.values
 
 

@@ -145,7 +145,16 @@ class _Derivatives:
             _, _, width, height = request.settings.film.window
             on_film = cotangent.T.reshape(height, width, 3)
             of_edges = edges.add_gradients(
-                scene, self._settings(1), given, wanted, call.dtype, on_film, self._edge_spp(), film_space, call.ranks
+                scene,
+                self._settings(1),
+                given,
+                wanted,
+                call.dtype,
+                on_film,
+                self._edge_spp(),
+                film_space,
+                call.ranks,
+                call.edge_guide,
             )
             grads[: len(wanted)] = [a if b is None else a + b for a, b in zip(grads, of_edges, strict=False)]
         no_grads = [None] * (len(tensors) - len(wanted) - (2 if differentiates_rays else 0))

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torchpt.core.autograd import is_transformed, outside_transforms
 from torchpt.core.errors import SceneError
+from torchpt.math.guiding import EdgeGuide
 from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.paths.integrators.base import Integrator
 from torchpt.paths.layers import LAYERS
@@ -387,6 +388,16 @@ class BatchOptions(TraceOptions, total=False):
 
 class RendererOptions(_SampleOptions, BatchOptions, total=False):
     """Arguments of :func:`torchpt.render` beside the scene, ``full``, ``seed`` and ``params``."""
+
+    edge_guide: Annotated[
+        EdgeGuide | None,
+        Argument(
+            None,
+            fits=lambda value: isinstance(value, EdgeGuide),
+            words="a torchpt.EdgeGuide",
+            doc="keeps from one backward pass of an optimization to the next where samples of edges brought something",
+        ),
+    ]
 
 
 class CommonOptions(RendererOptions, total=False):

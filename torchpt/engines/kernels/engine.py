@@ -31,6 +31,7 @@ from torchpt.engines.kernels.joins import HostJoins, Joins
 from torchpt.engines.kernels.layout import Memory
 from torchpt.engines.kernels.programs import Kernel, Kernels
 from torchpt.engines.kernels.searches import ChunkSearch
+from torchpt.paths.integrators.base import TO_FIRST_SURFACE
 from torchpt.paths.layers import LAYERS
 from torchpt.paths.photons import PHOTON_ROWS, LightOfSample, PhotonRows, SentLight
 from torchpt.paths.state import StageContext
@@ -303,7 +304,7 @@ class KernelsEngine:
         if self.shown is None or len(self.shown.words) != channels:
             self.shown = self.calls.memory(channels)
         self.shown.words[:, :count] = 0
-        walk(self, self.spawn(chunk), self.wave.integrator.limits, _Layers(self, names))
+        walk(self, self.spawn(chunk), TO_FIRST_SURFACE, _Layers(self, names))
         return count
 
     def start(self, chunk: Chunk) -> None:

@@ -18,7 +18,6 @@ from torchpt.gradients.edges.bodies import Bodies, bodies_of
 from torchpt.gradients.edges.curves import marked_primitives
 from torchpt.gradients.edges.cuts import Cuts, cuts_of
 from torchpt.gradients.edges.film import Worth
-from torchpt.gradients.edges.guide import Round, first_round
 from torchpt.gradients.edges.horizons import Horizons, horizons_of
 from torchpt.gradients.edges.occluders import occluders_of
 from torchpt.gradients.edges.primary import Look, primary_of
@@ -27,6 +26,7 @@ from torchpt.gradients.edges.segments import Segments, SegmentSampler, smooth_of
 from torchpt.gradients.edges.shadows import Shadows, sources_of
 from torchpt.gradients.edges.traced import Traced, traced_of
 from torchpt.gradients.parameters import near_of, scene_reach
+from torchpt.math.guiding import EdgeGuide, rounds
 from torchpt.math.vectors import take
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.ranks import Group, share
@@ -98,6 +98,7 @@ class Boundary:
         worth: of places on the film.
         pixels: of the picture.
         ranks: those that share the samples; None: there is but one process.
+        guide: what is kept of earlier backward passes; None: nothing.
     """
 
     scene: Scene
@@ -110,6 +111,7 @@ class Boundary:
     worth: Worth
     pixels: int
     ranks: Group | None = None
+    guide: EdgeGuide | None = None
 
     @property
     def _camera_moves(self) -> bool:
@@ -167,16 +169,17 @@ class Boundary:
         """
         total = math.ceil(spp * self.pixels)
         for estimator in self._estimators(holds_first):
-            turn = first_round(total)
-            if turn is not None:  # every rank draws it, as all learn from it
-                found = estimator.samples(turn, 0, turn.count)
-                if found is not None and (self.ranks is None or self.ranks.rank == 0):
-                    yield found
-            turn = Round(0, total) if turn is None else turn.then(total)
-            for first, count in self._chunks(turn.count):
-                found = estimator.samples(turn, first, count)
-                if found is not None:
-                    yield found
+            memory = None if self.guide is None else self.guide.memory(type(estimator).__name__)
+            for turn in rounds(total, memory):
+                if turn.memory is not None:  # every rank draws it, as all learn from it
+                    found = estimator.samples(turn, 0, turn.count)
+                    if found is not None and (self.ranks is None or self.ranks.rank == 0):
+                        yield found
+                    continue
+                for first, count in self._chunks(turn.count):
+                    found = estimator.samples(turn, first, count)
+                    if found is not None:
+                        yield found
 
     def _estimators(self, holds_first: bool) -> Iterator[Shadows | Segments | Horizons]:
         still, integrator = self.still, self.traced.wave.integrator
@@ -219,6 +222,7 @@ def boundary_of(
     dtype: torch.dtype,
     cotangent: Tensor,
     ranks: Group | None = None,
+    guide: EdgeGuide | None = None,
 ) -> Boundary | None:
     """Return what a backward pass knows of edges; None where none of the parameters moves any.
 
@@ -230,6 +234,7 @@ def boundary_of(
         dtype: of the lanes.
         cotangent: ``(C, H, W)`` of what is differentiated.
         ranks: those that share the samples.
+        guide: what is kept of earlier backward passes.
 
     Raises:
         SceneError: settings that this scene cannot be rendered with.
@@ -247,7 +252,7 @@ def boundary_of(
         traced = traced_of(scene, settings, plain, dtype)
         worth = Worth(cotangent, traced.wave.filter, traced.wave.crop)
     pixels = cotangent.shape[1] * cotangent.shape[2]
-    return Boundary(scene, settings, plain, leaves, moving, still, traced, worth, pixels, ranks)
+    return Boundary(scene, settings, plain, leaves, moving, still, traced, worth, pixels, ranks, guide)
 
 
 def add_gradients(
@@ -260,6 +265,7 @@ def add_gradients(
     samples: float,
     held: bool = False,
     ranks: Group | None = None,
+    guide: EdgeGuide | None = None,
 ) -> list[Tensor | None]:
     """Return what moving edges add to the gradients of ``wanted``; None for those that move none.
 
@@ -274,13 +280,14 @@ def add_gradients(
         held: whether the interior holds in place what the camera sees (:mod:`torchpt.gradients.camera`): edges count as they
             move over that.
         ranks: those that share the samples, which are the same on each.
+        guide: what is kept of earlier backward passes.
 
     Raises:
         SceneError: settings that this scene cannot be rendered with.
     """
     with limited_threads(settings.render.threads):
         cotangent = cotangent.permute(2, 0, 1)
-        every = boundary_of(scene, settings, params, wanted, dtype, cotangent, ranks)
+        every = boundary_of(scene, settings, params, wanted, dtype, cotangent, ranks, guide)
         if every is None:
             return [None] * len(wanted)
         if not held:
@@ -288,7 +295,7 @@ def add_gradients(
         found = every.gradients(every.primary(samples, every.traced.radiance, held=True), wanted)
         # What the camera sees is held: only lights move shadows.
         lights = [name for name in wanted if not name.startswith("camera.")]
-        thrown = boundary_of(scene, settings, params, lights, dtype, cotangent, ranks)
+        thrown = boundary_of(scene, settings, params, lights, dtype, cotangent, ranks, guide)
         if thrown is None:
             return found
         more = thrown.gradients(thrown.shadows(samples, holds_first=True), wanted)

@@ -20,10 +20,10 @@ from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import smooth_faces
-from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
 from torchpt.gradients.edges.traced import Use
 from torchpt.gradients.edges.vertices import Spot, met
+from torchpt.math.guiding import Round
 from torchpt.math.sampling import Distribution1D, uniform_triangle
 from torchpt.math.vectors import cross, dot, normalize, take
 from torchpt.paths.transmission import opacity_at
@@ -98,8 +98,9 @@ class Horizons:
         traced, bodies = self.frame.traced, self.frame.bodies
         number, key, u, coin = traced.edges(turn, first, count, Use.HORIZONS)
         draws = traced.draws(key)
-        even = torch.stack((u, draws.two(Dimension.BSDF)[0].double(), *draws.two(Dimension.LIGHT).double()))
-        (u, angle, *place), scale = turn.draw(even)
+        numbers = torch.stack((u, draws.two(Dimension.BSDF)[0].double(), *draws.two(Dimension.LIGHT).double()))
+        drawn, scale = turn.draw(numbers)
+        u, angle, *place = drawn
         place, angle = torch.stack(place), 2.0 * math.pi * angle
         index, _ = self.choice.draw(u)
         weight = take(self.area, index) * (2.0 * 2.0 * math.pi) * scale / take(self.choice.pmf, index)
@@ -126,11 +127,11 @@ class Horizons:
             lane, depth = prefix.lane, self.depth if self.depth < 0 else self.depth - prefix.count
             light = traced.radiance(take(o, lane), take(d, lane), take(number, lane), Use.BEHIND, depth)
             prefixes.append((prefix, (light * prefix.weight).sum(0) * take(weight, lane)))
-        if turn.lesson is not None:
+        if turn.memory is not None:
             brought = torch.zeros_like(u)
             for prefix, light in prefixes:
                 brought.index_add_(0, prefix.lane, light.abs())
-            turn.lesson.append((even, brought / scale))
+            turn.teach(drawn, scale, brought)
         seen, share = y.held(bodies), self.frame.share(y.hit.prim, r)
         return HorizonSamples(face, n, omega, seen, r, share, prefixes) if prefixes else None
 

@@ -26,9 +26,9 @@ from torchpt.gradients.edges.curves import (
 )
 from torchpt.gradients.edges.cuts import Crossing, Cuts, crossing_of
 from torchpt.gradients.edges.film import Worth, film_places, slopes
-from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.occluders import EdgePoints, Occluders, occluders_of
 from torchpt.gradients.edges.traced import Passing, Traced, Use
+from torchpt.math.guiding import Round
 from torchpt.math.sampling import Distribution1D
 from torchpt.math.vectors import cross, dot, rows, take
 from torchpt.scene import Scene

@@ -31,11 +31,11 @@ from torch import Tensor
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import smooth_faces
 from torchpt.gradients.edges.cuts import Crossing, crossing_of
-from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.occluders import Occluders
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, one_of_each, prefixes_of
 from torchpt.gradients.edges.traced import Passing, Use
 from torchpt.gradients.edges.vertices import Spot, met
+from torchpt.math.guiding import Round
 from torchpt.math.sampling import Distribution1D, uniform_sphere, uniform_triangle
 from torchpt.math.vectors import Frame, concatenate_lanes, cross, dot, normalize, rows, take
 from torchpt.physics.samplers import Dimension
@@ -371,13 +371,12 @@ class Segments:
         draws = traced.draws(key)
         aim = draws.two(Dimension.LIGHT).double()
         coins = torch.stack((coin, draws.one(Dimension.LOBE).double()))
-        even = torch.cat((u[None], draws.two(Dimension.BSDF).double()))
-        u, scale = turn.draw(even)
+        u, scale = turn.draw(torch.cat((u[None], draws.two(Dimension.BSDF).double())))
         rays, spot, lane = self._receivers(self.sampler.draw(u[0], u[1:], aim, coins), key)
         found = self._samples(rays, spot, *rows((number, key, scale), lane)) if len(lane) else None
-        if turn.lesson is not None and found is not None:
+        if turn.memory is not None and found is not None:
             brought = torch.zeros_like(scale).index_add_(0, found.number - number[0], found.brought(self.frame))
-            turn.lesson.append((even, brought / scale))
+            turn.teach(u, scale, brought)
         return found
 
     def _receivers(self, rays: SegmentRays, key: Tensor) -> tuple[SegmentRays, Spot, Tensor]:

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import View
-from torchpt.gradients.edges.guide import Round
 from torchpt.gradients.edges.occluders import Occluders, OutlinePoints
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
 from torchpt.gradients.edges.traced import Passing, Use
 from torchpt.gradients.edges.vertices import Spot, met
+from torchpt.math.guiding import Round
 from torchpt.math.sampling import Distribution1D, concentric_disk, uniform_sphere, uniform_triangle
 from torchpt.math.vectors import cross, dot, luminance, rows, take
 from torchpt.paths.vertex import light_radiance
@@ -280,8 +280,7 @@ class Shadows:
         """Return samples ``first .. first + count`` of a round; None where none of them counts."""
         traced = self.frame.traced
         _, key, u, coin = traced.edges(turn, first, count, Use.LIGHTS)
-        even = torch.cat((u[None], self.sources.numbers(traced.draws(key))))
-        u, scale = turn.draw(even)
+        u, scale = turn.draw(torch.cat((u[None], self.sources.numbers(traced.draws(key)))))
         beam = self.sources.draw(u[1:])
         passed = self.occluders.points(self.occluders.outlines, u[0], coin, beam.view)
         passed = rows(passed, passed.outline.nonzero().squeeze(1))
@@ -289,11 +288,11 @@ class Shadows:
         if not len(passed.lane):
             return None
         cast = self._cast(take(key, passed.lane), beam, passed, spot, outward, take(scale, passed.lane))
-        if turn.lesson is not None and cast is not None:
+        if turn.memory is not None and cast is not None:
             brought = torch.zeros_like(scale)
             for prefix, weight in cast.prefixes:
                 brought.index_add_(0, take(passed.lane, prefix.lane), dot(weight, weight).sqrt())
-            turn.lesson.append((even, brought / scale))
+            turn.teach(u, scale, brought)
         return cast
 
     def _past(self, beam: Beam, passed: OutlinePoints, key: Tensor) -> tuple[Beam, OutlinePoints, Spot, Tensor]:

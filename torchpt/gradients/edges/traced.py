@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.tree import map_leaves
 from torchpt.engines.engine import Kernels, forward_kernels, trace
-from torchpt.gradients.edges.guide import Round
+from torchpt.math.guiding import Round
 from torchpt.math.vectors import dot, rows, take
 from torchpt.paths.state import T_MAX, PathState
 from torchpt.paths.transmission import non_opaque, opacity_at, origins_behind

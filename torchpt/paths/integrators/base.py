@@ -40,6 +40,7 @@ __all__ = [
     "SAMPLES",
     "STRATEGY",
     "STRICT",
+    "TO_FIRST_SURFACE",
     "Integrator",
     "Limits",
     "check_fields",
@@ -116,6 +117,10 @@ class Limits:
         if depth < self.rr_depth:
             return 0.0
         return DEEP_CAP if self.max_depth < 0 and depth > DEEP else 1.0
+
+
+#: Limits of walks to the first surface alone, as for layers: they do not depend on how far the integrator's paths go.
+TO_FIRST_SURFACE = Limits(max_depth=1, rr_depth=2)
 
 
 class Integrator(FrozenConfig):

@@ -40,7 +40,7 @@ from torchpt.rendering.execution import execute_request
 from torchpt.rendering.requests import RenderRequest, prepare_request
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import BatchOptions, CommonOptions, Params, RenderOptions
+from torchpt.scene.settings import BatchOptions, CommonOptions, Params
 from torchpt.scene.versions import check_unchanged
 from torchpt.spec.arguments import SCENE_VALUE, check_names, expand_signature
 
@@ -147,7 +147,8 @@ def render_batch(
         RenderError: as :func:`torchpt.render`.
         TypeError: an unknown argument.
     """
-    check_names("render_batch", options, RenderOptions, own=("cameras", "on_progress"))
+    own = ("cameras", "params", "spp", "seed", "on_progress", "full")
+    check_names("render_batch", options, BatchOptions, own)
     if on_progress is not None and not callable(on_progress):
         raise SceneError("on_progress", on_progress, "a function")
     scenes = scenes_of(scenes)
