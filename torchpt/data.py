@@ -453,6 +453,8 @@ def _check_options(options: Mapping[str, Any], where: str = "") -> None:
     film, params = film_keys(options.get("film")), options.get("params")
     if "full" in options:
         raise SceneError(f"{where}full", options["full"], "none: an item holds the picture and its layers")
+    if options.get("edge_guide") is not None:
+        raise SceneError(f"{where}edge_guide", options["edge_guide"], "none: pictures of a data set have no gradients")
     if film is not None and not isinstance(film, Mapping):
         raise SceneError(f"{where}film", film, "(width, height), or a mapping of film settings")
     if params is not None and not isinstance(params, Mapping):

@@ -15,7 +15,7 @@ import torchpt
 from torchpt.gradients.edges import gradients as gradients_module
 from torchpt.gradients.edges.gradients import boundary_of, samples_for
 from torchpt.math import guiding
-from torchpt.math.guiding import EdgeGuide, Guide, Lesson, Memory, Round, guide_of, rounds
+from torchpt.math.guiding import EdgeGuide, Guide, Memory, Observations, Round, guide_of, rounds
 from torchpt.scene.formats.description import settings
 
 COUNT = 20_000
@@ -33,11 +33,11 @@ BROUGHT: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
-def lesson(name: str, seed: int = 1, guide: Guide | None = None, count: int = COUNT) -> Lesson:
+def lesson(name: str, seed: int = 1, guide: Guide | None = None, count: int = COUNT) -> Observations:
     """What numbers bring that are drawn evenly, or by a guide."""
     u = numbers(seed, count=count)
     u, inverse = (u, torch.ones_like(u[0])) if guide is None else guide.draw(u)
-    return Lesson(u, inverse, BROUGHT[name](u))
+    return Observations(u, inverse, BROUGHT[name](u))
 
 
 def taught(name: str) -> Guide:
@@ -87,7 +87,7 @@ def test_guided_means_are_right_and_vary_less(name: str, teach: Callable[[str], 
 
 
 def test_nothing_is_learned_of_nothing():
-    nothing = Lesson(numbers(5), torch.ones(COUNT, dtype=torch.float64), torch.zeros(COUNT))
+    nothing = Observations(numbers(5), torch.ones(COUNT, dtype=torch.float64), torch.zeros(COUNT))
     assert guide_of(nothing) is None
     memory = Memory()
     memory.add(nothing)
@@ -104,15 +104,11 @@ def test_a_memory_forgets_and_does_not_mind_how_much_a_lesson_brings(monkeypatch
     for seed in range(4):
         own = lesson("corner", seed) if seed else lesson("peak", seed)
         memory.add(own)
-        other.add(replace(own, brought=own.brought * 10.0**-seed))
+        other.add(replace(own, contribution=own.contribution * 10.0**-seed))
         assert memory.guide is not None and other.guide is not None
         torch.testing.assert_close(memory.guide.choice.pmf, other.guide.choice.pmf)
     assert memory._kept is not None and memory._kept.u.shape == (3, 3 * COUNT)
     assert torch.equal(memory._kept.u, torch.cat([lesson("corner", seed).u for seed in (1, 2, 3)], 1))
-    # Numbers of other dimensions are those of another scene.
-    u = numbers(7, dimensions=2)
-    memory.add(Lesson(u, torch.ones_like(u[0]), u[0]))
-    assert memory.guide is not None and len(memory.guide.low) == 2
 
 
 def even(turns: list[Round], u: Tensor) -> float:
@@ -134,7 +130,8 @@ def test_a_memory_learns_of_every_call(total: int):
     for turn in rounds(total, memory):
         found.append(turn)
         u, weight = turn.draw(numbers(8, count=turn.count))
-        turn.teach(u, weight, BROUGHT["corner"](u) * weight)
+        if turn.memory is not None:
+            turn.record(u, weight, BROUGHT["corner"](u) * weight)
     assert found[0].guide is None and all(turn.guide is not None for turn in found[1:])
     known = memory.guide
     later = list(rounds(total, memory))
@@ -202,10 +199,35 @@ def test_a_run_with_a_new_guide_repeats():
     assert not torch.equal(first[2], run(None)[2])
 
 
+def test_calls_of_one_seed_draw_samples_that_the_guide_was_not_learned_from():
+    """A guide would draw again more of what contributed much by chance, with less weight."""
+    true, found = numbers(9, count=400_000), list[float]()
+    small = (true - 0.5).square().sum(0).sqrt() < 0.12
+    for run in range(20):
+        guide = EdgeGuide()
+        memory = guide.memory("it", torch.device("cpu"))
+        for _ in range(6):
+            (turn,) = rounds(512, memory)
+            u, weight = turn.draw(numbers(guide.next_seed(run) % (1 << 40), count=512))
+            contribution = ((u - 0.5).square().sum(0).sqrt() < 0.12).double() * weight
+            turn.record(u, weight, contribution)
+            found.append(float(contribution.sum()))
+    values = torch.tensor(found).view(20, 6)[:, 2:].mean(1)
+    assert abs(float(values.mean()) - float(small.double().mean())) < 3 * float(values.std()) / 20**0.5
+    guide = EdgeGuide()
+    assert len({guide.next_seed(3) for _ in range(9)}) == 9
+
+
 def test_an_edge_guide_is_one():
     scene = known.loaded(known.PAIRS["block_in_corner"])
     with pytest.raises(torchpt.SceneError, match=r"edge_guide: expected a torchpt.EdgeGuide, got 3"):
         torchpt.render(scene, edge_guide=3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(torchpt.SceneError, match=r"edge_guide: expected None where edges is False"):
+        torchpt.render(scene, edge_guide=EdgeGuide(), edges=False)
+    with pytest.raises(torchpt.SceneError, match=r"edge_guide: expected none: pictures of a data set"):
+        torchpt.data.RenderDataset(lambda index: scene, 1, edge_guide=EdgeGuide())
+    with pytest.raises(torchpt.SceneError, match=r"edge_guide: expected none: pictures of a data set"):
+        torchpt.data.RenderDataset(lambda index: (scene, {"edge_guide": EdgeGuide()}), 1)[0]
     with pytest.raises(TypeError, match="edge_guide"):  # pictures of a batch are made side by side
         torchpt.render_batch([scene], edge_guide=EdgeGuide())  # pyright: ignore[reportCallIssue]
 

@@ -113,9 +113,12 @@ class _Derivatives:
         """Return the gradients of ``tensors``; ``cotangents``: of the picture alone."""
         cotangent = cotangents[0].reshape(-1, 3).T  # (3, H W)
         self._request.check_unchanged(AFTER)
-        with together(
-            self._request.call.ranks, "the loss", lambda: cotangent.detach().cpu().contiguous().numpy().tobytes()
-        ):
+        call = self._request.call
+
+        def content() -> bytes:
+            return cotangent.detach().cpu().contiguous().numpy().tobytes() + repr(call.edge_guide).encode()
+
+        with together(call.ranks, "the loss" if call.edge_guide is None else "the loss, and edge_guide", content):
             return self._gradients(cotangent, *tensors)
 
     def _gradients(self, cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:

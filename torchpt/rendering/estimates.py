@@ -14,6 +14,7 @@ from torchpt.core.autograd import gradients_of
 from torchpt.core.errors import SceneError
 from torchpt.rendering.api import render
 from torchpt.scene import Scene
+from torchpt.scene.entry import as_scene
 from torchpt.scene.settings import SeedOfCall, base_seed, seed_number
 
 __all__ = ["GradientEstimate", "gradient"]
@@ -21,7 +22,7 @@ __all__ = ["GradientEstimate", "gradient"]
 #: Ways to combine passes.
 COMBINE = ("mean", "median")
 #: Options that passes set by themselves.
-_OWN = ("params", "spp", "seed", "spp_grad", "seed_grad")
+_OWN = ("params", "spp", "seed", "spp_grad", "seed_grad", "full")
 #: Odd multiplier that gives passes seeds of their own, any constant.
 _STRIDE = 0x9E3779B1
 
@@ -86,7 +87,8 @@ def gradient(
         seed: see :func:`torchpt.render`.
         combine: ``mean`` or ``median``.
         grad_clip: longest gradient of a parameter in a pass, in units of the median length over passes; None: any.
-        options: further options of :func:`torchpt.render`.
+        options: further options of :func:`torchpt.render`. An ``edge_guide`` learns from pass to pass, so the first ones vary
+            more, which ``median`` and ``grad_clip`` do not know.
 
     Raises:
         SceneError: a setting or parameter is not accepted, or all passes of a parameter have gradients that are not finite.
@@ -100,8 +102,10 @@ def gradient(
             raise SceneError(name, value, f"a whole number >= {low}")
     if combine not in COMBINE:
         raise SceneError("combine", combine, " or ".join(COMBINE))
-    if grad_clip is not None and not grad_clip > 0:
+    if grad_clip is not None and not (isinstance(grad_clip, int | float) and grad_clip > 0):
         raise SceneError("grad_clip", grad_clip, "a number above 0, or None")
+    if not isinstance(loss, Tensor) and not callable(loss):
+        raise SceneError("loss", loss, "a function of the picture, or a tensor of its shape")
     first = base_seed(seed_number(seed))
     values = {name: _leaf(value) for name, value in _named(scene, params).items()}
     if not values:
@@ -148,7 +152,7 @@ def _named(scene: Scene, params: Mapping[str, Any] | Iterable[str]) -> Mapping[s
         return params
     if isinstance(params, str):
         raise SceneError("params", params, "values by name, or a list of names")
-    names = list(params)
+    names, scene = list(params), as_scene(scene)
     for name in names:
         if name not in scene.params:
             raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.params))}")
@@ -166,8 +170,9 @@ def _cotangent(loss: Callable[[Tensor], Tensor], picture: Tensor) -> tuple[float
     picture = picture.detach().requires_grad_()
     with torch.enable_grad():
         value = loss(picture)
-    if not isinstance(value, Tensor) or value.numel() != 1:
-        raise SceneError("loss", type(value).__name__, "a function that returns a single number as a tensor")
+    if not isinstance(value, Tensor) or value.numel() != 1 or not value.requires_grad:
+        expected = "a function that returns a single number as a tensor, differentiable in the picture"
+        raise SceneError("loss", type(value).__name__, expected)
     (cotangent,) = torch.autograd.grad(value, picture)
     return float(value.detach()), cotangent
 

@@ -163,6 +163,8 @@ _templates: WeakKeyDictionary[Scene, tuple[ResultCache[RequestTemplate], Descrip
 
 def _template_of(scene: Scene, full: bool, options: Mapping[str, Any]) -> RequestTemplate:
     call = CallArguments.of({**options, "full": full})
+    if call.edge_guide is not None and not call.edges:
+        raise SceneError("edge_guide", call.edge_guide, "None where edges is False")
     _check_device(scene, options.get("device"))
     settings = complete_settings(scene.description, settings_of_call(options))
     if not full:

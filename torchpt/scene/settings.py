@@ -395,7 +395,8 @@ class RendererOptions(_SampleOptions, BatchOptions, total=False):
             None,
             fits=lambda value: isinstance(value, EdgeGuide),
             words="a torchpt.EdgeGuide",
-            doc="keeps from one backward pass of an optimization to the next where samples of edges brought something",
+            doc="remembers which samples of edges contributed to earlier gradients of an optimization, and draws more of their"
+            " kind",
         ),
     ]
 

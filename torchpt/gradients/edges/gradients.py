@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from typing import Protocol
@@ -169,7 +169,11 @@ class Boundary:
         """
         total = math.ceil(spp * self.pixels)
         for estimator in self._estimators(holds_first):
-            memory = None if self.guide is None else self.guide.memory(type(estimator).__name__)
+            memory = (
+                None
+                if self.guide is None
+                else self.guide.memory(type(estimator).__name__, self.traced.wave.centre.device)
+            )
             for turn in rounds(total, memory):
                 if turn.memory is not None:  # every rank draws it, as all learn from it
                     found = estimator.samples(turn, 0, turn.count)
@@ -285,6 +289,8 @@ def add_gradients(
     Raises:
         SceneError: settings that this scene cannot be rendered with.
     """
+    if guide is not None:
+        settings = replace(settings, render=settings.render.but(seed=guide.next_seed(settings.render.seed)))
     with limited_threads(settings.render.threads):
         cotangent = cotangent.permute(2, 0, 1)
         every = boundary_of(scene, settings, params, wanted, dtype, cotangent, ranks, guide)

@@ -131,7 +131,7 @@ class Horizons:
             brought = torch.zeros_like(u)
             for prefix, light in prefixes:
                 brought.index_add_(0, prefix.lane, light.abs())
-            turn.teach(drawn, scale, brought)
+            turn.record(drawn, scale, brought)
         seen, share = y.held(bodies), self.frame.share(y.hit.prim, r)
         return HorizonSamples(face, n, omega, seen, r, share, prefixes) if prefixes else None
 

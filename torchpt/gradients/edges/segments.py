@@ -376,7 +376,7 @@ class Segments:
         found = self._samples(rays, spot, *rows((number, key, scale), lane)) if len(lane) else None
         if turn.memory is not None and found is not None:
             brought = torch.zeros_like(scale).index_add_(0, found.number - number[0], found.brought(self.frame))
-            turn.teach(u, scale, brought)
+            turn.record(u, scale, brought)
         return found
 
     def _receivers(self, rays: SegmentRays, key: Tensor) -> tuple[SegmentRays, Spot, Tensor]:

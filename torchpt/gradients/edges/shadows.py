@@ -292,7 +292,7 @@ class Shadows:
             brought = torch.zeros_like(scale)
             for prefix, weight in cast.prefixes:
                 brought.index_add_(0, take(passed.lane, prefix.lane), dot(weight, weight).sqrt())
-            turn.teach(u, scale, brought)
+            turn.record(u, scale, brought)
         return cast
 
     def _past(self, beam: Beam, passed: OutlinePoints, key: Tensor) -> tuple[Beam, OutlinePoints, Spot, Tensor]:
