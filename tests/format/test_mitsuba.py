@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from mitsuba_corpus import EXACT, NEAREST, OLD, scene, write_assets
+from PIL import Image
 
 import torchpt
 from torchpt.core.errors import AssetError, ImportedSceneWarning, SceneError
@@ -214,6 +216,88 @@ def test_defaults_of_versions(assets: Path) -> None:
     assert mix["weight"] == pytest.approx(0.5) and mix["a"]["weight"] == pytest.approx(0.6)
 
 
+def warned(folder: Path, text: str) -> tuple[dict[str, Any], str]:
+    """Return a scene and the warnings of its import."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        (folder / "scene.xml").write_text(text)
+        found = read_mitsuba(folder / "scene.xml", "scene.xml", ImportOptions())
+    return found, "; ".join(str(each.message) for each in caught)
+
+
+def test_files_before_version_2_mean_what_they_meant_then(assets: Path) -> None:
+    light = '<emitter type="constant"><spectrum name="radiance" value="2"/></emitter>'
+    assert (
+        read(assets, scene(light, "0.6.0"))["lights"]["constant_1"]["radiance"] == [2.0] * 3
+    )  # white, not equal energy
+    assert read(assets, scene(light))["lights"]["constant_1"]["radiance"] == pytest.approx([2.41, 1.90, 1.82], abs=0.01)
+    without = re.sub("<integrator.*</integrator>", "", scene(""), flags=re.DOTALL)
+    assert read(assets, without.replace("3.0.0", "0.6.0"))["integrator"]["type"] == "direct"
+    assert read(assets, without)["integrator"]["type"] == "path"
+    checker = (
+        '<bsdf type="diffuse"><texture type="checkerboard" name="reflectance"><float name="uscale" value="4"/>'
+        '<float name="uoffset" value="0.25"/></texture></bsdf>'
+    )
+    moved = material(assets, checker, "0.6.0")["reflectance"]["uv_transform"]
+    assert moved == {"scale": [4.0, 1.0], "translate": [0.25, 0.0]}
+    fog = '<medium type="homogeneous" name="{}" id="fog"/>'
+    lamp = f'<shape type="sphere"><emitter type="area"/>{fog.format("exterior")}</shape>'
+    border = f'<shape type="sphere">{fog.format("interior")}</shape>'
+    types = {
+        (version, shape): warned(assets, scene(shape, version))[0]["shapes"]["sphere_1"]["material"]
+        for version in ("0.6.0", "3.0.0")
+        for shape in (lamp, border)
+    }
+    assert [found["type"] for found in types.values()] == ["diffuse", "null", "diffuse", "diffuse"]
+    assert types["0.6.0", lamp]["reflectance"] == [0.0] * 3
+
+
+def test_what_would_be_lost_is_said(assets: Path) -> None:
+    two = '<shape type="sphere"><bsdf type="dielectric"/><bsdf type="diffuse"/></shape>'
+    assert "only the last bsdf of several" in warned(assets, scene(two))[1]
+    inner = '<float name="weight" value=".25"/><bsdf type="thindielectric"/><bsdf type="diffuse"/>'
+    glass = f'<bsdf type="blendbsdf">{inner}</bsdf>'
+    assert "seen from behind" in warned(assets, scene(f'<shape type="sphere">{glass}</shape>'))[1]
+
+
+def test_a_blend_with_nothing_is_an_opacity(assets: Path) -> None:
+    def blended(first: str, second: str) -> dict[str, Any]:
+        inner = f'<bsdf type="{first}"/><bsdf type="{second}"/>'
+        return material(assets, f'<bsdf type="blendbsdf"><float name="weight" value="0.25"/>{inner}</bsdf>')
+
+    for found, opacity in ((blended("null", "diffuse"), 0.25), (blended("diffuse", "null"), 0.75)):
+        assert found == {"type": "diffuse", "two_sided": False, "opacity": opacity}
+    assert blended("null", "null")["type"] == "blend"
+
+
+def test_shapes_of_a_merge_are_shapes_of_their_own(assets: Path) -> None:
+    inner = '<shape type="sphere"><bsdf type="plastic"/></shape><shape type="cube"/>'
+    found, said = warned(assets, scene(f'<shape type="merge">{inner}</shape>'))
+    assert {shape["type"] for shape in found["shapes"].values()} == {"sphere", "cube"} and not said
+
+
+def test_a_sky_and_its_sun_are_one_light(assets: Path) -> None:
+    sun = '<vector name="sunDirection" x="0" y=".6" z=".8"/><float name="turbidity" value="4"/>'
+    parts = [f'<emitter type="{part}">{sun}</emitter>' for part in ("sky", "sun", "sunsky")]
+    found, _ = warned(assets, scene(parts[0] + parts[1], "0.6.0"))
+    other, _ = warned(assets, scene(parts[1] + parts[0], "0.6.0"))
+    both, _ = warned(assets, scene(parts[2], "0.6.0"))
+    assert [*found["lights"].values()] == [*other["lights"].values()] == [*both["lights"].values()]
+    other_sun = parts[1].replace('value="4"', 'value="3"')
+    assert "an environment before it" in warned(assets, scene(parts[0] + other_sun, "0.6.0"))[1]
+
+
+def test_bitmaps_of_16_bits_are_decoded_too(tmp_path: Path) -> None:
+    Image.fromarray(np.full((2, 2), 32768, np.uint16)).save(tmp_path / "deep.png")
+    image = '<texture type="bitmap" name="reflectance"><string name="filename" value="deep.png"/>{}</texture>'
+    for more, value in (("", 0.21404), ('<boolean name="raw" value="true"/>', 0.5)):
+        shape = f'<shape type="rectangle"><bsdf type="diffuse">{image.format(more)}</bsdf></shape>'
+        (tmp_path / "scene.xml").write_text(scene(shape))
+        opened = torchpt.load(str(tmp_path / "scene.xml"), "cpu")
+        (texels,) = [texels for texels in opened.params.values() if texels.shape[:2] == (2, 2)]
+        assert float(texels.max()) == pytest.approx(value, abs=1e-4)
+
+
 # ---- Structure: parameters, files, references
 
 
@@ -285,6 +369,14 @@ def test_unknown_properties_warn(assets: Path) -> None:
         read_mitsuba(assets / "scene.xml", "scene.xml", ImportOptions())
 
 
+#: Each blend refers twice to the one before: two to the thirtieth of them.
+TWICE = '<bsdf type="diffuse" id="m0"/>' + "".join(
+    f'<bsdf type="blendbsdf" id="m{k + 1}"><float name="weight" value=".5"/><ref id="m{k}"/><ref id="m{k}"/></bsdf>'
+    for k in range(30)
+)
+MANY_PARAMETERS = f'<default name="a" value="{"x" * 1_000_000}"/>' + '<alias id="$a" as="b"/>' * 300
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -315,6 +407,10 @@ def test_unknown_properties_warn(assets: Path) -> None:
             "deep inside each other",
         ),
         (scene("<a>" * 70 + "</a>" * 70), "nested at most"),
+        (scene('<shape type="sphere"><float name="to_world" value="3"/></shape>'), "a transform as to_world"),
+        (scene(f'<shape type="sphere"><ref id="m30"/></shape>{TWICE}'), "at most 8 blends inside each other"),
+        (scene(f'<shape type="sphere"><float name="radius" value="${"a" * 200_000}"/></shape>'), "a <default>"),
+        (scene(MANY_PARAMETERS), "256 times that in all"),
     ],
 )
 def test_errors_are_one_line_and_name_a_line(assets: Path, text: str, words: str) -> None:

@@ -407,8 +407,7 @@ OLD: dict[str, tuple[str, str]] = {
         ),
         scene(
             '<shape type="rectangle"><bsdf type="diffuse"><texture type="checkerboard" name="reflectance">'
-            '<rgb name="color0" value="0.4"/><rgb name="color1" value="0.2"/>'
-            '<transform name="to_uv"><translate x="0.25"/><scale x="3" y="2"/></transform></texture></bsdf></shape>'
+            '<transform name="to_uv"><scale x="3" y="2"/><translate x="0.25"/></transform></texture></bsdf></shape>'
         ),
     ),
 }

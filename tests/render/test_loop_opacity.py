@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from scene_makers import lit_floor, turned
 from trials import film_of
 
 import torchpt
+from torchpt.engines.kernels.programs import _with_arguments, trace_stage
+from torchpt.rendering import kernels_of, make_wave
 from torchpt.rendering.api import render_scene
 from torchpt.scene.formats.description import settings
 
@@ -51,3 +54,21 @@ def test_light_that_passes_is_the_same_compiled(accel, copies):
     far = (on - off).abs() > 1e-3 * (1 + off.abs())
     assert float(far.float().mean()) < 0.01, float((on - off).abs().amax())
     torch.testing.assert_close(on.mean((0, 1)), off.mean((0, 1)), rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("accel", ["brute", "numba"])
+@pytest.mark.parametrize("lit", [True, False])
+def test_kernels_that_are_compiled_ahead_can_be_traced(lit: bool, accel: str) -> None:
+    """Where nothing is lit there are no shadow rays, which some of them would be of."""
+    described = description(copies=False)
+    if not lit:
+        described["materials"]["lamp"] = described["materials"]["grey"]
+    scene = torchpt.load(described, "cpu")
+    wave = make_wave(scene, settings(scene.description, {"render": {"accel": accel}}), None, torch.float32)
+    kernels = kernels_of(scene, wave)
+    assert kernels.has_opacity and (kernels.world.lights is not None) == lit
+    names = []
+    for listed, build, arguments in kernels.large_kernels():
+        names.append(build.__name__)
+        assert trace_stage(kernels._leaves, kernels, partial(_with_arguments, build, arguments), listed)
+    assert ("attenuate_shadow_rays" in names) == ("transmittance" in kernels.state)

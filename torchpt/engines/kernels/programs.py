@@ -526,7 +526,8 @@ class Kernels(Layout):
         if self.has_opacity:
             yield True, stages.transmit, (False,)
             yield False, stages.transmit, (True,)
-            yield False, stages.attenuate_shadow_rays, ()
+            if "transmittance" in self.state:
+                yield False, stages.attenuate_shadow_rays, ()
         if self.has_emitters:
             yield True, stages.emit, ()
         if self.has_environment:

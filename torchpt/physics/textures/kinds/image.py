@@ -58,7 +58,7 @@ class Image(Mapped):
         "colorspace": Choice(
             "auto",
             names=("auto", "srgb", "linear"),
-            doc="encoding of images of 8 bits a value; auto: sRGB for a colour, linear for a number",
+            doc="encoding of images of whole numbers; auto: sRGB for a colour of 8 bits a value, else linear",
         ),
         "scale": Color((1.0, 1.0, 1.0), low=None, doc="factor of the values"),
         "channel": Choice(None, names=CHANNELS, doc="channel for a number; luminance by default"),
@@ -97,9 +97,9 @@ class Image(Mapped):
         path = find(values["path"])
         max_pixels = MAX_PIXELS if values["max_pixels"] is None else values["max_pixels"]
         if path is not None and (key := (str(path), max_pixels)) not in image_cache:
-            space = values["colorspace"]
-            linear = space == "linear" or (space == "auto" and slot.linear)
-            image_cache[key] = ahead.add(partial(_read_converted, path, max_pixels, linear))
+            image_cache[key] = ahead.add(
+                partial(_read_converted, path, max_pixels, values["colorspace"], linear=slot.linear)
+            )
 
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
@@ -108,9 +108,7 @@ class Image(Mapped):
         label, picture = _read_image(values, opening)
         channel = opening.channel or values["channel"] or "luminance"  # the slot's choice comes first
         alpha = not slot.coloured and channel == "a"  # alpha is always linear
-        space = values["colorspace"]
-        # Files of 8 bits a value hold sRGB, unless the file says otherwise or the slot's values are no colours (`slot.linear`).
-        decode = picture.eight_bit and (space == "srgb" or (space == "auto" and (alpha or not slot.linear)))
+        decode = _is_encoded(picture, values["colorspace"], linear=slot.linear and not alpha)
         channels = picture.stored.shape[2]
         if alpha and channels in (1, 3):
             raise AssetError(label, f"has no alpha channel, asked for by {opening.key}")
@@ -157,10 +155,23 @@ def _read_image(values: Mapping[str, Any], opening: Opening) -> tuple[str, Texel
     return label, picture
 
 
-def _read_converted(path: FilePath, max_pixels: int, linear: bool) -> Texels:
-    """Read an image, and convert it to the values that a slot wants which takes 8 bits a value as ``linear`` ones or not."""
+def _is_encoded(picture: Texels, colorspace: str, *, linear: bool) -> bool:
+    """Return True if an image is to be decoded from sRGB.
+
+    Args:
+        picture: the image.
+        colorspace: as the scene says; ``auto``: images of 8 bits a value are encoded, unless they give no colours.
+        linear: True: the values of its slot are no colours.
+    """
+    if colorspace == "auto":
+        return picture.eight_bit and not linear
+    return colorspace == "srgb" and picture.white is not None
+
+
+def _read_converted(path: FilePath, max_pixels: int, colorspace: str, *, linear: bool) -> Texels:
+    """Read an image, and convert its values as a slot wants them; arguments as for :func:`_is_encoded`."""
     picture = read_texels(path, max_pixels)
-    _ = picture.values if linear or not picture.eight_bit else picture.decoded
+    _ = picture.decoded if _is_encoded(picture, colorspace, linear=linear) else picture.values
     return picture
 
 

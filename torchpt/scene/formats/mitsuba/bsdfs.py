@@ -10,6 +10,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from torchpt.physics.bsdfs.presets import INDICES, METALS, metal_index
+from torchpt.scene.formats.materials import MAX_BLENDS
 from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, nearest
 from torchpt.scene.formats.mitsuba.properties import Properties
 from torchpt.scene.formats.mitsuba.textures import scaled
@@ -214,6 +215,11 @@ def _blend(p: Properties, importer: Importer) -> Material:
 
 def _blended(sides: list[Material], weight: Any, p: Properties) -> Material:
     """Return a blend of two materials; what only the blend itself may have is taken from them."""
+    if not isinstance(weight, dict):
+        for null, other, share in ((*sides, weight), (*sides[::-1], 1.0 - weight)):
+            # Light passes one of them: the other is less opaque, and stays black from behind if it is.
+            if null == {"type": "null"} and "opacity" not in other and other["type"] != "null":
+                return other | {"opacity": share}
     inner: list[Material] = []
     one_sided = [side.get("two_sided") is False for side in sides]
     clear = [_passes(side) for side in sides]
@@ -232,12 +238,21 @@ def _blended(sides: list[Material], weight: Any, p: Properties) -> Material:
             if key in side:
                 p.note(f"a {key} inside a blend is left out")
         inner.append(kept)
+    if max(map(_depth, inner)) >= MAX_BLENDS:
+        raise p.element.error(p.element.label, f"at most {MAX_BLENDS} blends inside each other")
     found: Material = {"type": "blend", "a": inner[0], "b": inner[1], "weight": weight}
     if any(clear):
+        if any(one_sided):
+            p.note("both sides of the blend are seen from behind, as light passes one part of it")
         return found
     if one_sided[0] != one_sided[1]:
         p.note("both sides of the blend are seen from behind, as one of them is")
     return found | ({"two_sided": False} if all(one_sided) else {})
+
+
+def _depth(material: Material) -> int:
+    """Return how many blends are inside each other."""
+    return 1 + max(_depth(material["a"]), _depth(material["b"])) if material["type"] == "blend" else 0
 
 
 def _passes(material: Material) -> bool:
@@ -292,7 +307,7 @@ def _mapped(p: Properties, importer: Importer, key: str) -> Material:
     if len(textures) != 1:
         raise p.element.error(p.element.label, f"one texture inside it, not {len(textures)}")
     value = importer.texture(textures[0])
-    scale = p.number("scale", 1.0)
+    scale = p.number("scale", 1.0) if key == "bump_map" else 1.0
     if isinstance(value, list):
         p.note("a constant map is left out")
         return material

@@ -21,7 +21,7 @@ MAX_BYTES = 256 * 2**20
 MAX_DEPTH = 64  # levels of nesting
 MAX_ELEMENTS = 2_000_000
 MAX_FILES, MAX_INCLUDES = 256, 15  # files of a scene, and levels of <include>
-MAX_TEXT = 2**20  # characters of an attribute once parameters are substituted
+MAX_TEXT = 2**20  # characters of an attribute once parameters are substituted; 256 times as many in all
 
 #: Old names of tags, and those of today (Mitsuba 0.4 renamed cameras and luminaires).
 TAGS = {"camera": "sensor", "luminaire": "emitter", "lookAt": "lookat"}
@@ -106,7 +106,7 @@ class _Reader:
         self.parameters = parameters
         self.used: set[str] = set()
         self.declared: set[str] = set()
-        self.files = self.elements = 0
+        self.files = self.elements = self.substituted = 0
 
     def read(self, path: Path, file: str, trail: tuple[Path, ...]) -> Element:
         """Parse a file and the files that it includes; ``trail``: the files that include it."""
@@ -201,13 +201,14 @@ class _Reader:
             if "$" not in text:
                 continue
             found = _PARAMETER.sub(lambda match: self._value(match[1], element), text)
-            if len(found) > MAX_TEXT:
-                raise element.error(found[:40], f"at most {MAX_TEXT} characters in an attribute")
+            self.substituted += len(found)
+            if len(found) > MAX_TEXT or self.substituted > 256 * MAX_TEXT:
+                raise element.error(found[:40], f"at most {MAX_TEXT} characters in an attribute, 256 times that in all")
             element.attributes[key] = found
 
     def _value(self, name: str, element: Element) -> str:
         """Return the value of the parameter ``name``, or of the longest one that its letters begin with and the rest."""
-        for length in range(len(name), 0, -1):
+        for length in range(min(len(name), max(map(len, self.parameters), default=0)), 0, -1):
             if name[:length] in self.parameters:
                 self.used.add(name[:length])
                 return self.parameters[name[:length]] + name[length:]

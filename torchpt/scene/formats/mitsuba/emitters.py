@@ -123,6 +123,19 @@ def _sun_sky(p: Properties, importer: Importer) -> list[Light]:
     return [found]
 
 
+def join_skies(sky: Light, other: Light) -> bool:
+    """Add a sun without a sky to a sky without a sun, or the other way round; return False where they do not fit."""
+    parts = [light for light in (sky, other) if not light["sun_scale"]] + [
+        light for light in (sky, other) if not light["sky_scale"]
+    ]
+    alike = ("turbidity", "sun_direction", "transform")
+    if len(parts) != 2 or parts[0] is parts[1] or any(sky.get(key) != other.get(key) for key in alike):
+        return False
+    dome, sun = parts
+    sky |= {**dome, "sun_scale": sun["sun_scale"], "sun_aperture": sun["sun_aperture"]}
+    return True
+
+
 def _within(p: Properties, name: str, default: float, low: float, high: float) -> float:
     """Return a number, the nearest in a range; note one outside."""
     value = p.number(name, default)

@@ -12,7 +12,7 @@ from torchpt.core.errors import SceneError, did_you_mean
 from torchpt.core.files import is_regular
 from torchpt.scene.formats.mitsuba.bsdfs import BSDFS, UNKNOWN
 from torchpt.scene.formats.mitsuba.elements import Element, parse_scene, walk
-from torchpt.scene.formats.mitsuba.emitters import EMITTERS
+from torchpt.scene.formats.mitsuba.emitters import EMITTERS, join_skies
 from torchpt.scene.formats.mitsuba.notes import Notes
 from torchpt.scene.formats.mitsuba.plugins import Plugin, Twin, left_out, nearest
 from torchpt.scene.formats.mitsuba.properties import OBJECTS, Properties
@@ -304,7 +304,7 @@ class Importer:
     def _settings(self, sensors: list[Element], integrators: list[Element]) -> dict[str, Any]:
         """Return camera, film, sampler, integrator and ``render.spp``."""
         if len(sensors) > 1:
-            self.notes.add(sensors[1], f"{len(sensors) - 1} more sensor is left out: the first is rendered")
+            self.notes.add(sensors[1], "all sensors but the first are left out")
         sensor = sensors[0]
         inner: dict[str, Element] = {}
         rest: list[Element] = []
@@ -323,6 +323,8 @@ class Importer:
         if "sampler" in inner:
             sampler, count = self.build(SAMPLERS, inner["sampler"], UNKNOWN_SAMPLER)
         integrator: dict[str, Any] = {"type": "path", "max_depth": -1}
+        if self.root.version < (2,):  # without one, Mitsuba took direct light
+            integrator = {"type": "direct"}
         if integrators:
             integrator = self.build(INTEGRATORS, integrators[-1], UNKNOWN_INTEGRATOR)
         layers = integrator.pop("aovs", [])
@@ -344,6 +346,10 @@ class Importer:
         if name == "instance":
             self._instance(element)
             return
+        if name == "merge":  # one mesh of several shapes, which keeps their materials apart
+            for child in Properties(element, name, self).objects("shape"):
+                self._shape(child)
+            return
         shape = self._plain_shape(element)
         if shape is not None:
             self.shapes[self._free(self.shapes, element)] = shape
@@ -359,7 +365,8 @@ class Importer:
         if names:
             shape = with_attribute(shape, names, element, self)
         emitter = inner.get("emitter")
-        material, name = self._material_of(inner.get("bsdf"), lit=emitter is not None, has_medium=has_medium)
+        border = has_medium and emitter is None and element.version < (2,)
+        material, name = self._material_of(inner.get("bsdf"), lit=emitter is not None, border=border)
         if emitter is not None:
             radiance = self._radiance(emitter)
             if isinstance(radiance, dict):
@@ -376,6 +383,8 @@ class Importer:
         for child in element.children:
             target = self.target(child) if child.tag == "ref" else child
             if target.tag in ("bsdf", "emitter"):
+                if target.tag in inner:
+                    self.notes.add(element, f"{element.label}: only the last {target.tag} of several is taken")
                 inner[target.tag] = target
             elif target.tag in ("medium", "subsurface"):
                 has_medium |= target.tag == "medium"
@@ -384,12 +393,16 @@ class Importer:
                 rest.append(child)
         return inner, rest, has_medium
 
-    def _material_of(
-        self, element: Element | None, *, lit: bool, has_medium: bool
-    ) -> tuple[dict[str, Any], str | None]:
-        """Return the material of a shape, and its name where it has one."""
+    def _material_of(self, element: Element | None, *, lit: bool, border: bool) -> tuple[dict[str, Any], str | None]:
+        """Return the material of a shape, and its name where it has one.
+
+        Args:
+            element: the BSDF; None: that of Mitsuba.
+            lit: True for a shape that emits, which is black without a BSDF.
+            border: True for a shape that only bounds a medium where it has no BSDF.
+        """
         if element is None:
-            if has_medium:  # the border of a medium
+            if border:
                 return {"type": "null"}, None
             return {"type": "diffuse", "two_sided": False} | ({"reflectance": [0.0] * 3} if lit else {}), None
         material = self.material(element)
@@ -452,7 +465,10 @@ class Importer:
             self.notes.add(element, f"{element.label} is left out: it is on no shape")
             return
         for light in self.build(EMITTERS, element, _UNKNOWN) or ():
-            if light["type"] in _ENVIRONMENTS and any(other["type"] in _ENVIRONMENTS for other in self.lights.values()):
+            before = next((other for other in self.lights.values() if other["type"] in _ENVIRONMENTS), None)
+            if light["type"] in _ENVIRONMENTS and before is not None:
+                if before["type"] == light["type"] == "sky" and join_skies(before, light):
+                    continue
                 self.notes.add(element, f"{element.label} is left out: there is an environment before it")
                 continue
             self.lights[self._free(self.lights, element, light["type"])] = light

@@ -111,8 +111,9 @@ class Properties:
         if element.tag == "animation":
             self.note("the animation is left out: its first transform is taken")
             inner = [child for child in element.children if child.tag == "transform"]
-            element = inner[0] if inner else element
-            return values.transform(element) if inner else np.eye(4)
+            return values.transform(inner[0]) if inner else np.eye(4)
+        if element.tag != "transform":
+            raise element.error(f"<{element.written}>", f"a transform as {name}")
         return values.transform(element)
 
     def colour(self, name: str, default: Any = None, *, light: bool = False) -> Any:

@@ -148,6 +148,7 @@ def _film(p: Properties, importer: Importer) -> Block:
         if p.text("tonemap_method", "gamma") == "reinhard":
             found["tonemap"] = "reinhard"
             p.ignore("key", "burn")
+            p.note("reinhard becomes x / (1 + x) of each channel, without key and burn")
     filters = p.objects("rfilter")
     found["filter"] = importer.build(FILTERS, filters[-1], UNKNOWN_FILTER) if filters else {"type": "gaussian"}
     return found

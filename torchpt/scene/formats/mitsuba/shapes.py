@@ -78,7 +78,7 @@ def _mesh(p: Properties, importer: Importer) -> Shape | None:
     elif index < 0:
         raise p.element.error(index, "a shape_index >= 0")
     path = p.file()
-    upright = p.plugin == "obj"  # whether v is flipped where nothing is said
+    upright = p.plugin == "obj" and p.element.version >= (0, 3)  # whether v is flipped where nothing is said
     flips = p.flag("flip_tex_coords", upright)
     flat = p.flag("face_normals") or None
     if path is None:

@@ -24,15 +24,16 @@ _SHEAR = 1e-6  # relative to the scale: less is rounding
 
 
 def _uv_transform(p: Properties) -> dict[str, Any]:
-    """Return the block ``uv_transform`` of ``to_uv`` and of the older ``uoffset uscale``, which scale after they shift.
+    """Return the block ``uv_transform`` of ``to_uv`` and of the older ``uoffset uscale``.
 
-    A transform that shears is given as a matrix, any other by its parts.
+    Before version 2 the offset was added after the scale; Mitsuba 3, which reads old files too, scales after it shifts. A
+    transform that shears is given as a matrix, any other by its parts.
     """
     matrix = p.transform("to_uv")
     linear, shift = matrix[:2, :2], matrix[:2, 3]
     offset = np.array([p.number("uoffset", 0.0), p.number("voffset", 0.0)])
     factors = np.array([p.number("uscale", 1.0), p.number("vscale", 1.0)])
-    linear, shift = factors[:, None] * linear, factors * (shift + offset)
+    linear, shift = factors[:, None] * linear, factors * shift + (factors * offset if p.modern else offset)
     across, along = linear[:, 0], linear[:, 1]
     length = math.hypot(*across)
     angle = math.atan2(across[1], across[0]) if length else math.atan2(-along[0], along[1])
@@ -88,10 +89,6 @@ def _bitmap(p: Properties, importer: Importer) -> Any:
 
 def _checkerboard(p: Properties, importer: Importer) -> Any:
     colours = {key: p.colour(key) for key in ("color0", "color1")}
-    if not p.modern:  # the squares' sizes were the same, their colours not
-        colours = {
-            key: value or [default] * 3 for (key, value), default in zip(colours.items(), (0.4, 0.2), strict=True)
-        }
     return {"type": "checkerboard", **{k: v for k, v in colours.items() if v is not None}, **_uv_transform(p)}
 
 

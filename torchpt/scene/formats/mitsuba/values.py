@@ -162,7 +162,8 @@ def _spectrum(element: Element, *, light: bool, find: FindFile) -> Rgb:
         if _HEX.match(text):
             return colour(_as_rgb(element, text), light=light, find=find)
         if ":" not in text:
-            return _rgb(_flat(np.array(numbers(element, text, (1, 3))), light=light))
+            # Before version 2 light of one number was white.
+            return _rgb(_flat(np.array(numbers(element, text, (1, 3))), light=light and element.version >= (2,)))
         pairs = [numbers(element, pair.replace(":", " "), (2,)) for pair in text.replace(",", " ").split()]
         wavelengths, values = np.array(pairs).T
     if len(wavelengths) != len(values) or (np.diff(wavelengths) <= 0).any() or not len(values):
