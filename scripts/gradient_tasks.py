@@ -23,6 +23,7 @@ import json
 import math
 import time
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,9 @@ import torchpt
 TARGET, FIRST = 1_000_003, 17
 #: Factor by which Adam's learning rate has fallen at the end.
 FALL = 0.01
+
+#: Renders a picture of parameters, samples a pixel and a seed.
+Render = Callable[[Mapping[str, Tensor], int, int], Tensor]
 
 
 def main() -> None:
@@ -72,9 +76,14 @@ def main() -> None:
 
 
 def solved(
-    name: str, wishes: dict[str, Any], steps: int | None = None, spp: int | None = None, target_spp: int = 1024
+    name: str,
+    wishes: dict[str, Any],
+    steps: int | None = None,
+    spp: int | None = None,
+    target_spp: int = 1024,
+    render: Render | None = None,
 ) -> dict[str, Any]:
-    """Optimise a problem from its starting point to its last step."""
+    """Optimise a problem from its starting point to its last step; ``render``: by default torchpt with ``wishes``."""
     task = TASKS[name]
     steps, spp = steps or task.steps, spp or task.spp
     scene = described(task)
@@ -84,21 +93,24 @@ def solved(
         targets = [
             torchpt.render(scene, params={**true, **view}, spp=target_spp, seed=TARGET, **plain) for view in views
         ]
+
+    def by_torchpt(params: Mapping[str, Tensor], spp: int, seed: int) -> Tensor:
+        return torchpt.render(scene, params=params, spp=spp, seed=seed, **wishes)
+
+    render = by_torchpt if render is None else render
     numbers = task.start(scene).clone().requires_grad_()
     adam = torch.optim.Adam([numbers], lr=task.rate, betas=(0.9, 0.95))
     schedule = torch.optim.lr_scheduler.LambdaLR(
         adam, lambda step: FALL + (1 - FALL) * 0.5 * (1 + math.cos(math.pi * min(step / steps, 1)))
     )
-    errors = [task.error(scene, numbers)]
+    errors, at = [task.error(scene, numbers)], [0.0]
     begin = time.perf_counter()
     for step in range(steps):
         adam.zero_grad()
         params = task.params(scene, numbers)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", torchpt.EdgeWarning)
-            pictures = [
-                torchpt.render(scene, params={**params, **view}, spp=spp, seed=FIRST + step, **wishes) for view in views
-            ]
+            pictures = [render({**params, **view}, spp, FIRST + step) for view in views]
         losses = [loss(picture, target) for picture, target in zip(pictures, targets, strict=True)]
         torch.stack(losses).sum().backward()
         assert numbers.grad is not None
@@ -110,11 +122,12 @@ def solved(
         with torch.no_grad():
             numbers.clamp_(*task.bounds)
         errors.append(task.error(scene, numbers))
+        at.append(time.perf_counter() - begin)
     before, after = errors[0], errors[-1]
     ratio = before / max(after, 1e-12)  # 0 where a gradient was not finite
     return {
         "before": before, "after": after, "ratio": ratio, "bar": task.bar, "passes": ratio >= task.bar,
-        "steps": len(errors) - 1, "spp": spp, "seconds": time.perf_counter() - begin, "errors": errors,
+        "steps": len(errors) - 1, "spp": spp, "seconds": time.perf_counter() - begin, "errors": errors, "at": at,
     }  # fmt: skip
 
 

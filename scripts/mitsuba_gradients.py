@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ def pose_renderer(scene: Scene, integrator: str, threads: int = 1) -> PoseRender
     dr.set_thread_count(threads)
     given = settings(scene.description, {})
     with tempfile.TemporaryDirectory() as folder:
-        described = convert(mi, scene, replace(given, film=given.film), Path(folder))
+        described = convert(mi, scene, given, Path(folder))
         described["integrator"]["type"] = integrator
         theirs = mi.load_dict(described, optimize=False)  # meshes keep names of their own
     params = mi.traverse(theirs)
@@ -70,6 +69,7 @@ def pose_renderer(scene: Scene, integrator: str, threads: int = 1) -> PoseRender
                     own = back @ points
                     now = pose.detach().double().numpy() @ own
                     value = mi.Float(now[:3].T.ravel()) if flat else mi.Matrix4f(now.tolist())
+                    dr.make_opaque(value)  # a literal would be compiled anew with each pose
                     dr.enable_grad(value)
                     params[key] = value if flat else type(params[key])(value)
                     ctx.moved.append((number, own, value, flat))
@@ -98,15 +98,7 @@ def pose_renderer(scene: Scene, integrator: str, threads: int = 1) -> PoseRender
 
 
 def _numbers(value: Any) -> np.ndarray:
-    """Return an array of Mitsuba's as numbers: ``(4, 4)`` of a matrix or a transform."""
+    """Return Mitsuba's numbers as an array: ``(4, 4)`` of a transform or matrix, else flat."""
     matrix = getattr(value, "matrix", value)
-    return np.array(matrix, np.float64).reshape(-1) if matrix is value and not _is_matrix(value) else _square(matrix)
-
-
-def _is_matrix(value: Any) -> bool:
-    return type(value).__name__.startswith("Matrix")
-
-
-def _square(matrix: Any) -> np.ndarray:
     numbers = np.array(matrix, np.float64)
-    return numbers.reshape(4, 4)
+    return numbers.reshape(4, 4) if type(matrix).__name__.startswith("Matrix") else numbers.reshape(-1)
