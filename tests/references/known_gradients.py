@@ -188,6 +188,11 @@ def fan() -> dict[str, Any]:
     return {"type": "mesh", "vertices": [[0.1, 0.95, 0.05], *ring], "faces": faces, "material": BLUE}
 
 
+def halves() -> Tensor:
+    """Return two texels, a bright one and a dark one."""
+    return torch.tensor([0.8, 0.1])[None, :, None].expand(1, 2, 3).contiguous()
+
+
 def painted() -> Tensor:
     """Return a picture of 8 x 8 texels."""
     return 0.2 + 0.6 * torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(3))
@@ -309,6 +314,20 @@ CURTAIN = {
 SQUARES = {
     "type": "diffuse",
     "reflectance": {"type": "checkerboard", "color0": [0.9, 0.8, 0.7], "color1": 0.05, "scale": 2.5},
+}
+#: A floor of two colours, below what the camera sees of the wall that it lights.
+TWO_TONE: dict[str, Any] = {
+    "camera": {"origin": [0, 1, 3], "target": [0, 1, -2], "fov": 30},
+    "shapes": {
+        "floor": {
+            "type": "rectangle",
+            "material": diffuse(0, 0, 0)
+            | {"reflectance": {"type": "image", "path": "$FILES/halves.exr", "filter": "nearest"}},
+            "transform": [{"scale": 3}, turned([1, 0, 0], -90), moved(0.1, -0.5, 0)],
+        },
+        "wall": {"type": "rectangle", "material": WHITE, "transform": [{"scale": [2, 1, 1]}, moved(0, 1, -2)]},
+    },
+    "lights": {"lamp": {"type": "point", "position": [0.5, 3, 0.5], "intensity": 10}},
 }
 BOARD = {
     "type": "rectangle",
@@ -509,6 +528,7 @@ PAIRS: dict[str, Pair] = {
         0.01,
     ),
     "board_in_corner": Pair(with_shapes(CORNER, board=BOARD), "shapes.board.to_world", X, 0.02, depth=3),
+    "two_tone_floor": Pair(TWO_TONE, "shapes.floor.to_world", X, 0.02, depth=3, spp=256, files={"halves.exr": halves}),
     # The camera has a lens.
     "ball_through_lens": Pair(
         {**with_shapes(TABLE, ball={**BALL, "material": ORANGE}), "camera": LENS}, "shapes.ball.to_world", Z, 0.02
