@@ -155,9 +155,8 @@ class ShapeBuilder:
                 raise
             self.empty.append(entry.name)
             return []
-        if self.description.allows_empty_meshes and not any(
-            len(faces_with_area(piece, pose)[0]) for piece in mesh.pieces
-        ):
+        faces = [faces_with_area(piece, pose) for piece in mesh.pieces]
+        if self.description.allows_empty_meshes and not any(len(kept) for kept, _ in faces):
             self.empty.append(entry.name)
             return []
         lights = [light for piece in mesh.pieces for light in piece.lights]
@@ -165,7 +164,7 @@ class ShapeBuilder:
         labels = unique_labels([piece.name for piece in mesh.pieces])
         parts: list[Part] = []
         file_materials: dict[int, ResolvedMaterial] = {}  # by id of the file's record
-        for piece, label in zip(mesh.pieces, labels, strict=True):
+        for piece, label, kept in zip(mesh.pieces, labels, faces, strict=True):
             stem = entry.key if len(mesh.pieces) == 1 else f"{entry.key}.{label}"
             self.parameters.declare(f"{stem}.vertices", piece.vertices, Vertices())
             self._declare_pose(stem, pose, [])
@@ -178,7 +177,7 @@ class ShapeBuilder:
                 material = self._file_material(own, entry.key, f"{stem}.material", mesh.source)
                 file_materials[id(own)] = material
             part = self._part(entry, stem, material, Surface("triangle"), pose)
-            parts.append(_with_triangles(part, piece, mesh))
+            parts.append(_with_triangles(part, piece, mesh, *kept))
         if all(len(part.faces) == 0 for part in parts if part.faces is not None):
             problem = "every face is degenerate (without area)"
             if mesh.source:
@@ -268,9 +267,8 @@ class ShapeBuilder:
         )
 
 
-def _with_triangles(part: Part, piece: MeshPart, mesh: Mesh) -> Part:
-    """Return a part with its triangles."""
-    faces, dropped = faces_with_area(piece, part.to_world)
+def _with_triangles(part: Part, piece: MeshPart, mesh: Mesh, faces: np.ndarray, dropped: int) -> Part:
+    """Return a part with its triangles; ``faces`` and ``dropped``: see :func:`faces_with_area`."""
     flat = mesh.flat or piece.flat
     return replace(
         part,

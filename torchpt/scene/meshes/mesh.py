@@ -184,29 +184,32 @@ def too_many_parts(path: Path) -> AssetError:
 
 def _checked(part: MeshPart, path: Path) -> MeshPart:
     label = f" of part {part.name}" if part.name else ""  # for errors
-    bad = np.flatnonzero(~(np.abs(part.vertices) <= _LARGEST).all(axis=1))  # NaN compares false
-    if len(bad):
+    # Sums over rows of three numbers take numpy long: rows are looked at only where something is wrong.
+    if not (np.abs(part.vertices) <= _LARGEST).all():  # NaN compares false
+        bad = np.flatnonzero(~(np.abs(part.vertices) <= _LARGEST).all(axis=1))
         raise AssetError(path, f"vertex {bad[0]}{label} is not finite: {part.vertices[bad[0]].tolist()}")
     count = len(part.vertices)
-    bad = np.flatnonzero(((part.faces < 0) | (part.faces >= count)).any(axis=1))
-    if len(bad):
+    if ((part.faces < 0) | (part.faces >= count)).any():
+        bad = np.flatnonzero(((part.faces < 0) | (part.faces >= count)).any(axis=1))
         indices = part.faces[bad[0]].tolist()
         raise AssetError(path, f"face {bad[0]}{label} has an index outside 0..{count - 1}: {indices}")
     normals, uvs = part.normals, part.uvs
     if normals is not None:
-        bad = np.flatnonzero(~np.isfinite(normals).all(axis=1))
-        if len(bad):
+        if not np.isfinite(normals).all():
+            bad = np.flatnonzero(~np.isfinite(normals).all(axis=1))
             raise AssetError(path, f"normal {bad[0]}{label} is not finite: {normals[bad[0]].tolist()}")
         # Divided by the largest component first, whose square could overflow.
-        largest = np.abs(normals).max(axis=1, keepdims=True)
-        zero = largest[:, 0] == 0
-        scaled = normals / np.where(largest > 0, largest, 1.0)
-        normals = scaled / np.where(zero, 1.0, np.linalg.norm(scaled, axis=1))[:, None]
+        x, y, z = np.abs(normals).T
+        largest = np.maximum(np.maximum(x, y), z)
+        zero = largest == 0
+        scaled = normals / np.where(zero, 1.0, largest)[:, None]
+        x, y, z = (scaled * scaled).T
+        normals = scaled / np.where(zero, 1.0, np.sqrt(x + y + z))[:, None]
         if zero.any():
             normals[zero] = smooth_normals(part.vertices, part.faces)[zero]
     if part.colors is not None:
-        bad = np.flatnonzero(~((part.colors >= 0) & (part.colors <= _LARGEST)).all(axis=1))
-        if len(bad):
+        if not ((part.colors >= 0) & (part.colors <= _LARGEST)).all():
+            bad = np.flatnonzero(~((part.colors >= 0) & (part.colors <= _LARGEST)).all(axis=1))
             raise AssetError(path, f"colour {bad[0]}{label} is not finite and >= 0: {part.colors[bad[0]].tolist()}")
     if uvs is not None and not np.isfinite(uvs).all():
         uvs = np.where(np.isfinite(uvs), uvs, 0.0)
