@@ -47,6 +47,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help=f"pairs: {', '.join(PAIRS)}; tasks: {', '.join(TASKS)}")
     parser.add_argument("--spp", type=int, help="samples a pixel; by default 16, of tasks their own")
     parser.add_argument("--seeds", type=int, default=48)
+    parser.add_argument("--seconds", type=float, default=120.0, help="after which a task ends")
     parser.add_argument("--guided", action="store_true", help="ours keep an EdgeGuide from call to call")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the figures go")
     parser.add_argument("--worker", choices=(OURS, THEIRS), help=argparse.SUPPRESS)
@@ -71,7 +72,9 @@ def main() -> None:
 
 def ask(name: str, engine: str, arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what a process of one program found."""
-    given = [f"--{key}={value}" for key in ("spp", "seeds") if (value := getattr(arguments, key)) is not None]
+    given = [
+        f"--{key}={value}" for key in ("spp", "seeds", "seconds") if (value := getattr(arguments, key)) is not None
+    ]
     guided = ["--guided"] if arguments.guided else []
     command = [sys.executable, __file__, arguments.what, name, "--worker", engine, *given, *guided]
     answer = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
@@ -144,7 +147,7 @@ def task_of(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
 
     torch.set_num_threads(1)
     render = renderer_of(described(ALL[name]), arguments)
-    row = gradient_tasks.solved(name, {"threads": 1}, spp=arguments.spp, render=render)
+    row = gradient_tasks.solved(name, {"threads": 1}, spp=arguments.spp, render=render, most_seconds=arguments.seconds)
     return {"errors": row["errors"], "at": row["at"]}
 
 

@@ -82,8 +82,12 @@ def solved(
     spp: int | None = None,
     target_spp: int = 1024,
     render: Render | None = None,
+    most_seconds: float = math.inf,
 ) -> dict[str, Any]:
-    """Optimise a problem from its starting point to its last step; ``render``: by default torchpt with ``wishes``."""
+    """Optimise a problem from its starting point to its last step, or until it took ``most_seconds``.
+
+    ``render``: by default torchpt with ``wishes``.
+    """
     task = TASKS[name]
     steps, spp = steps or task.steps, spp or task.spp
     scene = described(task)
@@ -123,6 +127,8 @@ def solved(
             numbers.clamp_(*task.bounds)
         errors.append(task.error(scene, numbers))
         at.append(time.perf_counter() - begin)
+        if at[-1] > most_seconds:
+            break
     before, after = errors[0], errors[-1]
     ratio = before / max(after, 1e-12)  # 0 where a gradient was not finite
     return {
