@@ -1,4 +1,4 @@
-"""Render torchpt's scenes by Mitsuba 3, differentiable in poses: for benchmarks of gradients by geometry."""
+"""Render torchpt's scenes by Mitsuba 3, differentiable in where shapes are: for benchmarks of gradients by geometry."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from torch import Tensor
 from torchpt.scene import Scene
 from torchpt.scene.formats.description import settings
 
-__all__ = ["PoseRenderer", "pose_renderer"]
+__all__ = ["ShapeRenderer", "shape_renderer"]
 
-#: Renders a picture ``(H, W, 3)`` of poses by name, samples a pixel and a seed.
-PoseRenderer = Callable[[Mapping[str, Tensor], int, int], Tensor]
+#: Renders a picture ``(H, W, 3)`` of parameters by name, samples a pixel and a seed.
+ShapeRenderer = Callable[[Mapping[str, Tensor], int, int], Tensor]
 
 
-def pose_renderer(scene: Scene, integrator: str, threads: int = 1) -> PoseRenderer:
-    """Return a renderer of a scene of torchpt by Mitsuba (``llvm_ad_rgb``), differentiable in poses.
+def shape_renderer(scene: Scene, integrator: str, threads: int = 1) -> ShapeRenderer:
+    """Return a renderer of a scene of torchpt by Mitsuba (``llvm_ad_rgb``), differentiable in where its shapes are.
 
-    It takes ``shapes.NAME.to_world`` and ``camera.to_world``, ``(4, 4)``; the poses of others stay.
+    It takes ``shapes.NAME.to_world``, ``shapes.NAME.vertices`` and ``camera.to_world``; all else stays.
 
     Args:
         scene: without instances.
@@ -35,44 +35,47 @@ def pose_renderer(scene: Scene, integrator: str, threads: int = 1) -> PoseRender
     mi = load_mitsuba("llvm_ad_rgb")
     dr: Any = importlib.import_module("drjit")
     dr.set_thread_count(threads)
-    given = settings(scene.description, {})
     with tempfile.TemporaryDirectory() as folder:
-        described = convert(mi, scene, given, Path(folder))
+        described = convert(mi, scene, settings(scene.description, {}), Path(folder))
         described["integrator"]["type"] = integrator
         theirs = mi.load_dict(described, optimize=False)  # meshes keep names of their own
     params = mi.traverse(theirs)
+    # As converted: transforms (4, 4), vertices (N, 3).
     first = {key: _numbers(params[key]) for key in params.keys() if key.endswith(("to_world", "vertex_positions"))}
 
-    def keys_of(name: str) -> list[str]:
-        """Return the names of what a pose of ours moves."""
-        if name == "camera.to_world":
-            return ["sensor.to_world"]
-        shape = name.removesuffix(".to_world")
-        parts = [f"part{k}." for k, part in enumerate(scene.built.parts) if part.name == shape or part.shape == shape]
-        found = [key for key in first for part in parts if key.startswith(part)]
+    def moved(name: str, value: Tensor) -> dict[str, Tensor]:
+        """Return what a parameter of ours makes of Mitsuba's, by name there."""
+        shape = name.rpartition(".")[0]
+        prefixes = [f"part{k}." for k, part in enumerate(scene.built.parts) if shape in (part.name, part.shape)]
+        keys = ["sensor.to_world"] if shape == "camera" else [key for key in first if key.startswith(tuple(prefixes))]
+        found = {}
+        for key in keys if prefixes or shape == "camera" else ():
+            if name.endswith(".vertices"):
+                pose = scene.params[f"{shape}.to_world"].double()
+                places = value.double() @ pose[:3, :3].T + pose[:3, 3]
+                # There they come in another order, some of them twice.
+                found[key] = places[torch.cdist(first[key], places.detach()).argmin(1)]
+                continue
+            turned = value.double() @ scene.params[name].double().inverse()  # from the pose as converted
+            at = first[key]
+            found[key] = at @ turned[:3, :3].T + turned[:3, 3] if at.shape[1] == 3 else turned @ at
         if not found:
-            raise SystemExit(f"no shape of Mitsuba's scene for {name}")
+            raise SystemExit(f"nothing in Mitsuba's scene is moved by {name}")
         return found
 
     class Render(torch.autograd.Function):
-        """A picture by Mitsuba, and the gradient of poses."""
+        """A picture by Mitsuba of its own parameters."""
 
         @staticmethod
-        def forward(ctx: Any, names: list[str], spp: int, seed: int, *poses: Tensor) -> Tensor:
-            ctx.moved = []
-            for number, (name, pose) in enumerate(zip(names, poses, strict=True)):
-                # From the pose in which the scene was converted to this one.
-                back = scene.params[name].double().inverse().numpy()
-                for key in keys_of(name):
-                    flat = key.endswith("vertex_positions")
-                    points = np.c_[first[key].reshape(-1, 3), np.ones(first[key].size // 3)].T if flat else first[key]
-                    own = back @ points
-                    now = pose.detach().double().numpy() @ own
-                    value = mi.Float(now[:3].T.ravel()) if flat else mi.Matrix4f(now.tolist())
-                    dr.make_opaque(value)  # a literal would be compiled anew with each pose
-                    dr.enable_grad(value)
-                    params[key] = value if flat else type(params[key])(value)
-                    ctx.moved.append((number, own, value, flat))
+        def forward(ctx: Any, keys: list[str], spp: int, seed: int, *values: Tensor) -> Tensor:
+            ctx.values = []
+            for key, given in zip(keys, values, strict=True):
+                flat = given.shape[1] == 3
+                value = mi.Float(given.numpy().ravel()) if flat else mi.Matrix4f(given.tolist())
+                dr.make_opaque(value)  # a literal would be compiled anew with each pose
+                dr.enable_grad(value)
+                params[key] = value if flat else type(params[key])(value)
+                ctx.values.append(value)
             params.update()
             ctx.picture = mi.render(theirs, params, spp=spp, seed=seed)
             return torch.from_numpy(np.array(ctx.picture))
@@ -82,23 +85,21 @@ def pose_renderer(scene: Scene, integrator: str, threads: int = 1) -> PoseRender
             dr.set_grad(ctx.picture, mi.TensorXf(cotangents[0].contiguous().numpy()))
             dr.enqueue(dr.ADMode.Backward, ctx.picture)
             dr.traverse(dr.ADMode.Backward)
-            grads = [torch.zeros(4, 4) for _ in range(1 + max(number for number, *_ in ctx.moved))]
-            for number, own, value, flat in ctx.moved:
-                found = _numbers(dr.grad(value))
-                found = np.r_[found.reshape(-1, 3).T, np.zeros((1, found.size // 3))] if flat else found
-                grads[number] += torch.from_numpy(found @ own.T).float()
-            return None, None, None, *grads
+            return None, None, None, *(_numbers(dr.grad(value)) for value in ctx.values)
 
-    def render(poses: Mapping[str, Tensor], spp: int, seed: int) -> Tensor:
-        picture = Render.apply(list(poses), spp, seed, *poses.values())
+    def render(values: Mapping[str, Tensor], spp: int, seed: int) -> Tensor:
+        given: dict[str, Tensor] = {}
+        for name, value in values.items():
+            given |= moved(name, value)
+        picture = Render.apply(list(given), spp, seed, *given.values())
         assert isinstance(picture, Tensor)
         return picture
 
     return render
 
 
-def _numbers(value: Any) -> np.ndarray:
-    """Return Mitsuba's numbers as an array: ``(4, 4)`` of a transform or matrix, else flat."""
+def _numbers(value: Any) -> Tensor:
+    """Return Mitsuba's numbers, float64: ``(4, 4)`` of a transform or matrix, ``(N, 3)`` of vertices."""
     matrix = getattr(value, "matrix", value)
-    numbers = np.array(matrix, np.float64)
-    return numbers.reshape(4, 4) if type(matrix).__name__.startswith("Matrix") else numbers.reshape(-1)
+    numbers = torch.from_numpy(np.array(matrix, np.float64))
+    return numbers.reshape(4, 4) if type(matrix).__name__.startswith("Matrix") else numbers.reshape(-1, 3)
