@@ -163,7 +163,9 @@ def test_a_turn_of_the_benchmark(engine, sampler, taken, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["bench_gradients", "gradient_pairs", "gradient_tasks", "measure_features"])
+@pytest.mark.parametrize(
+    "name", ["bench_gradients", "bench_projective", "gradient_pairs", "gradient_tasks", "measure_features"]
+)
 def test_scripts_find_what_they_share_with_tests(name, tmp_path):
     """Started as the docs say, by their path and nothing else."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
