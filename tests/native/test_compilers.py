@@ -158,7 +158,8 @@ def test_quick_code_is_replaced(empty, monkeypatch):
     call(0, 0)  # its code is still there
     cpu.wait_for_final_code()
     assert function.code == compile_job(job()) and quick == compile_job(job()._replace(quick=True))
-    assert sorted(path.suffix for path in empty.iterdir()) == [".o", ".quick"]
+    # Whoever is first in the process also writes what is known of the machine.
+    assert sorted({path.suffix for path in empty.iterdir()} - {".json"}) == [".o", ".quick"]
 
 
 def test_quick_code_of_an_earlier_process_is_replaced(empty, monkeypatch):
