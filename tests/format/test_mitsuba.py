@@ -274,6 +274,9 @@ def test_shapes_of_a_merge_are_shapes_of_their_own(assets: Path) -> None:
     inner = '<shape type="sphere"><bsdf type="plastic"/></shape><shape type="cube"/>'
     found, said = warned(assets, scene(f'<shape type="merge">{inner}</shape>'))
     assert {shape["type"] for shape in found["shapes"].values()} == {"sphere", "cube"} and not said
+    itself = f'<shape type="merge" id="m">{inner}<float name="wish" value="1"/><ref id="m"/></shape>'
+    found, said = warned(assets, scene(itself))
+    assert len(found["shapes"]) == 2 and "inside a merge is left out" in said and "wish is unknown" in said
 
 
 def test_a_sky_and_its_sun_are_one_light(assets: Path) -> None:

@@ -107,8 +107,15 @@ def test_robust_means(monkeypatch: pytest.MonkeyPatch):
         ({"params": []}, "params"),
         ({"loss": torch.ones(4, 4, 3)}, "loss"),
         ({"loss": lambda picture: picture}, "loss"),
+        ({"loss": lambda picture: torch.ones(())}, "loss"),
+        ({"loss": lambda picture: torch.ones((), requires_grad=True) * 2}, "loss"),
+        ({"loss": 3}, "loss"),
+        ({"grad_clip": "3"}, "grad_clip"),
     ],
-    ids=["passes", "spp", "combine", "clip", "name", "none", "shape", "no number"],
+    ids=[
+        *("passes", "spp", "combine", "clip", "name", "none", "shape", "no number"),
+        *("constant", "other leaf", "no function", "clip as text"),
+    ],
 )
 def test_what_it_refuses(wish: dict[str, Any], named: str):
     given = {"loss": torch.ones(8, 8, 3), "params": [FLOOR], "spp": 2, "passes": 2, **wish}
@@ -119,3 +126,5 @@ def test_what_it_refuses(wish: dict[str, Any], named: str):
 def test_options_that_passes_set_themselves():
     with pytest.raises(TypeError, match="spp_grad"):
         torchpt.gradient(scene(), torch.ones(8, 8, 3), [FLOOR], spp_grad=3)
+    with pytest.raises(TypeError, match="full"):
+        torchpt.gradient(scene(), torch.ones(8, 8, 3), [FLOOR], full=True)

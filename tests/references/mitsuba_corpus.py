@@ -300,6 +300,10 @@ EXACT: dict[str, str] = {
         '</transform><bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
         '<string name="filename" value="a picture.png"/></texture></bsdf></shape>'
     ),
+    "merge": shape(
+        '<shape type="merge"><shape type="cube"><transform name="to_world"><scale value="0.6"/><translate y="0.8"/></transform>'
+        '<bsdf type="diffuse"><rgb name="reflectance" value="0.7 0.3 0.2"/></bsdf></shape></shape>'
+    ),
     "instances": shape(
         '<shape type="shapegroup" id="g"><shape type="obj"><string name="filename" value="meshes/roof.obj"/>'
         '<transform name="to_world"><scale value="0.5"/></transform><bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>'

@@ -170,10 +170,12 @@ def _cotangent(loss: Callable[[Tensor], Tensor], picture: Tensor) -> tuple[float
     picture = picture.detach().requires_grad_()
     with torch.enable_grad():
         value = loss(picture)
+    expected = "a function that returns a single number as a tensor, differentiable in the picture"
     if not isinstance(value, Tensor) or value.numel() != 1 or not value.requires_grad:
-        expected = "a function that returns a single number as a tensor, differentiable in the picture"
         raise SceneError("loss", type(value).__name__, expected)
-    (cotangent,) = torch.autograd.grad(value, picture)
+    (cotangent,) = torch.autograd.grad(value, picture, allow_unused=True)
+    if cotangent is None:
+        raise SceneError("loss", "a number that does not depend on the picture", expected)
     return float(value.detach()), cotangent
 
 

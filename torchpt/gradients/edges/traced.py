@@ -15,7 +15,7 @@ from torchpt.core.tree import map_leaves
 from torchpt.engines.engine import Kernels, forward_kernels, trace
 from torchpt.math.guiding import Round
 from torchpt.math.vectors import dot, rows, take
-from torchpt.paths.integrators import KINDS as INTEGRATORS
+from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.paths.state import T_MAX, PathState
 from torchpt.paths.transmission import non_opaque, opacity_at, origins_behind
 from torchpt.paths.wave import PixelSet, Rays, Wave, clamp_scale
@@ -231,9 +231,8 @@ class Traced:
         """
         wave = self.given(o, d, number)
         if depth is not None:
-            own = wave.integrator
-            path = INTEGRATORS["path"] if own.name == "direct" else type(own)  # `direct` has no depth of its own
-            wave = replace(wave, integrator=path(**{**own.values, "max_depth": depth}))
+            assert isinstance(wave.integrator, PathIntegrator)  # no other has these estimators
+            wave = replace(wave, integrator=wave.integrator.to_depth(depth))
         return self.with_rays.radiance(wave, int(use))
 
 

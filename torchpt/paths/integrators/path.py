@@ -23,6 +23,10 @@ __all__ = ["Ends", "PathIntegrator", "follows_ray", "partition"]
 class PathIntegrator(Integrator):
     """Base class of integrators that trace paths to their :attr:`limits`, vertex by vertex."""
 
+    def to_depth(self, depth: int) -> PathIntegrator:
+        """Return an integrator of the same stages that traces paths of at most so many vertices."""
+        return self.but(max_depth=depth)
+
 
 def follows_ray(plan: Plan, world: World, depth: int) -> bool:
     """Return True where hit points are intersected anew along their rays; see :func:`torchpt.physics.shapes.interact`.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from torchpt.paths.integrators.base import LIGHT_CHOICE, SAMPLES, STRATEGY
+from torchpt.paths.integrators.kinds.path import Path
 from torchpt.paths.integrators.path import PathIntegrator
 
 __all__ = ["Direct"]
@@ -15,3 +16,7 @@ class Direct(PathIntegrator):
 
     name = "direct"
     parameters: ClassVar = {**STRATEGY, **LIGHT_CHOICE, **SAMPLES}
+
+    def to_depth(self, depth: int) -> PathIntegrator:
+        """See :meth:`PathIntegrator.to_depth`: ``path`` has the parameter that this integrator lacks."""
+        return Path(**self.values, max_depth=depth)

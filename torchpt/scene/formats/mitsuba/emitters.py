@@ -125,13 +125,10 @@ def _sun_sky(p: Properties, importer: Importer) -> list[Light]:
 
 def join_skies(sky: Light, other: Light) -> bool:
     """Add a sun without a sky to a sky without a sun, or the other way round; return False where they do not fit."""
-    parts = [light for light in (sky, other) if not light["sun_scale"]] + [
-        light for light in (sky, other) if not light["sky_scale"]
-    ]
-    alike = ("turbidity", "sun_direction", "transform")
-    if len(parts) != 2 or parts[0] is parts[1] or any(sky.get(key) != other.get(key) for key in alike):
+    dome, sun = (sky, other) if other["sky_scale"] == 0.0 else (other, sky)
+    apart = dome["sun_scale"] == sun["sky_scale"] == 0.0
+    if not apart or any(sky.get(key) != other.get(key) for key in ("turbidity", "sun_direction", "transform")):
         return False
-    dome, sun = parts
     sky |= {**dome, "sun_scale": sun["sun_scale"], "sun_aperture": sun["sun_aperture"]}
     return True
 

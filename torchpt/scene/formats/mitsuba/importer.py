@@ -346,13 +346,22 @@ class Importer:
         if name == "instance":
             self._instance(element)
             return
-        if name == "merge":  # one mesh of several shapes, which keeps their materials apart
-            for child in Properties(element, name, self).objects("shape"):
-                self._shape(child)
+        if name == "merge":
+            self._merge(element)
             return
         shape = self._plain_shape(element)
         if shape is not None:
             self.shapes[self._free(self.shapes, element)] = shape
+
+    def _merge(self, element: Element) -> None:
+        """Add the shapes of a ``merge``, which keep their own materials."""
+        properties = Properties(element, "merge", self)
+        for child in properties.objects("shape"):
+            if plugin_name(child.tag, child.type) in ("merge", "shapegroup"):  # a merge could hold itself
+                self.notes.add(child, f"{child.label} inside a merge is left out")
+            else:
+                self._shape(child)
+        properties.left_over()
 
     def _plain_shape(self, element: Element) -> dict[str, Any] | None:
         """Return a shape with its material and emission; None where it is left out."""

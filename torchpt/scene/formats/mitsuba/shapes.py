@@ -194,6 +194,7 @@ SHAPES: dict[str, Plugin] = {
     "cube": exact("cube", _simple("cube")),
     "shapegroup": exact("shapes", _simple("shapes"), "its first instance, and instances of that"),
     "instance": exact("instance", _simple("instance"), "other shapes than meshes are copied"),
+    "merge": exact("shapes", _simple("shapes"), "its shapes, each by itself"),
     "hair": left_out("there are no curves"),
     "bsplinecurve": left_out("there are no curves"),
     "linearcurve": left_out("there are no curves"),
