@@ -265,16 +265,12 @@ def test_samples_by_what_is_differentiated():
     shapes = {"ball": {"type": "sphere"}, "fine": mesh(100), "coarse": mesh(10)}
     scene = torchpt.load({"camera": {"origin": [0, 0, 4], "target": [0, 0, 0]}, "shapes": shapes}, "cpu")
     ball, fine, coarse = "shapes.ball.to_world", "shapes.fine.vertices", "shapes.coarse.vertices"
-    assert samples_for(scene, [ball], 64, 1000) == (8, 8)
-    assert samples_for(scene, [ball, "shapes.ball.material.reflectance"], 20, 1000) == (
-        2.5,
-        4.096,
-    )  # enough to be guided
-    assert samples_for(scene, [ball], 16, 256 * 256) == (1, 1)
-    assert samples_for(scene, [coarse], 64, 1000) == samples_for(scene, [coarse, fine], 64, 1000) == (16, 16)
-    assert samples_for(scene, [fine, ball], 64, 1000) == (16, 16)
-    assert samples_for(scene, [fine], 16, 256 * 256) == (0.5, 0.5)
-    assert samples_for(scene, [fine], 16, 1000) == (0.5, 0.5)
+    assert samples_for(scene, [ball], 64, 1000) == 8
+    assert samples_for(scene, [ball, "shapes.ball.material.reflectance"], 20, 1000) == 2.5
+    assert samples_for(scene, [ball], 16, 256 * 256) == 1
+    assert samples_for(scene, [coarse], 64, 1000) == samples_for(scene, [coarse, fine], 64, 1000) == 16
+    assert samples_for(scene, [fine, ball], 64, 1000) == 16
+    assert samples_for(scene, [fine], 16, 256 * 256) == 0.5
 
 
 def mesh(count: int) -> dict[str, Any]:

@@ -111,7 +111,7 @@ def test_gradcheck_smooth_normals():
     with pytest.warns(torchpt.EdgeWarning):
         assert checked(scene, ("shapes.floor.vertices",), edges=False, **wish)
     leaf = scene.params["shapes.floor.vertices"].clone().requires_grad_()
-    torchpt.render(scene, params={"shapes.floor.vertices": leaf}, spp=2, **wish).mean().backward()
+    torchpt.render(scene, params={"shapes.floor.vertices": leaf}, spp=2, edge_spp=64, **wish).mean().backward()
     assert leaf.grad is not None and leaf.grad.isfinite().all() and leaf.grad.any()
 
 

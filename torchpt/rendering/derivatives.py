@@ -174,22 +174,22 @@ class _Derivatives:
         """Return what the backward pass of layers is to do."""
         self._request.check_unchanged(AFTER)
         request = self._request
-        return edges.Asked(request.scene, self._settings(), self._wanted, request.call.dtype, self._edge_spp()[0])
+        return edges.Asked(request.scene, self._settings(), self._wanted, request.call.dtype, self._edge_spp())
 
     def _settings(self, spp: int | None = None) -> Settings:
         """Return the settings of the backward pass: its seed, and its samples a pixel."""
         settings, spp = self._request.settings, spp or self._request.call.spp_grad or self.spp
         return replace(settings, render=settings.render.but(seed=self._seed, spp=spp))
 
-    def _edge_spp(self) -> tuple[float, float]:
-        """Return the samples a pixel for edges that the camera sees, and of each other estimator; 0: none."""
+    def _edge_spp(self) -> float:
+        """Return the samples a pixel for visibility edges; 0: none."""
         call = self._request.call
         if not call.edges:
-            return 0, 0
-        if call.edge_spp:
-            return call.edge_spp, call.edge_spp
+            return 0
         _, _, width, height = self._request.settings.film.window
-        return edges.samples_for(self._request.scene, self._wanted, call.spp_grad or self.spp, width * height)
+        return call.edge_spp or edges.samples_for(
+            self._request.scene, self._wanted, call.spp_grad or self.spp, width * height
+        )
 
 
 def second_derivatives(

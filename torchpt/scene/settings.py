@@ -372,8 +372,7 @@ class BatchOptions(TraceOptions, total=False):
         _whole_number(
             1,
             "samples a pixel of each estimator of edges; none: an eighth of the backward pass's, a sixteenth of many, "
-            "a quarter for vertices, at least 4,096 in all of those that the camera does not see, a thirty-second for large "
-            "meshes",
+            "a quarter for vertices, a thirty-second for large meshes",
         ),
     ]
     ranks: Annotated[

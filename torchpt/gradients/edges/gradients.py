@@ -48,9 +48,6 @@ _PER_EDGE_SAMPLE_OF_VERTICES = 4
 #: The same of meshes of so many: the variance of their gradients is that of the faces' normals, which turn the more the smaller
 #: a face is, and edges bring a tenth to a five-hundredth of it.
 _PER_EDGE_SAMPLE_OF_MESHES, _MESH = 32, 64
-#: Fewest samples of an estimator of shadows and reflected light, but of such meshes: of fewer nothing is learned where to draw
-#: them, and what is done once a call takes longer than they do.
-_LEAST = 1 << 12
 
 
 class Samples(Protocol):
@@ -66,18 +63,14 @@ def concerns(scene: Scene, names: Iterable[str]) -> bool:
     return any(scene.spec(name).moves in (Moves.SURFACES, Moves.SHADOWS) for name in names)
 
 
-def samples_for(scene: Scene, names: Iterable[str], spp: int, pixels: int) -> tuple[float, float]:
-    """Return how many samples a pixel estimators take beside ``spp`` of the backward pass, by what is differentiated.
-
-    The first number is of edges that the camera sees, the second of each other estimator.
-    """
+def samples_for(scene: Scene, names: Iterable[str], spp: int, pixels: int) -> float:
+    """Return how many samples a pixel each estimator takes beside ``spp`` of the backward pass, by what is differentiated."""
     moving = [name for name in names if concerns(scene, (name,))]
     vertices = [scene.params[name].numel() // 3 for name in moving if name.endswith(".vertices")]
-    if vertices and len(vertices) == len(moving) and min(vertices) >= _MESH:
-        return spp / _PER_EDGE_SAMPLE_OF_MESHES, spp / _PER_EDGE_SAMPLE_OF_MESHES
-    per_sample = _PER_EDGE_SAMPLE_OF_MANY if spp * pixels >= _MANY else _PER_EDGE_SAMPLE
-    found = spp / (_PER_EDGE_SAMPLE_OF_VERTICES if vertices else per_sample)
-    return found, max(found, _LEAST / pixels)
+    if not vertices:
+        return spp / (_PER_EDGE_SAMPLE_OF_MANY if spp * pixels >= _MANY else _PER_EDGE_SAMPLE)
+    meshes = len(vertices) == len(moving) and min(vertices) >= _MESH
+    return spp / (_PER_EDGE_SAMPLE_OF_MESHES if meshes else _PER_EDGE_SAMPLE_OF_VERTICES)
 
 
 def moving_primitives(scene: Scene, names: Iterable[str]) -> Tensor:
@@ -273,7 +266,7 @@ def add_gradients(
     wanted: tuple[str, ...],
     dtype: torch.dtype,
     cotangent: Tensor,
-    samples: tuple[float, float],
+    samples: float,
     held: bool = False,
     ranks: Group | None = None,
     guide: EdgeGuide | None = None,
@@ -287,7 +280,7 @@ def add_gradients(
         wanted: names of those that are differentiated.
         dtype: of the lanes.
         cotangent: ``(H, W, 3)`` of the picture.
-        samples: a pixel of the picture, of edges that the camera sees and of each other estimator.
+        samples: of each estimator, a pixel of the picture.
         held: whether the interior holds in place what the camera sees (:mod:`torchpt.gradients.camera`): edges count as they
             move over that.
         ranks: those that share the samples, which are the same on each.
@@ -304,13 +297,12 @@ def add_gradients(
         if every is None:
             return [None] * len(wanted)
         if not held:
-            own = chain(every.primary(samples[0], every.traced.radiance), every.shadows(samples[1]))
-            return every.gradients(own, wanted)
-        found = every.gradients(every.primary(samples[0], every.traced.radiance, held=True), wanted)
+            return every.gradients(chain(every.primary(samples, every.traced.radiance), every.shadows(samples)), wanted)
+        found = every.gradients(every.primary(samples, every.traced.radiance, held=True), wanted)
         # What the camera sees is held: only lights move shadows.
         lights = [name for name in wanted if not name.startswith("camera.")]
         thrown = boundary_of(scene, settings, params, lights, dtype, cotangent, ranks, guide)
         if thrown is None:
             return found
-        more = thrown.gradients(thrown.shadows(samples[1], holds_first=True), wanted)
+        more = thrown.gradients(thrown.shadows(samples, holds_first=True), wanted)
         return [b if a is None else a if b is None else a + b for a, b in zip(found, more, strict=True)]
