@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchpt.math.vectors import take
 from torchpt.physics.cameras import Camera
 from torchpt.physics.film import Filter
 
@@ -43,7 +44,9 @@ class Worth:
         for j, across in enumerate(wy):
             row = (y0 + j).clamp(0, height - 1) * width
             for i, along in enumerate(wx):
-                total += self._values.index_select(1, row + (x0 + i).clamp(0, width - 1)) * (along * across)
+                weight = along * across
+                if bool((weight != 0).any()):  # the last tap of a box is 0 but for ties
+                    total += take(self._values, row + (x0 + i).clamp(0, width - 1)) * weight
         return total
 
     def _taps(self, s: Tensor, low: int, size: int) -> tuple[Tensor, list[Tensor]]:

@@ -17,6 +17,7 @@ with ``v`` the velocity of the surface's own point, ``S`` that of the point that
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import torch
@@ -109,7 +110,8 @@ class Prefix:
         weight: ``(3, M)`` worth of the light that arrives at them, by area.
         place: ``(2, M)`` of the paths on the film.
         lens: ``(2, M)`` samples of the lens that they pass; None: there is none.
-        vertices: those behind the camera, first that which it sees; the last is the receiver.
+        chain: vertices behind the camera, first that which it sees, of these paths and others; the last is the receiver.
+        columns: ``(M,)`` for each of them: where it has those of these paths.
     """
 
     frame: MovingFrame
@@ -117,29 +119,36 @@ class Prefix:
     weight: Tensor
     place: Tensor
     lens: Tensor | None
-    vertices: tuple[PathVertex, ...]
+    chain: tuple[PathVertex, ...]
+    columns: tuple[Tensor, ...]
 
     @property
     def count(self) -> int:
         """Return the number of vertices behind the camera."""
-        return len(self.vertices)
+        return len(self.chain)
+
+    @cached_property
+    def vertices(self) -> list[PathVertex]:
+        """Return the vertices of these paths: most are left out before anyone asks for them."""
+        return [rows(vertex, column) for vertex, column in zip(self.chain, self.columns, strict=True)]
 
     def taken(self, index: Tensor) -> Prefix:
         """Return some of the lanes."""
-        return Prefix(self.frame, *rows((self.lane, self.weight, self.place, self.lens, self.vertices), index))
+        lane, weight, place, lens, columns = rows((self.lane, self.weight, self.place, self.lens, self.columns), index)
+        return Prefix(self.frame, lane, weight, place, lens, self.chain, columns)
 
-    def moves(self) -> Tensor:
-        """Return a mask ``(M,)`` of the paths that move."""
+    def moves(self, first: int | None = None) -> Tensor:
+        """Return a mask ``(M,)`` of the paths that move; ``first``: by so many vertices only."""
         if self.frame.camera_moves and not self.frame.holds_first:
             return torch.ones_like(self.lane, dtype=torch.bool)
         moving = torch.zeros_like(self.lane, dtype=torch.bool)
-        for vertex in self.vertices:
-            moving = moving | self.frame.moving(vertex.held.prim)
+        for vertex, column in zip(self.chain[:first], self.columns, strict=False):
+            moving = moving | self.frame.moving(take(vertex.held.prim, column))
         return moving
 
     def motion(self) -> Tensor:
         """Return about how far receivers move where all that moves does by 1 ``(M,)``."""
-        how = replace(self, vertices=self.vertices[:1]).moves().double()
+        how = self.moves(1).double()
         for before, vertex in pairwise(self.vertices):
             away = vertex.p - before.p
             share = self.frame.share(vertex.held.prim, dot(away, away).sqrt())
@@ -190,7 +199,7 @@ def prefixes_of(
     found: list[Prefix] = []
     lane = torch.arange(wi.shape[1], device=wi.device)
     carried = torch.ones_like(wi)
-    vertices = [_vertex(frame, spot)]
+    chain, columns = (_vertex(frame, spot),), (lane,)
     for k in range(1, longest + 1):
         index, place, lens, wo = _seen(frame, spot, Passing(take(key, lane), _TO_CAMERA + k))
         if len(index):
@@ -201,8 +210,7 @@ def prefixes_of(
             _, jacobian = slopes(frame.bodies.camera, seen.p.double(), lens)
             area = dot(cross(jacobian[0], jacobian[1]), seen.n.double()).abs()
             weight = frame.worth.at(place) * sent * take(carried, index) * area
-            chain = tuple(rows(vertex, index) for vertex in reversed(vertices))
-            prefix = Prefix(frame, take(lane, index), weight, place, lens, chain)
+            prefix = Prefix(frame, take(lane, index), weight, place, lens, chain, rows(columns, index))
             counts = (weight != 0).any(0)
             if moves is not None:
                 counts &= prefix.moves() | take(moves, prefix.lane)
@@ -226,7 +234,8 @@ def prefixes_of(
         if not len(kept):
             break
         lane, carried, spot = take(lane, kept), take(carried, kept), spot.taken(some)
-        vertices = [*(rows(vertex, kept) for vertex in vertices), _vertex(frame, spot)]
+        chain = _vertex(frame, spot), *chain
+        columns = torch.arange(len(kept), device=wi.device), *rows(columns, kept)
         wi = -spot.d.double()
     return found
 
