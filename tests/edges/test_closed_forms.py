@@ -11,6 +11,8 @@ import torch
 from few import few
 
 import torchpt
+from torchpt.gradients.edges import left_out
+from torchpt.scene.formats.description import settings
 
 #: What the camera shows is 4 wide: a pixel of 16 is a quarter.
 BASE: dict[str, Any] = {
@@ -141,6 +143,24 @@ def test_parameters_that_only_make_jumps_are_named() -> None:
     soft = torchpt.load({**described, "lights": {"spot": {**spot, "beam_width": 10}}}, "cpu")
     leaf = soft.params["lights.spot.cutoff_angle"].clone().requires_grad_()
     torchpt.render(soft, params={"lights.spot.cutoff_angle": leaf}, spp=1)
+    # What counts is the value that is given, not that of the scene.
+    with pytest.warns(torchpt.EdgeWarning, match="lights.spot.beam_width changes the picture by jumps alone"):
+        torchpt.render(soft, params={"lights.spot.beam_width": torch.tensor(20.0, requires_grad=True)}, spp=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", torchpt.EdgeWarning)
+        hard = torchpt.load({**BASE, "shapes": {"it": {"type": "rectangle"}}, "lights": {"spot": spot}}, "cpu")
+        torchpt.render(hard, params={"lights.spot.beam_width": torch.tensor(10.0, requires_grad=True)}, spp=1)
+
+
+@pytest.mark.parametrize(
+    ("alpha", "warns"), [(0.3, False), (1e-6, True), ({"type": "checkerboard", "color0": 0.1, "color1": 0.3}, False)]
+)
+def test_only_rough_materials_that_are_next_to_mirrors_are_named(alpha: Any, warns: bool) -> None:
+    material = {"type": "roughconductor", "alpha": alpha}
+    described = {**BASE, "shapes": {"it": {"type": "rectangle", "material": material}}}
+    scene = torchpt.load(described, "cpu")
+    said = left_out(scene, settings(scene.description))
+    assert any("mirrors" in line for line in said) == warns
 
 
 def test_what_is_left_out_is_named() -> None:

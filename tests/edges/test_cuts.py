@@ -147,7 +147,8 @@ def test_a_radius_whose_outline_is_hidden() -> None:
 )
 def test_bodies_that_touch_or_are_apart_do_not_cut(body: dict[str, Any]) -> None:
     scene = scene_of(body)
-    assert cuts_of(scene, bodies_of(scene, settings(scene.description, {}).film, {})) is None
+    bodies = bodies_of(scene, settings(scene.description, {}).film, {})
+    assert cuts_of(scene, bodies, scene.merged(None)) is None
 
 
 #: Bodies that stand through a floor, which a lamp shines on: body, and the entry of its pose.

@@ -1,44 +1,33 @@
-"""Curves along which visibility may jump: edges of meshes, outlines of smooth bodies, and what is left out of them."""
+"""Curves along which visibility may jump: edges of meshes, outlines of smooth bodies."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import chain
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchpt.core.tree import map_leaves
 from torchpt.gradients.edges.bodies import Bodies, Held
-from torchpt.gradients.edges.seams import jumps_elsewhere, lies_on_seams, seams_within
-from torchpt.math.vectors import cross, dot, take
-from torchpt.paths.integrators.path import PathIntegrator
-from torchpt.physics.bsdfs.resolved import ResolvedMaterial
-from torchpt.physics.parts import Copy, Part
-from torchpt.physics.shapes.geometry import KINDS
+from torchpt.gradients.edges.meshes import Edges, MeshOf, marked_primitives, meshes_of, owners_of, starts_of
+from torchpt.gradients.edges.seams import lies_on_seams, seams_within
+from torchpt.math.vectors import concatenate_lanes, cross, dot, largest, rows, take
 from torchpt.physics.shapes.quadrics import Form
-from torchpt.physics.textures import Node
 from torchpt.scene import Scene
-from torchpt.scene.prepare import scene_cache
-from torchpt.scene.settings import Settings
 
 __all__ = [
     "SEAM",
     "Curves",
-    "Edges",
     "Folds",
     "Rounds",
     "View",
-    "edges_of",
+    "corners",
     "folds_of",
     "generator",
     "joined",
     "known",
-    "left_out",
-    "marked_primitives",
     "mesh_edges",
     "own_view",
     "parts_of",
@@ -49,66 +38,7 @@ __all__ = [
     "seams_of",
     "smooth_faces",
     "straight",
-    "without_gradient",
 ]
-
-
-# ---- The edges of a mesh: which two faces meet at each, once a scene
-#
-# Vertices that lie at one place are one here, whatever a file made of them: a cube has four vertices a side, and still twelve
-# edges. An edge is told by a corner of each of its faces, so that it moves as the vertices of both do.
-
-
-@dataclass(frozen=True)
-class Edges:
-    """E edges of one mesh; corners are numbered as the mesh's own faces have them.
-
-    Attributes:
-        face: ``(2, E)`` int64 the two faces; the second is that of the first where there is none.
-        first: ``(2, E)`` int64 the corner of each face at which the edge begins.
-        last: ``(2, E)`` where it ends.
-        other: ``(2, E)`` the corner off the edge.
-        border: ``(E,)`` bool: one face alone.
-        split: ``(E,)`` bool: whether the faces have vertices of their own, so that normals and texture coordinates may jump.
-    """
-
-    face: Tensor
-    first: Tensor
-    last: Tensor
-    other: Tensor
-    border: Tensor
-    split: Tensor
-
-
-def edges_of(part: Part, device: torch.device) -> Edges:
-    """Return the edges of a mesh, on a device."""
-    assert part.faces is not None and part.vertices is not None
-    faces, vertices = part.faces, part.vertices
-    _, welded = np.unique(vertices, axis=0, return_inverse=True)
-    corners = welded.reshape(-1)[faces]  # (F, 3)
-    count = len(faces)
-    face = np.tile(np.arange(count), 3)
-    begin, end = np.repeat(np.arange(3), count), np.repeat((1, 2, 0), count)
-    a, b = corners[face, begin], corners[face, end]
-    turned = a > b
-    begin, end = np.where(turned, end, begin), np.where(turned, begin, end)
-    key = np.minimum(a, b).astype(np.int64) * (len(vertices) + 1) + np.maximum(a, b)
-    order = np.argsort(key, kind="stable")
-    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-    size = np.diff(starts, append=len(order))
-    # Of more than two faces at an edge each is a border of its own.
-    pairs, alone = starts[size == 2], order[np.repeat(size != 2, size)]
-    one, two = np.concatenate((order[pairs], alone)), np.concatenate((order[pairs + 1], alone))
-    split = np.zeros(len(one), bool)
-    for corner in (begin, end):
-        split |= faces[face[one], corner[one]] != faces[face[two], corner[two]]
-
-    def columns(values: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.stack((values[one], values[two])).astype(np.int64)).to(device)
-
-    border = torch.from_numpy(np.arange(len(one)) >= len(pairs)).to(device)
-    other = columns(3 - begin - end)
-    return Edges(columns(face), columns(begin), columns(end), other, border, torch.from_numpy(split).to(device))
 
 
 # ---- Curves on primitives along which visibility may jump: borders, edges of meshes, rims, and outlines of round surfaces
@@ -119,7 +49,7 @@ def edges_of(part: Part, device: torch.device) -> Edges:
 
 
 #: Numbers of a triangle's corners.
-_CORNERS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+_CORNERS = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -147,6 +77,7 @@ class Curves:
     low: Tensor  # (N,) from where t runs
     high: Tensor  # (N,) to where
     cut: Tensor  # (N,) bool: the primitive and its mate cut there (:mod:`torchpt.gradients.edges.cuts`)
+    bent: Tensor  # (N,) bool: the outline of a round surface; all of them are convex, so that none hides its own
 
     def within(self, low: Tensor, high: Tensor) -> Curves:
         """Return the same from ``low`` to ``high``."""
@@ -180,14 +111,23 @@ def straight(prim: Tensor, begin: Tensor, end: Tensor, mate: Tensor | None = Non
     """Return segments between numbers ``(3, N)``, ``t`` from 0 to 1."""
     zero, one = torch.zeros_like(begin[0]), torch.ones_like(begin[0])
     mate = torch.full_like(prim, -1) if mate is None else mate
-    return Curves(prim, mate, begin, end - begin, torch.zeros_like(begin), zero.bool(), zero, one, zero.bool())
+    return Curves(
+        prim, mate, begin, end - begin, torch.zeros_like(begin), zero.bool(), zero, one, zero.bool(), zero.bool()
+    )
 
 
 def circles(prim: Tensor, middle: Tensor, b: Tensor, c: Tensor) -> Curves:
     """Return whole circles, ``t`` from 0 to 2 pi."""
     zero = torch.zeros_like(middle[0])
     none = torch.full_like(prim, -1)
-    return Curves(prim, none, middle, b, c, zero == 0, zero, zero + 2.0 * math.pi, zero.bool())
+    return Curves(prim, none, middle, b, c, zero == 0, zero, zero + 2.0 * math.pi, zero.bool(), zero.bool())
+
+
+def corners(corner: Tensor, turned: bool = False) -> Tensor:
+    """Return numbers ``(3, N)`` of triangles' corners ``(N,)``; ``turned``: the last two are exchanged."""
+    numbers = _CORNERS[0], *(_CORNERS[:0:-1] if turned else _CORNERS[1:])
+    table = torch.tensor(numbers, dtype=torch.float64, device=corner.device).T
+    return take(table.contiguous(), corner)
 
 
 def mesh_edges(edges: Edges, index: Tensor, first: int, turned: bool) -> tuple[Curves, tuple[Held, Held]]:
@@ -199,11 +139,9 @@ def mesh_edges(edges: Edges, index: Tensor, first: int, turned: bool) -> tuple[C
         first: id of the mesh's, or copy's, first triangle.
         turned: whether its triangles have their last two corners exchanged.
     """
-    table = torch.tensor([(*corner, 0.0) for corner in _CORNERS], dtype=torch.float64, device=index.device).T
-    table = table[:, [0, 2, 1]] if turned else table
 
     def numbers(corner: Tensor) -> Tensor:
-        return take(table, take(corner, index))
+        return corners(take(corner, index), turned)
 
     one, two = (take(edges.face[k], index) + first for k in range(2))
     mate = torch.where(take(edges.border, index), -1, two)
@@ -253,7 +191,11 @@ def round_outline(bodies: Bodies, prim: Tensor, view: View) -> tuple[Curves, Ten
     b = cross(axis, aside)
     b = b / dot(b, b).sqrt()
     radius = (1.0 - w * w / far).clamp_min(0.0).sqrt()
-    return circles(prim, c * (w / far), b * radius, cross(axis, b) * radius), some
+    return _outline(circles(prim, c * (w / far), b * radius, cross(axis, b) * radius)), some
+
+
+def _outline(curves: Curves) -> Curves:
+    return replace(curves, bent=torch.ones_like(curves.bent))
 
 
 def _unit(like: Tensor, k: int) -> Tensor:
@@ -277,7 +219,7 @@ def generator(bodies: Bodies, prim: Tensor, form: Form, view: View, side: Tensor
     zero = torch.zeros_like(t)
     low = torch.stack((torch.cos(t), torch.sin(t), zero))
     high = torch.stack((zero, zero, zero + 1.0)) if pointed else torch.stack((low[0], low[1], zero + 1.0))
-    return straight(prim, low, high), some
+    return _outline(straight(prim, low, high)), some
 
 
 # ---- The curves of a scene, owner by owner: those that are there anyway, and round ones, whose outlines depend on the place
@@ -289,8 +231,10 @@ _FLAT = 1e-6
 SEAM = 0.25
 #: Least weight of a crease at which shading or texture coordinates may jump: most creases jump less than outlines.
 _CREASE = 0.05
-#: Points that are closer, against the size of all, are one.
-_SAME = 1e-6
+#: Points that are closer, against the size of all, are one; of edges that are longer than so many times that.
+_SAME, _LONG = 1e-6, 16.0
+#: Corners of two faces that are closer, against their coordinates, are together: parameters are of float32.
+_TOGETHER = 2.0**-22
 #: Odd multipliers that make one number of three, any constants.
 _MIX = 0x9E3779B97F4A7C1, 0x5851F42D4C957F2D, 0x2545F4914F6CDD1D
 
@@ -321,25 +265,6 @@ def known(form: Form) -> bool:
     return form.around or (form.half == 0 and (form.bend == 0 or (form.bend < 0 and form.level == 0)))
 
 
-def marked_primitives(
-    scene: Scene, of_part: Callable[[Part], bool], of_copy: Callable[[Copy, bool], bool] = lambda _, marked: marked
-) -> Tensor:
-    """Return a mask ``(P,)`` of primitives by ids of the search.
-
-    Args:
-        scene: the scene.
-        of_part: whether the primitives of a part are marked.
-        of_copy: whether those of a copy are, given whether those of its mesh are.
-    """
-    parts = [(part, of_part(part)) for part in scene.built.parts]
-    marks = [[marked] * part.primitive_count for part, marked in parts]
-    meshes = {part.name: (marked, part.primitive_count) for part, marked in parts}
-    for copy in scene.built.copies:
-        marked, count = meshes[copy.of]
-        marks.append([of_copy(copy, marked)] * count)
-    return torch.tensor(list(chain.from_iterable(marks)), dtype=torch.bool, device=scene.device)
-
-
 def smooth_faces(scene: Scene, bodies: Bodies) -> tuple[Tensor, Tensor]:
     """Return the faces that are shaded smooth, those of copies too, by ids of the search, and their areas: ``(F,)`` each."""
     prim = marked_primitives(scene, lambda part: part.kind == "triangle" and part.smooth).nonzero().squeeze(1)
@@ -348,64 +273,58 @@ def smooth_faces(scene: Scene, bodies: Bodies) -> tuple[Tensor, Tensor]:
     return prim, 0.5 * dot(n, n).sqrt()
 
 
-def _starts(parts: tuple[Part, ...], bodies: Bodies) -> list[int]:
-    """Return the id of the first primitive of each part."""
-    starts, at = [], 0
-    for part in parts:
-        starts.append(at)
-        at += part.primitive_count
-    assert at == sum(bodies.counts)
-    return starts
-
-
-def _topology(scene: Scene, part: Part) -> Edges:
-    made = scene_cache(scene).outlines
-    if part.name not in made:
-        made[part.name] = edges_of(part, scene.device)
-    return made[part.name]
-
-
-def folds_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Iterator[Folds]:
-    """Yield the edges of each mesh, and of each copy.
-
-    Args:
-        scene: whose.
-        bodies: detached.
-        poses: the parameters.
-    """
-    parts = scene.built.parts
-    starts = dict(zip((part.name for part in parts), _starts(parts, bodies), strict=True))
-    for part in parts:
-        if part.kind != KINDS[0]:
-            continue
-        edges = _topology(scene, part)
-        turned = bool(torch.linalg.det(poses[f"{part.name}.to_world"][:3, :3].double()) < 0)
+def folds_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Tensor | None = None) -> Iterator[Folds]:
+    """Yield the edges of each mesh, and of each copy; arguments: see :func:`torchpt.gradients.edges.meshes.meshes_of`."""
+    for mesh in meshes_of(scene, bodies, poses, moves):
+        edges, part = mesh.edges, mesh.part
         every = torch.arange(len(edges.border), device=scene.device)
-        for owner, first in _owners(scene, part, starts[part.name], bodies):
-            curves, others = mesh_edges(edges, every, first, turned)
-            normals = (_normal(bodies, others[0].prim), _normal(bodies, others[1].prim))
-            apart = normals[0] - normals[1]
-            bend = dot(apart, apart).sqrt()
-            bend = torch.where(bend > _FLAT, bend, 0.0)
-            jumps = edges.split if part.smooth else ~edges.border  # the shading
-            # Where faces are shaded smooth one side lacks the light below its face: of an angle, near the horizon.
-            crease = torch.where(jumps & (bend > 0), (0.5 * bend).clamp(_CREASE, 1.0), 0.25 * bend * bend)
-            if part.uvs is not None:
-                crease = torch.where(edges.split, crease.clamp_min(_CREASE), crease)
-            seam = ~edges.border & lies_on_seams(
-                scene, owner, part, poses, edges.face[0], (edges.first[0], edges.last[0])
+        curves, others = mesh_edges(edges, every, mesh.first, mesh.turned)
+        normals = (_normal(bodies, others[0].prim), _normal(bodies, others[1].prim))
+        apart = normals[0] - normals[1]
+        bend = dot(apart, apart).sqrt()
+        bend = torch.where(bend > _FLAT, bend, 0.0)
+        jumps = edges.split if part.smooth else ~edges.border  # the shading
+        # Where faces are shaded smooth one side lacks the light below its face: of an angle, near the horizon.
+        crease = torch.where(jumps & (bend > 0), (0.5 * bend).clamp(_CREASE, 1.0), 0.25 * bend * bend)
+        if part.uvs is not None:
+            crease = torch.where(edges.split, crease.clamp_min(_CREASE), crease)
+        seam = ~edges.border & lies_on_seams(scene, mesh, poses)
+        crease = torch.where(seam, crease.clamp_min(SEAM), crease)
+        folds = Folds(curves, others, edges.border, torch.where(edges.border, 0.0, crease), normals, bend, seam)
+        yield _opened(bodies, folds, mesh) if bool(edges.split.any()) else folds
+
+
+def _opened(bodies: Bodies, folds: Folds, mesh: MeshOf) -> Folds:
+    """Return edges with those as borders of either face whose faces have vertices of their own that are no longer together."""
+    some = (mesh.edges.split & ~mesh.edges.border).nonzero().squeeze(1)
+    one, two = (mesh_edges(mesh.edges.of_face(k), some, mesh.first, mesh.turned)[0] for k in (0, 1))
+    open_ = torch.zeros_like(one.round)
+    for a, b in ((one.a, two.a), (one.a + one.b, two.a + two.b)):
+        p, q = bodies.points(Held(one.prim, a)), bodies.points(Held(two.prim, b))
+        open_ |= largest((p - q).abs()) > largest(p.abs()) * _TOGETHER
+    index = open_.nonzero().squeeze(1)
+    if not len(index):
+        return folds
+    lone = torch.full_like(index, -1)
+    parted = some[index]
+    kept = torch.ones_like(folds.border)
+    kept[parted] = False
+    both = [rows(folds, kept.nonzero().squeeze(1))]
+    for side, curves in enumerate((one, two)):
+        own = rows(folds, parted)
+        held, n = own.others[side], own.normals[side]
+        both.append(
+            Folds(
+                replace(rows(curves, index), mate=lone),
+                (held, held),
+                torch.ones_like(own.border),
+                torch.zeros_like(own.crease),
+                (n, n),
+                torch.zeros_like(own.bend),
+                torch.zeros_like(own.seam),
             )
-            crease = torch.where(seam, crease.clamp_min(SEAM), crease)
-            yield Folds(curves, others, edges.border, torch.where(edges.border, 0.0, crease), normals, bend, seam)
-
-
-def _owners(scene: Scene, part: Part, start: int, bodies: Bodies) -> list[tuple[Part | Copy, int]]:
-    """Return a part and its copies, with the ids of their first primitives; ``start``: that of the part."""
-    found: list[tuple[Part | Copy, int]] = [(part, start)]
-    if bodies.copies is not None:
-        starts = bodies.copies.start.tolist()
-        found += [(copy, starts[k]) for k, copy in enumerate(scene.built.copies, 1) if copy.of == part.name]
-    return found
+        )
+    return concatenate_lanes(both)
 
 
 def _normal(bodies: Bodies, prim: Tensor) -> Tensor:
@@ -431,7 +350,8 @@ def parts_of(bodies: Bodies, curves: Curves) -> Tensor:
         pair = low + high * _MIX[2]
         _, group, count = torch.unique(pair, return_inverse=True, return_counts=True)
         parts = torch.minimum(parts, 1.0 / take(count.double(), group))
-    return torch.where(curves.round, 1.0, parts)
+    length = (ends[1] - ends[0]).square().sum(0).sqrt()
+    return torch.where(curves.round | (length < _LONG * grid), 1.0, parts)
 
 
 def plain_of(scene: Scene, bodies: Bodies) -> Curves | None:
@@ -447,10 +367,14 @@ def plain_of(scene: Scene, bodies: Bodies) -> Curves | None:
 
     if bodies.counts[1]:
         found.append(borders(ids(ends[1], ends[2])))
-    if bodies.counts[2]:
-        found.append(rims(ids(ends[2], ends[3])))
     parts = scene.built.parts
-    for part, start in zip(parts, _starts(parts, bodies), strict=True):
+    starts = starts_of(parts, bodies)
+    if bodies.counts[2]:
+        sides = {part.name: start for part, start in zip(parts, starts, strict=True) if part.quadric is not None}
+        mates = [sides.get(part.name, -1) for part in parts if part.kind == "disk"]
+        closed = rims(ids(ends[2], ends[3]))
+        found.append(replace(closed, mate=torch.tensor(mates, device=scene.device)))
+    for part, start in zip(parts, starts, strict=True):
         if part.quadric is None or part.piece or part.quadric.form.around or not known(part.quadric.form):
             continue
         found.append(rims(ids(start, start + 1)))
@@ -469,8 +393,8 @@ def seams_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Curves |
     """
     parts = scene.built.parts
     found = []
-    for part, start in zip(parts, _starts(parts, bodies), strict=True):
-        for owner, first in _owners(scene, part, start, bodies):
+    for part, start in zip(parts, starts_of(parts, bodies), strict=True):
+        for owner, first in owners_of(scene, part, start, bodies):
             seams = seams_within(scene, owner, part, poses)
             if seams is not None:
                 prim, begin, end = seams
@@ -482,7 +406,7 @@ def rounds_of(scene: Scene, bodies: Bodies) -> list[Rounds]:
     """Return the surfaces that have outlines."""
     parts, found = scene.built.parts, []
     forms: dict[Form | None, list[int]] = {}
-    for part, start in zip(parts, _starts(parts, bodies), strict=True):
+    for part, start in zip(parts, starts_of(parts, bodies), strict=True):
         if part.kind == "sphere":
             forms.setdefault(None, []).append(start)
         elif part.quadric is not None and known(part.quadric.form):
@@ -490,67 +414,3 @@ def rounds_of(scene: Scene, bodies: Bodies) -> list[Rounds]:
     for form, prims in forms.items():
         found.append(Rounds(torch.tensor(prims, device=scene.device), form))
     return found
-
-
-# ---- What of a scene moves edges that no estimator knows, for the warning; what no scene tells beforehand stands in the docs
-
-
-#: Of a spot: where its light ends, and where it begins to fade.
-_RIM = ("cutoff_angle", "beam_width")
-
-
-def left_out(scene: Scene, settings: Settings) -> list[str]:
-    """Return in a few words each the edges that are not differentiated where surfaces, lights or the camera move."""
-    return list(_found(scene, settings))
-
-
-def _found(scene: Scene, settings: Settings) -> Iterator[str]:
-    built, camera = scene.built, scene.description.camera.kind
-    if scene.camera(settings.film, scene.params, torch.float64).film_of(_point(scene.device)) is None:
-        yield f"those that a camera of kind {camera.name} sees"
-    materials = [owner.material for owner in (*built.parts, *built.copies)]
-    if any(part.model.delta for material in materials for part in material.with_inner()):
-        yield "those seen in mirrors and clear glass, and of light that these send on"
-    if any(_has_opacity_texture(part) for material in materials for part in material.with_inner()):
-        yield "those within textures of opacity"
-    if jumps_elsewhere(scene):
-        yield "those within textures that are not interpolated, on round surfaces or of very many texels"
-    if any(part.quadric is not None and not known(part.quadric.form) for part in built.parts):
-        yield "outlines of quadrics of kinds of your own"
-    if any(source.kind == "spot" and _sharp(scene, source.name) for source in built.sources):
-        yield "the rims of spots that do not fade out"
-    if not isinstance(settings.integrator, PathIntegrator):
-        yield f"edges of shadows where the integrator is {settings.integrator.name}"
-
-
-def _has_opacity_texture(material: ResolvedMaterial) -> bool:
-    sheer = any(inner.model.sheer for inner in material.inner)  # its weight is an opacity
-    return isinstance(material.opacity, Node) or (sheer and isinstance(material.values["weight"], Node))
-
-
-def _point(device: torch.device) -> Tensor:
-    """Return any point ``(3, 1)``: whether a camera has a film for points does not depend on it."""
-    return torch.zeros(3, 1, dtype=torch.float64, device=device)
-
-
-def without_gradient(scene: Scene, wanted: Iterable[str]) -> list[str]:
-    """Return the parameters on which pictures depend by jumps alone, so that their gradients are 0."""
-    owners = [*scene.built.parts, *scene.built.copies]
-    cut = {
-        material.name
-        for owner in owners
-        for material in owner.material.with_inner()
-        if material.alpha_cutoff is not None
-    }
-    rims = {f"{source.name}.{key}" for source in scene.built.sources if source.kind == "spot" for key in _RIM}
-    return [
-        name
-        for name in wanted
-        if (name in rims and _sharp(scene, name.rpartition(".")[0]))
-        or any(name.startswith(f"{own}.opacity") for own in cut)
-    ]
-
-
-def _sharp(scene: Scene, name: str) -> bool:
-    cutoff, beam = (float(scene.params[f"{name}.{key}"].detach()) for key in _RIM)
-    return beam > 0.999 * cutoff

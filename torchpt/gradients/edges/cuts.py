@@ -15,13 +15,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from torchpt.core.errors import EdgeWarning, warn_caller
 from torchpt.gradients.edges.bodies import Bodies, Held
-from torchpt.gradients.edges.curves import Curves, circles, joined, known, straight
+from torchpt.gradients.edges.curves import Curves, circles, corners, joined, known, straight
+from torchpt.gradients.edges.meshes import neighbours_of
 from torchpt.math.vectors import cross, dot, rows, take
 from torchpt.scene import Scene
 
@@ -91,20 +93,24 @@ def crossing_of(bodies: Bodies, cut: Tensor, held: Held, mate: Tensor) -> Crossi
 # ---- Where surfaces cut
 
 
-def cuts_of(scene: Scene, bodies: Bodies) -> Cuts | None:
+def cuts_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Cuts | None:
     """Return the curves; None where there are none, and, with a warning, where there are too many pairs to look at.
 
     Args:
         scene: whose.
         bodies: detached.
+        poses: the parameters.
     """
     found: list[Curves] = []
+    seams = _Seams(scene, bodies, poses)
     for one, two in _pairs(scene, bodies):
         flat = bodies.is_flat(two)
-        for mask, make in ((flat, _flat_cuts), (~flat, _round_cuts)):
-            some = mask.nonzero().squeeze(1)
-            if len(some):
-                found += make(bodies, take(one, some), take(two, some))
+        some = flat.nonzero().squeeze(1)
+        if len(some):
+            found += _flat_cuts(bodies, take(one, some), take(two, some), seams)
+        some = (~flat).nonzero().squeeze(1)
+        if len(some):
+            found += _round_cuts(bodies, take(one, some), take(two, some))
     found = [curves for curves in found if len(curves.prim)]
     if not found:
         return None
@@ -242,10 +248,63 @@ def _identity(like: Tensor) -> tuple[Tensor, Tensor]:
     return a0, a1
 
 
+#: The corners of triangles off the limits, in the order of :func:`_limits`.
+_OFF = 1, 2, 0, 0
+
+
+@dataclass(frozen=True)
+class _Seams:
+    """Edges between triangles of one mesh.
+
+    Attributes:
+        scene: whose.
+        bodies: detached.
+        poses: the parameters.
+    """
+
+    scene: Scene
+    bodies: Bodies
+    poses: dict[str, Tensor]
+
+    @cached_property
+    def behind(self) -> Tensor:
+        """Return :func:`~torchpt.gradients.edges.meshes.neighbours_of`: few cuts ask for them."""
+        return neighbours_of(self.scene, self.bodies, self.poses)
+
+    def are_cut(self, prim: Tensor, corner: int, other: Tensor) -> Tensor:
+        """Return a mask ``(N,)`` of edges of triangles ``prim (N,)`` along which flat surfaces ``other`` cut a mesh.
+
+        Those of its border are touched alone, as are those with both triangles to one side. An edge counts with the triangle
+        of the lower id. ``corner``: that off the edge.
+        """
+        bodies = self.bodies
+        good = bodies.is_triangle(prim)
+        mate = torch.where(good, take(self.behind[corner], torch.where(good, prim, 0)), -1)
+        index = (mate > prim).nonzero().squeeze(1)
+        one, two, plane = (take(t, index) for t in (prim, mate, other))
+        back = (take(self.behind, two) == one).to(torch.uint8).argmax(0)
+        sides = []
+        for triangle, off in ((one, torch.full_like(back, corner)), (two, back)):
+            sides.append(bodies.own(plane, bodies.points(Held(triangle, corners(off))))[2])
+        found = torch.zeros_like(good)
+        found[index] = sides[0] * sides[1] < 0
+        return found
+
+
 def _line(
-    one: Tensor, two: Tensor, at: Tensor, d: Tensor, limits: list[Tensor], disks: list[tuple[Tensor, Tensor, Tensor]]
+    one: Tensor,
+    two: Tensor,
+    at: Tensor,
+    d: Tensor,
+    limits: list[Tensor],
+    disks: list[tuple[Tensor, Tensor, Tensor]],
+    seams: _Seams | None = None,
 ) -> Curves:
-    """Return lines ``at + t d (2, N)`` on flat primitives, within limits and within disks (which, and their numbers)."""
+    """Return lines ``at + t d (2, N)`` on flat primitives, within limits and within disks (which, and their numbers).
+
+    ``seams``: where both primitives are flat, and the limits are those of the first and the second: lines along edges within a
+    mesh count too.
+    """
     low, high = torch.full_like(at[0], -torch.inf), torch.full_like(at[0], torch.inf)
 
     def along(g: Tensor) -> tuple[Tensor, Tensor]:
@@ -259,6 +318,7 @@ def _line(
     everywhere = torch.full_like(low, torch.inf)
     for g in limits:
         a, slope = along(g)
+        a = a if seams is None else a + 2.0 * _TOUCH
         zero = -a / torch.where(slope == 0, 1.0, slope)
         clip(slope > 0, zero, everywhere)
         clip(slope < 0, -everywhere, zero)
@@ -273,18 +333,26 @@ def _line(
         clip(mask & (inner <= 0), everywhere, -everywhere)
     good = (high > low) & torch.isfinite(low) & torch.isfinite(high)
     middle = torch.where(good, 0.5 * (low + high), 0.0)
-    for g in limits:
+    for k, g in enumerate(limits):
         a, slope = along(g)
-        good &= a + slope * middle > _TOUCH
+        inside = a + slope * middle
+        at_edge = good & (inside.abs() <= _TOUCH)
+        good &= inside > _TOUCH
+        if seams is not None:
+            edge = at_edge.nonzero().squeeze(1)
+            if len(edge):
+                prim, other = rows((one, two) if k < len(_OFF) else (two, one), edge)
+                good[edge] = seams.are_cut(prim, _OFF[k % len(_OFF)], other)
     index = good.nonzero().squeeze(1)
     at, d, low, high = take(at, index), take(d, index), take(low, index), take(high, index)
     ends = [torch.cat((at + d * t, torch.zeros_like(at[:1]))) for t in (low, high)]
     return straight(take(one, index), ends[0], ends[1], take(two, index))
 
 
-def _flat_cuts(bodies: Bodies, one: Tensor, two: Tensor) -> list[Curves]:
+def _flat_cuts(bodies: Bodies, one: Tensor, two: Tensor, seams: _Seams) -> list[Curves]:
     """Return the lines in which flat surfaces cut."""
-    n = [bodies.normals(Held(prim, torch.zeros(3, len(prim), dtype=torch.float64))) for prim in (one, two)]
+    zero = torch.zeros(3, len(one), dtype=torch.float64, device=one.device)
+    n = [bodies.normals(Held(prim, zero)) for prim in (one, two)]
     b0, b1, height = _on(bodies, one, two)
     size = (height[1] * height[1] + height[2] * height[2]).sqrt()
     steep = cross(n[0], n[1])
@@ -296,7 +364,7 @@ def _flat_cuts(bodies: Bodies, one: Tensor, two: Tensor) -> list[Curves]:
     a0, a1 = _identity(height)
     limits = _limits(bodies, one, a0, a1) + _limits(bodies, two, b0, b1)
     disks = [(_is_disk(bodies, one), a0, a1), (_is_disk(bodies, two), b0, b1)]
-    return [_line(one, two, at, d, limits, disks)]
+    return [_line(one, two, at, d, limits, disks, seams)]
 
 
 def _round_cuts(bodies: Bodies, one: Tensor, two: Tensor) -> list[Curves]:

@@ -15,10 +15,10 @@ from torch import Tensor
 from torchpt.core.autograd import gradients_of
 from torchpt.core.threads import limited_threads
 from torchpt.gradients.edges.bodies import Bodies, bodies_of
-from torchpt.gradients.edges.curves import marked_primitives
 from torchpt.gradients.edges.cuts import Cuts, cuts_of
 from torchpt.gradients.edges.film import Worth
 from torchpt.gradients.edges.horizons import Horizons, horizons_of
+from torchpt.gradients.edges.meshes import marked_primitives
 from torchpt.gradients.edges.occluders import occluders_of
 from torchpt.gradients.edges.primary import Look, primary_of
 from torchpt.gradients.edges.receivers import MovingFrame
@@ -121,7 +121,7 @@ class Boundary:
     def _cuts(self) -> Cuts | None:
         """Return the curves where surfaces cut."""
         with torch.no_grad():
-            return cuts_of(self.scene, self.still)
+            return cuts_of(self.scene, self.still, self.scene.merged(self.params))
 
     def gradients(self, samples: Iterable[Samples], wanted: Iterable[str]) -> list[Tensor | None]:
         """Return what samples add to the gradients of ``wanted``; None for those that move no edges."""
@@ -206,7 +206,7 @@ class Boundary:
             smooth = smooth_of(self.scene, still) if reflects else None
             horizons = horizons_of(self.scene, frame, depth) if reflects else None
         if occluders is not None:
-            yield Shadows(frame, occluders, sources, reach, depth, lights_move)
+            yield Shadows(frame, occluders, sources, depth, lights_move)
             if reflects and not 0 <= depth < 3:
                 yield Segments(frame, SegmentSampler(occluders, smooth), depth)
         if horizons is not None:

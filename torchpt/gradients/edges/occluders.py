@@ -40,6 +40,10 @@ _LEAST_CREASE = 0.1
 _STATIC = 0.3
 
 
+#: Square of the sine at which a face is seen along its plane.
+_ALONG = 1e-18
+
+
 @dataclass(frozen=True)
 class EdgePoints:
     """Points of curves, N lanes.
@@ -49,6 +53,7 @@ class EdgePoints:
         held: the points.
         mate: the other face at each; -1: there is none.
         cut: ``(N,)`` bool: the two cut there.
+        bent: ``(N,)`` bool: the curve is the outline of a round surface.
         p: where they are ``(3, N)``.
         along: how ``p`` changes with the curve's parameter.
         density: of the draw in that parameter.
@@ -58,6 +63,7 @@ class EdgePoints:
     held: Held
     mate: Tensor
     cut: Tensor
+    bent: Tensor
     p: Tensor
     along: Tensor
     density: Tensor
@@ -69,12 +75,10 @@ class OutlinePoints(EdgePoints):
 
     Attributes:
         outline: ``(N,)`` bool: no crease, as seen from there.
-        bent: ``(N,)`` bool: the curve is the outline of a round surface.
         part: with which the curve counts, where others lie on it.
     """
 
     outline: Tensor
-    bent: Tensor
     part: Tensor
 
 
@@ -136,11 +140,17 @@ class Occluders:
         span = curves.high - curves.low
         held, p, along = curves.moving(self.bodies, curves.low + rest * span)
         across = cross(along, view.toward(p))
-        one, two = (dot(across, self.bodies.points(rows(other, index)) - p) for other in self.others)
-        outline = ~take(self.folded, index) | (one * two >= 0)
-        some &= dot(across, across) > 0
+        square = dot(across, across)
+        sides = []
+        for other in self.others:
+            corner = self.bodies.points(rows(other, index)) - p
+            beside = dot(across, corner)
+            # A face that is seen along its plane lies on both sides: what rays meet there tells which of its edges counts.
+            sides.append(torch.where(beside * beside > square * dot(corner, corner) * _ALONG, beside, 0.0))
+        outline = ~take(self.folded, index) | (sides[0] * sides[1] >= 0)
+        some &= square > 0
         lane, part = torch.arange(len(index), device=index.device), take(self.part, index)
-        drawn = OutlinePoints(lane, held, curves.mate, curves.cut, p, along, chance / span, outline, form >= 0, part)
+        drawn = OutlinePoints(lane, held, curves.mate, curves.cut, curves.bent, p, along, chance / span, outline, part)
         return rows(drawn, some.nonzero().squeeze(1))
 
 

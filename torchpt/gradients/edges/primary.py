@@ -18,7 +18,6 @@ from torchpt.gradients.edges.curves import (
     folds_of,
     generator,
     joined,
-    marked_primitives,
     plain_of,
     round_outline,
     rounds_of,
@@ -26,6 +25,7 @@ from torchpt.gradients.edges.curves import (
 )
 from torchpt.gradients.edges.cuts import Crossing, Cuts, crossing_of
 from torchpt.gradients.edges.film import Worth, film_places, slopes
+from torchpt.gradients.edges.meshes import marked_primitives
 from torchpt.gradients.edges.occluders import EdgePoints, Occluders, occluders_of
 from torchpt.gradients.edges.traced import Passing, Traced, Use
 from torchpt.math.guiding import Round
@@ -191,7 +191,11 @@ def pieces_of(
         moves: ``(P,)`` bool: primitives that move; None: the camera does, and so all that it sees.
     """
     view = view_of(bodies)
-    found = [_lines(bodies, *_silhouettes(bodies, folds, view), bounds) for folds in folds_of(scene, bodies, poses)]
+    of_owners = None if moves is None else moves.cpu()
+    found = [
+        _lines(bodies, *_silhouettes(bodies, folds, view), bounds)
+        for folds in folds_of(scene, bodies, poses, of_owners)
+    ]
     fixed = plain_of(scene, bodies)
     if fixed is not None:
         for mine, cut in ((fixed.round, _arcs), (~fixed.round, _lines)):
@@ -305,7 +309,7 @@ def _arcs(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) ->
 
 #: A place counts as hidden where a ray beside it ends before this share of the way.
 _BEFORE = 1.0 - 2.0**-10
-#: The same where the ray meets the edge's own surface.
+#: The same where the ray meets the edge's own surface, which may come forward quickly.
 _OWN = 1.0 - 2.0**-6
 #: The same of the ray through the place itself.
 _NEAR = 1.0 - 2.0**-14
@@ -362,7 +366,8 @@ class Seen:
         t, density = pieces.place(rest)
         held, p, along = pieces.curves.moving(self.bodies, t)
         lane, density = torch.arange(len(u), device=u.device), density * take(self.choice.pmf, index)
-        return EdgePoints(lane, held, pieces.curves.mate, pieces.curves.cut, p, along, density)
+        curves = pieces.curves
+        return EdgePoints(lane, held, curves.mate, curves.cut, curves.bent, p, along, density)
 
 
 @dataclass(frozen=True)
@@ -466,9 +471,9 @@ class Primary:
         reach = (away * d[:, :n]).sum(0)
         t, prim = self.traced.nearest(o, d, _ending_at(reach.repeat(2), _BEFORE, key.repeat(1, 2)))
         t, prim = t.view(2, n), prim.view(2, n)
-        # A round surface comes forward quickly behind its outline.
-        own = (prim == place.held.prim) | (prim == place.mate)
-        seen = (t > reach * torch.where(own, _OWN, _BEFORE)).all(0)
+        own = (prim == place.held.prim) | ((prim == place.mate) & (place.mate >= 0))
+        # Of all edges that lie on one line of the film those count whose surface is seen beside it.
+        seen = ((t > reach * torch.where(own, _OWN, _BEFORE)) | (own & place.bent)).all(0) & own.any(0)
         near = (t - reach).abs() < reach * 2.0**-8
         return torch.where(seen, share_of(self.bodies, place, s, lens, prim, near, step), 0.0)
 

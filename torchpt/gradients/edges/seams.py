@@ -13,6 +13,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from torchpt.gradients.edges.meshes import MeshOf
 from torchpt.math.vectors import take
 from torchpt.physics.parts import Copy, Part
 from torchpt.physics.shapes.primitive import PRIMITIVES
@@ -135,27 +136,13 @@ def _around(corners: int, device: torch.device) -> Tensor:
     return torch.tensor(places, dtype=torch.float64, device=device)
 
 
-def lies_on_seams(
-    scene: Scene,
-    owner: Part | Copy,
-    part: Part,
-    params: Mapping[str, Tensor],
-    face: Tensor,
-    ends: tuple[Tensor, Tensor],
-) -> Tensor:
-    """Return a mask ``(E,)`` of the edges of a mesh that lie on lines.
-
-    Args:
-        scene: the scene.
-        owner: the mesh or a copy of it.
-        part: the mesh.
-        params: the parameters.
-        face: a face of each edge ``(E,)``.
-        ends: its corners at both ends of the edge ``(E,)``.
-    """
-    found = torch.zeros_like(face, dtype=torch.bool)
-    for lines in _lines_of(scene, owner, part, params):
-        a, b = (lines.at[corner, face] for corner in ends)
+def lies_on_seams(scene: Scene, mesh: MeshOf, params: Mapping[str, Tensor]) -> Tensor:
+    """Return a mask ``(E,)`` of the edges of a mesh, or a copy of one, that lie on lines; ``params``: the parameters."""
+    edges = mesh.edges
+    found = torch.zeros_like(edges.border)
+    swap = torch.tensor((0, 2, 1) if mesh.turned else (0, 1, 2), device=found.device)
+    for lines in _lines_of(scene, mesh.owner, mesh.part, params):
+        a, b = (lines.at[swap[corner[0]], edges.face[0]] for corner in (edges.first, edges.last))
         line = torch.round(a)
         on = ((a - line).abs() < _ON) & ((b - line).abs() < _ON)
         found |= on & (line >= lines.least) & (line <= lines.most)

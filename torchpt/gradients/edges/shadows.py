@@ -205,14 +205,16 @@ def sources_of(bodies: Bodies, world: World, reach: float, met: bool) -> Sources
 # the camera (boundary segments of Zhang, Miller, Yan, Gkioulekas, Zhao, *Path-Space Differentiable Rendering*, 2020).
 
 
-#: Rays past an edge go so far beside it, against the way to it.
-_STEP = 2.0**-16
-#: What ends so close to an edge, against the way to it, ends at it.
-_NEAR = 2.0**-10
-#: The same where it ends at the edge's own surface, which may come forward quickly.
-_OWN = 2.0**-6
-#: Where a ray from a light begins, against the way to the edge.
+#: Rays past an edge begin so many steps before it, and a step beside it: the rounding of its place.
+_BEFORE = 2.0**14
+#: What they meet within so many steps of the edge ends there.
+_AT = 16.0
+#: The same of the edge's own round surface, in roots of the surface's size times the step.
+_ROUND = 16.0
+#: Rays to lights end, and rays from near ones begin, so far before them, against the whole way.
 _BEGIN = 2.0**-12
+#: Random numbers of rays to lights are as of a vertex that no path has.
+_TO_LIGHT = 1 << 11
 
 
 @dataclass(frozen=True)
@@ -263,7 +265,6 @@ class Shadows:
         frame: of the interior.
         occluders: what throws shadows.
         sources: the lights.
-        reach: radius of the scene.
         depth: vertices of paths at most; -1: any number.
         lights_move: True: lights may move.
     """
@@ -271,7 +272,6 @@ class Shadows:
     frame: MovingFrame
     occluders: Occluders
     sources: Sources
-    reach: float
     depth: int
     lights_move: bool
 
@@ -298,35 +298,49 @@ class Shadows:
     def _past(self, beam: Beam, passed: OutlinePoints, key: Tensor) -> tuple[Beam, OutlinePoints, Spot, Tensor]:
         """Trace rays past edges: return what they meet, and unit vectors ``(3, N)`` across the edge to the lit side.
 
+        The rays begin close to the edge, so that what lies closely behind it is told from it however far the light is; another
+        ray looks from there to the light.
+
         Before the edge the rays to both sides pass the same surfaces by their opacity. Behind it the lit one decides anew, by
         numbers of its own: those that stopped the other one at the edge are used up.
         """
-        traced = self.frame.traced
+        traced, bodies = self.frame.traced, self.frame.bodies
         toward = beam.view.toward(passed.p)
         w = torch.as_tensor(beam.view.w, device=toward.device).expand(toward.shape[1])
         length = dot(toward, toward).sqrt()
-        o = torch.where(w > 0, passed.p + toward * (1.0 - _BEGIN), passed.p + toward * (4.0 * self.reach / length))
-        way = passed.p - o
+        away = -toward / length
+        step = self.frame.rounding(passed.held.prim, passed.p)
+        whole = torch.where(w > 0, length * (1.0 - _BEGIN), torch.inf)
+        begin = torch.minimum(step * _BEFORE, whole)
         aside = cross(passed.along, toward)
         aside = aside / dot(aside, aside).sqrt()
-        step = aside * (dot(way, way).sqrt() * _STEP)
         n = len(passed.lane)
-        passing = Passing(torch.cat((key, key), 1), depth=1)
-        t, prim = traced.nearest(torch.cat((o, o), 1), torch.cat((way + step, way - step), 1), passing)
+        o = passed.p - away * begin
+        beside = torch.cat((o + aside * step, o - aside * step), 1)
+        keys = torch.cat((key, key), 1)
+        # Behind a body's front an edge may throw a shadow's border too: both rays have to come from the light.
+        aim = torch.where(w > 0, beam.view.e - o, -away)
+        t, prim = traced.nearest(beside, torch.cat((aim, aim), 1), Passing(keys, depth=_TO_LIGHT))
+        free = (prim < 0).view(2, n) | ((w > 0) & (t.view(2, n) > 1.0 - _BEGIN))
+        lit = (begin == whole) | free.all(0)
+        t, prim = traced.nearest(beside, torch.cat((away, away), 1), Passing(keys, depth=1))
         t, prim = t.view(2, n), prim.view(2, n)
         own = (prim == passed.held.prim) | ((prim == passed.mate) & (passed.mate >= 0))
-        hidden = t < torch.where(own, 1.0 - _OWN, 1.0 - _NEAR)
-        # Rays that pass the front of a round surface may stop at its back.
-        reach = torch.where(own & passed.bent, 1.0 + _OWN, 1.0 + _NEAR)
-        near = (t < reach) & ~hidden
-        far = t > reach
-        good = (near[0] & far[1]) | (near[1] & far[0])
+        # A ray beside an edge meets a flat face of it anywhere, as one beside an outline what it is the outline of; at a rim a
+        # round surface comes forward by the root of the step.
+        ends = own & (passed.bent | torch.stack([bodies.is_flat(x.clamp_min(0)) for x in prim]))
+        size = torch.stack([dot(axis, axis) for axis in bodies.place(passed.held.prim)[1:]]).amax(0).sqrt()
+        slack = step * _AT + torch.where(own, _ROUND * (size * step).sqrt(), 0.0)
+        hidden = ~ends & (t < begin - slack)
+        near = ends | (~hidden & (t < begin + slack))
+        far = ~hidden & ~near
+        good = lit & ((near[0] & far[1]) | (near[1] & far[0]))
         index = good.nonzero().squeeze(1)
         side = torch.where(take(far[0], index), 1.0, -1.0)
         outward = take(aside, index) * side
-        lit = take(way, index) + take(step, index) * side
-        free = dot(lit, lit).sqrt() * torch.where(side > 0, take(reach[0], index), take(reach[1], index))
-        spot = met(traced, take(o, index), lit, Passing(take(key, index), depth=0, free=free))
+        o = take(o, index) + outward * take(step, index)
+        free = take(begin, index) + torch.where(side > 0, take(slack[0], index), take(slack[1], index))
+        spot = met(traced, o, take(away, index), Passing(take(key, index), depth=0, free=free))
         some = (spot.hit.prim >= 0).nonzero().squeeze(1)
         index = take(index, some)
         return rows(beam, index), rows(passed, index), spot.taken(some), take(outward, some)

@@ -1,0 +1,108 @@
+"""What of a scene moves edges that no estimator knows, for the warning; what no scene tells beforehand stands in the docs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+import torch
+from torch import Tensor
+
+from torchpt.gradients.edges.curves import known
+from torchpt.gradients.edges.seams import jumps_elsewhere
+from torchpt.math.microfacet import is_smooth
+from torchpt.paths.integrators.path import PathIntegrator
+from torchpt.physics.bsdfs.resolved import ResolvedMaterial
+from torchpt.physics.textures import Node
+from torchpt.physics.textures.atlas import ImageNode
+from torchpt.scene import Scene
+from torchpt.scene.settings import Settings
+
+__all__ = ["left_out", "without_gradient"]
+
+#: Of a spot: where its light ends, and where it begins to fade.
+_RIM = ("cutoff_angle", "beam_width")
+#: Numbers that tell how rough a material is.
+_ROUGHNESS = ("alpha", "roughness", "alpha_u", "alpha_v")
+
+
+def left_out(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None = None) -> list[str]:
+    """Return in a few words each the edges that are not differentiated where surfaces, lights or the camera move.
+
+    ``params``: those that replace the scene's.
+    """
+    return list(_found(scene, settings, scene.merged(params)))
+
+
+def _found(scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Iterator[str]:
+    built, camera = scene.built, scene.description.camera.kind
+    if scene.camera(settings.film, scene.params, torch.float64).film_of(_point(scene.device)) is None:
+        yield f"those that a camera of kind {camera.name} sees"
+    materials = [owner.material for owner in (*built.parts, *built.copies)]
+    if any(_mirrors(part, params) for material in materials for part in material.with_inner()):
+        yield "those seen in mirrors and clear glass, and of light that these send on"
+    if any(_has_opacity_texture(part) for material in materials for part in material.with_inner()):
+        yield "those within textures of opacity"
+    if jumps_elsewhere(scene):
+        yield "those within textures that are not interpolated, on round surfaces or of very many lines"
+    if any(part.quadric is not None and not known(part.quadric.form) for part in built.parts):
+        yield "outlines of quadrics of kinds of your own"
+    if any(source.kind == "spot" and _sharp(params, source.name) for source in built.sources):
+        yield "the rims of spots that do not fade out"
+    if not isinstance(settings.integrator, PathIntegrator):
+        yield f"edges of shadows where the integrator is {settings.integrator.name}"
+
+
+def _mirrors(material: ResolvedMaterial, params: Mapping[str, Tensor]) -> bool:
+    """Return True if a material reflects or refracts as a delta: rough ones only where their roughness is next to 0."""
+    if material.inner or material.model.sheer or not material.model.delta:  # inner ones are looked at by themselves
+        return False
+    if material.model.smooth:
+        return True
+    widest = [_least(material, name, params) for name in _ROUGHNESS if material.values.get(name) is not None]
+    return not widest or bool(is_smooth(torch.stack(widest).amax()))
+
+
+def _least(material: ResolvedMaterial, name: str, params: Mapping[str, Tensor]) -> Tensor:
+    """Return the least value of a number of a material; 0 of a texture of a kind of its own."""
+    value = material.values[name]
+    if isinstance(value, ImageNode):
+        return (value.image(params).amin() * value.scale[0]).detach().double()
+    least = torch.zeros(()) if isinstance(value, Node) else params[f"{material.name}.{name}"].detach().amin()
+    return least.double()
+
+
+def _has_opacity_texture(material: ResolvedMaterial) -> bool:
+    sheer = any(inner.model.sheer for inner in material.inner)  # its weight is an opacity
+    return isinstance(material.opacity, Node) or (sheer and isinstance(material.values["weight"], Node))
+
+
+def _point(device: torch.device) -> Tensor:
+    """Return any point ``(3, 1)``: whether a camera has a film for points does not depend on it."""
+    return torch.zeros(3, 1, dtype=torch.float64, device=device)
+
+
+def without_gradient(scene: Scene, wanted: Iterable[str], params: Mapping[str, Tensor] | None = None) -> list[str]:
+    """Return the parameters on which pictures depend by jumps alone, so that their gradients are 0.
+
+    ``params``: those that replace the scene's.
+    """
+    values = scene.merged(params)
+    owners = [*scene.built.parts, *scene.built.copies]
+    cut = {
+        material.name
+        for owner in owners
+        for material in owner.material.with_inner()
+        if material.alpha_cutoff is not None
+    }
+    rims = {f"{source.name}.{key}" for source in scene.built.sources if source.kind == "spot" for key in _RIM}
+    return [
+        name
+        for name in wanted
+        if (name in rims and _sharp(values, name.rpartition(".")[0]))
+        or any(name.startswith(f"{own}.opacity") for own in cut)
+    ]
+
+
+def _sharp(params: Mapping[str, Tensor], name: str) -> bool:
+    cutoff, beam = (float(params[f"{name}.{key}"].detach()) for key in _RIM)
+    return beam > 0.999 * cutoff
