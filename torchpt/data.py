@@ -138,7 +138,8 @@ class _ItemRenderer:
         if get_worker_info() is not None:
             options.setdefault("threads", 1)  # the workers share the cores
         options = {"spp": self.spp, "seed": self.seed + index, **options, "film": film}
-        return _Item(index, scene_index, params, film, request_of(scene, True, params=params, **options))
+        with naming_errors(f"make({scene_index})", ""):
+            return _Item(index, scene_index, params, film, request_of(scene, True, params=params, **options))
 
     def _tensors(self, item: _Item, rendering: Rendering) -> dict[str, Tensor]:
         """Return picture, layers and camera of a rendered item."""
@@ -156,7 +157,8 @@ class _ItemRenderer:
     def _scene(self, index: int) -> tuple[Scene, dict[str, Any]]:
         """Return a scene and its arguments of ``render``; the latest is cached for its next camera."""
         if self.latest is None or self.latest[0] != index:
-            made = self.make(index)
+            with naming_errors(f"make({index})", ""):
+                made = self.make(index)
             source, options = made if isinstance(made, tuple) and len(made) == 2 else (made, {})
             if not isinstance(source, Scene | Mapping) or not isinstance(options, Mapping):
                 expected = (
@@ -165,7 +167,8 @@ class _ItemRenderer:
                 raise SceneError(f"make({index})", made, expected)
             check_names("render", options, RenderOptions)
             _check_options(options, f"make({index}).")
-            scene = source if isinstance(source, Scene) else load(dict(source), self.device)
+            with naming_errors(f"make({index})", ""):
+                scene = source if isinstance(source, Scene) else load(dict(source), self.device)
             self.latest = index, scene, dict(options)
         _, scene, options = self.latest
         return scene, dict(options)
@@ -198,7 +201,7 @@ class RenderDataset(Dataset):
         options: further arguments of ``torchpt.render``.
 
     Raises:
-        SceneError: an argument is not accepted; on access, as ``load`` and ``render``.
+        SceneError: an argument is not accepted; on access, as ``load`` and ``render``, with ``make(index)`` in its key.
         TypeError: an unknown argument; on access, an index that is no integer.
         IndexError: on access, an index out of range.
     """

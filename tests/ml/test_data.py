@@ -389,6 +389,21 @@ def expected() -> Items:
         torch.set_num_threads(threads)
 
 
+def made_wrongly(index: int) -> Any:
+    return {**room(1), "shapes": {"ball": {"type": "sphere", "radius": -1}}} if index else (room(1), {"spp": 0})
+
+
+@pytest.mark.parametrize(
+    ("index", "key"), [(1, "make(1).shapes.ball.radius"), (0, "make(0).render.spp")], ids=["scene", "option"]
+)
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_in_a_worker_keeps_its_type_and_key(index, key, workers):
+    items = RenderStream(made_wrongly, start=index, scenes=index + 1, film=(4, 4))
+    with pytest.raises(SceneError) as error:
+        next(iter(DataLoader(items, num_workers=workers, multiprocessing_context="fork" if workers else None)))
+    assert error.value.key == key and str(error.value).startswith(f"{key}: expected") and "\n" not in str(error.value)
+
+
 def test_the_same_bits_without_workers(expected):
     assert same(by_index(DataLoader(data(), batch_size=2)), expected)
 

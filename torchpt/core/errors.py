@@ -6,12 +6,16 @@ Exceptions define ``__reduce__`` where their arguments are not their message, so
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
+from typing import Any
 
 __all__ = [
+    "ArgumentTypeError",
+    "ArgumentValueError",
     "AssetError",
     "EdgeWarning",
     "EmptyMeshError",
@@ -60,8 +64,28 @@ def _where(key: str, file: str | None) -> str:
     return f"{_one_line(file, len(file))}: {_one_line(key)}" if file else _one_line(key)
 
 
+#: Stands for an argument of an error that is made of its message alone.
+_NONE: Any = object()
+#: The line of a traceback that names one of these errors.
+_OWN_LINE = re.compile(r"torchpt\.[\w.]+: (.*)")
+
+
 class TorchptError(Exception):
-    """Base of all errors caused by input. ``str()`` is always a single line."""
+    """Base of all errors caused by input. ``str()`` is always a single line.
+
+    Each of them can be made of a message alone, so that a data loader of torch, which raises the errors of its workers again by
+    their type and text, keeps the type. Text of several lines, as such a loader makes it of a traceback, becomes a note.
+    """
+
+    def __init__(self, *arguments: object) -> None:
+        text = arguments[0] if len(arguments) == 1 else None
+        if not isinstance(text, str) or "\n" not in text:
+            super().__init__(*arguments)
+            return
+        lines = text.strip().splitlines()
+        own = [found[1] for found in map(_OWN_LINE.match, lines) if found]
+        super().__init__(own[-1] if own else _one_line(lines[-1]))
+        self.add_note(text)
 
 
 class SceneError(TorchptError):
@@ -74,18 +98,45 @@ class SceneError(TorchptError):
         file: the scene file, where the scene came from one.
     """
 
-    def __init__(self, key: str, value: object, expected: str, file: str | None = None) -> None:
+    def __init__(self, key: str, value: object = _NONE, expected: str = "", file: str | None = None) -> None:
+        if value is _NONE:
+            self._init_by_message(key)
+            return
         self.key, self.value, self.expected, self.file = key, value, expected, file
         super().__init__(f"{_where(key, file)}: expected {_one_line(expected, _EXPECTED_LENGTH)}, got {_shown(value)}")
 
+    def _init_by_message(self, text: str) -> None:
+        """Set all of a message; the value is then the text that shows it."""
+        TorchptError.__init__(self, text)
+        self.message_alone, (where, _, said) = True, str(self).partition(": expected ")
+        file, separator, key = where.rpartition(": ")
+        self.expected, _, self.value = said.rpartition(", got ")
+        self.key, self.file = key, file if separator else None
+
+    #: True for an error that was made of its message.
+    message_alone: bool = False
+
     def __reduce__(self) -> tuple:
+        if self.message_alone:
+            return type(self), (str(self),)
         return type(self), (self.key, self.value, self.expected, self.file)
+
+
+class ArgumentTypeError(SceneError, TypeError):
+    """An argument of a function that is of another type."""
+
+
+class ArgumentValueError(SceneError, ValueError):
+    """An argument of a function with a value that is not accepted."""
 
 
 class NotBuiltError(SceneError):
     """A value of the scene format that this version does not build yet; ``expected`` lists the values that it does."""
 
-    def __init__(self, key: str, value: object, expected: str = "", file: str | None = None) -> None:
+    def __init__(self, key: str, value: object = _NONE, expected: str = "", file: str | None = None) -> None:
+        if value is _NONE:
+            self._init_by_message(key)
+            return
         TorchptError.__init__(
             self,
             f"{_where(key, file)}: {_shown(value)} is not built yet" + (f"; available: {expected}" if expected else ""),
@@ -96,9 +147,11 @@ class NotBuiltError(SceneError):
 class AssetError(TorchptError):
     """A file that a scene reads (mesh, image) and that is missing, unreadable or malformed."""
 
-    def __init__(self, file: object, problem: str) -> None:
-        self.file, self.problem = str(file), _one_line(problem)
-        super().__init__(f"{_one_line(self.file, len(self.file))}: {self.problem}")
+    file: str
+    problem: str
+
+    def __init__(self, file: object, problem: str | None = None) -> None:
+        _init_of_file(self, file, None if problem is None else _one_line(problem))
 
     def __reduce__(self) -> tuple:
         return type(self), (self.file, self.problem)
@@ -111,12 +164,24 @@ class EmptyMeshError(AssetError):
 class OutputError(TorchptError):
     """A file that cannot be written."""
 
-    def __init__(self, file: object, problem: str) -> None:
-        self.file, self.problem = str(file), problem.replace("\n", " ")
-        super().__init__(f"{_one_line(self.file, len(self.file))}: {self.problem}")
+    file: str
+    problem: str
+
+    def __init__(self, file: object, problem: str | None = None) -> None:
+        _init_of_file(self, file, None if problem is None else problem.replace("\n", " "))
 
     def __reduce__(self) -> tuple:
         return type(self), (self.file, self.problem)
+
+
+def _init_of_file(error: AssetError | OutputError, file: object, problem: str | None) -> None:
+    """Set file, problem and message; without a problem ``file`` is the message."""
+    if problem is None:
+        TorchptError.__init__(error, str(file))
+        error.file, _, error.problem = str(error).partition(": ")
+        return
+    error.file, error.problem = str(file), problem
+    TorchptError.__init__(error, f"{_one_line(error.file, len(error.file))}: {error.problem}")
 
 
 class RenderError(TorchptError):

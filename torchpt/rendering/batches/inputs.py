@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.core.errors import AssetError, NotBuiltError, RenderError, SceneError
+from torchpt.core.errors import AssetError, RenderError, SceneError
 from torchpt.math.transforms import tensor_of
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
@@ -269,12 +269,11 @@ def naming_errors(scene: str, camera: str) -> Iterator[None]:
         key = error.key
         if camera and (key == "camera" or key.startswith(("camera.", "params.camera.to_world"))):
             key = f"{camera}{key.removeprefix('params.camera.to_world').removeprefix('camera')}"
-        elif scene and not key.startswith(("scenes[", "params[", "cameras", "seed")):
+        elif scene and not key.startswith(("scenes[", "params[", "cameras", "seed", "make(")):
             key = f"{scene}.{key}" if key else scene
-        error_type = NotBuiltError if isinstance(error, NotBuiltError) else SceneError
-        raise error_type(key, error.value, error.expected, error.file) from None
+        raise type(error)(key, error.value, error.expected, error.file) from None
     except AssetError as error:
-        raise AssetError(error.file, f"{error.problem} ({scene})" if scene else error.problem) from None
+        raise type(error)(error.file, f"{error.problem} ({scene})" if scene else error.problem) from None
     except RenderError as error:
         is_named = not scene or str(error).startswith(scene)
         raise RenderError(str(error) if is_named else f"{scene}: {error}") from None
