@@ -292,6 +292,70 @@ def test_inside_another_module_and_by_functional_call(renderer):
         torch.testing.assert_close(found[name], value.grad)
 
 
+def test_functional_call_in_training_mode_counts_a_step(renderer):
+    x = {name: value.detach() for name, value in renderer.named_parameters()}
+
+    def loss(x: dict[str, Tensor]) -> Tensor:
+        return torch.func.functional_call(renderer, x).mean()
+
+    found = torch.func.grad(loss)(x)
+    assert int(renderer.steps) == 1
+    renderer.steps.zero_()
+    renderer().mean().backward()
+    for name, value in renderer.named_parameters():
+        assert torch.equal(found[name], value.grad)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is:DeprecationWarning")  # of torch's own jvp, at its first call
+def test_forward_mode_and_second_derivatives_go_through_ranges(scene):
+    renderer = Renderer(scene, [WALL, LAMP], spp=8, threads=1, film=(8, 8)).eval()
+    x = {name: value.detach() for name, value in renderer.named_parameters()}
+    tangents = {name: torch.ones_like(value) for name, value in x.items()}
+
+    def loss(x: dict[str, Tensor]) -> Tensor:
+        return torch.func.functional_call(renderer, x, (), {"seed_grad": 0}).mean()  # of the picture's own samples
+
+    _, change = torch.func.jvp(loss, (x,), (tangents,))
+    grads = torch.func.grad(loss)(x)
+    torch.testing.assert_close(change, torch.stack([grad.sum() for grad in grads.values()]).sum(), rtol=1e-3, atol=0.0)
+    (key, _) = x
+    hessian = torch.func.hessian(lambda wall: loss({**x, key: wall}))(x[key])
+    assert hessian.shape == (3, 3) and bool(hessian.diagonal().abs().min() > 0)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is:DeprecationWarning")  # of torch's own jvp, at its first call
+def test_a_tangent_passes_within_the_range_and_ends_beyond_it():
+    kind = parametrization_of(Color(high=1.0), torch.full((3,), 0.5))
+    x = torch.tensor([-9.0, 0.0, 9.0])
+    _, tangent = torch.func.jvp(kind, (x,), (torch.ones(3),))
+    assert (tangent != 0).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("wishes", "says"),
+    [
+        ({"spp": 0}, "render.spp: expected a whole number"),
+        ({"film": "x"}, "film: expected"),
+        ({"integrator": "pth"}, "integrator.type: expected"),
+        ({"full": 1}, "full: expected True or False"),
+        ({"edges": False, "edge_guide": torchpt.EdgeGuide()}, "edge_guide: expected None"),
+    ],
+)
+def test_options_are_checked_when_it_is_made(scene, wishes, says):
+    with pytest.raises(SceneError, match=f"^{says}"):
+        Renderer(scene, WALL, **wishes)
+
+
+def test_a_tensor_in_place_of_params(renderer):
+    with pytest.raises(SceneError, match=r"^params: expected a mapping .*, got tensor"):
+        renderer(torch.ones(3))
+
+
+def test_layers_may_be_asked_for_by_a_call(scene):
+    renderer = Renderer(scene, film={"width": 4, "height": 4, "aovs": ["depth"]}, spp=1)
+    assert renderer(full=True).layers["depth"].shape == (4, 4, 1)
+
+
 def test_in_data_parallel_training(renderer, tmp_path):
     distributed = torch.distributed
     distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)

@@ -77,6 +77,26 @@ class _ProjectedClamp(torch.autograd.Function):
         return torch.where(outward, 0.0, cotangent), None, None
 
 
+class _ProjectedClampWithJvp(_ProjectedClamp):
+    """The same, with forward mode. A tangent has no loss by which it could lead back: it passes within the range, ends included."""
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        _ProjectedClamp.setup_context(ctx, inputs, output)
+        ctx.save_for_forward(inputs[0])
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        (x,) = ctx.saved_tensors
+        return torch.where((x >= ctx.low) & (x <= ctx.high), tangents[0], 0.0)
+
+
+def _projected_clamp(x: Tensor, low: float, high: float) -> Any:
+    # Graphs of torch.compile hold no function with a jvp of its own.
+    function = _ProjectedClamp if torch.compiler.is_compiling() else _ProjectedClampWithJvp
+    return function.apply(x, low, high)
+
+
 class Parametrization(nn.Module):
     """Map of one parameter: ``forward`` computes it from the optimized numbers ``x``, ``inverse`` computes ``x``.
 
@@ -117,7 +137,7 @@ class Bounded(Parametrization):
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
-        share: Any = _ProjectedClamp.apply(
+        share = _projected_clamp(
             (1.0 + self.overshoot_low + self.overshoot_high) * x.sigmoid() - self.overshoot_low,
             self.lowest_share,
             self.highest_share,
@@ -144,9 +164,8 @@ class LowerBounded(Parametrization):
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
-        above: Any = _ProjectedClamp.apply(nn.functional.softplus(x) - self.overshoot_low, self.lowest_share, math.inf)
-        value: Any = _ProjectedClamp.apply(self.low + self.scale * above, -math.inf, self.high)
-        return value
+        above = _projected_clamp(nn.functional.softplus(x) - self.overshoot_low, self.lowest_share, math.inf)
+        return _projected_clamp(self.low + self.scale * above, -math.inf, self.high)
 
     def inverse(self, value: Tensor) -> Tensor:
         """See :class:`Parametrization`."""

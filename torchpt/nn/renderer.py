@@ -9,9 +9,11 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor, nn
 
+from torchpt.core.autograd import outside_transforms, transforms_are_active
 from torchpt.core.errors import SceneError, example_names
 from torchpt.nn.parametrizations import Parametrization, PoseParametrization, parametrization_of
 from torchpt.rendering.api import render
+from torchpt.rendering.requests import check_options
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
@@ -56,7 +58,8 @@ class Renderer(nn.Module):
         options: further arguments of ``torchpt.render`` for all calls.
 
     Raises:
-        SceneError: no scene, a name or pattern that matches no parameter, or an argument that ``forward`` or this class has.
+        SceneError: no scene, a name or pattern that matches no parameter, an argument that ``forward`` or this class has, or
+            one that ``torchpt.render`` refuses.
         TypeError: an unknown argument.
     """
 
@@ -82,7 +85,10 @@ class Renderer(nn.Module):
             raise SceneError("params", options["params"], "an argument of Renderer.forward")
         if seed is not None:
             seed = base_seed(seed)
+        if type(full) is not bool:
+            raise SceneError("full", full, "True or False")
         self.scene, self.seed, self.full, self.options = as_scene(scene), seed, full, options
+        check_options(scene, options)
         self.names = () if names is None else _matching_names(scene, (names,) if isinstance(names, str) else names)
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
@@ -114,13 +120,18 @@ class Renderer(nn.Module):
 
         Args:
             params: values in place of parameters of the scene or of this module, by dotted name, such as those of the camera.
-            seed: seed in place of the counted one.
+            seed: seed in place of the counted one, which None keeps.
             full: in place of the constructor's ``full``.
             options: arguments of ``torchpt.render``, in place of the constructor's.
 
         Returns:
             The picture ``(H, W, 3)``; with ``full=True`` a :class:`torchpt.Rendering`.
+
+        Raises:
+            SceneError: ``params`` is no mapping, or as :func:`torchpt.render`.
         """
+        if params is not None and not isinstance(params, Mapping):
+            raise SceneError("params", params, "a mapping from names of scene.params to values, or None")
         all_options: RendererOptions = {**self.options, **options}
         if seed is None:
             seed = self._next_seed(shares_picture=all_options.get("ranks") is not None)
@@ -167,9 +178,16 @@ class Renderer(nn.Module):
         rank, world = 0, 1
         if not shares_picture and torch.distributed.is_available() and torch.distributed.is_initialized():
             rank, world = torch.distributed.get_rank(), torch.distributed.get_world_size()
-        seed = self.seed + int(self.steps) * world + rank
+        if torch.compiler.is_compiling() or not transforms_are_active():
+            return self.seed + self._count_step() * world + rank
+        with outside_transforms():  # which refuse changes in place of tensors from outside
+            return self.seed + self._count_step() * world + rank
+
+    def _count_step(self) -> int:
+        """Return the number of steps before this one."""
+        steps = int(self.steps)
         self.steps += 1
-        return seed
+        return steps
 
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Renderer:
         device_of(fn(self.steps).device)  # raises for a missing device before anything moves

@@ -47,6 +47,7 @@ from torchpt.spec.schema import ResultCache, scene_error
 __all__ = [
     "RenderRequest",
     "RequestTemplate",
+    "check_options",
     "prepare_request",
     "prepare_trace_request",
     "template_of",
@@ -162,16 +163,25 @@ _templates: WeakKeyDictionary[Scene, tuple[ResultCache[RequestTemplate], Descrip
 
 
 def _template_of(scene: Scene, full: bool, options: Mapping[str, Any]) -> RequestTemplate:
-    call = CallArguments.of({**options, "full": full})
-    if call.edge_guide is not None and not call.edges:
-        raise SceneError("edge_guide", call.edge_guide, "None where edges is False")
+    call, settings = check_options(scene, {**options, "full": full})
     _check_device(scene, options.get("device"))
-    settings = complete_settings(scene.description, settings_of_call(options))
     if not full:
         settings = _without_aovs(settings, film_keys(options.get("film")))
     elif settings.film.denoise:
         check_denoiser()
     return RequestTemplate(settings, call)
+
+
+def check_options(scene: Scene, options: Mapping[str, Any]) -> tuple[CallArguments, Settings]:
+    """Return the two kinds of options of a call on a scene, once they are checked; ``device`` is passed over.
+
+    Raises:
+        SceneError: an argument is not accepted.
+    """
+    call = CallArguments.of(options)
+    if call.edge_guide is not None and not call.edges:
+        raise SceneError("edge_guide", call.edge_guide, "None where edges is False")
+    return call, complete_settings(scene.description, settings_of_call(options))
 
 
 def _read_argument(name: str, value: Any, key: str) -> Any:
