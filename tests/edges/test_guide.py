@@ -228,7 +228,7 @@ def test_an_edge_guide_is_one():
         torchpt.data.RenderDataset(lambda index: scene, 1, edge_guide=EdgeGuide())
     with pytest.raises(torchpt.SceneError, match=r"edge_guide: expected none: pictures of a data set"):
         torchpt.data.RenderDataset(lambda index: (scene, {"edge_guide": EdgeGuide()}), 1)[0]
-    with pytest.raises(TypeError, match="edge_guide"):  # pictures of a batch are made side by side
+    with pytest.raises(torchpt.SceneError, match=r"edge_guide: expected None for a batch"):
         torchpt.render_batch([scene], edge_guide=EdgeGuide())  # pyright: ignore[reportCallIssue]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from few import few
+from torch import Tensor
 
 import torchpt
 from torchpt import gradients, search
@@ -830,5 +831,54 @@ def test_cameras_of_tensors_and_views_of_their_own():
     assert fov.grad is not None and leaf.grad is not None and torch.equal(fov.grad, leaf.grad)
     found = torch.func.grad(lambda x: torchpt.render(view, params={"camera.fov": x}, spp=4).sum())(torch.tensor(40.0))
     assert torch.equal(found, leaf.grad)
-    with pytest.raises(SceneError, match="transforms go through render"):
-        torch.func.grad(lambda x: torchpt.render_batch(scene, params=[{"camera.fov": x}], spp=1).sum())(fov.detach())
+    given = fov.detach()
+    found = torch.func.grad(lambda x: torchpt.render_batch(alone, params=[{"camera.fov": x}], spp=4).sum())(given)
+    assert torch.equal(found, leaf.grad)
+    with pytest.raises(SceneError, match=r"cameras\[0\].fov: expected plain numbers"):
+        torch.func.grad(lambda x: torchpt.render_batch(scene, [{**camera, "fov": x}], spp=1).sum())(given)
+
+
+def pictures_of(scene: torchpt.Scene, colours: Tensor, cameras: Tensor, **more: Any) -> Any:
+    film = {"width": 8, "height": 8}
+    return torchpt.render_batch(scene, cameras, {"materials.grey.reflectance": colours}, spp=2, film=film, **more)
+
+
+def test_transforms_of_torch_func_give_the_bits_of_plain_calls():
+    scene = room()
+    cameras, colours = poses(scene, 2), torch.tensor([[0.2, 0.3, 0.4], [0.5, 0.6, 0.7]])
+    weights = torch.linspace(0.0, 1.0, 2 * 2 * 8 * 8 * 3).reshape(2, 2, 8, 8, 3)
+
+    def loss(colours: Tensor, cameras: Tensor) -> Tensor:
+        return (pictures_of(scene, colours, cameras) * weights).sum()
+
+    leaves = [x.clone().requires_grad_() for x in (colours, cameras)]
+    plain = pictures_of(scene, colours, cameras)
+    loss(*leaves).backward()
+    found = torch.func.grad(loss, argnums=(0, 1))(colours, cameras)
+    assert all(torch.equal(a, b.grad) for a, b in zip(found, leaves, strict=True))
+    of_cameras = torch.func.grad(lambda cameras: loss(colours, cameras))(cameras)
+    leaf = cameras.clone().requires_grad_()
+    loss(colours, leaf).backward()
+    assert torch.equal(of_cameras, leaf.grad)
+    both = torch.func.vmap(lambda colours: pictures_of(scene, colours, cameras))(torch.stack((colours, colours / 2)))
+    assert torch.equal(both[0], plain) and not torch.equal(both[1], plain)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is:DeprecationWarning")  # of torch's own jvp, at its first call
+def test_forward_mode_of_a_batch():
+    scene = room()
+    cameras, colours = poses(scene, 2), torch.tensor([[0.2, 0.3, 0.4], [0.5, 0.6, 0.7]])
+    plain, tangents = pictures_of(scene, colours, cameras), torch.ones_like(colours)
+    picture, change = torch.func.jvp(lambda x: pictures_of(scene, x, cameras), (colours,), (tangents,))
+    assert torch.equal(picture, plain) and float(change.mean()) > 0.0
+    forward_ad = torch.autograd.forward_ad
+    for value in (colours, colours.clone().requires_grad_()):
+        with forward_ad.dual_level():
+            found = forward_ad.unpack_dual(pictures_of(scene, forward_ad.make_dual(value, tangents), cameras))
+            assert torch.equal(found.primal, plain) and torch.equal(found.tangent, change)
+
+
+def test_a_refused_colour_is_named_under_a_transform():
+    scene = room()
+    with pytest.raises(SceneError, match=r"^params\[1\].params.materials.grey.reflectance: expected"):
+        torch.func.grad(lambda x: pictures_of(scene, torch.stack((x, x - 5)), poses(scene, 1)).sum())(torch.ones(3))

@@ -35,6 +35,7 @@ __all__ = [
     "Forward",
     "Second",
     "custom_vjp",
+    "forward_mode_is_active",
     "gradients_of",
     "is_batched",
     "is_transformed",
@@ -151,6 +152,11 @@ def outside_transforms() -> AbstractContextManager[Any]:
 def transforms_are_active() -> bool:
     """Return True inside of a transform of ``torch.func``."""
     return _are_functorch_transforms_active()
+
+
+def forward_mode_is_active() -> bool:
+    """Return True inside of ``torch.autograd.forward_ad.dual_level``, or of forward mode of ``torch.func``."""
+    return torch.autograd.forward_ad._current_level >= 0
 
 
 def _levels(value: Tensor) -> Iterator[Tensor]:

@@ -78,7 +78,10 @@ class _ProjectedClamp(torch.autograd.Function):
 
 
 class _ProjectedClampWithJvp(_ProjectedClamp):
-    """The same, with forward mode. A tangent has no loss by which it could lead back: it passes within the range, ends included."""
+    """The same, with forward mode.
+
+    A tangent has no loss by which it could lead back: it passes within the range, ends included.
+    """
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

@@ -10,13 +10,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat
-from typing import Any, Literal, Unpack, overload
+from typing import Any, Literal, Unpack, cast, overload
 from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import is_transformed
+from torchpt.core.autograd import forward_mode_is_active, is_transformed, transforms_are_active
 from torchpt.core.errors import SceneError
 from torchpt.core.memory import check_limit, mb
 from torchpt.core.threads import limited_threads, outside_inference_mode
@@ -124,7 +124,8 @@ def render_batch(
     Picture ``[s, c]`` is to the bit ``torchpt.render(scenes[s].seen_by(cameras[c]), params=..., spp=..., seed=...)``. Threads
     share one queue of tasks of all pictures, and the next pictures are prepared while they trace. World, search structure and
     kernels are made once for all cameras of a scene. Pictures are rendered one after another by tensor operations (as on
-    CUDA), with a time limit or target error, in bounded memory, or by several ``ranks`` (which share each picture's pixels).
+    CUDA), with a time limit or target error, in bounded memory, by several ``ranks`` (which share each picture's pixels), and
+    under transforms of ``torch.func``.
 
     Args:
         scenes: scenes of :func:`torchpt.load` with films of one size: a sequence, or an iterator, which may load each while
@@ -139,8 +140,8 @@ def render_batch(
             each picture, from torch's default generator.
         on_progress: called after each picture with the number of finished and of all pictures (None: an iterator of scenes).
         full: True returns :class:`Renderings`: pictures, AOVs, and the facts of each picture.
-        options: other arguments of :func:`torchpt.render`, the same for all pictures. ``checkpoint`` is refused;
-            ``max_memory`` bounds the whole batch with its pictures.
+        options: other arguments of :func:`torchpt.render`, the same for all pictures. ``checkpoint`` and ``edge_guide`` are
+            refused; ``max_memory`` bounds the whole batch with its pictures.
 
     Raises:
         SceneError: an argument is not accepted; its key names the scene or camera, such as ``scenes[3].``.
@@ -148,6 +149,7 @@ def render_batch(
         TypeError: an unknown argument.
     """
     own = ("cameras", "params", "spp", "seed", "on_progress", "full")
+    edge_guide = cast(dict[str, Any], options).pop("edge_guide", None)
     check_names("render_batch", options, BatchOptions, own)
     if on_progress is not None and not callable(on_progress):
         raise SceneError("on_progress", on_progress, "a function")
@@ -155,6 +157,11 @@ def render_batch(
     checkpoint = options.get("checkpoint")
     if checkpoint is not None:
         raise SceneError("render.checkpoint", checkpoint, "null for a batch")
+    if edge_guide is not None:
+        expected = (
+            "None for a batch: a guide learns from one backward pass after the other, and those of a batch overlap"
+        )
+        raise SceneError("edge_guide", edge_guide, expected)
     param_sets = params_of(params, scenes)
     # Number of scenes; None for an iterator.
     size = (
@@ -194,7 +201,12 @@ def render_batch(
         # Others are errors, or None for the scenes' own.
         counts = [spp for spp in given_spp if type(spp) is int and spp > 0]
         tasks_of = task_counts(total, sum(counts) / len(counts) if counts else None) if total else lambda picture: 1
-        render_pictures(chain([first], pictures), tasks_of, on_done)
+        if _under_transforms():
+            for picture in chain([first], pictures):
+                with naming_errors(picture.name, ""):
+                    on_done(picture, None, execute_request(picture.request))
+        else:
+            render_pictures(chain([first], pictures), tasks_of, on_done)
     count = 1 + max(s for s, _ in found)
     rows_of_cameras = None if batch_cameras.shared else batch_cameras.rows
     for key, given in (("params", param_sets), ("cameras", rows_of_cameras), ("spp", spp), ("seed", seed)):
@@ -313,7 +325,14 @@ def _request_by(
         params = {**params, "camera.to_world": camera}
     elif camera is not None:
         scene = scene.seen_by(camera, options.get("film"))
+    if _under_transforms():  # their tensors are checked where they are plain
+        return prepare_request(scene, full, params=params, spp=spp, seed=seed, **options).with_versions()
     return request_of(scene, full, params=params, spp=spp, seed=seed, **options)
+
+
+def _under_transforms() -> bool:
+    """Return True where tensors may be of ``torch.func`` or of forward mode: threads of a queue cannot take these."""
+    return transforms_are_active() or forward_mode_is_active()
 
 
 def request_of(scene: Scene, full: bool, **options: Unpack[CommonOptions]) -> RenderRequest:
@@ -324,9 +343,7 @@ def request_of(scene: Scene, full: bool, **options: Unpack[CommonOptions]) -> Re
     """
     request = prepare_request(scene, full=full, **options)
     if any(map(is_transformed, request.params.values())):
-        raise SceneError(
-            "params", "tensors under a transform of torch.func", "plain ones: transforms go through render"
-        )
+        raise SceneError("params", "tensors under a transform of torch.func", "plain ones: items have no gradients")
     request.scene.check(request.params)
     return request.with_versions()
 
