@@ -105,7 +105,76 @@ def test_gradients_reach_the_point_that_a_camera_looks_at() -> None:
     assert torchpt.render_batch(own, poses, spp=1).shape == (1, 2, 12, 12, 3)
 
 
+def test_poses_of_lists_and_of_mixed_types() -> None:
+    made = look_at_pose([0, 1, 4], (0, 0, 0))
+    assert made.dtype is torch.float32 and torch.equal(
+        made, look_at_pose(torch.tensor([0.0, 1.0, 4.0]), torch.zeros(3))
+    )
+    assert axis_angle_pose(torch.zeros(3), torch.zeros(3).double()).dtype is torch.float64
+    assert quaternion_pose(torch.tensor([1, 0, 0, 0]), [0.5, 0.0, 0.0]).dtype is torch.float32
+    assert look_at_pose(torch.zeros(2, 3), [0, 0, 1], drawn(4, 1, 3)).shape == (4, 2, 4, 4)
+    height = torch.tensor(1.0, requires_grad=True)
+    look_at_pose([0.0, height, 4.0], [0, 0, 0]).sum().backward()
+    assert height.grad is not None and float(height.grad) != 0.0
+    compiled = torch.compile(look_at_pose, backend="eager", fullgraph=True)
+    assert torch.equal(compiled(torch.tensor([0.0, 1.0, 4.0]), [0, 0, 0]), made)
+
+
+WRONG_POSES: dict[str, tuple[Any, tuple[Any, ...], str]] = {
+    "no way": (look_at_pose, ([0, 0, 0], [0, 0, 0]), "^target: expected a point other than the origin, got"),
+    "parallel": (
+        look_at_pose,
+        ([0, 0, 0], [0, 2, 0]),
+        r"^up: expected a direction that is not parallel .* \[0.0, 1.0, 0.0\]",
+    ),
+    "no up": (look_at_pose, ([0, 0, 0], [0, 0, 1], [0, 0, 0]), "^up: expected a direction"),
+    "one of many": (
+        quaternion_pose,
+        (torch.eye(5)[:, :4], [0, 0, 0]),
+        "^quaternion: expected numbers that are not all 0",
+    ),
+    "shape": (
+        quaternion_pose,
+        ([0, 0, 1], [0, 0, 0]),
+        r"^quaternion: expected numbers of shape \(..., 4\), got \(3,\)",
+    ),
+    "batches": (axis_angle_pose, (torch.zeros(2, 3), torch.zeros(3, 3)), "^rotation, position: expected shapes that"),
+    "text": (axis_angle_pose, ("abc", [0, 0, 0]), r"^rotation: expected numbers of shape \(..., 3\), got 'abc'"),
+    "rags": (axis_angle_pose, ([0, 0, 0], [[0, 0], [0, 0, 0]]), "^position: expected numbers"),
+    "not finite": (axis_angle_pose, ([0, 0, 0], [0, torch.nan, 0]), "^position: expected finite numbers, got"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_POSES)
+def test_poses_that_are_none(case: str) -> None:
+    make, arguments, says = WRONG_POSES[case]
+    with pytest.raises(SceneError, match=says):
+        make(*arguments)
+
+
 # ---- Parametrizations: poses relative to the initial one
+
+
+@pytest.mark.parametrize("aim", [[0, 1, 0], [0, -1, 0], [0, 0, 0], [1e-8, 1, 0]])
+def test_a_look_at_along_up_and_at_itself_is_a_pose(aim: list[float]) -> None:
+    start = torch.eye(4).double()
+    kind = LookAtPose(start, 2.0)
+    x = torch.tensor([0.5, 0.0, 0.0, *aim], dtype=torch.float64)
+    x[3] += 0.5
+    pose = kind(x.requires_grad_())
+    torch.testing.assert_close(pose[:3, :3] @ pose[:3, :3].T, torch.eye(3).double())
+    pose.sum().backward()
+    assert x.grad is not None and bool(x.grad.isfinite().all())
+    torch.testing.assert_close(kind(kind.inverse(pose.detach())), pose.detach())
+
+
+def test_a_quaternion_of_zeros_turns_nothing() -> None:
+    start = scene().params["camera.to_world"]
+    x = torch.zeros(7, requires_grad=True)
+    pose = QuaternionPose(start, 2.0)(x)
+    torch.testing.assert_close(pose[:3, :3], start[:3, :3])
+    pose.sum().backward()
+    assert x.grad is not None and bool(x.grad.isfinite().all())
 
 
 @pytest.mark.parametrize("kind", POSES)
@@ -259,15 +328,24 @@ def test_a_renderer_with_large_steps() -> None:
 @pytest.mark.parametrize(
     ("faces", "weight", "error", "says"),
     [
-        ([[0, 1, 2]], 1.0, TypeError, "expected faces as a tensor of whole numbers, got list"),
-        (STRIP.float(), 1.0, TypeError, "expected faces as a tensor of whole numbers, got torch.float32"),
-        (STRIP[:, :2], 1.0, ValueError, r"expected faces of shape \(F, 3\), got \(4, 2\)"),
-        (STRIP, -1.0, ValueError, "expected lambda_ as a finite number >= 0, got -1.0"),
+        ([[0, 1, 2]], 1.0, TypeError, "^faces: expected a tensor of whole numbers, got 'list'"),
+        (STRIP.float(), 1.0, TypeError, "^faces: expected a tensor of whole numbers, got 'torch.float32'"),
+        (STRIP[:, :2], 1.0, ValueError, r"^faces: expected a tensor of shape \(F, 3\), got \(4, 2\)"),
+        (STRIP - 1, 1.0, ValueError, "^faces: expected indices of vertices, from 0, got -1"),
+        (STRIP, -1.0, ValueError, "^lambda_: expected a finite number >= 0, got -1.0"),
+        (STRIP, "x", TypeError, "^lambda_: expected a finite number >= 0, got 'x'"),
     ],
 )
 def test_large_steps_that_are_refused(faces: Any, weight: float, error: type[Exception], says: str) -> None:
-    with pytest.raises(error, match=says):
+    with pytest.raises(error, match=says) as refused:
         LargeSteps(faces, weight)
+    assert isinstance(refused.value, SceneError)
+
+
+def test_large_steps_of_too_few_vertices_and_what_print_says() -> None:
+    with pytest.raises(SceneError, match=r"^x: expected vertices \(V, 3\) .* V at least 6, got \(5, 3\)"):
+        LargeSteps(STRIP)(torch.zeros(5, 3))
+    assert repr(LargeSteps(STRIP, 4.5)) == "LargeSteps(lambda_=4.5, 9 edges)"
 
 
 def test_numbers_that_are_not_finite_are_an_error() -> None:

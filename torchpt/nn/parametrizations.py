@@ -30,8 +30,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchpt.core.errors import ArgumentTypeError, ArgumentValueError
 from torchpt.math.laplacian import LaplacianSystem, mesh_edges
-from torchpt.nn.poses import axis_angle_matrix, look_at_matrix, pose_of, quaternion_matrix
+from torchpt.nn.poses import PARALLEL, axis_angle_matrix, look_at_matrix, pose_of, quaternion_matrix
 from torchpt.spec import Pose, Spec
 
 __all__ = [
@@ -241,10 +242,15 @@ class AxisAnglePose(_RelativePose):
 class QuaternionPose(_RelativePose):
     """A rigid motion of a pose: ``x (7,)`` is a quaternion, real part first, then the position over ``length``.
 
-    The quaternion turns the initial pose, and is ``(1, 0, 0, 0)`` at first; it may have any length but 0.
+    The quaternion turns the initial pose, and is ``(1, 0, 0, 0)`` at first. It may have any length; 0 stands for no turn.
     """
 
-    matrix = staticmethod(quaternion_matrix)
+    @staticmethod
+    def matrix(rotation: Tensor) -> Tensor:
+        """Return the rotation of a quaternion."""
+        none = torch.zeros_like(rotation)
+        none[0] = 1.0
+        return quaternion_matrix(torch.where((rotation != 0).any(), rotation, none))
 
     @staticmethod
     def numbers(matrix: Tensor, /) -> Tensor:
@@ -258,7 +264,8 @@ class LookAtPose(PoseParametrization):
     """A pose aimed at a point: ``x (6,)`` is the position of the origin and the point, both over ``length``.
 
     The +z axis points to it, as a camera's does, and the initial +y axis stays in the upper half: no roll about the axis. At
-    first the point lies at distance ``length``. Scale and shear are kept.
+    first the point lies at distance ``length``. Scale and shear are kept. Where the point lies along the initial +y axis,
+    another axis stays in the upper half, and an origin that is the point looks along such an axis: all finite ``x`` are poses.
     """
 
     up: Tensor
@@ -273,8 +280,18 @@ class LookAtPose(PoseParametrization):
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Parametrization`."""
-        axes = look_at_matrix(x[:3], x[3:], self.up)
+        axes = self._axes(x[3:].double() - x[:3].double())
         return pose_of((axes @ self.frame.double()).to(x.dtype), self.length * x[:3])
+
+    def _axes(self, direction: Tensor) -> Tensor:
+        """Return the axes that look in a direction ``(3,)`` float64; another up or direction stands in where there are none."""
+        up = self.up.double()
+        beside = nn.functional.one_hot(up.abs().argmin(), 3).to(up)  # the axis of the world that is furthest from up
+        direction = torch.where((direction != 0).any(), direction, beside)
+        sine = torch.linalg.vector_norm(
+            torch.linalg.cross(nn.functional.normalize(up, dim=0), nn.functional.normalize(direction, dim=0))
+        )
+        return look_at_matrix(torch.zeros_like(direction), direction, torch.where(sine > PARALLEL, up, beside))
 
     def inverse(self, value: Tensor) -> Tensor:
         """See :class:`Parametrization`.
@@ -283,7 +300,7 @@ class LookAtPose(PoseParametrization):
             ValueError: the pose is not the initial one, aimed elsewhere and moved.
         """
         axes = value[:3, :3].double() @ torch.linalg.inv(self.frame.double())
-        aimed = look_at_matrix(torch.zeros_like(axes[:, 2]), axes[:, 2], self.up)
+        aimed = self._axes(axes[:, 2])
         if not _is_rotation(axes) or not torch.allclose(axes, aimed, atol=1e-4):
             raise ValueError("the pose at first, aimed elsewhere and moved, without roll")
         origin = value[:3, 3].double() / self.length
@@ -307,8 +324,7 @@ class LargeSteps(Parametrization):
         lambda_: weight λ of smoothness, from 0; the paper takes 19 for most meshes, more for finer ones.
 
     Raises:
-        TypeError: faces are no tensor of whole numbers.
-        ValueError: a wrong shape, or a λ below 0.
+        SceneError: faces are no tensor ``(F, 3)`` of indices, or λ is no number from 0; also a ``TypeError`` or ``ValueError``.
     """
 
     edges: Tensor
@@ -321,18 +337,29 @@ class LargeSteps(Parametrization):
             or faces.is_complex()
             or faces.dtype == torch.bool
         ):
-            found = faces.dtype if isinstance(faces, Tensor) else type(faces).__name__
-            raise TypeError(f"expected faces as a tensor of whole numbers, got {found}")
+            found = str(faces.dtype) if isinstance(faces, Tensor) else type(faces).__name__
+            raise ArgumentTypeError("faces", found, "a tensor of whole numbers")
         if faces.dim() != 2 or faces.shape[1] != 3:
-            raise ValueError(f"expected faces of shape (F, 3), got {tuple(faces.shape)}")
+            raise ArgumentValueError("faces", tuple(faces.shape), "a tensor of shape (F, 3)")
+        if faces.numel() and int(faces.min()) < 0:
+            raise ArgumentValueError("faces", int(faces.min()), "indices of vertices, from 0")
+        if isinstance(lambda_, bool) or not isinstance(lambda_, int | float):
+            raise ArgumentTypeError("lambda_", lambda_, "a finite number >= 0")
         if not 0.0 <= lambda_ < math.inf:
-            raise ValueError(f"expected lambda_ as a finite number >= 0, got {lambda_}")
+            raise ArgumentValueError("lambda_", lambda_, "a finite number >= 0")
         self.lambda_ = float(lambda_)
         self.register_buffer("edges", mesh_edges(faces), persistent=False)
+        self.vertex_count = int(faces.max()) + 1 if faces.numel() else 0  # at least
         self._system: LaplacianSystem | None = None
 
     def forward(self, x: Tensor) -> Tensor:
-        """See :class:`Parametrization`."""
+        """See :class:`Parametrization`.
+
+        Raises:
+            SceneError: not as many numbers as the mesh has; also a ``ValueError``.
+        """
+        if not self._fits(x):
+            raise ArgumentValueError("x", tuple(x.shape), self._expected())
         return self._system_of(x).solve(x)
 
     def inverse(self, value: Tensor) -> Tensor:
@@ -341,10 +368,19 @@ class LargeSteps(Parametrization):
         Raises:
             ValueError: the value is not of vertices of these faces.
         """
-        count = int(self.edges.max()) + 1 if len(self.edges) else 0
-        if value.dim() != 2 or value.shape[1] != 3 or len(value) < count:
-            raise ValueError(f"vertices (V, 3) of the mesh whose faces LargeSteps was given, V at least {count}")
+        if not self._fits(value):
+            raise ValueError(self._expected())
         return self._system_of(value).apply(value.double()).to(value)
+
+    def _fits(self, vertices: Tensor) -> bool:
+        return vertices.dim() == 2 and vertices.shape[1] == 3 and len(vertices) >= self.vertex_count
+
+    def _expected(self) -> str:
+        return f"vertices (V, 3) of the mesh whose faces LargeSteps was given, V at least {self.vertex_count}"
+
+    def extra_repr(self) -> str:
+        """Return the weight and the number of edges, for ``print``."""
+        return f"lambda_={self.lambda_:g}, {len(self.edges)} edges"
 
     def _system_of(self, vertices: Tensor) -> LaplacianSystem:
         system = self._system
