@@ -106,9 +106,9 @@ def test_robust_means(monkeypatch: pytest.MonkeyPatch):
         ({"params": ["materials.none.reflectance"]}, "materials.none.reflectance"),
         ({"params": []}, "params"),
         ({"loss": torch.ones(4, 4, 3)}, "loss"),
-        ({"loss": lambda picture: picture}, "loss"),
-        ({"loss": lambda picture: torch.ones(())}, "loss"),
-        ({"loss": lambda picture: torch.ones((), requires_grad=True) * 2}, "loss"),
+        ({"loss": lambda picture: picture}, r"loss: .* got 'a tensor of shape \(8, 8, 3\)'"),
+        ({"loss": lambda picture: torch.ones(())}, "loss: .* got 'a tensor that does not depend on the picture'"),
+        ({"loss": lambda picture: torch.ones((), requires_grad=True) * 2}, "loss: .* does not depend on the picture"),
         ({"loss": 3}, "loss"),
         ({"grad_clip": "3"}, "grad_clip"),
     ],
@@ -121,6 +121,24 @@ def test_what_it_refuses(wish: dict[str, Any], named: str):
     given = {"loss": torch.ones(8, 8, 3), "params": [FLOOR], "spp": 2, "passes": 2, **wish}
     with pytest.raises(SceneError, match=named):
         torchpt.gradient(scene(), **given)
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_modes_without_gradients_change_nothing(mode: Any):
+    given = {"loss": lambda picture: picture.mean(), "params": [FLOOR], "spp": 2, "passes": 2}
+    expected = torchpt.gradient(scene(), **given).gradients[FLOOR]
+    with mode():
+        found = torchpt.gradient(scene(), **given)
+    assert torch.equal(found.gradients[FLOOR], expected) and not found.gradients[FLOOR].is_inference()
+
+
+def test_one_name_and_patterns():
+    given = scene()
+    for names in (FLOOR, "*.reflectance", [FLOOR, "materials.*"]):
+        found = torchpt.gradient(given, torch.ones(8, 8, 3), names, spp=2, passes=2)
+        assert next(iter(found.gradients)) == FLOOR
+    with pytest.raises(SceneError, match=r"^params: expected a parameter of this scene or a pattern of some"):
+        torchpt.gradient(given, torch.ones(8, 8, 3), "lights.none.*")
 
 
 def test_options_that_passes_set_themselves():

@@ -10,15 +10,15 @@ import torch
 from torch import Tensor, nn
 
 from torchpt.core.autograd import outside_transforms, transforms_are_active
-from torchpt.core.errors import SceneError, example_names
+from torchpt.core.errors import SceneError
 from torchpt.nn.parametrizations import Parametrization, PoseParametrization, parametrization_of
 from torchpt.rendering.api import render
 from torchpt.rendering.requests import check_options
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
+from torchpt.scene.selection import matching_names
 from torchpt.scene.settings import Params, RendererOptions, RenderOptions, base_seed
-from torchpt.scene.sizes import is_size
 from torchpt.scene.validation import params_as_tensors
 from torchpt.spec.arguments import check_names, expand_signature
 
@@ -89,7 +89,7 @@ class Renderer(nn.Module):
             raise SceneError("full", full, "True or False")
         self.scene, self.seed, self.full, self.options = as_scene(scene), seed, full, options
         check_options(scene, options)
-        self.names = () if names is None else _matching_names(scene, (names,) if isinstance(names, str) else names)
+        self.names = () if names is None else _matching_names(scene, names)
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
             chosen = _chosen(parametrizations, self.names)
@@ -255,26 +255,11 @@ def _inverse(name: str, parametrization: Parametrization, value: Tensor) -> Tens
         raise SceneError(f"params.{name}", shown, str(error)) from None
 
 
-def _matches(scene: Scene, parameter: str, pattern: str) -> bool:
-    """Return True if a pattern matches a parameter. Sizes of shapes, which poses hold too, match by their own name alone."""
-    own_name = pattern.rpartition(".")[2] == parameter.rpartition(".")[2]
-    return fnmatchcase(parameter, pattern) and (own_name or not is_size(scene.spec(parameter)))
-
-
-def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
+def _matching_names(scene: Scene, names: str | Sequence[str]) -> tuple[str, ...]:
     """Return the parameters that match names and patterns, in the scene's order."""
-    if not isinstance(names, Iterable) or isinstance(names, Mapping):
-        raise SceneError("names", names, "a name of scene.params, or a sequence of names and patterns")
-    names = tuple(names)
-    if not names:
-        raise SceneError("names", [], "one name at least, or None for a module without parameters")
-    matched: set[str] = set()
-    for name in names:
-        if not isinstance(name, str):
-            raise SceneError("names", name, "a name of scene.params or a pattern of some, as text")
-        matches = [parameter for parameter in scene.params if parameter == name or _matches(scene, parameter, name)]
-        if not matches:
-            examples = example_names(name, list(scene.params))
-            raise SceneError("names", name, f"a parameter of this scene or a pattern of some, such as {examples}")
-        matched.update(matches)
+    if isinstance(names, Iterable) and not isinstance(names, str | Mapping):
+        names = tuple(names)
+        if not names:
+            raise SceneError("names", [], "one name at least, or None for a module without parameters")
+    matched = frozenset(matching_names(scene, names))
     return tuple(name for name in scene.params if name in matched)

@@ -12,9 +12,11 @@ from torch import Tensor
 
 from torchpt.core.autograd import gradients_of
 from torchpt.core.errors import SceneError
+from torchpt.core.threads import outside_inference_mode
 from torchpt.rendering.api import render
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
+from torchpt.scene.selection import matching_names
 from torchpt.scene.settings import SeedOfCall, base_seed, seed_number
 
 __all__ = ["GradientEstimate", "gradient"]
@@ -61,7 +63,7 @@ class GradientEstimate:
 def gradient(
     scene: Scene,
     loss: Callable[[Tensor], Tensor] | Tensor,
-    params: Mapping[str, Any] | Iterable[str],
+    params: Mapping[str, Any] | Iterable[str] | str,
     *,
     spp: int = 64,
     passes: int = 8,
@@ -77,11 +79,14 @@ def gradient(
     the median of the passes, number by number (each of which is a mean over its samples: a median of means), and ``grad_clip``
     shortens gradients that are long beside those of the other passes. Both errors fall as passes get more samples.
 
+    Under ``torch.no_grad`` and in inference mode it does the same: what it returns needs no gradients.
+
     Args:
         scene: from :func:`torchpt.load`.
         loss: function of the picture ``(H, W, 3)`` that returns a number, evaluated once, on a picture of ``spp`` samples a
             pixel; or the cotangent of the picture, ``(H, W, 3)``.
-        params: values in place of ``scene.params`` by name, or names of these; all are differentiated.
+        params: values in place of ``scene.params`` by name, or names of these, also one name, and patterns such as
+            ``materials.*.reflectance``; all are differentiated.
         spp: samples a pixel of the picture, and of all passes together.
         passes: number of independent passes, at least 2. Each takes ``spp / passes`` samples a pixel, rounded up.
         seed: see :func:`torchpt.render`.
@@ -107,56 +112,82 @@ def gradient(
     if not isinstance(loss, Tensor) and not callable(loss):
         raise SceneError("loss", loss, "a function of the picture, or a tensor of its shape")
     first = base_seed(seed_number(seed))
-    values = {name: _leaf(value) for name, value in _named(scene, params).items()}
-    if not values:
-        raise SceneError("params", params, "at least one name of scene.params")
-    share, found = -(-spp // passes), None
-    if not isinstance(loss, Tensor):
-        with torch.no_grad():
-            picture = render(scene, params=values, spp=spp, seed=first, **options)
-        found, loss = _cotangent(loss, picture)
-    each: dict[str, list[Tensor]] = {name: [] for name in values}
-    not_finite = 0
-    for number in range(passes):
-        leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
-        own = (first + (number + 1) * _STRIDE) % (1 << 32)
-        picture = render(scene, params=leaves, spp=1, seed=first, spp_grad=share, seed_grad=own, **options)
-        if loss.shape != picture.shape:
-            raise SceneError(
-                "loss", f"a tensor of shape {tuple(loss.shape)}", f"one of the picture's, {tuple(picture.shape)}"
-            )
-        grads = gradients_of([picture], list(leaves.values()), [loss.to(picture)])
-        for name, grad in zip(leaves, grads, strict=True):
-            grad = torch.zeros_like(leaves[name]) if grad is None else grad
-            if bool(torch.isfinite(grad).all()):
-                each[name].append(grad.double())
-            else:
-                not_finite += 1
+    share = -(-spp // passes)
+    with outside_inference_mode(), torch.enable_grad():
+        values = {name: _leaf(value) for name, value in _named(scene, params).items()}
+        if not values:
+            raise SceneError("params", params, "at least one name of scene.params")
+        found = None
+        if not isinstance(loss, Tensor):
+            with torch.no_grad():
+                picture = render(scene, params=values, spp=spp, seed=first, **options)
+            found, loss = _cotangent(loss, picture)
+        each = _by_passes(scene, loss, values, [share] * passes, first, options)
+    not_finite = sum(passes - len(grads) for grads in each.values())
     for name, grads in each.items():
         if len(grads) < 2:
             raise SceneError(name, "gradients that are not finite", "at least two passes with finite ones")
     gradients, errors, clipped = {}, {}, 0
-    for name, grads in each.items():
-        shorter, count = _clipped(grads, grad_clip)
-        stack = torch.stack(shorter)
-        whole = stack.mean(0) if combine == "mean" else _median(stack)
-        gradients[name] = whole.to(values[name])
-        errors[name] = (stack.std(0) / len(shorter) ** 0.5).to(values[name])
-        clipped += count
+    with outside_inference_mode():
+        for name, grads in each.items():
+            shorter, count = _clipped(grads, grad_clip)
+            stack = torch.stack(shorter)
+            whole = stack.mean(0) if combine == "mean" else _median(stack)
+            gradients[name] = whole.to(values[name])
+            errors[name] = (stack.std(0) / len(shorter) ** 0.5).to(values[name])
+            clipped += count
     return GradientEstimate(found, gradients, errors, passes, share, clipped, not_finite)
 
 
-def _named(scene: Scene, params: Mapping[str, Any] | Iterable[str]) -> Mapping[str, Any]:
-    """Return values by name; names alone stand for the scene's own values."""
+def _by_passes(
+    scene: Scene,
+    cotangent: Tensor,
+    values: Mapping[str, Tensor],
+    samples: Iterable[int],
+    seed: int,
+    options: Mapping[str, Any],
+) -> dict[str, list[Tensor]]:
+    """Return the gradients of all passes by name, without those that are not finite.
+
+    Args:
+        scene: the scene.
+        cotangent: of the picture.
+        values: of the parameters.
+        samples: samples a pixel of each pass.
+        seed: of the picture; each pass has one of its own.
+        options: further options of ``render``.
+
+    Raises:
+        SceneError: a cotangent of another shape than the picture's.
+    """
+    each: dict[str, list[Tensor]] = {name: [] for name in values}
+    for number, spp in enumerate(samples):
+        leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+        own = (seed + (number + 1) * _STRIDE) % (1 << 32)
+        picture = render(scene, params=leaves, spp=1, seed=seed, spp_grad=spp, seed_grad=own, **options)
+        if cotangent.shape != picture.shape:
+            shape = f"a tensor of shape {tuple(cotangent.shape)}"
+            raise SceneError("loss", shape, f"one of the picture's, {tuple(picture.shape)}")
+        grads = gradients_of([picture], list(leaves.values()), [cotangent.to(picture)])
+        for name, grad in zip(leaves, grads, strict=True):
+            grad = torch.zeros_like(leaves[name]) if grad is None else grad
+            if bool(torch.isfinite(grad).all()):
+                each[name].append(grad.double())
+    return each
+
+
+def _named(scene: Scene, params: Any) -> Mapping[str, Any]:
+    """Return values by name; names and patterns alone stand for the scene's own values.
+
+    Raises:
+        SceneError: neither, or a name or pattern that matches nothing.
+    """
     if isinstance(params, Mapping):
         return params
-    if isinstance(params, str):
-        raise SceneError("params", params, "values by name, or a list of names")
-    names, scene = list(params), as_scene(scene)
-    for name in names:
-        if name not in scene.params:
-            raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.params))}")
-    return {name: scene.params[name] for name in names}
+    if not isinstance(params, Iterable) or isinstance(params, Tensor):
+        raise SceneError("params", params, "values by name, or names and patterns of scene.params")
+    names = params if isinstance(params, str) else tuple(params)
+    return {name: scene.params[name] for name in matching_names(as_scene(scene), names, "params")}
 
 
 def _leaf(value: Any) -> Tensor:
@@ -170,12 +201,17 @@ def _cotangent(loss: Callable[[Tensor], Tensor], picture: Tensor) -> tuple[float
     picture = picture.detach().requires_grad_()
     with torch.enable_grad():
         value = loss(picture)
-    expected = "a function that returns a single number as a tensor, differentiable in the picture"
-    if not isinstance(value, Tensor) or value.numel() != 1 or not value.requires_grad:
-        raise SceneError("loss", type(value).__name__, expected)
-    (cotangent,) = torch.autograd.grad(value, picture, allow_unused=True)
+    cotangent, found = None, "a tensor that does not depend on the picture"
+    if not isinstance(value, Tensor):
+        found = value
+    elif value.numel() != 1:
+        found = f"a tensor of shape {tuple(value.shape)}"
+    elif value.requires_grad:
+        (cotangent,) = torch.autograd.grad(value, picture, allow_unused=True)
     if cotangent is None:
-        raise SceneError("loss", "a number that does not depend on the picture", expected)
+        raise SceneError(
+            "loss", found, "a function that returns a single number as a tensor, differentiable in the picture"
+        )
     return float(value.detach()), cotangent
 
 
