@@ -15,6 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchpt.core.errors import ArgumentTypeError, ArgumentValueError
 from torchpt.images.metrics import FLOOR, relative, symmetric
 from torchpt.math.laplacian import adjacent_faces, cotangent_weights, mesh_edges, neighbour_sums
 
@@ -36,22 +37,21 @@ def _check_pictures(*pictures: Tensor) -> None:
     for picture in pictures:
         if not isinstance(picture, Tensor):
             hint = "; hand over its .image" if hasattr(picture, "image") else ""
-            raise TypeError(f"expected a picture as a tensor, got {type(picture).__name__}{hint}")
+            raise ArgumentTypeError(f"picture: expected a tensor, got {type(picture).__name__}{hint}")
         if not picture.is_floating_point():
-            raise TypeError(
-                f"expected a picture of floating numbers, linear as renders are, got one of {picture.dtype}"
-            )
+            expected = "a tensor of floating numbers, linear as renders are"
+            raise ArgumentTypeError(f"picture: expected {expected}, got one of {picture.dtype}")
     shapes = {tuple(picture.shape) for picture in pictures}
     if len(shapes) > 1:
-        raise ValueError(f"pictures differ in shape: {', '.join(map(str, sorted(shapes)))}")
+        raise ArgumentValueError(f"pictures: expected one shape, got {' and '.join(map(str, sorted(shapes)))}")
 
 
 def l2(image: Tensor, target: Tensor) -> Tensor:
     """Return the mean of ``(x - t)²``.
 
     Raises:
-        ValueError: the shapes differ (all losses raise it).
-        TypeError: not a floating tensor, for example a :class:`torchpt.Rendering` (all losses raise it).
+        SceneError: the shapes differ, also a ``ValueError`` (all losses raise it); no floating tensor, for example a
+            :class:`torchpt.Rendering`, also a ``TypeError``.
     """
     _check_pictures(image, target)
     return (image - target).square().mean()
@@ -108,22 +108,21 @@ def _check_mesh(vertices: Tensor, faces: Tensor) -> Tensor:
     """Return faces on the device of the vertices.
 
     Raises:
-        TypeError: vertices are no floating tensor, or faces no tensor of whole numbers.
-        ValueError: a wrong shape, or a face with a vertex that is not there.
+        SceneError: vertices are no floating tensor, or faces no tensor of whole numbers, also a ``TypeError``; a wrong shape,
+            or a face with a vertex that is not there, also a ``ValueError``.
     """
     if not isinstance(vertices, Tensor) or not vertices.is_floating_point():
         found = vertices.dtype if isinstance(vertices, Tensor) else type(vertices).__name__
-        raise TypeError(f"expected vertices as a tensor of floating numbers, got {found}")
+        raise ArgumentTypeError(f"vertices: expected a tensor of floating numbers, got {found}")
     if not isinstance(faces, Tensor) or faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
         found = faces.dtype if isinstance(faces, Tensor) else type(faces).__name__
-        raise TypeError(f"expected faces as a tensor of whole numbers, got {found}")
+        raise ArgumentTypeError(f"faces: expected a tensor of whole numbers, got {found}")
     for name, value in (("vertices", vertices), ("faces", faces)):
         if value.dim() != 2 or value.shape[1] != 3:
-            raise ValueError(f"expected {name} of shape (N, 3), got {tuple(value.shape)}")
+            raise ArgumentValueError(f"{name}: expected shape (N, 3), got {tuple(value.shape)}")
     if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
-        raise ValueError(
-            f"expected indices of vertices in 0..{len(vertices) - 1}, got {int(faces.min())}..{int(faces.max())}"
-        )
+        expected = f"indices of vertices in 0..{len(vertices) - 1}"
+        raise ArgumentValueError(f"faces: expected {expected}, got {int(faces.min())}..{int(faces.max())}")
     return faces.to(vertices.device)
 
 
@@ -131,8 +130,8 @@ def mesh_edge_loss(vertices: Tensor, faces: Tensor, target_length: float = 0.0) 
     """Return the mean of ``(length - target_length)²`` over the edges of a mesh; 0 without edges.
 
     Raises:
-        TypeError: vertices are no floating tensor, or faces no tensor of whole numbers (all losses of meshes raise it).
-        ValueError: a wrong shape, or an index that is out of range (all losses of meshes raise it).
+        SceneError: vertices are no floating tensor, or faces no tensor of whole numbers, also a ``TypeError`` (all losses of
+            meshes raise it); a wrong shape, or an index that is out of range, also a ``ValueError``.
     """
     faces = _check_mesh(vertices, faces)
     if not len(faces):
@@ -154,7 +153,7 @@ def mesh_laplacian_smoothing(vertices: Tensor, faces: Tensor, method: str = "uni
     """
     faces = _check_mesh(vertices, faces)
     if method not in ("uniform", "cot"):
-        raise ValueError(f"expected method uniform or cot, got {method!r}")
+        raise ArgumentValueError("method", method, "uniform or cot")
     if not len(faces):
         return 0.0 * vertices.sum()
     edges = mesh_edges(faces)

@@ -14,7 +14,7 @@ import pytest
 import torch
 from few import few
 
-from torchpt.core.errors import AssetError, OutputError
+from torchpt.core.errors import AssetError, OutputError, SceneError
 from torchpt.images import check_writable, read_image, read_layers, write_image
 from torchpt.images import read as read_module
 
@@ -324,5 +324,7 @@ def test_huge_headers_are_refused_before_memory_is_asked_for(tmp_path: Path, mon
 )
 def test_what_is_no_linear_picture_is_refused(tmp_path, given, got):
     with pytest.raises(ValueError, match=f"expected a tensor of linear floats .* got {got}"):
+        write_image(tmp_path / "x.png", given)
+    with pytest.raises(SceneError, match="^image: "):
         write_image(tmp_path / "x.png", given)
     assert not any(tmp_path.iterdir())

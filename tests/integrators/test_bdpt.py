@@ -15,7 +15,7 @@ from light_rooms import ROOMS, room
 from same_means import SEEDS, assert_same_means, pictures
 
 import torchpt
-from torchpt.core.errors import NotBuiltError
+from torchpt.core.errors import SceneError
 from torchpt.math.vectors import dot, rows
 from torchpt.paths.integrators.kinds.bdpt import STRATEGIES, Bdpt
 from torchpt.paths.integrators.weights import (
@@ -273,7 +273,7 @@ def test_a_scene_without_light_is_black():
 def test_gradients_are_refused():
     scene = torchpt.load(GLASS, device="cpu")
     leaf = scene.params["lights.p.intensity"].clone().requires_grad_()
-    with pytest.raises(NotBuiltError, match="such as path"):
+    with pytest.raises(SceneError, match="expected one of path, direct, .* where gradients are wanted, got 'bdpt'"):
         torchpt.render(scene, params={"lights.p.intensity": leaf}, integrator="bdpt", spp=1, compile="off")
 
 

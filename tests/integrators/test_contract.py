@@ -12,7 +12,7 @@ from few import few
 from few_lanes import few_lanes
 
 import torchpt
-from torchpt.core.errors import NotBuiltError, SceneError
+from torchpt.core.errors import SceneError
 from torchpt.paths.integrators import KINDS
 from torchpt.paths.integrators.base import Integrator
 from torchpt.paths.layers import LAYERS
@@ -164,7 +164,7 @@ def test_gradients(name):
             torchpt.render(scene, params={"materials.clay.reflectance": leaf}, **wish)
         return
     if KINDS[name]().light_walk() is not None:
-        with pytest.raises(NotBuiltError, match="light paths"):
+        with pytest.raises(SceneError, match="expected one of path, direct, .* where gradients are wanted"):
             torchpt.render(scene, params={"materials.clay.reflectance": leaf}, **wish)
         return
     if key is None:

@@ -13,7 +13,7 @@ from light_rooms import ROOMS
 from same_means import assert_same_means, pictures
 
 import torchpt
-from torchpt.core.errors import NotBuiltError, SceneError
+from torchpt.core.errors import SceneError
 from torchpt.engines import tensors_forward
 from torchpt.engines.kernels.engine import KernelsEngine
 from torchpt.paths import photons
@@ -160,7 +160,7 @@ def test_what_is_refused():
     grey = torch.full((3,), 0.5, requires_grad=True)
     diffuse = {**LAMP, "materials": {"grey": {"type": "diffuse"}}}
     diffuse["shapes"] = {**LAMP["shapes"], "floor": {**LAMP["shapes"]["floor"], "material": "grey"}}
-    with pytest.raises(NotBuiltError, match="such as path"):
+    with pytest.raises(SceneError, match="expected one of path, direct, .* where gradients are wanted, got 'vcm'"):
         scene = torchpt.load(diffuse, device="cpu")
         torchpt.render(scene, params={"materials.grey.reflectance": grey}, integrator="vcm", spp=1)
 

@@ -197,7 +197,7 @@ UNKNOWN: dict[str, tuple[Callable[[torchpt.Scene], Any], str]] = {
         lambda s: losses.l2(pictures(s, full=True), torch.zeros(4, 4, 3)),
         "got Rendering; hand over its .image",
     ),
-    "loss of a list": (lambda s: losses.l1([1.0], torch.zeros(1)), "expected a picture as a tensor, got list$"),
+    "loss of a list": (lambda s: losses.l1([1.0], torch.zeros(1)), "picture: expected a tensor, got list$"),
     "one index": (lambda s: batch(s, full=True)[1], r"expected renderings\[s, c\].* got renderings\[1\]"),
 }
 

@@ -137,18 +137,19 @@ def test_gradients(loss: Any) -> None:
 @pytest.mark.parametrize(
     ("vertices", "faces", "error", "says"),
     [
-        (torch.zeros(4, 3, dtype=torch.int64), TETRAHEDRON[1], TypeError, "expected vertices as a tensor of floating"),
-        (TETRAHEDRON[0], TETRAHEDRON[1].float(), TypeError, "expected faces as a tensor of whole numbers"),
-        (TETRAHEDRON[0], [[0, 1, 2]], TypeError, "expected faces as a tensor of whole numbers, got list"),
-        (TETRAHEDRON[0][:, :2], TETRAHEDRON[1], ValueError, r"expected vertices of shape \(N, 3\), got \(4, 2\)"),
+        (torch.zeros(4, 3, dtype=torch.int64), TETRAHEDRON[1], TypeError, "vertices: expected a tensor of floating"),
+        (TETRAHEDRON[0], TETRAHEDRON[1].float(), TypeError, "faces: expected a tensor of whole numbers"),
+        (TETRAHEDRON[0], [[0, 1, 2]], TypeError, "faces: expected a tensor of whole numbers, got list"),
+        (TETRAHEDRON[0][:, :2], TETRAHEDRON[1], ValueError, r"vertices: expected shape \(N, 3\), got \(4, 2\)"),
         (TETRAHEDRON[0][:3], TETRAHEDRON[1], ValueError, r"expected indices of vertices in 0..2, got 0..3"),
     ],
 )
 def test_meshes_that_are_refused(vertices: Any, faces: Any, error: type[Exception], says: str) -> None:
     for loss in (mesh_edge_loss, mesh_laplacian_smoothing, mesh_normal_consistency):
-        with pytest.raises(error, match=says):
+        with pytest.raises(error, match=says) as refused:
             loss(vertices, faces)
-    with pytest.raises(ValueError, match="expected method uniform or cot"):
+        assert isinstance(refused.value, SceneError)
+    with pytest.raises(ValueError, match="method: expected uniform or cot, got 'cotan'"):
         mesh_laplacian_smoothing(*TETRAHEDRON, method="cotan")
 
 

@@ -64,7 +64,7 @@ def test_signatures_spell_every_argument_out(function: Any, own: tuple[str, ...]
 
 def test_signatures_are_as_they_were_written_by_hand() -> None:
     shown = inspect.signature(torchpt.render).parameters
-    assert str(shown["spp"]) == "spp: int | None = None" and str(shown["edges"]) == "edges: bool = True"
+    assert str(shown["edge_spp"]) == "edge_spp: int | None = None" and str(shown["edges"]) == "edges: bool = True"
     assert shown["dtype"].default is torch.float32 and shown["adjoint"].default is None and len(shown) == 26
 
 
@@ -369,3 +369,38 @@ def test_seeds_that_are_refused(scene: torchpt.Scene, seed: torch.Tensor) -> Non
             call(scene, spp=1, seed=seed)
     with pytest.raises(SceneError, match="seed: expected a whole number 0"):
         torchpt.render(scene, spp=1, seed=torch.tensor(-1))
+
+
+def test_whole_numbers_may_be_tensors(scene: torchpt.Scene) -> None:
+    grey = torch.tensor([0.5], requires_grad=True)  # one number for a colour, and for an angle
+    given = {"shapes.ball.material.reflectance": grey, "camera.fov": torch.tensor([40.0])}
+    numbers = {"spp": torch.tensor(3), "seed_grad": torch.tensor([5]), "spp_grad": torch.tensor(2)}
+    torchpt.render(scene, params=given, **numbers).mean().backward()
+    leaf = torch.tensor(0.5, requires_grad=True)
+    plain = {"shapes.ball.material.reflectance": leaf, "camera.fov": 40.0}
+    torchpt.render(scene, params=plain, spp=3, seed_grad=5, spp_grad=2).mean().backward()
+    assert grey.grad is not None and leaf.grad is not None and torch.equal(grey.grad[0], leaf.grad)
+    for name, value in (("spp", torch.tensor(2.0)), ("seed_grad", torch.tensor([1, 2]))):
+        options: Any = {name: value}
+        with pytest.raises(
+            SceneError, match=f"^{name}: expected a whole number, also as a tensor with one element, got"
+        ):
+            torchpt.render(scene, **options)
+
+
+def test_numbers_that_are_not_finite_are_named_by_their_place(scene: torchpt.Scene) -> None:
+    pose = scene.params["camera.to_world"].clone()
+    pose[1, 2] = torch.inf
+    colour = torch.tensor([0.5, torch.nan, 0.5])
+    for name, value, place in (
+        ("camera.to_world", pose, r"inf at \[1, 2\]"),
+        ("shapes.ball.material.reflectance", colour, r"nan at \[1\]"),
+        ("camera.fov", torch.tensor(torch.nan), "nan'"),
+    ):
+        with pytest.raises(SceneError, match=rf"^params.{name}: expected numbers finite in float32, got '{place}"):
+            torchpt.render(scene, params={name: value}, spp=1)
+
+
+def test_what_print_says_of_a_scene(scene: torchpt.Scene) -> None:
+    said = f"Scene(of a mapping: 4 x 4, 1 shapes, 1 primitives, {len(scene.params)} parameters, cpu)"
+    assert repr(scene) == said

@@ -22,13 +22,14 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from torchpt.core.errors import NotBuiltError
+from torchpt.core.errors import NotBuiltError, SceneError
 from torchpt.core.memory import check_memory
 from torchpt.core.threads import limited_threads
 from torchpt.gradients.camera import film_space_applies, film_space_backward, needs_direction_gradients
 from torchpt.gradients.parameters import SceneTape, attached
 from torchpt.gradients.replay import replay_paths
 from torchpt.gradients.tape import tape
+from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.ranks import Group
 from torchpt.scene import Scene
@@ -36,10 +37,14 @@ from torchpt.scene.memory_estimate import mark_loaded, memory_estimate
 from torchpt.scene.prepare import is_small
 from torchpt.scene.settings import Settings
 
-__all__ = ["WITHOUT_LIGHT_PATHS", "attached", "film_space_applies", "gradients"]
+__all__ = ["attached", "film_space_applies", "gradients", "integrators_with_gradients"]
 
-#: What is accepted in place of an integrator with light paths, which have no gradients.
-WITHOUT_LIGHT_PATHS = "one without light paths where gradients are asked for, such as path"
+
+def integrators_with_gradients() -> str:
+    """Return a phrase of the integrators that have gradients: samples of these light their own pixel, without light paths."""
+    kinds = {name: kind for name, kind in INTEGRATORS.items() if kind.light and not kind.splats}
+    names = [name for name, kind in kinds.items() if kind().light_walk() is None]
+    return f"one of {', '.join(names)} where gradients are wanted"
 
 
 def gradients(
@@ -82,7 +87,7 @@ def gradients(
         expected = "one without a transmit of its own, where geometry is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)
     if integrator.light_walk() is not None:
-        raise NotBuiltError("integrator.type", integrator.name, WITHOUT_LIGHT_PATHS)
+        raise SceneError("integrator.type", integrator.name, integrators_with_gradients())
     if (attached or film_space) and integrator.splats:
         expected = "one whose samples light their own pixels alone, where geometry or the camera is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from os import PathLike
 from typing import Any
 
-from torchpt.core.errors import AssetError
+from torchpt.core.errors import ArgumentValueError, AssetError
 from torchpt.images.decode import existing_image, oiio_error
 
 __all__ = ["Fact", "checked_header", "put_header", "read_header"]
@@ -32,15 +32,16 @@ def checked_header(header: Mapping[str, Fact]) -> dict[str, Fact]:
     """Return the metadata after checking that a header can store it.
 
     Raises:
-        ValueError: a name that is not an identifier, or a value that is not printable text, a number or a bool.
+        SceneError: a name that is not an identifier, or a value that is not printable text, a number or a bool; also a
+            ``ValueError``.
     """
     for name, value in header.items():
         if not isinstance(name, str) or not _IDENTIFIER.match(name):
-            raise ValueError(f"header: expected names of letters, digits and _, got {name!r}")
+            raise ArgumentValueError("header", name, "names of letters, digits and _")
         if not isinstance(value, str | int | float):
-            raise ValueError(f"header: {name}: expected text or a number, got {value!r}")
+            raise ArgumentValueError(f"header.{name}", value, "text or a number")
         if isinstance(value, str) and (not value or not value.isprintable()):
-            raise ValueError(f"header: {name}: expected printable text, got {value!r}")
+            raise ArgumentValueError(f"header.{name}", value, "printable text")
     return dict(header)
 
 

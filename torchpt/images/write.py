@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.core.errors import OutputError
+from torchpt.core.errors import ArgumentValueError, OutputError
 from torchpt.core.files import as_path
 from torchpt.images.colour import display
 from torchpt.images.header import Fact, checked_header, put_header
@@ -74,9 +74,9 @@ def write_image(
             ``torchpt:NAME``, and read by :func:`torchpt.read_header`.
 
     Raises:
-        SceneError: ``path`` is not a path.
+        SceneError: ``path`` is not a path; an image or layer of another shape, or a header that cannot be stored, also a
+            ``ValueError``.
         OutputError: an unsupported ending, or a path that cannot be written.
-        ValueError: an image or layer of another shape, or a header that cannot be stored.
     """
     destination = output_path(path)
     pixels, facts = _checked_pixels("image", image), checked_header(header or {})
@@ -85,11 +85,14 @@ def write_image(
         by_name = {"image": pixels} | {name: _checked_pixels(name, layer) for name, layer in (layers or {}).items()}
         for name, layer in by_name.items():
             if layer.shape[:2] != pixels.shape[:2]:
-                raise ValueError(f"layer {name!r} is {tuple(layer.shape[:2])}, the picture {tuple(pixels.shape[:2])}")
+                height, width = pixels.shape[:2]
+                expected = f"a layer of the picture's {height} x {width} pixels"
+                raise ArgumentValueError(f"layers.{name}: expected {expected}, got {tuple(layer.shape)}")
         channels = [channel for name, layer in by_name.items() for channel in channel_names(name, layer.shape[2])]
         duplicates = sorted({channel for channel in channels if channels.count(channel) > 1})
         if duplicates:
-            raise ValueError(f"two layers have the channel {duplicates[0]} (a picture of 4 channels has its alpha: A)")
+            expected = "layers of different channels (a picture of 4 channels has its alpha: A)"
+            raise ArgumentValueError(f"layers: expected {expected}, got two with the channel {duplicates[0]}")
         encode = partial(_encode_float, temporary, np.concatenate(list(by_name.values()), axis=2), channels, facts)
     elif temporary.suffix == ".hdr":  # RGBE has no sign: the encoder would wrap around
         rgb = np.nan_to_num(_rgb(pixels), nan=0.0, posinf=_LARGEST_RGBE).clip(0, _LARGEST_RGBE)
@@ -171,14 +174,14 @@ def _checked_pixels(name: str, image: Tensor) -> np.ndarray:
     if not isinstance(image, Tensor) or not image.is_floating_point():
         hint = "; hand over its .image" if hasattr(image, "image") else ""
         got = f"numbers of {image.dtype}" if isinstance(image, Tensor) else type(image).__name__
-        raise ValueError(f"{name}: expected a tensor of linear floats (H, W, C), got {got}{hint}")
+        raise ArgumentValueError(f"{name}: expected a tensor of linear floats (H, W, C), got {got}{hint}")
     pixels = image.detach().to("cpu", torch.float32)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or 0 in pixels.shape:
-        raise ValueError(f"{name}: expected (H, W, C), got {tuple(image.shape)}")
+        raise ArgumentValueError(f"{name}: expected (H, W, C), got {tuple(image.shape)}")
     if name == "image" and pixels.shape[2] not in (1, 3, 4):
-        raise ValueError(f"image: expected 1, 3 or 4 channels, got {pixels.shape[2]}")
+        raise ArgumentValueError(f"image: expected 1, 3 or 4 channels, got {pixels.shape[2]}")
     return np.ascontiguousarray(pixels.numpy())
 
 

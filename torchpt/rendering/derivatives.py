@@ -10,10 +10,9 @@ from torch import Tensor
 
 from torchpt import gradients
 from torchpt.core.autograd import Backward, custom_vjp
-from torchpt.core.errors import EdgeWarning, NotBuiltError, RenderError, SceneError, warn_caller
+from torchpt.core.errors import EdgeWarning, RenderError, SceneError, warn_caller
 from torchpt.gradients import edges
 from torchpt.gradients.second import hessian_products, jvp
-from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.ranks import together
 from torchpt.rendering import Rendering
 from torchpt.rendering.requests import RenderRequest
@@ -62,11 +61,8 @@ def differentiable_rendering(
 def _check_differentiable(settings: Settings) -> None:
     """Raise SceneError for settings of which pictures have no gradients."""
     integrator = settings.integrator
-    if not integrator.light:
-        others = ", ".join(name for name, kind in INTEGRATORS.items() if kind.light and not kind.splats)
-        raise SceneError("integrator.type", integrator.name, f"one of {others} where gradients are wanted")
-    if integrator.light_walk() is not None:
-        raise NotBuiltError("integrator.type", integrator.name, gradients.WITHOUT_LIGHT_PATHS)
+    if not integrator.light or integrator.light_walk() is not None:
+        raise SceneError("integrator.type", integrator.name, gradients.integrators_with_gradients())
     if settings.render.checkpoint is not None:
         raise SceneError("render.checkpoint", settings.render.checkpoint, "null where gradients are wanted")
 

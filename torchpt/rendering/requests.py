@@ -36,6 +36,7 @@ from torchpt.scene.settings import (
     film_keys,
     seed_number,
     settings_of_call,
+    with_plain_numbers,
 )
 from torchpt.scene.texel_params import update_texels, with_texel_params
 from torchpt.scene.validation import params_as_tensors
@@ -150,6 +151,7 @@ def template_of(scene: Scene, full: bool, options: Mapping[str, Any]) -> Request
         SceneError: an argument is not accepted.
         RenderError: the denoiser is missing.
     """
+    options = with_plain_numbers(options)
     shared = {name: value for name, value in options.items() if name not in ("params", "seed")}
     templates, description = _templates.get(scene, (None, None))
     if templates is None or description is not scene.description:
@@ -178,6 +180,7 @@ def check_options(scene: Scene, options: Mapping[str, Any]) -> tuple[CallArgumen
     Raises:
         SceneError: an argument is not accepted.
     """
+    options = with_plain_numbers(options)
     call = CallArguments.of(options)
     if call.edge_guide is not None and not call.edges:
         raise SceneError("edge_guide", call.edge_guide, "None where edges is False")

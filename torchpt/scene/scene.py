@@ -235,6 +235,17 @@ class Scene:
         """Return the name of its file without folder and ending; "" for a mapping."""
         return Path(self.description.file or "").stem
 
+    def __repr__(self) -> str:
+        """Return the name or file, the size of the film, and what the scene has."""
+        width, height = self.film_size()
+        parts, copies = self._built.parts, self._built.copies
+        shapes = len({part.name for part in parts}) + len(copies)
+        primitives = sum(part.primitive_count for part in parts)
+        return (
+            f"Scene({self.name or 'of a mapping'}: {width} x {height}, {shapes} shapes, {primitives} primitives, "
+            f"{len(self.params)} parameters, {self.device})"
+        )
+
     @property
     def size_phrase(self) -> str:
         """Return a phrase about the scene's size, for errors."""

@@ -66,6 +66,7 @@ __all__ = [
     "seed_number",
     "settings_of_call",
     "settings_with",
+    "with_plain_numbers",
 ]
 
 #: The blocks of settings.
@@ -206,6 +207,8 @@ Params = Mapping[str, Tensor | float | str | Sequence[Any] | np.ndarray]
 FilmSettings = Mapping[str, Any] | tuple[int, int] | list[int]
 #: Methods for gradients, the default first.
 ADJOINTS = ("replay", "autograd")
+#: Arguments of a call, beside its seed, that may be tensors of one whole number.
+_PLAIN_NUMBERS = ("spp", "spp_grad", "seed_grad")
 #: Phrases of what is accepted.
 _TYPE = "a type, or a mapping with `type` and its settings"
 _FILE = "null or a file path"
@@ -230,7 +233,9 @@ def _flag(doc: str, *, default: bool) -> Argument:
 class _SampleOptions(TypedDict, total=False):
     """The argument that tables list first."""
 
-    spp: Annotated[int | None, Integer(64, low=1, doc="samples a pixel; a limit of time or error may end sooner")]
+    spp: Annotated[
+        int | Tensor | None, Integer(64, low=1, doc="samples a pixel; a limit of time or error may end sooner")
+    ]
 
 
 class TraceOptions(TypedDict, total=False):
@@ -300,13 +305,14 @@ class TraceOptions(TypedDict, total=False):
         ),
     ]
     seed_grad: Annotated[
-        int | None,
+        int | Tensor | None,
         _whole_number(
             0, "of the backward pass; none: one of its own, as shared samples would bias the gradient of a squared loss"
         ),
     ]
     spp_grad: Annotated[
-        int | None, _whole_number(1, "samples a pixel of the backward pass; none: as many as the forward pass took")
+        int | Tensor | None,
+        _whole_number(1, "samples a pixel of the backward pass; none: as many as the forward pass took"),
     ]
 
 
@@ -507,14 +513,31 @@ def seed_number(seed: SeedOfCall) -> Any:
     if seed is None:
         with outside_transforms():
             return int(torch.randint(MAX_SEED, (), device="cpu"))
-    if not isinstance(seed, Tensor):
-        return seed
-    shown = (tuple(seed.shape), seed.dtype)
-    whole = not (seed.is_floating_point() or seed.is_complex() or seed.dtype == torch.bool or seed.is_meta)
-    if not whole or seed.numel() != 1 or is_transformed(seed):
-        shown = "a tensor under a transform of torch.func" if is_transformed(seed) else shown
-        raise SceneError("seed", shown, "a whole number, also as a tensor with one element, or None for a new one")
-    return int(seed)
+    expected = "a whole number, also as a tensor with one element, or None for a new one"
+    return _number_of(seed, "seed", expected) if isinstance(seed, Tensor) else seed
+
+
+def with_plain_numbers(options: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return arguments of a call in which samples and the seed of the backward pass are no tensors.
+
+    Raises:
+        SceneError: a tensor that is not a single whole number.
+    """
+    expected = "a whole number, also as a tensor with one element"
+    given = {name: options[name] for name in _PLAIN_NUMBERS if isinstance(options.get(name), Tensor)}
+    return (
+        {**options, **{name: _number_of(value, name, expected) for name, value in given.items()}} if given else options
+    )
+
+
+def _number_of(value: Tensor, key: str, expected: str) -> int:
+    """Return the whole number that a tensor holds."""
+    shown = (tuple(value.shape), value.dtype)
+    whole = not (value.is_floating_point() or value.is_complex() or value.dtype == torch.bool or value.is_meta)
+    if not whole or value.numel() != 1 or is_transformed(value):
+        shown = "a tensor under a transform of torch.func" if is_transformed(value) else shown
+        raise SceneError(key, shown, expected)
+    return int(value)
 
 
 def base_seed(seed: Any) -> int:

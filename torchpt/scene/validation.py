@@ -53,15 +53,15 @@ def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], 
 def params_as_tensors(scene: Scene, params: Mapping[str, Any]) -> dict[str, Any]:
     """Return parameters in the shapes that the scene has; numbers and lists become tensors as in a scene file.
 
-    A number stands for three equal channels of a colour, a tensor without dimensions too: gradients flow to it. Values that
-    are neither, and names that the scene has not, are returned unchanged: :meth:`Scene.check` refuses them.
+    A number stands for three equal channels of a colour, a tensor of one number too, ``()`` or ``(1,)``: gradients flow to it.
+    Values that are neither, and names that the scene has not, are returned unchanged: :meth:`Scene.check` refuses them.
     """
     return {name: _as_tensor(scene, name, value) if name in scene.params else value for name, value in params.items()}
 
 
 def _as_tensor(scene: Scene, name: str, value: Any) -> Any:
-    own, spec = scene.params[name], scene.spec(name)
-    if not isinstance(value, Tensor):
+    own, spec, is_tensor = scene.params[name], scene.spec(name), isinstance(value, Tensor)
+    if not is_tensor:
         if isinstance(value, str) and isinstance(spec, Index):  # the name of a medium
             value = _number_of(spec, name, value)
         if not isinstance(value, int | float | list | tuple | np.ndarray | np.number) or isinstance(value, bool):
@@ -71,6 +71,8 @@ def _as_tensor(scene: Scene, name: str, value: Any) -> Any:
         except (TypeError, ValueError, RuntimeError, OverflowError):
             return value
     colour = isinstance(spec, Color) and own.dim() == 1
+    if is_tensor and value.shape == (1,) and (colour or own.dim() == 0):
+        value = value.reshape(())
     return value.expand(own.shape) if colour and value.dim() == 0 and value.is_floating_point() else value
 
 

@@ -206,10 +206,7 @@ class _Numbers(Spec):
 
     def check(self, value: Tensor) -> None:
         """See :class:`Spec`."""
-        import torch
-
-        if not bool(torch.isfinite(value.float()).all()):
-            raise Refused("numbers finite in float32", "a value that is not finite in float32")
+        _check_finite(value)
         low, high = self.bounds
         # Rounding on the way here must not get a value refused.
         slack = getattr(self, "slack", 0.0)  # of texels
@@ -368,10 +365,7 @@ class _Vector(Spec):
 
     def check(self, value: Tensor) -> None:
         """See :class:`Spec`."""
-        import torch
-
-        if not bool(torch.isfinite(value.float()).all()):
-            raise Refused("numbers finite in float32", "a value that is not finite in float32")
+        _check_finite(value)
 
 
 @dataclass(frozen=True)
@@ -469,11 +463,8 @@ class Pose(Spec):
 
     def check(self, value: Tensor) -> None:
         """See :class:`Spec`."""
-        import torch
-
         matrix = value.double().cpu().numpy()
-        if not bool(torch.isfinite(value.float()).all()):
-            raise Refused("numbers finite in float32", "a value that is not finite in float32")
+        _check_finite(value)
         if not is_usable(matrix):
             raise Refused(f"a matrix that can be inverted, {FINITE_WORDS}", matrix.tolist())
         if abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > POSE_TOLERANCE:
@@ -627,3 +618,14 @@ class Custom(Spec):
     def read(self, value: Any) -> Any:
         """See :class:`Spec`."""
         return self.reader(value)
+
+
+def _check_finite(value: Tensor) -> None:
+    """Raise Refused unless all numbers are finite in float32; the error names the first that is not."""
+    import torch
+
+    finite = torch.isfinite(value.float())
+    if not bool(finite.all()):
+        index = tuple((~finite).nonzero()[0].tolist())
+        place = f" at {list(index)}" if index else ""
+        raise Refused("numbers finite in float32", f"{float(value[index])}{place}")
