@@ -38,6 +38,24 @@ def trace(stage: Callable[..., Iterable[Tensor]], *given: Tensor, **tables: Tens
     return tracer, kernel_ir(TracedStage(tracer.graph, Sinks(store=stores), tracer.tables, tensors=len(given)), VECTORS)
 
 
+def gradient_of_squares(x: Tensor) -> list[Tensor]:
+    with torch.enable_grad():
+        leaf = x.detach().requires_grad_()
+        return list(torch.autograd.grad(leaf.square(), leaf, torch.ones_like(x)))
+
+
+def test_anomaly_detection_is_off_within_and_comes_back() -> None:
+    x = torch.zeros(3, 1)
+    _, plain = trace(gradient_of_squares, x)
+    for check_nan in (True, False):
+        with torch.autograd.set_detect_anomaly(True, check_nan):
+            assert trace(gradient_of_squares, x)[1] == plain
+            with Tracer(LANES[0], {}), Tracer(LANES[0], {}):
+                assert not torch.is_anomaly_enabled()
+            assert torch.is_anomaly_enabled() and torch.is_anomaly_check_nan_enabled() is check_nan
+    assert not torch.is_anomaly_enabled()
+
+
 REFUSED: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "sum over lanes": ("a reduction over lanes", lambda x: x - x.sum(1, keepdim=True)),
     "maximum of all": ("a reduction over lanes", lambda x: x - x.amax()),

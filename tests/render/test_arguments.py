@@ -374,7 +374,7 @@ def test_seeds_that_are_refused(scene: torchpt.Scene, seed: torch.Tensor) -> Non
 def test_whole_numbers_may_be_tensors(scene: torchpt.Scene) -> None:
     grey = torch.tensor([0.5], requires_grad=True)  # one number for a colour, and for an angle
     given = {"shapes.ball.material.reflectance": grey, "camera.fov": torch.tensor([40.0])}
-    numbers = {"spp": torch.tensor(3), "seed_grad": torch.tensor([5]), "spp_grad": torch.tensor(2)}
+    numbers: Any = {"spp": torch.tensor(3), "seed_grad": torch.tensor([5]), "spp_grad": torch.tensor(2)}
     torchpt.render(scene, params=given, **numbers).mean().backward()
     leaf = torch.tensor(0.5, requires_grad=True)
     plain = {"shapes.ball.material.reflectance": leaf, "camera.fov": 40.0}

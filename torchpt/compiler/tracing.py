@@ -52,6 +52,8 @@ LOWERINGS: dict[str, Handler] = {}
 
 _PACKAGE = __file__.rpartition("compiler")[0]  # the folder of torchpt
 _active: list[Tracer] = []  # tracers that are entered, the innermost last
+#: While tracers are entered: whether anomaly detection, which they disable, looked for NaN. Empty where it was off.
+_anomaly: list[bool] = []
 
 
 def register_lowering(*names: str) -> Callable[[Handler], Handler]:
@@ -141,6 +143,10 @@ class Tracer(TorchDispatchMode):
 
     def __enter__(self) -> Tracer:
         _active.append(self)
+        # Anomaly detection of autograd reads the values of gradients, which lanes of a trace do not have.
+        if torch.is_anomaly_enabled():
+            _anomaly.append(torch.is_anomaly_check_nan_enabled())
+            torch.set_anomaly_enabled(False)
         self._reads.__enter__()
         return super().__enter__()
 
@@ -148,6 +154,8 @@ class Tracer(TorchDispatchMode):
         _active.remove(self)
         super().__exit__(*error)
         self._reads.__exit__(*error)
+        if _anomaly and not _active:
+            torch.set_anomaly_enabled(True, _anomaly.pop())
 
     # -- inputs and results
 
