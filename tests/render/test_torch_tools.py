@@ -208,6 +208,80 @@ def test_layers_under_func_grad(scene):
     assert torch.equal(torch.func.grad(depth)(pose), leaf.grad) and float(leaf.grad[2, 3]) == pytest.approx(1, rel=0.1)
 
 
+LAYERED = {**WISHES, "film": {**ROOM["film"], "aovs": ["depth", "object_id", "albedo"]}, "full": True}
+
+
+def layered(scene: torchpt.Scene, colour: Tensor) -> Any:
+    return torchpt.render(scene, params={WALL: colour}, **LAYERED)
+
+
+@own
+@pytest.mark.parametrize("way", [*ONCE, *TWICE])
+def test_layers_that_no_loss_reads_have_no_say(scene, colour, way):
+    def of_picture(colour: Tensor) -> Tensor:
+        rendering = layered(scene, colour)
+        assert list(rendering.layers) == ["depth", "object_id", "albedo"] and len(rendering.layers["object_id"])
+        return rendering.image.square().mean()
+
+    def alone(colour: Tensor) -> Tensor:
+        return torchpt.render(scene, params={WALL: colour}, **WISHES, film=ROOM["film"]).square().mean()
+
+    u = torch.tensor([1.0, -0.5, 0.3])
+    ways = {**ONCE, **TWICE}
+    assert torch.equal(ways[way](of_picture, colour, u), ways[way](alone, colour.clone(), u))
+
+
+READ: dict[str, Callable[[Any], Tensor]] = {
+    "item": lambda layers: layers["albedo"],
+    "get": lambda layers: layers.get("albedo"),
+    "values": lambda layers: list(layers.values())[2],
+    "items": lambda layers: dict(layers.items())["albedo"],
+    "copy": lambda layers: layers.copy()["albedo"],
+    "dict": lambda layers: {**layers}["albedo"],
+    "or": lambda layers: (layers | {})["albedo"],
+}
+
+
+@own
+@pytest.mark.parametrize("way", ["jvp", "hessian", "dual"])
+@pytest.mark.parametrize("read", READ)
+def test_a_layer_that_is_read_in_forward_mode_is_named(scene, colour, read, way):
+    """Its tangent was 0 without a word."""
+
+    def mean(colour: Tensor) -> Tensor:
+        return READ[read](layered(scene, colour).layers).mean()
+
+    forward_ad, u = torch.autograd.forward_ad, torch.ones(3)
+    named = r"^layers.(albedo|depth): this layer has no forward-mode derivatives"
+    with pytest.raises(TorchptError, match=named):
+        if way == "dual":
+            with forward_ad.dual_level():
+                mean(forward_ad.make_dual(colour, u))
+        else:
+            ({**ONCE, **TWICE}[way])(mean, colour, u)
+    if way == "jvp":
+        leaf = colour.clone().requires_grad_()
+        mean(leaf).backward()
+        assert leaf.grad is not None and torch.equal(torch.func.grad(mean)(colour), leaf.grad)
+
+
+@own
+def test_layers_of_a_batch_in_forward_mode(scene, colour):
+    def pictures(colour: Tensor) -> Any:
+        return torchpt.render_batch(scene, params=[{WALL: colour}], **LAYERED)
+
+    u = torch.ones(3)
+    assert float(torch.func.jvp(lambda c: pictures(c).image.mean(), (colour,), (u,))[1]) > 0.0
+    with pytest.raises(TorchptError, match=r"layers.albedo: "):
+        torch.func.jvp(lambda c: pictures(c).layers["albedo"].mean(), (colour,), (u,))
+
+
+def test_denoising_under_a_transform_is_refused(scene, colour):
+    film = {**ROOM["film"], "denoise": True}
+    with pytest.raises(SceneError, match="film.denoise: expected false under transforms of torch.func"):
+        torch.func.grad(lambda c: torchpt.render(scene, params={WALL: c}, full=True, film=film).image.mean())(colour)
+
+
 # -- modes
 
 

@@ -35,12 +35,12 @@ __all__ = [
     "Forward",
     "Second",
     "custom_vjp",
-    "forward_mode_is_active",
     "gradients_of",
     "is_batched",
     "is_transformed",
     "outside_transforms",
     "transforms_are_active",
+    "under_transforms",
     "wants_gradients",
 ]
 
@@ -56,7 +56,7 @@ _NO_FORWARD_MODE = (
     " or the difference of two renders of one seed"
 )
 _NO_SECOND_DERIVATIVES = (
-    "this layer has no second derivatives: take the difference of two gradients of one seed_grad,"
+    "a layer such as depth has no second derivatives: take the difference of two gradients of one seed_grad,"
     " or torch.func.vjp of the picture for a Gauss-Newton step"
 )
 _NO_THIRD_DERIVATIVES = (
@@ -154,9 +154,9 @@ def transforms_are_active() -> bool:
     return _are_functorch_transforms_active()
 
 
-def forward_mode_is_active() -> bool:
-    """Return True inside of ``torch.autograd.forward_ad.dual_level``, or of forward mode of ``torch.func``."""
-    return torch.autograd.forward_ad._current_level >= 0
+def under_transforms() -> bool:
+    """Return True inside of a transform of ``torch.func``, or of ``torch.autograd.forward_ad.dual_level``."""
+    return transforms_are_active() or torch.autograd.forward_ad._current_level >= 0
 
 
 def _levels(value: Tensor) -> Iterator[Tensor]:

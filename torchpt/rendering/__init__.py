@@ -12,6 +12,7 @@
 ``checkpoint.py``    saves and resumes a render; ``split.py`` shares a pass among ranks
 ``many.py``          several renders on one thread pool; ``batches/`` scenes by cameras in one call
 ``one_path.py``      prints one path vertex by vertex; ``nonfinite.py`` counts non-finite samples by cause
+``forward_layers.py`` layers in forward mode, which have no derivatives there
 ``graphs.py``        ``render`` as a custom operator for ``torch.compile``
 ===================  ===================================================================================
 

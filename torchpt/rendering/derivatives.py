@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from torchpt.gradients import edges
 from torchpt.gradients.second import hessian_products, jvp
 from torchpt.ranks import together
 from torchpt.rendering import Rendering
+from torchpt.rendering.forward_layers import with_derivatives
 from torchpt.rendering.requests import RenderRequest
 from torchpt.scene.settings import Settings
 from torchpt.scene.versions import AFTER
@@ -51,11 +53,10 @@ def differentiable_rendering(
     (image,) = custom_vjp(forward, backward, tensors, request.scene.weights(), derivatives.second)
     rendering = made[-1]
     made.clear()  # autograd keeps the closure alive: it must not hold pictures
-    layers = edges.followed(request.settings)
-    if layers:
-        values = {name: rendering.layers[name] for name in layers}
-        rendering.layers |= edges.differentiable(values, tensors, derivatives.of_layers, derivatives.params)
-    return replace(rendering, image=image)
+    followed = edges.followed(request.settings)
+    values = {name: rendering.layers[name] for name in followed}
+    make = partial(edges.differentiable, values, tensors, derivatives.of_layers, derivatives.params)
+    return replace(rendering, image=image, layers=with_derivatives(rendering.layers, followed, make))
 
 
 def _check_differentiable(settings: Settings) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 
 from torch import Tensor
 
-from torchpt.core.autograd import Backward, custom_vjp
-from torchpt.core.errors import NoLightWarning, RenderError, warn_caller
+from torchpt.core.autograd import Backward, custom_vjp, is_transformed, under_transforms
+from torchpt.core.errors import NoLightWarning, RenderError, SceneError, warn_caller
 from torchpt.rendering import Rendering, render_scene
 from torchpt.rendering.graphs import reuse_rendering
 from torchpt.rendering.requests import RenderRequest
@@ -35,6 +35,8 @@ def execute_request(
         SceneError: a parameter is not accepted.
     """
     scene, settings, call = request.scene, request.settings, request.call
+    if settings.film.denoise and any(map(is_transformed, request.params.values())):
+        raise SceneError("film.denoise", True, "false under transforms of torch.func: their pictures cannot be read")
 
     def render(params: Mapping[str, Tensor], rays: tuple[Tensor, ...]) -> Rendering:
         if rendered:
@@ -87,7 +89,13 @@ def _constant(
             " take torch.func.vjp of the picture"
         )
 
-    (image,) = custom_vjp(forward, backward, (*params.values(), *(request.rays or ())), (), second)
+    tensors = (*params.values(), *(request.rays or ()))
+    (image,) = custom_vjp(forward, backward, tensors, (), second)
     rendering = made[-1]
     made.clear()  # autograd keeps the closure alive: it must not hold pictures
-    return replace(rendering, image=image)
+    rendering = replace(rendering, image=image)
+    if rendering.layers and under_transforms():
+        from torchpt.rendering.forward_layers import constant_layers
+
+        rendering.layers = constant_layers(rendering.layers, settings, tensors, backward)
+    return rendering

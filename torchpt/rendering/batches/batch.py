@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import forward_mode_is_active, is_transformed, transforms_are_active
+from torchpt.core.autograd import is_transformed, under_transforms
 from torchpt.core.errors import SceneError
 from torchpt.core.memory import check_limit, mb
 from torchpt.core.threads import limited_threads, outside_inference_mode
@@ -37,6 +37,7 @@ from torchpt.rendering.batches.inputs import (
     values_of,
 )
 from torchpt.rendering.execution import execute_request
+from torchpt.rendering.forward_layers import with_derivatives
 from torchpt.rendering.requests import RenderRequest, prepare_request
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
@@ -201,7 +202,7 @@ def render_batch(
         # Others are errors, or None for the scenes' own.
         counts = [spp for spp in given_spp if type(spp) is int and spp > 0]
         tasks_of = task_counts(total, sum(counts) / len(counts) if counts else None) if total else lambda picture: 1
-        if _under_transforms():
+        if under_transforms():  # threads of a queue cannot take their tensors
             for picture in chain([first], pictures):
                 with naming_errors(picture.name, ""):
                     on_done(picture, None, execute_request(picture.request))
@@ -233,7 +234,12 @@ def render_batch(
     image = _stack(images)
     if not full:
         return image
-    layers = {name: _stack([[r.layers[name] for r in row] for row in rows]) for name in rows[0][0].layers}
+    names = tuple(rows[0][0].layers)
+
+    def stacked() -> dict[str, Tensor]:
+        return {name: _stack([[r.layers[name] for r in row] for row in rows]) for name in names}
+
+    layers = with_derivatives(dict.fromkeys(names, image), names, stacked)
     smooth = [[r.denoised for r in row if r.denoised is not None] for row in rows]
     return Renderings(image, layers, _stack(smooth) if smooth[0] else None, rows)
 
@@ -325,14 +331,9 @@ def _request_by(
         params = {**params, "camera.to_world": camera}
     elif camera is not None:
         scene = scene.seen_by(camera, options.get("film"))
-    if _under_transforms():  # their tensors are checked where they are plain
+    if under_transforms():  # their tensors are checked where they are plain
         return prepare_request(scene, full, params=params, spp=spp, seed=seed, **options).with_versions()
     return request_of(scene, full, params=params, spp=spp, seed=seed, **options)
-
-
-def _under_transforms() -> bool:
-    """Return True where tensors may be of ``torch.func`` or of forward mode: threads of a queue cannot take these."""
-    return transforms_are_active() or forward_mode_is_active()
 
 
 def request_of(scene: Scene, full: bool, **options: Unpack[CommonOptions]) -> RenderRequest:
