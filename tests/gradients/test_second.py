@@ -298,5 +298,5 @@ def test_second_derivatives_of_layers_are_refused():
         rendering = torchpt.render(scene, params={name: value}, full=True, film={"aovs": ["depth"]}, **WISHES)
         return rendering.layers["depth"].sum()
 
-    with pytest.raises(TorchptError, match="^this layer has no second derivatives"):
+    with pytest.raises(TorchptError, match="^a layer such as depth has no second derivatives"):
         torch.func.grad(lambda value: torch.func.grad(depth)(value).sum())(at)
