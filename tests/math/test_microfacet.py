@@ -13,6 +13,7 @@ from torch import Tensor
 from torchpt.math import beckmann
 from torchpt.math import microfacet as mf
 from torchpt.math.beckmann import BECKMANN
+from torchpt.math.diffuse_coat import diffuse_reflectance, normal_reflectance
 from torchpt.math.vectors import dot
 
 ROUGH = [(1e-4, 1e-4), (1e-3, 1e-3), (0.1, 0.1), (0.5, 0.5), (1.0, 1.0), (0.05, 0.6), (1.0, 1e-4)]
@@ -246,6 +247,52 @@ def test_what_facets_give_back(alpha, facets):
         anisotropic = mf.directional_albedo(towards(angle, 1), one, one, None, 64, 64, facets)
         assert abs(float(anisotropic) - float(directional_albedo)) < 1e-3
         cos = wo[2, :1]
-        both = mf.coat_reflectance(cos, one, eta, facets) + mf.coat_transmittance(cos, one, eta, facets)
+        seen = mf.fresnel_dielectric(dot(wo, m), eta).reflectance * facets.masking(wi, *rough)
+        both = seen.mean() + mf.coat_transmittance(cos, one, eta, facets)
         assert 0 < float(both) <= 1 + 1e-3
         assert float(both) <= float(mf.directional_albedo(wo[:, :1], one, None, eta, facets=facets)) + 1e-3
+
+
+@pytest.mark.parametrize("facets", FACETS.values(), ids=FACETS)
+@pytest.mark.parametrize("alpha", [0.03, 0.2, 1.0])
+@pytest.mark.parametrize("eta", [1 / 2.4, 1 / 1.49, 1.3])
+def test_diffuse_light_at_a_coat(facets, alpha, eta):
+    """The quadratures of smooth parts agree with an average over draws, from either side of the coat."""
+    n = 1 << 16
+    u = torch.quasirandom.SobolEngine(3, scramble=True, seed=7).draw(n, dtype=torch.float64).T.contiguous()
+    rough, one = lanes(alpha, alpha, n), torch.tensor([alpha], dtype=torch.float64)
+    index = torch.tensor([eta], dtype=torch.float64)
+
+    def reflected(cos: Tensor) -> float:
+        wo = torch.stack(((1.0 - cos * cos).sqrt(), torch.zeros_like(cos), cos))
+        m = facets.sample_normal(wo, *rough, u[:2])
+        cos_m = dot(wo, m)
+        wi = mf.reflect(wo, m, cos_m)
+        return float((mf.fresnel_dielectric(cos_m, index).reflectance * facets.masking(wi, *rough)).mean())
+
+    assert float(diffuse_reflectance(one, index, facets)) == pytest.approx(reflected(u[2].sqrt()), abs=3e-4)
+    assert float(normal_reflectance(one, index, facets)) == pytest.approx(reflected(torch.ones(n).double()), abs=3e-4)
+
+
+@pytest.mark.parametrize("facets", FACETS.values(), ids=FACETS)
+@pytest.mark.parametrize("alpha", [0.05, 0.3, 1.0])
+@pytest.mark.parametrize("eta", [1 / 2.4, 1 / 1.49, 1.3])
+@pytest.mark.parametrize("integral", [diffuse_reflectance, normal_reflectance])
+def test_derivatives_of_a_coat(integral, facets, alpha, eta):
+    """First and second derivatives by roughness and index are those of the values at steps that move many edges."""
+    for i, step in ((0, 0.02 * alpha), (1, 0.003)):
+        at = torch.tensor([alpha, eta], dtype=torch.float64)
+
+        def value(x: Tensor, i: int = i, at: Tensor = at) -> Tensor:
+            a, e = (x if k == i else at[k] for k in (0, 1))
+            return integral(a[None], e[None], facets)[0]
+
+        x = at[i].clone().requires_grad_()
+        slope = torch.autograd.grad(value(x), x, create_graph=True)[0]
+        first, second = slope.item(), torch.autograd.grad(slope, x)[0].item()
+        with torch.no_grad():
+            low, middle, high = value(x - step).item(), value(x).item(), value(x + step).item()
+        assert first == pytest.approx((high - low) / (2 * step), rel=5e-3)
+        # Beckmann's rational masking has a second derivative that jumps, which a step blurs.
+        size = abs(first) / at[i].item() * (0.03 if facets is mf.GGX else 0.2)
+        assert second == pytest.approx((high + low - 2 * middle) / step**2, rel=0.03, abs=size)

@@ -29,6 +29,7 @@ __all__ = [
     "directional_albedo",
     "fresnel_conductor",
     "fresnel_dielectric",
+    "gauss_legendre",
     "ggx",
     "half_vector",
     "height_correlated_masking",
@@ -406,23 +407,93 @@ GGX = Ggx()
 # ---- Integrals over visible normals: albedo of facets, reflectance and transmittance of coats
 
 
-def _legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
+def gauss_legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return Gauss-Legendre nodes and weights on [0, 1]."""
     x, weights = np.polynomial.legendre.leggauss(n)
     return 0.5 * (x + 1.0), 0.5 * weights
 
 
 class _Normals(NamedTuple):
-    """Quadrature nodes: visible normals ``m (3, K Q)`` of K directions ``wo (3, K Q)``, Q for each, and weights ``(Q,)``."""
+    """Quadrature nodes: visible normals of K directions, Q for each, in the frame of the azimuth of their direction.
+
+    Where integrands have edges, those of total internal reflection and of the horizon, the nodes are constants under
+    differentiation; what depends on the roughness is the density of normals at them. Nodes that followed the roughness would
+    cross the edges: then first derivatives are off by a tenth, and second derivatives miss what crosses.
+
+    Attributes:
+        wo: ``(3, K Q)``.
+        m: ``(3, K Q)``.
+        alpha_u: ``(K Q,)``.
+        alpha_v: ``(K Q,)``.
+        area: ``(K Q,)`` projected area of the facets that ``wo`` sees, see :class:`MaskingTerms`.
+        weights: ``(Q,)``, which sum to 1.
+        facets: distribution of the normals.
+    """
 
     wo: Tensor
     m: Tensor
-    alpha: Tensor
+    alpha_u: Tensor
+    alpha_v: Tensor
+    area: Tensor
     weights: Tensor
+    facets: MicrofacetDistribution
 
     def mean(self, x: Tensor) -> Tensor:
         """Average over the nodes of each direction: ``(K Q,) -> (K,)``."""
         return (x.reshape(-1, len(self.weights)) * self.weights).sum(1)
+
+    def density(self, m: Tensor) -> Tensor:
+        """Return the density of visible normals ``m (3, K Q)``, over its own value: 1, with derivatives."""
+        return _over_value(self.facets.density(m, self.alpha_u, self.alpha_v) / self.area)
+
+    def normalized(self, density: Tensor, at_nodes: Tensor) -> Tensor:
+        """Divide a density by its integral, which is 1, with derivatives that are 0 but for the error of the quadrature.
+
+        Args:
+            density: ``(K Q,)`` from :meth:`density`.
+            at_nodes: ``(K Q,)`` the same of the nodes, which are not bounded.
+        """
+        return density / _over_value(self.mean(at_nodes)).repeat_interleave(len(self.weights))
+
+    def open_normals(self, eta: Tensor, cos: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the normals for integrals over what passes, and the factor ``(K Q,)`` by which their density changes.
+
+        From the denser side they follow the index as the edge of total internal reflection does: refracted cosines are kept, so
+        sines against ``wo`` are in proportion to the index. Normals stay where they are if the great circle from ``wo`` through
+        them meets the horizon before that edge: they would cross the horizon.
+
+        Args:
+            eta: ``(1,)`` index of the far side over that of the side of ``wo``.
+            cos: ``(K Q,)`` cosines of ``wo`` and the nodes.
+        """
+        index, cos, up = eta.detach(), cos.detach(), self.wo[2].detach()
+        sin2 = (1.0 - cos * cos).clamp_min(0.0)
+        critical = (1.0 - index * index).clamp_min(0.0).sqrt()
+        # Height over the horizon of the great circle's point at the edge, times the sine.
+        height = up * critical * sin2.sqrt() + (self.m[2].detach() - up * cos) * index
+        moves = (index < 1.0) & (cos > critical) & (height > 0.0)
+        scale = torch.where(moves, _over_value(eta), 1.0)
+        along = torch.where(moves, 1.0 - sin2 * scale * scale, 1.0).sqrt()
+        moved = self.wo * along + (self.m - self.wo * cos) * scale
+        # The solid angle changes by scale^2 and the ratio of both cosines, which the visible area of the facet cancels.
+        return torch.where(moves, self.m.detach() + (moved - moved.detach()), self.m), scale * scale
+
+
+def _over_value(x: Tensor) -> Tensor:
+    """Return a positive tensor over its own value: 1, with the derivatives of its logarithm."""
+    return x / x.detach().clamp_min(torch.finfo(x.dtype).tiny)
+
+
+def _following(m: Tensor, wo: Tensor) -> Tensor:
+    """Return normals ``(3, N)`` that are constants in the frame of the azimuth of ``wo (3, N)``."""
+    r2 = torch.addcmul(wo[0] * wo[0], wo[1], wo[1])
+    slanted = r2 > 1e-24
+    r = torch.where(slanted, r2, 1.0).sqrt()
+    x, y = torch.where(slanted, wo[0] / r, 1.0), torch.where(slanted, wo[1] / r, 0.0)
+    cos, sin = x * x.detach() + y * y.detach(), y * x.detach() - x * y.detach()  # 1 and 0, with derivatives
+    m = m.detach()
+    turned = torch.stack((cos * m[0] - sin * m[1], sin * m[0] + cos * m[1], m[2]))
+    return m + (turned - turned.detach())
 
 
 def directional_albedo(
@@ -447,61 +518,58 @@ def directional_albedo(
         heights: number of Gauss-Legendre nodes.
         facets: distribution of the normals.
     """
-    (a, wa), (b, wb) = _legendre(azimuths), _legendre(heights)  # nodes and weights of u[0] and of u[1]
+    (a, wa), (b, wb) = gauss_legendre(azimuths), gauss_legendre(heights)  # nodes and weights of u[0] and of u[1]
     u = wo.new_tensor(np.stack(np.meshgrid(a if alpha_v is not None else 0.5 * a, b, indexing="ij")).reshape(2, -1))
     k, q = wo.shape[1], azimuths * heights  # directions, and nodes for each
     wo = wo.repeat_interleave(q, 1)
     au = alpha_u.expand(k * q)
     av = au if alpha_v is None else alpha_v.expand(k * q)
     bounded = eta is None and facets.bounded_sampling
-    m = facets.sample_normal(wo, au, av, u.repeat(1, k), bounded=bounded)
-    cos = dot(wo, m)
+    m = facets.sample_normal(wo.detach(), au.detach(), av.detach(), u.repeat(1, k), bounded=bounded)
+    m = m if alpha_v is None else _following(m, wo)
+    area = facets.masking_terms(wo, wo, au, av).area
+    nodes = _Normals(wo, m, au, av, area=area, weights=wo.new_tensor(np.outer(wa, wb).ravel()), facets=facets)
 
     def unblocked(w: Tensor, height: Tensor) -> Tensor:
         """Return the share of light along ``w`` that no facet blocks; ``height (K Q,)`` is its cosine, 0 if it fails."""
         return facets.masking_terms(wo, torch.stack((w[0], w[1], height)), au, av, by_height=True).shadowing
 
-    back = reflect(wo, m, cos)  # the reflected direction
-    out = unblocked(back, back[2].clamp_min(0.0))
+    def reflected(m: Tensor, cos: Tensor) -> Tensor:
+        """Return the share of light reflected at ``m`` that no facet blocks."""
+        back = reflect(wo, m, cos)
+        return unblocked(back, back[2].clamp_min(0.0))
+
+    cos, density = dot(wo, m), nodes.density(m)
+    out = reflected(m, cos)
     if bounded:
         # Bounded sampling has another density; this is the ratio of both.
         s_o = stretched_length(wo, au, av)
-        out = out * (_bound(wo, au, av).k * wo[2] + s_o) / (wo[2] + s_o)
+        ratio = (_bound(wo, au, av).k * wo[2] + s_o) / (wo[2] + s_o)
+        return nodes.mean(out * density * ratio.detach())
+    out = out * nodes.normalized(density, density)
     if eta is not None:
+        # Light that passes is taken from what is reflected, so that the index counts only where light passes.
+        m, change = nodes.open_normals(eta, cos)
+        cos = dot(wo, m)
         boundary = fresnel_dielectric(cos, eta)
         on = normalize(refract(wo, m, cos, boundary))  # the refracted direction
-        through = unblocked(on, (-on[2]).clamp_min(0.0))
-        out = boundary.reflectance * out + (1.0 - boundary.reflectance) * through
-    return (out.reshape(k, q) * wo.new_tensor(np.outer(wa, wb).ravel())).sum(1)
-
-
-def _lanes(cosines: Tensor, alpha: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """Return directions in the xz plane with given cosines, each ``n`` times, and as many roughnesses."""
-    z = cosines.repeat_interleave(n)
-    return torch.stack(((1.0 - z * z).clamp_min(0.0).sqrt(), torch.zeros_like(z), z)), alpha.expand_as(z)
-
-
-def _normals(
-    cosines: Tensor, alpha: Tensor, facets: MicrofacetDistribution, azimuths: int = 32, heights: int = 32
-) -> _Normals:
-    """Sample visible normals at Gauss-Legendre nodes; by symmetry half the azimuths suffice."""
-    (a, wa), (b, wb) = _legendre(azimuths), _legendre(heights)  # nodes and weights of u[0] and of u[1]
-    u = cosines.new_tensor(np.stack(np.meshgrid(0.5 * a, b, indexing="ij")).reshape(2, -1))
-    wo, alphas = _lanes(cosines, alpha, u.shape[1])
-    m = facets.sample_normal(wo, alphas, alphas, u.repeat(1, len(cosines)))
-    return _Normals(wo=wo, m=m, alpha=alphas, weights=cosines.new_tensor(np.outer(wa, wb).ravel()))
+        through = unblocked(on, (-on[2]).clamp_min(0.0)) - reflected(m, cos)
+        out = out + (1.0 - boundary.reflectance) * through * nodes.normalized(nodes.density(m) * change, density)
+    return nodes.mean(out)
 
 
 def _normals_of_mitsuba(cosines: Tensor, alpha: Tensor, facets: MicrofacetDistribution, n: int = 32) -> _Normals:
-    """Sample normals at the nodes of Mitsuba's integrals."""
-    (a, wa), (b, wb) = _legendre(n), _legendre(n)
+    """Sample normals at the nodes of Mitsuba's integrals, for directions in the xz plane."""
+    (a, wa), (b, wb) = gauss_legendre(n), gauss_legendre(n)
     half = n // 2  # by symmetry half of u[0] suffices
     u = cosines.new_tensor(np.stack(np.meshgrid(a[:half], b, indexing="ij")).reshape(2, -1))
-    wo, alphas = _lanes(cosines, alpha, u.shape[1])
+    z = cosines.repeat_interleave(u.shape[1])
+    wo, alphas = torch.stack(((1.0 - z * z).clamp_min(0.0).sqrt(), torch.zeros_like(z), z)), alpha.expand_as(z)
     u = u.repeat(1, len(cosines))
     m = _disk_normals(wo, alphas, u) if facets is GGX else facets.sample_normal(wo, alphas, alphas, u)
     weights = cosines.new_tensor(2.0 * np.outer(wa[:half], wb).ravel())  # 2: for the other half
-    return _Normals(wo=wo, m=m, alpha=alphas, weights=weights)
+    area = facets.masking_terms(wo, wo, alphas, alphas).area
+    return _Normals(wo, m, alphas, alphas, area=area, weights=weights, facets=facets)
 
 
 def _disk_normals(wo: Tensor, alphas: Tensor, u: Tensor) -> Tensor:
@@ -515,8 +583,41 @@ def _disk_normals(wo: Tensor, alphas: Tensor, u: Tensor) -> Tensor:
     return normalize(torch.stack((alphas * along, -alphas * x, up)))
 
 
-def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor, facets: MicrofacetDistribution = GGX) -> Tensor:
+def coat_reflectance(
+    cosines: Tensor, alpha: Tensor, eta: Tensor, facets: MicrofacetDistribution = GGX, n: int = 64
+) -> Tensor:
     """Compute the single-scattering reflectance ``(K,)`` of rough dielectric facets: the mean of ``F G1(wi)``.
+
+    Values near the critical angle are off by up to 1e-3, as the square root of Fresnel's formula begins between nodes. For
+    diffuse light, :func:`torchpt.math.diffuse_coat.diffuse_reflectance` is more precise, and faster.
+
+    Args:
+        cosines: ``(K,)`` cosines of ``wo``, positive.
+        alpha: ``(1,)``.
+        eta: ``(1,)`` index of the far side over that of the side of ``wo``.
+        facets: distribution of the normals.
+        n: number of Gauss-Legendre nodes an axis.
+    """
+    nodes = _normals_of_mitsuba(cosines, alpha, facets, n)
+    nodes = nodes._replace(m=nodes.m.detach())
+    cos, density = dot(nodes.wo, nodes.m), nodes.density(nodes.m)
+
+    def seen(m: Tensor, cos: Tensor) -> Tensor:
+        return facets.masking(reflect(nodes.wo, m, cos), nodes.alpha_u, nodes.alpha_v)
+
+    m, change = nodes.open_normals(eta, cos)
+    cos_open = dot(nodes.wo, m)
+    passed = (1.0 - fresnel_dielectric(cos_open, eta).reflectance) * seen(m, cos_open)
+    return nodes.mean(
+        seen(nodes.m, cos) * nodes.normalized(density, density)
+        - passed * nodes.normalized(nodes.density(m) * change, density)
+    )
+
+
+def coat_transmittance(cosines: Tensor, alpha: Tensor, eta: Tensor, facets: MicrofacetDistribution = GGX) -> Tensor:
+    """Compute the single-scattering transmittance ``(K,)`` of rough dielectric facets: the mean of ``(1 - F) G1(wi)``.
+
+    At the 32 x 32 nodes of Mitsuba: their error of up to 4e-4 is 1 % of a coat's small reflectance, and shows in comparisons.
 
     Args:
         cosines: ``(K,)`` cosines of ``wo``, positive.
@@ -524,23 +625,15 @@ def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor, facets: Microf
         eta: ``(1,)`` index of the far side over that of the side of ``wo``.
         facets: distribution of the normals.
     """
-    # Total reflection begins at an edge among the nodes, which Beckmann's narrower lobe meets more often.
-    n = 32 if facets is GGX else 64
-    nodes = _normals(cosines, alpha, facets, n, n)
-    cos = dot(nodes.wo, nodes.m)
-    wi = reflect(nodes.wo, nodes.m, cos)
-    seen = facets.masking(wi, nodes.alpha, nodes.alpha)
-    return nodes.mean(fresnel_dielectric(cos, eta).reflectance * seen)
-
-
-def coat_transmittance(cosines: Tensor, alpha: Tensor, eta: Tensor, facets: MicrofacetDistribution = GGX) -> Tensor:
-    """Compute the single-scattering transmittance ``(K,)`` of rough dielectric facets: the mean of ``(1 - F) G1(wi)``.
-
-    At the 32 x 32 nodes of Mitsuba: their error of up to 4e-4 is 1 % of a coat's small reflectance, and shows in comparisons.
-    """
     nodes = _normals_of_mitsuba(cosines, alpha, facets)
-    cos = dot(nodes.wo, nodes.m)
+    held = nodes._replace(m=nodes.m.detach())
+    m, change = held.open_normals(eta, dot(held.wo, held.m))
+    density = held.normalized(held.density(m) * change, held.density(held.m))
+    # Without total internal reflection nothing has an edge: nodes that follow the roughness are more precise.
+    edge = eta < 1.0
+    m, density = torch.where(edge, m, nodes.m), torch.where(edge, density, 1.0)
+    cos = dot(nodes.wo, m)
     side = fresnel_dielectric(cos, eta)
-    wi = normalize(refract(nodes.wo, nodes.m, cos, side))
-    seen = facets.masking(-wi, nodes.alpha, nodes.alpha)
-    return nodes.mean((1.0 - side.reflectance) * seen)
+    wi = normalize(refract(nodes.wo, m, cos, side))
+    seen = facets.masking(-wi, nodes.alpha_u, nodes.alpha_v)
+    return nodes.mean((1.0 - side.reflectance) * seen * density)

@@ -132,9 +132,9 @@ def energy_table(parameters: Parameters, etas: Sequence[Tensor | None], facets: 
     wo = torch.stack((r, torch.zeros_like(r), z)) if isotropic else torch.stack((r * x, r * y, z))
     blocks = []
     for eta in etas:
-        # Gauss-Legendre nodes an axis. The albedo has a kink where total internal reflection begins, which needs twice as
+        # Gauss-Legendre nodes an axis. Total internal reflection has an edge and Beckmann a narrow lobe: they need twice as
         # many; for anisotropic surfaces, whose tables are larger, that would take too long.
-        nodes = 64 if isotropic and eta is not None else 32
+        nodes = 64 if isotropic and (eta is not None or facets is not GGX) else 32
         index = None if eta is None else eta.double()
         albedo = microfacet.directional_albedo(
             wo, au, alpha_v=None if isotropic else av, eta=index, azimuths=nodes, heights=nodes, facets=facets

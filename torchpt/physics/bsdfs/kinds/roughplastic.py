@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math import microfacet
+from torchpt.math.diffuse_coat import diffuse_reflectance, normal_reflectance
 from torchpt.math.microfacet import fresnel_dielectric
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.math.vectors import dot
@@ -68,9 +69,27 @@ class RoughPlastic(Rough, Coat):
         cosines = torch.linspace(0, 1, _COSINES, dtype=torch.float64, device=eta.device).clamp_min(1e-6)
         alpha, index = surface["alpha_u"].double(), eta.double()
         transmittance = microfacet.coat_transmittance(cosines, alpha, index, self.facets)
-        from_below = microfacet.coat_reflectance(cosines, alpha, 1.0 / index, self.facets)
-        inner = 2.0 * (from_below * cosines).mean()[None].to(eta.dtype)  # the integral over cosines of 2 R cos
-        return {"transmittance": Table(transmittance.to(eta.dtype), count=_COSINES), "inner": inner}
+        inner = self._inner(cosines, alpha, 1.0 / index)
+        return {"transmittance": Table(transmittance.to(eta.dtype), count=_COSINES), "inner": inner.to(eta.dtype)}
+
+    def _inner(self, cosines: Tensor, alpha: Tensor, index: Tensor) -> Tensor:
+        """Return the coat's mean reflectance ``(1,)`` for diffuse light from below.
+
+        It is Mitsuba's mean of ``2 R cos`` over equidistant cosines, both ends included. That sum is not smooth in the index,
+        as total internal reflection begins between two of them. The Euler-Maclaurin formula gives it from the integral.
+
+        Args:
+            cosines: ``(K,)``.
+            alpha: ``(1,)``.
+            index: ``(1,)`` of the outside over that of the coat.
+        """
+        intervals = len(cosines) - 1
+        integral = diffuse_reflectance(alpha, index, self.facets)
+        along = normal_reflectance(alpha, index, self.facets)
+        ends = [0, -3, -2, -1]
+        first, before, last, end = microfacet.coat_reflectance(cosines[ends], alpha, index, self.facets) * cosines[ends]
+        slope = (1.5 * end - 2.0 * last + 0.5 * before) * intervals - first / cosines[0]  # of R cos, from end to end
+        return (intervals * (integral + slope / (6.0 * intervals**2)) + along) / len(cosines)
 
     def prepare(self, values: Parameters) -> Parameters:
         """Return the parameters of one material, or of all lanes, from its values; see :meth:`Bsdf.prepare`."""
