@@ -701,13 +701,12 @@ def inside(values: bsdfs.Parameters) -> bsdfs.Parameters:
     return out
 
 
-@each(
-    [case for case in CASES if case.differentiable and not case.smooth],
-    tables=True,
-    later=("roughplastic (nonlinear)",),  # for its tables; those of a metal are differentiated
-)
+@each([case for case in CASES if case.differentiable and not case.smooth and not case.model.tabulated])
 def test_gradients_of_eval(case):
-    """Finite differences in every number that a material is given, at directions within its lobes."""
+    """Finite differences in every number that a material is given, at directions within its lobes.
+
+    Those of tables are tested by longer steps, see ``test_derivatives.py``.
+    """
     values = inside(tensors(case.values, torch.float64))
     flat = [t.requires_grad_() for t in leaves(values)]
     wo, wi = pairs(case, 12, torch.float64, torch.Generator().manual_seed(11))
@@ -720,5 +719,4 @@ def test_gradients_of_eval(case):
         return case.model.eval(p, wo, wi)
 
     assert value(*flat).requires_grad
-    # A longer step moves the edge of total internal reflection over the nodes at which tables are integrated.
     assert torch.autograd.gradcheck(value, flat, eps=1e-7, atol=1e-5, rtol=1e-3, fast_mode=True)

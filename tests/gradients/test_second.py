@@ -38,6 +38,11 @@ MATERIALS: dict[str, dict[str, Any]] = {
     },
     "blend": {"type": "blend", "weight": 0.3, "a": "diffuse", "b": "roughconductor"},
 }
+#: Materials with tables, whose values are a little uneven over short steps.
+COATS: dict[str, dict[str, Any]] = {
+    f"coat_{name}": {"type": "roughplastic", "distribution": name, "diffuse_reflectance": [0.4, 0.5, 0.6], "alpha": 0.3}
+    for name in ("ggx", "beckmann")
+}
 WISHES: dict[str, Any] = {"spp": 4, "seed": 3, "seed_grad": 3, "threads": 1, "compile": "off"}
 
 
@@ -47,7 +52,7 @@ def lit(material: str) -> torchpt.Scene:
             "camera": {"origin": [0.4, 0.3, 2], "target": [0, 0, 0], "fov": 40},
             "film": {"width": 5, "height": 4, "filter": "gaussian"},
             "integrator": {"type": "path", "max_depth": 2},
-            "materials": MATERIALS,
+            "materials": {**MATERIALS, **COATS},
             "shapes": {"plate": {"type": "rectangle", "material": material, "transform": [{"scale": 2}]}},
             "lights": {"bulb": {"type": "point", "position": [0.5, -0.3, 1.5], "intensity": [5, 4, 3]}},
         },
@@ -117,6 +122,27 @@ def test_derivatives_of_materials_are_those_of_finite_differences(material: str)
         torch.testing.assert_close(torch.func.jvp(loss, (at,), (u,))[1], slope, rtol=1e-4, atol=1e-7)
         bend = (gradient(at + step * u) - gradient(at - step * u)) / (2 * step)
         torch.testing.assert_close(hessian_product(loss, at, u), bend, rtol=2e-4, atol=1e-6, msg=name)
+
+
+@pytest.mark.parametrize("name", ["alpha", "int_ior"])
+@pytest.mark.parametrize("coat", COATS)
+def test_derivatives_of_rough_coats_are_those_of_long_differences(coat: str, name: str):
+    """Steps that move total internal reflection past nodes of a quadrature, if its tables have such nodes."""
+    scene = lit(coat)
+    path = f"materials.{coat}.{name}"
+    at = scene.params[path].double()
+    one, step = torch.ones_like(at), 0.05 * at
+    loss = loss_of(scene, path, dtype=torch.float64)
+    low, middle, high = (loss(at + i * step) for i in (-1, 0, 1))
+    lower, higher = loss(at - 2 * step), loss(at + 2 * step)
+    slope = (8 * (high - low) - (higher - lower)) / (12 * step)
+    bend = (16 * (high + low) - (higher + lower) - 30 * middle) / (12 * step**2)
+    torch.testing.assert_close(torch.func.grad(loss)(at), slope, rtol=5e-3, atol=0.0)
+    torch.testing.assert_close(torch.func.jvp(loss, (at,), (one,))[1], slope, rtol=5e-3, atol=0.0)
+    # A curvature of the slope over the number is a large one.
+    torch.testing.assert_close(
+        hessian_product(loss, at, one), bend, rtol=0.03, atol=0.03 * float(slope.abs() / at), msg=name
+    )
 
 
 NAMES = (
