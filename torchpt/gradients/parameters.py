@@ -18,38 +18,69 @@ from torch import Tensor
 from torchpt.core.autograd import gradients_of
 from torchpt.core.memory import Budget, Span
 from torchpt.core.tree import map_leaves
+from torchpt.math.microfacet import is_smooth
 from torchpt.math.sums import GradientSums
 from torchpt.paths.adjoint import Tape
 from torchpt.paths.wave import Wave
+from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.shapes.geometry import LaneGeometry
+from torchpt.physics.textures import Node
+from torchpt.physics.textures.atlas import ImageNode
 from torchpt.ranks import Group, blocks
 from torchpt.scene import Scene
 from torchpt.scene.prepare import make_wave
 from torchpt.scene.settings import Settings
 from torchpt.spec import Moves
 
-__all__ = ["SceneTape", "attached", "near_of"]
+__all__ = ["SceneTape", "attached", "is_mirror", "near_of"]
 
 
 # ---- Which parameters move geometry, by their specs: gradients of colours then need no derivatives of geometry
 
 
+#: Numbers that tell how rough a material is.
+_ROUGHNESS = ("alpha", "roughness", "alpha_u", "alpha_v")
+#: Parameters of maps of normals.
+_MAPS = ("normal_map", "normal_strength", "bump_map")
+
+
 def attached(scene: Scene, names: Iterable[str]) -> bool:
     """Return True if a parameter moves surfaces or the camera, or changes the direction of rays behind delta lobes."""
     owners = [*scene.built.parts, *scene.built.copies]
+    materials = [material for owner in owners for material in owner.material.with_inner()]
     # Materials with smooth refraction: their index of refraction sets the direction of the refracted ray.
-    bending = {
-        material.name for owner in owners for material in owner.material.with_inner() if material.refracts_as_delta
-    }
+    turned = {f"{material.name}." for material in materials if material.refracts_as_delta}
+    # Mirrors and smooth coats: maps of their normals set the direction of the reflected ray.
+    for material in materials:
+        if (material.normal_map is not None or material.bump_map is not None) and is_mirror(material, scene.params):
+            turned |= {f"{material.name}.{name}" for name in _MAPS}
 
     def is_attached(name: str) -> bool:
         moves = scene.spec(name).moves
-        if moves is Moves.RAYS:  # of a bending material, or of a texture that it may read
-            of_bending = any(name.startswith(f"{material}.") for material in bending)
-            return of_bending or bool(bending and "textures." in name)
+        if moves is Moves.RAYS:  # of such a material, or of a texture that it may read
+            return name.startswith(tuple(turned)) or bool(turned and "textures." in name)
         return moves is Moves.SURFACES
 
     return any(map(is_attached, names))
+
+
+def is_mirror(material: ResolvedMaterial, params: Mapping[str, Tensor]) -> bool:
+    """Return True if a material reflects or refracts as a delta: rough ones only where their roughness is next to 0."""
+    if material.inner or material.model.sheer or not material.model.delta:  # inner ones are looked at by themselves
+        return False
+    if material.model.smooth:
+        return True
+    widest = [_least(material, name, params) for name in _ROUGHNESS if material.values.get(name) is not None]
+    return not widest or bool(is_smooth(torch.stack(widest).amax()))
+
+
+def _least(material: ResolvedMaterial, name: str, params: Mapping[str, Tensor]) -> Tensor:
+    """Return the least value of a number of a material; 0 of a texture of a kind of its own."""
+    value = material.values[name]
+    if isinstance(value, ImageNode):
+        return (value.image(params).amin() * value.scale[0]).detach().double()
+    least = torch.zeros(()) if isinstance(value, Node) else params[f"{material.name}.{name}"].detach().amin()
+    return least.double()
 
 
 # ---- The length over which points slide along their rays

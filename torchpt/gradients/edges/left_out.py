@@ -9,11 +9,10 @@ from torch import Tensor
 
 from torchpt.gradients.edges.curves import known
 from torchpt.gradients.edges.seams import jumps_elsewhere
-from torchpt.math.microfacet import is_smooth
+from torchpt.gradients.parameters import is_mirror
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.textures import Node
-from torchpt.physics.textures.atlas import ImageNode
 from torchpt.scene import Scene
 from torchpt.scene.settings import Settings
 
@@ -21,8 +20,6 @@ __all__ = ["left_out", "without_gradient"]
 
 #: Of a spot: where its light ends, and where it begins to fade.
 _RIM = ("cutoff_angle", "beam_width")
-#: Numbers that tell how rough a material is.
-_ROUGHNESS = ("alpha", "roughness", "alpha_u", "alpha_v")
 
 
 def left_out(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None = None) -> list[str]:
@@ -38,7 +35,7 @@ def _found(scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> It
     if scene.camera(settings.film, scene.params, torch.float64).film_of(_point(scene.device)) is None:
         yield f"those that a camera of kind {camera.name} sees"
     materials = [owner.material for owner in (*built.parts, *built.copies)]
-    if any(_mirrors(part, params) for material in materials for part in material.with_inner()):
+    if any(is_mirror(part, params) for material in materials for part in material.with_inner()):
         yield "those seen in mirrors and clear glass, and of light that these send on"
     if any(_has_opacity_texture(part) for material in materials for part in material.with_inner()):
         yield "those within textures of opacity"
@@ -50,25 +47,6 @@ def _found(scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> It
         yield "the rims of spots that do not fade out"
     if not isinstance(settings.integrator, PathIntegrator):
         yield f"edges of shadows where the integrator is {settings.integrator.name}"
-
-
-def _mirrors(material: ResolvedMaterial, params: Mapping[str, Tensor]) -> bool:
-    """Return True if a material reflects or refracts as a delta: rough ones only where their roughness is next to 0."""
-    if material.inner or material.model.sheer or not material.model.delta:  # inner ones are looked at by themselves
-        return False
-    if material.model.smooth:
-        return True
-    widest = [_least(material, name, params) for name in _ROUGHNESS if material.values.get(name) is not None]
-    return not widest or bool(is_smooth(torch.stack(widest).amax()))
-
-
-def _least(material: ResolvedMaterial, name: str, params: Mapping[str, Tensor]) -> Tensor:
-    """Return the least value of a number of a material; 0 of a texture of a kind of its own."""
-    value = material.values[name]
-    if isinstance(value, ImageNode):
-        return (value.image(params).amin() * value.scale[0]).detach().double()
-    least = torch.zeros(()) if isinstance(value, Node) else params[f"{material.name}.{name}"].detach().amin()
-    return least.double()
 
 
 def _has_opacity_texture(material: ResolvedMaterial) -> bool:

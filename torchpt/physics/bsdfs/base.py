@@ -23,7 +23,7 @@ from torch import Tensor
 from torchpt.math.vectors import take
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
 from torchpt.physics.bsdfs.specs import Heights, Normals, fraction
-from torchpt.spec import Color, Flag, Refused, Scalar, Spec, parameters_of
+from torchpt.spec import Color, Flag, Moves, Refused, Scalar, Spec, parameters_of
 
 __all__ = ["Bsdf", "Parameters", "Table", "Values", "diffuse_split_sum", "gather", "model_and_values", "stacked"]
 
@@ -70,9 +70,13 @@ class Bsdf:
         "alpha_cutoff": Scalar(None, high=1.0, doc="opacity below this value counts as 0, else as 1"),
         "emission": Color(None, texture=True, doc="radiance leaving the front side: an area light"),
         "emission_strength": Scalar(1.0, doc="factor of `emission`"),
-        "normal_map": Normals(doc="shading normals in the surface's own frame, `2 c - 1` of the colours c"),
-        "normal_strength": Scalar(1.0, doc="factor of the tilt of the map's normals"),
-        "bump_map": Heights(doc="heights along the normal, in the scene's units, whose slope tilts the shading normal"),
+        "normal_map": Normals(
+            doc="shading normals in the surface's own frame, `2 c - 1` of the colours c", moves=Moves.RAYS
+        ),
+        "normal_strength": Scalar(1.0, doc="factor of the tilt of the map's normals", moves=Moves.RAYS),
+        "bump_map": Heights(
+            doc="heights along the normal, in the scene's units, whose slope tilts the shading normal", moves=Moves.RAYS
+        ),
     }
     factors: tuple[str, ...] = ("specular_reflectance", "specular_transmittance")
     tabulated: tuple[str, ...] = ()

@@ -61,6 +61,8 @@ class Sphere(Primitive):
         t = _distance(o, d, p0, radius, rays.hit.t) if rays.follow_ray else rays.hit.t
         t = torch.where(is_kind, t, 0.0)
         away = o + d * t - p0
+        if not rays.follow_ray:  # the point stays where it is on the sphere
+            away = away.detach()
         outward = normalize(torch.where(is_kind, away, torch.ones_like(away)))
         return HitPoints(p=p0 + outward * radius, ng=outward * take(world.geometry.flip, primitives.prim))
 
