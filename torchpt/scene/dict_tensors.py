@@ -184,7 +184,7 @@ def _shape_params(name: str, key: Key, scene: _BuiltDict) -> Iterator[tuple[str,
         parameter = _dotted(key[3:])
         for material in dict.fromkeys(owner.material.name for owner in owners):
             yield from _param_named(key, f"{material}.{parameter}", scene)
-    elif part in ("vertices", *_VERTEX_ATTRIBUTES) and shape["displacement"] is None:
+    elif part in ("vertices", "colors", *_VERTEX_ATTRIBUTES) and shape["displacement"] is None:
         yield f"{stem}.{part}", scene.at(key)
     elif part == "emission":
         yield from _param_named(key, _dotted(key), scene)

@@ -77,7 +77,7 @@ def mesh_of(
         pieces, source = mesh_parts_of(triangles.object, materials=materials), "trimesh"
     else:
         assert triangles.vertices is not None and triangles.faces is not None
-        arrays = (triangles.vertices, triangles.faces, triangles.normals, triangles.uvs)
+        arrays = (triangles.vertices, triangles.faces, triangles.normals, triangles.uvs, triangles.colors)
         pieces, source = [MeshPart("", *arrays)], ""
     if triangles.displacement is not None:
         pieces = [_displaced(piece, triangles.displacement, key, texture_loader, source) for piece in pieces]

@@ -21,7 +21,7 @@ from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.parts import Parameters, Part, Source
 from torchpt.scene.formats.description import Description
 from torchpt.scene.meshes import FileLight
-from torchpt.spec import Refused, Spec, VertexAttribute, parameters_of
+from torchpt.spec import Refused, Spec, VertexAttribute, VertexColors, parameters_of
 from torchpt.spec.schema import ParsedParams, scene_error
 
 __all__ = [
@@ -39,8 +39,15 @@ __all__ = [
 
 
 def declare_vertex_attributes(parts: Sequence[Part], vertex_params: Collection[str], parameters: Parameters) -> None:
-    """Declare the normals and texture coordinates of ``parts`` whose dotted names are in ``vertex_params`` as parameters."""
-    for part in parts if vertex_params else ():
+    """Declare vertex colours of parts as parameters, and the normals and texture coordinates named in ``vertex_params``.
+
+    Colours that are at most 1 stay so, unless the part emits by a texture, which may read them.
+    """
+    for part in parts:
+        if part.colors is not None:
+            bounded = part.emission_texture is None and bool((part.colors <= 1.0).all())
+            spec = VertexColors(high=1.0 if bounded else None)
+            parameters.declare(f"{part.name}.colors", part.colors, spec)
         for key, value in (("normals", part.normals), ("uvs", part.uvs)):
             if value is not None and f"{part.name}.{key}" in vertex_params:
                 parameters.declare(f"{part.name}.{key}", value, VertexAttribute())

@@ -33,6 +33,7 @@ from torchpt.spec.parameters import (
     Spec,
     Texels,
     VertexAttribute,
+    VertexColors,
     Vertices,
     spec_of,
 )
@@ -64,6 +65,7 @@ __all__ = [
     "Spec",
     "Texels",
     "VertexAttribute",
+    "VertexColors",
     "Vertices",
     "parameters_of",
     "spec_of",

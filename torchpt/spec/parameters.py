@@ -44,6 +44,7 @@ __all__ = [
     "Spec",
     "Texels",
     "VertexAttribute",
+    "VertexColors",
     "Vertices",
     "spec_of",
 ]
@@ -426,6 +427,24 @@ class VertexAttribute(Vertices):
     """Vertex normals ``(V, 3)`` or texture coordinates ``(V, 2)`` of a mesh."""
 
     holds_positions: ClassVar[bool] = False
+
+
+@dataclass(frozen=True)
+class VertexColors(_Numbers):
+    """Vertex colours ``(V, 3)`` of a mesh, linear RGB."""
+
+    @property
+    def accepted(self) -> str:
+        """See :class:`Spec`."""
+        return f"a list of colours [r, g, b], finite numbers{self._range} each"
+
+    def read(self, value: Any) -> Any:
+        """See :class:`Spec`."""
+        found = reading.rows(value, 3, "colours [r, g, b]")
+        for index, row in enumerate(found.tolist()) if found.min() < 0 else ():
+            if min(row) < 0:
+                raise Refused(self.expected, row, at=(index,))
+        return found
 
 
 @dataclass(frozen=True)

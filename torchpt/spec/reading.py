@@ -156,7 +156,7 @@ def rows(value: Any, columns: int, what: str) -> NDArray[np.float64]:
         if not value or not set(map(type, value)) <= {list, tuple} or set(map(len, value)) != {columns}:
             _refuse_first_bad_row(value, columns, expected)
             raise Refused(expected)
-        if not set(map(type, chain.from_iterable(value))) <= {int, float}:
+        if not all(map(_is_number, set(map(type, chain.from_iterable(value))))):
             _refuse_first_bad_row(value, columns, expected)
     try:
         found = np.array(value, dtype=np.float64)
@@ -175,8 +175,13 @@ def rows(value: Any, columns: int, what: str) -> NDArray[np.float64]:
 def _refuse_first_bad_row(value: Any, columns: int, expected: str) -> None:
     """Raise for the first row of a list that is not ``columns`` numbers."""
     for index, row in enumerate(value):
-        if not isinstance(row, list | tuple) or len(row) != columns or not all(type(x) in (int, float) for x in row):
+        if not isinstance(row, list | tuple) or len(row) != columns or not all(_is_number(type(x)) for x in row):
             raise Refused(expected, row, at=(index,))
+
+
+def _is_number(kind: type) -> bool:
+    """Return True for types of numbers, numpy's included, other than bool."""
+    return kind is not bool and issubclass(kind, int | float | np.integer | np.floating)
 
 
 def faces(value: Any) -> NDArray[np.int64]:

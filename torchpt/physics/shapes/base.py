@@ -69,6 +69,7 @@ class Triangles:
         faces: ``(F, 3)`` int64 indices of vertices.
         normals: ``(V, 3)`` at the vertices, or None.
         uvs: ``(V, 2)`` texture coordinates at the vertices, or None.
+        colors: ``(V, 3)`` linear colours at the vertices, or None.
         shape_index: which mesh of the file is taken; None: all.
         flat: use face normals even if vertex normals are given.
         displacement: ``texture``, ``scale`` and ``subdivisions`` of :class:`~torchpt.physics.shapes.kinds.mesh.Displacement`,
@@ -82,6 +83,7 @@ class Triangles:
     faces: NDArray[np.int64] | None = None
     normals: Matrix | None = None
     uvs: Matrix | None = None
+    colors: Matrix | None = None
     flat: bool = False
     displacement: ParsedParams | None = None
     object: Any = None

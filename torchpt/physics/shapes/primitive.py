@@ -48,6 +48,7 @@ class Corners:
         mirrored: whether the two axes of a flat shape were swapped.
         frame: ``(12, 1)`` float64 ``p0 e1 e2 e3`` of a quadric.
         uvs: ``(V, 2)`` texture coordinates at the vertices if they are a parameter of the scene; None: those of the part.
+        colors: ``(V, 3)`` linear colours at the vertices; None: there are none.
     """
 
     p0: Tensor
@@ -58,6 +59,7 @@ class Corners:
     mirrored: bool = False
     frame: Tensor | None = None
     uvs: Tensor | None = None
+    colors: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,7 @@ class Primitive:
             pose: ``(3, 4)`` float64, to world coordinates.
             dtype: dtype of the world.
             own: arrays of the part that are parameters of the scene: ``vertices (V, 3)`` in object space for all meshes;
-                ``normals (V, 3)`` and ``uvs (V, 2)`` if they are differentiated.
+                ``normals (V, 3)`` and ``uvs (V, 2)`` if they are differentiated, and ``colors (V, 3)``.
         """
         raise NotImplementedError
 

@@ -99,18 +99,18 @@ def vertex_attributes_of(
         flags = torch.tensor([c.mirrored for c in corners], device=corners[0].p0.device)
         found["mirrored"] = torch.repeat_interleave(flags, torch.tensor(sizes, device=flags.device))
     if needs_colors:
-        colors = [_colors(part, c) for part, c in pairs]
+        colors = [_colors(c) for c in corners]
         found["colors"] = tuple(torch.cat([triple[k] for triple in colors], 1) for k in range(3))
     return found
 
 
-def _colors(part: Part, c: Corners) -> tuple[Tensor, Tensor, Tensor]:
+def _colors(c: Corners) -> tuple[Tensor, Tensor, Tensor]:
     """Return the colours ``(3, P)`` at the three corners; 1 where a shape has none."""
-    if part.colors is None:
+    if c.colors is None:
         white = torch.ones_like(c.p0)
         return white, white, white
     assert c.faces is not None
-    colors = torch.from_numpy(part.colors).to(c.p0).T
+    colors = c.colors.to(c.p0).T
     first, second, third = (colors.index_select(1, c.faces[:, k]) for k in range(3))
     return first, second, third
 

@@ -38,7 +38,7 @@ __all__ = [
 
 
 #: Arrays of a mesh that may be parameters.
-_MESH_PARAMS = ("vertices", "normals", "uvs")
+_MESH_PARAMS = ("vertices", "normals", "uvs", "colors")
 
 
 def corners_of(part: Part, parameters: Mapping[str, Tensor], space: Space, dtype: torch.dtype) -> Corners:

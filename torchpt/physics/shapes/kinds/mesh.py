@@ -8,9 +8,26 @@ from typing import Any, ClassVar
 import numpy as np
 
 from torchpt.physics.shapes.base import Shape, Triangles
-from torchpt.spec import REQUIRED, Block, Custom, Flag, Integer, Map, Path, Refused, Scalar, Vertices, reading
+from torchpt.spec import (
+    REQUIRED,
+    Block,
+    Custom,
+    Flag,
+    Integer,
+    Map,
+    Path,
+    Refused,
+    Scalar,
+    VertexColors,
+    Vertices,
+    reading,
+)
 
 __all__ = ["Displacement", "Mesh"]
+
+
+#: Parameters of an inline mesh.
+_ARRAYS = ("vertices", "faces", "normals", "uvs", "colors")
 
 
 class Displacement:
@@ -67,6 +84,7 @@ class Mesh(Shape):
             words="a list of [u, v], finite numbers each",
             doc="texture coordinates, one for each vertex",
         ),
+        "colors": VertexColors(None, doc="linear colours, one for each vertex, for textures of type `vertex_color`"),
         "face_normals": Flag(False, doc="whether to shade with face normals even if vertex normals exist"),
         "displacement": Block(None, kind=Displacement, doc="moves the vertices when the scene is loaded"),
     }
@@ -75,7 +93,7 @@ class Mesh(Shape):
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
         """See :meth:`Shape.check`."""
-        inline = {name: values[name] for name in ("vertices", "faces", "normals", "uvs")}
+        inline = {name: values[name] for name in _ARRAYS}
         vertices, faces = values["vertices"], values["faces"]
         if values["shape_index"] is not None:
             paths = values["path"] or ("",)
@@ -98,7 +116,7 @@ class Mesh(Shape):
         if len(bad):
             expected = f"vertex indices in 0..{len(vertices) - 1}"
             raise Refused(expected, faces[bad[0]].tolist(), ("faces", int(bad[0])))
-        for name in ("normals", "uvs"):
+        for name in ("normals", "uvs", "colors"):
             value = inline[name]
             if value is not None and len(value) != len(vertices):
                 raise Refused(f"one row for each of the {len(vertices)} vertices", len(value), (name,))
@@ -109,7 +127,7 @@ class Mesh(Shape):
     def triangles(cls, values: Mapping[str, Any]) -> Triangles:
         """See :meth:`Shape.triangles`."""
         # Parameters that have the same name in both.
-        same = {name: values[name] for name in ("path", "shape_index", "vertices", "faces", "normals", "uvs")}
+        same = {name: values[name] for name in ("path", "shape_index", *_ARRAYS)}
         return Triangles(
             **same, flat=values["face_normals"], displacement=values["displacement"], object=values["mesh"]
         )

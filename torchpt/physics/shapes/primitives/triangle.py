@@ -36,7 +36,7 @@ class Triangle(Primitive):
         points = points.to(dtype)
         p0, p1, p2 = (points.index_select(1, faces[:, k]) for k in range(3))
         if not part.smooth:
-            return Corners(p0=p0, p1=p1, p2=p2, faces=faces, uvs=own.get("uvs"))
+            return Corners(p0=p0, p1=p1, p2=p2, faces=faces, uvs=own.get("uvs"), colors=own.get("colors"))
         if part.normals is None:
             normals = smooth_normals(points, faces)
         else:
@@ -46,7 +46,10 @@ class Triangle(Primitive):
         if not bool((dot(normals, normals) > 0).all()):  # a corner without a normal gets that of its face
             flat = normalize(cross(p1 - p0, p2 - p0))
             n0, n1, n2 = (torch.where(dot(n, n) > 0, n, flat) for n in (n0, n1, n2))
-        return Corners(p0=p0, p1=p1, p2=p2, normals=(n0, n1, n2), faces=faces, uvs=own.get("uvs"))
+        own_normals = n0, n1, n2
+        return Corners(
+            p0=p0, p1=p1, p2=p2, normals=own_normals, faces=faces, uvs=own.get("uvs"), colors=own.get("colors")
+        )
 
     @classmethod
     def uvs(cls, part: Part, corners: Corners) -> Triple:

@@ -54,7 +54,7 @@ class _Table(Table):
 
 
 class VertexColor(Texture):
-    """The vertex colours of a mesh, read as linear; white on surfaces without them."""
+    """The vertex colours of a mesh (its file's, or its ``colors``), linear; white on surfaces without them."""
 
     name = "vertex_color"
     reads = "colors"
