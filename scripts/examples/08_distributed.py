@@ -10,6 +10,7 @@ gradient and the paints are saved beside the picture, as 08_distributed.pt.
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Sequence
 
@@ -124,6 +125,9 @@ def main(argv: Sequence[str] | None = None) -> tuple[float, float]:
         grid(args.out / "08_distributed.png", *[list(row) for row in rows], width=128)
         print(f"{world} processes: error of the paints (rms) {before:.3f} -> {after:.4f}")
     if world > 1:
+        # What holds the group has to go before it: else gloo's threads now and then abort a process that ends.
+        del model
+        gc.collect()
         dist.destroy_process_group()
     return before, after
 

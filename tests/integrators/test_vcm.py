@@ -169,7 +169,7 @@ def test_what_is_refused():
 def test_a_picture_that_is_stopped_within_a_sample(compiled):
     """Splats come with the pixels that sent them: those of a part of the pixels do not brighten the whole picture."""
     scene = torchpt.load(LAMP, device="cpu")
-    keys, film = {"type": "vcm", "radius": 1e-3, "light_paths": 1}, {"width": 64, "height": 48, "filter": "box"}
+    keys, film = {"type": "vcm", "radius": 1e-3, "light_paths": 1}, {"width": 192, "height": 144, "filter": "box"}
     render: dict[str, Any] = {"spp": 2, "compile": "on" if compiled else "off", "threads": 1}
     wish = settings(scene.description, {"integrator": keys, "film": film, "render": render})
     with few_lanes(512):
