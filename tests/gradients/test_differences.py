@@ -142,3 +142,38 @@ def test_vertex_colours_stay_reflectances() -> None:
     scene = torchpt.load(colored(COLORS), "cpu")
     with pytest.raises(torchpt.SceneError, match=r"in 0\.\.1"):
         torchpt.render(scene, params={"shapes.it.colors": torch.full((4, 3), 1.5)}, spp=1)
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_textures_of_opacity_move_with_their_card(axis: int) -> None:
+    """The sun throws the shadow of a card of changing opacity, which is 0 at its border."""
+    holes = torch.rand(4, 4, 1, generator=torch.Generator().manual_seed(2)) * 0.8 + 0.1
+    holes = torch.nn.functional.pad(holes.permute(2, 0, 1), (1, 1, 1, 1)).permute(1, 2, 0).contiguous()
+    veil = {"type": "diffuse", "reflectance": 0.0, "opacity": {"type": "image", "data": holes, "wrap": "clamp"}}
+    scene = torchpt.load(
+        {
+            "camera": {"type": "orthographic", "origin": [0, 0, 0.5], "target": [0, 0, 0], "up": [0, 1, 0], "width": 3},
+            "film": {"width": 12, "height": 12, "filter": "box"},
+            "integrator": {"type": "path", "max_depth": 2},
+            "lights": {"sun": {"type": "directional", "direction": [-0.3, 0.1, -1], "irradiance": [3, 3, 3]}},
+            "shapes": {
+                "card": {
+                    "type": "rectangle",
+                    "material": veil,
+                    "transform": [{"scale": 0.8}, {"translate": [0.1, 0, 1]}],
+                },
+                "floor": {"type": "rectangle", "transform": [{"scale": 3}]},
+            },
+        },
+        "cpu",
+    )
+    along = torch.linspace(-1.0, 1.0, 12, dtype=torch.float64)[None, :, None]
+    weight = along**3 + torch.linspace(0.0, 1.0, 12, dtype=torch.float64)[:, None, None] ** 2
+    name = "shapes.card.to_world"
+
+    def value(pose: Tensor, spp: int) -> Tensor:
+        return (torchpt.render(scene, params={name: pose}, spp=spp, seed=0).double() * weight).mean()
+
+    direction = torch.zeros(4, 4, dtype=torch.float64)
+    direction[axis, 3] = 1.0
+    agree(value, scene.params[name], direction, 0.02, 0.02)

@@ -168,7 +168,7 @@ class TensorsEngine:
 
     def _nearest(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
         """Return the nearest hits, opaque or not."""
-        t, prim, u, v = self.wave.accel.intersect(o, d, t_max)
+        t, prim, u, v = self.wave.accel.intersect(o.detach(), d.detach(), t_max)
         return Hit(t.to(self.plan.dtype), prim.to(torch.int64), u.to(self.plan.dtype), v.to(self.plan.dtype))
 
     def _may_transmit(self, state: PathState, hit: Hit) -> Tensor:
@@ -203,7 +203,7 @@ class TensorsEngine:
             scattered_lanes, new_state = take(lanes, index), rows(new_state, index)
             check_fields(self.wave.integrator, new_state)
             paths.state = map_leaves(lambda old, new: old.index_copy(-1, scattered_lanes, new), paths.state, new_state)
-        behind = self._nearest(state.o, state.d.detach(), state.t_max)
+        behind = self._nearest(state.o, state.d, state.t_max)
         # Distances are counted from the start of the segment; the offset across a surface is below their rounding error.
         values = {"t": behind.t + before, "prim": behind.prim, "u": behind.u, "v": behind.v}
         paths.hit = replace(hit, **{name: getattr(hit, name).index_copy(0, lanes, x) for name, x in values.items()})
@@ -378,7 +378,9 @@ class TensorsEngine:
         if self.world.materials.opacity is None:
             return (~self.wave.accel.occluded(shadow.o, shadow.d, shadow.t_max)).to(self.plan.dtype)
         transmittance = torch.ones_like(shadow.t_max)
-        o, d, t_max = shadow.o.detach(), shadow.d.detach(), shadow.t_max
+        o, d, t_max = shadow.o, shadow.d, shadow.t_max
+        if not self.plan.attached:
+            o, d = o.detach(), d.detach()
         lanes = torch.arange(len(t_max), device=t_max.device)
         while len(lanes):
             hit = self._nearest(o, d, t_max)
@@ -388,8 +390,7 @@ class TensorsEngine:
             passed, o, d = rows(hit, passing), take(o, passing), take(d, passing)
             lanes, t_max = take(lanes, passing), (take(t_max, passing) - passed.t).clamp_min(0.0)
             if len(lanes):
-                with torch.no_grad():
-                    o = origins_behind(self.world, o, d, passed)
+                o = origins_behind(self.world, o, d, passed)
         return transmittance
 
     def terminate(self, paths: Paths, truncated: bool) -> None:

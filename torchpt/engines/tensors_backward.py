@@ -95,7 +95,7 @@ class TensorsBackward(TensorsEngine):
         sorted_lane = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
         state, hit = rows(paths.state, order), rows(paths.hits, order)
         ends = Ends(take(sorted_lane, paths.ends.emissive).msort(), take(sorted_lane, paths.ends.missed).msort())
-        chance, chance_cotangent = self._chance(state, depth)
+        chance, chance_cotangent, rays = self._chance(state, depth)
         hit = replace(hit, chance=chance)
         if depth < self.wave.integrator.limits.last:
             transmittance, splat_transmittance = (iter(kept) for kept in paths.passed)
@@ -106,24 +106,33 @@ class TensorsBackward(TensorsEngine):
                 )
         self._light(ends, depth, state, hit, chance_cotangent)
         if chance is not None and chance_cotangent is not None:
-            self.sums.add_each(gradients_of([chance], self.tape.tables, [chance_cotangent]))
+            tables = self.tape.tables
+            gradients = gradients_of([chance], [*tables, *rays.values()], [chance_cotangent])
+            self.sums.add_each(gradients[: len(tables)])
+            for name, gradient in zip(rays, gradients[len(tables) :], strict=True):
+                if gradient is not None:
+                    self._ray_cotangents[name].index_add_(-1, state.lane, gradient)
         if self.plan.attached:
             for name in ("t", "prim", "u", "v"):
                 getattr(self._next_hit, name).index_copy_(0, state.lane, getattr(hit, name))
 
-    def _chance(self, state: PathState, depth: int) -> tuple[Tensor | None, Tensor | None]:
-        """Return the probability factor of passed surfaces on a tape, with a zero cotangent to add to.
+    def _chance(self, state: PathState, depth: int) -> tuple[Tensor | None, Tensor | None, dict[str, Tensor]]:
+        """Return the probability factor of passed surfaces on a tape, with a zero cotangent to add to, and the rays.
 
         It is ``Hit.chance``, a factor of value 1 with the derivative of the probability that rays passed surfaces and stopped
-        where they did. None: it has no derivative.
+        where they did. None: it has no derivative. The rays are leaves by the names of their fields; none where they do not
+        move.
         """
+        rays: dict[str, Tensor] = {}
         if not self.tape.differentiates_opacity:
-            return None, None
+            return None, None, rays
+        if self.plan.attached:
+            rays = {name: getattr(state, name).detach().requires_grad_() for name in ("o", "d")}
         with torch.enable_grad(), recording_gathers(self.sums):
-            chance = self._taped_engine.hits(state, depth).chance
+            chance = self._taped_engine.hits(replace(state, **rays), depth).chance
         if chance is None or not chance.requires_grad:
-            return None, None
-        return chance, torch.zeros_like(chance)
+            return None, None, {}
+        return chance, torch.zeros_like(chance), rays
 
     def _taped_context(self, depth: int, device: torch.device, roulette: float = 0.0) -> StageContext:
         """Return the taped stage context of a vertex."""

@@ -58,11 +58,13 @@ class Tape:
 
     @property
     def differentiates_opacity(self) -> bool:
-        """Return True if a gradient with respect to opacity, or an opacity texture, is wanted."""
+        """Return True if a gradient by opacity or an opacity texture is wanted, or one by geometry where there is a texture."""
         world = self.taped.context.world
         opacity, maps = world.materials.opacity, world.textures.opacity
         if opacity is None:
             return False
+        if maps is not None and self.taped.context.plan.attached:
+            return True
         # maps.tables: indices of the texture tables that opacities are read from.
         tables = [] if maps is None else [world.textures.tables[k] for k in maps.tables]
         texels = [tensor for table in tables for tensor in leaves(table)]

@@ -42,13 +42,23 @@ def times_opacity_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Ten
     Traced kernels cannot list lanes: they run another implementation (:mod:`torchpt.engines.dispatch`).
     """
     lanes = textured.nonzero().squeeze(1)
-    at = interact(world, take(o, lanes), take(d, lanes), rows(hit, lanes))
+    # As surfaces and rays move, points slide along the rays.
+    moves = torch.is_grad_enabled() and any(x.requires_grad for x in (o, d, world.geometry.p0))
+    at = interact(world, take(o, lanes), take(d, lanes), rows(hit, lanes), follow_ray=moves)
     return opacity.index_copy(0, lanes, take(opacity, lanes) * opacity_map(world, at))
 
 
 def origins_behind(world: World, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
-    """Return ray origins ``(3, N)`` just behind the surfaces that were hit, off them by their rounding bound."""
-    return offset_origin(world, interact(world, o, d, hit), d)
+    """Return ray origins ``(3, N)`` just behind the surfaces that were hit, off them by their rounding bound.
+
+    They move as places of the ray do, not as the surfaces.
+    """
+    with torch.no_grad():
+        behind = offset_origin(world, interact(world, o, d, hit), d)
+    if not (torch.is_grad_enabled() and (o.requires_grad or d.requires_grad)):
+        return behind
+    on_ray = o + d * hit.t.detach()
+    return behind + (on_ray - on_ray.detach())
 
 
 def non_opaque(world: World, prim: Tensor) -> Tensor:
@@ -75,6 +85,4 @@ def transmit(context: StageContext, vertex: VertexInput) -> Transmission:
         probability = torch.where(stops, opacity, 1.0 - opacity)
         # Of value 1, with the derivative of the logarithm of the probability. An opacity of 1 has none: 1 - opacity is 0.
         chance = torch.where(opacity.detach() < 1, probability / probability.detach(), 1.0)
-    with torch.no_grad():
-        o = origins_behind(world, state.o.detach(), state.d.detach(), hit)
-    return Transmission(on=~stops, o=o, chance=chance)
+    return Transmission(on=~stops, o=origins_behind(world, state.o, state.d, hit), chance=chance)

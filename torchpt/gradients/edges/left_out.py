@@ -38,7 +38,7 @@ def _found(scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> It
     if any(is_mirror(part, params) for material in materials for part in material.with_inner()):
         yield "those seen in mirrors and clear glass, and of light that these send on"
     if any(_has_opacity_texture(part) for material in materials for part in material.with_inner()):
-        yield "those within textures of opacity"
+        yield "those within textures of opacity that jump"
     if jumps_elsewhere(scene):
         yield "those within textures that are not interpolated, on round surfaces or of very many lines"
     if any(part.quadric is not None and not known(part.quadric.form) for part in built.parts):
@@ -50,8 +50,11 @@ def _found(scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> It
 
 
 def _has_opacity_texture(material: ResolvedMaterial) -> bool:
+    """Return True if opacity jumps on a surface: a texture that is not interpolated, or one with a cutoff."""
     sheer = any(inner.model.sheer for inner in material.inner)  # its weight is an opacity
-    return isinstance(material.opacity, Node) or (sheer and isinstance(material.values["weight"], Node))
+    maps = [material.opacity, *([material.values["weight"]] if sheer else [])]
+    jumps = material.alpha_cutoff is not None
+    return any(isinstance(node, Node) and (jumps or getattr(node, "nearest", False)) for node in maps)
 
 
 def _point(device: torch.device) -> Tensor:
