@@ -205,14 +205,15 @@ def sources_of(bodies: Bodies, world: World, reach: float, met: bool) -> Sources
 # the camera (boundary segments of Zhang, Miller, Yan, Gkioulekas, Zhao, *Path-Space Differentiable Rendering*, 2020).
 
 
-#: Rays past an edge begin so many steps before it, and a step beside it: the rounding of its place.
+#: Rays past an edge begin so many steps before it, but not nearer to a light than half the way, and a step beside it: the
+#: rounding of its place.
 _BEFORE = 2.0**14
 #: What they meet within so many steps of the edge ends there.
 _AT = 16.0
 #: The same of the edge's own round surface, in roots of the surface's size times the step.
 _ROUND = 16.0
-#: Rays to lights end, and rays from near ones begin, so far before them, against the whole way.
-_BEGIN = 2.0**-12
+#: What rays to lights meet so close before them, against the whole way, is the light.
+_END = 2.0**-12
 #: Random numbers of rays to lights are as of a vertex that no path has.
 _TO_LIGHT = 1 << 11
 
@@ -310,8 +311,7 @@ class Shadows:
         length = dot(toward, toward).sqrt()
         away = -toward / length
         step = self.frame.rounding(passed.held.prim, passed.p)
-        whole = torch.where(w > 0, length * (1.0 - _BEGIN), torch.inf)
-        begin = torch.minimum(step * _BEFORE, whole)
+        begin = torch.minimum(step * _BEFORE, torch.where(w > 0, 0.5 * length, torch.inf))
         aside = cross(passed.along, toward)
         aside = aside / dot(aside, aside).sqrt()
         n = len(passed.lane)
@@ -321,8 +321,7 @@ class Shadows:
         # Behind a body's front an edge may throw a shadow's border too: both rays have to come from the light.
         aim = torch.where(w > 0, beam.view.e - o, -away)
         t, prim = traced.nearest(beside, torch.cat((aim, aim), 1), Passing(keys, depth=_TO_LIGHT))
-        free = (prim < 0).view(2, n) | ((w > 0) & (t.view(2, n) > 1.0 - _BEGIN))
-        lit = (begin == whole) | free.all(0)
+        lit = ((prim < 0).view(2, n) | ((w > 0) & (t.view(2, n) > 1.0 - _END))).all(0)
         t, prim = traced.nearest(beside, torch.cat((away, away), 1), Passing(keys, depth=1))
         t, prim = t.view(2, n), prim.view(2, n)
         own = (prim == passed.held.prim) | ((prim == passed.mate) & (passed.mate >= 0))
