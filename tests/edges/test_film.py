@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from typing import Any
 
 import pytest
@@ -84,3 +86,29 @@ def test_slopes_are_derivatives_of_places(name: str) -> None:
     expected = torch.autograd.functional.jacobian(lambda q: film_places(made, q, lens).sum(1), p)
     torch.testing.assert_close(s, film_places(made, p, lens))
     torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("light", [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
+def test_outlines_of_round_surfaces_are_of_the_light_at_the_very_outline(light: list[float]) -> None:
+    """Radiance falls with the root of the distance to an outline: a step away, it is another."""
+    radius, width, size = 0.8, 2.0, 24
+    described = {
+        "camera": {"type": "orthographic", "origin": [0, 0, 5], "target": [0, 0, 0], "width": width},
+        "film": {"width": size, "height": size},
+        "integrator": {"type": "path", "max_depth": 2},
+        "lights": {"sun": {"type": "directional", "direction": [-x for x in light], "irradiance": 1.0}},
+        "shapes": {"ball": {"type": "sphere", "radius": radius, "material": {"type": "diffuse", "reflectance": 0.5}}},
+    }
+    scene, name = torchpt.load(described, "cpu"), "shapes.ball.radius"
+
+    def derivative(**wish: Any) -> float:
+        found = torchpt.gradient(scene, lambda picture: picture.double().sum(), [name], spp=16, seed=1, **wish)
+        return float(found.gradients[name])
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", torchpt.EdgeWarning)
+        found = derivative(edge_spp=256) - derivative(edges=False)
+    # The integral of the radiance around the outline, 3 channels of pixels.
+    scale = 3 * (size / width) ** 2 * 0.5 / math.pi * radius
+    sine = light[0] / math.hypot(*light)
+    assert found == pytest.approx(2.0 * sine * scale, abs=0.006 * scale)

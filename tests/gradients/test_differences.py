@@ -55,6 +55,31 @@ def test_the_camera_before_a_sphere(axis: int) -> None:
     agree(value, scene.params["camera.to_world"], direction, 0.02, 0.03)
 
 
+@pytest.mark.parametrize("filter", ["box", "gaussian"])
+def test_the_camera_before_samples_that_are_clamped(filter: str) -> None:
+    """How much of the film a point covers does not count for the clamp."""
+    floor = {"type": "rectangle", "transform": [{"scale": 9}]}
+    scene = torchpt.load(
+        {
+            "camera": {"origin": [0, -2, 3], "target": [0, 0, 0], "up": [0, 0, 1], "fov": 40},
+            "film": {"width": 12, "height": 12, "filter": filter},
+            "integrator": {"type": "path", "max_depth": 2, "clamp": 0.8},
+            "lights": {"bulb": {"type": "point", "position": [0.2, 0.3, 0.8], "intensity": 8.0}},
+            "shapes": {"floor": floor},
+        },
+        "cpu",
+    )
+    weight = torch.linspace(-1.0, 2.0, 12, dtype=torch.float64)[:, None, None]
+
+    def value(pose: Tensor, spp: int) -> Tensor:
+        return (torchpt.render(scene, params={"camera.to_world": pose}, spp=spp, seed=0).double() * weight).mean()
+
+    direction = torch.zeros(4, 4, dtype=torch.float64)
+    direction[2, 3] = 1.0
+    agree(value, scene.params["camera.to_world"], direction, 0.02, 0.01)
+
+
+@pytest.mark.filterwarnings("ignore:the gradient leaves out some edges. those seen in mirrors")
 @pytest.mark.parametrize("material", [{"type": "conductor"}, {"type": "plastic", "diffuse_reflectance": 0.0}])
 @pytest.mark.parametrize("key", ["normal_map", "bump_map"])
 def test_maps_of_mirrors_turn_rays(material: dict[str, Any], key: str) -> None:

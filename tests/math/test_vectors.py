@@ -9,7 +9,7 @@ import torch
 from trials import SIGNIFICANCE, chi_square_p
 
 from torchpt.math.sampling import Distribution1D, power_heuristic, uniform_sphere
-from torchpt.math.vectors import Frame, cross, dot, luminance, normalize, take
+from torchpt.math.vectors import Frame, cross, dot, inverse_square, luminance, normalize, take
 
 G = torch.Generator().manual_seed(4)
 AXES = torch.cat((torch.eye(3), -torch.eye(3)), 1)
@@ -32,6 +32,15 @@ def test_frames_are_orthonormal_right_handed_and_invert():
     w = directions(20_000)
     assert (frame.to_world(frame.to_local(w)) - w).abs().max() < 1e-6
     assert torch.equal(Frame.about(AXES).to_local(AXES)[2], torch.ones(6))
+
+
+def test_inverse_squares_of_no_distance_are_finite_and_so_are_their_derivatives():
+    square = torch.tensor([0.0, 1e-45, 1e-30, 1e-12, 4.0], requires_grad=True)
+    found = inverse_square(square)
+    found.sum().backward()
+    assert square.grad is not None and torch.isfinite(square.grad).all() and torch.isfinite(found).all()
+    torch.testing.assert_close(found.detach()[3:], torch.tensor([1e12, 0.25]))
+    torch.testing.assert_close(square.grad[4], torch.tensor(-1 / 16))
 
 
 def test_dot_and_cross_are_torchs():

@@ -106,7 +106,7 @@ def film_space_backward(scene_tape: SceneTape, settings: Settings, cotangent: Te
 
     def interior_loss(span: Span) -> tuple[Tensor, Tensor]:
         first_pixel, pixel_count, _, _ = span
-        pixels = sample_value(interior(primal, wave, span)).sum(1) / spp
+        pixels = interior(primal, wave, span, sample_value).sum(1) / spp
         return pixels, cotangent[:, first_pixel : first_pixel + pixel_count]
 
     def splat_loss(span: Span) -> tuple[Tensor, Tensor]:
@@ -137,19 +137,20 @@ class _HeldPoints:
     stretch: Tensor  # (N,) film area of the point's surroundings, relative to that of now: value 1, differentiable
 
 
-def interior(primal: Wave, wave: Wave, span: Span) -> Tensor:
-    """Return radiance ``(3, samples, pixels)`` with the derivative of pixels under a box filter, without the border term.
+def interior(primal: Wave, wave: Wave, span: Span, sample_value: SampleValue) -> Tensor:
+    """Return samples ``(3, samples, pixels)`` with the derivative of pixels under a box filter, without the border term.
 
     Args:
         primal: the wave with detached parameters.
         wave: the same wave on a tape.
         span: first pixel, number of pixels, first sample, number of samples.
+        sample_value: see :data:`SampleValue`; how much of the film a point covers does not count for the clamp.
     """
     with torch.no_grad():
         state = primal.rays(*span)
     held = _hold_points(primal, wave, state)
     _, pixel_count, _, spp = span
-    return (_radiance(wave, held.state) * held.stretch).view(3, spp, pixel_count)
+    return (sample_value(_radiance(wave, held.state)) * held.stretch).view(3, spp, pixel_count)
 
 
 def borders(
@@ -216,7 +217,7 @@ def splats(primal: Wave, wave: Wave, span: Span, samples: int, cotangent: Tensor
     with torch.no_grad():
         state = _rays(primal, column + left + offset[0], row + top + offset[1], key)
     held = _hold_points(primal, wave, state)
-    radiance = sample_value(_radiance(wave, held.state) * held.stretch)
+    radiance = sample_value(_radiance(wave, held.state)) * held.stretch
     reach = range(-beyond, beyond + 1)
     # Filter weights of the pixels around, by their distance in columns and in rows.
     across = [_filter(primal, held.x - (column + (left + k + 0.5))) for k in reach]

@@ -20,6 +20,7 @@ __all__ = [
     "concatenate_lanes",
     "cross",
     "dot",
+    "inverse_square",
     "largest",
     "luminance",
     "normalize",
@@ -76,6 +77,11 @@ def largest(a: Tensor) -> Tensor:
 def safe_reciprocal(a: Tensor) -> Tensor:
     """Compute ``1 / a`` for ``a >= 0``; finite (and huge) at 0, where the caller multiplies by 0."""
     return a.clamp_min(torch.finfo(a.dtype).tiny).reciprocal()
+
+
+def inverse_square(square: Tensor) -> Tensor:
+    """Compute ``1 / r^2`` of squared distances ``(N,)``; finite at 0, and so is its derivative, in which r^-4 is."""
+    return square.clamp_min(torch.finfo(square.dtype).tiny ** 0.5).reciprocal()
 
 
 def luminance(rgb: Tensor) -> Tensor:

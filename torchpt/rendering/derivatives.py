@@ -92,7 +92,7 @@ class _Derivatives:
         self._attached = request.differentiates_rays or gradients.attached(scene, self._wanted)
         moves_edges = edges.concerns(scene, self._wanted)
         self._edges = call.edges and moves_edges
-        if request.differentiates_rays or moves_edges:
+        if self._attached or moves_edges:
             _warn_of_edges(edges.left_out(scene, settings, request.params), all_edges=not call.edges)
         for name in edges.without_gradient(scene, self._wanted, request.params):
             said = f"{name} changes the picture by jumps alone, which are not differentiated: its gradient is 0"

@@ -98,6 +98,22 @@ class Bodies:
         p0, x, y, _ = self.place(prim)
         return [p0, p0 + x, torch.where(four, p0 + x + y, p0 + y), torch.where(four, p0 + y, p0)]
 
+    def boxes(self, prim: Tensor) -> tuple[Tensor, Tensor]:
+        """Return lower and upper corners ``(3, N)`` of boxes about primitives ``(N,)``."""
+        p0, x, y, z = self.place(prim)
+        zero = torch.zeros_like(p0)
+        triangle = self.is_triangle(prim)
+        four = ~triangle & (prim < sum(self.counts[:2]))
+        corners = torch.stack((zero, x, y, torch.where(four, x + y, zero)))
+        low, high = corners.amin(0), corners.amax(0)
+        ring = (x * x + y * y).sqrt()
+        ball = (x * x + y * y + z * z).sqrt()
+        tall = ~self.is_flat(prim) & torch.isfinite(self.forms_of(prim)[3])
+        for mask, reach, up in ((~triangle & ~four, ball, zero), (tall, ring, z)):
+            low = torch.where(mask, -reach + torch.minimum(up, zero), low)
+            high = torch.where(mask, reach + torch.maximum(up, zero), high)
+        return p0 + low, p0 + high
+
     def points(self, held: Held) -> Tensor:
         """Return where points are ``(3, N)``."""
         p0, x, y, z = self.place(held.prim)

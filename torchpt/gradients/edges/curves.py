@@ -231,8 +231,8 @@ _FLAT = 1e-6
 SEAM = 0.25
 #: Least weight of a crease at which shading or texture coordinates may jump: most creases jump less than outlines.
 _CREASE = 0.05
-#: Points that are closer, against the size of all, are one; of edges that are longer than so many times that.
-_SAME, _LONG = 1e-6, 16.0
+#: Points that are closer, against their coordinates, are one; of edges that are longer than so many times that.
+_SAME, _LONG = 2.0**-20, 16.0
 #: Corners of two faces that are closer, against their coordinates, are together: parameters are of float32.
 _TOGETHER = 2.0**-22
 #: Odd multipliers that make one number of three, any constants.
@@ -338,8 +338,9 @@ def parts_of(bodies: Bodies, curves: Curves) -> Tensor:
     if not len(curves.prim):
         return torch.ones_like(curves.low)
     ends = torch.stack([bodies.points(curves.at(t)[0]) for t in (curves.low, curves.high)])  # (2, 3, N)
-    size = float((ends.amax((0, 2)) - ends.amin((0, 2))).max())
-    grid = max(size * _SAME, torch.finfo(ends.dtype).tiny)
+    # Powers of two, so that curves between the same points have the same one.
+    size = ends.abs().amax((0, 1)).clamp_min(torch.finfo(ends.dtype).tiny)
+    grid = torch.exp2(torch.log2(size).ceil()) * _SAME
     parts = torch.ones_like(curves.low)
     for shift in (0.0, 0.5):  # points on the border of two cells of one grid lie within a cell of the other
         cells = torch.floor(ends / grid + shift).long()

@@ -38,6 +38,8 @@ _PAIRS, _MOST = 1 << 21, 1 << 22
 _PARALLEL = 1e-5
 #: Curves that are so near a border, in a flat surface's own numbers, are that border: there surfaces touch.
 _TOUCH = 1e-6
+#: Rounding of places, against coordinates in the scene: parameters are of float32.
+_ROUNDING = 2.0**-22
 #: Least determinant, against the square of the trace, at which a conic is an ellipse.
 _ELLIPSE = 1e-10
 #: Angles at which an ellipse is compared with the border of a disk, and halvings of the step between them.
@@ -110,7 +112,7 @@ def cuts_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Cuts | No
             found += _flat_cuts(bodies, take(one, some), take(two, some), seams)
         some = (~flat).nonzero().squeeze(1)
         if len(some):
-            found += _round_cuts(bodies, take(one, some), take(two, some))
+            found += _round_cuts(bodies, take(one, some), take(two, some), scene.space.shift[:, None])
     found = [curves for curves in found if len(curves.prim)]
     if not found:
         return None
@@ -129,7 +131,7 @@ def _pairs(scene: Scene, bodies: Bodies) -> Iterator[tuple[Tensor, Tensor]]:
     if len({name for name, _, _ in owners}) < 2:
         return
     prim = torch.arange(sum(count for _, _, count in owners), device=scene.device)
-    low, high = _boxes(bodies, prim)
+    low, high = bodies.boxes(prim)
     wanted, shape = torch.zeros_like(prim, dtype=torch.bool), torch.zeros_like(prim)
     names = {name: k for k, name in enumerate(dict.fromkeys(name for name, _, _ in owners))}
     spans = [slice(first, first + count) for _, first, count in owners]
@@ -199,23 +201,6 @@ def _overlap(low: Tensor, high: Tensor, others_low: Tensor, others_high: Tensor)
     return ((low <= others_high) & (others_low <= high)).all(0)
 
 
-def _boxes(bodies: Bodies, prim: Tensor) -> tuple[Tensor, Tensor]:
-    """Return lower and upper corners ``(3, N)`` of boxes about primitives ``(N,)``."""
-    p0, x, y, z = bodies.place(prim)
-    zero = torch.zeros_like(p0)
-    triangle = bodies.is_triangle(prim)
-    four = ~triangle & (prim < sum(bodies.counts[:2]))
-    corners = torch.stack((zero, x, y, torch.where(four, x + y, zero)))
-    low, high = corners.amin(0), corners.amax(0)
-    ring = (x * x + y * y).sqrt()
-    ball = (x * x + y * y + z * z).sqrt()
-    tall = ~bodies.is_flat(prim) & torch.isfinite(bodies.forms_of(prim)[3])
-    for mask, reach, up in ((~triangle & ~four, ball, zero), (tall, ring, z)):
-        low = torch.where(mask, -reach + torch.minimum(up, zero), low)
-        high = torch.where(mask, reach + torch.maximum(up, zero), high)
-    return p0 + low, p0 + high
-
-
 # ---- In the numbers of a flat surface: functions ``g (3, N)`` stand for ``g0 + g1 a0 + g2 a1``
 
 
@@ -235,6 +220,23 @@ def _limits(bodies: Bodies, prim: Tensor, b0: Tensor, b1: Tensor) -> list[Tensor
     rest = one - b0 - b1
     every = b0, b1, torch.where(triangle, rest, one - b0), torch.where(triangle, rest, one - b1)
     return [torch.where(disk, one, g) for g in every]
+
+
+def _touch(off: Tensor, *axes: Tensor) -> Tensor:
+    """Return how near a border of a primitive, in its own numbers along ``axes``, curves are that border ``(N,)``.
+
+    ``off``: ``(N,)`` by how much rounding moves the curves.
+    """
+    shortest = torch.stack([dot(axis, axis) for axis in axes]).amin(0).sqrt()
+    return (off / shortest).clamp_min(_TOUCH)
+
+
+def _off(bodies: Bodies, along: Tensor, shift: Tensor, *prims: Tensor) -> Tensor:
+    """Return by how much rounding moves primitives along directions ``(3, N)``; ``shift``: of the lanes' coordinates."""
+    size = shift.abs()
+    for prim in prims:
+        size = size + torch.stack([t.abs() for t in bodies.place(prim)]).sum(0)
+    return dot(along.abs(), size) * _ROUNDING
 
 
 def _is_disk(bodies: Bodies, prim: Tensor) -> Tensor:
@@ -283,9 +285,11 @@ class _Seams:
         index = (mate > prim).nonzero().squeeze(1)
         one, two, plane = (take(t, index) for t in (prim, mate, other))
         back = (take(self.behind, two) == one).to(torch.uint8).argmax(0)
+        n, shift = bodies.normals(Held(plane, torch.zeros_like(corners(back)))), self.scene.space.shift[:, None]
         sides = []
-        for triangle, off in ((one, torch.full_like(back, corner)), (two, back)):
-            sides.append(bodies.own(plane, bodies.points(Held(triangle, corners(off))))[2])
+        for triangle, third in ((one, torch.full_like(back, corner)), (two, back)):
+            above = dot(n, bodies.points(Held(triangle, corners(third))) - bodies.place(plane)[0])
+            sides.append(torch.where(above.abs() > _off(bodies, n, shift, triangle, plane), above, 0.0))
         found = torch.zeros_like(good)
         found[index] = sides[0] * sides[1] < 0
         return found
@@ -297,13 +301,14 @@ def _line(
     at: Tensor,
     d: Tensor,
     limits: list[Tensor],
+    touch: list[Tensor],
     disks: list[tuple[Tensor, Tensor, Tensor]],
     seams: _Seams | None = None,
 ) -> Curves:
     """Return lines ``at + t d (2, N)`` on flat primitives, within limits and within disks (which, and their numbers).
 
-    ``seams``: where both primitives are flat, and the limits are those of the first and the second: lines along edges within a
-    mesh count too.
+    ``touch``: how near a limit lines only touch it. ``seams``: where both primitives are flat, and the limits are those of the
+    first and the second: lines along edges within a mesh count too.
     """
     low, high = torch.full_like(at[0], -torch.inf), torch.full_like(at[0], torch.inf)
 
@@ -316,9 +321,9 @@ def _line(
         high = torch.where(some & (end < high), end, high)
 
     everywhere = torch.full_like(low, torch.inf)
-    for g in limits:
+    for g, near in zip(limits, touch, strict=True):
         a, slope = along(g)
-        a = a if seams is None else a + 2.0 * _TOUCH
+        a = a if seams is None else a + 2.0 * near
         zero = -a / torch.where(slope == 0, 1.0, slope)
         clip(slope > 0, zero, everywhere)
         clip(slope < 0, -everywhere, zero)
@@ -336,8 +341,8 @@ def _line(
     for k, g in enumerate(limits):
         a, slope = along(g)
         inside = a + slope * middle
-        at_edge = good & (inside.abs() <= _TOUCH)
-        good &= inside > _TOUCH
+        at_edge = good & (inside.abs() <= touch[k])
+        good &= inside > touch[k]
         if seams is not None:
             edge = at_edge.nonzero().squeeze(1)
             if len(edge):
@@ -357,28 +362,38 @@ def _flat_cuts(bodies: Bodies, one: Tensor, two: Tensor, seams: _Seams) -> list[
     size = (height[1] * height[1] + height[2] * height[2]).sqrt()
     steep = cross(n[0], n[1])
     some = ((dot(steep, steep) > _PARALLEL * _PARALLEL) & (size > 0)).nonzero().squeeze(1)
-    one, two, size = take(one, some), take(two, some), take(size, some)
-    b0, b1, height = (take(g, some) for g in (b0, b1, height))
+    one, two, size, n, steep, b0, b1, height = rows((one, two, size, n, steep, b0, b1, height), some)
     at = -height[1:] * (height[0] / (size * size))
     d = torch.stack((-height[2], height[1])) / size
     a0, a1 = _identity(height)
     limits = _limits(bodies, one, a0, a1) + _limits(bodies, two, b0, b1)
+    # Where one plane is off along its normal, the line is off by more the flatter the planes cut.
+    shift, sine = seams.scene.space.shift[:, None], dot(steep, steep).sqrt()
+    touch = []
+    for prim, across in ((one, n[1]), (two, n[0])):
+        touch += [_touch(_off(bodies, across, shift, one, two) / sine, *bodies.place(prim)[1:3])] * len(_OFF)
     disks = [(_is_disk(bodies, one), a0, a1), (_is_disk(bodies, two), b0, b1)]
-    return [_line(one, two, at, d, limits, disks, seams)]
+    return [_line(one, two, at, d, limits, touch, disks, seams)]
 
 
-def _round_cuts(bodies: Bodies, one: Tensor, two: Tensor) -> list[Curves]:
-    """Return the ellipses and lines in which flat surfaces ``one`` cut round ones ``two``."""
+def _round_cuts(bodies: Bodies, one: Tensor, two: Tensor, shift: Tensor) -> list[Curves]:
+    """Return the ellipses and lines in which flat surfaces ``one`` cut round ones ``two``.
+
+    ``shift``: ``(3, 1)`` of the lanes' coordinates.
+    """
     q = _on(bodies, one, two)
     forms = bodies.forms_of(two)
-    bend, shift, level = forms[0], forms[1], forms[2]
+    bend, middle, level = forms[0], forms[1], forms[2]
     limits = _limits(bodies, one, *_identity(q[0]))
     ends = torch.isfinite(forms[3])
     whole = torch.zeros_like(q[0])
     whole[0] = 1.0
     limits += [torch.where(ends, q[2] - whole * forms[3].nan_to_num(), whole)]
     limits += [torch.where(ends, whole * forms[4].nan_to_num() - q[2], whole)]
-    w = torch.stack((q[0], q[1], q[2] - whole * shift))
+    off = _off(bodies, bodies.normals(Held(one, torch.zeros_like(q[0]))), shift, one, two)
+    _, x, y, z = bodies.place(two)
+    touch = [_touch(off, *bodies.place(one)[1:3])] * len(_OFF) + [_touch(off, z)] * 2
+    w = torch.stack((q[0], q[1], q[2] - whole * middle))
     by = torch.stack((torch.ones_like(bend), torch.ones_like(bend), bend))
 
     def product(i: int, j: int) -> Tensor:
@@ -393,11 +408,11 @@ def _round_cuts(bodies: Bodies, one: Tensor, two: Tensor) -> list[Curves]:
     x, y = (a12 * l2 - a22 * l1) / safe, (a12 * l1 - a11 * l2) / safe
     size = -(l1 * x + l2 * y) - c
     index = (round_cut & (size > _TOUCH)).nonzero().squeeze(1)
-    found = [_ellipses(*rows((one, two, x, y, size, a11, a12, det, limits, _is_disk(bodies, one)), index))]
+    found = [_ellipses(*rows((one, two, x, y, size, a11, a12, det, limits, touch, _is_disk(bodies, one)), index))]
     lines = (~round_cut & (det.abs() <= _ELLIPSE * trace * trace) & (bend == 0)).nonzero().squeeze(1)
     if len(lines):
         one, two, trace, a11, a12, a22, l1, l2, c = rows((one, two, trace, a11, a12, a22, l1, l2, c), lines)
-        limits = [take(g, lines) for g in limits]
+        limits, touch = rows((limits, touch), lines)
         wide = a11 > a22
         v = torch.stack((torch.where(wide, a11, a12), torch.where(wide, a12, a22)))
         v = v / (v * v).sum(0).sqrt().clamp_min(torch.finfo(v.dtype).tiny)
@@ -409,7 +424,7 @@ def _round_cuts(bodies: Bodies, one: Tensor, two: Tensor) -> list[Curves]:
         some = (inner > _TOUCH * trace).nonzero().squeeze(1)
         for sign in (1.0, -1.0):
             at = v * ((sign * root - half) / trace)
-            found.append(_line(*rows((one, two, at, d, limits, disk), some)))
+            found.append(_line(*rows((one, two, at, d, limits, touch, disk), some)))
     return found
 
 
@@ -423,6 +438,7 @@ def _ellipses(
     a12: Tensor,
     det: Tensor,
     limits: list[Tensor],
+    touch: list[Tensor],
     disk: Tensor,
 ) -> Curves:
     """Return the arcs of ellipses about ``x, y`` on flat surfaces (``disk``: those that are disks) that are within limits."""
@@ -456,9 +472,9 @@ def _ellipses(
     begin, end = ends[:-1], ends[1:]
     t = 0.5 * (begin + end)
     good = end - begin > 1e-9
-    for g in limits:
+    for g, near in zip(limits, touch, strict=True):
         g0, gc, gs = parts(g)
-        good &= g0 + gc * torch.cos(t) + gs * torch.sin(t) > _TOUCH
+        good &= g0 + gc * torch.cos(t) + gs * torch.sin(t) > near
     good &= torch.stack([beyond(row) < 0 for row in t])
     piece, index = good.nonzero(as_tuple=True)
     arcs = circles(take(one, index), take(middle, index), take(b, index), take(c, index))

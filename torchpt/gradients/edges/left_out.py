@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.curves import known
-from torchpt.gradients.edges.seams import jumps_elsewhere
+from torchpt.gradients.edges.seams import jumps_elsewhere, jumps_where_u_begins
 from torchpt.gradients.parameters import is_mirror
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
@@ -41,6 +41,8 @@ def _found(scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> It
         yield "those within textures of opacity that jump"
     if jumps_elsewhere(scene):
         yield "those within textures that are not interpolated, on round surfaces or of very many lines"
+    if jumps_where_u_begins(scene):
+        yield "those where texture coordinates of round surfaces begin anew"
     if any(part.quadric is not None and not known(part.quadric.form) for part in built.parts):
         yield "outlines of quadrics of kinds of your own"
     if any(source.kind == "spot" and _sharp(params, source.name) for source in built.sources):

@@ -38,8 +38,8 @@ _LEAST_OUTLINE = 0.01
 _LEAST_CREASE = 0.1
 #: Weight of curves that do not move, against those that do: only what is behind and before them moves.
 _STATIC = 0.3
-
-
+#: They count by their length so near what moves, in radii of that, and this part of them by all of it.
+_NEAR, _EVEN = 4.0, 0.1
 #: Square of the sine at which a face is seen along its plane.
 _ALONG = 1e-18
 
@@ -217,6 +217,16 @@ def occluders_of(
         return None
     moving = every.move(moves)
     seen = length * seen * moving
+    still = _still(bodies, every, length, moves)
+
+    def choice(weight: Tensor, all_move: bool) -> Distribution1D:
+        own = length * weight
+        if not all_move:
+            other = torch.where(moving, 0.0, still * weight)
+            most = torch.where(moving, own, 0.0).sum() / other.sum().clamp_min(torch.finfo(own.dtype).tiny)
+            own = torch.where(moving, own, other * most.clamp_max(_STATIC) if bool(most > 0) else other)
+        return Distribution1D.of(own, torch.float64, even=0.0)
+
     known = ((form < 0) & (crease > 0)).nonzero().squeeze(1)
     return Occluders(
         bodies,
@@ -226,10 +236,43 @@ def occluders_of(
         torch.ones_like(length).index_copy(0, known, parts_of(bodies, rows(every, known))),
         form.long(),
         forms,
-        Distribution1D.of(length * outline * torch.where(moving | lights_move, 1.0, _STATIC), torch.float64, even=0.0),
+        choice(outline, lights_move),
         Distribution1D.of(seen, torch.float64, even=0.0) if bool((seen > 0).any()) else None,
-        Distribution1D.of(length * crease * torch.where(moving, 1.0, _STATIC), torch.float64, even=0.0),
+        choice(crease, False),
     )
+
+
+def _still(bodies: Bodies, curves: Curves, length: Tensor, moves: Tensor) -> Tensor:
+    """Return the lengths ``(N,)`` with which curves that do not move count.
+
+    What moves, of radius s, is seen from d away within an angle that falls with the square of d. So it is the integral of
+    ``1 / (1 + (d / s)²)`` along the chord, on large floors a small part of the length.
+
+    Args:
+        bodies: detached.
+        curves: all.
+        length: theirs.
+        moves: ``(P,)`` bool: primitives that move.
+    """
+    prim = moves.nonzero().squeeze(1)
+    if not len(prim):
+        return length
+    low, high = bodies.boxes(prim)
+    low, high = low.amin(1, keepdim=True), high.amax(1, keepdim=True)
+    centre, size = 0.5 * (low + high), 0.5 * _NEAR * (high - low).square().sum().sqrt()
+    _, begin, _ = curves.moving(bodies, curves.low)
+    _, end, _ = curves.moving(bodies, torch.where(curves.round, 0.5 * (curves.low + curves.high), curves.high))
+    chord, start = end - begin, begin - centre
+    long = dot(chord, chord).sqrt()
+    straight_ = long > 0
+    unit = chord / torch.where(straight_, long, 1.0)
+    first = dot(unit, start)
+    beside = (dot(start, start) - first * first).clamp_min(0.0)
+    reach = (size * size + beside).sqrt()
+    along = torch.atan((first + long) / reach) - torch.atan(first / reach)
+    share = torch.where(straight_, along * reach / torch.where(straight_, long, 1.0), 1.0) * (size / reach).square()
+    near = length * share
+    return (1.0 - _EVEN) * near + _EVEN * length * (near.sum() / length.sum())
 
 
 def _outline_length(bodies: Bodies, rounds: Rounds) -> Tensor:

@@ -438,10 +438,17 @@ class Primary:
             share = share * self._visible_nearby(place, s, lens, key)
         seen = (share > 0).nonzero().squeeze(1)
         both = torch.cat((seen, seen + len(index)))
+        half = s, lens, normal / length, 0.25 * step
         place, lens, normal, value, share = rows((place, lens, normal, value, share), seen)
         o, d = take(o, both), take(d, both)
         n = len(seen)
-        values = look(o, d, take(number, place.lane).repeat(2)) if n else torch.zeros(len(value), 0).to(value)
+        number = take(number, place.lane)
+        values = look(o, d, number.repeat(2)) if n else torch.zeros(len(value), 0).to(value)
+        bent = (place.bent & ~place.cut).nonzero().squeeze(1)
+        if len(bent):  # radiance beside outlines changes with the root of the step: two steps give what is at none
+            near = look(*self._beside(*rows(half, take(seen, bent))), take(number, bent).repeat(2))
+            bent = torch.cat((bent, bent + n))
+            values[:, bent] = 2.0 * near - values[:, bent]
         jump = values[:, :n] - values[:, n:]
         worthy = (value * jump).sum(0) * share
         chance = place.density * total

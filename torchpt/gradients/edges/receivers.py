@@ -35,14 +35,16 @@ __all__ = ["MovingFrame", "PathVertex", "Prefix", "one_of_each", "prefixes_of"]
 
 #: Rounding of a point that the search finds, against its coordinates.
 _ROUNDING = 2.0**-18
+#: The same along normals: with more of it rays from a large floor would pass small bodies on it.
+_LIFT = 2.0**-21
 #: Vertices after which light that reaches no camera is given up where paths have no limit of their own.
 _MAX_VERTICES = 32
 #: From this vertex on roulette plays.
 _ROULETTE = 3
 #: Random numbers of rays to the camera are as of vertices that prefixes do not have.
 _TO_CAMERA = 1 << 12
-#: What ends so close to a point, against the way to it, ends at it: of the point's own primitive, and of others.
-_NEAR, _NEAREST = 2.0**-10, 2.0**-14
+#: What is met so far from a point, against the way to the camera, is behind that.
+_TO_LENS = 2.0**-20
 #: Pixels beside the film that are looked at, for wide filters.
 _MARGIN = 16.0
 
@@ -79,6 +81,11 @@ class MovingFrame:
         p0, *axes = self.bodies.place(prim)
         size = p0.abs() + sum((axis.abs() for axis in axes), torch.zeros_like(p0))
         return torch.stack([largest(p.abs()) for p in (size, *points)]).amax(0) * _ROUNDING
+
+    def lift(self, prim: Tensor, n: Tensor) -> Tensor:
+        """Return by how much rounding moves primitives ``(N,)`` along their normals ``n (3, N)``; little if these are axes."""
+        size = torch.stack([t.abs() for t in self.bodies.place(prim)]).sum(0)
+        return dot(n.abs(), size) * _LIFT
 
     def moving(self, prim: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of primitives that move; False where ``prim`` is -1."""
@@ -285,11 +292,11 @@ def _seen(frame: MovingFrame, spot: Spot, passing: Passing) -> tuple[Tensor, Ten
     s, x, lens = rows((s, x, lens), index)
     o, d = camera.rays(s[0], s[1], lens)
     o = o.expand_as(d)
-    away = x - o
-    reach = dot(away, d)
-    passing = replace(passing, key=take(passing.key, index), stop=reach * (1.0 - _NEAR))
-    t, prim = frame.traced.nearest(o, d, passing)
-    off = (t - reach).abs() / reach
-    visible = ((prim == take(spot.hit.prim, index)) & (off < _NEAR)) | (off < _NEAREST)
-    some = visible.nonzero().squeeze(1)
+    # From the point: the rounding of a ray from far away is more than what may lie before the point.
+    n, prim = take(spot.n, index).double(), take(spot.hit.prim, index)
+    lift = torch.maximum(frame.lift(prim, n), largest(x.abs()) * _ROUNDING)
+    begin = x - n * (torch.sign(dot(n, d)) * lift)
+    passing = replace(passing, key=take(passing.key, index))
+    t, _ = frame.traced.nearest(begin, -d, passing)
+    some = (t > dot(begin - o, d) * (1.0 - _TO_LENS)).nonzero().squeeze(1)
     return take(index, some), take(s, some), rows(lens, some), -take(d, some)

@@ -22,7 +22,7 @@ from torchpt.physics.textures.atlas import ImageNode
 from torchpt.scene import Scene
 from torchpt.scene.world.primitives import corners_of
 
-__all__ = ["jumps_elsewhere", "lies_on_seams", "seams_within"]
+__all__ = ["jumps_elsewhere", "jumps_where_u_begins", "lies_on_seams", "seams_within"]
 
 #: Kinds of primitives whose texture coordinates are affine in their own numbers.
 _FLAT = ("triangle", "rectangle")
@@ -147,6 +147,19 @@ def lies_on_seams(scene: Scene, mesh: MeshOf, params: Mapping[str, Tensor]) -> T
         on = ((a - line).abs() < _ON) & ((b - line).abs() < _ON)
         found |= on & (line >= lines.least) & (line <= lines.most)
     return found
+
+
+def jumps_where_u_begins(scene: Scene) -> bool:
+    """Return True if a texture jumps where u of a round surface goes on from 1 to 0."""
+
+    def jumps(node: Node) -> bool:
+        turns = [row[0] for row in getattr(node, "transform", ())]
+        wrap = getattr(node, "wrap", "repeat")
+        return any(turns) if wrap == "clamp" else any(turn % (2.0 if wrap == "mirror" else 1.0) for turn in turns)
+
+    return any(
+        jumps(node) for part in scene.built.parts if part.kind not in _FLAT for node in part.material.textures()
+    )
 
 
 def jumps_elsewhere(scene: Scene) -> bool:

@@ -72,8 +72,7 @@ class SegmentRays:
         curvature: ``(N,)`` of round surfaces along ``omega``; 0 on edges.
         omega: unit directions ``(3, N)``.
         density: ``(N,)`` of ``omega`` by solid angle; 1 where ``weight`` has it.
-        target: ``(3, N)`` points toward which directions were drawn.
-        aimed: ``(N,)`` bool: they were.
+        aimed: ``(N,)`` faces toward which directions were drawn; -1: none.
         m: ``(3, N)`` unit vectors across both the edge and ``omega``.
         weight: ``(N,)`` the measure over the density of the point.
     """
@@ -86,7 +85,6 @@ class SegmentRays:
     curvature: Tensor
     omega: Tensor
     density: Tensor
-    target: Tensor
     aimed: Tensor
     m: Tensor
     weight: Tensor
@@ -197,14 +195,14 @@ class SegmentSampler:
         lengthwise = 2.0 * direction[0] - 1.0
         crosswise = (1.0 - lengthwise * lengthwise).clamp_min(0.0).sqrt()
         omega = tangent * lengthwise + (one * torch.cos(angle) + two * torch.sin(angle)) * crosswise
-        target, aimed = e, torch.zeros_like(folded)
+        aimed = torch.full_like(index, -1)
         if self.smooth is not None:
-            aimed = coins[1] < _TOWARD
-            target = torch.where(aimed, bodies.points(self.smooth.draw(sample.aim)), e)
-            away = target - e
+            target = self.smooth.draw(sample.aim)
+            away = bodies.points(target) - e
             size = dot(away, away).sqrt()
-            aimed = aimed & (size > 0)
-            omega = torch.where(aimed, away / torch.where(size > 0, size, 1.0), omega)
+            toward = (coins[1] < _TOWARD) & (size > 0)
+            omega = torch.where(toward, away / torch.where(toward, size, 1.0), omega)
+            aimed = torch.where(toward, target.prim, aimed)
         angle = torch.remainder(torch.atan2(dot(omega, two), dot(omega, one)), math.pi)
         even = torch.where(folded, 0.25, 0.5) / math.pi
         density = 0.5 * (even + torch.where(folded & (angle >= beta), 0.25 / wedge, 0.0))
@@ -212,7 +210,7 @@ class SegmentSampler:
         sine = dot(side, side).sqrt()
         m, zero = side / torch.where(sine > 0, sine, 1.0), torch.zeros_like(e)
         weight = sine * length * span * take(self.occluders.part, index) / sample.chance
-        return SegmentRays(held, part.mate, part.cut, e, zero, zero[0], omega, density, target, aimed, m, weight)
+        return SegmentRays(held, part.mate, part.cut, e, zero, zero[0], omega, density, aimed, m, weight)
 
     def _across(self, face: Held, e: Tensor, tangent: Tensor) -> Tensor:
         """Return unit vectors in faces ``(3, N)``, across their edges; any across these where the point lies on the edge."""
@@ -240,9 +238,7 @@ class SegmentSampler:
         curvature = (own[0] + own[1] + (1.0 if form is None else form.bend) * own[2]).abs() / steep
         weight = curvature * area * (2.0 * math.pi) / sample.chance
         none, one = torch.full_like(prim, -1), torch.ones_like(weight)
-        return SegmentRays(
-            Held(prim, a), none, none >= 0, e, normal, curvature, omega, one, e, none >= 0, normal, weight
-        )
+        return SegmentRays(Held(prim, a), none, none >= 0, e, normal, curvature, omega, one, none, normal, weight)
 
 
 def _place(form: Form | None, u: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -393,9 +389,8 @@ class Segments:
             shaded = torch.isin(spot.hit.prim, smooth.prim)
             by_area = r * r / (dot(spot.n.double(), rays.omega).abs().clamp_min(1e-12) * smooth.area)
             density = (1.0 - _TOWARD) * rays.density + torch.where(shaded, _TOWARD * by_area, 0.0)
-            off = p - rays.target
-            # The density is that of what is met first: directions to points behind it count nothing.
-            hits &= ~rays.aimed | (shaded & (dot(off, off).sqrt() < 1e-3 * r + 8.0 * tiny))
+            # The density is that of what is met first: directions to faces behind it count nothing.
+            hits &= (rays.aimed < 0) | (rays.aimed == spot.hit.prim)
             rays = replace(rays, density=torch.where(rays.curvature > 0, rays.density, density))
         lane = hits.nonzero().squeeze(1)
         return rows(rays, lane), spot.taken(lane), lane
@@ -406,7 +401,8 @@ class Segments:
         """Return the samples of rays and the receivers that they met; None where none of them counts."""
         x, n = receiver.p.double(), receiver.n.double()
         tiny = self.frame.rounding(rays.held.prim, x, rays.e)
-        o = x - n * (torch.sign(dot(n, rays.omega)) * tiny)
+        lift = torch.maximum(tiny, self.frame.lift(receiver.hit.prim, n))
+        o = x - n * (torch.sign(dot(n, rays.omega)) * lift)
         way = rays.e - o
         r = dot(way, way).sqrt()
         step = r * _STEP + tiny

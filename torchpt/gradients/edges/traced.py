@@ -43,7 +43,7 @@ class Along:
     """
 
     def __init__(self, scene: Scene, settings: Settings, wave: Wave) -> None:
-        self._scene, self._clamp = scene, wave.integrator.clamp
+        self._scene = scene
         # Kernels of a kind with stages of its own are made anew for each depth that is asked for.
         own = wave.integrator.has_own_stages or scene.device.type != "cpu"
         compiled = not own and uses_kernels(settings, scene.device, wave.context.plan.dtype)
@@ -63,7 +63,8 @@ class Along:
                 self._compiled = False
         values = trace(wave, wave.rays(0, wave.crop[2], sample, 1))
         values = torch.where(torch.isfinite(values).all(0), values, 0.0).double()
-        return values if self._clamp is None else values * clamp_scale(values, self._clamp)
+        clamp = wave.integrator.clamp
+        return values if clamp is None else values * clamp_scale(values, clamp)
 
     def _by_kernels(self, wave: Wave, sample: int) -> Tensor:
         self._kernels = kernels_of(self._scene, wave, self._kernels)
@@ -233,6 +234,8 @@ class Traced:
         if depth is not None:
             assert isinstance(wave.integrator, PathIntegrator)  # no other has these estimators
             wave = replace(wave, integrator=wave.integrator.to_depth(depth))
+        if use is not Use.PRIMARY:  # no samples of pixels: what is before their edges weighs them
+            wave = replace(wave, integrator=wave.integrator.but(clamp=None))
         return self.with_rays.radiance(wave, int(use))
 
 

@@ -12,7 +12,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import affine, dot, safe_reciprocal
+from torchpt.math.vectors import affine, dot, inverse_square
 from torchpt.physics.lights.base import KINDS, Cone, Emitter
 from torchpt.physics.lights.records import Lights
 from torchpt.physics.shapes.geometry import KINDS as PRIMITIVES
@@ -58,7 +58,7 @@ def flat_inverse_pdf(normal: Tensor, area: Tensor, wi: Tensor, square: Tensor) -
         square: squared distance ``(N,)``.
     """
     cosine = (-dot(wi, normal)).clamp_min(0.0)
-    return area * cosine * safe_reciprocal(square)
+    return area * cosine * inverse_square(square)
 
 
 class Surface(Emitter):

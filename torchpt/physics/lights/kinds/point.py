@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt import spec
-from torchpt.math.vectors import dot, safe_reciprocal
+from torchpt.math.vectors import dot, inverse_square
 from torchpt.physics.lights.base import Light, Row, Setting, bright
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.spec import Color, Moves
@@ -21,7 +21,7 @@ def toward(x: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
     """Return unit directions ``(3, N)`` from ``x (3, N)`` to points, and inverse squared distances ``(N,)``, 0 at the point."""
     to = position - x
     square = dot(to, to)
-    return to / square.clamp_min(torch.finfo(square.dtype).tiny).sqrt(), safe_reciprocal(square)
+    return to / square.clamp_min(torch.finfo(square.dtype).tiny).sqrt(), inverse_square(square)
 
 
 class Point(Light):

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.sampling import one_minus_cos, uniform_cone, uniform_sphere
-from torchpt.math.vectors import Frame, dot, normalize, safe_reciprocal
+from torchpt.math.vectors import Frame, dot, inverse_square, normalize
 from torchpt.physics.lights.records import Lights
 from torchpt.physics.lights.surface import Faces, Surface, SurfaceSample
 
@@ -49,7 +49,7 @@ def inverse_pdf(x: Tensor, centre: Tensor, radius: Tensor, normal: Tensor, wi: T
     """Return ``1 / pdf`` in steradians ``(N,)`` of :func:`sample` at a point with this normal; 0 behind the emitting side."""
     _, _, outside, width = _cone(x, centre, radius)
     cosine = -dot(wi, normal)
-    whole = (4.0 * math.pi) * radius * radius * cosine * safe_reciprocal(square)
+    whole = (4.0 * math.pi) * radius * radius * cosine * inverse_square(square)
     return torch.where(cosine > 0, torch.where(outside, (2.0 * math.pi) * width, whole), 0.0)
 
 
