@@ -157,9 +157,7 @@ def jumps_where_u_begins(scene: Scene) -> bool:
         wrap = getattr(node, "wrap", "repeat")
         return any(turns) if wrap == "clamp" else any(turn % (2.0 if wrap == "mirror" else 1.0) for turn in turns)
 
-    return any(
-        jumps(node) for part in scene.built.parts if part.kind not in _FLAT for node in part.material.textures()
-    )
+    return any(jumps(node) for part in scene.built.parts if part.kind not in _FLAT for node in part.material.textures())
 
 
 def jumps_elsewhere(scene: Scene) -> bool:
