@@ -1,6 +1,6 @@
 """Parse Mitsuba's XML to elements, with parameters substituted and included files in place.
 
-Entities, document types and external references are refused; files are read from disk only, within the limits below.
+Entities and external references are refused; files are read from disk only, within the limits below.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class _Reader:
         folder = path.resolve().parent
 
         def refuse(what: str) -> SceneError:
-            return SceneError(f"line {parser.CurrentLineNumber}", what, "XML without document types and entities", file)
+            return SceneError(f"line {parser.CurrentLineNumber}", what, "XML without entities", file)
 
         def start(tag: str, attributes: dict[str, str]) -> None:
             self.elements += 1
@@ -138,18 +138,17 @@ class _Reader:
             (stack[-1].children if stack else roots).append(element)
             stack.append(element)
 
-        def doctype(*_: object) -> None:
-            raise refuse("<!DOCTYPE>")
-
         def entity(*_: object) -> None:
             raise refuse("an entity")
 
         parser.StartElementHandler = start
         parser.EndElementHandler = lambda _: stack.pop() and None
-        parser.StartDoctypeDeclHandler = doctype
         parser.EntityDeclHandler = entity
         parser.ExternalEntityRefHandler = entity  # type: ignore[assignment]
         parser.SkippedEntityHandler = entity  # type: ignore[assignment]
+        start_of = re.match(rb"\s+(<\?xml[^>]*\?>)", data)
+        if start_of:  # blanks before the declaration, which some XML readers allow: it is taken out, lines stay
+            data = data.replace(start_of[1], b"", 1)
         try:
             parser.Parse(data, True)
         except expat.ExpatError as error:
@@ -230,10 +229,11 @@ def _bytes_of(path: Path, file: str) -> bytes:
 
 def _version(root: Element) -> tuple[int, ...]:
     """Return the version of Mitsuba that a file was written for; 3.0.0 where it does not say."""
-    text = root.attributes.get("version", "3.0.0")
-    if not re.fullmatch(r"[0-9]{1,6}(\.[0-9]{1,6}){0,3}", text):
+    text = root.attributes.get("version", "3.0.0").strip()
+    found = re.match(r"[0-9]{1,6}(\.[0-9]{1,6}){0,3}", text)  # before a suffix such as "-alpha"
+    if found is None:
         raise root.error(text, "a version such as 0.6.0 or 3.0.0")
-    return tuple(int(part) for part in text.split("."))
+    return tuple(int(part) for part in found[0].split("."))
 
 
 def _required(element: Element, name: str) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpt.math.transforms import apply_points, similarity_scale
+from torchpt.math.transforms import similarity_scale
 from torchpt.physics.lights.sun_position import sun_angles
 from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, left_out, nearest
 from torchpt.scene.formats.mitsuba.properties import Properties
@@ -25,6 +25,7 @@ Light = dict[str, Any]
 Matrix = NDArray[np.float64]
 
 _ONE = [1.0, 1.0, 1.0]
+_NARROWEST = 1e-6  # beam of a spot, of its cutoff
 
 
 def _common(p: Properties) -> None:
@@ -37,12 +38,13 @@ def _position(p: Properties) -> list[float]:
     return [float(x) for x in p.transform()[:3, 3]] if point is None else point
 
 
-def _axis(p: Properties, name: str = "direction") -> list[float]:
-    """Return a direction: the property, or the z axis of ``to_world``."""
-    matrix, given = p.transform(), p.point(name)
+def _axis(p: Properties) -> list[float] | None:
+    """Return the direction of a light: the property, or the z axis of ``to_world``; None where it is 0."""
+    matrix, given = p.transform(), p.point("direction") if p.plugin == "directional" else None
     axis = matrix[:3, 2] if given is None else np.array(given)
-    if not np.isfinite(axis).all() or not axis.any():
-        raise p.element.error([float(x) for x in axis], f"a {name} other than 0")
+    if not axis.any():
+        p.note("it is left out: it has no direction")
+        return None
     return [float(x) for x in axis]
 
 
@@ -53,21 +55,32 @@ def _point(p: Properties, importer: Importer) -> list[Light]:
 
 def _spot(p: Properties, importer: Importer) -> list[Light]:
     _common(p)
-    matrix = p.transform()
-    position, target = apply_points(matrix, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])).tolist()
-    found: Light = {"type": "spot", "position": position, "target": target}
-    found["intensity"] = p.colour("intensity", _ONE, light=True)
-    found["cutoff_angle"] = p.number("cutoff_angle", 20.0)
-    if p.has("beam_width"):
-        found["beam_width"] = p.number("beam_width", 15.0)
-    if p.objects("texture"):
+    matrix, texture = p.transform(), p.slot("texture", _ONE, light=True)
+    intensity, cutoff = p.colour("intensity", _ONE, light=True), p.number("cutoff_angle", 20.0)
+    beam = p.number("beam_width", 0.75 * cutoff)
+    if isinstance(texture, dict) or p.objects("texture"):
         p.note("the texture of the beam is left out")
-    return [found]
+    else:
+        intensity = [a * b for a, b in zip(intensity, texture, strict=True)]
+    axis = _axis(p)
+    if axis is None:
+        return []
+    if not cutoff > 0.0:
+        p.note("it is left out: its cutoff_angle is not above 0")
+        return []
+    if cutoff > 180.0:
+        p.note("a cutoff_angle above 180 becomes 180")
+        cutoff = 180.0
+    # A beam beyond the cutoff ends there; one of width 0 falls off from its axis.
+    angles = {"cutoff_angle": cutoff, "beam_width": min(max(beam, _NARROWEST * cutoff), cutoff)}
+    target = [float(a + b) for a, b in zip(matrix[:3, 3], axis, strict=True)]
+    return [{"type": "spot", "position": matrix[:3, 3].tolist(), "target": target, "intensity": intensity, **angles}]
 
 
 def _directional(p: Properties, importer: Importer) -> list[Light]:
     _common(p)
-    return [{"type": "directional", "direction": _axis(p), "irradiance": p.colour("irradiance", _ONE, light=True)}]
+    irradiance, axis = p.colour("irradiance", _ONE, light=True), _axis(p)
+    return [] if axis is None else [{"type": "directional", "direction": axis, "irradiance": irradiance}]
 
 
 def _constant(p: Properties, importer: Importer) -> list[Light]:

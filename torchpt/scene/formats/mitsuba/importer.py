@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from torchpt.core.errors import SceneError, did_you_mean
+import numpy as np
+
+from torchpt.core.errors import AssetError, SceneError, did_you_mean
 from torchpt.core.files import is_regular
+from torchpt.math.transforms import is_usable
 from torchpt.scene.formats.mitsuba.bsdfs import BSDFS, UNKNOWN
 from torchpt.scene.formats.mitsuba.elements import Element, parse_scene, walk
 from torchpt.scene.formats.mitsuba.emitters import EMITTERS, join_skies
 from torchpt.scene.formats.mitsuba.notes import Notes
 from torchpt.scene.formats.mitsuba.plugins import Plugin, Twin, left_out, nearest
-from torchpt.scene.formats.mitsuba.properties import OBJECTS, Properties
+from torchpt.scene.formats.mitsuba.properties import OBJECTS, VALUES, Properties
 from torchpt.scene.formats.mitsuba.sensors import (
     FILMS,
     FILTERS,
@@ -26,7 +30,7 @@ from torchpt.scene.formats.mitsuba.sensors import (
     UNKNOWN_INTEGRATOR,
     UNKNOWN_SAMPLER,
 )
-from torchpt.scene.formats.mitsuba.shapes import SHAPES, posed, with_attribute
+from torchpt.scene.formats.mitsuba.shapes import SHAPES, bounds, posed, with_attribute
 from torchpt.scene.formats.mitsuba.textures import TEXTURES, attributes_of
 from torchpt.scene.formats.mitsuba.versions import plugin_name
 
@@ -285,14 +289,16 @@ class Importer:
             target = self.target(child) if child.tag == "ref" else child
             if target.tag in found:
                 found[target.tag].append(target)
+            elif target.tag in VALUES:
+                self.notes.add(child, f"the property {child.attributes.get('name', '')} of the scene is left out")
             elif target.tag not in ("alias", "path"):
                 known = ", ".join((*OBJECTS, "default", "include", "alias", "ref", "path"))
                 raise child.error(f"<{child.written}>", f"one of the elements {known}")
-        if not found["sensor"]:
-            raise self.root.error("no sensor", "a sensor (a camera)")
         settings = self._settings(found["sensor"], found["integrator"])
         for element in found["shape"]:
             self._shape(element)
+        if not found["sensor"]:
+            settings["camera"] = self._camera_of_all()
         for element in found["emitter"]:
             self._emitter(element)
         for tag in ("medium", "phase", "volume", "subsurface"):
@@ -305,7 +311,7 @@ class Importer:
         """Return camera, film, sampler, integrator and ``render.spp``."""
         if len(sensors) > 1:
             self.notes.add(sensors[1], "all sensors but the first are left out")
-        sensor = sensors[0]
+        sensor = sensors[0] if sensors else replace(self.root, tag="sensor", attributes={}, children=[])
         inner: dict[str, Element] = {}
         rest: list[Element] = []
         for child in sensor.children:
@@ -315,7 +321,7 @@ class Importer:
             else:
                 rest.append(child)
         bare = replace(sensor, children=rest)
-        camera = self.build(SENSORS, bare, _UNKNOWN_SENSOR)
+        camera = self.build(SENSORS, bare, _UNKNOWN_SENSOR) if sensors else {}
         film = {"width": 768, "height": 576, "filter": {"type": "gaussian"}}
         if "film" in inner:
             film = self.build(FILMS, inner["film"], UNKNOWN_FILM)
@@ -337,6 +343,22 @@ class Importer:
             "sampler": {"type": sampler},
             "render": {"spp": count},
         }
+
+    def _camera_of_all(self) -> dict[str, Any]:
+        """Return the camera of a scene without one: along z, with all shapes before it, as Mitsuba before version 2 had."""
+        try:
+            box = bounds(self.shapes, self.base)
+        except AssetError as error:
+            raise self.root.error("no sensor", f"a sensor (a camera), or readable meshes: {error.problem}") from None
+        if box is None:
+            raise self.root.error("no sensor", "a sensor (a camera)")
+        self.notes.add(self.root, "there is no sensor: a camera along z sees all shapes")
+        middle, sizes = box.mean(0), box[1] - box[0]
+        distance = (float(max(sizes[:2])) or float(sizes[2]) or 1.0) / (2.0 * math.tan(math.radians(22.5)))
+        origin = [float(middle[0]), float(middle[1]), float(box[0, 2]) - distance]
+        pose = np.eye(4)
+        pose[:3, 3] = origin
+        return {"type": "perspective", "to_world": pose.tolist(), "fov": 45.0}
 
     def _shape(self, element: Element) -> None:
         """Add a shape of the scene."""
@@ -445,6 +467,9 @@ class Importer:
         properties = Properties(replace(element, children=rest), "instance", self)
         pose = properties.transform()
         properties.left_over()
+        if not is_usable(pose):
+            properties.note("it is left out: its to_world cannot be inverted")
+            return
         drawn = self._meshes_of_groups.setdefault(id(groups[0]), {})
         for child in groups[0].children:
             target = self.target(child) if child.tag == "ref" else child
@@ -458,8 +483,11 @@ class Importer:
                 self.shapes[name] = posed(shape, pose)
                 drawn[id(target)] = name
             elif before is not None:
-                own = self._own_pose(target)
-                copy = posed(posed({"type": "instance", "of": drawn[id(target)]}, own), pose)
+                total = pose @ self._own_pose(target)
+                if not is_usable(total):
+                    self.notes.add(target, f"{target.label}: a flattened copy is left out")
+                    continue
+                copy = posed({"type": "instance", "of": drawn[id(target)]}, total)
                 self.shapes[self._free(self.shapes, target)] = copy
 
     def _own_pose(self, element: Element) -> Any:

@@ -16,7 +16,7 @@ from torchpt.scene.formats.mitsuba.versions import property_name
 if TYPE_CHECKING:
     from torchpt.scene.formats.mitsuba.importer import Importer
 
-__all__ = ["OBJECTS", "Properties"]
+__all__ = ["OBJECTS", "VALUES", "Properties"]
 
 #: Tags of objects, which have a plugin; all other tags are values.
 OBJECTS = (
@@ -24,7 +24,7 @@ OBJECTS = (
     "subsurface",
 )  # fmt: skip
 _COLOURS = ("rgb", "srgb", "spectrum", "blackbody", "color", "float", "integer")
-_VALUES = (*_COLOURS, "boolean", "string", "point", "vector", "transform", "animation")
+VALUES = (*_COLOURS, "boolean", "string", "point", "vector", "transform", "animation")
 
 
 class Properties:
@@ -46,14 +46,16 @@ class Properties:
             target = importer.target(child) if child.tag == "ref" else child
             if target.tag in OBJECTS:
                 self._objects.append((name, target))
-            elif target.tag not in _VALUES:
-                known = ", ".join((*_VALUES, *OBJECTS, "ref"))
+            elif target.tag not in VALUES:
+                known = ", ".join((*VALUES, *OBJECTS, "ref"))
                 raise child.error(f"<{child.written}>", f"one of the elements {known}")
             elif not name:
                 raise child.error(f"<{child.written}>", "an attribute name")
-            elif name in self._values:
+            elif name in self._values and self.modern:
                 raise child.error(name, f"a property only once (line {self._values[name].line} has it too)")
             else:
+                if name in self._values:
+                    self.note(f"the property {name} stands there several times: the last one is taken")
                 self._values[name] = target
 
     @property
@@ -114,7 +116,10 @@ class Properties:
             return values.transform(inner[0]) if inner else np.eye(4)
         if element.tag != "transform":
             raise element.error(f"<{element.written}>", f"a transform as {name}")
-        return values.transform(element)
+        found = values.transform(element)
+        if values.is_projective(element):
+            self.note("a matrix with perspective becomes affine: its last row is left out")
+        return found
 
     def colour(self, name: str, default: Any = None, *, light: bool = False) -> Any:
         """Return a colour ``[r, g, b]``, or ``default``; a texture's place is taken by grey."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchpt.math.transforms import is_rigid, is_singular
 from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, nearest
 from torchpt.scene.formats.mitsuba.properties import Properties
 
@@ -39,11 +40,20 @@ def _pose(p: Properties) -> tuple[Any, Any]:
     matrix = p.transform()
     if p.element.written == "camera":  # before 0.4, when x was to the right
         matrix = matrix @ np.diag([-1.0, 1.0, 1.0, 1.0])
-    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
-    if not (lengths > 0.0).all():
-        raise p.element.error(matrix[:3].tolist(), "a to_world that can be inverted")
     matrix = matrix.copy()
+    if p.plugin in ("orthographic", "telecentric") and not matrix[:3, 2].any():  # its length has no meaning there
+        matrix[:3, 2] = np.cross(matrix[:3, 0], matrix[:3, 1])
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    if not (lengths > 0.0).all() or is_singular(matrix):
+        raise p.element.error(matrix[:3].tolist(), "a to_world that can be inverted")
     matrix[:3, :3] /= lengths
+    if not is_rigid(matrix):
+        p.note("the shear of to_world is left out")
+        view = matrix[:3, 2]
+        above = matrix[:3, 1] - view * (matrix[:3, 1] @ view)
+        above /= np.linalg.norm(above)
+        left = np.cross(above, view)
+        matrix[:3, 0], matrix[:3, 1] = left * np.sign(left @ matrix[:3, 0]), above
     return [[float(x) for x in row] for row in matrix], lengths
 
 
@@ -216,8 +226,8 @@ def _sampler(type: str) -> Any:
         p.ignore("seed", "jitter", "dimension", "scramble", "shift", "resolution", "pixel_offset")
         count = p.integer("sample_count", 4)
         if count < 1:
-            raise p.element.error(count, "a sample_count >= 1")
-        return type, count
+            p.note("a sample_count below 1 becomes 1")
+        return type, max(count, 1)
 
     return build
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError, SceneError
-from torchpt.math.transforms import is_usable
+from torchpt.math.transforms import apply_points, is_usable, similarity_scale
 from torchpt.math.vectors import Frame
 from torchpt.physics.shapes import KINDS
 from torchpt.scene.formats.mitsuba.elements import Element
@@ -24,45 +24,62 @@ from torchpt.scene.meshes.ply import load_ply_attribute
 if TYPE_CHECKING:
     from torchpt.scene.formats.mitsuba.importer import Importer
 
-__all__ = ["SHAPES", "posed", "with_attribute"]
+__all__ = ["SHAPES", "bounds", "posed", "with_attribute"]
 
 Shape = dict[str, Any]
 Matrix = NDArray[np.float64]
 
+_THIN = 1e-5  # of the largest scale: that across a solid or a mesh whose to_world flattens it
+
 
 def posed(shape: Shape, matrix: Matrix) -> Shape:
     """Return a shape with a transform ``(4, 4)`` after its own."""
-    before = np.array(shape["transform"][0]["matrix"]) if "transform" in shape else np.eye(4)
-    total = matrix @ before
+    total = matrix @ _pose_of(shape)
     kept = {key: value for key, value in shape.items() if key != "transform"}
     if np.array_equal(total, np.eye(4)):
         return kept
     return kept | {"transform": [{"matrix": [[float(x) for x in row] for row in total]}]}
 
 
-def _shape(p: Properties, type: str, own: Matrix | None = None, **keys: Any) -> Shape:
-    """Return a shape with the transform and the flag that all of Mitsuba's have; keys of None are left out."""
+def _shape(p: Properties, type: str, pose: Matrix, *, flip: bool = False, **keys: Any) -> Shape | None:
+    """Return a shape with its pose and the flag that all of Mitsuba's have, None where it has no area.
+
+    Args:
+        p: its properties.
+        type: its type here.
+        pose: ``(4, 4)``.
+        flip: True to turn its normals round once more.
+        keys: other keys; those of None are left out.
+    """
     found = {"type": type, **{key: value for key, value in keys.items() if value is not None}}
-    if p.flag("flip_normals"):
+    if p.flag("flip_normals") != flip:
         found["flip_normals"] = True
-    pose = p.transform()
-    pose = pose if own is None else pose @ own
-    if type in ("rectangle", "disk"):
-        pose = _with_normal(pose)
     if not is_usable(pose):
-        raise p.element.error(pose[:3].tolist(), "a to_world that can be inverted")
+        pose = _with_normal(pose) if type in ("rectangle", "disk") else _thin(p, pose)
+    if not is_usable(pose):
+        p.note("it is left out: its to_world leaves it no area")
+        return None
     return posed(found, pose)
 
 
 def _with_normal(pose: Matrix) -> Matrix:
-    """Return a pose of a flat shape with a third axis, which does not matter, where that is 0."""
-    if is_usable(pose):
-        return pose
+    """Return a pose of a flat shape with a third axis, which does not matter."""
     across = np.cross(pose[:3, 0], pose[:3, 1])
     length = np.linalg.norm(across)
     if length > 0.0:
         pose = pose.copy()
         pose[:3, 2] = across / np.sqrt(length)
+    return pose
+
+
+def _thin(p: Properties, pose: Matrix) -> Matrix:
+    """Return a pose that flattens a solid or a mesh to a plane as one that leaves it some thickness."""
+    u, values, v = np.linalg.svd(pose[:3, :3])
+    if not values[1] > _THIN * values[0]:
+        return pose
+    p.note("a to_world that flattens it leaves it a little thickness")
+    pose = pose.copy()
+    pose[:3, :3] += _THIN * values[0] * np.outer(u[:, 2], v[2])
     return pose
 
 
@@ -81,21 +98,36 @@ def _mesh(p: Properties, importer: Importer) -> Shape | None:
     upright = p.plugin == "obj" and p.element.version >= (0, 3)  # whether v is flipped where nothing is said
     flips = p.flag("flip_tex_coords", upright)
     flat = p.flag("face_normals") or None
+    pose = p.transform()
     if path is None:
-        p.transform()
         return None
+    flip = np.linalg.det(pose[:3, :3]) < 0.0 and _turned_by_mirrors(p, path, index)
     if flips == upright:
-        return _shape(p, "mesh", path=importer.path(path), shape_index=index, face_normals=flat)
-    part = _flipped(p, path, index)
-    return _shape(p, "mesh", mesh=(part,), face_normals=flat or part.flat or None)
+        return _shape(p, "mesh", pose, flip=flip, path=importer.path(path), shape_index=index, face_normals=flat)
+    part = _flipped(_parts(p, path, index))
+    return _shape(p, "mesh", pose, flip=flip, mesh=(part,), face_normals=flat or part.flat or None)
 
 
-def _flipped(p: Properties, path: Path, index: int | None) -> MeshPart:
-    """Return the parts of a mesh file, joined to one, with flipped texture coordinates."""
+def _turned_by_mirrors(p: Properties, path: Path, index: int | None) -> bool:
+    """Return True where Mitsuba takes the normals of a mesh from its faces, whose winding a mirror turns round.
+
+    Ours keep their fronts. Mitsuba's normals of a file do so too, and its reader of serialized meshes before version 2.
+    """
+    if p.plugin == "serialized" and not p.modern:
+        return False
+    return p.flag("face_normals") or all(part.normals is None or part.flat for part in _parts(p, path, index))
+
+
+def _parts(p: Properties, path: Path, index: int | None) -> Sequence[MeshPart]:
+    """Return the parts of a mesh file."""
     try:
-        parts = load_mesh(path, materials=False, index=index)
+        return load_mesh(path, materials=False, index=index)
     except AssetError as error:
         raise SceneError(f"line {p.element.line}", str(path), error.problem, p.element.file) from None
+
+
+def _flipped(parts: Sequence[MeshPart]) -> MeshPart:
+    """Return the parts of a mesh file, joined to one, with flipped texture coordinates."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
     normals = [part.normals for part in parts if part.normals is not None]
@@ -156,30 +188,76 @@ def with_attribute(shape: Shape, names: Sequence[str], element: Element, importe
     return shape
 
 
-def _sphere(p: Properties, importer: Importer) -> Shape:
-    radius = p.number("radius", 1.0)
-    if not radius > 0.0:
-        raise p.element.error(radius, "a radius > 0")
-    return _shape(p, "sphere", center=p.point("center"), radius=None if radius == 1.0 else radius)
+def _sphere(p: Properties, importer: Importer) -> Shape | None:
+    """Return a sphere. One that ``to_world`` stretches stays a sphere of its size along x, as in Mitsuba.
+
+    Since version 2 a mirror, or a negative radius, turns its normals round.
+    """
+    radius, center, pose = p.number("radius", 1.0), p.point("center"), p.transform()
+    flip = p.modern and (np.linalg.det(pose[:3, :3]) < 0.0) != (radius < 0.0)
+    if radius == 0.0 or (radius < 0.0 and not p.modern):
+        p.note("it is left out: its radius is not above 0")
+        return None
+    if is_usable(pose) and similarity_scale(pose) is None:
+        p.note("a stretched sphere stays one, of its size along x")
+        u, values, v = np.linalg.svd(pose[:3, :3])
+        size = v.T @ np.diag(values) @ v  # the pose is a turn after it
+        length = size[0, 0] if p.modern else np.linalg.norm(pose[:3, 0])
+        middle = apply_points(pose, np.array([center or [0.0] * 3]))[0]
+        pose, center = pose.copy(), None
+        pose[:3, :3], pose[:3, 3] = u @ v * length, middle
+    radius = abs(radius)
+    return _shape(p, "sphere", pose, flip=flip, center=center, radius=None if radius == 1.0 else radius)
 
 
-def _cylinder(p: Properties, importer: Importer) -> Shape:
+def _cylinder(p: Properties, importer: Importer) -> Shape | None:
     """Return the side of a cylinder between two points. Mitsuba's axis is z, from 0 to 1; ours is y, about 0."""
     radius, low, high = p.number("radius", 1.0), p.point("p0") or [0.0] * 3, p.point("p1") or [0.0, 0.0, 1.0]
     along = np.subtract(high, low)
     length = float(np.linalg.norm(along))
     if not (length > 0.0 and radius > 0.0):
-        raise p.element.error([low, high, radius], "two points p0 and p1, and a radius > 0")
+        p.note("it is left out: its length or its radius is not above 0")
+        return None
     matrix = np.eye(4)
     frame = Frame.about(torch.from_numpy(along / length)[:, None])  # the one that Mitsuba takes
     matrix[:3, 0], matrix[:3, 1] = radius * frame.s[:, 0].numpy(), radius * frame.t[:, 0].numpy()
     matrix[:3, 2], matrix[:3, 3] = along, low
     ours = KINDS["cylinder"].own({"center": (0.0, 0.0, 0.0), "radius": 1.0, "height": 1.0})
-    return _shape(p, "cylinder", matrix @ np.linalg.inv(ours), capped=False)
+    return _shape(p, "cylinder", p.transform() @ matrix @ np.linalg.inv(ours), capped=False)
 
 
 def _simple(type: str) -> Any:
-    return lambda p, importer: _shape(p, type)
+    return lambda p, importer: _shape(p, type, p.transform())
+
+
+def bounds(shapes: Mapping[str, Shape], base: Path) -> Matrix | None:
+    """Return the least and the greatest coordinates ``(2, 3)`` of shapes; None without any.
+
+    Args:
+        shapes: shapes by name.
+        base: the folder where their relative paths start.
+    """
+    box = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, 8).T
+    points = []
+    for shape in shapes.values():
+        pose = np.eye(4)
+        while shape["type"] == "instance":
+            pose, shape = pose @ _pose_of(shape), shapes[shape["of"]] | {"transform": [{"matrix": np.eye(4)}]}
+        own = box * shape.get("radius", 1.0) + (shape.get("center") or [0.0] * 3)
+        if shape["type"] in ("rectangle", "disk"):
+            own = box * [1.0, 1.0, 0.0]
+        elif shape["type"] == "mesh":
+            parts = shape.get("mesh") or load_mesh(
+                base / shape["path"], materials=False, index=shape.get("shape_index")
+            )
+            own = np.concatenate([part.vertices for part in parts])
+        points.append(apply_points(pose @ _pose_of(shape), own))
+    found = np.concatenate(points or [np.zeros((0, 3))])
+    return np.stack((found.min(0), found.max(0))) if len(found) else None
+
+
+def _pose_of(shape: Shape) -> Matrix:
+    return np.array(shape["transform"][0]["matrix"]) if "transform" in shape else np.eye(4)
 
 
 #: Plugins of the tag ``shape``; ``shapegroup`` and ``instance`` are taken apart by the importer.

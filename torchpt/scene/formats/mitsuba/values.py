@@ -6,7 +6,6 @@ emitter as it is (an equal energy spectrum of 1 is then ``[1.205, 0.948, 0.909]`
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,10 +18,11 @@ from torchpt.core.errors import SceneError
 from torchpt.core.files import read_regular
 from torchpt.images.colour import srgb_to_linear
 from torchpt.math import transforms
+from torchpt.math.vectors import Frame
 from torchpt.scene.formats.mitsuba.cie import D65, WAVELENGTHS, XYZ
 from torchpt.scene.formats.mitsuba.elements import Element
 
-__all__ = ["LARGEST", "boolean", "colour", "integer", "number", "numbers", "transform", "vector"]
+__all__ = ["LARGEST", "boolean", "colour", "integer", "is_projective", "number", "numbers", "transform", "vector"]
 
 Rgb = tuple[float, float, float]
 Matrix = NDArray[np.float64]
@@ -285,10 +285,16 @@ def _matrix(element: Element) -> Matrix:
         total[:3, :3] = values.reshape(3, 3)
         return total
     total = values.reshape(4, 4)
-    if not np.allclose(total[3], [0.0, 0.0, 0.0, 1.0], atol=1e-6):
-        raise element.error(total[3].tolist(), "a matrix whose last row is 0 0 0 1")
+    if element.version < (2,) and total[3, 3] != 0.0:  # Mitsuba divided by it then, and takes no notice of it now
+        total = total / total[3, 3]
     total[3] = [0.0, 0.0, 0.0, 1.0]
     return total
+
+
+def is_projective(element: Element) -> bool:
+    """Return True for a ``<transform>`` with a ``<matrix>`` in whose last row more than the last number stands."""
+    rows = (child.attributes.get("value", "").replace(",", " ").split()[12:15] for child in element.children)
+    return any(abs(float(word)) > 1e-6 for row in rows for word in row)
 
 
 def _look_at(element: Element) -> Matrix:
@@ -305,9 +311,20 @@ def _look_at(element: Element) -> Matrix:
     origin, target = (numbers(element, attributes.get(name, ""), (3,)) for name in ("origin", "target"))
     away = np.subtract(target, origin)
     up = numbers(element, attributes["up"], (3,)) if "up" in attributes else None
-    if up is None or not any(up):
-        up = [0.0, 0.0, 1.0] if abs(away[0]) + abs(away[2]) < 1e-9 * math.hypot(*away) else [0.0, 1.0, 0.0]
+    if (up is None or not any(up)) and away.any():
+        up = _any_up(away, modern=element.version >= (2,))
     return transforms.look_at(origin, target, up) @ mirror
+
+
+def _any_up(away: Matrix, *, modern: bool) -> list[float]:
+    """Return the direction across ``away`` that Mitsuba takes as up where none is given."""
+    away = away / np.abs(away).max()
+    away = away / np.linalg.norm(away)
+    if modern:
+        return Frame.about(torch.from_numpy(away)[:, None]).s[:, 0].tolist()
+    x, y, z = away
+    across = np.array([z, 0.0, -x]) if abs(x) > abs(y) else np.array([0.0, z, -y])
+    return np.cross(across, away).tolist()
 
 
 _OPERATIONS: dict[str, Callable[[Element], Matrix]] = {

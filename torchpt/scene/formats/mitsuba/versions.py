@@ -52,6 +52,7 @@ _HUMP = re.compile(r"(?<=[a-z0-9])([A-Z]+)")
 
 def plugin_name(tag: str, name: str) -> str:
     """Return the present name of a plugin."""
+    name = name.lower()  # `shapeGroup` was found where files are, whatever their case
     return PLUGINS.get((tag, name), name)
 
 
