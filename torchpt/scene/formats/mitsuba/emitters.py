@@ -55,13 +55,11 @@ def _point(p: Properties, importer: Importer) -> list[Light]:
 
 def _spot(p: Properties, importer: Importer) -> list[Light]:
     _common(p)
-    matrix, texture = p.transform(), p.slot("texture", _ONE, light=True)
+    matrix = p.transform()
     intensity, cutoff = p.colour("intensity", _ONE, light=True), p.number("cutoff_angle", 20.0)
     beam = p.number("beam_width", 0.75 * cutoff)
-    if isinstance(texture, dict) or p.objects("texture"):
+    if p.objects("texture"):
         p.note("the texture of the beam is left out")
-    else:
-        intensity = [a * b for a, b in zip(intensity, texture, strict=True)]
     axis = _axis(p)
     if axis is None:
         return []

@@ -487,7 +487,8 @@ class Importer:
                 if not is_usable(total):
                     self.notes.add(target, f"{target.label}: a flattened copy is left out")
                     continue
-                copy = posed({"type": "instance", "of": drawn[id(target)]}, total)
+                sides = {"flip_normals": True} if before.get("flip_normals") else {}  # a copy has its own
+                copy = posed({"type": "instance", "of": drawn[id(target)], **sides}, total)
                 self.shapes[self._free(self.shapes, target)] = copy
 
     def _own_pose(self, element: Element) -> Any:

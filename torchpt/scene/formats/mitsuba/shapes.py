@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError, SceneError
-from torchpt.math.transforms import apply_points, is_usable, similarity_scale
+from torchpt.math.transforms import affine, apply_points, is_usable, similarity_scale
 from torchpt.math.vectors import Frame
 from torchpt.physics.shapes import KINDS
 from torchpt.scene.formats.mitsuba.elements import Element
@@ -198,14 +198,11 @@ def _sphere(p: Properties, importer: Importer) -> Shape | None:
     if radius == 0.0 or (radius < 0.0 and not p.modern):
         p.note("it is left out: its radius is not above 0")
         return None
-    if is_usable(pose) and similarity_scale(pose) is None:
+    if similarity_scale(pose) is None:
         p.note("a stretched sphere stays one, of its size along x")
-        u, values, v = np.linalg.svd(pose[:3, :3])
-        size = v.T @ np.diag(values) @ v  # the pose is a turn after it
-        length = size[0, 0] if p.modern else np.linalg.norm(pose[:3, 0])
+        u, _, v = np.linalg.svd(pose[:3, :3])
         middle = apply_points(pose, np.array([center or [0.0] * 3]))[0]
-        pose, center = pose.copy(), None
-        pose[:3, :3], pose[:3, 3] = u @ v * length, middle
+        pose, center = affine(u @ v * np.linalg.norm(pose[:3, 0]), middle), None
     radius = abs(radius)
     return _shape(p, "sphere", pose, flip=flip, center=center, radius=None if radius == 1.0 else radius)
 
