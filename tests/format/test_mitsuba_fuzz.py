@@ -10,7 +10,7 @@ import warnings
 from pathlib import Path
 
 import pytest
-from mitsuba_corpus import EXACT, NEAREST, OLD, write_assets
+from mitsuba_corpus import EXACT, NEAREST, OLD, scene, write_assets
 
 from torchpt.core.errors import EnergyWarning, ImportedSceneWarning, TorchptError
 from torchpt.scene.formats.description import read_description
@@ -21,7 +21,31 @@ TOKENS = (
     "bsdf", "shape", "texture", "sphere", "obj", "name", "\x00", "\ud7ff", "<!--", "]]>", "<scene>", "</scene>", "9" * 400,
     "0 0 0", "1,2,3", "../../../etc/passwd", "true", "to_world", "radius", "id=\"a\"", "<include filename='scene.xml'/>",
 )  # fmt: skip
-TEXTS = [*EXACT.values(), *(text for text, *_ in NEAREST.values()), *(text for pair in OLD.values() for text in pair)]
+FLAT, PROJECTIVE, LOOK = (
+    f'<transform name="to_world">{operation}</transform>'
+    for operation in (
+        '<scale x="-2" y="0" z="0"/>',
+        '<matrix value="1 0 0 0 0 1 0 0 0 0 0 0 0 0 0.1 2"/>',
+        '<lookat origin="0, 1, 0" target="1, 0, 0"/>',
+    )
+)
+#: Poses, spots and heads of files that need mending.
+PUBLISHED = (
+    scene(f'<shape type="sphere"><float name="radius" value="-1"/>{FLAT}</shape>'),
+    scene(f'<shape type="cube">{PROJECTIVE}</shape>'),
+    scene(f'<emitter type="spot"><float name="cutoff_angle" value="270"/>{FLAT}</emitter>'),
+    scene(
+        '<shape type="shapegroup" id="g"><shape type="cube"/></shape><shape type="instance"><ref id="g"/>'
+        f"{LOOK}</shape>"
+    ),
+    f' <?xml version="1.0"?><!DOCTYPE scene><scene version="0.6.0"><shape type="disk">{LOOK}</shape></scene>',
+)
+TEXTS = [
+    *PUBLISHED,
+    *EXACT.values(),
+    *(text for text, *_ in NEAREST.values()),
+    *(text for pair in OLD.values() for text in pair),
+]
 #: Longest that one scene may take, in seconds; most take a few milliseconds.
 LONGEST = 20.0
 #: Most bytes that the process may grow to beside what it has before.

@@ -70,13 +70,12 @@ _SHAPES = {
 @pytest.mark.mitsuba
 @pytest.mark.parametrize("shape", _SHAPES)
 @pytest.mark.parametrize("flipped", [False, True])
-@pytest.mark.parametrize("version", ["3.0.0", "2.1.0"])
-def test_mirrored_shapes_shine_where_mitsubas_do(tmp_path: Path, shape: str, flipped: bool, version: str) -> None:
+def test_mirrored_shapes_shine_where_mitsubas_do(tmp_path: Path, shape: str, flipped: bool) -> None:
     """Mitsuba turns mirrored spheres inside out, and meshes whose normals are those of their faces."""
     type, inside = _SHAPES[shape]
     inside += '<boolean name="flip_normals" value="true"/>' * flipped + _AREA
     pose = '<scale x="-1"/><rotate x="0.6" y="0.8" angle="-70"/><translate y="0.8"/>'
-    found = agreements(write(tmp_path, scene(posed(type, pose, inside), version)), 300)
+    found = agreements(write(tmp_path, scene(posed(type, pose, inside))), 300)
     assert found["emission"].count > 5 or shape in ("sphere", "cube", "cylinder")
     # Mitsuba decides by the interpolated normal which side of a smooth mesh shines.
     assert found["emission"].off <= (0.15 if shape == "smooth mesh" else 0.01), found
@@ -218,13 +217,6 @@ def test_the_depth_scale_of_an_orthographic_sensor_has_no_meaning(tmp_path: Path
     assert np.allclose(camera(tmp_path, pose, "orthographic")[0][:3, :3], np.eye(3))
 
 
-def test_a_perspective_sensor_without_extent_is_an_error_of_one_line(tmp_path: Path) -> None:
-    file = write(tmp_path, scene("").replace("<lookat", '<scale x="0"/><lookat'))
-    with pytest.raises(SceneError, match=r"scene.xml: line 3: expected a to_world that can be inverted") as caught:
-        read_mitsuba(file, "scene.xml", ImportOptions())
-    assert "\n" not in str(caught.value)
-
-
 def test_a_scene_without_a_sensor_is_seen_whole(tmp_path: Path) -> None:
     body = posed("cube", '<scale y="2"/><translate x="5"/>') + posed(
         "obj", '<scale value="0.1"/>', _OBJ.format("plain")
@@ -239,7 +231,7 @@ def test_a_scene_without_a_sensor_is_seen_whole(tmp_path: Path) -> None:
 
 
 @pytest.mark.mitsuba
-@pytest.mark.parametrize(("cutoff", "beam"), [(20, 30), (20, 20), (20, 0), (180, 90)])
+@pytest.mark.parametrize(("cutoff", "beam"), [(20, 30), (20, 0)])
 def test_beams_of_spots_are_mitsubas(tmp_path: Path, cutoff: float, beam: float) -> None:
     angles = f'<float name="cutoff_angle" value="{cutoff}"/><float name="beam_width" value="{beam}"/>'
     look = '<transform name="to_world"><lookat origin="0, 4, 1" target="0, 0, 0" up="0, 0, 1"/></transform>'

@@ -235,20 +235,18 @@ def bounds(shapes: Mapping[str, Shape], base: Path) -> Matrix | None:
         base: the folder where their relative paths start.
     """
     box = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, 8).T
-    points = []
+    points: list[Matrix] = []
     for shape in shapes.values():
-        pose = np.eye(4)
-        while shape["type"] == "instance":
-            pose, shape = pose @ _pose_of(shape), shapes[shape["of"]] | {"transform": [{"matrix": np.eye(4)}]}
-        own = box * shape.get("radius", 1.0) + (shape.get("center") or [0.0] * 3)
-        if shape["type"] in ("rectangle", "disk"):
+        solid = shapes[shape["of"]] if shape["type"] == "instance" else shape  # an instance has the whole pose itself
+        own = box * solid.get("radius", 1.0) + (solid.get("center") or [0.0] * 3)
+        if solid["type"] in ("rectangle", "disk"):
             own = box * [1.0, 1.0, 0.0]
-        elif shape["type"] == "mesh":
-            parts = shape.get("mesh") or load_mesh(
-                base / shape["path"], materials=False, index=shape.get("shape_index")
+        elif solid["type"] == "mesh":
+            parts: Sequence[MeshPart] = solid.get("mesh") or load_mesh(
+                base / solid["path"], materials=False, index=solid.get("shape_index")
             )
             own = np.concatenate([part.vertices for part in parts])
-        points.append(apply_points(pose @ _pose_of(shape), own))
+        points.append(apply_points(_pose_of(shape), own))
     found = np.concatenate(points or [np.zeros((0, 3))])
     return np.stack((found.min(0), found.max(0))) if len(found) else None
 
