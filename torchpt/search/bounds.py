@@ -6,7 +6,7 @@ spheres, quadrics; ``counts`` has the number of each.
 
 from __future__ import annotations
 
-from itertools import accumulate
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
@@ -17,6 +17,8 @@ __all__ = ["half_areas", "primitive_bounds", "select_primitives"]
 
 #: Margin of a box relative to coordinates and size: four float32 roundings (2^-24 each).
 _MARGIN = 2.0**-22
+#: Primitives whose boxes are computed at once: of a large mesh the temporaries in float64 would be many times the boxes.
+_BLOCK = 1 << 14
 
 
 def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
@@ -27,6 +29,31 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
 
     A rectangle's fourth corner is ``p1 + p2 - p0``; an ellipse extends ``sqrt(e1^2 + e2^2)`` from its centre on each axis.
     """
+    low, high = (torch.empty_like(geometry.p0, dtype=torch.float32) for _ in range(2))
+    for first in range(0, geometry.size, _BLOCK):
+        block = slice(first, min(first + _BLOCK, geometry.size))
+        low[:, block], high[:, block] = _bounds(_block_of(geometry, block.start, block.stop))
+    return low, high
+
+
+def _block_of(geometry: Geometry, first: int, end: int) -> Geometry:
+    """Return views of the primitives ``first`` to ``end - 1``, without instances."""
+    starts = [0, *accumulate(geometry.counts)]
+    triangles, rectangles, disks, spheres, quadrics = (
+        max(0, min(end, stop) - max(first, start)) for start, stop in pairwise(starts)
+    )
+    table = geometry.quadrics
+    if table is not None:
+        begin = max(first - starts[4], 0)
+        table = QuadricTable(
+            *(x[:, begin : begin + quadrics] for x in (table.frame, table.form, table.low, table.high))
+        )
+    p0, p1, p2 = (p[:, first:end] for p in (geometry.p0, geometry.p1, geometry.p2))
+    return Geometry(p0, p1, p2, (triangles, rectangles, disks, spheres, quadrics), table)
+
+
+def _bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
+    """Return :func:`primitive_bounds` of one block."""
     p0, p1, p2 = geometry.p0.double(), geometry.p1.double(), geometry.p2.double()
     # the ids one past the last triangle, rectangle, disk and sphere; the others are quadrics
     triangles_end, rectangles_end, disks_end, spheres_end = accumulate(geometry.counts[:4])
@@ -48,7 +75,7 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
     down, up = low.float(), high.float()  # rounded to nearest; moved outward below where that went inward
     down = torch.where(down.double() > low, torch.nextafter(down, torch.full_like(down, -torch.inf)), down)
     up = torch.where(up.double() < high, torch.nextafter(up, torch.full_like(up, torch.inf)), up)
-    return down.contiguous(), up.contiguous()
+    return down, up
 
 
 def select_primitives(geometry: Geometry, prim: Tensor) -> Geometry:
