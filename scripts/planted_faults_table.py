@@ -393,7 +393,7 @@ FAULTS = (
         "disk_box_by_one_axis",
         "search/bounds.py",
         "search shapes",
-        "primitive_bounds",
+        "_bounds",
         "((p1 - p0)[:, disks].square() + (p2 - p0)[:, disks].square()).sqrt()",
         "torch.maximum((p1 - p0)[:, disks].abs(), (p2 - p0)[:, disks].abs())",
         "disks that are turned about their own axis are cut off at four sides",
