@@ -124,7 +124,7 @@ def loaded(name: str, **changed: Any) -> torchpt.Scene:
 
 
 def table_of(scene: torchpt.Scene, dtype: torch.dtype = torch.float32) -> Any:
-    return scene.world(dtype)[0].lights
+    return scene.world(dtype, alone=True)[0].lights
 
 
 def rand(*shape: int, seed: int = 3) -> Tensor:
@@ -160,7 +160,7 @@ def place(name: str, scene: torchpt.Scene, radii: float) -> tuple[Tensor, Tensor
 
 def shining(name: str, scene: torchpt.Scene, x: Tensor, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
     """Radiance ``(3, N)`` and density ``(N,)`` that rays from ``x`` along ``d`` find by chance."""
-    world, _ = scene.world(torch.float32)
+    world, _ = scene.world(torch.float32, alone=True)
     assert world.lights is not None
     if name in lights.KINDS:
         kind = lights.KINDS[name]
@@ -357,7 +357,7 @@ def test_derivatives_are_those_of_differences(name):
             params[key] = (1 + 0.5 * torch.sin(2 * j) * torch.sin(i)[:, None])[:, :, None].expand(value.shape).clone()
 
     def irradiance(given: dict[str, Tensor]) -> Tensor:
-        table = scene.world(torch.float64, given)[0].lights
+        table = scene.world(torch.float64, given, alone=True)[0].lights
         assert table is not None
         light = drawn(table, x, u)
         return (light.radiance * light.weight * dot(light.wi, axis).clamp_min(0) * weights).sum(0).mean()
@@ -365,7 +365,7 @@ def test_derivatives_are_those_of_differences(name):
     def integral(given: dict[str, Tensor]) -> Tensor:
         if not CASES[name].density_moves:
             return irradiance(given)
-        table, d = scene.world(torch.float64, given)[0].lights, sphere(squares(400))
+        table, d = scene.world(torch.float64, given, alone=True)[0].lights, sphere(squares(400))
         kind = lights.KINDS[name]
         assert table is not None and issubclass(kind, lights.Environment)
         radiance, _ = kind.radiance_pdf(table.environment, d, mis=True)

@@ -46,7 +46,12 @@ class Floor:
         camera = {"type": "perspective", "origin": [0, 1, 4], "target": [0, 0, 0]}
         scene = {"camera": camera, "shapes": {"floor": floor, **shapes}, "lights": sources}
         scene = torchpt.load(scene, device="cpu")
-        wave = make_wave(scene, settings(scene.description, {"integrator": "bdpt"}), None, torch.float64)
+        wave = make_wave(
+            scene,
+            settings(scene.description, {"integrator": {"type": "bdpt", "strategy": "light_paths"}}),
+            None,
+            torch.float64,
+        )
         self.space, self.world = scene.space, wave.context.world
         assert self.world.emission is not None and self.world.lights is not None
         self.emission, self.lights = self.world.emission, self.world.lights

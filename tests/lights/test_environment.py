@@ -99,9 +99,11 @@ def test_directions_on_the_map(quadrants):
 def test_a_lambert_floor_under_a_map(quadrants, strategy):
     sky = {"type": "envmap", "path": str(quadrants), "scale": 1.5}
     scene = torchpt.load(plane(sky), "cpu")
-    world, _ = scene.world(torch.float32)
-    assert world.lights is not None and isinstance(world.lights.environment, EnvironmentMap)
-    assert world.lights.environment.compensated is not None
+    for alone in (False, True):  # the density by luminance is made only where it is read
+        world, _ = scene.world(torch.float32, alone=alone)
+        assert world.lights is not None and isinstance(world.lights.environment, EnvironmentMap)
+        assert world.lights.environment.compensated is not None
+        assert (world.lights.environment.plain is not None) == alone
     mean, error = estimate(shoot(scene, 64, 7, integrator={"max_depth": 2, "strategy": strategy}).image)
     expected = ALBEDO * irradiance(scene.params["lights.sky.texels"], 1.5)
     assert ((mean - expected).abs() < z_limit(12) * error).all(), (mean, expected, error)

@@ -45,6 +45,7 @@ __all__ = [
     "on_low_memory",
     "release_memory",
     "retry_out_of_memory",
+    "trim_heap",
 ]
 
 #: Lanes of the first wave under a limit. After it all code is loaded, whose memory must not count as that of lanes.
@@ -205,6 +206,11 @@ def release_memory() -> None:
     gc.collect()
     if torch.cuda.is_initialized():
         torch.cuda.empty_cache()
+    trim_heap()
+
+
+def trim_heap() -> None:
+    """Give freed memory of the heap back to the system, where the C library can."""
     trim = _malloc_trim()
     if trim is not None:
         trim(0)  # bytes to keep at the top of the heap

@@ -202,7 +202,13 @@ class Distribution2D:
         """Build the distribution of non-negative weights ``(R, C)``, at least one of them positive."""
         w = weights.detach().double()
         num_rows = w.shape[0]
-        along = torch.cumsum(w, 1)  # (R, C) over the columns of each row
+        count, blocks = 1 + w.numel(), None
+        rest = -count % _BLOCK if count > _SMALL else 0
+        columns = w.new_empty(count + rest)
+        columns[0] = 0.0
+        columns[count:] = torch.inf
+        along = columns[1:count].view(w.shape)  # over the columns of each row
+        torch.cumsum(w, 1, out=along)
         total = along[:, -1:].clone()
         # In place, as grids may be large. A row without weight is never drawn.
         along.div_(torch.where(total > 0, total, 1.0)).masked_fill_(total <= 0, 1.0)
@@ -210,9 +216,6 @@ class Distribution2D:
         down = torch.cumsum(total[:, 0], 0)
         zero = down.new_zeros(1)
         width = torch.tensor(w.shape[1], dtype=torch.int64, device=w.device)
-        count, blocks = 1 + along.numel(), None
-        rest = -count % _BLOCK if count > _SMALL else 0
-        columns = torch.cat((zero, along.reshape(-1), zero.new_full((rest,), torch.inf)))
         if count > _SMALL:
             blocks = columns[::_BLOCK].contiguous()
         return Distribution2D(rows=torch.cat((zero, down / down[-1])), columns=columns, width=width, blocks=blocks)

@@ -160,7 +160,9 @@ def make_wave(
     if like is None:
         uv = any(layer.uv for layer in surface_layers(settings).values())  # an AOV shows texture coordinates
         with one_thread() if scene.numbers <= QUICK_NUMBERS else nullcontext():
-            world, geometry = scene.world(dtype, world_params, uv=uv, choice=settings.light_choice)
+            world, geometry = scene.world(
+                dtype, world_params, uv=uv, choice=settings.light_choice, alone=settings.lights_alone
+            )
             threads = None if settings.render.threads == "auto" else int(settings.render.threads)
             surfaces_move = any(
                 name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in world_params
@@ -342,7 +344,9 @@ def rebuild_with_tape(wave: Wave, scene: Scene, settings: Settings, params: Mapp
         params: tensors in place of the scene's, by name.
     """
     uv = any(layer.uv for layer in surface_layers(settings).values())
-    world, _ = scene.world(wave.context.plan.dtype, params, uv=uv, choice=settings.light_choice)
+    world, _ = scene.world(
+        wave.context.plan.dtype, params, uv=uv, choice=settings.light_choice, alone=settings.lights_alone
+    )
     if not wave.integrator.lit:
         world = replace(world, lights=None)
     camera = scene.camera(settings.film, scene.merged(params), wave.context.plan.dtype)

@@ -24,7 +24,7 @@ from torch import Tensor
 from torchpt import search
 from torchpt.core.autograd import outside_transforms
 from torchpt.core.errors import SceneError, example_names
-from torchpt.core.memory import MemoryMeter, mb, retry_out_of_memory
+from torchpt.core.memory import MemoryMeter, mb, retry_out_of_memory, trim_heap
 from torchpt.core.threads import outside_inference_mode, warm_up
 from torchpt.core.tree import moved
 from torchpt.physics.bsdfs import Bsdf
@@ -132,7 +132,7 @@ class Scene:
         self._unchanged_sizes = unchanged_sizes(self._sized_shapes, self.params)
         self._lock = threading.RLock()
         # By dtype, whether texture coordinates were asked for, and light sampler.
-        self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
+        self._worlds: dict[tuple[torch.dtype, bool, str, bool], tuple[World, Geometry]] = {}
         self._pieces = KeptPieces()  # of the latest worlds
         # By kind of search and number of threads: those of the scene's own parameters, and the latest of any parameters, to
         # refit or to reuse its topology.
@@ -380,7 +380,12 @@ class Scene:
                 raise SceneError(f"params.{changed}", merged[changed].tolist(), expected) from None
 
     def world(
-        self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None, uv: bool = False, choice: str = "auto"
+        self,
+        dtype: torch.dtype,
+        params: Mapping[str, Tensor] | None = None,
+        uv: bool = False,
+        choice: str = "auto",
+        alone: bool = False,
     ) -> tuple[World, Geometry]:
         """Return the world and the geometry for the search; cached for the scene's own parameters.
 
@@ -389,15 +394,18 @@ class Scene:
             params: checked tensors in place of the scene's.
             uv: True for texture coordinates even where no texture reads them.
             choice: the light sampler, from ``lights.LIGHT_SAMPLERS``.
+            alone: True where lights are sampled alone, not combined with BSDF sampling by MIS.
         """
         if params:
-            return self._assemble(self.merged(params), dtype, uv=uv, choice=choice)
+            return self._assemble(self.merged(params), dtype, uv=uv, choice=choice, alone=alone)
         with self._lock:
             self._refresh()
-            key = dtype, uv, choice
+            key = dtype, uv, choice, alone
             if key not in self._worlds:
                 with outside_inference_mode(), torch.no_grad():
-                    self._worlds[key] = self._assemble(self.merged(None), dtype, uv=uv, choice=choice)
+                    merged = self.merged(None)
+                    self._worlds[key] = self._assemble(merged, dtype, uv=uv, choice=choice, alone=alone)
+                trim_heap()  # of large meshes and textures, temporaries are as much as what is kept
             return self._worlds[key]
 
     def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
@@ -503,7 +511,7 @@ class Scene:
         return describe(self.description, self._built, world, self.accel(settings.render.accel, threads), settings)
 
     def _assemble(
-        self, params: Mapping[str, Tensor], dtype: torch.dtype, *, uv: bool, choice: str
+        self, params: Mapping[str, Tensor], dtype: torch.dtype, *, uv: bool, choice: str, alone: bool
     ) -> tuple[World, Geometry]:
         """Assemble the world on the host, and copy it to the device.
 
@@ -512,7 +520,7 @@ class Scene:
         """
         host = self._host_copies.of(params, self.params)
         own = frozenset(name for name, value in params.items() if self.params.get(name) is value)
-        reads = ParameterReads(host, self._pieces, own, variant=(dtype, uv, choice))
+        reads = ParameterReads(host, self._pieces, own, variant=(dtype, uv, choice, alone))
         built, space = self._built, self._host_space
         made = assemble(
             built.parts,
@@ -523,6 +531,7 @@ class Scene:
             built.copies,
             uv=uv,
             choice=choice,
+            alone=alone,
             own_models=self.own_models,
         )
         if self.device.type == "cpu":

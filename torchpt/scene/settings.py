@@ -625,6 +625,11 @@ class Settings:
         """Return the name of the light sampler."""
         return self.integrator.light_choice
 
+    @property
+    def lights_alone(self) -> bool:
+        """Return True if lights may be sampled alone, not combined with BSDF sampling by MIS."""
+        return self.integrator.strategy != "mis"
+
     def plain(self, without: Mapping[str, Collection[str]] = MappingProxyType({})) -> dict[str, Any]:
         """Return the settings as plain values in the form of a scene file, without the keys ``without``, by block."""
         blocks = {name: _plain(getattr(self, name)) for name in BLOCKS}

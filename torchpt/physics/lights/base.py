@@ -108,6 +108,7 @@ class Setting:
         unit: length of the world unit in scene units.
         reach: ``()`` float64 radius of the scene in world units; the power of a distant light grows with its square.
         dtype: dtype of the world.
+        alone: True where lights are sampled alone, not combined with BSDF sampling by MIS.
     """
 
     given: Callable[[str], Tensor]
@@ -116,6 +117,7 @@ class Setting:
     unit: float
     reach: Tensor
     dtype: torch.dtype
+    alone: bool
 
     def __getitem__(self, key: str) -> Tensor:
         """Return a parameter in float64."""

@@ -56,6 +56,7 @@ def assemble(
     copies: Sequence[Copy] = (),
     uv: bool = False,
     choice: str = "auto",
+    alone: bool = False,
     own_models: Sequence[Bsdf] = (),
 ) -> tuple[World, Geometry]:
     """Build the world that stages read, and the geometry that the search reads.
@@ -70,13 +71,16 @@ def assemble(
         copies: instances of parts, in the order of their slots.
         uv: True for texture coordinates even where no texture reads them.
         choice: the light sampler, from ``lights.LIGHT_SAMPLERS``.
+        alone: True where lights are sampled alone, not combined with BSDF sampling by MIS.
         own_models: the user's own BSDFs, whose results may depend on more than parameters.
 
     Raises:
         SceneError: parameters with positions or sizes beyond the range of float32.
     """
     reads = parameters if isinstance(parameters, ParameterReads) else ParameterReads(parameters)
-    assembly = _Assembly(parts, copies, sources, reads, space, dtype, uv=uv, choice=choice, own_models=own_models)
+    assembly = _Assembly(
+        parts, copies, sources, reads, space, dtype, uv=uv, choice=choice, alone=alone, own_models=own_models
+    )
     return assembly.world(), assembly.geometry()
 
 
@@ -94,12 +98,13 @@ class _Assembly(Pieced):
         *,
         uv: bool,
         choice: str,
+        alone: bool,
         own_models: Sequence[Bsdf],
     ) -> None:
         super().__init__(parameters)
         self.parts, self.copies, self.sources = parts, copies, sources
         self.space, self.dtype, self.device = space, dtype, space.centre.device
-        self.uv, self.choice, self.own_models = uv, choice, own_models
+        self.uv, self.choice, self.alone, self.own_models = uv, choice, alone, own_models
         self.owners: list[Part | Copy] = [*parts, *copies]  # in the order of slots
 
     @cached_property
@@ -297,6 +302,7 @@ class _Assembly(Pieced):
             emissive=self.dark() == 0,
             opacity_mapped=opacity_mapped,
             choice=self.choice,
+            alone=self.alone,
         )
 
     @piece

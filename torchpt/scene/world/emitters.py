@@ -75,6 +75,7 @@ def lights_of(
     emissive: Tensor,
     opacity_mapped: bool,
     choice: str = "auto",
+    alone: bool = False,
 ) -> Lights | None:
     """Build the light table; None where nothing emits.
 
@@ -89,6 +90,7 @@ def lights_of(
         emissive: ``(P + I,)`` bool, True for primitives that emit.
         opacity_mapped: True where an emissive part has an opacity texture.
         choice: the light sampler, from ``lights.LIGHT_SAMPLERS``.
+        alone: True where lights are sampled alone, not combined with BSDF sampling by MIS.
     """
     prim = emissive.nonzero().squeeze(1)  # emissive primitives, in the order of their rows
     if not len(prim) and not sources:
@@ -103,7 +105,7 @@ def lights_of(
     radius = _scene_radius(geometry) if sources else torch.ones((), device=device)
     environments = []
     for source in sources:
-        row, environment = _source(source, parameters, space, radius, dtype)
+        row, environment = _source(source, parameters, space, radius, dtype, alone)
         groups.append(row)
         environments.append(environment)
     names = [name for group in groups for name in group.kind]
@@ -206,7 +208,7 @@ def _surfaces(
 
 
 def _source(
-    source: Source, parameters: Mapping[str, Tensor], space: Space, radius: Tensor, dtype: torch.dtype
+    source: Source, parameters: Mapping[str, Tensor], space: Space, radius: Tensor, dtype: torch.dtype, alone: bool
 ) -> tuple[_Rows, Any]:
     """Return the row of a delta light or environment, and the environment's data or None.
 
@@ -216,6 +218,7 @@ def _source(
         space: the coordinates of lanes.
         radius: radius of the scene, float64.
         dtype: dtype of the lanes.
+        alone: see :func:`lights_of`.
     """
 
     def parameter(key: str) -> Tensor:
@@ -224,7 +227,13 @@ def _source(
     try:
         row = LIGHTS[source.kind].row(
             Setting(
-                given=parameter, values=source.values, place=space.point, unit=space.unit, reach=radius, dtype=dtype
+                given=parameter,
+                values=source.values,
+                place=space.point,
+                unit=space.unit,
+                reach=radius,
+                dtype=dtype,
+                alone=alone,
             )
         )
     except Refused as error:

@@ -46,6 +46,8 @@ __all__ = ["EVEN", "EnvironmentMap", "Envmap", "Grid", "build", "environment", "
 
 #: A map is near-constant if less than this fraction of its light is above the mean, over more than this fraction of the sphere.
 EVEN = 0.1
+#: Rows of cells that are integrated at once.
+_ROWS = 64
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class EnvironmentMap:
             the north pole, of the second at the south pole.
         steps: ``(H - 1,)`` one over the differences of ``halves[0]``.
         mean: ``()`` mean luminance over the sphere, without ``scale``; detached.
-        plain: density by luminance.
+        plain: density by luminance, for light sampling alone; None where only the other one is asked for.
         compensated: density for MIS; None if it is ``plain``.
     """
 
@@ -91,15 +93,19 @@ class EnvironmentMap:
     halves: Tensor
     steps: Tensor
     mean: Tensor
-    plain: Grid
+    plain: Grid | None
     compensated: Grid | None
 
     def grid(self, mis: bool) -> Grid:
         """Return the density for MIS with BSDF sampling, or for light sampling alone."""
-        return self.compensated if mis and self.compensated is not None else self.plain
+        grid = self.compensated if mis and self.compensated is not None else self.plain
+        assert grid is not None, "a world of strategy mis has no density for light sampling alone"
+        return grid
 
 
-def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None = None) -> EnvironmentMap:
+def build(
+    texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None = None, alone: bool = True
+) -> EnvironmentMap:
     """Build a map for look-ups and sampling; radiance is differentiable in all three tensors, densities are not.
 
     Args:
@@ -107,6 +113,7 @@ def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None
         turn: ``(3, 3)`` orthogonal, from the world to the map's own space.
         scale: ``()`` factor of the texels.
         compensation: whether to apply MIS compensation; None: unless the map is near-constant.
+        alone: whether there is a density for light sampling alone, where that is not the one for MIS.
     """
     if texels.shape[0] == 1:
         texels = texels.expand(2, -1, -1)
@@ -124,17 +131,19 @@ def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None
     with torch.no_grad():
         light = luminance(planes).clamp_min(0.0).view(height, width)
         zero = light.new_zeros(())
-        weights = _weights(light, heights)
-        mean = sum_all(weights)
+        mean = sum_all(_weights(light, heights))
         black = not bool(mean > 0)
-        # With a floor of -1 every texel of a black map has the value 1: a uniform density.
-        plain = _grid(_weights(torch.ones_like(light), heights), zero - 1.0) if black else _grid(weights, zero)
-        compensated = None
+        compensated = plain = None
         if not black and compensation is not False:
             floor = mean.to(light.dtype)
-            weights = _weights((light - floor).clamp_min(0.0), heights)
-            if bool(sum_all(weights) > 0) and (compensation or _uneven(weights, mean, heights)):
-                compensated = _grid(weights, floor)
+            above = _weights((light - floor).clamp_min(0.0), heights)
+            if bool(sum_all(above) > 0) and (compensation or _uneven(above, mean, heights)):
+                compensated = _grid(above, floor)
+            del above  # a map may be large
+        if alone or compensated is None:
+            # With a floor of -1 every texel of a black map has the value 1: a uniform density.
+            values, floor = (torch.ones_like(light), zero - 1.0) if black else (light, zero)
+            plain = _grid(_weights(values, heights), floor)
     return EnvironmentMap(
         texels=planes,
         height=height,
@@ -152,16 +161,20 @@ def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None
 
 def _weights(values: Tensor, heights: Tensor) -> Tensor:
     """Return integrals ``(H - 1, W)`` float64 over the cells of values ``(H, W)`` at the texels; the sphere has measure 1."""
-    v = values.double()
-    v = v.roll(-1, 1).add_(v)
-    # In place: a map may be large.
-    return (v[:-1] + v[1:]).mul_(0.25).mul_((heights / values.shape[1])[:, None])
+    found = torch.empty(len(values) - 1, values.shape[1], dtype=torch.float64, device=values.device)
+    for first in range(0, len(found), _ROWS):  # a map may be large, and so would be what is between
+        block = found[first : first + _ROWS]
+        v = values[first : first + len(block) + 1].double()
+        v = v.roll(-1, 1).add_(v)
+        torch.add(v[:-1], v[1:], out=block)
+    return found.mul_(0.25).mul_((heights / values.shape[1])[:, None])
 
 
 def _uneven(weights: Tensor, mean: Tensor, heights: Tensor) -> bool:
     """Return False for a near-constant map, see :data:`EVEN`; ``weights`` are integrals of the luminance above the mean."""
     above = sum_all(weights)
-    spread = above * above / sum_all(weights * weights * (weights.shape[1] / heights[:, None]))
+    squares = torch.linalg.vector_norm(weights, dim=1).square()  # of each row
+    spread = above * above / sum_all(squares * (weights.shape[1] / heights))
     return bool((above > EVEN * mean) | (spread < EVEN))
 
 
@@ -314,7 +327,7 @@ class Envmap(Environment):
         texels, scale = (scene.given(key).to(scene.dtype) for key in ("texels", "scale"))
         linear = scene["to_world"][:3, :3]  # the tensor of the key `transform`
         turn = torch.linalg.inv(linear) * torch.linalg.det(linear).abs() ** (1.0 / 3.0)
-        around = build(texels, turn.to(scene.dtype), scale)
+        around = build(texels, turn.to(scene.dtype), scale, alone=scene.alone)
         color = (around.mean * around.scale.detach()).expand(3)
         # From each direction through a disk as wide as the scene, whose radius is `reach`; `bright` is the detached luminance.
         power = 4.0 * math.pi**2 * scene.reach**2 * bright(color)
