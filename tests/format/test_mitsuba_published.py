@@ -249,7 +249,8 @@ def test_a_cutoff_beyond_all_directions_is_all(tmp_path: Path) -> None:
 
 
 def test_document_types_without_entities_are_read(tmp_path: Path) -> None:
-    read(tmp_path, "<!DOCTYPE scene>" + scene('<shape type="sphere"/>'))
+    found, said = read(tmp_path, "<!DOCTYPE scene>" + scene('<shape type="sphere"/>'))
+    assert [shape["type"] for shape in found["shapes"].values()] == ["sphere"] and not said
 
 
 def test_blanks_before_the_declaration_keep_lines(tmp_path: Path) -> None:
@@ -261,7 +262,8 @@ def test_blanks_before_the_declaration_keep_lines(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("version", ["3.0.0-alpha", " 2.1.0 ", "3.0.0a1"])
 def test_versions_with_a_suffix(tmp_path: Path, version: str) -> None:
-    read(tmp_path, scene('<shape type="sphere"/>').replace("3.0.0", version))
+    found, said = read(tmp_path, scene('<shape type="sphere"/>').replace("3.0.0", version))
+    assert [shape["type"] for shape in found["shapes"].values()] == ["sphere"] and not said
 
 
 def test_properties_of_the_scene_are_left_out(tmp_path: Path) -> None:

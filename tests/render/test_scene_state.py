@@ -34,6 +34,13 @@ def test_a_parameter_replaced_or_changed_in_place_takes_effect():
     assert value(scene) == pytest.approx(58)
 
 
+@pytest.mark.parametrize("integrator", [{}, {"strategy": "light"}, {"light_choice": "power"}, "ibl"], ids=str)
+def test_a_render_makes_one_world(integrator):
+    scene = torchpt.load({**LAMP, "lights": {"sky": {"type": "constant"}}}, "cpu")
+    torchpt.render(scene, spp=1, integrator=integrator)
+    assert len(scene._worlds) == 1  # pyright: ignore[reportPrivateUsage]
+
+
 @pytest.mark.parametrize("change", [{"width": 6}, {"height": 6}, {"crop": [1, 0, 2, 3]}, {"filter": "tent"}], ids=str)
 def test_a_scene_remembers_no_other_film(change):
     """A render leaves tables for the next one, which asks for another film."""

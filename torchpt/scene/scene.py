@@ -131,7 +131,7 @@ class Scene:
         self._size_names = frozenset(name for shape in self._sized_shapes for name in shape.names)
         self._unchanged_sizes = unchanged_sizes(self._sized_shapes, self.params)
         self._lock = threading.RLock()
-        # By dtype, whether texture coordinates were asked for, and light sampler.
+        # By dtype, whether texture coordinates were asked for, light sampler, and whether lights are sampled alone.
         self._worlds: dict[tuple[torch.dtype, bool, str, bool], tuple[World, Geometry]] = {}
         self._pieces = KeptPieces()  # of the latest worlds
         # By kind of search and number of threads: those of the scene's own parameters, and the latest of any parameters, to
@@ -408,6 +408,12 @@ class Scene:
                 trim_heap()  # of large meshes and textures, temporaries are as much as what is kept
             return self._worlds[key]
 
+    def _own_geometry(self) -> Geometry:
+        """Return the float32 geometry of the scene's own parameters; any world has it, whatever its lights."""
+        made = (geometry for (dtype, *_), (_, geometry) in self._worlds.items() if dtype == torch.float32)
+        found = next(made, None)
+        return self.world(torch.float32)[1] if found is None else found
+
     def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
         """Return a search structure: a new one for ``geometry``, else the cached one of the scene's own.
 
@@ -422,9 +428,9 @@ class Scene:
         key = kind, threads
         with self._lock:
             if geometry is None:
-                _, own = self.world(torch.float32)
+                self._refresh()
                 if key not in self._accels:
-                    self._accels[key] = self._build_accel(key, own)
+                    self._accels[key] = self._build_accel(key, self._own_geometry())
                 return self._accels[key]
         return self._build_accel(key, geometry)
 

@@ -6,7 +6,7 @@ spheres, quadrics; ``counts`` has the number of each.
 
 from __future__ import annotations
 
-from itertools import accumulate, pairwise
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -32,24 +32,9 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
     low, high = (torch.empty_like(geometry.p0, dtype=torch.float32) for _ in range(2))
     for first in range(0, geometry.size, _BLOCK):
         block = slice(first, min(first + _BLOCK, geometry.size))
-        low[:, block], high[:, block] = _bounds(_block_of(geometry, block.start, block.stop))
+        prim = torch.arange(block.start, block.stop, device=low.device)
+        low[:, block], high[:, block] = _bounds(select_primitives(geometry, prim))
     return low, high
-
-
-def _block_of(geometry: Geometry, first: int, end: int) -> Geometry:
-    """Return views of the primitives ``first`` to ``end - 1``, without instances."""
-    starts = [0, *accumulate(geometry.counts)]
-    triangles, rectangles, disks, spheres, quadrics = (
-        max(0, min(end, stop) - max(first, start)) for start, stop in pairwise(starts)
-    )
-    table = geometry.quadrics
-    if table is not None:
-        begin = max(first - starts[4], 0)
-        table = QuadricTable(
-            *(x[:, begin : begin + quadrics] for x in (table.frame, table.form, table.low, table.high))
-        )
-    p0, p1, p2 = (p[:, first:end] for p in (geometry.p0, geometry.p1, geometry.p2))
-    return Geometry(p0, p1, p2, (triangles, rectangles, disks, spheres, quadrics), table)
 
 
 def _bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:

@@ -24,7 +24,10 @@ from torchpt.scene import Scene
 from torchpt.scene.settings import Film
 from torchpt.scene.world.primitives import copies_of, copy_maps, corners_of, primitives_of
 
-__all__ = ["Bodies", "Held", "bodies_of"]
+__all__ = ["ROUNDING", "Bodies", "Held", "bodies_of"]
+
+#: Rounding of places, against coordinates: parameters are of float32.
+ROUNDING = 2.0**-22
 
 #: A unit sphere as a row of :attr:`Bodies.forms`.
 _BALL = (1.0, 0.0, 1.0, -math.inf, math.inf)
@@ -113,6 +116,13 @@ class Bodies:
             low = torch.where(mask, -reach + torch.minimum(up, zero), low)
             high = torch.where(mask, reach + torch.maximum(up, zero), high)
         return p0 + low, p0 + high
+
+    def rounding(self, along: Tensor, *prims: Tensor) -> Tensor:
+        """Return by how much rounding moves primitives ``(N,)`` along directions ``(3, N)``; little along an axis near 0."""
+        size = torch.zeros_like(along)
+        for prim in prims:
+            size = size + torch.stack([t.abs() for t in self.place(prim)]).sum(0)
+        return dot(along.abs(), size) * ROUNDING
 
     def points(self, held: Held) -> Tensor:
         """Return where points are ``(3, N)``."""

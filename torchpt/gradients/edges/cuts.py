@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import EdgeWarning, warn_caller
-from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.bodies import ROUNDING, Bodies, Held
 from torchpt.gradients.edges.curves import Curves, circles, corners, joined, known, straight
 from torchpt.gradients.edges.meshes import neighbours_of
 from torchpt.math.vectors import cross, dot, rows, take
@@ -38,8 +38,6 @@ _PAIRS, _MOST = 1 << 21, 1 << 22
 _PARALLEL = 1e-5
 #: Curves that are so near a border, in a flat surface's own numbers, are that border: there surfaces touch.
 _TOUCH = 1e-6
-#: Rounding of places, against coordinates in the scene: parameters are of float32.
-_ROUNDING = 2.0**-22
 #: Least determinant, against the square of the trace, at which a conic is an ellipse.
 _ELLIPSE = 1e-10
 #: Angles at which an ellipse is compared with the border of a disk, and halvings of the step between them.
@@ -233,10 +231,7 @@ def _touch(off: Tensor, *axes: Tensor) -> Tensor:
 
 def _off(bodies: Bodies, along: Tensor, shift: Tensor, *prims: Tensor) -> Tensor:
     """Return by how much rounding moves primitives along directions ``(3, N)``; ``shift``: of the lanes' coordinates."""
-    size = shift.abs()
-    for prim in prims:
-        size = size + torch.stack([t.abs() for t in bodies.place(prim)]).sum(0)
-    return dot(along.abs(), size) * _ROUNDING
+    return bodies.rounding(along, *prims) + dot(along.abs(), shift.abs()) * ROUNDING
 
 
 def _is_disk(bodies: Bodies, prim: Tensor) -> Tensor:

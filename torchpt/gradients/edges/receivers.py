@@ -35,8 +35,8 @@ __all__ = ["MovingFrame", "PathVertex", "Prefix", "one_of_each", "prefixes_of"]
 
 #: Rounding of a point that the search finds, against its coordinates.
 _ROUNDING = 2.0**-18
-#: The same along normals: with more of it rays from a large floor would pass small bodies on it.
-_LIFT = 2.0**-21
+#: Along normals, against the rounding of the primitive: with more of it rays from a large floor would pass small bodies on it.
+_LIFT = 2.0
 #: Vertices after which light that reaches no camera is given up where paths have no limit of their own.
 _MAX_VERTICES = 32
 #: From this vertex on roulette plays.
@@ -83,9 +83,8 @@ class MovingFrame:
         return torch.stack([largest(p.abs()) for p in (size, *points)]).amax(0) * _ROUNDING
 
     def lift(self, prim: Tensor, n: Tensor) -> Tensor:
-        """Return by how much rounding moves primitives ``(N,)`` along their normals ``n (3, N)``; little if these are axes."""
-        size = torch.stack([t.abs() for t in self.bodies.place(prim)]).sum(0)
-        return dot(n.abs(), size) * _LIFT
+        """Return how far off primitives ``(N,)`` rays begin along their normals ``n (3, N)``; little if these are axes."""
+        return _LIFT * self.bodies.rounding(n, prim)
 
     def moving(self, prim: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of primitives that move; False where ``prim`` is -1."""
